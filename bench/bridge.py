@@ -1,9 +1,4 @@
-"""Measures the latency of drive commands to the wheels and of MCU reports to the operator, on MQTT and on Zenoh.
-
-Down: from the operator's publish call to the last byte of the command's line at the MCU's pty. Up: from the moment at
-which the MCU writes a report until the operator receives it. In between are a remote broker, the bridge, the robot's
-local transport and the serial bridge. Real processes, stock mosquitto, loopback.
-"""
+"""Measures the latency of drive commands to the wheels and of MCU reports to the operator, with whole robots."""
 
 from __future__ import annotations
 
@@ -17,8 +12,6 @@ from itertools import pairwise
 from statistics import fmean
 from typing import Any
 
-from rich.table import Table
-
 from pebble.bench import null
 from pebble.bench.aims import Aim, RatioAim, with_lost
 from pebble.bench.bridge_operator import ALL, FLOWS, HOP, STAND_IN, DrivenRobot, Turn, Wheels, arrivals, wheels_of
@@ -27,7 +20,7 @@ from pebble.bench.drivers import RATE_HZ
 from pebble.bench.pictures import bars, ecdf, null_ratios, ratios
 from pebble.bench.ratios import LEAST_ROUNDS
 from pebble.bench.results import Cell, grouped
-from pebble.bench.tables import COUNT, SPREAD, Claims, Grid, latency_table, percentile_column, single_column
+from pebble.bench.tables import COUNT, LOST, SPREAD, Claims, Grid, percentile_column, single_column
 from pebble.errors import PebbleError
 from pebble.rig.robot import KINDS
 
@@ -41,16 +34,10 @@ AIMED = {
 }
 #: Percentile, ms, and how many samples are needed to assess it: with fewer, hardly any lie beyond.
 AIMS_MS = ((50, 0.7, 1), (99, 2.0, 300))
-#: At most this ratio to the stand-in, where nothing but commands is forwarded. With fewer samples in each round than
-#: the last number, the percentile is the maximum.
-AIMS_COMMANDS = (("mqtt", 50, 1.0, 1), ("zenoh", 50, 1.05, 1), ("mqtt", 99, 0.5, 100), ("zenoh", 99, 0.5, 100))
-#: The same of the CPU for each message, by process, where commands and reports are forwarded.
-AIMS_CPU = (
-    ("mqtt", "bridge", 1.0),
-    ("zenoh", "bridge", 1.1),
-    ("mqtt", "serial bridge", 1.1),
-    ("zenoh", "serial bridge", 1.4),
-)
+#: Ratios to the stand-in, at most: of mqtt and zenoh. Commands where nothing else is forwarded, by percentile; with
+#: fewer samples in each round than the last number, the percentile is the maximum. CPU where all is, by process.
+AIMS_COMMANDS = {50: (1.0, 1.05, 1), 99: (0.5, 0.5, 100)}
+AIMS_CPU = {"bridge": (1.0, 1.1), "serial bridge": (1.1, 1.4)}
 _TURN_S, _NULL_TURN_S = 1.0, 0.05  # of driving one robot before the next one
 _STARTUP_S = 1.0  # for start-up work to finish
 _LOADED_S = 4.0  # at most, of driving each robot while media flow
@@ -94,7 +81,8 @@ def measure(round_: Round) -> Iterator[Cell]:
             yield from _in_turns(round_, load, driven)
             for case in round_.cases([{"load": LOADED}], 1) if media else ():
                 if case.variant in KINDS:  # the stand-in has no media
-                    yield from _with_media(case, driven[case.variant])
+                    turn, flowed = driven[case.variant].drive_with_media(min(run["seconds"], _LOADED_S))
+                    yield from cells_of(case, turn, flowed)
 
 
 def _in_turns(round_: Round, load: str, driven: Mapping[str, DrivenRobot], rate_hz: float = RATE_HZ) -> Iterator[Cell]:
@@ -107,17 +95,6 @@ def _in_turns(round_: Round, load: str, driven: Mapping[str, DrivenRobot], rate_
         driven[name].match_arrivals([turn for _, turn in own])
         for case, turn in own:
             yield from cells_of(case, turn)
-
-
-def _with_media(case: Case, robot: DrivenRobot) -> Iterator[Cell]:
-    """While its own camera and microphone are in use."""
-    with robot.media_load() as counts:
-        time.sleep(_STARTUP_S)
-        before = counts()
-        turn = robot.drive(min(case.run["seconds"], _LOADED_S))
-        after = counts()
-    robot.match_arrivals([turn])
-    yield from cells_of(case, turn, {name: after[name] - before[name] for name in after})
 
 
 def cells_of(case: Case, turn: Turn, flowed: Mapping[str, int] | None = None) -> Iterator[Cell]:
@@ -181,10 +158,7 @@ def hops(sent: Mapping[Wheels, int], stations: Sequence[Mapping[Wheels, int]]) -
 
 
 def capture() -> socket.socket:
-    """Captures from now on; packets are read only by :func:`passed`: the measurement is not disturbed.
-
-    Raises PebbleError without permission.
-    """
+    """Captures packets from now on; :func:`passed` reads them afterwards. Raises PebbleError without permission."""
     try:
         wire = socket.socket(socket.AF_PACKET, socket.SOCK_DGRAM)  # no protocol: it receives nothing yet
     except OSError as error:
@@ -219,14 +193,14 @@ def commands(packet: bytes) -> list[tuple[tuple[int, int], Wheels]]:
 # -- the report
 
 
-def latencies(cells: Sequence[Cell]) -> Iterator[Table]:
-    some = [cell for cell in cells if cell.measure != CPU]
-    yield latency_table("Commands down, reports up; and the load on the robot", some, some[0].variant)
-
-
+LATENCIES = Grid(
+    title="Commands down, reports up; and the load on the robot", rows=("conditions", "variant"),
+    columns=(percentile_column(50, "p50 ms"), *map(percentile_column, (95, 99, 100)), COUNT, LOST),
+    baseline=STAND_IN, of=lambda cell: cell.measure != CPU,
+)  # fmt: skip
 CPU_TABLE = Grid(
     title="CPU for each forwarded message, us: median (minimum to maximum) of the rounds",
-    rows=("load", "process", "variant"), heads=("load", "process", "robot"),
+    rows=("load", "variant", "process"), heads=("load", "robot", "process"),
     columns=(SPREAD, COUNT), baseline=STAND_IN, of=lambda cell: cell.measure == CPU,
 )  # fmt: skip
 MEANWHILE = Grid(
@@ -253,16 +227,19 @@ def _aims() -> Iterator[Aim | RatioAim]:
                 of=matches(measure_, load=load), value=with_lost(percent), at_most=ms, unit="ms",
                 least=least, least_rounds=LEAST_ROUNDS, never="not within 1 s",
             )  # fmt: skip
-    for kind, percent, at_most, least in AIMS_COMMANDS:
-        yield RatioAim(
-            what=f"{{variant}}, {AIMED[DOWN, COMMANDS]}, p{percent} at most {{bound:.2f}} of {STAND_IN}'s",
-            of=matches(DOWN, kind, load=COMMANDS), to=STAND_IN, percent=percent, at_most=at_most, least=least,
-        )  # fmt: skip
-    for kind, process, at_most in AIMS_CPU:
-        yield RatioAim(
-            what=f"{{variant}}, {CPU} of the {process}, commands and reports, at most {{bound:.2f}} of {STAND_IN}'s",
-            of=matches(CPU, kind, load=UNLOADED, process=process), to=STAND_IN, at_most=at_most,
-        )  # fmt: skip
+    for percent, (*bounds, least) in AIMS_COMMANDS.items():
+        for kind, at_most in zip(KINDS, bounds, strict=True):
+            yield RatioAim(
+                what=f"{{variant}}, {AIMED[DOWN, COMMANDS]}, p{percent} at most {{bound:.2f}} of {STAND_IN}'s",
+                of=matches(DOWN, kind, load=COMMANDS), to=STAND_IN, percent=percent, at_most=at_most, least=int(least),
+            )  # fmt: skip
+    for process, both in AIMS_CPU.items():
+        what = f"{CPU} of the {process}, commands and reports"
+        for kind, at_most in zip(KINDS, both, strict=True):
+            yield RatioAim(
+                what=f"{{variant}}, {what}, at most {{bound:.2f}} of {STAND_IN}'s",
+                of=matches(CPU, kind, load=UNLOADED, process=process), to=STAND_IN, at_most=at_most,
+            )  # fmt: skip
 
 
 _OPTIONS = (
@@ -292,7 +269,7 @@ BRIDGE_NULL = Comparison(
     measure=pilot,
     # very short turns, so that a disturbance of the machine hits all roles
     measure_round=lambda round_: _in_turns(round_, UNLOADED, {round_.run["variants"][0]: round_.env}, NULL_RATE_HZ),
-    tables=(latencies,),
+    tables=(LATENCIES,),
     assessment=(null.assessment,),
     words=("bench", "bridge"),
     reported=("--null",),
@@ -341,12 +318,11 @@ BRIDGE = Comparison(
     measure_round=measure,
     measures=(DOWN, UP, CPU),
     figures=dict.fromkeys(("cpu_percent", "frames_per_s", "video_per_s", "audio_per_s"), of_known(fmean, 1)),
-    tables=(latencies, CPU_TABLE, MEANWHILE),
+    tables=(LATENCIES, CPU_TABLE, MEANWHILE),
     assessment=(
         Claims(
-            what="Median, {measure}, load {load}",
+            what="Median, {measure}, load {load}", judged=lambda cell: cell.params["load"] == UNLOADED,
             of=lambda cell: cell.measure != CPU and cell.variant in KINDS,
-            judged=lambda cell: cell.params["load"] == UNLOADED,
         ),
         Claims(
             what="{measure}, {process}, load {load}", quantity={CPU: "CPU time"},

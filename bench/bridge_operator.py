@@ -14,8 +14,8 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -45,7 +45,7 @@ _DIGITS = 3  # of a wheel's speed on the serial line
 _STEPS = 800  # wheel values 0.100 … 0.899
 _READ_S = 0.2
 _EVERY = 16  # bytes: one in so many of a picture's is read
-_UP_S, _ANSWER_S = 30.0, 5.0
+_UP_S, _STARTUP_S, _ANSWER_S = 30.0, 1.0, 5.0
 _ARRIVE_S = 1.0  # commands and reports that take longer count as lost
 _POLL_S = 0.05
 
@@ -197,12 +197,10 @@ class DrivenRobot(Processes):
         """An error with the robot's log."""
         return PebbleError(f"{self.kind}: {what}\n{self.subject.log()}")
 
-    @contextmanager
-    def media_load(self) -> Iterator[Callable[[], dict[str, int]]]:
-        """Puts its camera and microphone in use: a program on the robot reads frames, an operator gets both.
+    def drive_with_media(self, seconds: float) -> tuple[Turn, dict[str, int]]:
+        """The same with its camera and microphone in use: a program on the robot reads frames, an operator gets both.
 
-        All media flow as the ``with`` block begins, and stop with it. It is given what counts the received frames and
-        packets so far, by flow. Raises PebbleError if they do not.
+        Returns what arrived, and how many frames and packets were received meanwhile. Raises PebbleError without any.
         """
         robot, before = self.subject, len(self.subject.pids())
         workers = [
@@ -217,11 +215,16 @@ class DrivenRobot(Processes):
 
         self._allow_media(True)
         robot.expect(lambda: all(counts().values()), "its media do not flow", _UP_S)
-        yield counts
+        time.sleep(_STARTUP_S)
+        first = counts()
+        turn = self.drive(seconds)
+        flowed = {name: count - first[name] for name, count in counts().items()}
         self._allow_media(False)
         for worker in workers:
             self.end(worker)
         robot.expect(lambda: len(robot.pids()) <= before, "its media do not end", _UP_S)
+        self.match_arrivals([turn])
+        return turn, flowed
 
     def _allow_media(self, wanted: bool) -> None:
         """Allows and requests video and audio, or stops both."""

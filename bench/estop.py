@@ -2,7 +2,6 @@
 
 Two Linux robots, one on each local transport, and a fleet of boards with Wi-Fi share one remote broker. Each is driven
 all the time by a process of its own; this one stops and resets them with the code that ``pebble estop`` is made of.
-Real processes, stock mosquitto, loopback.
 """
 
 from __future__ import annotations
