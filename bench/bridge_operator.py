@@ -155,7 +155,7 @@ class DrivenRobot(Processes):
         running = self.subject.processes()
         self._parts = {part: [running[name]] for part, name in _SERVICES.items() if name in running}
         if running and len(self._parts) < len(_SERVICES):
-            raise self.problem("a bridge is not running")
+            raise PebbleError(f"{self.kind}: a bridge is not running\n{self.subject.log()}")
 
     def drive(self, seconds: float, rate_hz: float = RATE_HZ, *, work_us: float = 0.0, slowed: bool = False) -> Turn:
         """The operator works for ``work_us`` before each command: before it reads the clock, or, if ``slowed``, after.
@@ -177,7 +177,7 @@ class DrivenRobot(Processes):
         turn.ended = time.monotonic_ns()
         turn.cpu_s = {name: cpu_s(pids) - before[name] for name, pids in groups.items() if pids}
         if min(turn.cpu_s.values(), default=1.0) <= 0:
-            raise self.problem("a process has ended while it was driven")
+            raise PebbleError(f"{self.kind}: a process ended while it was driven\n{self.subject.log()}")
         return turn
 
     def match_arrivals(self, turns: Sequence[Turn]) -> None:
@@ -192,10 +192,6 @@ class DrivenRobot(Processes):
             if [turn.match(commands, reports, received) for turn in turns][-1]:
                 return
             time.sleep(_POLL_S)
-
-    def problem(self, what: str) -> PebbleError:
-        """An error with the robot's log."""
-        return PebbleError(f"{self.kind}: {what}\n{self.subject.log()}")
 
     def drive_with_media(self, seconds: float) -> tuple[Turn, dict[str, int]]:
         """The same with its camera and microphone in use: a program on the robot reads frames, an operator gets both.

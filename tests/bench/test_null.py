@@ -42,7 +42,7 @@ def test_a_passed_null_test() -> None:
     assert null.passed(cells())
     (aim,) = null.assessment(cells())
     assert aim.outcome == "met"
-    assert aim.measured.startswith("mqtt again 1.00 (0.")
+    assert aim.measured.startswith("mqtt again 1.01 (0.99 to 1.02)")
     assert ", mqtt +20 % 1.2" in aim.measured
 
 
