@@ -197,7 +197,7 @@ class FakeRobot:
 
     def drive(self, seconds: float, rate_hz: float = 20, **work: Any) -> Turn:
         self.driven.append(f"{self.kind} {seconds:g}")
-        self.work += [work] if work else []
+        self.work.extend([work] if work else [])
         return turn_of([1.0], [1.0], cpu_s={} if self.kind == HOP else {FORWARDER: 0.1, SERIAL: 0.1}, forwarded=2)
 
     def match_arrivals(self, turns: Sequence[Turn]) -> None:
