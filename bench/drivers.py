@@ -27,7 +27,6 @@ MANY: Final = 65_535  # messages in flight
 AHEAD: Final = json.dumps({"x": 0.0, "z": 0.5}).encode()
 ZERO: Final = json.dumps({"x": 0.0, "z": 0.0}).encode()
 _ANSWER_S = 10.0
-_NODELAY = socket.IPPROTO_TCP, socket.TCP_NODELAY
 
 
 class StockClient:
@@ -51,7 +50,7 @@ class StockClient:
         self.paho.on_subscribe = lambda *_: self._ready.set()
         self.paho.on_message = lambda _client, _data, message: receive(message)
         if at_once:
-            self.paho.on_socket_open = lambda _client, _data, sock: sock.setsockopt(*_NODELAY, 1)
+            self.paho.on_socket_open = _send_at_once
 
     def open(self, port: int) -> Self:
         """Connects and starts the network thread; returns before anything was subscribed."""
@@ -84,6 +83,10 @@ class StockClient:
             client.subscribe(list(self._subscriptions))  # type: ignore[arg-type]
         else:
             self._ready.set()
+
+
+def _send_at_once(_client: Client, _data: Any, sock: Any) -> None:
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
 
 class Driver(StockClient):

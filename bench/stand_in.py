@@ -28,9 +28,9 @@ _PIECE = 4096  # bytes
 _TOUCH = ("a0", "a1", "a2")
 
 
-def client(port: int, *filters: str) -> Client:
+def client(port: int, *filters: str) -> Any:
     """Connected, on a thread of its own, and subscribed to ``filters`` with QoS 1."""
-    made = Client(CallbackAPIVersion.VERSION2)
+    made: Any = Client(CallbackAPIVersion.VERSION2)
     made.on_connect = lambda *_: made.subscribe([(filter_, 1) for filter_ in filters])
     made.connect("127.0.0.1", port)
     return made
