@@ -307,7 +307,7 @@ BRIDGE = Comparison(
     "that owns the serial line, for each command and report that they forwarded.",
     help="Drive commands from an operator to the wheels of a whole simulated robot, and its telemetry back: on MQTT, "
     "Zenoh and plain paho, compared with one hop through a stock broker. Needs mosquitto.",
-    options=(*_OPTIONS, variants((STAND_IN, *KINDS), "[--null: one of mqtt and zenoh, by default zenoh]")),
+    options=(*_OPTIONS, variants((STAND_IN, *KINDS), "paho, mqtt, zenoh; --null: one of ours, zenoh by default.")),
     full=Budget(1900, **_UNSET, rounds=10, seconds=25.0),
     quick=Budget(22, rounds=2, seconds=0.5),
     constants={"rate_hz": RATE_HZ},
