@@ -2,119 +2,83 @@
 
 As processes beside the robot: ``python -m pebble.bench.bridge_operator WHAT …``. ``frames RUN_DIR`` reads a robot's
 frames and ``media PORT BASE`` receives its video and sound; both answer every line with the counts so far. ``hop PORT
-TOPIC`` is a stock client one hop from the operator: it writes one line once it is subscribed, and answers every line
-with the commands since the last one.
+BASE TRACE`` is a stock client one hop from the operator, which writes a trace as a simulated MCU does.
 """
 
 from __future__ import annotations
 
 import json
+import signal
+import socket
 import sys
+import threading
 import time
-from abc import ABC, abstractmethod
-from collections import Counter, deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
-from dataclasses import dataclass, field, replace
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from paho.mqtt.client import Client, MQTTMessage
+from paho.mqtt.client import MQTTMessage
 
+from pebble import contract
+from pebble.bench.drivers import RATE_HZ, StockClient
 from pebble.bench.null import spin
 from pebble.bench.subscribers import RobotSubscriber
 from pebble.bench.usage import cpu_s
-from pebble.contract import (
-    AUDIO,
-    AUDIO_CONTROL,
-    CAMERA,
-    DRIVE,
-    MQTT_AUDIO,
-    MQTT_VIDEO,
-    ONLINE,
-    STATUS,
-    TOUCH_SENSORS,
-    VIDEO_CONTROL,
-)
+from pebble.contract import DRIVE, ONLINE, STATUS, TOUCH_SENSORS
 from pebble.errors import PebbleError
 from pebble.rig.processes import Processes, python
 from pebble.rig.robot import BASE, Robot, synthetic_media
-from pebble.rig.stock_client import StockClient, steadily
-from pebble.rig.worker_end import answer, serve, serve_on_thread
+from pebble.rig.worker_end import serve, serve_on_thread
 from pebble.services.serial_mcu_bridge.text.goob_base import Touch, parse
-from pebble.simulation.trace import Entry
+from pebble.simulation.trace import Entry, Trace
 
-RATE_HZ = 20.0  # of an operator's commands
 STAND_IN, HOP = "paho", "one hop"  # paho: two plain programs in place of a robot of ours, see stand_in
-FORWARDER, SERIAL = "bridge", "serial bridge"
+ALL, FORWARDER, SERIAL = "all", "bridge", "serial bridge"  # processes of a robot
 FLOWS = ("frames", "video", "audio")
 _SERVICES = {FORWARDER: "mqtt_bridge", SERIAL: "serial_mcu_bridge"}
 _MODULE = "pebble.bench.bridge_operator"
 _MEDIA: Final = synthetic_media((1920, 1080, 30), (640, 360, 15))
-_HOP_BASE = "pebble/robots/one-hop"
 _DIGITS = 3  # of a wheel's speed on the serial line
 _STEPS = 800  # wheel values 0.100 … 0.899
-_REPORTS_LIMIT = 400_000  # reports; a robot sends 50 a second
 _READ_S = 0.2
 _EVERY = 16  # bytes: one in so many of a picture's is read
-_UP_S, _FLOW_S, _STOP_S = 30.0, 20.0, 10.0
-_ANSWER_S = 5.0
+_UP_S, _STARTUP_S, _ANSWER_S = 30.0, 1.0, 5.0
 _ARRIVE_S = 1.0  # commands and reports that take longer count as lost
 _POLL_S = 0.05
 
 Wheels = tuple[float, float]
-Reports = Sequence[tuple[int, int | None]]
-"""When each report was sent, and when it was received; None: it was not."""
-Arrivals = tuple[Mapping[Wheels, int], Reports, Sequence[tuple[int, Touch]]]
-"""When each command arrived; the reports; and all reports that were received."""
+Reports = Sequence[tuple[int, int | None]]  # when each was sent, and when it was received; None: it was not
+Received = Sequence[tuple[int, Touch]]  # all reports that were received, with their times
 
 
-class Operator(StockClient):
-    """One MQTT connection to the remote broker. Each command is identified by the wheel speeds it causes.
+@dataclass(slots=True, kw_only=True)
+class Turn:
+    """One turn of driving. ``sent`` maps each pair of wheel speeds to the time of its command: CLOCK_MONOTONIC, ns."""
 
-    It uses the same TCP options as our own clients. TCP_NODELAY: see :class:`StockClient`. TCP_QUICKACK: otherwise a
-    stock broker delays a report by up to 40 ms while its answer to a command is not acknowledged. Without them the
-    comparison would measure that.
-    """
+    began: int = 0
+    ended: int = 0
+    sent: dict[Wheels, int] = field(default_factory=dict)
+    cpu_s: Mapping[str, float] = field(default_factory=dict)  # of the robot's processes: of all, and of its bridges
+    down: Sequence[float] = ()  # latencies of commands, ms
+    up: Sequence[float] = ()  # and of reports
+    reports: int = 0  # that were sent
+    forwarded: int = 0  # commands and reports that arrived
 
-    def __init__(self, port: int, base: str) -> None:
-        self._base, self._number = base, 0
-        self._received: deque[tuple[int, bytes | bytearray]] = deque(maxlen=_REPORTS_LIMIT)
-        channels = (STATUS, ONLINE, TOUCH_SENSORS)
-        super().__init__(lambda _: self.acknowledge(), [(channel.topic(base), 1) for channel in channels])
-        self.paho.on_publish = lambda *_: self.acknowledge()
-        self.paho.message_callback_add(TOUCH_SENSORS.topic(base), self._on_report)
-        self.open(port)
+    def match(self, commands: Mapping[Wheels, int], reports: Reports, received: Received = ()) -> bool:
+        """Takes what belongs to the turn; ``received`` has reports of equal values, too.
 
-    def media(self, wanted: bool) -> None:
-        """Allows and requests video and audio, or stops both."""
-        for flag in (MQTT_VIDEO, MQTT_AUDIO):
-            self.send(flag, self._base, wanted)
-        for request in (VIDEO_CONTROL, AUDIO_CONTROL):
-            self.send(request, self._base, {"enabled": wanted})
-
-    def drive(self, seconds: float, rate_hz: float, *, work_us: float = 0.0, slowed: bool = False) -> dict[Wheels, int]:
-        """Returns the time (CLOCK_MONOTONIC, ns) at which the command for each pair of wheel speeds was published.
-
-        It works for ``work_us`` before each: before it reads the clock, or, if ``slowed``, after that.
+        Returns whether the last command and report arrived. What is missing then was overtaken or lost: order is kept.
         """
-        sent: dict[Wheels, int] = {}
-        for _ in steadily(seconds, rate_hz):
-            self._number += 1
-            left, right = wheels(self._number)
-            spin(0.0 if slowed else work_us)
-            sent[left, right] = time.monotonic_ns()
-            spin(work_us if slowed else 0.0)
-            self.send(DRIVE, self._base, {"x": (left - right) / 2, "z": (left + right) / 2})
-        return sent
-
-    def received(self, since_ns: int) -> list[tuple[int, Touch]]:
-        """The MCU's reports after ``since_ns``, each with its time of arrival."""
-        return [(ns, Touch(**json.loads(payload)["value"])) for ns, payload in self._received.copy() if ns >= since_ns]
-
-    def _on_report(self, _client: Client, _data: Any, message: MQTTMessage) -> None:
-        self._received.append((time.monotonic_ns(), message.payload))
-        self.acknowledge()
+        arrived = sorted((commands[wheels], sent) for wheels, sent in self.sent.items() if wheels in commands)
+        own = [one for one in reports if self.began <= one[0] <= self.ended]
+        self.down = [(ns - sent) / 1e6 for ns, sent in arrived]
+        self.up = [(ns - sent) / 1e6 for sent, ns in own if ns is not None]
+        self.reports = len(own)
+        self.forwarded = len(arrived) + sum(self.began <= ns <= self.ended for ns, _ in received)
+        return all(last in commands for last in [*self.sent][-1:]) and (not own or own[-1][1] is not None)
 
 
 def wheels(number: int) -> Wheels:
@@ -122,35 +86,13 @@ def wheels(number: int) -> Wheels:
     return round(0.1 + (number % _STEPS) / 1000, 3), round(0.1 + (number // _STEPS % _STEPS) / 1000, 3)
 
 
-def wheels_of(payload: bytes) -> Wheels:
+def wheels_of(payload: bytes | bytearray) -> Wheels:
     """The wheel speeds of a drive command, mixed as the serial bridge does."""
     wanted = json.loads(payload)
     return round(wanted["z"] + wanted["x"], _DIGITS), round(wanted["z"] - wanted["x"], _DIGITS)
 
 
-# -- one segment of driving, and what arrived
-
-
-@dataclass(frozen=True, slots=True)
-class DriveSegment:
-    """``sent`` maps each pair of wheel speeds to the time of its command; all times are CLOCK_MONOTONIC, ns."""
-
-    began: int
-    ended: int
-    sent: Mapping[Wheels, int]
-    cpu_s: float = 0.0  # of all the robot's processes
-    parts_cpu_s: Mapping[str, float] = field(default_factory=dict)  # of some of them
-
-
-@dataclass(slots=True)
-class Arrived:
-    """Latencies of one segment, ms, and how many commands and reports were sent."""
-
-    down: list[float] = field(default_factory=list)
-    up: list[float] = field(default_factory=list)
-    sent: int = 0
-    reports: int = 0
-    forwarded: int = 0  # commands and reports that arrived
+# -- what arrived
 
 
 def arrivals(entries: Sequence[Entry]) -> dict[Wheels, int]:
@@ -158,7 +100,7 @@ def arrivals(entries: Sequence[Entry]) -> dict[Wheels, int]:
     return {line.drive: line.ns for line in reversed(entries) if line.drive is not None}
 
 
-def matched(entries: Sequence[Entry], received: Sequence[tuple[int, Touch]]) -> list[tuple[int, int | None]]:
+def matched(entries: Sequence[Entry], received: Received) -> list[tuple[int, int | None]]:
     """Pairs the time each report was sent with the time it was received; None if it was not.
 
     A report is identified by its values: while the wheels turn, the sensors never report the same values for long.
@@ -172,152 +114,131 @@ def matched(entries: Sequence[Entry], received: Sequence[tuple[int, Touch]]) -> 
     return [(ns, first.get(touch)) for touch, ns in wanted.items()]
 
 
-def all_arrived(segment: DriveSegment, commands: Mapping[Wheels, int], reports: Reports) -> bool:
-    """Whether the last command and report arrived. What is still missing then was overtaken or lost: order is kept."""
-    own = [received for published, received in reports if segment.began <= published <= segment.ended]
-    return list(segment.sent)[-1] in commands and (not own or own[-1] is not None)
-
-
-def arrived_of(
-    segment: DriveSegment,
-    commands: Mapping[Wheels, int],
-    reports: Reports,
-    received: Sequence[tuple[int, Touch]] = (),
-) -> Arrived:
-    """Selects the commands and reports that belong to the segment; ``received`` has reports of equal values, too."""
-    arrived = sorted((commands[wheels], sent) for wheels, sent in segment.sent.items() if wheels in commands)
-    own = [(published, received) for published, received in reports if segment.began <= published <= segment.ended]
-    return Arrived(
-        down=[(ns - sent) / 1e6 for ns, sent in arrived],
-        up=[(received - published) / 1e6 for published, received in own if received is not None],
-        sent=len(segment.sent),
-        reports=len(own),
-        forwarded=len(arrived) + sum(segment.began <= ns <= segment.ended for ns, _ in received),
-    )
-
-
 # -- what is driven
 
 
-class Driven(Processes, ABC):
-    """What is driven, and its operator: starts both in ``with``; both are ready when :meth:`wait` returns."""
+class DrivenRobot(Processes):
+    """A robot and its operator: starts both in ``with``. With ``reports`` it forwards those of its MCU.
 
-    operator: Operator
-
-    @abstractmethod
-    def wait(self) -> None:
-        """Raises PebbleError if it does not become ready."""
-
-    def drive(
-        self, seconds: float, rate_hz: float = RATE_HZ, *, work_us: float = 0.0, slowed: bool = False
-    ) -> DriveSegment:
-        """See :meth:`Operator.drive`."""
-        began = time.monotonic_ns()
-        sent = self.operator.drive(seconds, rate_hz, work_us=work_us, slowed=slowed)
-        return DriveSegment(began, time.monotonic_ns(), sent)
-
-    def match_arrivals(self, segments: Sequence[DriveSegment]) -> list[Arrived]:
-        """Waits for the last commands and reports, or until they count as lost; returns one result for each segment."""
-        since, end = min(segment.began for segment in segments), time.monotonic() + _ARRIVE_S
-        while True:
-            late = time.monotonic() > end
-            commands, reports, received = self._arrivals(since)
-            if late or all_arrived(segments[-1], commands, reports):
-                return [arrived_of(segment, commands, reports, received) for segment in segments]
-            time.sleep(_POLL_S)
-
-    @abstractmethod
-    def _arrivals(self, since: int) -> Arrivals:
-        """What arrived after ``since``."""
-
-
-class DrivenRobot(Driven):
-    """A whole robot. With ``reports`` it forwards those of its MCU."""
+    The operator has one MQTT connection to the remote broker, with the TCP options of our own clients. TCP_NODELAY: see
+    :class:`StockClient`. TCP_QUICKACK: otherwise a stock broker delays a report by up to 40 ms while its answer to a
+    command is not acknowledged. Without them the comparison would measure that.
+    """
 
     def __init__(self, kind: str, *, media: bool = False, reports: bool = True) -> None:
         super().__init__()
         self.kind, self._media, self._reports = kind, media, reports
-        self._parts: Mapping[str, int] = {}
+        self._number = 0  # of the last command
+        self._received: list[tuple[int, bytes]] = []  # reports
+        self._parts: dict[str, list[int]] = {}  # the processes that forward
 
     def start(self) -> None:
         """Raises PebbleError if something does not start."""
-        make, services = StandIn if self.kind == STAND_IN else Robot, _MEDIA if self._media else {}
+        make, services = {STAND_IN: StandIn, HOP: OneHop}.get(self.kind, Robot), _MEDIA if self._media else {}
         broker = self.broker("remote")
         self.subject = make(self, self.kind, ("127.0.0.1", broker.port), services=services, reports=self._reports)
         broker.wait()
         self.subject.prepare()
         self.subject.launch()
-        self.operator = Operator(broker.port, BASE)
-        self.closing.callback(self.operator.close)
+        channels = (STATUS, ONLINE, TOUCH_SENSORS)
+        self._client = StockClient(self._on_message, [(channel.topic(BASE), 1) for channel in channels])
+        self._client.paho.on_publish = self._acknowledge
+        self.closing.enter_context(closing(self._client.open(broker.port)))
 
     def wait(self) -> None:
+        """Until it is ready. Raises PebbleError if it does not become so."""
         with closing(RobotSubscriber(self.subject.remote_port, BASE)) as subscriber:
             self.subject.expect(
                 lambda: subscriber.ready_ns is not None and subscriber.first_heartbeat_ns is not None,
                 f"{self.kind}: the robot is not ready", _UP_S,
             )  # fmt: skip
         running = self.subject.processes()
-        if missing := [name for name in _SERVICES.values() if name not in running]:
-            raise self.problem(f"{' and '.join(missing)} is not running")
-        self._parts = {part: running[name] for part, name in _SERVICES.items()}
+        self._parts = {part: [running[name]] for part, name in _SERVICES.items() if name in running}
+        if running and len(self._parts) < len(_SERVICES):
+            raise PebbleError(f"{self.kind}: a bridge is not running\n{self.subject.log()}")
 
-    def drive(
-        self, seconds: float, rate_hz: float = RATE_HZ, *, work_us: float = 0.0, slowed: bool = False
-    ) -> DriveSegment:
-        """See :meth:`Operator.drive`. Raises PebbleError if one of the two bridges has ended."""
-        pids = self.subject.pids()
-        used, before = cpu_s(pids), self._parts_cpu_s()
-        segment = super().drive(seconds, rate_hz, work_us=work_us, slowed=slowed)
-        parts = {part: after - before[part] for part, after in self._parts_cpu_s().items()}
-        if ended := [part for part, used_s in parts.items() if used_s <= 0]:
-            raise self.problem(f"the {' and the '.join(ended)} ended while it was driven")
-        return replace(segment, cpu_s=cpu_s(pids) - used, parts_cpu_s=parts)
+    def drive(self, seconds: float, rate_hz: float = RATE_HZ, *, work_us: float = 0.0, slowed: bool = False) -> Turn:
+        """The operator works for ``work_us`` before each command: before it reads the clock, or, if ``slowed``, after.
 
-    def _parts_cpu_s(self) -> dict[str, float]:
-        return {part: cpu_s([pid]) for part, pid in self._parts.items()}
+        Raises PebbleError if one of the two bridges has ended.
+        """
+        groups = {ALL: self.subject.pids(), **self._parts}
+        before = {name: cpu_s(pids) for name, pids in groups.items()}
+        turn, due = Turn(began=time.monotonic_ns()), time.monotonic()
+        for _ in range(round(seconds * rate_hz)):
+            self._number += 1
+            left, right = wheels(self._number)
+            spin(0.0 if slowed else work_us)
+            turn.sent[left, right] = time.monotonic_ns()
+            spin(work_us if slowed else 0.0)
+            self._client.send(DRIVE, BASE, {"x": (left - right) / 2, "z": (left + right) / 2})
+            due += 1 / rate_hz
+            time.sleep(max(0.0, due - time.monotonic()))
+        turn.ended = time.monotonic_ns()
+        turn.cpu_s = {name: cpu_s(pids) - before[name] for name, pids in groups.items() if pids}
+        if min(turn.cpu_s.values(), default=1.0) <= 0:
+            raise PebbleError(f"{self.kind}: a process ended while it was driven\n{self.subject.log()}")
+        return turn
 
-    def _arrivals(self, since: int) -> Arrivals:
-        entries, received = self.subject.lines(since), self.operator.received(since)
-        return arrivals(entries), matched(entries, received), received
+    def match_arrivals(self, turns: Sequence[Turn]) -> None:
+        """Waits for the last commands and reports, or until they count as lost, and adds to each turn what arrived."""
+        since, end = min(turn.began for turn in turns), time.monotonic() + _ARRIVE_S
+        late = False
+        while not late:
+            late = time.monotonic() > end
+            entries = self.subject.lines(since)
+            received = [(ns, Touch(**json.loads(raw)["value"])) for ns, raw in self._received.copy() if ns >= since]
+            commands, reports = arrivals(entries), matched(entries, received)
+            if [turn.match(commands, reports, received) for turn in turns][-1]:
+                return
+            time.sleep(_POLL_S)
 
-    def problem(self, what: str) -> PebbleError:
-        """An error with the robot's log."""
-        return PebbleError(f"{self.kind}: {what}\n{self.subject.log()}")
+    def drive_with_media(self, seconds: float) -> tuple[Turn, dict[str, int]]:
+        """The same with its camera and microphone in use: a program on the robot reads frames, an operator gets both.
 
-    @contextmanager
-    def media_load(self) -> Iterator[Callable[[], dict[str, int]]]:
-        """Puts its camera and microphone in use: a program on the robot reads frames, an operator gets both.
-
-        All media flow as the ``with`` block begins, and stop with it. It is given what counts the received frames and
-        packets so far, by flow. Raises PebbleError naming what does not flow.
+        Returns what arrived, and how many frames and packets were received meanwhile. Raises PebbleError without any.
         """
         robot, before = self.subject, len(self.subject.pids())
         workers = [
             self.worker("frame reader", _MODULE, "frames", robot.run_dir),
-            self.worker("media operator", _MODULE, "media", robot.remote_port, robot.base),
+            self.worker("media operator", _MODULE, "media", robot.remote_port, BASE),
         ]
 
         def counts() -> dict[str, int]:
             for worker in workers:
                 worker.send("")
-            found = {name: count for worker in workers for name, count in worker.answer(_ANSWER_S).items()}
-            return {name: found.get(name, 0) for name in FLOWS}
+            return {name: count for worker in workers for name, count in worker.answer(_ANSWER_S).items()}
 
-        try:
-            self.operator.media(True)
-            end = time.monotonic() + _FLOW_S
-            while missing := [name for name, count in counts().items() if not count]:
-                if time.monotonic() > end:
-                    raise self.problem(f"no {', '.join(missing)} after {_FLOW_S:.0f} s")
-                time.sleep(_POLL_S)
-            yield counts
-        finally:
-            self.operator.media(False)
-            for worker in workers:
-                self.end(worker)
-            end = time.monotonic() + _STOP_S
-            while len(robot.pids()) > before and time.monotonic() < end:
-                time.sleep(_POLL_S)
+        self._allow_media(True)
+        robot.expect(lambda: all(counts().values()), "its media do not flow", _UP_S)
+        time.sleep(_STARTUP_S)
+        first = counts()
+        turn = self.drive(seconds)
+        flowed = {name: count - first[name] for name, count in counts().items()}
+        self._allow_media(False)
+        for worker in workers:
+            self.end(worker)
+        robot.expect(lambda: len(robot.pids()) <= before, "its media do not end", _UP_S)
+        self.match_arrivals([turn])
+        return turn, flowed
+
+    def _allow_media(self, wanted: bool) -> None:
+        """Allows and requests video and audio, or stops both."""
+        for flag in (contract.MQTT_VIDEO, contract.MQTT_AUDIO):
+            self._client.send(flag, BASE, wanted)
+        for request in (contract.VIDEO_CONTROL, contract.AUDIO_CONTROL):
+            self._client.send(request, BASE, {"enabled": wanted})
+
+    def _on_message(self, message: MQTTMessage) -> None:
+        if message.topic.endswith(TOUCH_SENSORS.suffix):
+            self._received.append((time.monotonic_ns(), bytes(message.payload)))
+        self._acknowledge()
+
+    def _acknowledge(self, *_: object) -> None:
+        """Sets TCP_QUICKACK. The kernel resets it whenever we send, so this is called after every message."""
+        sock: Any = self._client.paho.socket()
+        if sock is not None:
+            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
 
 
 class StandIn(Robot):
@@ -334,26 +255,20 @@ class StandIn(Robot):
         return {name: one.pid for name, one in zip(_SERVICES.values(), self._started, strict=False)}
 
 
-class OneHop(Driven):
-    """The lower bound: the same commands to a stock client, one hop through a stock broker without other traffic."""
+class OneHop(Robot):
+    """The lower bound: a stock client, one hop through a stock broker without other traffic. Its CPU does not count."""
 
-    def start(self) -> None:
-        """Raises PebbleError if something does not start."""
-        broker = self.broker("hop")
-        broker.wait()
-        self._subscriber = self.worker("the subscriber", _MODULE, "hop", broker.port, DRIVE.topic(_HOP_BASE))
-        self.operator = Operator(broker.port, _HOP_BASE)
-        self.closing.callback(self.operator.close)
-        self._received: dict[Wheels, int] = {}
+    def prepare(self, _ending: threading.Event | None = None) -> None:
+        self._trace.touch()
 
-    def wait(self) -> None:
-        """Raises PebbleError if its client does not subscribe."""
-        self._subscriber.answer(_UP_S)
+    def launch(self) -> None:
+        self.start("the subscriber", python(_MODULE, "hop", self.remote_port, self.base, self._trace))
 
-    def _arrivals(self, _since: int) -> Arrivals:
-        new = self._subscriber.ask("", _ANSWER_S)["received"]
-        self._received |= {(left, right): ns for left, right, ns in new}
-        return self._received, [], []
+    def processes(self) -> dict[str, int]:
+        return {}
+
+    def pids(self) -> list[int]:
+        return []
 
 
 # -- programs beside the robot
@@ -362,8 +277,8 @@ class OneHop(Driven):
 def frames(run_dir: str) -> None:
     from pebble.transports.frames import FrameReader  # only here: it needs numpy
 
-    counts: Counter[str] = Counter()
-    ended = serve_on_thread(lambda _line: dict(counts))
+    counts = {"frames": 0}
+    ended = serve_on_thread(lambda _line: counts)
     with FrameReader(Path(run_dir), "camera", views=True) as reader:
         while not ended.is_set():
             frame = reader.read(_READ_S)
@@ -373,37 +288,29 @@ def frames(run_dir: str) -> None:
 
 
 def media(port: str, base: str) -> None:
-    names = {CAMERA.topic(base): "video", AUDIO.topic(base): "audio"}
-    counts: Counter[str] = Counter()
+    names = {contract.CAMERA.topic(base): "video", contract.AUDIO.topic(base): "audio"}
+    counts = dict.fromkeys(names.values(), 0)
 
     def count(message: MQTTMessage) -> None:
         counts[names[message.topic]] += 1
 
-    client = StockClient(count, [(topic, 0) for topic in names], at_once=False).open(int(port))
-    serve(lambda _line: dict(counts))
-    client.close()
+    with closing(StockClient(count, [(topic, 0) for topic in names], at_once=False).open(int(port))):
+        serve(lambda _line: counts)
 
 
-def hop(port: str, topic: str) -> None:
-    received: list[tuple[int, bytes]] = []
+def hop(port: str, base: str, path: str) -> None:
+    trace = Trace(Path(path))
 
     def receive(message: MQTTMessage) -> None:
-        if not message.payload.isspace():  # else a bridge's probe
-            received.append((time.monotonic_ns(), bytes(message.payload)))
+        ns = time.monotonic_ns()
+        trace.add(Entry(ns, "line", "M {:.3f} {:.3f}".format(*wheels_of(message.payload))))
 
-    def take(_line: str) -> dict[str, Any]:
-        new = received.copy()
-        del received[: len(new)]
-        return {"received": [[*wheels_of(payload), ns] for ns, payload in new]}
-
-    client = StockClient(receive, [(topic, DRIVE.default_qos)], at_once=False).open(int(port))
+    client = StockClient(receive, [(DRIVE.topic(base), DRIVE.default_qos)], at_once=False).open(int(port))
     client.wait()
-    answer({"subscribed": True})
-    serve(take)
-    client.close()
+    client.send(STATUS, base, {"value": {"services": {HOP: {"state": "ready"}}}})
+    client.send(ONLINE, base, {})
+    signal.pause()
 
-
-_PROGRAMS: Mapping[str, Callable[..., None]] = {"frames": frames, "media": media, "hop": hop}
 
 if __name__ == "__main__":
-    _PROGRAMS[sys.argv[1]](*sys.argv[2:])
+    globals()[sys.argv[1]](*sys.argv[2:])

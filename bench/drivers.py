@@ -1,45 +1,102 @@
-"""Operators who drive many robots over one MQTT connection. Commands are spread evenly over time, robot after robot.
+"""Stock paho clients, of which the comparisons' operators and subscribers are made, and one that drives many robots.
 
-As processes: ``python -m pebble.bench.drivers PORT`` drives the robots whose base topics its newest line names,
-separated by spaces. ``python -m pebble.bench.drivers PORT SECONDS RATE_HZ ID…`` drives a fleet: it writes a JSON line
-when every robot is online, and the results when it has driven for ``SECONDS``.
+``python -m pebble.bench.drivers PORT`` drives the robots whose base topics its newest line names, separated by spaces.
 """
 
 from __future__ import annotations
 
 import json
-import os
+import socket
 import sys
 import threading
 import time
-from array import array
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
-from typing import Final
+from typing import Any, Final, Self
 
-from paho.mqtt.client import MQTTMessage
+from paho.mqtt.client import Client, MQTTMessage
+from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
+from paho.mqtt.subscribeoptions import SubscribeOptions
 
-from pebble.contract import DRIVE, ONLINE
-from pebble.contract.identity import Identity
-from pebble.rig.stock_client import MANY, StockClient
-from pebble.rig.worker_end import answer, serve, serve_on_thread
+from pebble.contract import DRIVE, Channel
+from pebble.errors import PebbleError
+from pebble.rig.worker_end import serve
 
 RATE_HZ: Final = 20.0  # of each robot
+MANY: Final = 65_535  # messages in flight
 AHEAD: Final = json.dumps({"x": 0.0, "z": 0.5}).encode()
 ZERO: Final = json.dumps({"x": 0.0, "z": 0.0}).encode()
-#: Wheel speeds, left and right, in sequence: no robot gets the same command twice within eight commands.
-STEPS: Final = ((1, 1), (-1, -1), (1, 0), (-1, 0), (1, -1), (0, 1), (-1, 1), (0, -1))
-_ONLINE_S = 60.0
-_POLL_S = 0.05
+_ANSWER_S = 10.0
+
+
+class StockClient:
+    """One paho client on loopback with its own network thread, on which ``receive`` runs.
+
+    ``at_once`` sets TCP_NODELAY, as Pebble's own clients do. Without it, a client that receives as much as it sends
+    delays a command in a hundred by 40 ms, until the broker's delayed ACK.
+    """
+
+    def __init__(
+        self,
+        receive: Callable[[MQTTMessage], None] = lambda _: None,
+        subscriptions: Sequence[tuple[str, int]] | Sequence[tuple[str, SubscribeOptions]] = (),
+        *,
+        at_once: bool = True,
+        protocol: MQTTProtocolVersion = MQTTProtocolVersion.MQTTv311,
+    ) -> None:
+        self._ready, self._subscriptions = threading.Event(), subscriptions
+        self.paho = Client(CallbackAPIVersion.VERSION2, protocol=protocol)
+        self.paho.on_connect = self._on_connect
+        self.paho.on_subscribe = lambda *_: self._ready.set()
+        self.paho.on_message = lambda _client, _data, message: receive(message)
+        if at_once:
+            self.paho.on_socket_open = _send_at_once
+
+    def open(self, port: int) -> Self:
+        """Connects and starts the network thread; returns before anything was subscribed."""
+        self.paho.connect("127.0.0.1", port)
+        self.paho.loop_start()
+        return self
+
+    def wait(self) -> None:
+        """Until the broker has acknowledged the subscriptions, or the connection without any. Raises PebbleError."""
+        if not self._ready.wait(_ANSWER_S):
+            raise PebbleError(f"the broker acknowledged nothing within {_ANSWER_S:.0f} s")
+
+    def subscribe(self, filter_: str, qos: int) -> None:
+        """One more subscription, acknowledged by the broker when this returns. Raises PebbleError."""
+        self._ready.clear()
+        self.paho.subscribe(filter_, qos)
+        self.wait()
+
+    def close(self) -> None:
+        self.paho.disconnect()
+        self.paho.loop_stop()
+
+    def send(self, channel: Channel, base: str, body: Any) -> None:
+        """Publishes ``body`` as JSON, with the QoS and the retain flag of the channel."""
+        payload = body if isinstance(body, bytes) else json.dumps(body)
+        self.paho.publish(channel.topic(base), payload, qos=channel.default_qos, retain=channel.default_retain)
+
+    def _on_connect(self, client: Client, *_: Any) -> None:
+        if self._subscriptions:
+            client.subscribe(list(self._subscriptions))  # type: ignore[arg-type]
+        else:
+            self._ready.set()
+
+
+def _send_at_once(_client: Client, _data: Any, sock: Any) -> None:
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
 
 class Driver(StockClient):
-    """Drives the chosen robots at :data:`RATE_HZ`. Robots that begin or end to be driven are sent a zero."""
+    """Drives the chosen robots at :data:`RATE_HZ`, spread evenly. Those that begin or end to be driven get a zero."""
 
     def __init__(self, port: int) -> None:
+        super().__init__()
         self._lock, self._closed = threading.Lock(), threading.Event()
         self._bases: tuple[str, ...] = ()
-        super().__init__(in_flight=MANY)
+        self.paho.max_inflight_messages_set(MANY)
         self.open(port)
 
     def choose(self, bases: tuple[str, ...]) -> None:
@@ -74,56 +131,6 @@ def driving(port: int, *bases: str) -> Iterator[Driver]:
         yield driver
 
 
-def drive_fleet(port: int, seconds: float, rate_hz: float, ids: Sequence[str]) -> None:
-    """Drives a whole fleet in :data:`STEPS`, and subscribes to all heartbeats. Times are CLOCK_MONOTONIC, ns."""
-    bases = [Identity("pebble", "robots", name).base for name in ids]
-    heartbeats = {ONLINE.topic(base): array("q") for base in bases}
-
-    def receive(message: MQTTMessage) -> None:
-        if not message.retain and b"true" in message.payload:
-            heartbeats[message.topic].append(time.monotonic_ns())
-
-    client = StockClient(receive, [(topic, 0) for topic in heartbeats], in_flight=MANY).open(port)
-    end = time.monotonic() + _ONLINE_S
-    while not all(heartbeats.values()) and time.monotonic() < end:
-        time.sleep(_POLL_S)
-    answer({"online": sum(map(bool, heartbeats.values()))})
-    began = time.monotonic_ns()
-    sent, late = _send_steps(client, [DRIVE.topic(base) for base in bases], seconds, rate_hz)
-    ended = time.monotonic_ns()
-    received = [[ns for ns in robot if began <= ns <= ended] for robot in heartbeats.values()]
-    answer({"began": began, "ended": ended, "late": late, "sent": sent, "heartbeats": received})
-    client.close()
-
-
-def _send_steps(
-    client: StockClient, topics: Sequence[str], seconds: float, rate_hz: float
-) -> tuple[list[list[int]], int]:
-    """When each robot's commands were published, n is STEPS[n % 8]; and how many were not sent in time."""
-    sent: list[list[int]] = [[] for _ in topics]
-    late, gap = 0, 1 / rate_hz / len(topics)
-    bodies = [json.dumps({"x": (left - right) / 2, "z": (left + right) / 2}) for left, right in STEPS]
-    began = time.monotonic()
-    for number in range(round(seconds * rate_hz) * len(topics)):
-        step, robot = divmod(number, len(topics))
-        left = began + number * gap - time.monotonic()
-        if left > 0:
-            time.sleep(left)
-        late += left < -1 / rate_hz
-        sent[robot].append(time.monotonic_ns())
-        client.paho.publish(topics[robot], bodies[step % len(STEPS)], qos=DRIVE.default_qos)
-    return sent, late
-
-
-def main(port: str, *fleet: str) -> None:
-    if fleet:
-        seconds, rate_hz, *ids = fleet
-        serve_on_thread(lambda _line: None, lambda: os._exit(0))
-        drive_fleet(int(port), float(seconds), float(rate_hz), ids)
-    else:
-        with driving(int(port)) as driver:
-            serve(lambda line: driver.choose(tuple(line.split())))
-
-
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    with driving(int(sys.argv[1])) as only:
+        serve(lambda line: only.choose(tuple(line.split())))

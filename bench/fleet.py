@@ -1,32 +1,42 @@
 """Measures a fleet of simulated MCU robots on one broker: heartbeats, command latency and cost, with one operator.
 
-Three processes on this machine: a stock mosquitto, the fleet (real firmware files, real TCP), and the operator. A
-command's latency is from the operator's publish call to the resulting change of the pins.
+Three processes on this machine: a stock mosquitto, the fleet (real firmware files, real TCP), and the operator:
+``python -m pebble.bench.fleet PORT SECONDS RATE_HZ ID…``. It writes a JSON line when every robot is online, and the
+results when it has driven for ``SECONDS``.
 """
 
 from __future__ import annotations
 
 import itertools
+import json
+import os
+import sys
 import time
-from collections.abc import Iterator, Sequence
+from bisect import bisect_left
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import msgspec
+from paho.mqtt.client import MQTTMessage
 
 from pebble.bench.comparison import Budget, Case, Comparison, Option, seconds
-from pebble.bench.drivers import STEPS
+from pebble.bench.drivers import MANY, StockClient
 from pebble.bench.pictures import ecdf
 from pebble.bench.results import Cell, grouped, percentile, rounded
-from pebble.bench.tables import COUNT, Grid, percentile_column, single_column
+from pebble.bench.tables import COUNT, LOST, Grid, percentile_column, single_column
 from pebble.bench.usage import cpu_s, pss_mb
+from pebble.contract import DRIVE, ONLINE
+from pebble.contract.identity import Identity
 from pebble.rig.processes import Processes
+from pebble.rig.worker_end import answer, serve_on_thread
 from pebble.simulation.fleet import MOST, Moved, members
 from pebble.simulation.wireless import KINDS
 
-_ONLINE_S = 90.0
-_ARRIVE_S = 1.0
+#: Wheel speeds, left and right, in sequence: no robot gets the same command twice within eight commands.
+STEPS: Final = ((1, 1), (-1, -1), (1, 0), (-1, 0), (1, -1), (0, 1), (-1, 1), (0, -1))
 _SPREAD = {"min": 0, "median": 50, "max": 100}
+_ONLINE_S, _UP_S, _ARRIVE_S, _POLL_S = 60.0, 90.0, 1.0, 0.05
 
 
 def measure(case: Case) -> Iterator[Cell]:
@@ -38,58 +48,51 @@ def measure(case: Case) -> Iterator[Cell]:
         broker.wait()
         where = ("--kinds", ",".join(KINDS), "--broker", f"127.0.0.1:{broker.port}", "--trace", trace)
         fleet = processes.robot("fleet", "pebble.simulation.fleet_program", "--robots", count, *where)
-        how = (broker.port, run["seconds"], run["rate"])
-        operator = processes.worker("operator", "pebble.bench.drivers", *how, *ids)
+        operator = processes.worker("operator", "pebble.bench.fleet", broker.port, run["seconds"], run["rate"], *ids)
         run.show(f"{count} robots are connecting")
-        online = operator.answer(_ONLINE_S)["online"]
-        run.show(f"{online} robots are online and being driven for {run['seconds']:.0f} s")
+        online = operator.answer(_UP_S)["online"]
+        run.show(f"{online} robots are online and driven")
         pids = {"broker": broker.pid, "fleet": fleet.pid, "operator": operator.pid}
         began, before = time.monotonic(), {name: cpu_s([pid]) for name, pid in pids.items()}
-        answer = operator.answer(run["seconds"] + _ONLINE_S)
+        found = operator.answer(run["seconds"] + _UP_S)
         took = time.monotonic() - began
         cpu = {name: 100 * (cpu_s([pid]) - before[name]) / took for name, pid in pids.items()}
         time.sleep(_ARRIVE_S)  # commands in flight arrive, or count as lost
-        yield cell_of(case, online, answer, read_moves(trace), cpu, pss_mb(fleet.pid))
+        yield cell_of(case, online, found, read_moves(trace), cpu, pss_mb(fleet.pid))
 
 
 def cell_of(
-    case: Case, online: int, answer: dict[str, Any], moves: dict[str, list[Moved]], cpu: dict[str, float], mb: float
+    case: Case, online: int, found: dict[str, Any], moves: dict[str, list[Moved]], cpu: dict[str, float], mb: float
 ) -> Cell:
-    """Latencies in ms, rates in Hz, CPU in % of one core; ``answer`` is the operator's."""
-    robots, sent = case.run["robots"], answer["sent"]
-    rates = [rate for heartbeats in answer["heartbeats"] if (rate := _rate(heartbeats)) is not None]
-    ids = [identity.id for _, identity in members(robots, KINDS)]
+    """Latencies in ms, rates in Hz, CPU in % of one core; ``found`` is the operator's answer."""
+    robots, sent = case.run["robots"], found["sent"]
+    began, ended = min(map(min, sent.values())), max(map(max, sent.values()))
+    heartbeats = [[ns for ns in own if began <= ns <= ended] for own in found["heartbeats"]]
+    rates = [(len(own) - 1) / (own[-1] - own[0]) * 1e9 for own in heartbeats if len(own) > 1]
     return case.cell(
-        "command to pins", "ms", latencies_ms(dict(zip(ids, sent, strict=True)), moves),
-        {"robots": robots, "rate": f"{case.run['rate']:g} Hz"},
-        sent=sum(map(len, sent)),
+        "command to pins", "ms", latencies_ms(sent, moves), {"robots": robots, "rate": f"{case.run['rate']:g} Hz"},
+        sent=sum(map(len, sent.values())),
         online=online,
-        late=answer["late"],
-        **{f"beats_{name}_hz": rounded(percentile(rates, percent), 3) for name, percent in _SPREAD.items()},
-        longest_gap_s=rounded(longest_gap_s(answer["heartbeats"], answer["began"], answer["ended"]), 3),
+        late=found["late"],
+        **{f"beats_{name}_hz": rounded(percentile(rates, at), 3) for name, at in _SPREAD.items()},
+        longest_gap_s=rounded(longest_gap_s(heartbeats, began, ended), 3),
         **{f"cpu_{name}": rounded(share, 1) for name, share in cpu.items()},
         fleet_mb=rounded(mb, 1),
         mb_per_robot=rounded(mb / robots, 3),
     )  # fmt: skip
 
 
-def latencies_ms(sent: dict[str, list[int]], moves: dict[str, list[Moved]]) -> list[float]:
+def latencies_ms(sent: Mapping[str, Sequence[int]], moves: Mapping[str, Sequence[Moved]]) -> list[float]:
     """Latencies of all commands that the motors obeyed before another command asked for the same speeds."""
     found = []
     for robot, times in sent.items():
-        changes, at = moves.get(robot, []), 0
+        changes = grouped(moves.get(robot, ()), lambda moved: tuple(round(motor, 1) for motor in moved.motors))
         for number, time_ns in enumerate(times):
-            again = times[number + len(STEPS)] if number + len(STEPS) < len(times) else 1 << 63
-            while at < len(changes) and changes[at].ns < time_ns:
-                at += 1
-            change = next((c for c in changes[at : at + len(STEPS)] if _is(c, STEPS[number % len(STEPS)])), None)
-            if change is not None and change.ns < again:
-                found.append((change.ns - time_ns) / 1e6)
+            own, again = changes.get(STEPS[number % len(STEPS)], []), number + len(STEPS)
+            at = bisect_left(own, time_ns, key=lambda moved: moved.ns)
+            if at < len(own) and (again >= len(times) or own[at].ns < times[again]):
+                found.append((own[at].ns - time_ns) / 1e6)
     return found
-
-
-def _is(moved: Moved, step: tuple[int, int]) -> bool:
-    return all(abs(motor - wish) < 0.01 for motor, wish in zip(moved.motors, step, strict=True))
 
 
 def read_moves(trace: Path) -> dict[str, list[Moved]]:
@@ -98,28 +101,48 @@ def read_moves(trace: Path) -> dict[str, list[Moved]]:
     return grouped((msgspec.json.decode(line, type=Moved) for line in lines), lambda moved: moved.robot)
 
 
-def _rate(heartbeats: list[int]) -> float | None:
-    return (len(heartbeats) - 1) / (heartbeats[-1] - heartbeats[0]) * 1e9 if len(heartbeats) > 1 else None
-
-
-def longest_gap_s(robots: list[list[int]], began: int, ended: int) -> float:
+def longest_gap_s(robots: Sequence[Sequence[int]], began: int, ended: int) -> float:
     """The longest gap of any robot between the first and the last command; a robot that stops counts until the end."""
-    gaps = (b - a for heartbeats in robots for a, b in itertools.pairwise([began, *heartbeats, ended]))
-    return max(gaps, default=0) / 1e9
+    return max(b - a for own in robots for a, b in itertools.pairwise([began, *own, ended])) / 1e9
 
 
-# -- the report
+# -- the operator
 
 
-def sentences(cells: Sequence[Cell]) -> Iterator[str]:
-    """About connections, latency and heartbeats."""
-    for cell in cells:
-        yield (
-            f"{cell.figures['online']} of {cell.params['robots']} robots were online; of {cell.figures['sent']}"
-            f" commands {cell.lost} were overtaken or lost"
-        )
-        yield f"the wheels obeyed within {cell.percentile(50):.1f} ms (p50) and {cell.percentile(99):.1f} ms (p99)"
-        yield f"the longest time without a heartbeat of one robot was {cell.figures['longest_gap_s']:.2f} s"
+def drive_fleet(port: int, seconds: float, rate_hz: float, ids: Sequence[str]) -> None:
+    """Drives a whole fleet in :data:`STEPS`, evenly spread, and subscribes to all heartbeats.
+
+    It answers when each robot's commands were published (CLOCK_MONOTONIC, ns) and its heartbeats arrived, and how many
+    commands were more than a period late.
+    """
+    bases = [Identity("pebble", "robots", name).base for name in ids]
+    heartbeats: dict[str, list[int]] = {ONLINE.topic(base): [] for base in bases}
+    topics = [DRIVE.topic(base) for base in bases]
+    bodies = [json.dumps({"x": (left - right) / 2, "z": (left + right) / 2}) for left, right in STEPS]
+
+    def receive(message: MQTTMessage) -> None:
+        if not message.retain and b"true" in message.payload:
+            heartbeats[message.topic].append(time.monotonic_ns())
+
+    client = StockClient(receive, [(topic, 0) for topic in heartbeats])
+    client.paho.max_inflight_messages_set(MANY)
+    client.open(port)
+    end = time.monotonic() + _ONLINE_S
+    while not all(heartbeats.values()) and time.monotonic() < end:
+        time.sleep(_POLL_S)
+    answer({"online": sum(map(bool, heartbeats.values()))})
+    sent: dict[str, list[int]] = {name: [] for name in ids}
+    began, late, gap = time.monotonic(), 0, 1 / rate_hz / len(ids)
+    for number in range(round(seconds * rate_hz) * len(ids)):
+        step, robot = divmod(number, len(ids))
+        left = began + number * gap - time.monotonic()
+        if left > 0:
+            time.sleep(left)
+        late += left < -1 / rate_hz
+        sent[ids[robot]].append(time.monotonic_ns())
+        client.paho.publish(topics[robot], bodies[step % len(STEPS)], qos=DRIVE.default_qos)
+    answer({"late": late, "sent": sent, "heartbeats": list(heartbeats.values())})
+    client.close()
 
 
 FLEET = Comparison(
@@ -127,14 +150,8 @@ FLEET = Comparison(
     title="A fleet on one broker",
     what="Robots that are their own MCU, the real firmware on simulated pins, all on one stock broker and driven "
     "by one operator at 10 Hz each. The latency is from the operator's publish call to the change of the pins.",
-    help="""Hundreds of MCU robots on one broker: heartbeats, command latency, cost.
-
-    The real firmware files on simulated pins, real TCP; one operator drives all of them. Needs mosquitto.
-
-    \b
-        pebble bench fleet
-        pebble bench fleet --robots 20 --seconds 10
-    """,
+    help="Hundreds of MCU robots on one broker, driven by one operator: heartbeats, command latency, cost. The real "
+    "firmware on simulated pins, real TCP. Needs mosquitto.",
     options=(
         Option(name="robots", kind=int, least=1, most=MOST, help="How many robots with Wi-Fi."),
         seconds("Driving time.", least=1),
@@ -147,8 +164,10 @@ FLEET = Comparison(
     tables=(
         Grid(
             title="Command to pins, ms", rows=("robots", "rate"),
-            columns=(*map(percentile_column, (50, 95, 99, 100)), COUNT, single_column("sent", "sent"),
-                     single_column("late", "late")),
+            columns=(
+                *map(percentile_column, (50, 95, 99, 100)), COUNT, LOST,
+                *(single_column(name, name) for name in ("sent", "late", "online")),
+            ),
         ),
         Grid(
             title="Heartbeats of a robot, Hz; CPU, % of a core; memory, MB", rows=("robots",),
@@ -159,8 +178,11 @@ FLEET = Comparison(
             )),
         ),
     ),
-    assessment=(sentences,),
     complete=lambda cells: all(cell.samples and cell.figures["online"] == cell.params["robots"] for cell in cells),
     pictures=(ecdf("Fleet"),),
     reported_full=("--robots", "100", "--seconds", "20"),
 )  # fmt: skip
+
+if __name__ == "__main__":
+    serve_on_thread(lambda _line: None, lambda: os._exit(0))
+    drive_fleet(int(sys.argv[1]), float(sys.argv[2]), float(sys.argv[3]), sys.argv[4:])

@@ -12,7 +12,6 @@ import itertools
 import json
 import sys
 import time
-from collections.abc import Iterator
 from typing import Any
 
 import serial
@@ -29,14 +28,10 @@ _PIECE = 4096  # bytes
 _TOUCH = ("a0", "a1", "a2")
 
 
-def client(port: int, *filters: str) -> Client:
+def client(port: int, *filters: str) -> Any:
     """Connected, on a thread of its own, and subscribed to ``filters`` with QoS 1."""
-    made = Client(CallbackAPIVersion.VERSION2)
-
-    def subscribe(*_: Any) -> None:
-        made.subscribe([(filter_, 1) for filter_ in filters])
-
-    made.on_connect = subscribe
+    made: Any = Client(CallbackAPIVersion.VERSION2)
+    made.on_connect = lambda *_: made.subscribe([(filter_, 1) for filter_ in filters])
     made.connect("127.0.0.1", port)
     return made
 
@@ -71,30 +66,20 @@ def serial_bridge(local_port: int, base: str, device: str, *, reports: bool) -> 
     local = client(local_port, DRIVE.topic(base))
     local.on_message = drive
     local.loop_start()
-    for line in _lines(port):
-        if not reports:
-            continue
-        fields = dict(token.split("=", 1) for token in line.decode().split() if "=" in token)
-        if all(name in fields for name in _TOUCH):
-            touch = {name: int(fields[name]) for name in _TOUCH}
-            local.publish(TOUCH_SENSORS.topic(base), json.dumps({"value": touch}), TOUCH_SENSORS.default_qos)
-
-
-def _lines(port: serial.Serial) -> Iterator[bytes]:
-    """Without pyserial's own ``readline``, which reads byte by byte."""
     rest = b""
-    while True:
+    while True:  # without pyserial's own readline, which reads byte by byte
         *lines, rest = (rest + port.read(max(1, min(port.in_waiting, _PIECE)))).split(b"\n")
-        yield from lines
-
-
-def main(part: str, local: str, remote: str, base: str, device: str, reports: str = "") -> None:
-    """Ports of the two brokers, the base of the robot's topics, its serial line; ``--reports`` publishes reports."""
-    if part == "bridge":
-        bridge(int(remote), int(local), base)
-    else:
-        serial_bridge(int(local), base, device, reports=bool(reports))
+        for line in lines if reports else ():
+            fields = dict(token.split("=", 1) for token in line.decode().split() if "=" in token)
+            if all(name in fields for name in _TOUCH):
+                touch = {name: int(fields[name]) for name in _TOUCH}
+                local.publish(TOUCH_SENSORS.topic(base), json.dumps({"value": touch}), TOUCH_SENSORS.default_qos)
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    # ports of the two brokers, the base of the robot's topics, its serial line, and whether reports are published
+    part, local_port, remote_port, topics, device, *options = sys.argv[1:]
+    if part == "bridge":
+        bridge(int(remote_port), int(local_port), topics)
+    else:
+        serial_bridge(int(local_port), topics, device, reports="--reports" in options)

@@ -22,12 +22,12 @@ from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
 import pebble.transports.mqtt.transport  # noqa: F401  (otherwise the first subscriber would include the import)
+from pebble.bench.drivers import StockClient
 from pebble.config import load
 from pebble.contract import AUDIO, AUDIO_CONTROL, CAMERA, MQTT_AUDIO, MQTT_VIDEO, ONLINE, STATUS, VIDEO_CONTROL
 from pebble.contract.packets import Codec, Picture, PictureKind, Sound
 from pebble.errors import PayloadError, PebbleError
 from pebble.rig.robot import BASE, MEDIA, Robot, one_robot
-from pebble.rig.stock_client import StockClient
 from pebble.rig.worker_end import answer, serve
 from pebble.runtime.connections import local_transport
 from pebble.transports import Message, MqttSettings, Transport, create

@@ -18,8 +18,7 @@ from rich.console import Console
 from pebble import cli
 from pebble.bench import engine
 from pebble.bench.comparison import Case
-from pebble.bench.drivers import STEPS
-from pebble.bench.fleet import FLEET, cell_of, latencies_ms, longest_gap_s, measure
+from pebble.bench.fleet import FLEET, STEPS, cell_of, latencies_ms, longest_gap_s, measure
 from pebble.bench.results import load
 from pebble.errors import ConfigError, PebbleError
 from pebble.simulation.fleet import MOST, Moved, members
@@ -123,15 +122,15 @@ def test_what_cannot_be_measured_is_named(tmp_path: Path) -> None:
 def test_figures_are_shown_and_written(tmp_path: Path) -> None:
     second = 1_000_000_000
     heartbeats = [[number * second // 4 for number in range(5)], [number * second // 4 for number in range(9)]]
-    answer = {"sent": [[0, second], [0]], "late": 0, "heartbeats": heartbeats, "began": 0, "ended": 2 * second}
+    sent = {"minilamp-001": [0, second], "benjr-001": [0]}
+    answer = {"sent": sent, "late": 0, "heartbeats": heartbeats}
     moves = {name: [Moved(ms * 1_000_000, name, (1.0, 1.0))] for name, ms in (("minilamp-001", 1), ("benjr-001", 9))}
     measured = replace(FLEET, measure=lambda case: [cell_of(case, 2, answer, moves, {"fleet": 1.0}, 8.0)])
     out = StringIO()
     assert engine.run(measured.run_of(robots=2, output=tmp_path, console=Console(file=out, width=100))) == 0
-    assert re.search(r"2 +10 Hz +1.00 +9.00 +9.00 +9.00 +2 +3 +0", out.getvalue())  # p50 … max, n, sent, late
-    results = load(tmp_path / "fleet.json")
-    assert results.cells[0].rounds == [[1.0, 9.0]]
-    assert results.assessment[0] == "2 of 2 robots were online; of 3 commands 1 were overtaken or lost"
+    # p50 … max, n, lost, sent, late, online
+    assert re.search(r"2 +10 Hz +1.00 +9.00 +9.00 +9.00 +2 +1 +3 +0 +2", out.getvalue())
+    assert load(tmp_path / "fleet.json").cells[0].rounds == [[1.0, 9.0]]
 
 
 class Command:
