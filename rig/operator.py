@@ -106,16 +106,12 @@ class CompletedStop:
     """An emergency stop of one robot."""
 
     robot: str
+    began: float  # the driving before it
     pressed: float
     confirmed_s: float | None  # after the press
     reset: float  # when the reset was sent
     is_free: bool  # after the reset
     ended: float
-
-    @property
-    def began(self) -> float:
-        """The driving before it."""
-        return self.pressed - _BEFORE_S
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,16 +119,12 @@ class CompletedFollow:
     """A script on one robot, and what the operator did."""
 
     robot: str
-    started: float  # the script
+    began: float  # the script
     took_over: float  # first drive command
     wheels: Wheels  # of the operator's drive commands
     released: float  # the zero after them
     ended: float  # the script, by a stop command
     clip: str
-
-    @property
-    def began(self) -> float:
-        return self.started
 
 
 class EndedEarlyError(Exception):
@@ -313,7 +305,7 @@ class Operator:
 
     def _stop_all(self, robots: Sequence[DiscoveredRobot]) -> None:
         """Drive all, stop them, drive in vain, reset, drive again; a stop by a person is the person's to reset."""
-        received: queue.SimpleQueue[Message] = queue.SimpleQueue()
+        received, began = queue.SimpleQueue[Message](), time.monotonic()
         self._begin(EMERGENCY_STOP, robots)
         with closing(self._transport.subscribe(ALL_OUTGOING, received.put)):  # brings retained capabilities again
             self._hold(_FORWARD, _BEFORE_S)
@@ -339,7 +331,7 @@ class Operator:
         self._wait(_STOPPED_REST_S)
         for robot, reset in resets.items():
             confirmed_s, free = sender.robots[robot.base].confirmed_s, bool(reset.shown) and reset.free
-            self._complete(CompletedStop(robot.name, pressed, confirmed_s, reset_at, free, ended))
+            self._complete(CompletedStop(robot.name, began, pressed, confirmed_s, reset_at, free, ended))
 
     # -- a script
 
@@ -372,7 +364,7 @@ class Operator:
         config = {"tag_id": TAG_ID, "tag_size_m": TAG_SIZE_M, "target_distance_m": DISTANCE_M}
         sound = codec.encode(SOUNDBOARD_COMMAND, SoundboardCommand(action="play", file=CLIP))
         with closing(self._transport.subscribe(APRILTAG_DATA.topic(robot.base), receive)):
-            started = time.monotonic()
+            began = time.monotonic()
             try:
                 command(AutonomyCommand(action="start", file=FOLLOW, config=config))
                 self._publish(SOUNDBOARD_COMMAND.topic(robot.base), sound)
@@ -381,7 +373,7 @@ class Operator:
             finally:
                 command(AutonomyCommand(action="stop"))
         self._wait(_FOLLOWED_REST_S)
-        return CompletedFollow(robot.name, started, took_over, mix(_BACK.x, _BACK.z), released, ended, CLIP)
+        return CompletedFollow(robot.name, began, took_over, mix(_BACK.x, _BACK.z), released, ended, CLIP)
 
     def _overrule(self, robot: DiscoveredRobot, seen: Sequence[TagData]) -> tuple[float, float]:
         """Drive, and wait until the script has arrived: when the first command was sent, and the zero after them."""
