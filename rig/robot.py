@@ -114,6 +114,7 @@ class Robot(SimulatedRobot):
         super().__init__(running, name, folder or running.folder)
         self.kind, self.base = kind, Identity("pebble", "robots", name).base
         self._remote_host, self.remote_port = remote
+        self.broker_ports = [self.remote_port]  # and that of its own local broker, once it runs
         self.run_dir, self.config, self.port = (self.folder / file for file in ("run", f"{name}.json", "mcu"))
         self.local_broker: Broker | None = None
         self.local_port: int | None = None  # of the local broker, which may be that of several robots
@@ -135,6 +136,7 @@ class Robot(SimulatedRobot):
             self.local_broker = self.running.broker("local", folder=self.folder, wrap=self._wrap)
             self.programs.append(self.local_broker)
             self.local_port = self.local_broker.port
+            self.broker_ports.append(self.local_port)
             if self._wrap is unchanged:  # else it is in another network
                 self.local_broker.wait()
         self._trace.touch()
@@ -157,11 +159,6 @@ class Robot(SimulatedRobot):
     @property
     def launcher(self) -> Program:
         return self._started[0]
-
-    @property
-    def broker_ports(self) -> list[int]:
-        """The remote broker's port, then that of the local broker, if there is one."""
-        return [self.remote_port, *([] if self.local_broker is None else [self.local_broker.port])]
 
     def pids(self) -> list[int]:
         """Of the launcher, its children (including a hub), and the local broker, if there is one."""
