@@ -1,78 +1,166 @@
-"""A scripted operator: discovers robots on a broker, drives them through the same steps, and overrules a script.
+"""A scripted operator drives the robots of a broker: steps, an emergency stop, and a script that it overrules.
 
 It yields to people: a robot that is driven or was stopped from the operator page is left alone until the step after.
+Times are seconds of time.monotonic().
 """
 
 from __future__ import annotations
 
+import math
+import queue
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Sequence
+from contextlib import closing, suppress
+from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
 
 from pebble.client.discovery import ALL_OUTGOING, DiscoveredRobot, Discovery
-from pebble.contract import DRIVE, DRIVING, LIGHTS_FLASH, LIGHTS_SOLID, codec
-from pebble.contract.identity import parse_topic
-from pebble.contract.payloads import Drive, Driver, LightsFlash
-from pebble.errors import PayloadError, PebbleError
-from pebble.rig.acts import (
-    BY_ITSELF,
-    COMMAND_PERIOD_S,
-    EMERGENCY_STOP,
-    SCRIPT,
-    CompletedFollow,
-    CompletedStep,
-    CompletedStop,
-    EndedEarlyError,
-    Step,
-    TakeOver,
-    emergency_stop,
-    repeat,
+from pebble.client.driver_lease import FILTER, VALID_S
+from pebble.client.estop import StopSender, new_name
+from pebble.client.estop_states import Reset
+from pebble.contract import (
+    APRILTAG_DATA,
+    AUTONOMY_COMMAND,
+    DRIVE,
+    DRIVING,
+    LIGHTS_FLASH,
+    LIGHTS_SOLID,
+    SOUNDBOARD_COMMAND,
+    codec,
 )
+from pebble.contract.payloads import AutonomyCommand, Drive, LightsFlash, LightsSolid, SoundboardCommand, TagData
+from pebble.errors import PayloadError, PebbleError
+from pebble.motion.arbiter import HOLD_MS
+from pebble.services.serial_mcu_bridge.text.goob_base import mix
 from pebble.transports import Message, MqttSettings, QoS, create
 
-STOP = Drive()
+COMMAND_PERIOD_S = 0.05  # how often a held stick is repeated
 NAME = "the demo's operator"
+STOP = Drive()
 _POLL_S = 0.02
-_COMPLETED = 1000  # finished steps that wait to be assessed
-_EVENTS = 100  # that wait to be shown
 _MOST_TIMES = 3  # for the emergency stop and for the script
 _ASSESSED_S = 5.0  # until what was completed is assessed, on the smallest machine
+
+Wheels = tuple[float, float]  # left and right, -1..1
+
+
+# -- what it does
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """Repeat ``drive`` for ``drive_s``, then send a stop or simply nothing more, and observe for ``rest_s``."""
+
+    name: str
+    drive: Drive
+    drive_s: float
+    sends_stop: bool
+    rest_s: float
+    lights: LightsSolid | LightsFlash
+
+
+SCRIPT = (
+    Step("forward, stop", Drive(z=0.6), 1.2, True, 1.4, LightsSolid(g=1.0)),
+    Step("turn right, stop", Drive(x=0.35), 0.8, True, 1.4, LightsFlash(b=1.0, period=0.5)),
+    Step("forward, let go", Drive(z=0.6), 0.8, False, 1.4, LightsSolid(r=1.0)),
+    Step("back, stop", Drive(z=-0.5), 0.8, True, 1.4, LightsSolid(b=0.3, g=0.3, r=0.3)),
+)
+ROUND_S = sum(step.drive_s + step.rest_s for step in SCRIPT)
+
+EMERGENCY_STOP = "emergency stop"  # of all robots, which are driven in vain, and reset
+_BEFORE_S, _IN_VAIN_S, _RESET_S, _AFTER_S, _STOPPED_REST_S = 0.8, 1.0, 0.8, 0.6, 0.8
+EMERGENCY_S = _BEFORE_S + _IN_VAIN_S + _RESET_S + _AFTER_S + _STOPPED_REST_S + 0.5
+_CONFIRMED_S = 3.0  # until every robot has confirmed, on the smallest machine
+_FORWARD = Drive(z=0.5)
+
+BY_ITSELF = "by itself"  # a robot follows a tag by a script, and is driven for a moment in between
+FOLLOW = "apriltag-follow"
+TAG_ID, TAG_SIZE_M = 21, 0.25  # of the tag that Goob follows, as in the world file
+CLIP = "horn.wav"
+DISTANCE_M, TOLERANCE_M = 0.9, 0.05
+HOLD_S = HOLD_MS / 1000  # scripts are refused this long after a person's last command
+_APPROACH_S, _OVERRIDE_S, _STEADY_S, _FOLLOWED_REST_S = 1.0, 1.0, 0.8, 0.5
+_START_S, _ARRIVAL_S = 10.0, 10.0  # at most, on the smallest machine
+_STATUS_S = 1.0  # until the robot's status has changed
+#: Of most runs; a slow one takes longer.
+TAKEOVER_S = 2.0 + _APPROACH_S + _OVERRIDE_S + HOLD_S + 4.5 + _STEADY_S + _FOLLOWED_REST_S
+_BACK = Drive(x=-0.1, z=-0.5)
 _BACK_OFF, _BACK_OFF_S = Drive(z=-0.5), 1.0
-EXPIRES_S = 3.0  # of a visit; announcements come every second
+
+
+@dataclass(frozen=True, slots=True)
+class CompletedStep:
+    """A step that was sent to one robot."""
+
+    robot: str  # its id
+    step: Step
+    began: float
+    released: float  # the last moving command, or the stop command if the step sends one
+    ended: float
+
+
+@dataclass(frozen=True, slots=True)
+class CompletedStop:
+    """An emergency stop of one robot."""
+
+    robot: str
+    began: float  # the driving before it
+    pressed: float
+    confirmed_s: float | None  # after the press
+    reset: float  # when the reset was sent
+    is_free: bool  # after the reset
+    ended: float
+
+
+@dataclass(frozen=True, slots=True)
+class CompletedFollow:
+    """A script on one robot, and what the operator did."""
+
+    robot: str
+    began: float  # the script
+    took_over: float  # first drive command
+    wheels: Wheels  # of the operator's drive commands
+    released: float  # the zero after them
+    ended: float  # the script, by a stop command
+    clip: str
+
+
+class EndedEarlyError(Exception):
+    """The demo ends, or a person has taken the robot."""
 
 
 class Operator:
     """Drives on its own thread and connection.
 
-    ``activity`` and ``events`` (monotonic seconds and a line) are for display; ``completed`` collects finished steps,
-    and ``left_alone`` the names of robots of which people had the control meanwhile. The emergency stop and the script
+    ``activity`` and ``events`` (seconds and a line) are for display; ``completed`` collects finished steps, and
+    ``left_alone`` the names of robots of which people had the control meanwhile. The emergency stop and the script
     belong to the first round; while ``again`` has their names, they are repeated at once. Whoever assesses what was
     completed removes it only then.
     """
 
     def __init__(self, port: int, name: str = "pebble-demo-operator") -> None:
-        self.discovery, self.visitors = Discovery(), Visitors()
+        self.discovery = Discovery()
         self.left_alone: set[str] = set()
         self.again: frozenset[str] = frozenset()
         self.rounds = 0
-        self.commands: dict[str, tuple[Drive, float]] = {}  # by base topic: the last one sent, and when (monotonic)
-        self.events: deque[tuple[float, str]] = deque(maxlen=_EVENTS)
-        self.completed: deque[CompletedStep | CompletedStop | CompletedFollow] = deque(maxlen=_COMPLETED)
-        self._doing = "discovering robots"
-        self._step_began = 0.0
-        self._yours = ""
+        self.commands: dict[str, tuple[Drive, float]] = {}  # by base topic: the last one sent, and when
+        self.events: deque[tuple[float, str]] = deque()
+        self.completed: deque[CompletedStep | CompletedStop | CompletedFollow] = deque()
+        self._doing, self._step_began = "discovering robots", 0.0
+        self._robots: list[DiscoveredRobot] = []  # that take part in the present step
+        self._scripted: DiscoveredRobot | None = None  # if a person takes it, the present step ends
+        self._visits: dict[str, tuple[str, float]] = {}  # by base topic: who drives it from the page, announced when
         self._transport = create("mqtt", name, MqttSettings(host="127.0.0.1", port=port))
         self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._drive, name=name, daemon=True)
+        self._thread = threading.Thread()
 
     def connect(self) -> None:
         """Connect and subscribe; returns at once."""
         self._transport.open(timeout=0.0)
-        self._transport.subscribe(ALL_OUTGOING, self._receive)
+        self._transport.subscribe(ALL_OUTGOING, lambda one: self.discovery.receive(one, time.monotonic(), time.time()))
+        self._transport.subscribe(FILTER, self._note_visits)
 
     def ready(self, wanted: int) -> bool:
         """Are that many robots online, with a drive topic?"""
@@ -93,13 +181,12 @@ class Operator:
     @property
     def activity(self) -> str:
         """What it does, and which robots it leaves alone."""
-        now = time.monotonic()
-        others = [f"{robot.name} {why}" for robot in self.discovery.all_robots() if (why := self._taken(robot, now))]
+        others = [f"{robot.name} {why}" for robot in self.discovery.all_robots() if (why := self._taken(robot))]
         return "; ".join([self._doing, *others])
 
     def begin(self, yours: str = "") -> None:
         """Start driving all robots discovered so far, round after round; with ``yours`` only once, and then show it."""
-        self._yours = yours
+        self._thread = threading.Thread(target=self._run, args=(yours,), name="operator", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
@@ -109,44 +196,48 @@ class Operator:
             self._thread.join(1.0)
         self._transport.close()
 
-    def _receive(self, message: Message) -> None:
-        self.discovery.receive(message, time.monotonic(), time.time())
-        self.visitors.receive(message, time.monotonic())
+    # -- people at the page
 
-    def _taken(self, robot: DiscoveredRobot, now: float) -> str:
+    def _note_visits(self, message: Message) -> None:
+        """A server announces once a second which robots are driven."""
+        with suppress(PayloadError):
+            for base, driver in codec.decode(DRIVING, message.payload).robots.items():
+                who = f"{driver.by} on {driver.device}" if driver.device else driver.by
+                self._visits[base] = who, time.monotonic()
+
+    def _taken(self, robot: DiscoveredRobot) -> str:
         """Why people have the control of it now; empty: they have not."""
-        if driver := self.visitors.driver(robot.base, now):
-            return f"is driven by {driver}"
+        who, at = self._visits.get(robot.base, ("", -math.inf))
+        if time.monotonic() - at < VALID_S:
+            return f"is driven by {who}"
         stop = robot.stopped_by
         return "" if stop is None or stop.by == NAME else f"is stopped by {stop.by or 'unknown'}"
 
     def _mine(self, robot: DiscoveredRobot) -> bool:
-        """Whether it may be driven in the present step."""
-        now = time.monotonic()
-        if not self._taken(robot, now) and not self.visitors.driven_since(robot.base, self._step_began, now):
+        """Whether it may be driven in the present step, in which no person has had it so far."""
+        _, at = self._visits.get(robot.base, ("", -math.inf))
+        if at < self._step_began and not self._taken(robot):
             return True
         self.left_alone.add(robot.name)
         return False
 
     # -- the operator's thread
 
-    def _drive(self) -> None:
+    def _run(self, yours: str) -> None:
         robots = self.discovery.all_robots()
         with suppress(EndedEarlyError):
-            while not (self._yours and self.rounds):
+            while not (yours and self.rounds):
                 for step in SCRIPT:
-                    self._perform(step, self._begin(step.name, robots))
+                    self._begin(step.name, robots)
+                    self._perform(step)
                 if not self.rounds:
-                    self._until_right(EMERGENCY_STOP, lambda: self._stop_all(robots))
-                    self._until_right(BY_ITSELF, lambda: self._take_over(robots))
+                    self._until_right(EMERGENCY_STOP, partial(self._stop_all, robots))
+                    self._until_right(BY_ITSELF, partial(self._take_over, robots))
                 self.rounds += 1
-            self._doing = self._yours
+            self._doing = yours
             self._stopping.wait()
-        self._send(STOP, self._begin("disconnecting", robots))
-
-    def _wait(self, seconds: float) -> None:
-        if self._stopping.wait(seconds):
-            raise EndedEarlyError
+        self._begin("disconnecting", robots)
+        self._drive(STOP)
 
     def _until_right(self, name: str, act: Callable[[], None]) -> None:
         """Once, and again while its assessment leaves ``name`` in ``again``."""
@@ -158,103 +249,163 @@ class Operator:
             if name not in self.again:
                 return
 
-    def _begin(self, step: str, robots: list[DiscoveredRobot]) -> list[DiscoveredRobot]:
-        """The robots that take part in the next step."""
+    def _begin(self, step: str, robots: Sequence[DiscoveredRobot]) -> None:
+        """With those that are free."""
         self._doing, self._step_began = step, time.monotonic()
-        return [robot for robot in robots if self._mine(robot)]
+        self._robots = [robot for robot in robots if self._mine(robot)]
 
-    def _perform(self, step: Step, robots: list[DiscoveredRobot]) -> None:
+    def _complete(self, *completed: CompletedStep | CompletedStop | CompletedFollow) -> None:
+        """Those of robots that are still free."""
+        mine = {robot.name for robot in self._robots if self._mine(robot)}
+        self.completed.extend(one for one in completed if one.robot in mine)
+
+    def _wait(self, seconds: float) -> None:
+        if self._stopping.wait(seconds) or (self._scripted is not None and not self._mine(self._scripted)):
+            raise EndedEarlyError
+
+    def _drive(self, drive: Drive) -> float:
+        """Send one command to all robots that are free; returns when."""
+        for robot in filter(self._mine, self._robots):
+            self.commands[robot.base] = drive, time.monotonic()
+            self._publish(robot.drive_topic, codec.encode(DRIVE, drive))
+        return time.monotonic()
+
+    def _hold(self, drive: Drive, seconds: float) -> float:
+        """Send a command again and again, as a held stick does; returns when it was last sent."""
+        began = due = sent = time.monotonic()
+        while due < began + seconds:
+            sent = self._drive(drive)
+            due += COMMAND_PERIOD_S
+            self._wait(max(0.0, due - sent))
+        return sent
+
+    def _publish(self, topic: str | None, payload: bytes, qos: QoS = QoS.DELIVERED) -> None:
+        if topic is not None:
+            self._transport.publish(topic, payload, qos=qos, urgent=True)
+
+    def _note(self, event: str) -> None:
+        self._doing = event
+        self.show(event)
+
+    # -- a step, and an emergency stop
+
+    def _perform(self, step: Step) -> None:
         began = time.monotonic()
         flash = isinstance(step.lights, LightsFlash)
         lights = codec.encode(LIGHTS_FLASH if flash else LIGHTS_SOLID, step.lights)
-        for robot in robots:
+        for robot in self._robots:
             self._publish(robot.lights_topic(flash=flash), lights)
-        released = repeat(lambda: self._send(step.drive, robots), self._wait, step.drive_s)
+        released = self._hold(step.drive, step.drive_s)
         if step.sends_stop:
-            self._send(STOP, robots)
-            released = time.monotonic()
+            released = self._drive(STOP)
         self._doing = f"{step.name}: observing"
         self._wait(step.rest_s)
         ended = time.monotonic()
-        self.completed.extend(
-            CompletedStep(robot.name, step, began, released, ended) for robot in robots if self._mine(robot)
-        )
+        self._complete(*(CompletedStep(robot.name, step, began, released, ended) for robot in self._robots))
 
-    def _stop_all(self, robots: list[DiscoveredRobot]) -> None:
-        robots = self._begin(EMERGENCY_STOP, robots)
-        completed = emergency_stop(self._transport, robots, partial(self._send, robots=robots), self._wait, NAME)
-        mine = {robot.name for robot in robots if self._mine(robot)}
-        self.completed.extend(one for one in completed if one.robot in mine)
+    def _stop_all(self, robots: Sequence[DiscoveredRobot]) -> None:
+        """Drive all, stop them, drive in vain, reset, drive again; a stop by a person is the person's to reset."""
+        received, began = queue.SimpleQueue[Message](), time.monotonic()
+        self._begin(EMERGENCY_STOP, robots)
+        with closing(self._transport.subscribe(ALL_OUTGOING, received.put)):  # brings retained capabilities again
+            self._hold(_FORWARD, _BEFORE_S)
+            pressed = time.monotonic()
+            bases = [robot.base for robot in self._robots]
+            sender = StopSender(new_name(), by=NAME, why="part of the demo", now=pressed, robots=bases)
+            while not sender.confirmed and time.monotonic() < pressed + _CONFIRMED_S:
+                for message in sender.tick(time.monotonic()):
+                    self._publish(message.topic, message.payload, message.qos)
+                self._hold(_FORWARD, COMMAND_PERIOD_S)
+                while not received.empty():
+                    sender.receive(received.get(), time.monotonic())
+        self._hold(_FORWARD, _IN_VAIN_S)
+        reset_at, resets = time.monotonic(), {}
+        for robot in self._robots:
+            if robot.stopped_by is None or robot.stopped_by.by == NAME:
+                resets[robot] = Reset(robot.estop, NAME)
+                for message in resets[robot].messages():
+                    self._publish(message.topic, message.payload, message.qos)
+        self._wait(_RESET_S)
+        self._hold(_FORWARD, _AFTER_S)
+        ended = self._drive(STOP)
+        self._wait(_STOPPED_REST_S)
+        for robot, reset in resets.items():
+            confirmed_s, free = sender.robots[robot.base].confirmed_s, bool(reset.shown) and reset.free
+            self._complete(CompletedStop(robot.name, began, pressed, confirmed_s, reset_at, free, ended))
 
-    def _take_over(self, robots: list[DiscoveredRobot]) -> None:
+    # -- a script
+
+    def _take_over(self, robots: Sequence[DiscoveredRobot]) -> None:
         """Let each robot with scripts follow a tag, and overrule the script for a moment."""
-        for robot in self._begin("scripts", [robot for robot in robots if robot.offers("autonomy")]):
-            drive, wait = partial(self._send, robots=[robot]), partial(self._wait_with, robot)
+        for robot in [robot for robot in robots if robot.offers("autonomy")]:
+            self._begin("scripts", [robot])
+            self._scripted = robot
             with suppress(EndedEarlyError):
+                self._wait(0.0)
                 if BY_ITSELF in self.again:  # away from the tag before which it arrived, for a way to drive
-                    repeat(partial(drive, _BACK_OFF), wait, _BACK_OFF_S)
-                    drive(STOP)
-                self.completed.append(TakeOver(self._transport, robot, drive, wait, self._note).perform())
+                    self._hold(_BACK_OFF, _BACK_OFF_S)
+                    self._drive(STOP)
+                self._complete(self._follow(robot))
+            self._scripted = None
             self._wait(0.0)
 
-    def _wait_with(self, robot: DiscoveredRobot, seconds: float) -> None:
-        self._wait(seconds)
-        if not self._mine(robot):
-            raise EndedEarlyError
+    def _follow(self, robot: DiscoveredRobot) -> CompletedFollow:
+        """What goes wrong is for the assessment."""
+        seen: deque[TagData] = deque(maxlen=1)
 
-    def _note(self, what: str, text: str) -> None:
-        self._doing = f"{what}: {text}"
-        self.show(f"{what}: {text}")
+        def receive(message: Message) -> None:
+            with suppress(PayloadError):
+                seen.append(codec.decode(APRILTAG_DATA, message.payload))
 
-    def _send(self, drive: Drive, robots: list[DiscoveredRobot]) -> None:
-        payload = codec.encode(DRIVE, drive)
-        for robot in filter(self._mine, robots):
-            self.commands[robot.base] = drive, time.monotonic()
-            self._publish(robot.drive_topic, payload)
+        def command(what: AutonomyCommand) -> None:
+            self._publish(AUTONOMY_COMMAND.topic(robot.base), codec.encode(AUTONOMY_COMMAND, what))
 
-    def _publish(self, topic: str | None, payload: bytes) -> None:
-        if topic is not None:
-            self._transport.publish(topic, payload, qos=QoS.DELIVERED, urgent=True)
+        self._note(f"STARTS: {FOLLOW}, {robot.name} plays {CLIP} and drives to tag {TAG_ID} by itself")
+        config = {"tag_id": TAG_ID, "tag_size_m": TAG_SIZE_M, "target_distance_m": DISTANCE_M}
+        sound = codec.encode(SOUNDBOARD_COMMAND, SoundboardCommand(action="play", file=CLIP))
+        with closing(self._transport.subscribe(APRILTAG_DATA.topic(robot.base), receive)):
+            began = time.monotonic()
+            try:
+                command(AutonomyCommand(action="start", file=FOLLOW, config=config))
+                self._publish(SOUNDBOARD_COMMAND.topic(robot.base), sound)
+                took_over, released = self._overrule(robot, seen)
+                ended = time.monotonic()
+            finally:
+                command(AutonomyCommand(action="stop"))
+        self._wait(_FOLLOWED_REST_S)
+        return CompletedFollow(robot.name, began, took_over, mix(_BACK.x, _BACK.z), released, ended, CLIP)
 
+    def _overrule(self, robot: DiscoveredRobot, seen: Sequence[TagData]) -> tuple[float, float]:
+        """Drive, and wait until the script has arrived: when the first command was sent, and the zero after them."""
 
-# -- people at the page
+        def scripted() -> bool:
+            """Whether the robot reports that no person goes before its script, as after the steps before."""
+            status = robot.autonomy
+            return status is not None and status.running and status.overridden is not True
 
+        def distance_m() -> float:
+            """From the tag; infinite if the robot does not see it."""
+            return math.inf if not seen or seen[0].distance_m is None else seen[0].distance_m
 
-class _Visit(NamedTuple):
-    server: str
-    driver: Driver | None  # None: it is over
-    announced: float  # monotonic
+        self._until(lambda: bool(seen) and scripted(), _START_S)
+        self._wait(_APPROACH_S)
+        self._note(f"TAKES OVER: drives {robot.name}, {FOLLOW} is overruled")
+        took_over = time.monotonic()
+        self._hold(_BACK, _OVERRIDE_S)
+        released = self._drive(STOP)
+        self._note(f"LETS GO: {robot.name} waits {HOLD_S:.0f} s for another command")
+        self._until(scripted, HOLD_S + _STATUS_S)
+        self._note(f"GIVES BACK: {FOLLOW} drives {robot.name} again")
+        self._until(lambda: abs(distance_m() - DISTANCE_M) <= TOLERANCE_M, _ARRIVAL_S, _STEADY_S)
+        self._note(f"ENDS: {FOLLOW}, {robot.name} sees tag {TAG_ID} at {distance_m():.2f} m")
+        return took_over, released
 
-
-class Visitors:
-    """Which robots people drive from the operator page, by what its server announces; times are monotonic. Pure.
-
-    It has the newest visit of every robot, by base topic. One thread receives, another reads.
-    """
-
-    def __init__(self) -> None:
-        self._visits: dict[str, _Visit] = {}
-
-    def receive(self, message: Message, now: float) -> None:
-        address = parse_topic(message.topic)
-        if address is None or not address.identity.is_server or message.retain:
-            return
-        try:
-            driven = codec.decode(DRIVING, message.payload).robots
-        except PayloadError:  # from something that is no server of ours
-            return
-        server = address.identity.id
-        running = [base for base, visit in self._visits.items() if visit.server == server and visit.driver is not None]
-        self._visits |= {base: _Visit(server, driven.get(base), now) for base in {*running, *driven}}
-
-    def driver(self, base: str, now: float) -> str:
-        """Who has that robot now, for display; empty: nobody."""
-        visit = self._visits.get(base)
-        if visit is None or visit.driver is None or now - visit.announced > EXPIRES_S:
-            return ""
-        return f"{visit.driver.by} on {visit.driver.device}" if visit.driver.device else visit.driver.by
-
-    def driven_since(self, base: str, since: float, now: float) -> bool:
-        """Whether a person has it, or had it at any time after ``since``."""
-        visit = self._visits.get(base)
-        return visit is not None and (visit.announced >= since or bool(self.driver(base, now)))
+    def _until(self, condition: Callable[[], bool], timeout: float, steady_s: float = 0.0) -> None:
+        """Wait until the condition has held for ``steady_s``, at most for ``timeout``."""
+        since = time.monotonic()
+        end = since + timeout
+        while (now := time.monotonic()) < end:
+            since = since if condition() else now
+            if since < now - steady_s:
+                return
+            self._wait(_POLL_S)

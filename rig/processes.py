@@ -16,6 +16,8 @@ from pebble.rig.programs import Program, Worker, Wrap, end_all, unchanged
 #: In this order they end: robots while the brokers to which they report it still run, MCUs after what they move.
 OPERATORS, ROBOTS, MCUS, BROKERS = range(4)
 
+_LONGEST_FOLDER = 40  # characters: Unix sockets live below, and their paths end at 108 bytes
+
 P = TypeVar("P", bound=Program)
 
 
@@ -29,9 +31,9 @@ class Processes:
     ends_s: ClassVar[tuple[float, ...]] = (4.0, 6.0, 2.0, 2.0)  # what is left of each kind after that is killed
     keep = False  # the folder
 
-    def __init__(self, prefix: str = "pbl-", into: str | None = None) -> None:
-        """The folder's name begins with ``prefix``; it is in the usual place for temporary ones unless ``into``."""
-        self.folder = Path(tempfile.mkdtemp(prefix=prefix, dir=into))
+    def __init__(self, prefix: str = "pbl-") -> None:
+        usual = tempfile.gettempdir()  # mkdtemp makes a 0700 folder in it
+        self.folder = Path(tempfile.mkdtemp(prefix=prefix, dir=usual if len(usual) <= _LONGEST_FOLDER else "/tmp"))  # noqa: S108
         self.closing = ExitStack()
         self.workers: list[Worker] = []
         self._kinds: dict[Program, int] = {}
@@ -68,28 +70,22 @@ class Processes:
         return [f"{program.name} ended unexpectedly: see {program.log}" for program in programs if program.ended]
 
     def worker(self, name: str, module: str, *arguments: object, wrap: Wrap = unchanged) -> Worker:
-        """``python -m module``."""
         return self.command(name, wrap(python(module, *arguments)))
 
     def command(self, name: str, command: Sequence[str]) -> Worker:
-        """Another command that is a worker."""
+        """A worker that is not a module."""
         self.workers.append(self.add(Worker(name, command, self.folder / f"{name}.log"), OPERATORS))
         return self.workers[-1]
 
     def robot(self, name: str, module: str, *arguments: object) -> Program:
-        """``python -m module``, one or more robots."""
+        """One or more robots."""
         return self.add(Program(name, python(module, *arguments), self.folder / f"{name}.log"), ROBOTS)
 
     def broker(
-        self,
-        name: str = "broker",
-        kind: BrokerKind = BrokerKind.MOSQUITTO,
-        *,
-        folder: Path | None = None,
-        **options: Any,
+        self, name: str = "broker", kind: BrokerKind = BrokerKind.MOSQUITTO, *, folder: Path | None = None, **more: Any
     ) -> Broker:
         """A broker that is starting: wait for it."""
-        return self.add(Broker(name, kind, folder or self.folder, **options), BROKERS)
+        return self.add(Broker(name, kind, folder or self.folder, **more), BROKERS)
 
 
 def python(module: str, *arguments: object) -> list[str]:

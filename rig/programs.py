@@ -12,13 +12,16 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from pebble.errors import PebbleError
 from pebble.runtime.parent import tied_to_parent
 
 Wrap = Callable[[Sequence[str]], Sequence[str]]
 """Extends a command, so that it runs in another network."""
+
+Each = Callable[[bytes], object]
+"""Gets one line of a program's standard output."""
 
 _STEP_S = 0.01
 _END_S = 4.0  # for workers
@@ -35,28 +38,20 @@ class Program:
     Start programs from the main thread: the kernel ends them when the thread that started them ends.
     """
 
-    def __init__(
-        self,
-        name: str,
-        command: Sequence[str],
-        log: Path,
-        *,
-        each: Callable[[bytes], object] | None = None,
-        has_input: bool = False,
-    ) -> None:
-        """``each`` gets the lines of its standard output on a thread of its own; without it they are in the log.
+    has_input: ClassVar = False  # it ends with its standard input, not with the thread that starts it
 
-        ``has_input``: it ends with its standard input, not with the thread that starts it.
-        """
+    def __init__(self, name: str, command: Sequence[str], log: Path, each: Each | None = None) -> None:
+        """``each`` runs on a thread of its own; without it standard output is in the log, as errors are."""
         self.name, self.log = name, log
         with log.open("ab") as errors:
             self._process = subprocess.Popen(
-                command if has_input else tied_to_parent(command, signal.SIGTERM),
-                stdin=subprocess.PIPE if has_input else subprocess.DEVNULL,
+                command if self.has_input else tied_to_parent(command, signal.SIGTERM),
+                stdin=subprocess.PIPE if self.has_input else subprocess.DEVNULL,
                 stdout=errors if each is None else subprocess.PIPE,
                 stderr=errors,
                 start_new_session=True,
             )
+        self.pid = self._process.pid
         self._reader = threading.Thread(target=self._read, args=(each,), name=f"output of {name}", daemon=True)
         if each is not None:
             self._reader.start()
@@ -65,10 +60,6 @@ class Program:
     def is_read(self) -> bool:
         """Whether ``each`` still gets lines: the program has not closed its output, and no line was an error."""
         return self._reader.is_alive()
-
-    @property
-    def pid(self) -> int:
-        return self._process.pid
 
     @property
     def code(self) -> int | None:
@@ -83,17 +74,16 @@ class Program:
         """The end of its log."""
         return self.log.read_text(errors="replace").strip()[-_TAIL:] if self.log.exists() else ""
 
-    def kill(self) -> None:
-        """SIGKILL; returns when it has ended."""
-        self._process.kill()
-        self._process.wait()
-
     def freeze(self) -> None:
         """SIGSTOP: its connections stay, and it answers nothing. A process that has ended stays so."""
         self._process.send_signal(signal.SIGSTOP)
 
     def thaw(self) -> None:
         self._process.send_signal(signal.SIGCONT)
+
+    def kill(self) -> None:
+        self._process.kill()
+        self._process.wait()
 
     def wait_until(self, condition: Callable[[], bool], timeout: float, ending: threading.Event | None = None) -> None:
         """Wait for ``condition``, or until ``ending``. Raises PebbleError on timeout or if the program ends first."""
@@ -108,37 +98,31 @@ class Program:
         if not self.ended:
             self._process.terminate()
 
-    def end(self, deadline: float) -> None:
-        """Wait until ``deadline`` (monotonic), then kill the program and its children."""
-        try:
-            self._process.wait(max(0.0, deadline - time.monotonic()))
-        except subprocess.TimeoutExpired:
-            os.killpg(self._process.pid, signal.SIGKILL)
-            self._process.wait()
-
-    def _read(self, each: Callable[[bytes], object]) -> None:
+    def _read(self, each: Each) -> None:
         for line in self._process.stdout or ():
             each(line)
 
 
 class Worker(Program):
-    """A program that reads lines, answers in JSON lines, and ends with its input: its other end is worker_end.
+    """A program that reads lines, answers in JSON lines, and ends with its input, so also when this process ends.
 
-    So it also ends when this process ends in any way.
+    Its other end is worker_end.
     """
+
+    has_input = True
 
     def __init__(self, name: str, command: Sequence[str], log: Path) -> None:
         self._answers: queue.Queue[dict[str, Any] | None] = queue.Queue()
-        super().__init__(name, command, log, each=lambda line: self._answers.put(json.loads(line)), has_input=True)
+        super().__init__(name, command, log, each=lambda line: self._answers.put(json.loads(line)))
 
     def answer(self, timeout: float) -> dict[str, Any]:
-        """The next answer. Raises PebbleError if the process ends, or does not answer within ``timeout`` seconds."""
+        """The next answer. Raises PebbleError with its log if it ends, or does not answer within ``timeout`` s."""
         try:
             answer = self._answers.get(timeout=timeout)
         except queue.Empty:
-            raise self._problem(f"did not answer within {timeout:.0f} s") from None
+            raise PebbleError(f"{self.name} did not answer within {timeout:.0f} s\n{self.tail()}".rstrip()) from None
         if answer is None:
-            raise self._problem(f"ended with code {self._process.wait()}")
+            raise PebbleError(f"{self.name} ended with code {self._process.wait()}\n{self.tail()}".rstrip())
         return answer
 
     def send(self, line: str) -> None:
@@ -157,26 +141,26 @@ class Worker(Program):
             with suppress(BrokenPipeError):  # it ended by itself
                 self._process.stdin.close()
 
-    def _read(self, each: Callable[[bytes], object]) -> None:
+    def _read(self, each: Each) -> None:
         super()._read(each)
         self._answers.put(None)
 
-    def _problem(self, what: str) -> PebbleError:
-        return PebbleError(":\n".join(filter(None, (f"{self.name} {what}", self.tail()))))
-
 
 def end_all(programs: Iterable[Program], within_s: float) -> None:
-    """Send SIGTERM to all of them, and kill those that still run after ``within_s``."""
-    programs = list(programs)
-    deadline = time.monotonic() + within_s
+    """Send SIGTERM to all of them, and kill those that still run after ``within_s``, with their children."""
+    programs, deadline = list(programs), time.monotonic() + within_s
     for program in programs:
         program.ask_to_end()
     for program in programs:
-        program.end(deadline)
+        try:
+            program._process.wait(max(0.0, deadline - time.monotonic()))
+        except subprocess.TimeoutExpired:
+            os.killpg(program.pid, signal.SIGKILL)
+            program._process.wait()
 
 
 def end_workers(workers: Iterable[Worker]) -> None:
-    """Ends all workers at the same time; kills those that do not end within seconds."""
+    """Close the input of all workers, and kill those that still run seconds later."""
     end_all(workers, _END_S)
 
 

@@ -23,7 +23,7 @@ from pebble.errors import PebbleError
 from pebble.launcher.programs import programs
 from pebble.rig.broker import Broker
 from pebble.rig.processes import MCUS, ROBOTS, Processes, python
-from pebble.rig.programs import Program, Wrap, children, unchanged
+from pebble.rig.programs import Each, Program, Wrap, children, unchanged
 from pebble.simulation.trace import Entry, read_trace
 
 if TYPE_CHECKING:
@@ -77,16 +77,13 @@ class SimulatedRobot:
         """What came of a script that ended at ``at``; only a robot with scripts knows."""
         raise NotImplementedError
 
-    def _add(
-        self, name: str, command: Sequence[str], kind: int, log: str, each: Callable[[bytes], object] | None = None
-    ) -> Program:
-        self.programs.append(Program(name, command, self.folder / log, each=each))
+    def _add(self, name: str, command: Sequence[str], kind: int, log: str, each: Each | None = None) -> Program:
+        self.programs.append(Program(name, command, self.folder / log, each))
         return self.running.add(self.programs[-1], kind)
 
-    def _start_mcu(self, module: str, *options: object, reports: bool = True) -> Program:
-        """The MCU of its motors; with ``reports`` what it measures is collected."""
-        command = python(module, *options, *(["--report"] if reports else []))
-        return self._add(f"{self.name}'s MCU", command, MCUS, "mcu.log", self._collect if reports else None)
+    def _start_mcu(self, module: str, *options: object) -> Program:
+        """The MCU of its motors, whose reports are collected."""
+        return self._add(f"{self.name}'s MCU", python(module, *options, "--report"), MCUS, "mcu.log", self._collect)
 
     def _collect(self, line: bytes) -> None:
         from pebble.simulation.mcu import Snapshot
@@ -117,6 +114,7 @@ class Robot(SimulatedRobot):
         super().__init__(running, name, folder or running.folder)
         self.kind, self.base = kind, Identity("pebble", "robots", name).base
         self._remote_host, self.remote_port = remote
+        self.broker_ports = [self.remote_port]  # and that of its own local broker, once it runs
         self.run_dir, self.config, self.port = (self.folder / file for file in ("run", f"{name}.json", "mcu"))
         self.local_broker: Broker | None = None
         self.local_port: int | None = None  # of the local broker, which may be that of several robots
@@ -138,6 +136,7 @@ class Robot(SimulatedRobot):
             self.local_broker = self.running.broker("local", folder=self.folder, wrap=self._wrap)
             self.programs.append(self.local_broker)
             self.local_port = self.local_broker.port
+            self.broker_ports.append(self.local_port)
             if self._wrap is unchanged:  # else it is in another network
                 self.local_broker.wait()
         self._trace.touch()
@@ -161,16 +160,10 @@ class Robot(SimulatedRobot):
     def launcher(self) -> Program:
         return self._started[0]
 
-    @property
-    def broker_ports(self) -> list[int]:
-        """The remote broker's port, then that of the local broker, if there is one."""
-        return [self.remote_port, *([] if self.local_broker is None else [self.local_broker.port])]
-
     def pids(self) -> list[int]:
-        """The launcher, its children (including a hub), and the local broker, if there is one."""
-        local = [] if self.local_broker is None else [self.local_broker.pid]
+        """Of the launcher, its children (including a hub), and the local broker, if there is one."""
         own = [pid for program in self._started for pid in (program.pid, *children(program.pid))]
-        return [*own, *local]
+        return own if self.local_broker is None else [*own, self.local_broker.pid]
 
     def processes(self) -> dict[str, int]:
         """The same by name."""
@@ -180,9 +173,7 @@ class Robot(SimulatedRobot):
             with suppress(OSError):  # it has just ended
                 comm = Path(f"/proc/{pid}/comm").read_text().strip()
                 found[names.get(comm, comm)] = pid
-        if self.local_broker is not None:
-            found[BROKER] = self.local_broker.pid
-        return found
+        return found if self.local_broker is None else found | {BROKER: self.local_broker.pid}
 
     def complete(self) -> bool:
         """Whether all its programs run, including those started on demand."""
@@ -204,7 +195,7 @@ class Robot(SimulatedRobot):
 
     def _start_motors(self) -> Program:
         options = [*board("goob", self.port, self._trace), *(["--trace-said"] if self.reports else [])]
-        return self._start_mcu("pebble.simulation.mcu", *options, reports=False)
+        return self._add(f"{self.name}'s MCU", python("pebble.simulation.mcu", *options), MCUS, "mcu.log")
 
     def _contents(self) -> Config:
         """Of its config file: its own, with the addresses and paths of this robot."""
@@ -230,14 +221,10 @@ def board(kind: str, port: Path, trace: Path) -> tuple[object, ...]:
 def synthetic_media(camera: tuple[int, int, int], published: tuple[int, int, int]) -> dict[str, Config]:
     """Services of a robot with a camera and a microphone; width, height and rate of what is captured and published."""
     names = ("width", "height", "fps")
+    video = {"backend": "synthetic", **dict(zip(names, camera, strict=True))}
     sizes = {f"publish_{name}": value for name, value in zip(names, published, strict=True)}
-    return {
-        "mqtt_bridge": {"media": {"video_publisher": sizes}},
-        "av_daemon": {
-            "video": {"backend": "synthetic", **dict(zip(names, camera, strict=True))},
-            "audio": {"source": "synthetic"},
-        },
-    }
+    bridge = {"media": {"video_publisher": sizes}}
+    return {"mqtt_bridge": bridge, "av_daemon": {"video": video, "audio": {"source": "synthetic"}}}
 
 
 #: What most comparisons use.
@@ -245,11 +232,11 @@ MEDIA = synthetic_media((640, 480, 15), (640, 480, 15))
 
 
 @contextmanager
-def one_robot(kind: str, make: Callable[..., Robot] = Robot, **options: Any) -> Iterator[Robot]:
+def one_robot(kind: str, **options: Any) -> Iterator[Robot]:
     """A robot of its own with a remote broker of its own, ready to be launched. Raises PebbleError."""
     with Processes() as processes:
         broker = processes.broker("remote")
-        robot = make(processes, kind, (_HOST, broker.port), **options)
+        robot = Robot(processes, kind, (_HOST, broker.port), **options)
         broker.wait()
         robot.prepare()
         yield robot

@@ -4,27 +4,25 @@ from __future__ import annotations
 
 import json
 import math
-import tempfile
 import threading
 import time
-from collections.abc import Callable, Sequence
+from array import array
+from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import msgspec
-import numpy as np
 
 from pebble.config.raw import deep_merge
 from pebble.contract.identity import Identity
-from pebble.errors import PebbleError
 from pebble.media.sound_file import write_wav
 from pebble.media.world.world_file import read_world
-from pebble.rig.acts import CLIP, TAG_ID
 from pebble.rig.broker import BrokerKind
-from pebble.rig.operator import Operator
+from pebble.rig.operator import CLIP, TAG_ID, Operator
 from pebble.rig.processes import MCUS, OPERATORS, Processes, python
 from pebble.rig.programs import Program
 from pebble.rig.robot import MCU_START_S, MEDIA, Robot, SimulatedRobot, board
@@ -37,25 +35,17 @@ from pebble.web.extra import require_packages
 from pebble.web.program import Ready
 
 ROBOTS = ("goob", "fred", "minilamp", "benjr")
-IMU, OUTLETS = "goob_imu", "outlets"
-_LINES = {IMU: "imu", OUTLETS: "outlets"}  # instances of the serial bridge
-_OPTIONS = {OUTLETS: ("--unreachable", "o4")}
+OUTLETS = "outlets"
 CAMERA_FPS: int = MEDIA["av_daemon"]["video"]["fps"]
+_BOARDS = {"minilamp": "ESP32-C6", "benjr": "ESP8266"}
+#: Self-describing MCUs that Goob has besides, by their instance of the serial bridge: kind and options.
+_DEVICES = {"imu": ("goob_imu",), OUTLETS: ("outlets", "--unreachable", "o4")}
 _HOST = "127.0.0.1"
 _PAGE_START_S = 15.0  # it takes a while to import on a small machine
 _DRIVABLE_S = 30.0
-_LONGEST_FOLDER = 40  # characters: Unix sockets live below, and their paths end at 108 bytes
 _RESTART = ["sh", "-c", "kill $PPID"]  # the bridge alone, which runs it: the demo would take more for a failure
-_AT_REST = (0.0, 0.0)
-
-CLIP_S = 1.0
-#: Further clips: the tones of each in Hz, and how long one lasts.
-_SIGNALS = {
-    "signals/beep.wav": ((880.0,), 0.15),
-    "signals/fanfare.wav": ((392.0, 523.3, 659.3, 784.0), 0.2),
-    "signals/two-tone.wav": ((440.0, 587.3) * 3, 0.4),
-}
 _RATE = 16_000
+_HORN = array("h", ([8000] * 20 + [-8000] * 20) * 400).tobytes()  # 1 s of 400 Hz
 #: After the first round of driving Goob looks at the tag, and has space for further rounds wherever it is then.
 _START = {"goob": {"kind": "goob", "x": -0.3, "y": 0.2, "heading_deg": 0.0}}
 
@@ -70,20 +60,19 @@ class LinuxRobot(Robot):
     stop_s = 0.85  # 0.75 s watchdog, and its resolution
     has_media = True
 
-    def __init__(self, running: Processes, name: str, local_port: int, remote_port: int, *devices: str) -> None:
-        """``devices``: self-describing MCUs that it has besides, by their kind."""
+    def __init__(self, running: Testbed, name: str) -> None:
         own = json.loads((files("pebble") / "configs" / f"{name}.json").read_text())
-        folder = running.folder / name
-        super().__init__(running, own["transport"]["kind"], (_HOST, remote_port), name=name, folder=folder)
-        self.has_imu = IMU in devices
-        self.local_port = local_port
+        remote, folder = (_HOST, running.broker_port), running.folder / name
+        super().__init__(running, own["transport"]["kind"], remote, name=name, folder=folder)
+        self.has_imu = name == "goob"
+        self.local_port = running.local_broker.port
         self.voice = folder / "voice"  # where its loudspeaker records what it plays of operators' voices
-        self._devices = {kind: folder / kind for kind in devices}  # their serial ports
+        self._devices = {instance: folder / instance for instance in _DEVICES if name == "goob"}  # their serial ports
         self._own = own | {"services": own["services"] | {"av_daemon": {}}}
         raw = ["-t", "raw", "-f", "S16_LE", "-c", "{channels}", "-r", "{rate}", "-"]
         instances = {
-            _LINES[kind]: {"protocol": "pebble_serial_v1", "serial": {"port": str(port)}}
-            for kind, port in self._devices.items()
+            instance: {"protocol": "pebble_serial_v1", "serial": {"port": str(port)}}
+            for instance, port in self._devices.items()
         }
         self._services = {
             "mqtt_bridge": {
@@ -98,10 +87,10 @@ class LinuxRobot(Robot):
         """Start the MCUs first, so that their ports exist, then the robot."""
         self.prepare(ending)
         starting = []
-        for kind, port in self._devices.items():
-            options = (*board(kind, port, self.folder / f"{kind}.jsonl"), *_OPTIONS.get(kind, ()))
-            command = python("pebble.simulation.mcu", *options)
-            starting.append((self._add(f"{self.name}'s {kind}", command, MCUS, f"{kind}.log"), port))
+        for instance, port in self._devices.items():
+            kind, *options = _DEVICES[instance]
+            command = python("pebble.simulation.mcu", *board(kind, port, self.folder / f"{instance}.jsonl"), *options)
+            starting.append((self._add(f"{self.name}'s {instance}", command, MCUS, f"{instance}.log"), port))
         for program, port in starting:
             program.wait_until(port.exists, MCU_START_S, ending)
         self.start(self.name, python("pebble.cli", "up", self.config))
@@ -128,14 +117,15 @@ class RoomRobot(LinuxRobot):
 
     has_scripts, has_counter = True, False
 
-    def __init__(self, running: Processes, name: str, local_port: int, remote_port: int, *devices: str) -> None:
-        super().__init__(running, name, local_port, remote_port, *devices)
+    def __init__(self, running: Testbed, name: str) -> None:
+        super().__init__(running, name)
         self._room, self._record = self.folder / "room.json", self.folder / "played"
         self.port, self._trace = port_path(self.folder, name), trace_path(self.folder, name)
         room = json.loads((files("pebble.simulation.world") / "room.json").read_text())
         self._room.write_text(json.dumps(room | {"robots": _START}, indent=1))
         sounds = self.folder / "sounds"
-        self._clip = _write_clips(sounds)
+        sounds.mkdir()
+        write_wav(sounds / CLIP, _HORN, _RATE)
         playback = {"directory": str(sounds), "player_command": _loudspeaker(self._record)}
         self._services |= {
             "av_daemon": deep_merge(MEDIA["av_daemon"], {"video": {"device": f"{self._room}#{name}"}}),
@@ -149,8 +139,8 @@ class RoomRobot(LinuxRobot):
         tag = next(tag for tag in read_world(self._room).tags if tag.id == TAG_ID)
         dx, dy = tag.x - pose.x_mm / 1000, tag.y - pose.y_mm / 1000
         bearing = math.remainder(math.atan2(dy, dx) - pose.heading_rad, math.tau)
-        played = [len(one.frames()) for one in playbacks(self._record) if self._clip.startswith(one.frames())]
-        return Outcome(math.hypot(dx, dy), bearing, CLIP_S * max(played, default=0) / len(self._clip), CLIP_S)
+        played = [len(one.frames()) for one in playbacks(self._record) if _HORN.startswith(one.frames())]
+        return Outcome(math.hypot(dx, dy), bearing, max(played, default=0) / len(_HORN), 1.0)
 
     def _start_motors(self) -> Program:
         return self._start_mcu("pebble.simulation.world", self._room, "--folder", self.folder, "--trace")
@@ -164,29 +154,14 @@ def _loudspeaker(record: Path) -> list[str]:
     return python("pebble.simulation.loudspeaker", "--record", record)
 
 
-def _write_clips(folder: Path) -> bytes:
-    """A horn in ``folder``, which is created, and some signals; returns the samples of the horn."""
-    (folder / "signals").mkdir(parents=True)
-    horn = _sound(CLIP_S, 440.0, 554.4)
-    signals = {name: b"".join(_sound(seconds, tone) for tone in tones) for name, (tones, seconds) in _SIGNALS.items()}
-    for name, samples in {**signals, CLIP: horn}.items():
-        write_wav(folder / name, samples, _RATE)
-    return horn
-
-
-def _sound(seconds: float, *tones: float) -> bytes:
-    phases = 2 * np.pi * np.outer(tones, np.arange(round(seconds * _RATE)) / _RATE)
-    return bytes((np.sin(phases).sum(axis=0) * 8000).astype("<i2"))
-
-
 class McuRobot(SimulatedRobot):
     """MiniLAMP or BenJr: the firmware's own files against simulated pins, with its own connection to the broker."""
 
     stop_s = 1.0
 
-    def __init__(self, running: Processes, name: str, runs_on: str, remote_port: int) -> None:
+    def __init__(self, running: Testbed, name: str) -> None:
         super().__init__(running, name, running.folder / name)
-        self.runs_on, self._broker = runs_on, f"{_HOST}:{remote_port}"
+        self.runs_on, self._broker = _BOARDS[name], f"{_HOST}:{running.broker_port}"
 
     def bring_up(self, ending: threading.Event) -> None:
         options = ("--kind", self.name, "--trace", self._trace, "--broker", self._broker)
@@ -198,17 +173,15 @@ class McuRobot(SimulatedRobot):
 
 
 class PageServer(Program):
-    """A server of the operator page for one broker. Raises PebbleError.
+    """A server of the operator page for one broker; ``settings`` are further fields of WebSettings."""
 
-    ``port`` 0 is a free one. ``settings`` are further fields of WebSettings.
-    """
-
-    def __init__(self, folder: Path, broker_port: int, port: int = 0, **settings: Any) -> None:
+    def __init__(self, folder: Path, broker_port: int, **settings: Any) -> None:
+        """Raises PebbleError without the packages that it needs."""
         require_packages()
         self.url = ""  # with a slash at the end; empty until it can be opened
-        fields = {"broker": {"host": _HOST, "port": broker_port}, "host": _HOST, "port": port, **settings}
+        fields = {"broker": {"host": _HOST, "port": broker_port}, "host": _HOST, "server": "demo", **settings}
         command = python("pebble.web.program", msgspec.json.encode(fields, enc_hook=str).decode())
-        super().__init__("the operator page", command, folder / "page.log", each=self._take)
+        super().__init__("the operator page", command, folder / "page.log", self._take)
 
     def wait(self, ending: threading.Event | None = None) -> None:
         """Wait until the page can be opened at ``url``, or ``ending``. Raises PebbleError if it cannot."""
@@ -226,36 +199,30 @@ class Testbed(Processes):
     """
 
     ends_s = (1.0, 2.5, 1.0, 1.0)  # with the operator's disconnect: every process ends within five seconds
+    server: PageServer  # the newest
 
     def __init__(self, ending: threading.Event, names: Sequence[str] = ROBOTS, *, room: bool = True) -> None:
-        usual = tempfile.gettempdir()  # mkdtemp makes a 0700 folder in it
-        super().__init__("pebble-demo-", usual if len(usual) <= _LONGEST_FOLDER else "/tmp")  # noqa: S108
+        super().__init__("pebble-demo-")
         self.keep = True
         self.robots: dict[str, LinuxRobot | McuRobot] = {}
-        self.page: PageServer | None = None
         self._ending, self._names, self._room = ending, names, room
 
     def start_brokers(self, kind: BrokerKind = BrokerKind.MOSQUITTO) -> None:
         """Start the operators' remote broker and Fred's local one. Raises PebbleError if one fails."""
-        self.remote_broker, local = (self.broker(name, kind) for name in ("remote-broker", "freds-broker"))
-        for broker in (self.remote_broker, local):
+        self.remote_broker, self.local_broker = self.broker("remote-broker", kind), self.broker("freds-broker", kind)
+        for broker in (self.remote_broker, self.local_broker):
             broker.wait(self._ending)
-        remote = self.broker_port = self.remote_broker.port
-        goob = RoomRobot if self._room else LinuxRobot
-        makers: dict[str, Callable[[], LinuxRobot | McuRobot]] = {
-            "goob": lambda: goob(self, "goob", local.port, remote, IMU, OUTLETS),
-            "fred": lambda: LinuxRobot(self, "fred", local.port, remote),
-            "minilamp": lambda: McuRobot(self, "minilamp", "ESP32-C6", remote),
-            "benjr": lambda: McuRobot(self, "benjr", "ESP8266", remote),
-        }
-        self.robots = {name: makers[name]() for name in self._names}
+        self.broker_port = self.remote_broker.port
+        for name in self._names:
+            linux = RoomRobot if name == "goob" and self._room else LinuxRobot
+            self.robots[name] = McuRobot(self, name) if name in _BOARDS else linux(self, name)
 
     def start_page(self, port: int = 0, **settings: Any) -> PageServer:
-        """Start the operator page's server, and end one that was started before; wait for it. Raises PebbleError."""
-        if self.page is not None:
-            self.end(self.page)
-        self.page = PageServer(self.folder, self.broker_port, port, **{"server": "demo", **settings})
-        return self.add(self.page, OPERATORS)
+        """The operator page's server, which is starting, instead of an earlier one; ``port`` 0 is a free one."""
+        for earlier in [program for program in self._kinds if isinstance(program, PageServer)]:
+            self.end(earlier)
+        self.server = self.add(PageServer(self.folder, self.broker_port, port=port, **settings), OPERATORS)
+        return self.server
 
     def start_robots(self) -> None:
         """Raises PebbleError if a simulated MCU fails; the operator detects any other failure."""
@@ -268,7 +235,7 @@ class Stage(Testbed):
 
     ``robots``, by name, are traced: ``entries()`` is what each MCU received and did, with time.monotonic_ns().
     ``room``: Goob sees its room, in pictures as old as the room's state; else a scene that is drawn when due.
-    ``settings`` are fields of WebSettings. A context manager, for the main thread. Raises PebbleError.
+    ``settings`` are fields of WebSettings. ``url`` of the page ends with a slash. Raises PebbleError.
     """
 
     def __init__(self, *names: str, room: bool = True, **settings: Any) -> None:
@@ -280,30 +247,14 @@ class Stage(Testbed):
         self.start_page(**self._settings)
         self.start_robots()
         self.server.wait()
+        self.url = self.server.url
         with closing(Operator(self.broker_port, "stage")) as operator:
             operator.connect()
             operator.wait_until_ready(len(self.robots), _DRIVABLE_S, self.unexpected_exits)
 
-    def __exit__(self, *_: object) -> None:
-        if self.page is not None:
-            self.page.thaw()
-        super().__exit__()
-
-    @property
-    def server(self) -> PageServer:
-        if self.page is None:
-            raise PebbleError("the stage has not been entered")
-        return self.page
-
-    @property
-    def url(self) -> str:
-        """The address of the page, with a slash at the end."""
-        return self.server.url
-
     def restart_server(self) -> None:
         """Start it again at the same address; ends the old one if it runs."""
-        port = int(self.url.rpartition(":")[2].rstrip("/"))
-        self.start_page(**{**self._settings, "port": port}).wait()
+        self.start_page(**{**self._settings, "port": urlsplit(self.url).port}).wait()
 
     def ref(self, name: str) -> str:
         return Identity("pebble", "robots", name).base
@@ -321,7 +272,7 @@ class Stage(Testbed):
         """From when until when its motors ran at the same speeds; now if they run."""
         changes = self.motors(name)
         ends = [*(ns for ns, _ in changes[1:]), time.monotonic_ns()]
-        return [(ns, end) for (ns, speeds), end in zip(changes, ends, strict=False) if speeds != _AT_REST]
+        return [(ns, end) for (ns, speeds), end in zip(changes, ends, strict=False) if any(speeds)]
 
     def wheels_turning(self, name: str, since_ns: int | None = None) -> bool:
         """Whether its motors run now; with ``since_ns`` whether they have run at any time since then."""

@@ -23,8 +23,7 @@ def answer(what: bytes | dict[str, Any]) -> None:
 def serve(handle: Handle) -> None:
     """Pass each line to ``handle`` and write what it answers, if anything, until standard input closes."""
     for line in sys.stdin:
-        reply = handle(line.strip())
-        if reply is not None:
+        if (reply := handle(line.strip())) is not None:
             answer(reply)
 
 

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from pebble.rig.acts import BY_ITSELF, DISTANCE_M, FOLLOW, HOLD_S, TOLERANCE_M, CompletedFollow, Wheels
+from pebble.rig.operator import BY_ITSELF, DISTANCE_M, FOLLOW, HOLD_S, TOLERANCE_M, CompletedFollow, Wheels
 from pebble.rig.testbed import Outcome
 from pebble.simulation.trace import Entry
 
@@ -53,12 +53,10 @@ def assess(completed: CompletedFollow, entries: Sequence[Entry], outcome: Outcom
 
 def _driven(completed: CompletedFollow, drives: Sequence[tuple[float, Wheels]]) -> Check:
     name = "the script drives"
-    first = next(
-        (at for at, wheels in drives if completed.started <= at < completed.took_over and wheels != _STOP), None
-    )
+    first = next((at for at, wheels in drives if completed.began <= at < completed.took_over and wheels != _STOP), None)
     if first is None:
         return Check(name, "never", f"{FOLLOW} did not drive before the operator took over")
-    took = first - completed.started
+    took = first - completed.began
     return Check(
         name,
         f"{took:.2f} s after its start",

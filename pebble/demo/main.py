@@ -24,7 +24,8 @@ from pebble.demo.results import Result, Results
 from pebble.demo.steps import assess
 from pebble.demo.view import View, show_media_results, show_results
 from pebble.errors import PebbleError
-from pebble.rig.acts import (
+from pebble.rig.broker import BrokerKind, best_kind
+from pebble.rig.operator import (
     BY_ITSELF,
     EMERGENCY_S,
     EMERGENCY_STOP,
@@ -34,9 +35,8 @@ from pebble.rig.acts import (
     CompletedFollow,
     CompletedStep,
     CompletedStop,
+    Operator,
 )
-from pebble.rig.broker import BrokerKind, best_kind
-from pebble.rig.operator import Operator
 from pebble.rig.testbed import ROBOTS, PageServer, Testbed
 from pebble.web.extra import require_packages
 from pebble.web.settings import DEFAULT_PORT

@@ -3,7 +3,7 @@
 import pytest
 
 from pebble.demo.emergency import StopResult, assess
-from pebble.rig.acts import CompletedStop
+from pebble.rig.operator import CompletedStop
 from pebble.simulation.trace import Entry
 
 PRESSED, RESET, ENDED = 100.0, 102.0, 104.0
@@ -12,7 +12,7 @@ OBEYS = ((99.5, True), (100.01, False), (103.0, True), (104.1, False))
 
 def judged(*motors: tuple[float, bool], confirmed_s: float | None = 0.05, is_free: bool = True) -> StopResult:
     entries = [Entry(round(at * 1e9), "motors", "0.500 0.500" if runs else "0.000 0.000") for at, runs in motors]
-    return assess(CompletedStop("goob", PRESSED, confirmed_s, RESET, is_free, ENDED), entries)
+    return assess(CompletedStop("goob", PRESSED - 0.8, PRESSED, confirmed_s, RESET, is_free, ENDED), entries)
 
 
 def test_a_robot_that_stops_and_moves_again_after_the_reset() -> None:

@@ -2,49 +2,68 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from pebble.client.discovery import DiscoveredRobot
+from pebble.client.driver_lease import VALID_S
 from pebble.contract import DRIVING, codec
 from pebble.contract.payloads import Driver, Driving
-from pebble.rig.operator import EXPIRES_S, Visitors
+from pebble.rig.operator import Operator
 from pebble.transports import Message
 
-GOOB, FRED = "pebble/robots/goob", "pebble/robots/fred"
+GOOB, FRED = (DiscoveredRobot(f"pebble/robots/{name}", name) for name in ("goob", "fred"))
 
 
-def announcement(server: str, *robots: str, device: str = "phone") -> Message:
-    driven = {base: Driver(by="anna", device=device, since=1) for base in robots}
+def announcement(server: str, *robots: DiscoveredRobot, device: str = "phone") -> Message:
+    driven = {robot.base: Driver(by="anna", device=device, since=1) for robot in robots}
     return Message(DRIVING.topic(f"pebble/servers/{server}"), codec.encode(DRIVING, Driving(t=1, robots=driven)))
 
 
-def test_a_robot_is_driven_while_a_server_announces_it() -> None:
-    visitors = Visitors()
-    assert visitors.driver(GOOB, 0.0) == ""
-    visitors.receive(announcement("hall", GOOB), 10.0)
-    assert visitors.driver(GOOB, 11.0) == "anna on phone"
-    assert visitors.driver(FRED, 11.0) == ""
-    visitors.receive(announcement("hall"), 12.0)
-    assert visitors.driver(GOOB, 12.1) == ""
-    assert visitors.driven_since(GOOB, 11.5, 13.0)
-    assert not visitors.driven_since(GOOB, 12.5, 13.0)
+@pytest.fixture
+def operator() -> Iterator[Operator]:
+    made = Operator(1)
+    yield made
+    made.close()
 
 
-def test_an_announcement_expires_with_its_server() -> None:
-    visitors = Visitors()
-    visitors.receive(announcement("hall", GOOB, device=""), 10.0)
-    assert visitors.driver(GOOB, 10.0 + EXPIRES_S) == "anna"
-    assert visitors.driver(GOOB, 10.1 + EXPIRES_S) == ""
-    assert not visitors.driven_since(GOOB, 10.5, 20.0)
+@pytest.fixture
+def at(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
+    """Sets the time."""
+    return lambda now: monkeypatch.setattr(time, "monotonic", lambda: now)
 
 
-def test_another_servers_silence_about_a_robot_means_nothing() -> None:
-    visitors = Visitors()
-    visitors.receive(announcement("hall", GOOB), 10.0)
-    visitors.receive(announcement("lab", FRED), 10.1)
-    assert (visitors.driver(GOOB, 11.0), visitors.driver(FRED, 11.0)) == ("anna on phone", "anna on phone")
+def test_a_robot_is_driven_while_a_server_announces_it(operator: Operator, at: Callable[[float], None]) -> None:
+    at(10.0)
+    assert operator._taken(GOOB) == ""
+    operator._note_visits(announcement("hall", GOOB))
+    at(11.0)
+    assert operator._taken(GOOB) == "is driven by anna on phone"
+    assert operator._taken(FRED) == ""
+    operator._note_visits(announcement("lab", FRED, device=""))  # its silence about the other means nothing
+    assert operator._taken(GOOB) == "is driven by anna on phone"
+    assert operator._taken(FRED) == "is driven by anna"
+    at(10.0 + VALID_S)
+    assert operator._taken(GOOB) == ""
+    assert operator._taken(FRED) == "is driven by anna"
 
 
-def test_what_is_no_announcement_is_ignored() -> None:
-    visitors = Visitors()
-    visitors.receive(Message(DRIVING.topic("pebble/servers/hall"), b"{"), 10.0)
-    visitors.receive(Message(DRIVING.topic(GOOB), announcement("hall", GOOB).payload), 10.0)
-    visitors.receive(Message("nonsense", b""), 10.0)
-    assert visitors.driver(GOOB, 10.0) == ""
+def test_a_robot_that_was_driven_is_left_alone_until_the_step_after(
+    operator: Operator, at: Callable[[float], None]
+) -> None:
+    at(9.0)
+    operator._begin("a step", [GOOB, FRED])
+    at(10.0)
+    operator._note_visits(announcement("hall", GOOB))
+    at(20.0)
+    assert [operator._mine(robot) for robot in (GOOB, FRED)] == [False, True]
+    assert operator.left_alone == {"goob"}
+    operator._begin("the step after", [GOOB, FRED])
+    assert operator._mine(GOOB)
+
+
+def test_what_is_no_announcement_is_ignored(operator: Operator) -> None:
+    operator._note_visits(Message(DRIVING.topic("pebble/servers/hall"), b"{"))
+    assert operator._taken(GOOB) == ""

@@ -92,7 +92,7 @@ def test_lights_reach_the_mcu(goob: Console, stage: Stage) -> None:
 
 
 def test_a_clip_is_played_and_stopped(goob: Console, stage: Stage, reports: Reports) -> None:
-    name = "signals/two-tone.wav"
+    name = "horn.wav"
 
     def played() -> list[Playback]:
         return [one for one in playbacks(stage.folder / "goob" / "played") if one.file.endswith(name)]
@@ -100,7 +100,7 @@ def test_a_clip_is_played_and_stopped(goob: Console, stage: Stage, reports: Repo
     before = len(played())
     goob.uncover("clip")
     goob.test("repeat").check()
-    goob.test("sound-filter").fill("two-tone")
+    goob.test("sound-filter").fill("horn")
     goob.test("clip").click()
     assert goob.tab.until(lambda: reports.last("soundboard-status").get("file") == name, 5)
     assert goob.tab.until(lambda: name in goob.test("playing").inner_text(), 3)
