@@ -41,6 +41,7 @@ NAME = "the demo's operator"
 STOP = Drive()
 _POLL_S = 0.02
 _MOST_TIMES = 3  # for the emergency stop and for the script
+_MOST_WAITING = 1000  # events and completed steps; beyond them the oldest is dropped
 _ASSESSED_S = 5.0  # until what was completed is assessed, on the smallest machine
 
 Wheels = tuple[float, float]  # left and right, -1..1
@@ -146,8 +147,8 @@ class Operator:
         self.again: frozenset[str] = frozenset()
         self.rounds = 0
         self.commands: dict[str, tuple[Drive, float]] = {}  # by base topic: the last one sent, and when
-        self.events: deque[tuple[float, str]] = deque()
-        self.completed: deque[CompletedStep | CompletedStop | CompletedFollow] = deque()
+        self.events: deque[tuple[float, str]] = deque(maxlen=_MOST_WAITING)
+        self.completed: deque[CompletedStep | CompletedStop | CompletedFollow] = deque(maxlen=_MOST_WAITING)
         self._doing, self._step_began = "discovering robots", 0.0
         self._robots: list[DiscoveredRobot] = []  # that take part in the present step
         self._scripted: DiscoveredRobot | None = None  # if a person takes it, the present step ends
@@ -199,7 +200,9 @@ class Operator:
     # -- people at the page
 
     def _note_visits(self, message: Message) -> None:
-        """A server announces once a second which robots are driven."""
+        """A server announces once a second which robots are driven; what the broker retained is older."""
+        if message.retain:
+            return
         with suppress(PayloadError):
             for base, driver in codec.decode(DRIVING, message.payload).robots.items():
                 who = f"{driver.by} on {driver.device}" if driver.device else driver.by

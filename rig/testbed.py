@@ -124,8 +124,9 @@ class RoomRobot(LinuxRobot):
         room = json.loads((files("pebble.simulation.world") / "room.json").read_text())
         self._room.write_text(json.dumps(room | {"robots": _START}, indent=1))
         sounds = self.folder / "sounds"
-        sounds.mkdir()
-        write_wav(sounds / CLIP, _HORN, _RATE)
+        for clip, seconds in {CLIP: 1.0, "signals/beep.wav": 0.15, "signals/long.wav": 0.6}.items():
+            (sounds / clip).parent.mkdir(parents=True, exist_ok=True)
+            write_wav(sounds / clip, _HORN[: 2 * round(seconds * _RATE)], _RATE)
         playback = {"directory": str(sounds), "player_command": _loudspeaker(self._record)}
         self._services |= {
             "av_daemon": deep_merge(MEDIA["av_daemon"], {"video": {"device": f"{self._room}#{name}"}}),
