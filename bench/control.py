@@ -28,9 +28,8 @@ from pebble.rig.programs import Program, Worker
 from pebble.transports import MqttSettings, ZenohSettings
 
 NONE, MEDIA, HOG = LOADS = ("none", "media", "hog")
-LARGEST, FASTEST = 1 << 20, 2000.0
 AIM_P50, AIM_MEDIA_P99 = 0.70, 0.35
-_JUDGED = {"size": "40 B", "rate": "200 Hz"}
+_JUDGED = condition(40, 200)
 _LOADED_RATES = 2  # the first ones
 _READY_S = 40.0
 _ANSWER_S = 30.0  # in addition to the slice itself
@@ -51,8 +50,7 @@ VARIANTS = {
     "zenoh-p2p": Variant("zenoh"),
     "zenoh-hub": Variant("zenoh", {"client": True}),  # everything goes through the hub
 }
-BASELINE, NODELAY = "mqtt", "mqtt-nodelay"
-P2P, HUB = "zenoh-p2p", "zenoh-hub"
+P2P, HUB, NODELAY = "zenoh-p2p", "zenoh-hub", "mqtt-nodelay"
 MQTT = tuple(name for name, variant in VARIANTS.items() if variant.kind != "zenoh")
 
 
@@ -165,7 +163,7 @@ TABLE = Grid(
         ),
         Column("lost/\nlate", lambda cell: f"{cell.lost}/{cell.figures['late']}"),
     ),
-    baseline=BASELINE,
+    baseline="mqtt",
 )
 HOPS = Grid(
     title="where the time goes: {size} at {rate}, unloaded, medians, us",
@@ -271,8 +269,8 @@ def _aim(what: str, value: float, aim: float, interval: Interval) -> Judged:
 _list = partial(Option, many=True, recorded=False)
 _OPTIONS = (
     variants(tuple(VARIANTS)),
-    _list(name="sizes", kind=int, least=SMALLEST, most=LARGEST, metavar="BYTES", help="Bytes, for example 40,1024."),
-    _list(name="rates", kind=float, least=1, most=FASTEST, metavar="HZ", help="Messages a second, for example 20,200."),
+    _list(name="sizes", kind=int, least=SMALLEST, most=1 << 20, metavar="BYTES", help="Bytes, for example 40,1024."),
+    _list(name="rates", kind=float, least=1, most=2000, metavar="HZ", help="Messages a second, for example 20,200."),
     Option(name="loads", many=True, known=LOADS, metavar="NAMES", help="Some of none, media and hog."),
     seconds("Duration of one case in a round."),
     rounds("Rounds of all cases."),

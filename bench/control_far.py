@@ -15,7 +15,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
 from statistics import median
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from rich.console import Console
 
@@ -33,7 +33,7 @@ from pebble.bench.control_worker import (
     opened,
 )
 from pebble.bench.results import Cell, Value, percentile, rounded
-from pebble.bench.tables import LOST, Column, Grid, figure
+from pebble.bench.tables import LOST, Grid, percentile_column, single_column
 from pebble.errors import PebbleError
 from pebble.runtime.signals import interrupted_by_signals
 from pebble.transports import MqttSettings, create
@@ -142,15 +142,13 @@ def measure(case: Case) -> Iterator[Cell]:
     """
     done = case.env.run(SliceSpec.of(case))
     offset = estimate(done.exchanges)
-    clocks: dict[str, Any] = {
-        "clock_offset_ms": rounded(offset.ns / 1e6, 6),
-        "clock_error_ms": rounded(offset.error_ns / 1e6, 6),
-    }
     trips = [(one.t4 - one.t1 - (one.t3 - one.t2)) / 1e6 for one in done.exchanges]
-    yield case.cell(ROUND_TRIP, "ms", trips, sent=done.sent, late=done.late, **clocks)
+    yield case.cell(ROUND_TRIP, "ms", trips, sent=done.sent, late=done.late)
+    offset_ms, error_ms = (rounded(ns / 1e6, 6) for ns in offset)
     for way, name in enumerate((THERE, BACK)):
         times = [one_way_ns(one, offset)[way] / 1e6 for one in done.exchanges]
-        yield case.cell(name, "ms", times if percentile(times, 50) > offset.error_ns / 1e6 else [])
+        known = percentile(times, 50) > offset.error_ns / 1e6
+        yield case.cell(name, "ms", times if known else [], clock_offset_ms=offset_ms, clock_error_ms=error_ms)
 
 
 JOINED: Mapping[str, Combine] = {
@@ -160,18 +158,14 @@ JOINED: Mapping[str, Combine] = {
 }
 
 
-def _both(cell: Cell) -> str:
-    return f"{figure(cell.percentile(50))}/{figure(cell.percentile(99))}" if cell.samples else "unknown"
-
-
 TABLE = Grid(
-    title="Between two machines, ms: p50/p99; the far clock is ahead, ±",
-    rows=("size", "rate"),
+    title="Between two machines, ms; how far ahead the far clock is, ± the error of one-way times",
+    rows=("size", "rate", "measure"),
     columns=(
-        Column("round trip", _both, ROUND_TRIP),
-        *(Column(name, _both, name) for name in (THERE, BACK)),
-        Column("far clock", lambda cell: f"{cell.single('clock_offset_ms'):+.3f}", ROUND_TRIP),
-        Column("±", lambda cell: figure(cell.single("clock_error_ms")), ROUND_TRIP),
+        percentile_column(50),
+        percentile_column(99),
         LOST,
+        single_column("far clock", "clock_offset_ms", "+.3f"),
+        single_column("±", "clock_error_ms", ".3f"),
     ),
 )

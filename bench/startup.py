@@ -6,7 +6,6 @@ broker; for the first pictures another one, with a camera.
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable, Iterator, Set
 from contextlib import closing, contextmanager
@@ -31,16 +30,16 @@ from pebble.transports import Message, MqttSettings, Transport, create
 PICTURES_EVERY = 5  # launches, the first of which is followed by one of a robot with a camera
 PICTURES = tuple(f"picture, {encoding}, {state}" for state in ("at rest", "running") for encoding in ALL_VIDEO)
 STARTED = ("first heartbeat", "all ready", "first drive obeyed")
-LATE = ("late operator", "late operator, paho", "late service")
-MEASURES = (*STARTED, *LATE, *PICTURES)
+MEASURES = (*STARTED, "late operator", "late operator, paho", "late service", *PICTURES)
 _CAMERA = "camera_publisher"  # runs while it is requested
 _LATE_S = 10.0  # for one late subscriber
 _QUIET_S = 0.3  # without another retained message until all count as received
 _REST_S, _PICTURE_S = 10.0, 15.0
 _EVERYTHING = f"{BASE}/#"
-_POLL_S = 0.02  # how often an operator looks whether a key frame is missing
+_POLL_S = 0.02  # how often is looked whether all has arrived, or a key frame is missing
 
-_Client = tuple[StockClient | Transport, Callable[[Callable[[str], None]], None]]  # and what opens it
+_Receive = Callable[[str], object]  # is called with the topic of each message
+_Client = tuple[StockClient | Transport, Callable[[], object]]  # and what opens it
 
 
 def measure(case: Case) -> Iterator[Cell]:
@@ -78,71 +77,58 @@ def _late(case: Case, robot: Robot, subscriber: RobotSubscriber) -> Iterator[Cel
     local, port = partial(local_transport, load(robot.config)), robot.remote_port
     inside = _retained_topics(local("retained-topics"))  # meanwhile start-up work finishes
     outside = set(subscriber.retained)
-    late: dict[str, tuple[set[str], Callable[[], _Client]]] = {
-        "late service": (inside, lambda: _of_pebble(local("late-service"))),
-        "late operator": (outside, lambda: _of_pebble(_connection(port))),
-        "late operator, paho": (outside, lambda: _of_paho(port)),
+    late: dict[str, tuple[set[str], Callable[[_Receive], _Client]]] = {
+        "late service": (inside, lambda receive: _pebble(local("late-service"), receive)),
+        "late operator": (outside, lambda receive: _pebble(_connection(port), receive)),
+        "late operator, paho": (outside, lambda receive: _paho(port, receive)),
     }
     for name, (topics, make) in late.items():
-        yield case.cell(name, "ms", [_until_all(topics, make) for _ in range(case.run["joins"])], topics=len(topics))
+        yield case.cell(name, "ms", [_late_ms(topics, make) for _ in range(case.run["joins"])], topics=len(topics))
 
 
 def _retained_topics(transport: Transport) -> set[str]:
     """The topics with a retained message. Waits for a pause, since no message is marked as the last."""
     found: set[str] = set()
-    received = threading.Event()
 
     def on_message(message: Message) -> None:
-        if message.retain and message.topic not in found:
+        if message.retain:
             found.add(message.topic)
-            received.set()
 
     with transport:
         transport.subscribe(_EVERYTHING, on_message, direct=True)
-        while received.wait(_QUIET_S):
-            received.clear()
+        before = -1
+        while before < len(found):
+            before = len(found)
+            time.sleep(_QUIET_S)
     return found
 
 
-def _of_paho(port: int) -> _Client:
-    client = StockClient(subscriptions=[(_EVERYTHING, 1)], at_once=False)
-
-    def begin(arrived: Callable[[str], None]) -> None:
-        client.paho.on_message = lambda _client, _data, message: arrived(message.topic)
-        client.open(port)
-
-    return client, begin
+def _paho(port: int, receive: _Receive) -> _Client:
+    client = StockClient(lambda message: receive(message.topic), [(_EVERYTHING, 1)], at_once=False)
+    return client, lambda: client.open(port)
 
 
-def _of_pebble(transport: Transport) -> _Client:
-    """As a service opens its transport."""
-
-    def begin(arrived: Callable[[str], None]) -> None:
+def _pebble(transport: Transport, receive: _Receive) -> _Client:
+    def begin() -> None:
+        """As a service does."""
         transport.open(timeout=0.0)
-        transport.subscribe(_EVERYTHING, lambda message: arrived(message.topic), direct=True)
+        transport.subscribe(_EVERYTHING, lambda message: receive(message.topic), direct=True)
 
     return transport, begin
 
 
-def _until_all(topics: Set[str], make: Callable[[], _Client]) -> float:
+def _late_ms(topics: Set[str], make: Callable[[_Receive], _Client]) -> float:
     """Milliseconds from opening a client until messages of all topics have arrived. Raises PebbleError."""
-    missing, complete, ended_ns = set(topics), threading.Event(), 0
-
-    def arrived(topic: str) -> None:
-        nonlocal ended_ns
-        missing.discard(topic)
-        if not missing and not complete.is_set():
-            ended_ns = time.monotonic_ns()
-            complete.set()
-
-    client, begin = make()
+    arrived_ns: dict[str, int] = {}
+    client, begin = make(lambda topic: arrived_ns.setdefault(topic, time.monotonic_ns()))
     with closing(client):
         began_ns = time.monotonic_ns()
-        begin(arrived)
-        complete.wait(_LATE_S)
-    if missing:
-        raise PebbleError(f"a late subscriber did not receive {', '.join(sorted(missing))} within {_LATE_S:.0f} s")
-    return (ended_ns - began_ns) / 1e6
+        begin()
+        while missing := [topic for topic in topics if topic not in arrived_ns]:
+            if time.monotonic_ns() - began_ns > 1e9 * _LATE_S:
+                raise PebbleError(f"a late subscriber did not receive {', '.join(missing)} within {_LATE_S:.0f} s")
+            time.sleep(_POLL_S)
+    return (max(arrived_ns[topic] for topic in topics) - began_ns) / 1e6
 
 
 def _connection(port: int) -> Transport:
@@ -156,7 +142,7 @@ def _connection(port: int) -> Transport:
 class _Operator(MediaReceiver):
     """An operator who waits for the first picture in one encoding."""
 
-    def _init__(self, transport: Transport, encoding: str) -> None:
+    def __init__(self, transport: Transport, encoding: str) -> None:
         self._encoding, self._first_ns = encoding, 0  # not yet
         super().__init__(transport, BASE)
 
