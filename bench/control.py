@@ -55,7 +55,10 @@ MQTT = tuple(name for name, variant in VARIANTS.items() if variant.kind != "zeno
 
 
 class Participants(Processes):
-    """The processes of each role: a broker or a hub, two ends, and a stream of pictures if it is one of the loads."""
+    """The processes of each role: a broker or a hub, two ends, and a stream of pictures if that is one of the loads.
+
+    They are ready when the ``with`` block begins.
+    """
 
     def __init__(self, roles: Sequence[str], loads: Sequence[str]) -> None:
         super().__init__()
@@ -216,7 +219,7 @@ def assessment(cells: Sequence[Cell]) -> Iterator[str | Judged]:
         if (interval := _ratio(by_key, ours, theirs, percent)) is not None
     ]
     if lines:
-        yield f"One way, 40 B at 200 Hz. The better MQTT variant is {best}, with media {best_loaded}."
+        yield f"One way, 40 B at 200 Hz; {P2P} is compared with the better MQTT variant."
     yield from lines
     rates = {cell.variant: figure(cell.single("pictures_hz")) for (_, load), cell in by_key.items() if load == MEDIA}
     if rates:
