@@ -38,7 +38,7 @@ _REST_S, _PICTURE_S = 10.0, 15.0
 _EVERYTHING = f"{BASE}/#"
 _POLL_S = 0.02  # how often is looked whether all has arrived, or a key frame is missing
 
-_Receive = Callable[[str], object]  # is called with the topic of each message
+_Receive = Callable[[str], None]  # is called with the topic of each message
 _Client = tuple[StockClient | Transport, Callable[[], object]]  # and what opens it
 
 
@@ -120,7 +120,11 @@ def _pebble(transport: Transport, receive: _Receive) -> _Client:
 def _late_ms(topics: Set[str], make: Callable[[_Receive], _Client]) -> float:
     """Milliseconds from opening a client until messages of all topics have arrived. Raises PebbleError."""
     arrived_ns: dict[str, int] = {}
-    client, begin = make(lambda topic: arrived_ns.setdefault(topic, time.monotonic_ns()))
+
+    def receive(topic: str) -> None:
+        arrived_ns.setdefault(topic, time.monotonic_ns())
+
+    client, begin = make(receive)
     with closing(client):
         began_ns = time.monotonic_ns()
         begin()
