@@ -6,6 +6,7 @@ broker; for the first pictures another one, with a camera.
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable, Iterator, Set
 from contextlib import closing, contextmanager
@@ -36,7 +37,7 @@ _LATE_S = 10.0  # for one late subscriber
 _QUIET_S = 0.3  # without another retained message until all count as received
 _REST_S, _PICTURE_S = 10.0, 15.0
 _EVERYTHING = f"{BASE}/#"
-_POLL_S = 0.02  # how often is looked whether all has arrived, or a key frame is missing
+_POLL_S = 0.02  # how often an operator looks whether a key frame is missing
 
 _Receive = Callable[[str], None]  # is called with the topic of each message
 _Client = tuple[StockClient | Transport, Callable[[], object]]  # and what opens it
@@ -119,20 +120,23 @@ def _pebble(transport: Transport, receive: _Receive) -> _Client:
 
 def _late_ms(topics: Set[str], make: Callable[[_Receive], _Client]) -> float:
     """Milliseconds from opening a client until messages of all topics have arrived. Raises PebbleError."""
-    arrived_ns: dict[str, int] = {}
+    missing, complete, ended_ns = set(topics), threading.Event(), 0
 
     def receive(topic: str) -> None:
-        arrived_ns.setdefault(topic, time.monotonic_ns())
+        nonlocal ended_ns
+        missing.discard(topic)
+        if not missing and not complete.is_set():
+            ended_ns = time.monotonic_ns()
+            complete.set()
 
     client, begin = make(receive)
     with closing(client):
         began_ns = time.monotonic_ns()
         begin()
-        while missing := [topic for topic in topics if topic not in arrived_ns]:
-            if time.monotonic_ns() - began_ns > 1e9 * _LATE_S:
-                raise PebbleError(f"a late subscriber did not receive {', '.join(missing)} within {_LATE_S:.0f} s")
-            time.sleep(_POLL_S)
-    return (max(arrived_ns[topic] for topic in topics) - began_ns) / 1e6
+        complete.wait(_LATE_S)
+    if missing:
+        raise PebbleError(f"a late subscriber did not receive {', '.join(missing)} within {_LATE_S:.0f} s")
+    return (ended_ns - began_ns) / 1e6
 
 
 def _connection(port: int) -> Transport:
