@@ -3,264 +3,246 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from statistics import fmean, median
-from typing import Any
+from typing import Any, NamedTuple
 
-from msgspec import structs
-from rich.table import Table
+import msgspec
 
 from pebble.bench import control_far as far
 from pebble.bench import null
-from pebble.bench.aims import MISSED, NOT_JUDGED, outcome, rounds_with_lost, single
-from pebble.bench.comparison import Budget, Case, Combine, Comparison, Option, Run, of_known, rounds, seconds, variants
-from pebble.bench.control_ends import ONE_WAY, ROUND_TRIP, SMALLEST, SliceSpec, rate_name, size_name
-from pebble.bench.control_participants import (
-    BASELINE,
-    HOG,
-    HUB,
-    LOADS,
-    MEDIA,
-    MQTT,
-    NONE,
-    P2P,
-    PICTURES_HZ,
-    VARIANTS,
-    Participants,
-)
+from pebble.bench.aims import outcome, rounds_with_lost
+from pebble.bench.comparison import Budget, Case, Comparison, Option, Run, of_known, rounds, seconds, variants
+from pebble.bench.control_worker import ONE_WAY, PICTURES_HZ, ROUND_TRIP, SMALLEST, Slice, SliceSpec, condition
 from pebble.bench.engine import roles_of
 from pebble.bench.pictures import ecdf, null_ratios, ratios
-from pebble.bench.ratios import LEAST_ROUNDS, Interval, paired
-from pebble.bench.results import Cell, Judged, Value, grouped, percentile, rounded
-from pebble.bench.tables import Column, Grid, base_of, figure
-from pebble.bench.usage import wake_up_us
-from pebble.errors import PebbleError
+from pebble.bench.ratios import Interval, paired
+from pebble.bench.results import Cell, Judged, Value, percentile, rounded
+from pebble.bench.tables import Column, Grid, figure, percentile_column, single_column
+from pebble.bench.usage import wake_up_us, wake_ups
+from pebble.rig.processes import BROKERS, OPERATORS, Processes, python
+from pebble.rig.programs import Program, Worker
+from pebble.transports import MqttSettings, ZenohSettings
 
-SIZES = (40, 1024)
-RATES = (20.0, 200.0, 1000.0)
-LOADED_SIZE, LOADED_RATES = 40, (20.0, 200.0)  # with a load, unless given
-_LARGEST, _FASTEST = 1 << 20, 2000.0
-_LONG_US = 995.0
-_MUCH_LATE, _MUCH_LOST = 0.05, 0.005
-_FEWER_HZ = 0.9 * PICTURES_HZ  # pictures: the load is lighter than intended
+NONE, MEDIA, HOG = LOADS = ("none", "media", "hog")
 AIM_P50, AIM_MEDIA_P99 = 0.70, 0.35
-_JUDGED = {"size": "40 B", "rate": "200 Hz"}
+_JUDGED = condition(40, 200)
+_LOADED_RATES = 2  # the first ones
+_READY_S = 40.0
+_ANSWER_S = 30.0  # in addition to the slice itself
 
-_Key = tuple[str | None, str]  # variant and load
-_ByKey = Mapping[_Key, Cell]
+
+class Variant(NamedTuple):
+    kind: str  # a transport, or ``paho``
+    settings: Mapping[str, Any] = {}
+    broker: Sequence[str] = ()  # lines of mosquitto's configuration
+
+
+_NODELAY = ("set_tcp_nodelay true",)
+VARIANTS = {
+    "paho": Variant("paho"),  # at both ends
+    "mqtt": Variant("mqtt"),
+    "mqtt-nodelay": Variant("mqtt", broker=_NODELAY),
+    "mqtt5": Variant("mqtt", {"protocol": "5"}, _NODELAY),
+    "zenoh-p2p": Variant("zenoh"),
+    "zenoh-hub": Variant("zenoh", {"client": True}),  # everything goes through the hub
+}
+P2P, HUB, NODELAY = "zenoh-p2p", "zenoh-hub", "mqtt-nodelay"
+MQTT = tuple(name for name, variant in VARIANTS.items() if variant.kind != "zenoh")
+
+
+class Participants(Processes):
+    """The processes of each role: a broker or a hub, two ends, and a stream of pictures if that is one of the loads.
+
+    They are ready when the ``with`` block begins.
+    """
+
+    def __init__(self, roles: Sequence[str], loads: Sequence[str]) -> None:
+        super().__init__()
+        self._roles, self._loads = roles, loads
+        self._backbones: dict[str, Program] = {}
+        self._workers: dict[str, list[Worker]] = {}  # sender, echo, writer and reader
+
+    def start(self) -> None:
+        for number, role in enumerate(self._roles):
+            folder, variant = self.folder / str(number), VARIANTS[null.variant_of(role)]
+            folder.mkdir()
+            begin = self._hub if variant.kind == "zenoh" else self._broker
+            self._backbones[role], settings, stream = begin(folder, variant)
+            ends = {name: (variant.kind, _json(settings)) for name in ("sender", "echo")}
+            streams = {name: stream for name in ("writer", "reader") if MEDIA in self._loads}
+            self._workers[role] = [
+                self.worker(f"{role}: {name}", "pebble.bench.control_worker", name, *where)
+                for name, where in {**ends, **streams}.items()
+            ]
+        for worker in self.workers:
+            worker.answer(_READY_S)
+
+    def _hub(self, folder: Path, variant: Variant) -> tuple[Program, ZenohSettings, tuple[str, Path]]:
+        run_dir = folder / "z"  # short, as the folder's name: paths of Unix sockets begin with it
+        command = python("pebble.runtime.hub", _json(ZenohSettings(run_dir=run_dir)))
+        hub = self.add(Program("hub", command, folder / "hub.log"), BROKERS)
+        hub.wait_until((run_dir / "hub.sock").exists, _READY_S)
+        return hub, ZenohSettings(run_dir=run_dir, **variant.settings), ("zenoh-shm", run_dir)
+
+    def _broker(self, folder: Path, variant: Variant) -> tuple[Program, MqttSettings, tuple[str, int]]:
+        broker = self.broker(extra=variant.broker, folder=folder)
+        broker.wait()
+        return broker, MqttSettings(host="127.0.0.1", port=broker.port, **variant.settings), ("mqtt", broker.port)
+
+    def run(self, role: str, spec: SliceSpec, load: str) -> tuple[Slice, dict[str, float]]:
+        """Runs one slice; returns its results, and the wake-ups in a round trip and pictures per second, by name.
+
+        Raises PebbleError if a process ended, or no pictures flow.
+        """
+        sender, echo, *stream = self._workers[role]
+        pids = {"wake_ups": [sender.pid, echo.pid], "broker_wake_ups": [self._backbones[role].pid]}
+        if load == MEDIA:
+            stream[0].ask("1", _ANSWER_S)
+            begun = stream[1].ask("", _ANSWER_S)
+        elif load == HOG:
+            loop = ["sh", "-c", "while :; do :; done"]
+            hog = self.add(Program("hog", loop, self.folder / "hog.log"), OPERATORS)
+        before = {name: wake_ups(some) for name, some in pids.items()}
+        done = msgspec.convert(sender.ask(_json(spec), spec.seconds + _ANSWER_S), Slice)
+        used = {name: (wake_ups(some) - before[name]) / done.trips for name, some in pids.items()}
+        if load == MEDIA:
+            ended = stream[1].ask("", _ANSWER_S)
+            stream[0].ask("0", _ANSWER_S)
+            used["pictures_hz"] = (ended["pictures"] - begun["pictures"]) / (ended["s"] - begun["s"])
+        elif load == HOG:
+            self.end(hog)
+        return done, used
+
+
+def _json(what: MqttSettings | ZenohSettings | SliceSpec) -> str:
+    return msgspec.json.encode(what, enc_hook=str).decode()
+
+
+# -- what is measured, and shown
 
 
 def conditions(run: Run) -> list[dict[str, Value]]:
-    """With sizes or rates given all of them with every load, else only some with a load."""
-    one, given = run.quick or run.comparison.is_null, run["sizes"] is not None or run["rates"] is not None
+    """With a load only the first size and the first rates."""
     return [
-        {"size": size_name(size), "rate": rate_name(rate), "load": load}
-        for load in _loads(run)
-        for size in run["sizes"] or ((LOADED_SIZE,) if one else SIZES)
-        for rate in run["rates"] or ((200.0,) if one else RATES)
-        if one or given or load == NONE or (size == LOADED_SIZE and rate in LOADED_RATES)
+        {**condition(size, rate), "load": load}
+        for load in run["loads"]
+        for size in run["sizes"]
+        for rate in run["rates"]
+        if load == NONE or (size == run["sizes"][0] and rate in run["rates"][:_LOADED_RATES])
     ]
 
 
-def _loads(run: Run) -> list[str]:
-    return list(run["loads"] or ((NONE,) if run.comparison.is_null else (NONE, MEDIA) if run.quick else LOADS))
-
-
-def prepare(run: Run) -> None:
-    run.recorded["loads"] = [*_loads(run)]
-
-
 def measure(case: Case) -> Iterator[Cell]:
-    """One slice. The null test uses only the one-way times, since its slowdown is a fifth of them."""
-    answer, used = case.env.run(case.role, SliceSpec.of(case), str(case.condition["load"]))
-    hops = {"call_us": answer.call, "fabric_us": answer.transport_times, "inbox_us": answer.inbox}
-    figures: dict[str, Any] = {
-        "sent": answer.sent,
-        "late": answer.late,
-        **{name: rounded(percentile(times, 50), 1) for name, times in hops.items()},
-        "pictures_hz": None,
-        **used,
+    """One slice, in us. The null test uses only the one-way times, since its slowdown is a fifth of them."""
+    done, used = case.env.run(case.role, SliceSpec.of(case), str(case.condition["load"]))
+    hops = {
+        "call_us": done.calls_ns,
+        "fabric_us": [one.transport_ns - one.t3 for one in done.exchanges],  # until the near transport has the reply
+        "inbox_us": [one.t4 - one.transport_ns for one in done.exchanges],  # from then until its handler runs
     }
-    yield case.cell(ONE_WAY, "us", answer.one_way, **figures)
+    medians = {name: rounded(percentile(times, 50) / 1000, 1) for name, times in hops.items()}
+    figures = {"sent": done.sent, "late": done.late, **medians, **used}
+    yield case.cell(ONE_WAY, "us", [(one.t2 - one.t1) / 1000 for one in done.exchanges], **figures)
     if not case.run.comparison.is_null:
-        yield case.cell(ROUND_TRIP, "us", answer.round_trip, **figures)
-
-
-# -- the tables, for a terminal of 80 columns
-
-
-def legend(cells: Sequence[Cell]) -> list[str]:
-    names = dict.fromkeys(null.variant_of(cell.variant) for cell in cells)
-    return [f"{name}: {VARIANTS[name].about}" for name in names]
-
-
-def tables(cells: Sequence[Cell]) -> Iterator[Table]:
-    """One table per measure with a column for each variant; then the ratios to the baseline, if it was measured."""
-    yield from _side_by_side(
-        "{measure}, us: p50/p99 (k: thousands)",
-        cells,
-        lambda cell: f"{_short(cell.percentile(50))}/{_short(cell.percentile(99))}",
-    )
-    others = [cell for cell in cells if cell.measure == ONE_WAY and base_of(cell, cells, BASELINE) is not None]
-    title = f"{{measure}}, p50 as a ratio to that of {BASELINE}, and its 99 % interval"
-    yield from _side_by_side(title, others, lambda cell: _ratio(cell, base_of(cell, cells, BASELINE)))
-    if any(map(_HOPS.of, cells)):
-        yield from _HOPS(cells)
-
-
-def _side_by_side(title: str, cells: Sequence[Cell], shown: Callable[[Cell], str]) -> Iterator[Table]:
-    """A row for each condition, a column for each variant."""
-    names = list(dict.fromkeys(cell.variant for cell in cells))
-    column = Column(names[0] if len(names) == 1 else "", shown)
-    for table in Grid(title=title, rows=("size", "rate", "load"), columns=(column,), each=("measure",))(cells):
-        table.padding = 0  # six variants in 80 columns
-        for head in table.columns:
-            head.header = str(head.header).replace("-", "-\n").replace(" ", "\n", 1)
-        yield table
-
-
-def _short(us: float) -> str:
-    """Formats microseconds in at most four characters."""
-    if us < _LONG_US:
-        return figure(us)
-    return f"{us / 1000:.1f}k" if us < 10 * _LONG_US else f"{us / 1000:.0f}k"
-
-
-def _ratio(cell: Cell, base: Cell | None) -> str:
-    """Formats a ratio on two lines, so that five fit side by side."""
-    interval = Interval() if base is None else paired(cell.rounds, base.rounds)
-    if interval.few:
-        return str(interval)
-    return f"{figure(interval.ratio)}\n{figure(interval.low)}–{figure(interval.high)}"
+        yield case.cell(ROUND_TRIP, "us", [(one.t4 - one.t1) / 1000 for one in done.exchanges], **figures)
 
 
 def _is_judged(cell: Cell) -> bool:
     return cell.measure == ONE_WAY and _JUDGED.items() <= cell.params.items()
 
 
-def _hop(head: str, name: str) -> Column:
-    return Column(head, lambda cell: figure(single(name)(cell)))
-
-
-_HOPS = Grid(
-    title="where the time goes: 40 B at 200 Hz, unloaded, medians, us",
+TABLE = Grid(
+    title="latency, us; the ratio is one-way",
+    rows=("size", "rate", "load", "variant"),
+    columns=(
+        *(
+            replace(percentile_column(percent, f"{measure} p{percent}".replace(" ", "\n")), measure=measure)
+            for measure in (ONE_WAY, ROUND_TRIP)
+            for percent in (50, 99)
+        ),
+        Column("lost/\nlate", lambda cell: f"{cell.lost}/{cell.figures['late']}"),
+    ),
+    baseline="mqtt",
+)
+HOPS = Grid(
+    title="where the time goes: {size} at {rate}, unloaded, medians, us",
     rows=("variant",),
     columns=(
-        _hop("publish\ncall", "call_us"),
-        _hop("thread\nhas it", "fabric_us"),
-        _hop("handler\nruns", "inbox_us"),
-        _hop("wake-ups:\nends", "wake_ups"),
-        _hop("broker\nor hub", "broker_wake_ups"),
+        single_column("publish\ncall", "call_us", ".1f"),
+        single_column("thread\nhas it", "fabric_us", ".1f"),
+        single_column("handler\nruns", "inbox_us", ".1f"),
+        single_column("wake-ups:\nends", "wake_ups", ".1f"),
+        single_column("broker\nor hub", "broker_wake_ups", ".1f"),
     ),
-    of=lambda cell: _is_judged(cell) and cell.params["load"] == NONE and "fabric_us" in cell.figures,
+    of=lambda cell: _is_judged(cell) and cell.params["load"] == NONE,
+    each=("size", "rate"),
 )
 
 
 # -- the assessment
 
-
-def wake_up_cost(cells: Sequence[Cell]) -> Iterator[str]:
-    """The cost of one wake-up on this machine, on the same core and another one, and the wake-ups per message."""
-    by_key, shown = _judged(cells), []
-    for name in (_better(by_key, NONE, 50), P2P):
-        figures = by_key[name, NONE].figures if (name, NONE) in by_key else {}
-        ends, backbone = (float(figures.get(key) or 0) for key in ("wake_ups", "broker_wake_ups"))
-        if ends:
-            shown.append(f"{ends + backbone:.1f} with {name}")
-    if not shown:
-        return
-    try:
-        same_us, other_us = wake_up_us()
-    except PebbleError as error:
-        yield str(error)
-    else:
-        yield (
-            f"Waking up a waiting process takes {same_us:.0f} us on the same core, {other_us:.0f} us on another; "
-            f"a round trip takes {' and '.join(shown)} such wake-ups, including brokers."
-        )
-
-
-def assessment(cells: Sequence[Cell]) -> list[str | Judged]:
-    """One sentence for each comparison that was measured, warnings, and the aims."""
-    by_key = _judged(cells)
-    best, best_loaded = _better(by_key, NONE, 50), _better(by_key, MEDIA, 99)
-
-    def compare(percent: float, ours: _Key, theirs: _Key, before: str = "", names: Sequence[str] = ()) -> list[str]:
-        interval = _ratio_of(by_key, ours, theirs, percent)
-        if interval is None:
-            return []
-        one, other = names or (str(ours[0]), str(theirs[0]))
-        return [f"{before}{'' if percent == 50 else f'p{percent:g}: '}{interval.words(one, other)}"]
-
-    better = "{} (the better MQTT variant)".format
-    lines = [
-        *compare(50, (P2P, NONE), (best, NONE), names=(P2P, better(best))),
-        *compare(99, (P2P, MEDIA), (best_loaded, MEDIA), f"with {MEDIA}, ", (P2P, better(best_loaded))),
-        *_pictures(by_key),
-        *compare(50, (HUB, NONE), (P2P, NONE)),
-    ]
-    for name in (P2P, best):
-        for percent in (50, 99):
-            names = (f"{name} beside a busy process", f"{name} alone")
-            lines += compare(percent, (name, HOG), (name, NONE), names=names)
-    for slow in ("paho", "mqtt"):
-        for percent in (50, 99):
-            lines += compare(percent, (slow, NONE), ("mqtt-nodelay", NONE), "Nagle: ")
-    lines += compare(50, ("mqtt5", NONE), ("mqtt-nodelay", NONE))
-    what = "40 B at 200 Hz, one way, medians unless p99 is named; with the 99 % interval of the ratio."
-    return [*([what, *lines] if lines else []), *_warnings(cells), *_aims(by_key)]
+_Key = tuple[str | None, str]  # variant and load
+_ByKey = Mapping[_Key, Cell]
 
 
 def _judged(cells: Sequence[Cell]) -> _ByKey:
     return {(cell.variant, str(cell.params["load"])): cell for cell in cells if _is_judged(cell)}
 
 
+def wake_up_cost(_cells: Sequence[Cell]) -> Iterator[str]:
+    same_us, other_us = wake_up_us()
+    yield (
+        f"Waking up a waiting process takes {same_us:.0f} us on the same core, {other_us:.0f} us on another; "
+        "the last table counts the wake-ups of a round trip."
+    )
+
+
+def assessment(cells: Sequence[Cell]) -> Iterator[str | Judged]:
+    """One sentence for each comparison that was measured, and the aims."""
+    by_key = _judged(cells)
+    best, best_loaded = _better(by_key, NONE, 50), _better(by_key, MEDIA, 99)
+    compared: list[tuple[int, _Key, _Key]] = [
+        (50, (P2P, NONE), (best, NONE)),
+        (99, (P2P, MEDIA), (best_loaded, MEDIA)),
+        (50, (HUB, NONE), (P2P, NONE)),
+        *((percent, (name, HOG), (name, NONE)) for name in (P2P, best) for percent in (50, 99)),
+        *((percent, (slow, NONE), (NODELAY, NONE)) for slow in ("paho", "mqtt") for percent in (50, 99)),
+        (50, ("mqtt5", NONE), (NODELAY, NONE)),
+    ]
+    lines = [
+        f"p{percent}: {interval.words(_name(ours), _name(theirs))}"
+        for percent, ours, theirs in compared
+        if (interval := _ratio(by_key, ours, theirs, percent)) is not None
+    ]
+    if lines:
+        yield f"One way, 40 B at 200 Hz; {P2P} is compared with the better MQTT variant."
+    yield from lines
+    rates = {cell.variant: figure(cell.single("pictures_hz")) for (_, load), cell in by_key.items() if load == MEDIA}
+    if rates:
+        shown = ", ".join(f"{name} {rate}" for name, rate in rates.items())
+        yield f"With media, pictures received per second, of {PICTURES_HZ:g}: {shown}"
+    yield from _aims(by_key)
+
+
+def _name(key: _Key) -> str:
+    return str(key[0]) if key[1] == NONE else f"{key[0]} with {key[1]}"
+
+
 def _better(by_key: _ByKey, load: str, percent: float) -> str | None:
     """The MQTT variant with the lowest percentile."""
-    there = [cell for name in MQTT if (cell := by_key.get((name, load))) is not None and cell.samples]
-    best = min(there, key=lambda cell: cell.percentile(percent), default=None)
-    return None if best is None else best.variant
+    there = [by_key[name, load] for name in MQTT if (name, load) in by_key and by_key[name, load].samples]
+    return min(there, key=lambda cell: cell.percentile(percent)).variant if there else None
 
 
-def _ratio_of(by_key: _ByKey, ours: _Key, theirs: _Key, percent: float) -> Interval | None:
+def _ratio(by_key: _ByKey, ours: _Key, theirs: _Key, percent: float) -> Interval | None:
     """None if one of the two was not measured."""
     if ours not in by_key or theirs not in by_key:
         return None
     return paired(by_key[ours].rounds, by_key[theirs].rounds, percent)
-
-
-def _pictures(by_key: _ByKey) -> Iterator[str]:
-    """The rate of pictures meanwhile: a variant that carries fewer has a lighter load."""
-    rates = {str(name): single("pictures_hz")(cell) for (name, load), cell in by_key.items() if load == MEDIA}
-    if known := {name: rate for name, rate in rates.items() if not math.isnan(rate)}:
-        shown = ", ".join(f"{name} {figure(rate)}" for name, rate in known.items())
-        yield f"With media, pictures received per second, of {PICTURES_HZ:g}: {shown}"
-    if fewer := [name for name, rate in known.items() if rate < _FEWER_HZ]:
-        yield f"With media, {', '.join(fewer)}: fewer than {_FEWER_HZ:g} pictures per second, so the load was lighter."
-
-
-def _warnings(cells: Sequence[Cell]) -> Iterator[str]:
-    """Reasons to distrust the results: too few rounds, late or lost messages."""
-    if min((len(cell.rounds) for cell in cells), default=0) < LEAST_ROUNDS:
-        yield f"A 99 % interval needs {LEAST_ROUNDS} rounds."
-    one_way = [cell for cell in cells if cell.measure == ONE_WAY]
-    for rate, ours in grouped(one_way, lambda cell: cell.params["rate"]).items():
-        late, sent = _total(ours, "late"), _total(ours, "sent")
-        if late > _MUCH_LATE * sent:
-            yield f"At {rate} {late / sent:.0%} of the messages were sent late: this machine cannot keep that rate."
-        shares = {
-            name: sum(cell.lost or 0 for cell in own) / max(1, _total(own, "sent"))
-            for name, own in grouped(ours, lambda cell: cell.variant).items()
-        }
-        if lost := ", ".join(f"{share:.1%} of {name}" for name, share in shares.items() if share > _MUCH_LOST):
-            yield f"At {rate} messages were lost: {lost}. Percentiles exclude them, aims count them as infinitely late."
-
-
-def _total(cells: Sequence[Cell], name: str) -> int:
-    return sum(int(cell.figures.get(name) or 0) for cell in cells)
 
 
 def _aims(by_key: _ByKey) -> Iterator[Judged]:
@@ -268,11 +250,11 @@ def _aims(by_key: _ByKey) -> Iterator[Judged]:
 
     If too many messages were lost in total, the aim is missed even if few rounds lost them.
     """
-    by_key = {key: structs.replace(cell, rounds=rounds_with_lost(cell)) for key, cell in by_key.items()}
-    without = _ratio_of(by_key, (P2P, NONE), (_better(by_key, NONE, 50), NONE), 50)
+    by_key = {key: msgspec.structs.replace(cell, rounds=rounds_with_lost(cell)) for key, cell in by_key.items()}
+    without = _ratio(by_key, (P2P, NONE), (_better(by_key, NONE, 50), NONE), 50)
     if without is not None:
         yield _aim(f"{P2P} / better MQTT, p50, upper end of the interval", without.high, AIM_P50, without)
-    media = _ratio_of(by_key, (P2P, MEDIA), (_better(by_key, MEDIA, 99), MEDIA), 99)
+    media = _ratio(by_key, (P2P, MEDIA), (_better(by_key, MEDIA, 99), MEDIA), 99)
     if media is not None:
         value = media.ratio if math.isfinite(by_key[P2P, MEDIA].percentile(99)) else math.inf
         yield _aim(f"{P2P} / better MQTT with media, p99", value, AIM_MEDIA_P99, media)
@@ -280,35 +262,19 @@ def _aims(by_key: _ByKey) -> Iterator[Judged]:
 
 def _aim(what: str, value: float, aim: float, interval: Interval) -> Judged:
     """A ratio that is equal to 1 within noise does not meet an aim."""
-    if interval.few:
-        how, why = NOT_JUDGED, f" of {interval.rounds} rounds"
-    elif math.isinf(value):
-        how, why = MISSED, ", too much was lost"
-    elif interval.equal:
-        how, why = MISSED, ", equal within noise"
-    else:
-        how, why = outcome(value <= aim), ""
-    return Judged(what=f"{what}, at most {aim:.2f}", outcome=how, measured=f"{interval}{why}")
+    why = f" of {interval.rounds} rounds" if interval.few else ", too much was lost" if math.isinf(value) else ""
+    met = outcome(value <= aim and not interval.equal, judged=not interval.few)
+    return Judged(what=f"{what}, at most {aim:.2f}", outcome=met, measured=f"{interval}{why}")
 
 
 # -- the declarations
 
-_USED = ("cpu_percent", "broker_cpu_percent", "wake_ups", "broker_wake_ups", "pictures_hz")
-_JOINED: Mapping[str, Combine] = {
-    "late": sum,
-    **dict.fromkeys(("call_us", "fabric_us", "inbox_us"), of_known(median, 1)),
-    **dict.fromkeys(_USED, of_known(fmean, 1)),
-}
 _list = partial(Option, many=True, recorded=False)
 _OPTIONS = (
     variants(tuple(VARIANTS)),
-    _list(
-        name="sizes", kind=int, least=SMALLEST, most=_LARGEST, metavar="BYTES", help="Bytes, for example 40,1024."
-    ),
-    _list(
-        name="rates", kind=float, least=1, most=_FASTEST, metavar="HZ", help="Messages a second, for example 20,200."
-    ),
-    _list(name="loads", known=LOADS, metavar="NAMES", help="Some of none, media and hog."),
+    _list(name="sizes", kind=int, least=SMALLEST, most=1 << 20, metavar="BYTES", help="Bytes, for example 40,1024."),
+    _list(name="rates", kind=float, least=1, most=2000, metavar="HZ", help="Messages a second, for example 20,200."),
+    Option(name="loads", many=True, known=LOADS, metavar="NAMES", help="Some of none, media and hog."),
     seconds("Duration of one case in a round."),
     rounds("Rounds of all cases."),
     Option(
@@ -324,25 +290,25 @@ _OPTIONS = (
         help="Certificate authority to trust with mqtts://.",
     ),
 )  # fmt: skip
-_UNSET = dict.fromkeys(("sizes", "rates", "loads", "null", "far", "password-file", "ca-cert"))
+_ONE = {"sizes": [40], "rates": [200.0]}
+_ALL = {"sizes": [40, 1024], "rates": [20.0, 200.0, 1000.0], "loads": LOADS}
 
 CONTROL_FAR = Comparison(
     name="control-far",
     title="Between two machines",
     what="Round trips to an echo on another machine, and one-way times as precise as the two clocks allow.",
     options=_OPTIONS,
-    full=Budget(90, **_UNSET, seconds=2.0, rounds=10, fresh_every=10_000),  # one connection for all rounds
-    quick=Budget(5, seconds=1.0, rounds=4),
+    full=Budget(  # one connection for all rounds
+        90, sizes=[40, 1024], rates=[20.0, 200.0], loads=None, seconds=2.0, rounds=10, fresh_every=10_000
+    ),
+    quick=Budget(5, **_ONE, seconds=1.0, rounds=4),
     variants=(far.VARIANT,),
     conditions=far.conditions,
     prepare=far.prepare,
     environment=far.environment,
     measure=far.measure,
-    measures=far.MEASURES,
     figures=far.JOINED,
-    derived=far.derived,
-    tables=far.TABLES,
-    assessment=(far.assessment,),
+    tables=(far.TABLE,),
     complete=lambda cells: all(cell.samples for cell in cells if cell.measure == ROUND_TRIP),
     words=("bench", "control"),
     reported=None,
@@ -367,17 +333,19 @@ _CONTROL = Comparison(
         pebble bench control --far mqtt://broker.local
     """,
     options=_OPTIONS,
-    full=Budget(700, **_UNSET, seconds=0.35, rounds=10, passes=2, fresh_every=1),
-    quick=Budget(40, seconds=0.3, rounds=4, passes=1, fresh_every=2),
+    full=Budget(700, **_ALL, seconds=0.35, rounds=10, passes=2, fresh_every=1),
+    quick=Budget(40, **_ONE, loads=[NONE, MEDIA], seconds=0.3, rounds=4, passes=1, fresh_every=2),
     variants=tuple(VARIANTS),
     conditions=conditions,
-    prepare=prepare,
-    environment=lambda run: Participants(roles_of(run), _loads(run)),
+    environment=lambda run: Participants(roles_of(run), run["loads"]),
     measure=measure,
     measures=(ONE_WAY, ROUND_TRIP),
-    figures=_JOINED,
-    tables=(tables,),
-    legend=legend,
+    figures={
+        "late": sum,
+        **dict.fromkeys(("call_us", "fabric_us", "inbox_us"), of_known(median, 1)),
+        **dict.fromkeys(("wake_ups", "broker_wake_ups", "pictures_hz"), of_known(fmean, 1)),
+    },
+    tables=(TABLE, HOPS),
     assessment=(wake_up_cost, assessment),
     summary_lines=5,
     pictures=(ecdf("Service to service"), ratios("Service to service", "mqtt")),
@@ -389,10 +357,11 @@ CONTROL_NULL = replace(
     what="One variant against itself, and against itself with a fifth of its usual latency planted by the sender. "
     "The first interval must include 1.00, the second must lie above it; otherwise the comparison above finds "
     "differences that do not exist, or misses some that do.",
-    full=Budget(180, **{**_UNSET, "null": True}, seconds=0.3, rounds=30, passes=2, fresh_every=1),
+    full=Budget(180, **_ONE, loads=[NONE], null=True, seconds=0.3, rounds=30, passes=2, fresh_every=1),
     quick=Budget(10, seconds=0.25, rounds=4, passes=1, fresh_every=2),
     is_null=True,
     variants=(P2P,),
+    tables=(replace(TABLE, baseline=""), HOPS),
     assessment=(null.assessment,),
     words=("bench", "control"),
     reported=("--null",),

@@ -6,33 +6,40 @@ broker; for the first pictures another one, with a camera.
 
 from __future__ import annotations
 
+import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Set
 from contextlib import closing, contextmanager
+from functools import partial
 
-from pebble.bench import subscribers
 from pebble.bench.comparison import Budget, Case, Comparison, rounds, variants
-from pebble.bench.drivers import RATE_HZ, driving
+from pebble.bench.drivers import RATE_HZ, StockClient, driving
 from pebble.bench.pictures import dots
 from pebble.bench.results import Cell
 from pebble.bench.subscribers import UP_S, RobotSubscriber, ready_robot
 from pebble.bench.tables import SPREAD, Claims, Grid
 from pebble.client.media_receiver import MediaReceiver
+from pebble.config import load
 from pebble.contract.encodings import ALL_VIDEO
 from pebble.errors import PebbleError
 from pebble.media.decode import Decoded
 from pebble.rig.robot import BASE, KINDS, Robot, one_robot
-from pebble.transports import MqttSettings, Transport, create
+from pebble.runtime.connections import local_transport
+from pebble.transports import Message, MqttSettings, Transport, create
 
 PICTURES_EVERY = 5  # launches, the first of which is followed by one of a robot with a camera
-AT_REST, RUNNING = "at rest", "running"  # the camera
-PICTURES = tuple(f"picture, {encoding}, {state}" for state in (AT_REST, RUNNING) for encoding in ALL_VIDEO)
-LATE = ("late operator", "late operator, paho", "late service")
-MEASURES = ("first heartbeat", "all ready", "first drive obeyed", *LATE, *PICTURES)
+PICTURES = tuple(f"picture, {encoding}, {state}" for state in ("at rest", "running") for encoding in ALL_VIDEO)
+STARTED = ("first heartbeat", "all ready", "first drive obeyed")
+MEASURES = (*STARTED, "late operator", "late operator, paho", "late service", *PICTURES)
 _CAMERA = "camera_publisher"  # runs while it is requested
+_LATE_S = 10.0  # for one late subscriber
+_QUIET_S = 0.3  # without another retained message until all count as received
 _REST_S, _PICTURE_S = 10.0, 15.0
-_ANSWER_S = 60.0
+_EVERYTHING = f"{BASE}/#"
 _POLL_S = 0.02  # how often an operator looks whether a key frame is missing
+
+_Receive = Callable[[str], None]  # is called with the topic of each message
+_Client = tuple[StockClient | Transport, Callable[[], object]]  # and what opens it
 
 
 def measure(case: Case) -> Iterator[Cell]:
@@ -45,35 +52,95 @@ def measure(case: Case) -> Iterator[Cell]:
 def launch(case: Case) -> Iterator[Cell]:
     """Measures one robot from its start to its end. Seconds count from just before its launcher is started."""
     with one_robot(case.variant) as robot, closing(RobotSubscriber(robot.remote_port, BASE)) as subscriber:
-        service = robot.running.worker("late service", "pebble.bench.subscribers", robot.config)
-        service.answer(_ANSWER_S)  # it is started beforehand, so that its imports do not disturb the launch
         subscriber.wait()
-        for measure_, seconds in zip(MEASURES, _start(robot, subscriber), strict=False):
-            yield case.cell(measure_, "s", [seconds])
-        joins = range(case.run["joins"])
-        service.send(str(len(joins)))  # it first counts the retained messages, which gives start-up time to finish
-        answer = service.answer(_ANSWER_S)
-        port, retained = robot.remote_port, set(subscriber.retained)
-        for measure_, join in zip(LATE, (subscribers.operator_ms, subscribers.stock_operator_ms), strict=False):
-            yield case.cell(measure_, "ms", [join(port, BASE, retained) for _ in joins], topics=len(retained))
-        yield case.cell(LATE[-1], "ms", answer["ms"], topics=len(answer["retained"]))
-
-
-def _start(robot: Robot, subscriber: RobotSubscriber) -> list[float]:
-    """Seconds to the first heartbeat, to all services ready, and to the first command that moves the wheels."""
-    with driving(robot.remote_port, BASE):
-        began_ns = time.monotonic_ns()
-        robot.launch()
-        robot.expect(lambda: subscriber.first_heartbeat_ns is not None, "no heartbeat", UP_S)
-        robot.expect(lambda: subscriber.ready_ns is not None, "not every service is ready", UP_S)
-        robot.expect(lambda: bool(_obeyed(robot, began_ns)), "no drive command was obeyed", UP_S)
-    times = (subscriber.first_heartbeat_ns or 0, subscriber.ready_ns or 0, _obeyed(robot, began_ns)[0])
-    return [(time_ns - began_ns) / 1e9 for time_ns in times]
+        with driving(robot.remote_port, BASE):
+            began_ns = time.monotonic_ns()
+            robot.launch()
+            robot.expect(lambda: subscriber.first_heartbeat_ns is not None, "no heartbeat", UP_S)
+            robot.expect(lambda: subscriber.ready_ns is not None, "not every service is ready", UP_S)
+            robot.expect(lambda: bool(_obeyed(robot, began_ns)), "no drive command was obeyed", UP_S)
+        times = (subscriber.first_heartbeat_ns or 0, subscriber.ready_ns or 0, _obeyed(robot, began_ns)[0])
+        for name, at_ns in zip(STARTED, times, strict=True):
+            yield case.cell(name, "s", [(at_ns - began_ns) / 1e9])
+        yield from _late(case, robot, subscriber)
 
 
 def _obeyed(robot: Robot, since_ns: int) -> list[int]:
     """The times at which lines that move the wheels reached the MCU."""
     return [line.ns for line in robot.lines(since_ns) if line.drive is not None and any(line.drive)]
+
+
+# -- late subscribers, operators and services, wait for all retained messages of a running robot
+
+
+def _late(case: Case, robot: Robot, subscriber: RobotSubscriber) -> Iterator[Cell]:
+    local, port = partial(local_transport, load(robot.config)), robot.remote_port
+    inside = _retained_topics(local("retained-topics"))  # meanwhile start-up work finishes
+    outside = set(subscriber.retained)
+    late: dict[str, tuple[set[str], Callable[[_Receive], _Client]]] = {
+        "late service": (inside, lambda receive: _pebble(local("late-service"), receive)),
+        "late operator": (outside, lambda receive: _pebble(_connection(port), receive)),
+        "late operator, paho": (outside, lambda receive: _paho(port, receive)),
+    }
+    for name, (topics, make) in late.items():
+        yield case.cell(name, "ms", [_late_ms(topics, make) for _ in range(case.run["joins"])], topics=len(topics))
+
+
+def _retained_topics(transport: Transport) -> set[str]:
+    """The topics with a retained message. Waits for a pause, since no message is marked as the last."""
+    found: set[str] = set()
+
+    def on_message(message: Message) -> None:
+        if message.retain:
+            found.add(message.topic)
+
+    with transport:
+        transport.subscribe(_EVERYTHING, on_message, direct=True)
+        before = -1
+        while before < len(found):
+            before = len(found)
+            time.sleep(_QUIET_S)
+    return found
+
+
+def _paho(port: int, receive: _Receive) -> _Client:
+    client = StockClient(lambda message: receive(message.topic), [(_EVERYTHING, 1)], at_once=False)
+    return client, lambda: client.open(port)
+
+
+def _pebble(transport: Transport, receive: _Receive) -> _Client:
+    def begin() -> None:
+        """As a service does."""
+        transport.open(timeout=0.0)
+        transport.subscribe(_EVERYTHING, lambda message: receive(message.topic), direct=True)
+
+    return transport, begin
+
+
+def _late_ms(topics: Set[str], make: Callable[[_Receive], _Client]) -> float:
+    """Milliseconds from opening a client until messages of all topics have arrived. Raises PebbleError."""
+    missing, complete, ended_ns = set(topics), threading.Event(), 0
+
+    def receive(topic: str) -> None:
+        nonlocal ended_ns
+        missing.discard(topic)
+        if not missing and not complete.is_set():
+            ended_ns = time.monotonic_ns()
+            complete.set()
+
+    client, begin = make(receive)
+    with closing(client):
+        began_ns = time.monotonic_ns()
+        begin()
+        complete.wait(_LATE_S)
+    if missing:
+        raise PebbleError(f"a late subscriber did not receive {', '.join(missing)} within {_LATE_S:.0f} s")
+    return (ended_ns - began_ns) / 1e6
+
+
+def _connection(port: int) -> Transport:
+    """An operator's, not yet opened."""
+    return create("mqtt", f"operator-{time.monotonic_ns()}", MqttSettings(host="127.0.0.1", port=port))
 
 
 # -- the first picture
@@ -109,26 +176,15 @@ def first_pictures(case: Case) -> Iterator[Cell]:
         for encoding in ALL_VIDEO:
             robot.expect(lambda: _CAMERA not in robot.processes(), "the camera does not rest", _REST_S)
             with _operator(robot, encoding) as first, _operator(robot, encoding) as second:
-                for state, operator in ((AT_REST, first), (RUNNING, second)):
-                    yield case.cell(f"picture, {encoding}, {state}", "ms", [operator.wait_ms()])
+                yield case.cell(f"picture, {encoding}, at rest", "ms", [first.wait_ms()])
+                yield case.cell(f"picture, {encoding}, running", "ms", [second.wait_ms()])
 
 
 @contextmanager
 def _operator(robot: Robot, encoding: str) -> Iterator[_Operator]:
     """Connected beforehand, as an operator who has the robot's page open."""
-    settings = MqttSettings(host="127.0.0.1", port=robot.remote_port)
-    with (
-        create("mqtt", f"operator-{time.monotonic_ns()}", settings) as transport,
-        closing(_Operator(transport, encoding)) as operator,
-    ):
+    with _connection(robot.remote_port) as transport, closing(_Operator(transport, encoding)) as operator:
         yield operator
-
-
-def paper(_cells: Sequence[Cell]) -> Iterator[str]:
-    yield (
-        "The paper (5.1.1) names start-up delay first among what its MQTT video should improve, and gives no figure "
-        "for it; its pictures are our json."
-    )
 
 
 STARTUP = Comparison(
@@ -160,7 +216,7 @@ STARTUP = Comparison(
             columns=(SPREAD,), ratio=True,
         ),
     ),
-    assessment=(Claims(judged=lambda cell: cell.measure not in PICTURES), paper),
+    assessment=(Claims(judged=lambda cell: cell.measure not in PICTURES),),
     pictures=(dots("Start-up"),),
     summary_lines=2,
 )  # fmt: skip

@@ -1,12 +1,12 @@
-"""The offset of two clocks from messages there and back: within its error, or refused."""
+"""The offset of two clocks from messages there and back: within its error, or unknown."""
 
+import math
 import random
 
 import pytest
 
-from pebble.bench.control_ends import Exchange
 from pebble.bench.control_far import DRIFT, LEAST, estimate, one_way_ns
-from pebble.errors import PebbleError
+from pebble.bench.control_worker import Exchange
 
 SECOND = 10**9
 SEEDS = range(300)
@@ -57,14 +57,12 @@ def test_the_two_ways_add_up_to_the_round_trip() -> None:
         assert sum(one_way_ns(one, found)) == one.t4 - one.t1 - (one.t3 - one.t2)
 
 
-def test_too_few_exchanges_are_refused() -> None:
+def test_the_offset_of_too_few_exchanges_is_unknown() -> None:
     measured = exchanges(random.Random(3), count=LEAST - 1, there_us=1, back_us=1)
-    with pytest.raises(PebbleError, match=f"at least {LEAST}"):
-        estimate(measured)
+    assert estimate(measured).error_ns == math.inf
 
 
-def test_a_clock_that_was_set_meanwhile_is_refused() -> None:
+def test_the_offset_of_a_clock_that_was_set_meanwhile_is_unknown() -> None:
     before = exchanges(random.Random(4), there_us=1, back_us=1)
     after = [one._replace(t2=one.t2 + SECOND, t3=one.t3 + SECOND) for one in before[100:]]
-    with pytest.raises(PebbleError, match="one of them was set"):
-        estimate(before[:100] + after)
+    assert estimate(before[:100] + after).error_ns == math.inf

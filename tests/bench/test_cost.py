@@ -9,7 +9,7 @@ from rich.console import Console
 
 from pebble.bench import cost
 from pebble.bench.comparison import Case
-from pebble.bench.cost import COST, IDLE, Reading, legend
+from pebble.bench.cost import COST, IDLE, Reading
 from pebble.bench.engine import Collected
 from pebble.bench.results import Cell
 from pebble.bench.subscribers import encoding_of
@@ -86,11 +86,8 @@ def test_the_assessment_is_about_sums(cells: list[Cell]) -> None:
     printed = "\n".join(map(str, COST.assessed(cells)))
     assert "idle, memory: mqtt 31.5 (30.0 to 33.0) MB, zenoh 60.0 (60.0 to 60.0) MB\n" in printed
     assert "json+pcm, CPU per delivered picture: mqtt 4.20" in printed
+    assert "json+pcm, pictures per second: mqtt 15.0 (15.0 to 15.0) 1/s" in printed
     assert "needs 8" in printed
-
-
-def test_the_legend_lists_what_is_in_the_sum(cells: list[Cell]) -> None:
-    assert any("Without the remote broker" in line for line in legend(cells))
 
 
 def test_encodings_are_distinguished() -> None:

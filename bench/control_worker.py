@@ -1,10 +1,12 @@
-"""The two ends of the control comparison, a periodic sender and an echo, which use a transport as services do.
+"""The programs of the control comparison: its two ends, which use a transport as services do, and a load.
 
 A service handles a drive command on the transport's thread that brings it, if it is idle; else its inbox keeps the
-command for its own thread (decision 24). These do the same. Stock paho calls its handler on its network thread.
+command for its own thread (decision 24). The ends do the same. Stock paho calls its handler on its network thread.
 
-As a process: ``python -m pebble.bench.control_ends echo|sender paho|mqtt|zenoh SETTINGS`` (JSON, of the transport). It
-writes ``{"ready": true}``. A sender receives slices as JSON and answers each.
+``python -m pebble.bench.control_worker echo|sender paho|mqtt|zenoh SETTINGS`` (JSON, of the transport). A sender
+receives slices as JSON and answers each. ``… writer|reader mqtt|zenoh-shm WHERE``: one end of a stream of raw 640x480
+pictures at 30 Hz, as in ``pebble bench frames``. Line ``1`` switches the writer on, ``0`` off. To any line a reader
+answers when some more pictures have arrived: how many so far, and when.
 """
 
 from __future__ import annotations
@@ -12,12 +14,12 @@ from __future__ import annotations
 import math
 import struct
 import sys
+import threading
 import time
 from collections.abc import Callable
 from contextlib import closing
 from functools import partial
 from pathlib import Path
-from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgspec
@@ -25,27 +27,33 @@ import msgspec
 from pebble.bench.null import spin
 from pebble.contract import DRIVE
 from pebble.errors import PebbleError
-from pebble.rig.worker_end import answer, serve_on_thread
+from pebble.rig.worker_end import answer, serve, serve_on_thread
 from pebble.runtime.inbox import Inbox
 from pebble.runtime.work_lock import WorkLock
 from pebble.transports import Message, MqttSettings, QoS, State, Transport, ZenohSettings, create
 
 if TYPE_CHECKING:
     from pebble.bench.comparison import Case
+    from pebble.bench.frames_worker import Reader, Writer
+    from pebble.bench.results import Value
 
 ONE_WAY, ROUND_TRIP = "one-way", "round trip"  # measures
 REQUESTS, REPLIES = "pebble/bench/echo", "pebble/bench/echoed"  # followed by the sender's name
-QOS = QoS(DRIVE.default_qos)
+PICTURES_HZ = 30.0  # as in bench/frames_worker.py
+_QOS = QoS(DRIVE.default_qos)
 _LEAD_S = 0.1  # messages at the start of a slice do not count: caches are cold after a pause
 _LAST_S = 1.0  # how long to wait for the last replies of a slice
 _POLL_S = 0.01
+_FLOWING = 3  # pictures received until the stream counts as flowing
 _CONNECT_S = 10.0
 _WHO = "bench"  # the sender's name
 _WARM_UP, _WARM_UP_S = 20, 15.0  # messages
+_PICTURE = 640 * 480 * 3  # bytes
+_READ_S = 1.0
+_EVERY = 64  # bytes: one in each cache line is read
 
-_FORM = struct.Struct("<Qqqq")
-_ECHOED = struct.Struct("<qq")
-_ECHOED_AT = 16  # behind the number and the first stamp
+_FORM = struct.Struct("<Qqqq")  # of a message: its number and t1 to t3; padding follows
+_ECHOED, _ECHOED_AT = struct.Struct("<qq"), 16  # t2 and t3
 SMALLEST = _FORM.size
 
 Handler = Callable[[str, bytes, int], None]  # topic, payload, and when the transport received it (ns)
@@ -63,26 +71,20 @@ class SliceSpec(msgspec.Struct, frozen=True, kw_only=True):
 
     @staticmethod
     def of(case: Case) -> SliceSpec:
-        """The slice of a case, whose condition has the :func:`size_name` and the :func:`rate_name`."""
-        number, unit = str(case.condition["size"]).split()
+        """The slice of a case with a :func:`condition`."""
+        (number, unit), (rate, _) = (str(case.condition[name]).split() for name in ("size", "rate"))
         return SliceSpec(
             size=int(number) * (1024 if unit == "KB" else 1),
-            rate=float(str(case.condition["rate"]).split()[0]),
+            rate=float(rate),
             seconds=case.run["seconds"],
             work_us=case.planted_us,
             slowed=case.slowed,
         )
 
 
-def size_name(size: int) -> str:
-    return f"{size // 1024} KB" if size % 1024 == 0 else f"{size} B"
-
-
-def rate_name(rate: float) -> str:
-    return f"{rate:g} Hz"
-
-
-# -- messages: a number, three time stamps, and padding to the requested size
+def condition(size: int, rate: float) -> dict[str, Value]:
+    """``{"size": "1 KB", "rate": "20 Hz"}``"""
+    return {"size": f"{size // 1024} KB" if size % 1024 == 0 else f"{size} B", "rate": f"{rate:g} Hz"}
 
 
 class Exchange(NamedTuple):
@@ -95,20 +97,14 @@ class Exchange(NamedTuple):
     transport_ns: int = 0  # before t4: when the near transport received it
 
 
-def request(number: int, t1: int, size: int) -> bytes:
-    return _FORM.pack(number, t1, 0, 0).ljust(size, b"\0")
+class Slice(msgspec.Struct, frozen=True, kw_only=True):
+    """The results of a slice."""
 
-
-def stamped(payload: bytes, t2: int, t3: int) -> bytes:
-    """The same message with the echo's stamps, of the same length: at least :data:`SMALLEST`."""
-    message = bytearray(payload)
-    _ECHOED.pack_into(message, _ECHOED_AT, t2, t3)
-    return bytes(message)
-
-
-def parse(payload: bytes) -> tuple[int, ...]:
-    """Number, t1, t2, t3, of at least :data:`SMALLEST` bytes."""
-    return _FORM.unpack_from(payload)
+    trips: int  # all messages sent
+    sent: int  # counted messages
+    late: int  # of these, by more than half of the period
+    calls_ns: list[int]  # durations of their publish calls
+    exchanges: list[Exchange]
 
 
 # -- connections, and the two ends
@@ -160,9 +156,9 @@ def opened(transport: Transport, desk: Desk) -> Connection:
             received_ns = time.monotonic_ns()
             desk.bring(lambda: handler(message.topic, message.payload, received_ns))
 
-        transport.subscribe(filter_, on_message, qos=QOS, direct=True)
+        transport.subscribe(filter_, on_message, qos=_QOS, direct=True)
 
-    return Connection(subscribe, partial(transport.publish, qos=QOS), transport.close)
+    return Connection(subscribe, partial(transport.publish, qos=_QOS), transport.close)
 
 
 def stock(port: int) -> Connection:
@@ -177,25 +173,22 @@ def stock(port: int) -> Connection:
             handler(message.topic, message.payload, time.monotonic_ns())
 
         client.paho.on_message = on_message
-        client.subscribe(filter_, QOS)
+        client.subscribe(filter_, _QOS)
 
-    return Connection(subscribe, partial(client.paho.publish, qos=QOS), client.close)
+    return Connection(subscribe, partial(client.paho.publish, qos=_QOS), client.close)
 
 
-class Echo:
-    """Returns every message for ``who`` (``+`` for all) at once, with its own time stamps."""
+def echo(connection: Connection, who: str, clock: Clock) -> None:
+    """From now on returns every message for ``who`` (``+`` for all) at once, with time stamps of its own."""
 
-    def __init__(self, connection: Connection, who: str, clock: Clock) -> None:
-        self.count = 0
-        self._connection, self._clock = connection, clock
-        connection.subscribe(f"{REQUESTS}/{who}", self._on_message)
-
-    def _on_message(self, topic: str, payload: bytes, _transport_ns: int) -> None:
-        received = self._clock()
+    def on_message(topic: str, payload: bytes, _transport_ns: int) -> None:
+        received = clock()
         if len(payload) >= SMALLEST:  # else a foreign message on a shared broker
-            reply = stamped(payload, received, self._clock())
-            self._connection.publish(REPLIES + topic.removeprefix(REQUESTS), reply)
-            self.count += 1
+            reply = bytearray(payload)
+            _ECHOED.pack_into(reply, _ECHOED_AT, received, clock())
+            connection.publish(REPLIES + topic.removeprefix(REQUESTS), bytes(reply))
+
+    connection.subscribe(f"{REQUESTS}/{who}", on_message)
 
 
 class Sender:
@@ -204,36 +197,29 @@ class Sender:
     def __init__(self, connection: Connection, who: str, clock: Clock, desk: Desk) -> None:
         self._connection, self._clock, self._desk = connection, clock, desk
         self._topic = f"{REQUESTS}/{who}"
-        self._next = self._first = self._missing = 0
+        self._first = 0  # the number of the first message
         self._received: list[Exchange | None] = []
-        self._calls: list[int] = []
-        self.trips = 0  # in the last slice
-        self.calls_ns: list[int] = []  # durations of its publish calls
-        self.ended = False
+        self._calls_ns: list[int] = []
         connection.subscribe(f"{REPLIES}/{who}", self._on_message)
 
     def warm_up(self, count: int, timeout: float) -> bool:
         """Exchanges ``count`` messages, so that both ends are connected and their code has run; False if that fails."""
         end, returned = time.monotonic() + timeout, 0
-        while returned < count and time.monotonic() < end and not self.ended:
+        while returned < count and time.monotonic() < end:
             self._expect(1)
             with self._desk.lock:
                 self._send(self._first, SliceSpec(size=40, rate=1, seconds=1))
             self._collect(0.1)
-            returned += not self._missing
+            returned += None not in self._received
         return returned >= count
 
-    def run(self, spec: SliceSpec) -> tuple[int, int, list[Exchange]]:
-        """Runs one slice; returns the number of counted messages, how many of them were late, and the exchanges.
-
-        Late means by more than half of the period.
-        """
+    def run(self, spec: SliceSpec) -> Slice:
         lead, period = max(1, math.ceil(_LEAD_S * spec.rate)), 1 / spec.rate
         counting = max(1, round(spec.seconds * spec.rate))
         self._expect(lead + counting)
         sent = late = 0
         due = time.monotonic() + period
-        while sent < lead + counting and not self.ended:
+        while sent < lead + counting:
             self._desk.turn(max(0.0, due - time.monotonic()))
             behind = time.monotonic() - due
             if behind >= 0:
@@ -242,98 +228,109 @@ class Sender:
                     self._send(self._first + sent, spec)
                 sent, due = sent + 1, due + period
         self._collect(_LAST_S)
-        self.trips, self.calls_ns = sent, self._calls[lead:]
-        return counting, late, [exchange for exchange in self._received[lead:] if exchange is not None]
+        exchanges = [exchange for exchange in self._received[lead:] if exchange is not None]
+        return Slice(trips=sent, sent=counting, late=late, calls_ns=self._calls_ns[lead:], exchanges=exchanges)
 
     def _expect(self, count: int) -> None:
-        self._first, self._next = self._next, self._next + count
-        self._received, self._missing, self._calls = [None] * count, count, []
+        self._first += len(self._received)
+        self._received, self._calls_ns = [None] * count, []
 
     def _send(self, number: int, spec: SliceSpec) -> None:
         spin(0.0 if spec.slowed else spec.work_us)
-        message = request(number, self._clock(), spec.size)
+        message = _FORM.pack(number, self._clock(), 0, 0).ljust(spec.size, b"\0")
         spin(spec.work_us if spec.slowed else 0.0)
         called = time.monotonic_ns()
         self._connection.publish(self._topic, message)
-        self._calls.append(time.monotonic_ns() - called)
+        self._calls_ns.append(time.monotonic_ns() - called)
 
     def _collect(self, timeout: float) -> None:
         end = time.monotonic() + timeout
-        while self._missing and time.monotonic() < end and not self.ended:
+        while None in self._received and time.monotonic() < end:
             self._desk.turn(_POLL_S)
 
     def _on_message(self, _topic: str, payload: bytes, transport_ns: int) -> None:
         received = self._clock()
         if len(payload) < SMALLEST:
             return
-        number, t1, t2, t3 = parse(payload)
+        number, t1, t2, t3 = _FORM.unpack_from(payload)
         index = number - self._first
         if 0 <= index < len(self._received) and self._received[index] is None:  # QoS 1 may deliver twice
             self._received[index] = Exchange(t1, t2, t3, received, transport_ns)
-            self._missing -= 1
 
 
-# -- one of them as a process
-
-
-class Answer(msgspec.Struct, frozen=True, kw_only=True):
-    """The results of a slice, µs."""
-
-    trips: int  # all messages sent
-    sent: int  # counted messages
-    late: int
-    one_way: list[float]
-    round_trip: list[float]
-    call: list[float]  # durations of this end's publish calls
-    transport_times: list[float]  # from the echo's publish call until this end's transport received the reply
-    inbox: list[float]  # from then until its handler ran
-
-
-def _echo(connection: Connection, desk: Desk) -> None:
-    Echo(connection, _WHO, time.monotonic_ns)
-    ended = serve_on_thread(lambda _line: None, desk.inbox.wake)
-    answer({"ready": True})
-    while not ended.is_set():
-        desk.turn()
-
-
-def _send(connection: Connection, desk: Desk) -> None:
-    sender, lines = Sender(connection, _WHO, time.monotonic_ns, desk), SimpleQueue[str]()
-
-    def end() -> None:
-        sender.ended = True
-        desk.inbox.wake()
-        lines.put("")
-
-    serve_on_thread(lines.put, end)
-    if not sender.warm_up(_WARM_UP, _WARM_UP_S):
-        raise PebbleError("the echo does not answer")
-    answer({"ready": True})
-    while line := lines.get():
-        sent, late, exchanges = sender.run(msgspec.json.decode(line, type=SliceSpec))
-        done = Answer(
-            trips=sender.trips,
-            sent=sent,
-            late=late,
-            one_way=[(one.t2 - one.t1) / 1000 for one in exchanges],
-            round_trip=[(one.t4 - one.t1) / 1000 for one in exchanges],
-            call=[ns / 1000 for ns in sender.calls_ns],
-            transport_times=[(one.transport_ns - one.t3) / 1000 for one in exchanges],
-            inbox=[(one.t4 - one.transport_ns) / 1000 for one in exchanges],
-        )
-        answer(msgspec.json.encode(done))
-
-
-def main(role: str, kind: str, settings: str) -> None:
+def run_end(role: str, kind: str, settings: str) -> None:
     desk, form = Desk(), ZenohSettings if kind == "zenoh" else MqttSettings
     where: Any = msgspec.json.decode(settings, type=form, dec_hook=lambda _kind, text: Path(text))
-    try:
-        paho = kind == "paho"
-        with closing(stock(where.port) if paho else opened(create(kind, role, where), desk)) as connection:
-            (_echo if role == "echo" else _send)(connection, desk)
-    except PebbleError as error:
-        sys.exit(str(error))
+    with closing(stock(where.port) if kind == "paho" else opened(create(kind, role, where), desk)) as connection:
+        if role == "echo":
+            echo(connection, _WHO, time.monotonic_ns)
+            ended = serve_on_thread(lambda _line: None, desk.inbox.wake)
+            answer({"ready": True})
+            while not ended.is_set():
+                desk.turn()
+        else:
+            sender = Sender(connection, _WHO, time.monotonic_ns, desk)
+            if not sender.warm_up(_WARM_UP, _WARM_UP_S):
+                raise PebbleError("the echo does not answer")
+            answer({"ready": True})
+            serve(lambda line: msgspec.json.encode(sender.run(msgspec.json.decode(line, type=SliceSpec))))
+
+
+# -- the load of pictures
+
+
+def write(writer: Writer) -> None:
+    import numpy as np  # only these processes need it
+
+    on, due = threading.Event(), 0.0
+
+    def switch(line: str) -> dict[str, Any]:
+        (on.set if line == "1" else on.clear)()
+        return {}
+
+    picture = np.random.default_rng(1).integers(0, 256, _PICTURE, dtype=np.uint8)
+    ended = serve_on_thread(switch, on.set)
+    answer({"ready": True})
+    while on.wait() and not ended.is_set():
+        frame = writer.begin()
+        if frame is not None:
+            np.copyto(frame, picture)
+            writer.send()
+        del frame
+        now = time.monotonic()
+        due = max(due, now - 1 / PICTURES_HZ) + 1 / PICTURES_HZ
+        time.sleep(max(0.0, due - now))
+
+
+def read(reader: Reader) -> None:
+    """Reads even while no pictures are sent: a client whose network loop does not run loses its connection."""
+    pictures = 0
+
+    def count(_line: str) -> dict[str, Any]:
+        enough = pictures + _FLOWING
+        while pictures < enough:
+            time.sleep(_POLL_S)
+        return {"pictures": pictures, "s": time.monotonic()}
+
+    ended = serve_on_thread(count)
+    answer({"ready": True})
+    while not ended.is_set():
+        frame = reader.read(_READ_S)
+        if frame is not None:
+            pictures += bool(frame[::_EVERY].any())
+            del frame
+
+
+def run_stream(role: str, kind: str, where: str) -> None:
+    from pebble.bench import frames_worker
+
+    if role == "writer":
+        with closing(frames_worker.writer(kind, where, _PICTURE)) as writer:
+            write(writer)
+    else:
+        with closing(frames_worker.reader(kind, where)) as reader:
+            read(reader)
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    (run_stream if sys.argv[1] in ("writer", "reader") else run_end)(*sys.argv[1:])
