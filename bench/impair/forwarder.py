@@ -26,7 +26,6 @@ import struct
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Coroutine
 from contextlib import suppress
 from pathlib import Path
 from random import Random
@@ -37,8 +36,7 @@ import msgspec
 from pebble.bench.impair.conditions import Condition, Schedule, Shape
 from pebble.rig import worker_end
 
-WIRE, TIMED = "wire", "timed"  # the devices of a namespace; packets of the second one pass through this process
-ETHERNET = 14  # bytes of header that packets of a TUN device lack, but would have on a wire
+TIMED = "timed"  # the TUN device of a namespace
 _TUN = Path("/dev/net/tun")
 _CLONE_NEWNET = 0x40000000
 _TUNSETIFF, _IFF_TUN, _IFF_NO_PI = 0x400454CA, 0x0001, 0x1000
@@ -57,8 +55,6 @@ _SLACK_S = 0.005  # of the rate that a late wake-up does not lose
 _RTO_MIN_S = 0.2  # Linux's TCP_RTO_MIN
 _CONNECT_S = 5.0
 
-_libc = ctypes.CDLL(None, use_errno=True)
-
 
 class Direction:
     """One direction: what was sent, and what was dropped."""
@@ -74,10 +70,9 @@ class Direction:
 
 
 def answer(line: str, up: Direction, down: Direction) -> dict[str, Any]:
-    """Of both kinds of network: what was counted so far, or a condition is applied from now on."""
+    """Of both kinds of network: what was counted so far of the uplink, or a condition is applied from now on."""
     if line == "count":
-        both, counted = (("up", up), ("down", down)), ("bytes", "packets", "dropped")
-        return {f"{name}_{way}": getattr(direction, name) for way, direction in both for name in counted}
+        return {"bytes_up": up.bytes, "packets_up": up.packets, "dropped_up": up.dropped}
     condition = msgspec.json.decode(line, type=Condition)
     round_trip_s = (condition.up.delay_ms + condition.down.delay_ms) / 1000
     up.apply(condition.up, round_trip_s)
@@ -97,22 +92,19 @@ class Packets(Direction):
         self._in_flight: deque[tuple[float, bytes]] = deque()
 
     @property
-    def due(self) -> float | None:
-        return self._in_flight[0][0] if self._in_flight else None
+    def due(self) -> float:
+        return self._in_flight[0][0] if self._in_flight else math.inf
 
     def take(self) -> None:
         """Reads the packets available at the source."""
-        for _ in range(_AT_ONCE):
-            try:
-                packet = os.read(self._source, _PACKET)
-            except BlockingIOError:
-                return
-            self._send(packet)
+        with suppress(BlockingIOError):
+            for _ in range(_AT_ONCE):
+                self._send(os.read(self._source, _PACKET))
 
     def deliver(self) -> None:
         """Writes the packets that are due."""
         now = time.monotonic()
-        while self._in_flight and self._in_flight[0][0] <= now:
+        while self.due <= now:
             try:
                 os.write(self._sink, self._in_flight.popleft()[1])
             except OSError:  # the kernel's queue is full: the packet is lost
@@ -130,73 +122,40 @@ class Packets(Direction):
 def namespaces() -> int:
     with suppress(PermissionError):
         os.setpriority(os.PRIO_PROCESS, 0, _NICE)
-    if not _TUN.exists():  # containers often lack it
-        with suppress(PermissionError):
+        if not _TUN.exists():  # containers often lack it
             _TUN.parent.mkdir(exist_ok=True)
             os.mknod(_TUN, stat.S_IFCHR | 0o600, os.makedev(10, 200))
     try:
-        robot, remote = _namespace(), _namespace()
+        (robot, robot_tun), (remote, remote_tun) = _namespace(), _namespace()
     except OSError as error:
-        worker_end.answer(_refusal(error))
+        why = f"{error.filename or 'new namespaces'}: {error.strerror}"
+        worker_end.answer({"unavailable": f"{why}: run it as root, or in `unshare --map-root-user`"})
         return 1
-    worker_end.answer({"robot": robot[0], "remote": remote[0]})
-    _forward(*robot, *remote)
-    return 0
-
-
-def _forward(robot: int, robot_tun: int, remote: int, remote_tun: int) -> None:
-    """Forwards, and answers requests until standard input closes; each waits for the answer to the one before."""
+    worker_end.answer({"robot": robot, "remote": remote})
     up, down = Packets(robot_tun, remote_tun, "up"), Packets(remote_tun, robot_tun, "down")
     sources, requests = {robot_tun: up, remote_tun: down}, sys.stdin.fileno()
     while True:
-        dues = [due for due in (up.due, down.due) if due is not None]
-        idle_s = max(0.0, min(dues) - time.monotonic()) if dues else None
+        due = min(up.due, down.due)
+        idle_s = None if due == math.inf else max(0.0, due - time.monotonic())
         ready, _, _ = select.select([requests, *sources], [], [], idle_s)
-        for source in ready:
-            if source != requests:
-                sources[source].take()
+        for source in sources.keys() & ready:
+            sources[source].take()
         up.deliver()
         down.deliver()
-        if requests in ready:
+        if requests in ready:  # each waits for the answer to the one before
             if not (line := sys.stdin.buffer.readline()):
-                return
-            up.bytes, up.packets = _transmitted(robot)
-            down.bytes, down.packets = _transmitted(remote)
+                return 0
             worker_end.answer(answer(line.decode().strip(), up, down))
 
 
 def _namespace() -> tuple[int, int]:
-    """Enters a new network namespace with a TUN device in it; returns the descriptors of both."""
-    _checked(_libc.unshare, _CLONE_NEWNET)
-    space = os.open("/proc/thread-self/ns/net", os.O_RDONLY)
+    """Enters a new network namespace with a TUN device in it; returns the descriptors of both. Raises OSError."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.unshare(_CLONE_NEWNET):
+        raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
     tun = os.open(_TUN, os.O_RDWR | os.O_NONBLOCK)  # of the namespace it is opened in
     fcntl.ioctl(tun, _TUNSETIFF, struct.pack("16sH22x", TIMED.encode(), _IFF_TUN | _IFF_NO_PI))
-    return space, tun
-
-
-def _transmitted(space: int) -> tuple[int, int]:
-    """Bytes and packets sent by both devices of a namespace, as on a wire."""
-    _checked(_libc.setns, space, _CLONE_NEWNET)
-    lines = (line.partition(":") for line in Path("/proc/thread-self/net/dev").read_text().splitlines())
-    sent = {name.strip(): [int(column) for column in columns.split()[8:10]] for name, _, columns in lines if columns}
-    (wire_bytes, wire_packets), (timed_bytes, timed_packets) = sent[WIRE], sent[TIMED]
-    return wire_bytes + timed_bytes + timed_packets * ETHERNET, wire_packets + timed_packets
-
-
-def _checked(call: Callable[..., int], *arguments: int) -> None:
-    if call(*arguments) < 0:
-        number = ctypes.get_errno()
-        raise OSError(number, os.strerror(number))
-
-
-def _refusal(error: OSError) -> dict[str, str]:
-    """The answer if there are no namespaces: unavailable without permission or without TUN, else an error."""
-    if isinstance(error, PermissionError):
-        what = error.filename or "new namespaces"
-        return {"unavailable": f"{what}: not permitted: run it as root, or in `unshare --map-root-user`"}
-    if error.filename == str(_TUN):
-        return {"unavailable": f"{_TUN}: {error.strerror}: the kernel has no TUN"}
-    return {"error": f"new namespaces: {error.strerror}"}
+    return os.open("/proc/thread-self/ns/net", os.O_RDONLY), tun
 
 
 # -- TCP connections through a proxy
@@ -253,36 +212,33 @@ _InFlight = asyncio.Queue[tuple[float, bytes]]
 
 
 class Proxy:
-    """Listeners for the requested ports, and their connections."""
+    """Listeners for the requested ports, and their connections, which end with the process."""
 
     def __init__(self) -> None:
         self._up, self._down = Stream("up"), Stream("down")
-        self._ports: dict[int, int] = {}  # ours, by that of the broker
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._tasks: list[asyncio.Task[None]] = []
 
     async def serve(self) -> None:
-        """Answers requests until standard input closes; connections end with the process."""
+        """Answers requests until standard input closes."""
         reader, loop = asyncio.StreamReader(), asyncio.get_running_loop()
         await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(reader), os.fdopen(0, "rb"))
         worker_end.answer({"proxy": True})
-        while line := await reader.readline():
-            word, _, rest = (text := line.decode().strip()).partition(" ")
+        while line := (await reader.readline()).decode().strip():
+            word, _, port = line.partition(" ")
             listens = word == "listen"
-            worker_end.answer({"port": self._listen(int(rest))} if listens else answer(text, self._up, self._down))
+            worker_end.answer({"port": self._listen(int(port))} if listens else answer(line, self._up, self._down))
 
     def _listen(self, target: int) -> int:
-        if target not in self._ports:
-            listener = _socket()
-            listener.bind((_HOST, 0))
-            listener.listen(64)
-            self._start(self._accept(listener, target))
-            self._ports[target] = listener.getsockname()[1]
-        return self._ports[target]
+        listener = _socket()
+        listener.bind((_HOST, 0))
+        listener.listen(64)
+        self._tasks.append(asyncio.create_task(self._accept(listener, target)))
+        return int(listener.getsockname()[1])
 
     async def _accept(self, listener: socket.socket, target: int) -> None:
         while True:
             near, _ = await asyncio.get_running_loop().sock_accept(listener)
-            self._start(self._join(near, target))
+            self._tasks.append(asyncio.create_task(self._join(near, target)))
 
     async def _join(self, near: socket.socket, target: int) -> None:
         """Forwards one connection until both directions have ended, or one side fails: then the other closes, too."""
@@ -298,11 +254,6 @@ class Proxy:
                         group.create_task(_deliver(in_flight, sink))
             except* OSError:
                 pass
-
-    def _start(self, what: Coroutine[Any, Any, None]) -> None:
-        task = asyncio.get_running_loop().create_task(what)
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
 
 
 def _socket() -> socket.socket:

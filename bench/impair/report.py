@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterator, Sequence
 from pebble.bench import paper
 from pebble.bench.aims import Aim, outcome, single, with_lost
 from pebble.bench.impair import metrics as measures
-from pebble.bench.impair.conditions import chosen
+from pebble.bench.impair.conditions import CONDITIONS
 from pebble.bench.ratios import paired
-from pebble.bench.results import Cell, Judged, percentile
+from pebble.bench.results import Cell, Judged, grouped, percentile
 from pebble.bench.tables import Column, Grid, figure
 
 QUOTED = (
@@ -34,9 +34,12 @@ def arrived(percent: float) -> _Value:
     return lambda cell: cell.percentile(percent)
 
 
-def _column(head: str, measure: str, value: _Value, *, whole: bool = False) -> Column:
+def _column(head: str, measure: str, value: str | _Value, *, whole: bool = False) -> Column:
+    """Of a single value, or another one."""
+    value_of = single(value) if isinstance(value, str) else value
+
     def shown(cell: Cell) -> str:
-        found = value(cell)
+        found = value_of(cell)
         return "never" if math.isinf(found) else f"{found:.0f}" if whole and not math.isnan(found) else figure(found)
 
     return Column(head, shown, measure)
@@ -49,42 +52,43 @@ def _grid(title: str, *columns: Column) -> Grid:
     )  # fmt: skip
 
 
-def _after(measure: str, what: str) -> tuple[Column, ...]:
-    return (
-        _column(f"no {what}\nbytes", measure, single("bytes_up"), whole=True),
-        _column("beats", measure, single("heartbeats"), whole=True),
-        _column("gap\ns", measure, single("longest_gap_s")),
-    )
-
-
 TABLES = (
     _grid(
         "trials",
-        _column("audio\n%", measures.SOUND, single("delivered_percent")),
+        _column("audio\n%", measures.SOUND, "delivered_percent"),
         _column("p95\nms", measures.SOUND, arrived(95)),
-        _column("video\nfps", measures.PICTURES, single("fps")),
-        _column("frozen\ns", measures.PICTURES, single("frozen_s")),
+        _column("video\nfps", measures.PICTURES, "fps"),
+        _column("frozen\ns", measures.PICTURES, "frozen_s"),
         _column("drive\np95 ms", measures.DRIVE, _p95),
-        _column("heart-\nbeat\ngap s", measures.HEARTBEAT_GAP, single("longest_gap_s")),
+        _column("heart-\nbeat\ngap s", measures.HEARTBEAT_GAP, "longest_gap_s"),
     ),
     _grid(
         "details of media",
-        _column("video\nkbit/s", measures.PICTURES, single("kbit_up")),
-        _column("audio\nkbit/s", measures.SOUND, single("kbit_up")),
-        _column("video\ndrops", measures.PICTURES, single("dropped_up"), whole=True),
-        _column("audio\ndrops", measures.SOUND, single("dropped_up"), whole=True),
+        _column("video\nkbit/s", measures.PICTURES, "kbit_up"),
+        _column("audio\nkbit/s", measures.SOUND, "kbit_up"),
+        _column("video\ndrops", measures.PICTURES, "dropped_up", whole=True),
+        _column("audio\ndrops", measures.SOUND, "dropped_up", whole=True),
         _column("audio\np50 ms", measures.SOUND, arrived(50)),
     ),
     _grid(
         "details of driving, and a clip",
         _column("drive\np50 ms", measures.DRIVE, with_lost(50)),
-        _column("drive\n%", measures.DRIVE, single("delivered_percent")),
-        _column("stopped\ntimes", measures.DRIVE, single("trips"), whole=True),
-        _column("at rest\ns", measures.DRIVE, single("rest_s")),
+        _column("drive\n%", measures.DRIVE, "delivered_percent"),
+        _column("stopped\ntimes", measures.DRIVE, "trips", whole=True),
+        _column("at rest\ns", measures.DRIVE, "rest_s"),
         _column("clip\nms", measures.CLIP, with_lost(100)),
     ),
     _grid(
-        "after media were switched off", *_after(measures.AFTER_VIDEO, "video"), *_after(measures.AFTER_AUDIO, "audio")
+        "after media were switched off",
+        *(
+            column
+            for what, measure in (("video", measures.AFTER_VIDEO), ("audio", measures.AFTER_AUDIO))
+            for column in (
+                _column(f"no {what}\nbytes", measure, "bytes_up", whole=True),
+                _column("beats", measure, "heartbeats", whole=True),
+                _column("gap\ns", measure, "longest_gap_s"),
+            )
+        ),
     ),
 )
 
@@ -93,41 +97,36 @@ TABLES = (
 
 
 def _aim(
-    trial: str, words: str, measure: str, value: _Value, unit: str,
+    trial: str, words: str, measure: str, value: str | _Value, unit: str,
     *, at_most: float | None = None, at_least: float | None = None,
 ) -> Aim:  # fmt: skip
     def beside(cell: Cell) -> str:
-        """By how much it was missed, how much was lost, and in which window."""
-        found, sent = value(cell), cell.figures.get("sent")
-        by = (at_least - found) if at_least is not None else found - (at_most or 0.0)
-        lost = (cell.lost or 0) / sent if isinstance(sent, int) and sent and at_least is None else 0.0
-        parts = [
-            f", by {figure(by)} {unit}" if by > 0 and math.isfinite(by) else "",
-            f", {figure(100 * lost)} % lost" if lost > _LOSS_SHOWN else "",
-        ]
-        return f"{''.join(parts)}, window of {single('window_s')(cell):.3g} s"
+        """How much was lost, and in which window."""
+        sent = cell.single("sent")
+        lost = (cell.lost or 0) / sent if at_most is not None and sent > 0 else 0.0
+        words = f", {figure(100 * lost)} % lost" if lost > _LOSS_SHOWN else ""
+        return f"{words}, window of {cell.single('window_s'):.3g} s"
 
-    bound = "at most" if at_least is None else "at least"
     return Aim(
-        what=f"{{variant}} at {trial}, {words} {bound} {{bound:g}} {unit}",
+        what=f"{{variant}} at {trial}, {words} {'at least' if at_most is None else 'at most'} {{bound:g}} {unit}",
         of=lambda cell: cell.variant.endswith(_OURS) and (cell.measure, cell.params.get("trial")) == (measure, trial),
-        value=value, at_most=at_most, at_least=at_least, unit=unit, least=0, never="too much was lost", beside=beside,
+        value=single(value) if isinstance(value, str) else value, unit=unit, least=0, never="too much was lost",
+        beside=beside, at_most=at_most, at_least=at_least,
     )  # fmt: skip
 
 
 def behind_media(cells: Sequence[Cell]) -> Iterator[Judged]:
     """The aim that commands do not wait behind media. Trials with loss or delay are excluded: they dominate the p95."""
-    steady = {one.name for one in chosen() if not one.up.loss and not one.up.timed}
+    steady = {one.name for one in CONDITIONS if not one.up.loss and not one.up.timed}
     for subject, trials in _found(cells, measures.DRIVE_ALONE).items():
-        alone_ms = {trial: _p95(cell) for trial, cell in trials.items() if trial in steady}
-        waits = {
-            f"{measure.removeprefix('drive during ')} at {trial}": _p95(busy) - alone_ms[trial]
+        waits = [
+            (_p95(busy) - _p95(trials[trial]), f"{measure.removeprefix('drive during ')} at {trial}")
             for measure in (measures.DRIVE_VIDEO, measures.DRIVE_AUDIO)
             for trial, busy in _found(cells, measure).get(subject, {}).items()
-            if math.isfinite(alone_ms.get(trial, math.nan))
-        }
+            if trial in steady and math.isfinite(_p95(trials[trial]))
+        ]
         if waits and subject.endswith(_OURS):
-            where, longest_ms = max(waits.items(), key=lambda one: one[1])
+            longest_ms, where = max(waits, key=lambda one: one[0])
             most = f"most: {longest_ms:+.0f} ms" if math.isfinite(longest_ms) else "some were lost"
             yield Judged(
                 what=f"{subject}, drive commands wait at most one command's time ({_DRIVE_WAITS_MS:g} ms) behind media"
@@ -138,15 +137,15 @@ def behind_media(cells: Sequence[Cell]) -> Iterator[Judged]:
 
 
 AIMS = (
-    _aim(paper.NARROW, "sound delivered", measures.SOUND, single("delivered_percent"), "%",
+    _aim(paper.NARROW, "sound delivered", measures.SOUND, "delivered_percent", "%",
          at_least=paper.NARROW_SOUND_PERCENT),
     _aim(paper.NARROW, "sound p95", measures.SOUND, _p95, "ms", at_most=paper.NARROW_SOUND_P95_MS),
-    _aim(paper.NARROW, "longest time without a new picture", measures.PICTURES, single("longest_gap_s"), "s",
+    _aim(paper.NARROW, "longest time without a new picture", measures.PICTURES, "longest_gap_s", "s",
          at_most=paper.NARROW_PICTURE_GAP_S),
-    _aim(paper.WORST, "sound delivered", measures.SOUND, single("delivered_percent"), "%",
+    _aim(paper.WORST, "sound delivered", measures.SOUND, "delivered_percent", "%",
          at_least=paper.WORST_SOUND_PERCENT),
     _aim(paper.WORST, "drive p95", measures.DRIVE, _p95, "ms", at_most=paper.WORST_DRIVE_P95_MS),
-    _aim(paper.WORST, "seen offline", measures.HEARTBEAT_GAP, single("longest_offline_s"), "s",
+    _aim(paper.WORST, "seen offline", measures.HEARTBEAT_GAP, "longest_offline_s", "s",
          at_most=paper.WORST_OFFLINE_S),
     behind_media,
 )  # fmt: skip
@@ -198,8 +197,5 @@ SENTENCES = (encodings, trips, clips, transports)
 
 def _found(cells: Sequence[Cell], measure: str) -> dict[str, dict[str, Cell]]:
     """The cells of a measure by subject, then by trial."""
-    found: dict[str, dict[str, Cell]] = {}
-    for cell in cells:
-        if cell.measure == measure:
-            found.setdefault(cell.variant, {})[str(cell.params["trial"])] = cell
-    return found
+    subjects = grouped((cell for cell in cells if cell.measure == measure), lambda cell: cell.variant)
+    return {subject: {str(cell.params["trial"]): cell for cell in own} for subject, own in subjects.items()}

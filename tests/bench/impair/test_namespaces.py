@@ -34,24 +34,20 @@ def test_loss_drops_the_configured_share_of_packets(delay_ms: int, tmp_path: Pat
         assert traffic.packets_up - before.packets_up >= _SENT
 
 
-def test_loss_of_the_downlink_is_counted_there(tmp_path: Path) -> None:
+def test_loss_of_the_downlink_is_on_the_robots_side(tmp_path: Path) -> None:
     with open_network("namespaces") as network, ProbeConnection(network, tmp_path) as talk:
         network.apply(Condition("down", Shape(), Shape(loss=0.2)))
         talk.down(100_000)
-        assert network.traffic().dropped_down > 0
+        counter = network.on_robot(["nft", "-j", "list", "counter", "ip", "impair", "lost"])
+        assert json.loads(subprocess.check_output(counter))["nftables"][-1]["counter"]["packets"] > 0
         assert network.traffic().dropped_up == 0
 
 
-def test_a_full_queue_drops_and_the_count_survives_the_next_condition(tmp_path: Path) -> None:
+def test_a_full_queue_drops(tmp_path: Path) -> None:
     with open_network("namespaces") as network, ProbeConnection(network, tmp_path) as talk:
         network.apply(Condition("64k", Shape(kbit=64)))
         talk.send_datagrams(400)
-        dropped = network.traffic().dropped_up
-        assert dropped > 50
-        for kbit in (128, None, 256):
-            network.apply(Condition("next", Shape(kbit=kbit)))
-            assert network.traffic().dropped_up >= dropped
-        assert network.traffic().dropped_up <= 400
+        assert 50 < network.traffic().dropped_up <= 400
 
 
 @pytest.mark.parametrize("kbit", [None, 4000])

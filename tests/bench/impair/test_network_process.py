@@ -17,7 +17,7 @@ def test_a_late_answer_is_not_taken_for_the_next_one(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(programs, "_END_S", 0.1)
     os.kill(process.pid, signal.SIGSTOP)
     with pytest.raises(PebbleError, match="network did not answer"):
-        process.ask("count")
+        process.traffic()
     with pytest.raises(PebbleError, match="network is closed"):
-        process.ask("count")
+        process.traffic()
     process.close()

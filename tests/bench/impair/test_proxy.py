@@ -34,12 +34,6 @@ def joined(network: ProxyNetwork, listener: socket.socket) -> tuple[socket.socke
     return near, far
 
 
-def test_a_port_is_asked_for_once(network: ProxyNetwork) -> None:
-    port = free_port()
-    assert network.broker_address(port) == network.broker_address(port)
-    assert network.broker_address(port) != (network.broker_host, port)
-
-
 def test_an_end_in_one_direction_leaves_the_other_open(network: ProxyNetwork, listener: socket.socket) -> None:
     near, far = joined(network, listener)
     with near, far:

@@ -99,10 +99,10 @@ def test_the_table_has_a_column_for_each_label(run: Run, robot: PictureRobot, ur
     assert rows["robot"] == ["goob", "goob"]
     assert rows["measured, s"] == ["3", "3"]
     assert all(8 <= float(cell) <= 18 for cell in rows["pictures a second"])  # the camera's rate is 15
-    assert rows["pictures lost"] == ["0.0%", "0.0%"]
+    assert rows["pictures lost, %"] == ["0.0", "0.0"]
     assert all(float(cell) < 1000 for cell in rows["heartbeat latency p95, ms"])
     assert all(float(cell) > 10 for cell in rows["video, kbit/s"])
-    assert "sound lost" not in rows
+    assert "sound lost, %" not in rows
     assert run("impair", "--compare") == 0
     assert run.out == table
     assert run("analyse", "impair/unlimited") == 0
