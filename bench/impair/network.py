@@ -1,17 +1,32 @@
 """Networks between a robot and its broker that can be impaired and restored while both use them.
 
-Of two network namespaces: rate by TBF and loss by nftables, in the kernel; delay by the forwarder. Two pairs of devices
-join the namespaces. Without delay, a veth pair carries everything, entirely in the kernel. With delay, the route uses
-TUN devices and the forwarder. The addresses stay the same, so connections survive. Or a proxy on loopback.
+Two network namespaces, each with two devices: rate by TBF and loss by nftables, in the kernel. Without delay, a veth
+pair carries everything, entirely in the kernel. With delay, the route uses TUN devices, whose descriptors are held by a
+process: a packet sent into one device leaves the other one when its schedule allows. The addresses stay the same, so
+connections survive. When the process ends, the devices disappear, and so do the namespaces once they are empty.
+
+``python -m pebble.bench.impair.network`` is that process. It applies each condition that it reads; after every line it
+answers with the packets that it has dropped.
 """
 
 from __future__ import annotations
 
+import ctypes
+import fcntl
 import json
+import math
 import os
+import select
 import shutil
+import signal
+import stat
+import struct
 import subprocess
+import sys
+import time
+from collections import deque
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -19,14 +34,14 @@ from typing import Any, Self
 
 import msgspec
 
-from pebble.bench.impair.conditions import Condition, Shape
-from pebble.bench.impair.forwarder import TIMED
+from pebble.bench.impair.conditions import Condition, Schedule, Shape
 from pebble.errors import PebbleError
 from pebble.rig.processes import python
 from pebble.rig.programs import Worker, end_workers
+from pebble.rig.worker_end import answer
 
 ROBOT_HOST, REMOTE_HOST = "10.77.0.1", "10.77.0.2"
-_WIRE = "wire"  # the veth device of a namespace
+_WIRE, _TIMED = "wire", "timed"  # the devices of a namespace; packets of the second one pass through the process
 _PREFIX = 30
 _MTU = 1500
 _ETHERNET = 14  # bytes of header that packets of a TUN device lack, but would have on a wire
@@ -36,6 +51,14 @@ _QUEUE_PACKETS = 4  # at least; at 64 kbit/s 0.3 s hold fewer than two
 _COMMAND_S = _ANSWER_S = 10.0
 _SBIN = "/usr/local/sbin:/usr/sbin:/sbin"  # not in the PATH of users
 _PACKAGES = {"nsenter": "util-linux", "ip": "iproute2", "tc": "iproute2", "nft": "nftables"}
+
+_TUN = Path("/dev/net/tun")
+_CLONE_NEWNET = 0x40000000
+_TUNSETIFF, _IFF_TUN, _IFF_NO_PI = 0x400454CA, 0x0001, 0x1000
+_PACKET = 65536  # bytes at most
+_ROOM = 1000  # packets in flight per direction; 100 ms at 100 Mbit/s are 800
+_AT_ONCE = 64  # packets read before others are written
+_NICE = -10  # must not wait while the robot encodes pictures
 
 _TABLE = """table ip impair {
     counter lost { }
@@ -60,48 +83,52 @@ class UnavailableError(PebbleError):
     """This machine or user does not permit such a network."""
 
 
-class ImpairedNetwork(Worker):
-    """One robot's network: the process that impairs it, whose end cuts all connections. ``name`` is for messages.
+class NamespaceNetwork(Worker):
+    """One robot's network: the process that holds its namespaces, whose end cuts all connections.
 
-    Several may be open at the same time, independent. Raises UnavailableError if the process cannot make one.
+    Several may be open at the same time, independent; ``name`` is for messages. Raises UnavailableError if the process
+    cannot make one.
     """
-
-    kind: str  # "namespaces" or "proxy"
-    broker_host: str  # the address on which the broker must listen
 
     def __init__(self, name: str = "") -> None:
         self._file = os.fdopen(os.memfd_create("link"))  # unnamed: nothing is left behind if we are killed
-        command, log = python("pebble.bench.impair.forwarder", self.kind), Path(f"/proc/self/fd/{self._file.fileno()}")
+        command, log = python("pebble.bench.impair.network"), Path(f"/proc/self/fd/{self._file.fileno()}")
         super().__init__(f"network {name}".strip(), command, log)
         try:
-            self.set_up(self.answer(_ANSWER_S))
+            spaces = self.answer(_ANSWER_S)
+            if "unavailable" in spaces:
+                raise UnavailableError(spaces["unavailable"])
+            robot, remote = (f"/proc/{self.pid}/fd/{spaces[side]}" for side in ("robot", "remote"))
+            self._robot, self._remote = _Side(robot, ROBOT_HOST, REMOTE_HOST), _Side(remote, REMOTE_HOST, ROBOT_HOST)
+            self._robot.batch("ip", f"link add {_WIRE} type veth peer name {_WIRE} netns {remote}")
+            self._robot.set_up()
+            self._remote.set_up()
         except BaseException:
             self.close()
             raise
 
-    def set_up(self, answer: dict[str, Any]) -> None:
-        """What is left to do after the first answer of the process."""
-
-    def broker_address(self, port: int) -> tuple[str, int]:
-        """The robot's address for a broker that listens on ``broker_host:port``."""
-        return self.broker_host, port
-
     def on_robot(self, command: Sequence[str]) -> list[str]:
         """Wraps a command so that it runs on the robot's side. The process is replaced: pid and signals stay."""
-        return list(command)
+        return self._robot.inside(command)
 
     def on_remote(self, command: Sequence[str]) -> list[str]:
         """Wraps a command so that it runs on the broker's side."""
-        return list(command)
+        return self._remote.inside(command)
 
     def apply(self, condition: Condition) -> None:
         """Applies a condition. Connections stay; the condition's time starts at 0."""
-        self.request(msgspec.json.encode(condition).decode())
+        self._request(msgspec.json.encode(condition).decode())
+        device = _TIMED if condition.up.timed or condition.down.timed else _WIRE
+        self._robot.apply(condition.up.kbit, condition.down.loss, device)
+        self._remote.apply(condition.down.kbit, condition.up.loss, device)
 
     def traffic(self) -> Traffic:
-        return msgspec.convert(self.request("count"), Traffic)
+        """The kernel counts, and the process what it dropped itself."""
+        dropped = self._request("")["dropped_up"] + self._remote.lost()
+        sent_bytes, sent_packets, queue_dropped = self._robot.sent()
+        return Traffic(sent_bytes, sent_packets, dropped + queue_dropped)
 
-    def request(self, line: str) -> dict[str, Any]:
+    def _request(self, line: str) -> dict[str, Any]:
         """Sends a line and returns the answer. A timeout ends the process: its late answer would be misread."""
         if self.ended:
             raise PebbleError(f"{self.name} is closed")
@@ -126,49 +153,6 @@ class ImpairedNetwork(Worker):
         self.close()
 
 
-class ProxyNetwork(ImpairedNetwork):
-    """A TCP proxy on loopback, which models loss as delay; only connections through `broker_address` are impaired."""
-
-    kind = "proxy"
-    broker_host = "127.0.0.1"
-
-    def broker_address(self, port: int) -> tuple[str, int]:
-        return self.broker_host, int(self.request(f"listen {port}")["port"])
-
-
-class NamespaceNetwork(ImpairedNetwork):
-    """Of two namespaces, which its process holds."""
-
-    kind = "namespaces"
-    broker_host = REMOTE_HOST
-
-    def set_up(self, answer: dict[str, Any]) -> None:
-        if "unavailable" in answer:
-            raise UnavailableError(answer["unavailable"])
-        robot, remote = (f"/proc/{self.pid}/fd/{answer[side]}" for side in ("robot", "remote"))
-        self._robot, self._remote = _Side(robot, ROBOT_HOST, REMOTE_HOST), _Side(remote, REMOTE_HOST, ROBOT_HOST)
-        self._robot.batch("ip", f"link add {_WIRE} type veth peer name {_WIRE} netns {remote}")
-        self._robot.set_up()
-        self._remote.set_up()
-
-    def on_robot(self, command: Sequence[str]) -> list[str]:
-        return self._robot.inside(command)
-
-    def on_remote(self, command: Sequence[str]) -> list[str]:
-        return self._remote.inside(command)
-
-    def apply(self, condition: Condition) -> None:
-        super().apply(condition)
-        device = TIMED if condition.up.timed or condition.down.timed else _WIRE
-        self._robot.apply(condition.up.kbit, condition.down.loss, device)
-        self._remote.apply(condition.down.kbit, condition.up.loss, device)
-
-    def traffic(self) -> Traffic:
-        """The kernel counts, and the process what it dropped itself."""
-        sent_bytes, sent_packets, dropped = self._robot.sent()
-        return Traffic(sent_bytes, sent_packets, dropped + self._remote.lost() + super().traffic().dropped_up)
-
-
 class _Side:
     """One of the namespaces, configured with the system's tools."""
 
@@ -180,7 +164,7 @@ class _Side:
 
     def set_up(self) -> None:
         self.batch("ip", "link set lo up", f"address add {self._address}/{_PREFIX} dev {_WIRE}")
-        for device in (_WIRE, TIMED):
+        for device in (_WIRE, _TIMED):
             self.batch(
                 "ip",
                 f"link set {device} mtu {_MTU} addrgenmode none",  # no IPv6 traffic of its own
@@ -192,7 +176,7 @@ class _Side:
 
     def apply(self, kbit: float | None, loss: float, device: str) -> None:
         """Limits the rate of outgoing packets, and drops a share of incoming ones, on both devices; one is in use."""
-        self.batch("tc", *(f"qdisc replace dev {one} root {_queue(kbit, one)}" for one in (_WIRE, TIMED)))
+        self.batch("tc", *(f"qdisc replace dev {one} root {_queue(kbit, one)}" for one in (_WIRE, _TIMED)))
         rule = f'iifname != "lo" numgen random mod 10000 < {round(loss * 10000)} counter name lost drop'
         add = f"add rule ip impair arriving {rule}\n" if loss else ""
         self._run("nft", "-f", "-", stdin=f"flush chain ip impair arriving\n{add}")
@@ -201,7 +185,7 @@ class _Side:
     def sent(self) -> tuple[int, int, int]:
         """Bytes and packets sent by both devices, as on a wire, and the packets dropped by their queues."""
         links = {one["ifname"]: one["stats64"]["tx"] for one in json.loads(self._run("ip", "-s", "-j", "link"))}
-        wire, timed = links[_WIRE], links[TIMED]
+        wire, timed = links[_WIRE], links[_TIMED]
         sent_bytes = wire["bytes"] + timed["bytes"] + timed["packets"] * _ETHERNET
         queues = json.loads(self._run("tc", "-s", "-j", "qdisc", "show"))
         return sent_bytes, wire["packets"] + timed["packets"], sum(queue["drops"] for queue in queues)
@@ -246,14 +230,9 @@ def _program(name: str) -> str:
     return found
 
 
-def open_network(kind: str, name: str = "") -> ImpairedNetwork:
-    """Raises PebbleError if this kind is unavailable."""
-    return NamespaceNetwork(name) if kind == "namespaces" else ProxyNetwork(name)
-
-
 @cache
 def why_no_namespaces() -> str | None:
-    """What prevents networks of kind ``namespaces``; None: nothing. Tested with every feature a condition may use.
+    """What prevents such networks; None: nothing. Tested with every feature a condition may use.
 
     Raises PebbleError if namespaces are permitted, but fail.
     """
@@ -265,5 +244,96 @@ def why_no_namespaces() -> str | None:
     except UnavailableError as error:
         return str(error)
     except PebbleError as error:
-        raise PebbleError(f"network namespaces do not work here: {error}; or choose the proxy") from None
+        raise PebbleError(f"network namespaces do not work here: {error}") from None
     return None
+
+
+# -- its process
+
+
+class Packets:
+    """Packets in flight from one device to the other, in order."""
+
+    def __init__(self, source: int, sink: int, seed: str) -> None:
+        self._source, self._sink, self._seed = source, sink, seed
+        self._in_flight: deque[tuple[float, bytes]] = deque()
+        self.dropped = 0
+        self.apply(Shape())
+
+    def apply(self, shape: Shape) -> None:
+        self._began, self._schedule = time.monotonic(), Schedule(shape, self._seed)
+
+    @property
+    def due(self) -> float:
+        return self._in_flight[0][0] if self._in_flight else math.inf
+
+    def take(self) -> None:
+        """Reads the packets available at the source."""
+        with suppress(BlockingIOError):
+            for _ in range(_AT_ONCE):
+                self._send(os.read(self._source, _PACKET))
+
+    def deliver(self) -> None:
+        """Writes the packets that are due."""
+        now = time.monotonic()
+        while self.due <= now:
+            try:
+                os.write(self._sink, self._in_flight.popleft()[1])
+            except OSError:  # the kernel's queue is full: the packet is lost
+                self.dropped += 1
+
+    def _send(self, packet: bytes) -> None:
+        arrival = self._schedule.arrival(time.monotonic() - self._began)
+        if arrival is None or len(self._in_flight) >= _ROOM:
+            self.dropped += 1
+            return
+        last = self._in_flight[-1][0] if self._in_flight else 0.0
+        self._in_flight.append((max(last, self._began + arrival), packet))
+
+
+def main() -> int:
+    with suppress(PermissionError):
+        os.setpriority(os.PRIO_PROCESS, 0, _NICE)
+        if not _TUN.exists():  # containers often lack it
+            _TUN.parent.mkdir(exist_ok=True)
+            os.mknod(_TUN, stat.S_IFCHR | 0o600, os.makedev(10, 200))
+    try:
+        (robot, robot_tun), (remote, remote_tun) = _namespace(), _namespace()
+    except OSError as error:
+        why = f"{error.filename or 'new namespaces'}: {error.strerror}"
+        answer({"unavailable": f"{why}: run it as root, or in `unshare --map-root-user`"})
+        return 1
+    answer({"robot": robot, "remote": remote})
+    up, down = Packets(robot_tun, remote_tun, "up"), Packets(remote_tun, robot_tun, "down")
+    sources, requests = {robot_tun: up, remote_tun: down}, sys.stdin.fileno()
+    while True:
+        due = min(up.due, down.due)
+        idle_s = None if due == math.inf else max(0.0, due - time.monotonic())
+        ready, _, _ = select.select([requests, *sources], [], [], idle_s)
+        for source in sources.keys() & ready:
+            sources[source].take()
+        up.deliver()
+        down.deliver()
+        if requests in ready:  # each waits for the answer to the one before
+            if not (line := sys.stdin.buffer.readline()):
+                return 0
+            if line.strip():
+                condition = msgspec.json.decode(line, type=Condition)
+                up.apply(condition.up)
+                down.apply(condition.down)
+            answer({"dropped_up": up.dropped})
+
+
+def _namespace() -> tuple[int, int]:
+    """Enters a new network namespace with a TUN device in it; returns the descriptors of both. Raises OSError."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.unshare(_CLONE_NEWNET):
+        raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
+    tun = os.open(_TUN, os.O_RDWR | os.O_NONBLOCK)  # of the namespace it is opened in
+    fcntl.ioctl(tun, _TUNSETIFF, struct.pack("16sH22x", _TIMED.encode(), _IFF_TUN | _IFF_NO_PI))
+    return os.open("/proc/thread-self/ns/net", os.O_RDONLY), tun
+
+
+if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    sys.exit(main())

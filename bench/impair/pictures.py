@@ -15,7 +15,7 @@ from matplotlib.lines import Line2D
 
 from pebble.bench import paper
 from pebble.bench.aims import single, with_lost
-from pebble.bench.impair.report import arrived
+from pebble.bench.impair.trials import arrived
 from pebble.bench.plots import Picture, Style, around, finite, guide, legend, log_axis, panels, short, styles, unique
 from pebble.bench.results import OVER_TIME, Cell, Results, grouped
 
@@ -88,10 +88,9 @@ def over_trials(results: Results) -> list[Picture]:
     cells = [cell for cell in results.cells if "trial" in cell.params]
     if not cells:
         return []
-    run = "; windows of {window_s:g} s, over {link_words}".format_map(
-        {"window_s": 0.0, "link_words": "", **results.options}
-    )
-    run += ". “original”: this program with the original's encodings"
+    options = results.options
+    run = f"; windows of {options.get('window_s', 0):g} s, over {options.get('link_words')}. “original”: this program "
+    run += "with the original's encodings"
     return [
         Picture(f"{results.bench}-{name}", caption + run, partial(_trials, cells, caption + run, height, shown))
         for name, (caption, height, shown) in _OVER_TRIALS.items()

@@ -24,10 +24,9 @@ from rich.text import Text
 from pebble.bench.engine import check_folder
 from pebble.bench.results import named
 from pebble.client.connection import Target, connected, resolve
-from pebble.client.names import ANY_ROBOT, id_of
+from pebble.client.names import id_of
 from pebble.client.viewer import Medium, Viewer
-from pebble.contract import AUDIO, CAMERA, ONLINE
-from pebble.contract.identity import parse_topic
+from pebble.contract import AUDIO, CAMERA
 from pebble.errors import PebbleError
 from pebble.recordings.files.reader import RecordingError
 from pebble.recordings.library import FOREVER_NS
@@ -38,18 +37,16 @@ from pebble.recordings.traffic.duck import require_packages
 from pebble.recordings.traffic.report import remarks as remarks_of
 from pebble.recordings.traffic.results import FAMILIES, Traffic
 from pebble.recordings.traffic.sources import sources
-from pebble.transports import Message, QoS, Transport
 
 NAME: Final = "impair.json"
 _LABEL: Final = re.compile(r"(?!\d+$)[A-Za-z0-9][A-Za-z0-9._+%-]{0,63}")  # a recorder's own folders are digits
-_HEARTBEAT_S: Final = 5.0
 _CAPABILITIES_S: Final = 5.0
 _FIRST_S: Final = 15.0  # a camera that is off takes a moment to open
 _TURN_S: Final = 0.1
 _MEDIA: Final[tuple[Medium, ...]] = ("video", "audio")
 
 
-class Measurement(msgspec.Struct, kw_only=True):
+class Measurement(msgspec.Struct):
     """What was measured, beside its recordings; times in nanoseconds since 1970."""
 
     robot: str  # its base topic
@@ -57,7 +54,7 @@ class Measurement(msgspec.Struct, kw_only=True):
     until_ns: int = FOREVER_NS  # unless it was completed
 
     def save(self, folder: Path) -> None:
-        (folder / NAME).write_bytes(msgspec.json.format(msgspec.json.encode(self)) + b"\n")
+        (folder / NAME).write_bytes(msgspec.json.encode(self))
 
 
 class Plan(msgspec.Struct, frozen=True, kw_only=True):
@@ -82,16 +79,13 @@ def measure(plan: Plan, progress: Callable[[str], None]) -> float:
     withdrawn.
     """
     _check(plan)
-    with connected(plan.target) as (transport, names):
-        progress(f"waiting for a heartbeat of {id_of(names.base)}")
-        _require_heartbeat(transport, names.base)
-        with closing(Viewer(transport, names.base, None)) as viewer:
-            if plan.media:
-                viewer.wait_for_capabilities(_CAPABILITIES_S)
-            with named(plan.folder):
-                shutil.rmtree(plan.folder, ignore_errors=not plan.folder.exists())
-            check_folder(plan.folder)
-            return _record(plan, viewer, progress)
+    with connected(plan.target) as (transport, names), closing(Viewer(transport, names.base, None)) as viewer:
+        if plan.media:
+            viewer.wait_for_capabilities(_CAPABILITIES_S)
+        with named(plan.folder):
+            shutil.rmtree(plan.folder, ignore_errors=not plan.folder.exists())
+        check_folder(plan.folder)
+        return _record(plan, viewer, progress)
 
 
 def _check(plan: Plan) -> None:
@@ -102,25 +96,6 @@ def _check(plan: Plan) -> None:
         raise PebbleError(f"{plan.folder} exists: add --replace to measure it again, or use another --label")
     if plan.folder.exists() and not (plan.folder / NAME).is_file():
         raise PebbleError(f"{plan.folder} is no measurement, so it is not replaced: use another --label or --into")
-
-
-def _require_heartbeat(transport: Transport, base: str) -> None:
-    """Waits for a heartbeat of the robot. Raises PebbleError that names the robots that were received instead."""
-    received: set[str] = set()
-
-    def on_heartbeat(message: Message) -> None:
-        address = parse_topic(message.topic)
-        if address is not None and not message.retain:  # a retained heartbeat may be old
-            received.add(address.identity.base)
-
-    with closing(transport.subscribe(ONLINE.filter(ANY_ROBOT), on_heartbeat, qos=QoS.LATEST, direct=True)):
-        end = time.monotonic() + _HEARTBEAT_S
-        while base not in received and time.monotonic() < end:
-            time.sleep(_TURN_S)
-    if base not in received:
-        others = ", ".join(sorted(map(id_of, received)))
-        instead = f"received instead: {others}" if others else "nor of any other robot"
-        raise PebbleError(f"no heartbeat of {id_of(base)} came within {_HEARTBEAT_S:g} s; {instead}")
 
 
 class _Recorder(Recorder):
@@ -164,7 +139,7 @@ def _record(plan: Plan, viewer: Viewer, progress: Callable[[str], None]) -> floa
         recorder.start()
         stack.callback(recorder.stop)
         stack.enter_context(closing(source)).start()
-        measurement = Measurement(robot=viewer.base, since_ns=recorder.clock.now())
+        measurement = Measurement(viewer.base, recorder.clock.now())
         measurement.save(plan.folder)
         with suppress(KeyboardInterrupt):  # what was measured until then is the measurement
             for medium in _MEDIA if plan.media else ():
@@ -188,7 +163,7 @@ def compared(into: Path) -> tuple[Table, list[str]]:
     Rows are the figures of the paper, columns the labels; a row that would be empty is left out.
     """
     require_packages("duckdb", "zstandard")
-    found = {path.parent: _load(path) for path in into.glob(f"*/{NAME}")}
+    found = {path.parent: msgspec.json.decode(path.read_bytes(), type=Measurement) for path in into.glob(f"*/{NAME}")}
     if not found:
         raise PebbleError(f"{into}: there is no measurement of a real robot: see pebble impair --help")
     table, notes, columns = Table("", box=box.SIMPLE_HEAD), list[str](), list[dict[str, str]]()
@@ -202,21 +177,12 @@ def compared(into: Path) -> tuple[Table, list[str]]:
     return table, notes
 
 
-def _load(path: Path) -> Measurement:
-    try:
-        with named(path):
-            return msgspec.json.decode(path.read_bytes(), type=Measurement)
-    except msgspec.DecodeError as error:
-        raise PebbleError(f"{path}: {error}") from None
-
-
 def _analysed(folder: Path, one: Measurement) -> tuple[dict[str, str], list[str]]:
-    about = {"robot": id_of(one.robot)}
-    with tempfile.TemporaryDirectory(prefix="pebble-impair-") as name:
-        scratch = Path(name)
+    """The rows of the table, and remarks."""
+    about, times = {"robot": id_of(one.robot)}, {"since_ns": one.since_ns, "until_ns": one.until_ns}
+    with tempfile.TemporaryDirectory(prefix="pebble-impair-") as scratch:
         try:
-            found = sources([folder], scratch, robots=[one.robot], since_ns=one.since_ns, until_ns=one.until_ns)
-            traffic = analyse(found, scratch, since_ns=one.since_ns, until_ns=one.until_ns)
+            traffic = analyse(sources([folder], Path(scratch), robots=[one.robot], **times), Path(scratch), **times)
         except RecordingError as error:  # no message arrived
             return about, [str(error)]
     until_ns = traffic.until_ns if one.until_ns == FOREVER_NS else one.until_ns  # the program was killed

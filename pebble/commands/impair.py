@@ -42,7 +42,7 @@ def impair(
 
     Simulated robots on MQTT and on Zenoh, with the original's encodings and with H.264 and Opus, each with its own
     network to its broker. In each trial the network has a low rate, loses packets, or both; an operator drives the
-    robot and receives its video and audio. Needs mosquitto; without root, a proxy replaces network namespaces.
+    robot and receives its video and audio. Needs mosquitto and network namespaces, so usually root.
 
     With --robot, a real robot behind a network that you limit yourself: it is recorded while its pictures and sound
     are requested, it is never driven, and a table shows all labels side by side. Needs the extra "archive".
@@ -50,7 +50,7 @@ def impair(
     \b
         pebble impair --quick
         pebble impair --trials base-start,256k,64k+5%
-        pebble impair --link proxy --subjects "mqtt h264 opus"
+        pebble impair --subjects "mqtt h264 opus"
         pebble impair --robot goob --url mqtt://192.168.1.2 --label 512k
         pebble impair --compare
     """

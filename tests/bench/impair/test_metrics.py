@@ -24,7 +24,7 @@ from pebble.bench.impair.metrics import (
     over_time,
 )
 from pebble.bench.impair.network import Traffic
-from pebble.bench.impair.trials import IMPAIR, NAMES, QUICK, SUBJECTS, ImpairedRobot, conditions, groups
+from pebble.bench.impair.trials import IMPAIR, QUICK, SUBJECTS, ImpairedRobot, conditions, groups
 from pebble.bench.results import Cell
 from pebble.errors import PebbleError
 from pebble.simulation.loudspeaker import Playback
@@ -244,8 +244,6 @@ def test_a_clip_is_timed_from_its_command_to_its_first_sample() -> None:
     found = cells_of([trial(), never], fps=10)
     (silent,) = (cell for cell in found if cell.measure == metrics.CLIP and cell.params["trial"] == "64k")
     assert (silent.samples, silent.lost) == ([], 1)
-    line = "Clips that the loudspeaker played when commanded: zenoh h264 opus 1 of 2 (p50 70.0 ms, longest 70.0 ms)."
-    assert line in lines_of(found)
 
 
 def test_a_trial_in_which_nothing_arrived_has_metrics_too() -> None:
@@ -307,7 +305,7 @@ def test_transports_are_compared_where_both_were_tried() -> None:
 
 
 def test_the_tables_fit_a_terminal() -> None:
-    tried = [trial(name, condition) for condition in ("wifi-power-save", "64k+5%") for name in NAMES]
+    tried = [trial(name, condition) for condition in ("wifi-power-save", "64k+5%") for name in SUBJECTS]
     console = Console(file=io.StringIO(), width=80)
     shown = IMPAIR.shown(cells_of(tried, fps=10))
     assert len(shown) == 4
@@ -325,7 +323,6 @@ def test_the_tables_fit_a_terminal() -> None:
         {"trials": ["512"]},
         {"variants": ["pigeon"]},
         {"variants": []},
-        {"link": "string"},
         {"window_s": 0.1},
         {"window_s": math.nan},
     ],
@@ -338,16 +335,19 @@ def test_invalid_options_are_refused_before_anything_starts(given: dict[str, Any
 def test_a_full_run_groups_transports_and_a_quick_one_all_subjects() -> None:
     full, quick = IMPAIR.run_of(), IMPAIR.run_of(quick=True)
     robots = [cast(ImpairedRobot, SimpleNamespace(subject=subject)) for subject in SUBJECTS]
-    assert [[one.subject.name for one in group] for group in groups(full, robots)] == [list(NAMES[:2]), list(NAMES[2:])]
+    assert [[one.subject for one in group] for group in groups(full, robots)] == [
+        SUBJECTS[:2],
+        SUBJECTS[2:],
+    ]
     assert [len(group) for group in groups(quick, robots)] == [4]
     assert tuple(condition.name for condition in conditions(quick)) == QUICK
     assert len(conditions(full)) == 16
 
 
 def test_the_command_line_repeats_the_run() -> None:
-    assert IMPAIR.run_of().command == ["pebble", "impair", "--link", "auto", "--window", "8"]
-    run = IMPAIR.run_of(trials=["256k", "1%"], variants=[NAMES[3]], link="proxy", quick=True)
+    assert IMPAIR.run_of().command == ["pebble", "impair", "--window", "8"]
+    run = IMPAIR.run_of(trials=["256k", "1%"], variants=[SUBJECTS[3]], quick=True)
     assert run.command == [
         *("pebble", "impair", "--trials", "256k,1%", "--subjects", "zenoh h264 opus"),
-        *("--link", "proxy", "--window", "4", "--quick"),
+        *("--window", "4", "--quick"),
     ]

@@ -9,7 +9,7 @@ import pytest
 
 from pebble.bench.impair import network as networks
 from pebble.bench.impair.conditions import Condition, Shape
-from pebble.bench.impair.network import open_network
+from pebble.bench.impair.network import NamespaceNetwork
 from pebble.errors import PebbleError
 from tests.bench.impair.peers import ProbeConnection, largest_packet
 from tests.support import ROOT, until
@@ -22,7 +22,7 @@ _BAND = range(50, 151)  # of 100 on average; five standard deviations
 
 @pytest.mark.parametrize("delay_ms", [0, 1], ids=["wire", "timed"])
 def test_loss_drops_the_configured_share_of_packets(delay_ms: int, tmp_path: Path) -> None:
-    with open_network("namespaces") as network, ProbeConnection(network, tmp_path) as talk:
+    with NamespaceNetwork() as network, ProbeConnection(network, tmp_path) as talk:
         before = network.traffic()
         network.apply(Condition("5%", Shape(loss=0.05, delay_ms=delay_ms)))
         talk.send_datagrams(_SENT)
@@ -35,7 +35,7 @@ def test_loss_drops_the_configured_share_of_packets(delay_ms: int, tmp_path: Pat
 
 
 def test_loss_of_the_downlink_is_on_the_robots_side(tmp_path: Path) -> None:
-    with open_network("namespaces") as network, ProbeConnection(network, tmp_path) as talk:
+    with NamespaceNetwork() as network, ProbeConnection(network, tmp_path) as talk:
         network.apply(Condition("down", Shape(), Shape(loss=0.2)))
         talk.down(100_000)
         counter = network.on_robot(["nft", "-j", "list", "counter", "ip", "impair", "lost"])
@@ -44,7 +44,7 @@ def test_loss_of_the_downlink_is_on_the_robots_side(tmp_path: Path) -> None:
 
 
 def test_a_full_queue_drops(tmp_path: Path) -> None:
-    with open_network("namespaces") as network, ProbeConnection(network, tmp_path) as talk:
+    with NamespaceNetwork() as network, ProbeConnection(network, tmp_path) as talk:
         network.apply(Condition("64k", Shape(kbit=64)))
         talk.send_datagrams(400)
         assert 50 < network.traffic().dropped_up <= 400
@@ -53,7 +53,7 @@ def test_a_full_queue_drops(tmp_path: Path) -> None:
 @pytest.mark.parametrize("kbit", [None, 4000])
 def test_no_packet_is_larger_than_on_a_wire(kbit: float | None, tmp_path: Path) -> None:
     with (
-        open_network("namespaces") as network,
+        NamespaceNetwork() as network,
         ProbeConnection(network, tmp_path) as talk,
         largest_packet(network, tmp_path) as largest,
     ):
@@ -64,7 +64,7 @@ def test_no_packet_is_larger_than_on_a_wire(kbit: float | None, tmp_path: Path) 
 
 
 def test_the_namespaces_have_no_other_connection() -> None:
-    with open_network("namespaces") as network:
+    with NamespaceNetwork() as network:
         for command in (network.on_robot, network.on_remote):
             shown = subprocess.check_output(command(["cat", "/proc/net/dev"]), text=True)
             devices = {line.split(":")[0].strip() for line in shown.splitlines()[2:]}
@@ -77,14 +77,14 @@ def test_a_missing_program_is_named_with_its_package(monkeypatch: pytest.MonkeyP
     assert networks.why_no_namespaces.__wrapped__() == "ip is not installed: apt-get install iproute2"
 
 
-def test_namespaces_that_fail_are_an_error_and_not_replaced_by_a_proxy(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_namespaces_that_fail_are_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(networks, "_TABLE", "nonsense")
     with pytest.raises(PebbleError, match="namespaces do not work here: nft -f -: "):
         networks.why_no_namespaces.__wrapped__()
 
 
 def test_a_user_without_permission_gets_the_reason() -> None:
-    forwarder = [sys.executable, "-m", "pebble.bench.impair.forwarder", "namespaces"]
+    forwarder = [sys.executable, "-m", "pebble.bench.impair.network"]
     uid = ["setpriv", "--bounding-set=-all", "--inh-caps=-all", "--", *forwarder]
     printed = json.loads(subprocess.run(uid, stdin=subprocess.DEVNULL, capture_output=True, check=False).stdout)
     assert "not permitted: run it as root" in printed["unavailable"]
