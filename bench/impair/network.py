@@ -75,7 +75,6 @@ class Traffic:
     """
 
     bytes_up: int = 0
-    packets_up: int = 0
     dropped_up: int = 0
 
 
@@ -124,9 +123,8 @@ class NamespaceNetwork(Worker):
 
     def traffic(self) -> Traffic:
         """The kernel counts, and the process what it dropped itself."""
-        dropped = self._request("")["dropped_up"] + self._remote.lost()
-        sent_bytes, sent_packets, queue_dropped = self._robot.sent()
-        return Traffic(sent_bytes, sent_packets, dropped + queue_dropped)
+        dropped = self._request("")["dropped_up"] + self._robot.dropped() + self._remote.lost()
+        return Traffic(self._robot.sent_bytes(), dropped)
 
     def _request(self, line: str) -> dict[str, Any]:
         """Sends a line and returns the answer. A timeout ends the process: its late answer would be misread."""
@@ -182,13 +180,14 @@ class _Side:
         self._run("nft", "-f", "-", stdin=f"flush chain ip impair arriving\n{add}")
         self.batch("ip", f"route replace {self._peer}/32 dev {device} src {self._address}")
 
-    def sent(self) -> tuple[int, int, int]:
-        """Bytes and packets sent by both devices, as on a wire, and the packets dropped by their queues."""
+    def sent_bytes(self) -> int:
+        """Sent by both devices, as on a wire."""
         links = {one["ifname"]: one["stats64"]["tx"] for one in json.loads(self._run("ip", "-s", "-j", "link"))}
-        wire, timed = links[_WIRE], links[_TIMED]
-        sent_bytes = wire["bytes"] + timed["bytes"] + timed["packets"] * _ETHERNET
-        queues = json.loads(self._run("tc", "-s", "-j", "qdisc", "show"))
-        return sent_bytes, wire["packets"] + timed["packets"], sum(queue["drops"] for queue in queues)
+        return int(links[_WIRE]["bytes"] + links[_TIMED]["bytes"] + links[_TIMED]["packets"] * _ETHERNET)
+
+    def dropped(self) -> int:
+        """Packets dropped by the queues."""
+        return sum(queue["drops"] for queue in json.loads(self._run("tc", "-s", "-j", "qdisc", "show")))
 
     def lost(self) -> int:
         listed = json.loads(self._run("nft", "-j", "list", "counter", "ip", "impair", "lost"))["nftables"]

@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 import shutil
 import tempfile
+import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, closing, suppress
@@ -26,7 +27,7 @@ from pebble.bench.results import named
 from pebble.client.connection import Target, connected, resolve
 from pebble.client.names import id_of
 from pebble.client.viewer import Medium, Viewer
-from pebble.contract import AUDIO, CAMERA
+from pebble.contract import AUDIO, CAMERA, ONLINE
 from pebble.errors import PebbleError
 from pebble.recordings.files.reader import RecordingError
 from pebble.recordings.library import FOREVER_NS
@@ -37,9 +38,11 @@ from pebble.recordings.traffic.duck import require_packages
 from pebble.recordings.traffic.report import remarks as remarks_of
 from pebble.recordings.traffic.results import FAMILIES, Traffic
 from pebble.recordings.traffic.sources import sources
+from pebble.transports import Message, QoS, Transport
 
 NAME: Final = "impair.json"
 _LABEL: Final = re.compile(r"(?!\d+$)[A-Za-z0-9][A-Za-z0-9._+%-]{0,63}")  # a recorder's own folders are digits
+_HEARTBEAT_S: Final = 5.0
 _CAPABILITIES_S: Final = 5.0
 _FIRST_S: Final = 15.0  # a camera that is off takes a moment to open
 _TURN_S: Final = 0.1
@@ -80,6 +83,7 @@ def measure(plan: Plan, progress: Callable[[str], None]) -> float:
     """
     _check(plan)
     with connected(plan.target) as (transport, names), closing(Viewer(transport, names.base, None)) as viewer:
+        _wait_for_heartbeat(transport, names.base)
         if plan.media:
             viewer.wait_for_capabilities(_CAPABILITIES_S)
         with named(plan.folder):
@@ -96,6 +100,19 @@ def _check(plan: Plan) -> None:
         raise PebbleError(f"{plan.folder} exists: add --replace to measure it again, or use another --label")
     if plan.folder.exists() and not (plan.folder / NAME).is_file():
         raise PebbleError(f"{plan.folder} is no measurement, so it is not replaced: use another --label or --into")
+
+
+def _wait_for_heartbeat(transport: Transport, base: str) -> None:
+    """Raises PebbleError without one."""
+    came = threading.Event()
+
+    def on_heartbeat(message: Message) -> None:
+        if not message.retain:  # else it may be old
+            came.set()
+
+    with closing(transport.subscribe(ONLINE.topic(base), on_heartbeat, qos=QoS.LATEST, direct=True)):
+        if not came.wait(_HEARTBEAT_S):
+            raise PebbleError(f"no heartbeat of {id_of(base)} came within {_HEARTBEAT_S:g} s: is this its broker?")
 
 
 class _Recorder(Recorder):

@@ -53,9 +53,7 @@ def test_loss_is_late_to_tcp_but_nothing_is_missing(network: NamespaceNetwork, t
     with ProbeConnection(network, tmp_path) as talk:
         network.apply(Condition("lossy", Shape(loss=0.1)))
         talk.up(200_000)
-        traffic = network.traffic()
-        assert traffic.packets_up > 130
-        assert traffic.dropped_up > 0
+        assert network.traffic().dropped_up > 0
 
 
 def test_what_was_carried_is_counted_with_its_headers(network: NamespaceNetwork, tmp_path: Path) -> None:
@@ -64,7 +62,6 @@ def test_what_was_carried_is_counted_with_its_headers(network: NamespaceNetwork,
         talk.up(100_000)
         after = network.traffic()
     assert 100_000 + 66 * 69 <= after.bytes_up - before.bytes_up < 125_000
-    assert after.packets_up - before.packets_up >= 69
 
 
 def test_conditions_of_every_kind_can_follow_each_other(network: NamespaceNetwork) -> None:

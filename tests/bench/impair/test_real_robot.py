@@ -149,9 +149,9 @@ def test_interrupted_it_withdraws_and_prints_what_was_measured(
     assert float(_rows(out)["measured, s"][0]) < 100
 
 
-def test_a_robot_that_is_not_there(run: Run, robot: PictureRobot, url: str) -> None:
+def test_a_robot_without_heartbeats(run: Run, robot: PictureRobot, url: str) -> None:
     assert run("impair", "--robot", "gobo", "--url", url, "--label", "512k") == 1
-    assert run.err.startswith("pebble: pebble/robots/gobo publishes no capabilities: is the robot up")
+    assert run.err == "pebble: no heartbeat of gobo came within 5 s: is this its broker?\n"
     assert not Path("impair").exists()
 
 
