@@ -90,6 +90,10 @@ class Window(msgspec.Struct, frozen=True):
     def holds(self, ns: int) -> bool:
         return self.began_ns <= ns < self.ended_ns
 
+    def overlap_s(self, began_ns: int, ended_ns: int) -> float:
+        """The part of another window that lies in this one."""
+        return max(0, min(ended_ns, self.ended_ns) - max(began_ns, self.began_ns)) / 1e9
+
 
 class Record(msgspec.Struct, kw_only=True):
     """Everything the operator recorded in one trial."""
@@ -126,8 +130,7 @@ def received(sounds: Iterable[Sound], window: Window) -> list[Sound]:
 
 def overlap_s(sound: Sound, window: Window) -> float:
     """Seconds of the packet that were captured in the window."""
-    began, ended = sound.sent_ns, sound.sent_ns + round(1e9 * sound.seconds)
-    return max(0, min(ended, window.ended_ns) - max(began, window.began_ns)) / 1e9
+    return window.overlap_s(sound.sent_ns, sound.sent_ns + round(1e9 * sound.seconds))
 
 
 def sound_percent(sounds: Iterable[Sound], window: Window, within_s: float = math.inf) -> float:
@@ -188,11 +191,7 @@ def rest_s(commands: Sequence[Command], entries: Iterable[Entry]) -> float:
     driven = Window(commands[0].sent_ns, commands[-1].sent_ns)
     moves = [(entry.ns, entry.motors) for entry in entries if entry.motors is not None]
     spans = pairwise([(driven.began_ns, _STOP), *moves, (driven.ended_ns, _STOP)])
-    return sum(
-        max(0, min(ended, driven.ended_ns) - max(began, driven.began_ns)) / 1e9
-        for (began, motors), (ended, _) in spans
-        if motors == _STOP
-    )
+    return sum((driven.overlap_s(began, ended) for (began, motors), (ended, _) in spans if motors == _STOP), 0.0)
 
 
 # -- cells

@@ -309,7 +309,7 @@ def test_unknown_names_are_an_error_and_no_names_are_all(monkeypatch: pytest.Mon
     monkeypatch.setattr(os, "geteuid", lambda: 0)
     assert chosen([]) == catalogue.reported()
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
-    assert [one.name for one in catalogue.reported() if one not in chosen([])] == ["bridge-profile"]
+    assert [one.name for one in catalogue.reported() if one not in chosen([])] == ["bridge-profile", "impair"]
     with pytest.raises(PebbleError, match=r"there is no nonsense in the report: there are control, "):
         chosen(["nonsense"])
 
