@@ -44,7 +44,7 @@ class MediaSubscriber(MediaReceiver):
 
     def __init__(self, transport: Transport, base: str) -> None:
         self.seen: list[Arrival] = []
-        self.heard: list[Sound] = []
+        self.received: list[Sound] = []
         super().__init__(transport, base)
 
     def on_picture(self, picture: Decoded) -> None:
@@ -53,7 +53,7 @@ class MediaSubscriber(MediaReceiver):
 
     def on_sound(self, received: ReceivedSound) -> None:
         now, seconds = time.monotonic_ns(), len(received.samples) / received.rate
-        self.heard.append(Sound(_monotonic_ns(received.captured_ms), now, seconds, received.sequence))
+        self.received.append(Sound(_monotonic_ns(received.captured_ms), now, seconds, received.sequence))
 
 
 class TrialOperator:
@@ -110,7 +110,7 @@ class TrialOperator:
         self._over_at = time.monotonic()
         return Record(
             commands=list(self._commands), heartbeats=self._heartbeats[first_heartbeat:], pictures=viewed.seen,
-            sounds=listener.heard, windows=self._windows, clip_ns=clip_ns,
+            sounds=listener.received, windows=self._windows, clip_ns=clip_ns,
         )  # fmt: skip
 
     # -- phases
@@ -120,7 +120,7 @@ class TrialOperator:
         subscriber = MediaSubscriber(self._media, self._base)
         subscriber.wait_for_capabilities(_KNOWN_S)
         subscriber.viewer.request(medium, encoding)
-        _wait(lambda: bool(subscriber.seen or subscriber.heard), _FIRST_S, subscriber.poll)
+        _wait(lambda: bool(subscriber.seen or subscriber.received), _FIRST_S, subscriber.poll)
         return closing(subscriber)
 
     def _play_clip(self) -> int:

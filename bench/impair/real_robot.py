@@ -196,14 +196,16 @@ def compared(into: Path) -> tuple[Table, list[str]]:
 
 def _analysed(folder: Path, one: Measurement) -> tuple[dict[str, str], list[str]]:
     """The rows of the table, and remarks."""
-    about, times = {"robot": id_of(one.robot)}, {"since_ns": one.since_ns, "until_ns": one.until_ns}
-    with tempfile.TemporaryDirectory(prefix="pebble-impair-") as scratch:
+    about, since_ns, until_ns = {"robot": id_of(one.robot)}, one.since_ns, one.until_ns
+    with tempfile.TemporaryDirectory(prefix="pebble-impair-") as name:
+        scratch = Path(name)
         try:
-            traffic = analyse(sources([folder], Path(scratch), robots=[one.robot], **times), Path(scratch), **times)
+            found = sources([folder], scratch, robots=[one.robot], since_ns=since_ns, until_ns=until_ns)
+            traffic = analyse(found, scratch, since_ns=since_ns, until_ns=until_ns)
         except RecordingError as error:  # no message arrived
             return about, [str(error)]
-    until_ns = traffic.until_ns if one.until_ns == FOREVER_NS else one.until_ns  # the program was killed
-    return about | _rows(traffic, (until_ns - one.since_ns) / 1e9), remarks_of(traffic)
+    ended_ns = traffic.until_ns if until_ns == FOREVER_NS else until_ns  # forever: the program was killed
+    return about | _rows(traffic, (ended_ns - since_ns) / 1e9), remarks_of(traffic)
 
 
 def _rows(traffic: Traffic, seconds: float) -> dict[str, str]:
