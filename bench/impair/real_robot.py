@@ -86,8 +86,9 @@ def measure(plan: Plan, progress: Callable[[str], None]) -> float:
         _wait_for_heartbeat(transport, names.base)
         if plan.media:
             viewer.wait_for_capabilities(_CAPABILITIES_S)
-        with named(plan.folder):
-            shutil.rmtree(plan.folder, ignore_errors=not plan.folder.exists())
+        if plan.folder.exists():
+            with named(plan.folder):
+                shutil.rmtree(plan.folder)
         check_folder(plan.folder)
         return _record(plan, viewer, progress)
 
