@@ -120,7 +120,7 @@ firmware: .venv/.ready-dev
 # Parts whose packages cannot be installed are left out, and the report says so; only a broker is required.
 report: .venv/.ready-bench
 	@sh tools/debian-packages.sh mosquitto=mosquitto
-	@sh tools/debian-packages.sh ip=iproute2 tc=iproute2 nft=nftables || echo "pebble: without them a proxy impairs the network"
+	@sh tools/debian-packages.sh ip=iproute2 tc=iproute2 nft=nftables || echo "pebble: without them pebble impair fails"
 	@$(VENV) -c "import sys; from pebble.bench.frames import missing; sys.exit(missing('gstreamer-shm') is not None)" || \
 		sh tools/debian-packages.sh =gstreamer1.0-plugins-base =gstreamer1.0-plugins-bad =gir1.2-gst-plugins-base-1.0 \
 		=python3-gst-1.0 =python3-numpy || echo "pebble: continuing without GStreamer"

@@ -1,7 +1,6 @@
 """The network's impairment in each trial: the paper's conditions (chapter 4.2) and two profiles of real networks.
 
-The paper limits the rate of, or drops packets on, the robot's uplink only. Its list has 14 trials; with the profiles
-there are 16:
+The paper limits the rate of, or drops packets on, the robot's uplink only. The profiles impair both directions:
 
 ``starlink``
     A median round trip of 50 ms, 40 to 60 ms between the quartiles (APNIC blog, 28 Nov 2022, measured in Belgium). The
@@ -20,11 +19,8 @@ there are 16:
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from random import Random
-
-from pebble.errors import PebbleError
 
 _JITTER_STEP_S = 0.01  # the jitter is constant for this long: packets sent together arrive together
 
@@ -51,15 +47,6 @@ class Shape:
     handover: Handover | None = None
     beacon_ms: float = 0.0  # packets are held until the next beacon; 0: they are not
 
-    def __post_init__(self) -> None:
-        """Raises PebbleError for an impossible shape."""
-        if self.kbit is not None and not self.kbit > 0:
-            raise PebbleError(f"a network of {self.kbit} kbit/s carries nothing: give a rate above 0, or none")
-        if not 0 <= self.loss < 1:
-            raise PebbleError(f"loss is a share from 0 to below 1, not {self.loss}")
-        if min(self.delay_ms, self.jitter_ms, self.beacon_ms) < 0:
-            raise PebbleError("delay, jitter and beacon interval cannot be negative")
-
     @property
     def timed(self) -> bool:
         """Whether it delays packets, or has gaps."""
@@ -78,21 +65,19 @@ class Condition:
 _SATELLITE = Shape(delay_ms=25, jitter_ms=5, handover=Handover(15, first_s=5, gap_ms=100, extra_ms=25, recovery_s=1))
 _AIR = Shape(delay_ms=2, jitter_ms=1)
 
-_PAPER = {
-    "base-start": Shape(),
-    **{f"{kbit}k": Shape(kbit=kbit) for kbit in (1024, 512, 256, 128, 64)},
-    **{f"{percent}%": Shape(loss=percent / 100) for percent in (1, 2, 5, 10)},
-    **{f"{kbit}k+{percent}%": Shape(kbit=kbit, loss=percent / 100) for kbit, percent in ((256, 1), (128, 2), (64, 5))},
-    "base-end": Shape(),
-}
-_PROFILES = {"starlink": (_SATELLITE, _SATELLITE), "wifi-power-save": (_AIR, replace(_AIR, beacon_ms=102.4))}
-TRIALS = (*_PAPER, *_PROFILES)
-
-
-def chosen(names: Sequence[str] = TRIALS, both_ways: bool = False) -> list[Condition]:
-    """The conditions of these trials, in order. ``both_ways`` shapes the downlink alike, except in the profiles."""
-    shapes = {name: (shape, shape if both_ways else Shape()) for name, shape in _PAPER.items()} | _PROFILES
-    return [Condition(name, *both) for name, both in shapes.items() if name in names]
+#: In the order of a run: those of the paper, then the profiles.
+CONDITIONS = (
+    Condition("base-start"),
+    *(Condition(f"{kbit}k", Shape(kbit=kbit)) for kbit in (1024, 512, 256, 128, 64)),
+    *(Condition(f"{percent}%", Shape(loss=percent / 100)) for percent in (1, 2, 5, 10)),
+    *(
+        Condition(f"{kbit}k+{percent}%", Shape(kbit=kbit, loss=percent / 100))
+        for kbit, percent in ((256, 1), (128, 2), (64, 5))
+    ),
+    Condition("base-end"),
+    Condition("starlink", _SATELLITE, _SATELLITE),
+    Condition("wifi-power-save", _AIR, replace(_AIR, beacon_ms=102.4)),
+)
 
 
 class Schedule:

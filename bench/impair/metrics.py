@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import groupby, pairwise
 
 import msgspec
@@ -33,8 +33,8 @@ _POLL_NS = 10_000_000  # interval at which the operator's page checks the heartb
 _STOP = (0.0, 0.0)
 
 
-class TrialRequest(msgspec.Struct, kw_only=True, tag="trial"):
-    """Requests one trial. An encoding of None leaves the choice to the robot."""
+class Plan(msgspec.Struct, kw_only=True):
+    """What the operator does in each trial. An encoding of None leaves the choice to the robot."""
 
     video: str | None
     audio: str | None
@@ -43,12 +43,7 @@ class TrialRequest(msgspec.Struct, kw_only=True, tag="trial"):
     grace_s: float  # for sound of the window that is still in flight
     off_s: float  # after video was switched off, and after audio was
     clip_s: float  # at most, for a clip to be played to its end
-
-
-class RecoveryRequest(msgspec.Struct, kw_only=True, tag="recover"):
-    """Requests a wait until the last trial is ``quiet_s`` ago, and heartbeats arrive without delay."""
-
-    quiet_s: float
+    quiet_s: float  # between two trials, at least
 
 
 class Command(msgspec.Struct, array_like=True, frozen=True):
@@ -60,7 +55,7 @@ class Command(msgspec.Struct, array_like=True, frozen=True):
 
 
 class Arrival(msgspec.Struct, array_like=True, frozen=True):
-    """What was received; ``sent_ns`` is when it was sent, or its first sample was captured."""
+    """What was received; ``sent_ns`` is when it was sent, or when a picture or the first sample was captured."""
 
     sent_ns: int
     arrived_ns: int
@@ -82,19 +77,11 @@ class Sound(Arrival, array_like=True, frozen=True):
     sequence: int
 
 
-class Picture(msgspec.Struct, array_like=True, frozen=True):
-    """A decoded picture; ``captured_ns`` is None if its message did not contain it."""
-
-    captured_ns: int | None
-    arrived_ns: int
-
-
 class Window(msgspec.Struct, frozen=True):
-    """A measured time window; ``first_s``: from the request to the first picture or sound, if any arrived."""
+    """A measured time window."""
 
     began_ns: int
     ended_ns: int
-    first_s: float | None = None
 
     @property
     def seconds(self) -> float:
@@ -103,12 +90,9 @@ class Window(msgspec.Struct, frozen=True):
     def holds(self, ns: int) -> bool:
         return self.began_ns <= ns < self.ended_ns
 
-
-class ClipCommand(msgspec.Struct, array_like=True, frozen=True):
-    """The command to play a clip; ``playing_ns`` is when the robot's status arrived, None if it did not in time."""
-
-    sent_ns: int
-    playing_ns: int | None = None
+    def overlap_s(self, began_ns: int, ended_ns: int) -> float:
+        """The part of another window that lies in this one."""
+        return max(0, min(ended_ns, self.ended_ns) - max(began_ns, self.began_ns)) / 1e9
 
 
 class Record(msgspec.Struct, kw_only=True):
@@ -116,27 +100,21 @@ class Record(msgspec.Struct, kw_only=True):
 
     commands: list[Command]
     heartbeats: list[Heartbeat]
-    pictures: list[Picture]
+    pictures: list[Arrival]  # that could be decoded
     sounds: list[Sound]
-    alone: Window
-    video: Window
-    audio: Window
-    video_off: Window
-    audio_off: Window
-    clip: ClipCommand
-    payloads: int  # of video that arrived, decoded or not
+    windows: dict[str, Window]  # by phase: "alone", "video", "video off", "audio" and "audio off"
+    clip_ns: int  # when it was commanded
 
     @property
-    def whole(self) -> Window:
+    def driven(self) -> Window:
         """The time in which the robot was driven."""
-        return Window(self.alone.began_ns, self.audio.ended_ns)
+        return Window(self.windows["alone"].began_ns, self.windows["audio"].ended_ns)
 
 
 class OperatorReport(msgspec.Struct, kw_only=True, omit_defaults=True):
-    """A line from the operator; one of the fields is set."""
+    """A line from the operator: one of these, or that what was requested is done."""
 
-    ready: bool = False  # the robot is ready, or has recovered
-    phase: str | None = None  # "alone", "video", "video off", "audio" or "audio off" begins now; "": it ended
+    phase: str | None = None  # begins now; "": it ended
     record: Record | None = None
     problem: str | None = None
 
@@ -152,20 +130,13 @@ def received(sounds: Iterable[Sound], window: Window) -> list[Sound]:
 
 def overlap_s(sound: Sound, window: Window) -> float:
     """Seconds of the packet that were captured in the window."""
-    began, ended = sound.sent_ns, sound.sent_ns + round(1e9 * sound.seconds)
-    return max(0, min(ended, window.ended_ns) - max(began, window.began_ns)) / 1e9
+    return window.overlap_s(sound.sent_ns, sound.sent_ns + round(1e9 * sound.seconds))
 
 
-def sound_percent(sounds: Iterable[Sound], window: Window, within_s: float | None = None) -> float:
-    """Share of the window's sound that arrived, or arrived within that many seconds."""
-    packets = received(sounds, window)
-    arrived_s = [overlap_s(one, window) for one in packets if within_s is None or one.ms <= 1e3 * within_s]
+def sound_percent(sounds: Iterable[Sound], window: Window, within_s: float = math.inf) -> float:
+    """Share of the window's sound that arrived within that many seconds."""
+    arrived_s = [overlap_s(one, window) for one in received(sounds, window) if one.ms <= 1e3 * within_s]
     return min(100.0, 100 * sum(arrived_s) / window.seconds)
-
-
-def sent_packets(sounds: Sequence[Sound], percent: float) -> int | None:
-    """The number of packets sent in the window, estimated from those received; None if none arrived."""
-    return max(len(sounds), round(100 * len(sounds) / percent)) if sounds and percent else None
 
 
 # -- gaps between pictures and heartbeats
@@ -206,31 +177,21 @@ def driven_ms(commands: Sequence[Command], entries: Sequence[Entry]) -> list[tup
     return driven[::-1]
 
 
-def overtaken(commands: Sequence[Command], entries: Sequence[Entry]) -> int:
-    """The number of commands that did not reach the MCU although a newer one did."""
-    arrived = arrivals(entries)
-    reached = [number for number, command in enumerate(commands, 1) if (command.left, command.right) in arrived]
-    return reached[-1] - len(reached) if reached else 0
-
-
 def trips(commands: Sequence[Command], entries: Iterable[Entry]) -> int:
     """How often the robot stopped by itself while being driven."""
     wheels = {(command.left, command.right) for command in commands}
-    drives = [entry for entry in entries if entry.drive is not None and commands and entry.ns <= commands[-1].sent_ns]
-    return sum(a.drive in wheels and b.drive == _STOP for a, b in pairwise(drives))
+    drives = [entry.drive for entry in entries if entry.drive and commands and entry.ns <= commands[-1].sent_ns]
+    return sum(before in wheels and after == _STOP for before, after in pairwise(drives))
 
 
 def rest_s(commands: Sequence[Command], entries: Iterable[Entry]) -> float:
     """Seconds in which the wheels were at rest between the first and the last command."""
     if not commands:
         return 0.0
-    since, ended, rest = commands[0].sent_ns, commands[-1].sent_ns, True
-    rest_ns = 0
-    for entry in (*(entry for entry in entries if entry.motors is not None), Entry(ended, "motors")):
-        now = min(max(entry.ns, since), ended)
-        rest_ns += now - since if rest else 0
-        since, rest = now, entry.motors == _STOP
-    return rest_ns / 1e9
+    driven = Window(commands[0].sent_ns, commands[-1].sent_ns)
+    moves = [(entry.ns, entry.motors) for entry in entries if entry.motors is not None]
+    spans = pairwise([(driven.began_ns, _STOP), *moves, (driven.ended_ns, _STOP)])
+    return sum((driven.overlap_s(began, ended) for (began, motors), (ended, _) in spans if motors == _STOP), 0.0)
 
 
 # -- cells
@@ -252,13 +213,11 @@ class Trial:
         about: dict[str, Value] = {"trial": self.name}
         return Cell(variant=self.subject, params=about, measure=measure, unit=unit, rounds=[samples], figures=figures)
 
-    def wire(self, phase: str, window: Window) -> dict[str, Value]:
-        """What the network carried and dropped in a phase."""
-        before, after = map(asdict, self.traffic[phase])
-        by = {name: after[name] - before[name] for name in after}
-        kbit = {f"kbit_{way}": 8e-3 * by[f"bytes_{way}"] / window.seconds for way in ("up", "down")}
-        counted = {name: by[name] for name in ("bytes_up", "dropped_up", "dropped_down")}
-        return {"window_s": window.seconds, **counted, **kbit}
+    def wire(self, phase: str) -> dict[str, Value]:
+        """What the robot sent in a phase, and what the network dropped of it."""
+        (before, after), seconds = self.traffic[phase], self.record.windows[phase].seconds
+        sent, dropped = after.bytes_up - before.bytes_up, after.dropped_up - before.dropped_up
+        return {"window_s": seconds, "bytes_up": sent, "dropped_up": dropped, "kbit_up": 8e-3 * sent / seconds}
 
 
 def cells_of(trials: Iterable[Trial], fps: float) -> list[Cell]:
@@ -284,65 +243,56 @@ def over_time(trials: Iterable[Trial], began_ns: int) -> list[Cell]:
 
 
 def _sound(trial: Trial) -> Cell:
-    sounds, window = trial.record.sounds, trial.record.audio
-    packets = received(sounds, window)
-    delivered, on_time = sound_percent(sounds, window), sound_percent(sounds, window, ON_TIME_S)
+    sounds, window = trial.record.sounds, trial.record.windows["audio"]
+    packets, delivered = received(sounds, window), sound_percent(sounds, window)
     return trial.cell(
         SOUND, "ms", [packet.ms for packet in packets],
-        delivered_percent=delivered, on_time_percent=on_time, late_percent=delivered - on_time,
-        sent=sent_packets(packets, delivered), first_s=window.first_s, **trial.wire("audio", window),
+        sent=max(len(packets), round(100 * len(packets) / delivered)) if packets else None,  # as far as can be told
+        delivered_percent=delivered, on_time_percent=sound_percent(sounds, window, ON_TIME_S), **trial.wire("audio"),
     )  # fmt: skip
 
 
 def _pictures(trial: Trial, wanted_fps: float) -> Iterator[Cell]:
-    record, window = trial.record, trial.record.video
-    pictures = [picture for picture in record.pictures if window.holds(picture.arrived_ns)]
-    gaps = gaps_s([picture.arrived_ns for picture in pictures], window)
-    fps = len(pictures) / window.seconds
-    latencies = [(one.arrived_ns - one.captured_ns) / 1e6 for one in pictures if one.captured_ns is not None]
+    window = trial.record.windows["video"]
+    pictures = [picture for picture in trial.record.pictures if window.holds(picture.arrived_ns)]
+    gaps, fps = gaps_s([picture.arrived_ns for picture in pictures], window), len(pictures) / window.seconds
     yield trial.cell(
-        PICTURES, "ms", latencies,
+        PICTURES, "ms", [picture.ms for picture in pictures],
         fps=fps, delivered_percent=min(100.0, 100 * fps / wanted_fps),
-        frozen_s=sum((gap for gap in gaps if gap > FROZEN_S), 0.0), longest_gap_s=max(gaps),
-        decoded=len(record.pictures), arrived=record.payloads, first_s=window.first_s, **trial.wire("video", window),
+        frozen_s=sum((gap for gap in gaps if gap > FROZEN_S), 0.0), longest_gap_s=max(gaps), **trial.wire("video"),
     )  # fmt: skip
     yield trial.cell(PICTURE_GAP, "s", gaps)
 
 
 def _heartbeats(trial: Trial) -> Iterator[Cell]:
-    heartbeats, whole = trial.record.heartbeats, trial.record.whole
-    gaps = gaps_s([heartbeat.arrived_ns for heartbeat in heartbeats], whole)
-    offline = offline_s(heartbeats, whole)
+    heartbeats, driven = trial.record.heartbeats, trial.record.driven
+    gaps, offline = gaps_s([one.arrived_ns for one in heartbeats], driven), offline_s(heartbeats, driven)
     longest = {"longest_gap_s": max(gaps), "longest_offline_s": max(offline, default=0.0)}
-    yield trial.cell(HEARTBEAT_GAP, "s", gaps, offline_s=sum(offline, 0.0), window_s=whole.seconds, **longest)
-    delays = [heartbeat.ms for heartbeat in heartbeats if whole.holds(heartbeat.arrived_ns)]
-    yield trial.cell(HEARTBEAT_DELAY, "ms", delays)
+    yield trial.cell(HEARTBEAT_GAP, "s", gaps, window_s=driven.seconds, **longest)
+    yield trial.cell(HEARTBEAT_DELAY, "ms", [one.ms for one in heartbeats if driven.holds(one.arrived_ns)])
 
 
 def _drive(trial: Trial) -> Iterator[Cell]:
     record, commands = trial.record, trial.record.commands
-    driven, late = driven_ms(commands, trial.entries), overtaken(commands, trial.entries)
+    driven, reached = driven_ms(commands, trial.entries), arrivals(trial.entries)
+    own = sum((command.left, command.right) in reached for command in commands)  # the others were overtaken or lost
     yield trial.cell(
         DRIVE, "ms", [ms for _, ms in driven],
-        sent=len(commands), delivered_percent=100 * (len(driven) - late) / len(commands) if commands else None,
-        overtaken=late, trips=trips(commands, trial.entries), rest_s=rest_s(commands, trial.entries),
-        window_s=record.whole.seconds,
+        sent=len(commands), delivered_percent=100 * own / len(commands) if commands else None,
+        trips=trips(commands, trial.entries), rest_s=rest_s(commands, trial.entries), window_s=record.driven.seconds,
     )  # fmt: skip
-    for measure, window in ((DRIVE_ALONE, record.alone), (DRIVE_VIDEO, record.video), (DRIVE_AUDIO, record.audio)):
+    for measure, phase in ((DRIVE_ALONE, "alone"), (DRIVE_VIDEO, "video"), (DRIVE_AUDIO, "audio")):
+        window = record.windows[phase]
         took = [ms for command, ms in driven if window.holds(command.sent_ns)]
-        sent = sum(window.holds(command.sent_ns) for command in commands)
-        wire = trial.wire("alone", window) if measure == DRIVE_ALONE else {"window_s": window.seconds}
-        yield trial.cell(measure, "ms", took, sent=sent, **wire)
+        yield trial.cell(measure, "ms", took, sent=sum(window.holds(command.sent_ns) for command in commands))
 
 
 def _afterwards(trial: Trial) -> Iterator[Cell]:
     """What is sent and received while nothing is requested any more, and the clip."""
-    record, clip = trial.record, trial.record.clip
-    off = ((AFTER_VIDEO, "video off", record.video_off), (AFTER_AUDIO, "audio off", record.audio_off))
-    for measure, phase, window in off:
-        times = [heartbeat.arrived_ns for heartbeat in record.heartbeats if window.holds(heartbeat.arrived_ns)]
-        gaps, wire = gaps_s(times, window), trial.wire(phase, window)
-        yield trial.cell(measure, "s", gaps, heartbeats=len(times), longest_gap_s=max(gaps), **wire)
-    played = [(one.began_ns - clip.sent_ns) / 1e6 for one in trial.playbacks if one.began_ns >= clip.sent_ns]
-    status_ms = None if clip.playing_ns is None else (clip.playing_ns - clip.sent_ns) / 1e6
-    yield trial.cell(CLIP, "ms", sorted(played)[:1], sent=1, status_ms=status_ms)
+    record = trial.record
+    for measure, phase in ((AFTER_VIDEO, "video off"), (AFTER_AUDIO, "audio off")):
+        gaps = gaps_s([heartbeat.arrived_ns for heartbeat in record.heartbeats], record.windows[phase])
+        longest = {"heartbeats": len(gaps) - 1, "longest_gap_s": max(gaps)}
+        yield trial.cell(measure, "s", gaps, **longest, **trial.wire(phase))
+    played = [(one.began_ns - record.clip_ns) / 1e6 for one in trial.playbacks if one.began_ns >= record.clip_ns]
+    yield trial.cell(CLIP, "ms", sorted(played)[:1], sent=1)

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -16,7 +16,7 @@ from matplotlib.lines import Line2D
 
 from pebble.bench import paper
 from pebble.bench.aims import single, with_lost
-from pebble.bench.impair.report import arrived
+from pebble.bench.impair.trials import arrived
 from pebble.bench.plots import Picture, Style, around, finite, guide, legend, log_axis, panels, short, styles, unique
 from pebble.bench.results import OVER_TIME, Cell, Results, grouped
 
@@ -40,7 +40,6 @@ class Panel:
     value: Callable[[Cell], float]  # not drawn if it is infinite
     log: bool = False
     ends: tuple[float, float] | None = None  # of a linear axis; None: from 0 to the largest value
-    least_top: float = 1.0  # of a linear axis from 0
     aim: float | None = None  # drawn as a guide
     aim_text: str = ""
     crosses: Mapping[str, float] = field(default_factory=dict)  # the original's values by trial
@@ -53,7 +52,6 @@ def _drive(what: str) -> Panel:
                  aim=paper.WORST_DRIVE_P95_MS, aim_text=_WORST)  # fmt: skip
 
 
-_FIGURE_4_8: Final = "Latency of the audio that arrived, over the trials, in the form of the paper's Figure 4.8"
 _FRAMES: Final = ("video", "picture")
 #: By name: the caption, the height of a panel in inches, and the panels.
 _OVER_TRIALS: Final[dict[str, tuple[str, float, tuple[Panel, ...]]]] = {
@@ -64,7 +62,8 @@ _OVER_TRIALS: Final[dict[str, tuple[str, float, tuple[Panel, ...]]]] = {
         Panel(label="audio within 1 s, %", measures=("audio",), value=single("on_time_percent"), ends=(-4, 106),
               crosses=_original(lambda one: one.on_time_percent)),
     )),
-    "audio-latency": (_FIGURE_4_8, 3.3, (
+    "audio-latency": (
+        "Latency of the audio that arrived, over the trials, in the form of the paper's Figure 4.8", 3.3, (
         Panel(label="audio latency p50, ms", measures=("audio latency",), value=arrived(50), log=True),
         Panel(label="audio latency p95, ms", measures=("audio latency",), value=arrived(95), log=True,
               crosses=_original(lambda one: one.p95_s, 1000.0), aim=paper.NARROW_SOUND_P95_MS, aim_text=_NARROW),
@@ -79,7 +78,7 @@ _OVER_TRIALS: Final[dict[str, tuple[str, float, tuple[Panel, ...]]]] = {
     "drive": ("Drive commands and heartbeat over the trials (no point: more than 5 % of the commands were lost)", 2.3, (
         _drive("alone"), _drive("during video"), _drive("during audio"),
         Panel(label="robot seen offline,\nlongest, s", measures=("heartbeat",), value=single("longest_offline_s"),
-              least_top=paper.WORST_OFFLINE_S, aim=paper.WORST_OFFLINE_S, aim_text=_WORST),
+              aim=paper.WORST_OFFLINE_S, aim_text=_WORST),
     )),
 }  # fmt: skip
 
@@ -90,9 +89,8 @@ def over_trials(results: Results) -> list[Picture]:
     if not cells:
         return []
     options = results.options
-    window = f"; windows of {options['window_s']:g} s" if "window_s" in options else ""
-    link = f", over {options['link_words']}" if "link_words" in options else ""
-    run = f"{window}{link}. “original”: this program with the original's encodings"
+    run = f"; windows of {options.get('window_s', 0):g} s, over {options.get('link_words')}. “original”: this program "
+    run += "with the original's encodings"
     return [
         Picture(f"{results.bench}-{name}", caption + run, partial(_trials, cells, caption + run, height, shown))
         for name, (caption, height, shown) in _OVER_TRIALS.items()
@@ -109,7 +107,7 @@ def _trials(cells: Sequence[Cell], title: str, height: float, shown: Sequence[Pa
             same = [one for other, found in zip(shown, seen, strict=True) for one in found if other.aim == panel.aim]
             log_axis(axes, "y", panel.label, *around([*(same if panel.aim else values), panel.aim]))
         else:
-            axes.set_ylim(*(panel.ends or (-0.1, 1.15 * max(finite([*values, panel.least_top])))))
+            axes.set_ylim(*(panel.ends or (-0.1, 1.15 * max(finite([*values, panel.aim, 1.0])))))
             axes.set_ylabel(panel.label)
         if panel.aim is not None:
             guide(axes, panel.aim, panel.aim_text)
@@ -167,9 +165,9 @@ def over_time(results: Results) -> list[Picture]:
 
 
 def marks(text: str) -> list[tuple[str, float]]:
-    """Parses ``256k@37.2;512k@60`` into names and seconds; skips invalid parts."""
-    found = ((name, float(second)) for name, second in re.findall(r"([^;@]+)@(\d+(?:\.\d+)?)", text))
-    return sorted(found, key=lambda mark: mark[1])
+    """Parses ``256k@37.2;512k@60`` into names and seconds."""
+    found = (mark.partition("@") for mark in text.split(";") if mark)
+    return [(name, float(second)) for name, _, second in found]
 
 
 def _series(cells: Sequence[Cell], results: Results, title: str) -> Figure:
@@ -187,9 +185,8 @@ def _series(cells: Sequence[Cell], results: Results, title: str) -> Figure:
 
 
 def _bands(axes: Axes, found: Sequence[tuple[str, float]], end: float, *, named: bool) -> None:
-    ends = [second for _, second in found[1:]] + [end]
-    for number, ((name, begin), until) in enumerate(zip(found, ends, strict=False)):
-        axes.axvspan(begin, max(begin, until), color=_BANDS[number % 2], zorder=0)
+    for number, ((name, begin), (_, until)) in enumerate(pairwise([*found, ("", end)])):
+        axes.axvspan(begin, until, color=_BANDS[number % 2], zorder=0)
         axes.axvline(begin, color="#999", linewidth=0.6, zorder=1)
         if named:
             axes.annotate(

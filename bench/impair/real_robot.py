@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 import shutil
 import tempfile
+import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, closing, suppress
@@ -24,10 +25,9 @@ from rich.text import Text
 from pebble.bench.engine import check_folder
 from pebble.bench.results import named
 from pebble.client.connection import Target, connected, resolve
-from pebble.client.names import ANY_ROBOT, id_of
+from pebble.client.names import id_of
 from pebble.client.viewer import Medium, Viewer
 from pebble.contract import AUDIO, CAMERA, ONLINE
-from pebble.contract.identity import parse_topic
 from pebble.errors import PebbleError
 from pebble.recordings.files.reader import RecordingError
 from pebble.recordings.library import FOREVER_NS
@@ -35,8 +35,8 @@ from pebble.recordings.recorder.recorder import Options, Recorder
 from pebble.recordings.recorder.source import Source
 from pebble.recordings.traffic.analysis import analyse
 from pebble.recordings.traffic.duck import require_packages
-from pebble.recordings.traffic.report import remarks
-from pebble.recordings.traffic.results import FAMILIES, Stream, Traffic
+from pebble.recordings.traffic.report import remarks as remarks_of
+from pebble.recordings.traffic.results import FAMILIES, Traffic
 from pebble.recordings.traffic.sources import sources
 from pebble.transports import Message, QoS, Transport
 
@@ -46,11 +46,18 @@ _HEARTBEAT_S: Final = 5.0
 _CAPABILITIES_S: Final = 5.0
 _FIRST_S: Final = 15.0  # a camera that is off takes a moment to open
 _TURN_S: Final = 0.1
-_MOST_NAMES: Final = 8
-_NONE: Final = "–"
 _MEDIA: Final[tuple[Medium, ...]] = ("video", "audio")
 
-Progress = Callable[[str], None]
+
+class Measurement(msgspec.Struct):
+    """What was measured, beside its recordings; times in nanoseconds since 1970."""
+
+    robot: str  # its base topic
+    since_ns: int
+    until_ns: int = FOREVER_NS  # unless it was completed
+
+    def save(self, folder: Path) -> None:
+        (folder / NAME).write_bytes(msgspec.json.encode(self))
 
 
 class Plan(msgspec.Struct, frozen=True, kw_only=True):
@@ -68,44 +75,27 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
         return self.into / self.label
 
 
-class Measurement(msgspec.Struct, kw_only=True):
-    """What was measured, beside its recordings; times in nanoseconds since 1970."""
-
-    label: str
-    robot: str  # its base topic
-    since_ns: int
-    until_ns: int = FOREVER_NS
-    format: int = 1
-
-    def save(self, folder: Path) -> None:
-        (folder / NAME).write_bytes(msgspec.json.format(msgspec.json.encode(self)) + b"\n")
-
-
-def measure(plan: Plan, progress: Progress) -> float:
-    """Record the robot for the plan's time, or until KeyboardInterrupt; returns the seconds. Raises PebbleError.
+def measure(plan: Plan, progress: Callable[[str], None]) -> float:
+    """Records the robot for so long, or until KeyboardInterrupt; returns the seconds. Raises PebbleError.
 
     Nothing is measured before all requested media have arrived, for at most 15 s. At the end the requests are
     withdrawn.
     """
     _check(plan)
-    with connected(plan.target) as (transport, names):
-        progress(f"waiting for a heartbeat of {id_of(names.base)}")
-        _require_heartbeat(transport, names.base)
-        with closing(Viewer(transport, names.base, None)) as viewer:
-            if plan.media:
-                viewer.wait_for_capabilities(_CAPABILITIES_S)
-            if plan.folder.exists():
-                with named(plan.folder):
-                    shutil.rmtree(plan.folder)
-            check_folder(plan.folder)
-            return _record(plan, viewer, progress)
+    with connected(plan.target) as (transport, names), closing(Viewer(transport, names.base, None)) as viewer:
+        _wait_for_heartbeat(transport, names.base)
+        if plan.media:
+            viewer.wait_for_capabilities(_CAPABILITIES_S)
+        if plan.folder.exists():
+            with named(plan.folder):
+                shutil.rmtree(plan.folder)
+        check_folder(plan.folder)
+        return _record(plan, viewer, progress)
 
 
 def _check(plan: Plan) -> None:
     if not _LABEL.fullmatch(plan.label):
-        raise PebbleError(
-            f'--label "{plan.label}" cannot name a folder: use letters, digits and . _ + % -, such as 512k'
-        )
+        raise PebbleError(f'--label "{plan.label}" cannot name a folder: use letters, digits and . _ + % -')
     require_packages("duckdb", "zstandard")
     if plan.folder.exists() and not plan.replace:
         raise PebbleError(f"{plan.folder} exists: add --replace to measure it again, or use another --label")
@@ -113,24 +103,17 @@ def _check(plan: Plan) -> None:
         raise PebbleError(f"{plan.folder} is no measurement, so it is not replaced: use another --label or --into")
 
 
-def _require_heartbeat(transport: Transport, base: str) -> None:
-    """Wait for a heartbeat of the robot. Raises PebbleError that names the robots that were received instead."""
-    received: set[str] = set()
+def _wait_for_heartbeat(transport: Transport, base: str) -> None:
+    """Raises PebbleError without one."""
+    came = threading.Event()
 
     def on_heartbeat(message: Message) -> None:
-        address = parse_topic(message.topic)
-        if address is not None and not message.retain:  # a retained heartbeat may be old
-            received.add(address.identity.base)
+        if not message.retain:  # else it may be old
+            came.set()
 
-    with closing(transport.subscribe(ONLINE.filter(ANY_ROBOT), on_heartbeat, qos=QoS.LATEST, direct=True)):
-        end = time.monotonic() + _HEARTBEAT_S
-        while base not in received and time.monotonic() < end:
-            time.sleep(_TURN_S)
-    if base not in received:
-        names = sorted(map(id_of, received))
-        more = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
-        others = f"received instead: {', '.join(names[:_MOST_NAMES])}{more}" if names else "nor of any other robot"
-        raise PebbleError(f"no heartbeat of {id_of(base)} came within {_HEARTBEAT_S:g} s; {others}")
+    with closing(transport.subscribe(ONLINE.topic(base), on_heartbeat, qos=QoS.LATEST, direct=True)):
+        if not came.wait(_HEARTBEAT_S):
+            raise PebbleError(f"no heartbeat of {id_of(base)} came within {_HEARTBEAT_S:g} s: is this its broker?")
 
 
 class _Recorder(Recorder):
@@ -140,8 +123,7 @@ class _Recorder(Recorder):
         super().__init__(plan.folder, Options(), {"impair": plan.label, "filters": f"{viewer.base}/#"})
         self.arrived: set[Medium] = set()
         self._viewer = viewer
-        topics = {medium: viewer.capabilities.get(medium, {}).get("topic") for medium in _MEDIA}
-        self._media = {topic: medium for medium, topic in topics.items() if isinstance(topic, str)}
+        self._media = {viewer.capabilities.get(medium, {}).get("topic"): medium for medium in _MEDIA}
 
     def receive(self, topic: str, payload: bytes, *about: Any, retained: bool = False, **more: Any) -> None:
         medium = self._media.get(topic)
@@ -151,10 +133,10 @@ class _Recorder(Recorder):
         super().receive(topic, payload, *about, retained=retained, **more)
 
 
-def _record(plan: Plan, viewer: Viewer, progress: Progress) -> float:
+def _record(plan: Plan, viewer: Viewer, progress: Callable[[str], None]) -> float:
     kind, settings, _, _ = resolve(plan.target)
     settings = replace(settings, protocol="5") if kind == "mqtt" else settings
-    recorder = _Recorder(plan, viewer)
+    recorder, requested = _Recorder(plan, viewer), set[Medium]()
     source = Source(recorder, kind, settings, [f"{viewer.base}/#"])
 
     def watch(seconds: float, what: str, is_over: Callable[[], bool]) -> None:
@@ -165,8 +147,8 @@ def _record(plan: Plan, viewer: Viewer, progress: Progress) -> float:
                 checked = now
                 source.check()
                 viewer.repeat_requests()
-            count = f"{recorder.counters['messages']:,} messages, {recorder.counters['bytes'] / 1e6:.1f} MB"
             problem = "" if source.connected else f", not connected: {source.problem or 'no answer'}"
+            count = f"{recorder.counters['messages']:,} messages"
             progress(f"{what}: {now - began:.0f} of {seconds:g} s, {count}{problem}")
             if recorder.blocked:
                 raise PebbleError(f"{plan.folder}: {recorder.blocked}")
@@ -175,119 +157,81 @@ def _record(plan: Plan, viewer: Viewer, progress: Progress) -> float:
         recorder.start()
         stack.callback(recorder.stop)
         stack.enter_context(closing(source)).start()
-        measurement = Measurement(label=plan.label, robot=viewer.base, since_ns=recorder.clock.now())
+        measurement = Measurement(viewer.base, recorder.clock.now())
         measurement.save(plan.folder)
-        try:
-            with suppress(KeyboardInterrupt):  # what was measured until then is the measurement
-                requested = _request(viewer) if plan.media else []
-                watch(_FIRST_S, "waiting for pictures and sound", lambda: recorder.arrived.issuperset(requested))
-                measurement.since_ns = recorder.clock.now()
-                watch(plan.seconds, "measuring", lambda: False)
-        finally:
-            measurement.until_ns = recorder.clock.now()
-            measurement.save(plan.folder)
+        with suppress(KeyboardInterrupt):  # what was measured until then is the measurement
+            for medium in _MEDIA if plan.media else ():
+                with suppress(PebbleError):  # the robot does not offer it
+                    viewer.request(medium)
+                    requested.add(medium)
+            watch(_FIRST_S, "waiting for pictures and sound", lambda: recorder.arrived >= requested)
+            measurement.since_ns = recorder.clock.now()
+            watch(plan.seconds, "measuring", lambda: False)
+        measurement.until_ns = recorder.clock.now()
+        measurement.save(plan.folder)
     return (measurement.until_ns - measurement.since_ns) / 1e9
-
-
-def _request(viewer: Viewer) -> list[Medium]:
-    """Requests all media that the robot offers."""
-    sections = viewer.capabilities
-    offered = [one for one in _MEDIA if sections.get(one, {}).get("available") and sections[one].get("controls")]
-    for medium in offered:
-        viewer.request(medium)
-    return offered
 
 
 # -- all measurements side by side
 
 
-class Column(msgspec.Struct):
-    """One measurement, analysed."""
+def compared(into: Path) -> tuple[Table, list[str]]:
+    """All measurements in a folder, the oldest first, and what stands out. Raises PebbleError, also if there is none.
 
-    label: str
-    rows: list[dict[str, str]]  # in groups
-    remarks: list[str]
-
-
-def columns(into: Path) -> list[Column]:
-    """All measurements in a folder, the oldest first. Raises PebbleError, also if there is none."""
+    Rows are the figures of the paper, columns the labels; a row that would be empty is left out.
+    """
     require_packages("duckdb", "zstandard")
-    found = [(_load(path), path.parent) for path in sorted(into.glob(f"*/{NAME}"))]
+    found = {path.parent: msgspec.json.decode(path.read_bytes(), type=Measurement) for path in into.glob(f"*/{NAME}")}
     if not found:
         raise PebbleError(f"{into}: there is no measurement of a real robot: see pebble impair --help")
-    return [_column(one, folder) for one, folder in sorted(found, key=lambda pair: pair[0].since_ns)]
+    table, notes, columns = Table("", box=box.SIMPLE_HEAD), list[str](), list[dict[str, str]]()
+    for folder, one in sorted(found.items(), key=lambda pair: pair[1].since_ns):
+        rows, remarks = _analysed(folder, one)
+        columns.append(rows)
+        notes += [f"{folder.name}: {remark}" for remark in remarks]
+        table.add_column(Text(folder.name), justify="right", no_wrap=True)
+    for name in dict.fromkeys(name for rows in columns for name in rows):
+        table.add_row(Text(name), *(Text(rows.get(name, "–")) for rows in columns))
+    return table, notes
 
 
-def _load(path: Path) -> Measurement:
-    try:
-        with named(path):
-            return msgspec.json.decode(path.read_bytes(), type=Measurement)
-    except msgspec.DecodeError as error:
-        raise PebbleError(f"{path}: {error}") from None
-
-
-def _column(one: Measurement, folder: Path) -> Column:
+def _analysed(folder: Path, one: Measurement) -> tuple[dict[str, str], list[str]]:
+    """The rows of the table, and remarks."""
+    about, since_ns, until_ns = {"robot": id_of(one.robot)}, one.since_ns, one.until_ns
     with tempfile.TemporaryDirectory(prefix="pebble-impair-") as name:
         scratch = Path(name)
         try:
-            found = sources([folder], scratch, robots=[one.robot], since_ns=one.since_ns, until_ns=one.until_ns)
-            traffic = analyse(found, scratch, since_ns=one.since_ns, until_ns=one.until_ns)
+            found = sources([folder], scratch, robots=[one.robot], since_ns=since_ns, until_ns=until_ns)
+            traffic = analyse(found, scratch, since_ns=since_ns, until_ns=until_ns)
         except RecordingError as error:  # no message arrived
-            return Column(one.label, [_head(one, one.until_ns)], [str(error)])
-    until_ns = traffic.until_ns if one.until_ns == FOREVER_NS else one.until_ns  # the program was killed
-    return Column(one.label, [_head(one, until_ns), *_rows(traffic, until_ns - one.since_ns)], remarks(traffic))
+            return about, [str(error)]
+    ended_ns = traffic.until_ns if until_ns == FOREVER_NS else until_ns  # forever: the program was killed
+    return about | _rows(traffic, (ended_ns - since_ns) / 1e9), remarks_of(traffic)
 
 
-def table(found: list[Column]) -> Table:
-    """Rows are the figures of the paper, columns the labels; a row that would be empty is left out."""
-    made = Table(box=box.SIMPLE_HEAD)
-    made.add_column("", no_wrap=True)
-    for column in found:
-        made.add_column(Text(column.label), justify="right", no_wrap=True)
-    for at in range(max(len(column.rows) for column in found)):
-        groups = [column.rows[at] if at < len(column.rows) else {} for column in found]
-        for name in dict.fromkeys(name for group in groups for name in group):
-            cells = [group.get(name, _NONE) for group in groups]
-            if any(cell != _NONE for cell in cells):
-                made.add_row(name, *map(Text, cells))
-        made.add_section()
-    return made
-
-
-def _head(one: Measurement, until_ns: int) -> dict[str, str]:
-    seconds = 0.0 if until_ns == FOREVER_NS else (until_ns - one.since_ns) / 1e9
-    return {"robot": id_of(one.robot), "measured, s": f"{seconds:.0f}"}
-
-
-def _rows(traffic: Traffic, length_ns: int) -> list[dict[str, str]]:
+def _rows(traffic: Traffic, seconds: float) -> dict[str, str]:
     robot = traffic.robots[0]
-    pictures, sound = ({one.metric: one for one in robot.streams}.get(channel.metric) for channel in (CAMERA, AUDIO))
+    streams = {one.metric: one for one in robot.streams}
     latency, outages = robot.latency, [one.length_ms for one in robot.outages]
-    rate = _NONE if pictures is None or not length_ns else f"{1e9 * pictures.messages / length_ns:.1f}"
-    bandwidths = {family: robot.of(family) for family in FAMILIES}
-    return [
-        {
-            "heartbeat latency p50, ms": _ms(latency.median_ms if latency else None),
-            "heartbeat latency p95, ms": _ms(latency.p95_ms if latency else None),
-            "heartbeat intervals": str(robot.intervals.count if robot.intervals else 0),
-            "outages": str(len(outages)),
-            "outage, median, ms": _ms(median(outages) if outages else None),
-            "outage, longest, ms": _ms(max(outages, default=None)),
-            "offline, times": str(robot.offline or _NONE),
-        },
-        {"pictures a second": rate, **_stream("pictures", pictures)},
-        _stream("sound", sound),
-        {f"{family}, kbit/s": f"{one.median_kbps:.1f}" if one else _NONE for family, one in bandwidths.items()},
-    ]
-
-
-def _stream(name: str, stream: Stream | None) -> dict[str, str]:
-    return {
-        f"{name} lost": f"{stream.lost_share:.1%}" if stream else _NONE,
-        f"{name}, jitter p50, ms": _ms(stream.jitter_median_ms if stream else None),
-        f"{name}, jitter p95, ms": _ms(stream.jitter_p95_ms if stream else None),
+    rows: dict[str, float | None] = {
+        "measured, s": round(seconds),
+        "heartbeat latency p50, ms": latency.median_ms if latency else None,
+        "heartbeat latency p95, ms": latency.p95_ms if latency else None,
+        "heartbeat intervals": robot.intervals.count if robot.intervals else 0,
+        "outages": len(outages),
+        "outage, median, ms": median(outages) if outages else None,
+        "outage, longest, ms": max(outages, default=None),
+        "offline, times": robot.offline,
     }
+    for what, channel in (("pictures", CAMERA), ("sound", AUDIO)):
+        if stream := streams.get(channel.metric):
+            rows[f"{what} a second"] = stream.messages / seconds if seconds else None
+            rows[f"{what} lost, %"] = 100 * stream.lost_share
+            rows[f"{what}, jitter p50, ms"] = stream.jitter_median_ms
+            rows[f"{what}, jitter p95, ms"] = stream.jitter_p95_ms
+    rows |= {f"{family}, kbit/s": one.median_kbps for family in FAMILIES if (one := robot.of(family))}
+    return {name: _shown(value) for name, value in rows.items() if value is not None}
 
 
-def _ms(value: float | None) -> str:
-    return _NONE if value is None else f"{value:.0f}" if abs(value) >= 10 else f"{value:.1f}"
+def _shown(value: float) -> str:
+    return str(value) if isinstance(value, int) else f"{value:.0f}" if abs(value) >= 10 else f"{value:.1f}"

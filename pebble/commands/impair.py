@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -43,7 +42,7 @@ def impair(
 
     Simulated robots on MQTT and on Zenoh, with the original's encodings and with H.264 and Opus, each with its own
     network to its broker. In each trial the network has a low rate, loses packets, or both; an operator drives the
-    robot and receives its video and audio. Needs mosquitto; without root, a proxy replaces network namespaces.
+    robot and receives its video and audio. Needs mosquitto and network namespaces, so usually root.
 
     With --robot, a real robot behind a network that you limit yourself: it is recorded while its pictures and sound
     are requested, it is never driven, and a table shows all labels side by side. Needs the extra "archive".
@@ -51,24 +50,24 @@ def impair(
     \b
         pebble impair --quick
         pebble impair --trials base-start,256k,64k+5%
-        pebble impair --link proxy --subjects "mqtt h264 opus"
+        pebble impair --subjects "mqtt h264 opus"
         pebble impair --robot goob --url mqtt://192.168.1.2 --label 512k
         pebble impair --compare
     """
-    from pebble.bench.impair.real_robot import Plan, columns, measure, table
+    from pebble.bench.impair.real_robot import Plan, compared, measure
 
     if not compare:
+        if url is None or label is None:
+            raise PebbleError(f"--{'url' if url is None else 'label'} is missing: --robot needs --url and --label")
         target = Target(url=url, robot=robot, password_file=password_file, ca_cert=ca_cert)
-        plan = Plan(target=target, label=str(label), into=into, seconds=seconds, media=not no_media, replace=replace)
+        plan = Plan(target=target, label=label, into=into, seconds=seconds, media=not no_media, replace=replace)
         with interrupted_by_signals(), Console(stderr=True).status("") as status:
             took_s = measure(plan, lambda text: status.update(Text(printable(text))))
         typer.echo(f"Measured {took_s:.0f} s into {plan.folder}; `pebble analyse {plan.folder}` draws it", err=True)
-    found, console = columns(into), Console()
-    console.print(table(found))
-    console.print("kbit/s: medians over active seconds, of payloads.", style="dim", soft_wrap=True)
-    for column in found:
-        for remark in column.remarks:
-            console.print(printable(f"{column.label}: {remark}"), markup=False, highlight=False, soft_wrap=True)
+    console, (table, notes) = Console(), compared(into)
+    console.print(table)
+    for line in ("kbit/s: medians over active seconds, of payloads.", *map(printable, notes)):
+        console.print(line, style="dim", markup=False, highlight=False, soft_wrap=True)
     return 0
 
 
@@ -88,30 +87,20 @@ class _Command(TyperCommand):
         return [*self._simulated.params, *super().get_params(ctx)]
 
     def invoke(self, ctx: Context) -> Any:
+        """Raises PebbleError for options that do not belong together."""
         simulated = {one.name for one in self._simulated.params}
-        real = self._is_real(ctx, simulated)
-        ctx.params = {name: value for name, value in ctx.params.items() if (name in simulated) != real}
-        return super().invoke(ctx) if real else self._simulated.invoke(ctx)
-
-    def _is_real(self, ctx: Context, simulated: Collection[str | None]) -> bool:
-        """Whether the options are those of a real robot. Raises PebbleError if they do not belong together."""
         sources = {name: ctx.get_parameter_source(name) for name in ctx.params}
         given = [name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"]
+        real, why = "compare" in given or "robot" in given, "is for a real robot: add --robot ID"
+        wrong = [name for name in given if (name in simulated) == real]
         if "compare" in given:
             wrong, why = [name for name in given if name not in ("compare", "into")], "does not go with --compare"
-        elif "robot" in given:
-            wrong, why = (
-                [name for name in given if name in simulated],
-                "is for simulated robots, --robot for a real one",
-            )
-        else:
-            wrong, why = [name for name in given if name not in simulated], "is for a real robot: add --robot ID"
+        elif real:
+            why = "is for simulated robots, --robot for a real one"
         if wrong:
             raise PebbleError(f"--{wrong[0].replace('_', '-')} {why}")
-        for name in ("url", "label"):
-            if "robot" in given and name not in given:
-                raise PebbleError(f"--{name} is missing: --robot needs --url and --label")
-        return "compare" in given or "robot" in given
+        ctx.params = {name: value for name, value in ctx.params.items() if (name in simulated) != real}
+        return super().invoke(ctx) if real else self._simulated.invoke(ctx)
 
 
 def register(app: typer.Typer) -> None:

@@ -250,7 +250,7 @@ def test_unknown_names_are_an_error_and_no_names_are_all(monkeypatch: pytest.Mon
     monkeypatch.setattr(os, "geteuid", lambda: 0)
     assert chosen([]) == reported()
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
-    assert [one.name for one in reported() if one not in chosen([])] == ["bridge-profile"]
+    assert [one.name for one in reported() if one not in chosen([])] == ["bridge-profile", "impair"]
     with pytest.raises(PebbleError, match=r"there is no nonsense in the report: there are control, "):
         chosen(["nonsense"])
 

@@ -1,10 +1,10 @@
-"""Networks of both kinds, where the machine permits them."""
+"""Impaired networks, where the machine permits them."""
 
 from collections.abc import Iterator
 
 import pytest
 
-from pebble.bench.impair.network import ImpairedNetwork, open_network, why_no_namespaces
+from pebble.bench.impair.network import NamespaceNetwork, why_no_namespaces
 
 
 @pytest.fixture
@@ -14,14 +14,7 @@ def namespaces_permitted() -> None:
         pytest.skip(f"no namespaces: {obstacle}")
 
 
-@pytest.fixture(params=["namespaces", "proxy"])
-def kind(request: pytest.FixtureRequest) -> str:
-    if request.param == "namespaces":
-        request.getfixturevalue("namespaces_permitted")
-    return str(request.param)
-
-
 @pytest.fixture
-def network(kind: str) -> Iterator[ImpairedNetwork]:
-    with open_network(kind, name="of a test") as made:
+def network(namespaces_permitted: None) -> Iterator[NamespaceNetwork]:
+    with NamespaceNetwork("of a test") as made:
         yield made

@@ -7,7 +7,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from pebble.bench.impair.network import ImpairedNetwork
+from pebble.bench.impair.network import REMOTE_HOST, NamespaceNetwork
 from pebble.rig.programs import Worker, end_workers
 
 _ANSWER_S = 40.0
@@ -17,13 +17,12 @@ _PEER = [sys.executable, "-I", str(Path(__file__).with_name("peer.py"))]
 class ProbeConnection:
     """One connection from the robot's side to the broker's."""
 
-    def __init__(self, network: ImpairedNetwork, logs: Path) -> None:
-        self._server = Worker("server", network.on_remote([*_PEER, "serve", network.broker_host]), logs / "server.log")
+    def __init__(self, network: NamespaceNetwork, logs: Path) -> None:
+        self._server = Worker("server", network.on_remote([*_PEER, "serve", REMOTE_HOST]), logs / "server.log")
         self._workers = [self._server]
         try:
             printed = self._server.answer(_ANSWER_S)
-            host, port = network.broker_address(printed["tcp"])
-            command = [*_PEER, "talk", host, str(port), str(printed["udp"])]
+            command = [*_PEER, "talk", REMOTE_HOST, str(printed["tcp"]), str(printed["udp"])]
             self._client = Worker("client", network.on_robot(command), logs / "client.log")
             self._workers.append(self._client)
             self._client.answer(_ANSWER_S)
@@ -64,7 +63,7 @@ class ProbeConnection:
 
 
 @contextmanager
-def largest_packet(network: ImpairedNetwork, logs: Path) -> Iterator[Callable[[], int]]:
+def largest_packet(network: NamespaceNetwork, logs: Path) -> Iterator[Callable[[], int]]:
     """Bytes of the largest packet, with its Ethernet header, that arrives at the broker's side meanwhile."""
     listener = Worker("capture", network.on_remote([*_PEER, "capture"]), logs / "log")
     try:

@@ -1,4 +1,4 @@
-"""Behaviour of impaired networks of either kind."""
+"""Behaviour of impaired networks."""
 
 import os
 import subprocess
@@ -7,24 +7,24 @@ from pathlib import Path
 
 import pytest
 
-from pebble.bench.impair.conditions import Condition, Shape, chosen
-from pebble.bench.impair.network import ImpairedNetwork, open_network
+from pebble.bench.impair.conditions import CONDITIONS, Condition, Shape
+from pebble.bench.impair.network import NamespaceNetwork
 from pebble.errors import PebbleError
 from pebble.rig.programs import children
 from tests.bench.impair.peers import ProbeConnection
 from tests.support import ROOT, Child, gone, until
 
 _OWNER = """
-import sys, time
-from pebble.bench.impair.network import open_network
-network = open_network(sys.argv[1])
-print(network.kind, flush=True)
+import time
+from pebble.bench.impair.network import NamespaceNetwork
+network = NamespaceNetwork()
+print("ready", flush=True)
 time.sleep(60)
 """
 _SLACK = 20.0  # a transfer may take so many times longer on a busy machine
 
 
-def test_a_rate_limits_the_uplink_only_and_the_connection_stays(network: ImpairedNetwork, tmp_path: Path) -> None:
+def test_a_rate_limits_the_uplink_only_and_the_connection_stays(network: NamespaceNetwork, tmp_path: Path) -> None:
     with ProbeConnection(network, tmp_path) as talk:
         network.apply(Condition("1024k", Shape(kbit=1024)))
         must = 30_000 * 8 / 1_024_000
@@ -34,14 +34,14 @@ def test_a_rate_limits_the_uplink_only_and_the_connection_stays(network: Impaire
         assert talk.up(1_000_000) < 1_000_000 * 8 / 1_024_000 / 2
 
 
-def test_both_ways(network: ImpairedNetwork, tmp_path: Path) -> None:
+def test_both_ways(network: NamespaceNetwork, tmp_path: Path) -> None:
     with ProbeConnection(network, tmp_path) as talk:
         network.apply(Condition("1024k", Shape(kbit=1024), Shape(kbit=1024)))
         must = 30_000 * 8 / 1_024_000
         assert must * 0.95 < talk.down(30_000) < must * _SLACK
 
 
-def test_delay_and_back_to_none_on_one_connection(network: ImpairedNetwork, tmp_path: Path) -> None:
+def test_delay_and_back_to_none_on_one_connection(network: NamespaceNetwork, tmp_path: Path) -> None:
     with ProbeConnection(network, tmp_path) as talk:
         network.apply(Condition("far", Shape(delay_ms=40), Shape(delay_ms=20)))
         assert 0.06 <= min(talk.round_trips()) < 0.5
@@ -49,36 +49,31 @@ def test_delay_and_back_to_none_on_one_connection(network: ImpairedNetwork, tmp_
         assert min(talk.round_trips()) < 0.06
 
 
-def test_loss_is_late_to_tcp_but_nothing_is_missing(network: ImpairedNetwork, tmp_path: Path) -> None:
+def test_loss_is_late_to_tcp_but_nothing_is_missing(network: NamespaceNetwork, tmp_path: Path) -> None:
     with ProbeConnection(network, tmp_path) as talk:
         network.apply(Condition("lossy", Shape(loss=0.1)))
         talk.up(200_000)
-        traffic = network.traffic()
-        assert traffic.packets_up > 130
-        assert traffic.dropped_up > 0
-        assert traffic.dropped_down == 0
+        assert network.traffic().dropped_up > 0
 
 
-def test_what_was_carried_is_counted_with_its_headers(network: ImpairedNetwork, tmp_path: Path) -> None:
+def test_what_was_carried_is_counted_with_its_headers(network: NamespaceNetwork, tmp_path: Path) -> None:
     with ProbeConnection(network, tmp_path) as talk:
         before = network.traffic()
         talk.up(100_000)
-        talk.down(50_000)
         after = network.traffic()
     assert 100_000 + 66 * 69 <= after.bytes_up - before.bytes_up < 125_000
-    assert 50_000 + 66 * 34 <= after.bytes_down - before.bytes_down < 75_000
-    assert after.packets_up - before.packets_up >= 69
 
 
-def test_conditions_of_every_kind_can_follow_each_other(network: ImpairedNetwork) -> None:
-    for condition in chosen(["64k", "5%", "64k+5%", "base-end", "starlink", "wifi-power-save"], both_ways=True):
-        network.apply(condition)
+def test_conditions_of_every_kind_can_follow_each_other(network: NamespaceNetwork) -> None:
+    for condition in CONDITIONS[5:]:
+        network.apply(Condition(condition.name, condition.up, condition.up))
 
 
-def test_networks_are_independent(kind: str, tmp_path: Path) -> None:
+@pytest.mark.usefixtures("namespaces_permitted")
+def test_networks_are_independent(tmp_path: Path) -> None:
     with (
-        open_network(kind) as one,
-        open_network(kind) as other,
+        NamespaceNetwork() as one,
+        NamespaceNetwork() as other,
         ProbeConnection(one, tmp_path) as first,
         ProbeConnection(other, tmp_path) as second,
     ):
@@ -87,9 +82,10 @@ def test_networks_are_independent(kind: str, tmp_path: Path) -> None:
         assert min(second.round_trips()) < 0.1
 
 
-def test_close_leaves_nothing_and_may_be_repeated(kind: str) -> None:
+@pytest.mark.usefixtures("namespaces_permitted")
+def test_close_leaves_nothing_and_may_be_repeated() -> None:
     before = set(children(os.getpid()))
-    network = open_network(kind)
+    network = NamespaceNetwork()
     (process,) = set(children(os.getpid())) - before
     network.close()
     network.close()
@@ -99,14 +95,10 @@ def test_close_leaves_nothing_and_may_be_repeated(kind: str) -> None:
         network.apply(Condition("late"))
 
 
-def test_a_killed_owner_leaves_nothing(kind: str) -> None:
-    with Child([sys.executable, "-c", _OWNER, kind], cwd=ROOT, stdout=subprocess.PIPE, text=True) as owner:
-        assert owner.stdout.readline().strip() == kind
+@pytest.mark.usefixtures("namespaces_permitted")
+def test_a_killed_owner_leaves_nothing() -> None:
+    with Child([sys.executable, "-c", _OWNER], cwd=ROOT, stdout=subprocess.PIPE, text=True) as owner:
+        assert owner.stdout.readline().strip() == "ready"
         (process,) = children(owner.pid)
         owner.kill()
         assert until(lambda: gone(process))
-
-
-def test_unknown_kinds_of_networks_are_refused() -> None:
-    with pytest.raises(PebbleError, match="no kind of network 'wire': choose from auto, namespaces, proxy"):
-        open_network("wire")

@@ -99,10 +99,10 @@ def test_the_table_has_a_column_for_each_label(run: Run, robot: PictureRobot, ur
     assert rows["robot"] == ["goob", "goob"]
     assert rows["measured, s"] == ["3", "3"]
     assert all(8 <= float(cell) <= 18 for cell in rows["pictures a second"])  # the camera's rate is 15
-    assert rows["pictures lost"] == ["0.0%", "0.0%"]
+    assert rows["pictures lost, %"] == ["0.0", "0.0"]
     assert all(float(cell) < 1000 for cell in rows["heartbeat latency p95, ms"])
     assert all(float(cell) > 10 for cell in rows["video, kbit/s"])
-    assert "sound lost" not in rows
+    assert "sound lost, %" not in rows
     assert run("impair", "--compare") == 0
     assert run.out == table
     assert run("analyse", "impair/unlimited") == 0
@@ -149,10 +149,9 @@ def test_interrupted_it_withdraws_and_prints_what_was_measured(
     assert float(_rows(out)["measured, s"][0]) < 100
 
 
-def test_a_robot_without_heartbeats(run: Run, broker: Broker, robot: PictureRobot, url: str) -> None:
-    with RecordingRobot(broker.port, "lab/robots/benjr"):
-        assert run("impair", "--robot", "gobo", "--url", url, "--label", "512k") == 1
-    assert run.err == "pebble: no heartbeat of gobo came within 5 s; received instead: goob, lab/robots/benjr\n"
+def test_a_robot_without_heartbeats(run: Run, robot: PictureRobot, url: str) -> None:
+    assert run("impair", "--robot", "gobo", "--url", url, "--label", "512k") == 1
+    assert run.err == "pebble: no heartbeat of gobo came within 5 s: is this its broker?\n"
     assert not Path("impair").exists()
 
 

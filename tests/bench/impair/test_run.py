@@ -3,45 +3,41 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
-from types import TracebackType
-from typing import Self
+from types import SimpleNamespace
+from typing import Any
 
+import msgspec
 import pytest
 from rich.console import Console
 
 from pebble.bench import engine
-from pebble.bench.impair import trials as module
+from pebble.bench.comparison import Run
 from pebble.bench.impair.conditions import Condition
-from pebble.bench.impair.metrics import ClipCommand, OperatorReport, Record, RecoveryRequest, TrialRequest, Window
+from pebble.bench.impair.metrics import OperatorReport, Record, Window
 from pebble.bench.impair.network import Traffic
-from pebble.bench.impair.trials import IMPAIR, Subject
+from pebble.bench.impair.trials import IMPAIR, SUBJECTS, ImpairedRobot
 from pebble.bench.results import load
 from pebble.errors import PebbleError
 
 S = 1_000_000_000
+PHASES = ("alone", "video", "video off", "audio", "audio off")
 NOTHING = Record(
     commands=[],
     heartbeats=[],
     pictures=[],
     sounds=[],
-    alone=Window(0, S),
-    video=Window(S, 2 * S),
-    audio=Window(2 * S, 3 * S),
-    video_off=Window(2 * S, 3 * S),
-    audio_off=Window(3 * S, 4 * S),
-    clip=ClipCommand(4 * S),
-    payloads=0,
+    windows={phase: Window(number * S, (number + 1) * S) for number, phase in enumerate(PHASES)},
+    clip_ns=5 * S,
 )
-PHASES = ("alone", "video", "video off", "audio", "audio off")
 TRIAL = [OperatorReport(phase=phase) for name in PHASES for phase in (name, "")] + [OperatorReport(record=NOTHING)]
 
 
 class QuietNetwork:
-    kind = "proxy"
-
     def __init__(self, log: list[str], name: str) -> None:
         self._log, self._name = log, name
 
@@ -52,63 +48,46 @@ class QuietNetwork:
         return Traffic()
 
 
-class FakeRobot:
+class FakeOperator:
     """Reports ``trials`` trials, then nothing."""
 
-    def __init__(self, subject: Subject, log: list[str], trials: int) -> None:
-        self.subject, self.network = subject, QuietNetwork(log, subject.name)
-        printed = [
-            OperatorReport(ready=True),
-            *(one for _ in range(trials) for one in (OperatorReport(ready=True), *TRIAL)),
-        ]
-        self._reports: Iterator[OperatorReport] = iter(printed)
-
-    def send(self, request: TrialRequest | RecoveryRequest) -> None: ...
-
-    def next_report(self, timeout: float) -> OperatorReport:
-        printed = next(self._reports, None)
-        if printed is None:
-            raise PebbleError(f"{self.subject.name} said nothing for {timeout:.0f} s")
-        return printed
-
-    def entries(self, _since_ns: int) -> list[object]:
-        return []
-
-    def playbacks(self) -> list[object]:
-        return []
-
-
-class FakeTestBed:
-    """Replaces pebble.bench.impair.trials.TestBed."""
-
     def __init__(self, log: list[str], trials: int) -> None:
-        self._log, self._trials = log, trials
-        self.robots: list[FakeRobot] = []
+        self._log = log
+        printed = [OperatorReport(), *(one for _ in range(trials) for one in (OperatorReport(), *TRIAL))]
+        self._reports = iter(printed)
 
-    def __call__(self, subjects: Sequence[Subject], _kind: str) -> Self:
-        self.robots = [FakeRobot(subject, self._log, self._trials) for subject in subjects]
-        return self
+    def send(self, _line: str) -> None: ...
 
-    def __enter__(self) -> Self:
-        return self
+    def answer(self, timeout: float) -> Any:
+        for report in self._reports:
+            return msgspec.to_builtins(report)
+        raise PebbleError(f"the operator said nothing for {timeout:.0f} s")
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None
-    ) -> None: ...
-
-    def end_trials(self) -> None:
+    def ask_to_end(self) -> None:
         self._log.append("hurry")
 
 
-def go(monkeypatch: pytest.MonkeyPatch, folder: Path, trials: int, network: str = "proxy") -> tuple[list[str], str]:
+def fake_robots(log: list[str], trials: int) -> Callable[[Run], AbstractContextManager[list[ImpairedRobot]]]:
+    """Replaces pebble.bench.impair.trials.robots."""
+    nothing = SimpleNamespace(
+        programs=[], lines=lambda _since: [], log=lambda: "", folder=Path("/nowhere"), ended=False
+    )
+
+    def fake(subject: str) -> ImpairedRobot:
+        parts: Any = (QuietNetwork(log, subject), nothing, nothing, FakeOperator(log, trials))
+        return ImpairedRobot(subject, *parts, limit_s=30)
+
+    return lambda run: nullcontext([fake(subject) for subject in SUBJECTS if subject in run["variants"]])
+
+
+def go(monkeypatch: pytest.MonkeyPatch, folder: Path, trials: int) -> tuple[list[str], str]:
     log: list[str] = []
     printed = io.StringIO()
-    monkeypatch.setattr(module, "TestBed", FakeTestBed(log, trials))
     monkeypatch.setattr("pebble.bench.engine.find_spec", lambda _name: None)  # no plots
-    run = IMPAIR.run_of(
+    monkeypatch.setattr("pebble.bench.impair.trials.why_no_namespaces", lambda: None)
+    run = replace(IMPAIR, environment=fake_robots(log, trials)).run_of(
         trials=["1024k", "5%"],
         variants=["mqtt original", "zenoh original", "mqtt h264 opus"],
-        link=network,
         output=folder,
         console=Console(file=printed, width=120),
     )
@@ -122,35 +101,29 @@ def go(monkeypatch: pytest.MonkeyPatch, folder: Path, trials: int, network: str 
 def test_each_group_runs_each_condition_and_then_a_clean_network(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    log, printed = go(monkeypatch, tmp_path, trials=2)
+    log, _ = go(monkeypatch, tmp_path, trials=2)
     pair, single = ("mqtt original", "zenoh original"), ("mqtt h264 opus",)
     turns = [(pair, "1024k"), (single, "1024k"), (single, "5%"), (pair, "5%")]  # the last one comes first
     expected = [sorted(f"{one}: {what}" for one in group) for group, name in turns for what in (name, "clean")]
     applied = iter(log)
     assert [sorted(islice(applied, len(group))) for group in expected] == expected
-    assert list(applied) == ["hurry"]
-    assert "loss modelled" in printed
+    assert list(applied) == ["hurry"] * 3
 
 
 def test_the_file_records_the_conditions(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     go(monkeypatch, tmp_path, trials=2)
     results = load(tmp_path / "impair.json")
-    assert (results.bench, results.options["link"], results.options["window_s"]) == ("impair", "proxy", 8.0)
+    assert (results.bench, results.options["link"], results.options["window_s"]) == ("impair", "namespaces", 8.0)
     marks = [mark.partition("@")[0] for mark in str(results.options["marks"]).split(";")]
     assert marks == ["1024k", "5%"]
-    assert "--link proxy" in " ".join(results.command)
-    assert results.options["why_proxy"] is None
     assert {len(cell.rounds) for cell in results.cells if "trial" in cell.params} == {1}
     assert {len(cell.rounds) for cell in results.cells if "trial" not in cell.params} <= {2}  # curves
 
 
-def test_an_automatic_proxy_is_explained(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr("pebble.bench.impair.network.why_no_namespaces", lambda: "not permitted")
-    _, printed = go(monkeypatch, tmp_path, trials=2, network="auto")
-    assert "A proxy replaces the network namespaces: not permitted" in printed
-    results = load(tmp_path / "impair.json")
-    assert (results.options["link"], results.options["why_proxy"]) == ("proxy", "not permitted")
-    assert "--link proxy" in " ".join(results.command)
+def test_without_namespaces_it_does_not_begin(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr("pebble.bench.impair.trials.why_no_namespaces", lambda: "not permitted")
+    with pytest.raises(PebbleError, match="no network namespaces: not permitted"):
+        engine.run(IMPAIR.run_of(output=tmp_path))
 
 
 def test_a_robot_that_fails_ends_the_run_and_costs_no_results(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -165,6 +138,6 @@ def test_a_robot_that_fails_ends_the_run_and_costs_no_results(monkeypatch: pytes
 def test_robots_that_fail_at_once_leave_no_file(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     log, printed = go(monkeypatch, tmp_path, trials=0)
     assert log[0] == "hurry"
-    assert log[1].endswith("original said nothing for 30 s")
+    assert log[-1] == "mqtt original: the operator said nothing for 30 s"
     assert "trial" not in printed
     assert not (tmp_path / "impair.json").exists()
