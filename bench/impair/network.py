@@ -24,6 +24,7 @@ import struct
 import subprocess
 import sys
 import time
+import weakref
 from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
@@ -90,8 +91,9 @@ class NamespaceNetwork(Worker):
     """
 
     def __init__(self, name: str = "") -> None:
-        self._file = os.fdopen(os.memfd_create("link"))  # unnamed: nothing is left behind if we are killed
-        command, log = python("pebble.bench.impair.network"), Path(f"/proc/self/fd/{self._file.fileno()}")
+        file = os.memfd_create("link")  # unnamed: nothing is left behind if we are killed
+        weakref.finalize(self, os.close, file)
+        command, log = python("pebble.bench.impair.network"), Path(f"/proc/self/fd/{file}")
         super().__init__(f"network {name}".strip(), command, log)
         try:
             spaces = self.answer(_ANSWER_S)
@@ -135,10 +137,6 @@ class NamespaceNetwork(Worker):
         except PebbleError:
             self.close()
             raise
-
-    def end(self, deadline: float) -> None:
-        super().end(deadline)
-        self._file.close()
 
     def close(self) -> None:
         """May be called repeatedly."""
