@@ -11,25 +11,17 @@ import queue
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
-from contextlib import closing, suppress
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import ExitStack, closing, suppress
 from functools import partial
+from typing import NamedTuple
 
+from pebble import contract
 from pebble.client.discovery import ALL_OUTGOING, DiscoveredRobot, Discovery
 from pebble.client.driver_lease import FILTER, VALID_S
 from pebble.client.estop import StopSender, new_name
 from pebble.client.estop_states import Reset
-from pebble.contract import (
-    APRILTAG_DATA,
-    AUTONOMY_COMMAND,
-    DRIVE,
-    DRIVING,
-    LIGHTS_FLASH,
-    LIGHTS_SOLID,
-    SOUNDBOARD_COMMAND,
-    codec,
-)
+from pebble.contract import APRILTAG_DATA, AUTONOMY_COMMAND, DRIVE, DRIVING, SOUNDBOARD_COMMAND, codec
 from pebble.contract.payloads import AutonomyCommand, Drive, LightsFlash, LightsSolid, SoundboardCommand, TagData
 from pebble.errors import PayloadError, PebbleError
 from pebble.motion.arbiter import HOLD_MS
@@ -47,11 +39,7 @@ _ASSESSED_S = 5.0  # until what was completed is assessed, on the smallest machi
 Wheels = tuple[float, float]  # left and right, -1..1
 
 
-# -- what it does
-
-
-@dataclass(frozen=True, slots=True)
-class Step:
+class Step(NamedTuple):
     """Repeat ``drive`` for ``drive_s``, then send a stop or simply nothing more, and observe for ``rest_s``."""
 
     name: str
@@ -91,8 +79,7 @@ _BACK = Drive(x=-0.1, z=-0.5)
 _BACK_OFF, _BACK_OFF_S = Drive(z=-0.5), 1.0
 
 
-@dataclass(frozen=True, slots=True)
-class CompletedStep:
+class CompletedStep(NamedTuple):
     """A step that was sent to one robot."""
 
     robot: str  # its id
@@ -102,8 +89,7 @@ class CompletedStep:
     ended: float
 
 
-@dataclass(frozen=True, slots=True)
-class CompletedStop:
+class CompletedStop(NamedTuple):
     """An emergency stop of one robot."""
 
     robot: str
@@ -115,8 +101,7 @@ class CompletedStop:
     ended: float
 
 
-@dataclass(frozen=True, slots=True)
-class CompletedFollow:
+class CompletedFollow(NamedTuple):
     """A script on one robot, and what the operator did."""
 
     robot: str
@@ -177,6 +162,7 @@ class Operator:
             time.sleep(_POLL_S)
 
     def show(self, event: str) -> None:
+        self._doing = event
         self.events.append((time.monotonic(), f"operator {event}"))
 
     @property
@@ -246,9 +232,7 @@ class Operator:
         """Once, and again while its assessment leaves ``name`` in ``again``."""
         for _ in range(_MOST_TIMES):
             act()
-            end = time.monotonic() + _ASSESSED_S
-            while self.completed and time.monotonic() < end:
-                self._wait(COMMAND_PERIOD_S)
+            self._until(lambda: not self.completed, _ASSESSED_S)
             if name not in self.again:
                 return
 
@@ -266,6 +250,16 @@ class Operator:
         if self._stopping.wait(seconds) or (self._scripted is not None and not self._mine(self._scripted)):
             raise EndedEarlyError
 
+    def _until(self, condition: Callable[[], bool], timeout: float, steady_s: float = 0.0) -> None:
+        """Wait until the condition has held for ``steady_s``, at most for ``timeout``."""
+        since = time.monotonic()
+        end = since + timeout
+        while (now := time.monotonic()) < end:
+            since = since if condition() else now
+            if since < now - steady_s:
+                return
+            self._wait(_POLL_S)
+
     def _drive(self, drive: Drive) -> float:
         """Send one command to all robots that are free; returns when."""
         for robot in filter(self._mine, self._robots):
@@ -282,20 +276,19 @@ class Operator:
             self._wait(max(0.0, due - sent))
         return sent
 
-    def _publish(self, topic: str | None, payload: bytes, qos: QoS = QoS.DELIVERED) -> None:
+    def _publish(self, topic: str | None, payload: bytes) -> None:
         if topic is not None:
-            self._transport.publish(topic, payload, qos=qos, urgent=True)
+            self._publish_all([Message(topic, payload, QoS.DELIVERED)])
 
-    def _note(self, event: str) -> None:
-        self._doing = event
-        self.show(event)
+    def _publish_all(self, messages: Iterable[Message]) -> None:
+        for one in messages:
+            self._transport.publish(one.topic, one.payload, qos=one.qos, urgent=True)
 
-    # -- a step, and an emergency stop
+    # -- a step, an emergency stop, and a script
 
     def _perform(self, step: Step) -> None:
-        began = time.monotonic()
-        flash = isinstance(step.lights, LightsFlash)
-        lights = codec.encode(LIGHTS_FLASH if flash else LIGHTS_SOLID, step.lights)
+        began, flash = time.monotonic(), isinstance(step.lights, LightsFlash)
+        lights = codec.encode(contract.LIGHTS_FLASH if flash else contract.LIGHTS_SOLID, step.lights)
         for robot in self._robots:
             self._publish(robot.lights_topic(flash=flash), lights)
         released = self._hold(step.drive, step.drive_s)
@@ -316,18 +309,15 @@ class Operator:
             bases = [robot.base for robot in self._robots]
             sender = StopSender(new_name(), by=NAME, why="part of the demo", now=pressed, robots=bases)
             while not sender.confirmed and time.monotonic() < pressed + _CONFIRMED_S:
-                for message in sender.tick(time.monotonic()):
-                    self._publish(message.topic, message.payload, message.qos)
+                self._publish_all(sender.tick(time.monotonic()))
                 self._hold(_FORWARD, COMMAND_PERIOD_S)
                 while not received.empty():
                     sender.receive(received.get(), time.monotonic())
         self._hold(_FORWARD, _IN_VAIN_S)
-        reset_at, resets = time.monotonic(), {}
-        for robot in self._robots:
-            if robot.stopped_by is None or robot.stopped_by.by == NAME:
-                resets[robot] = Reset(robot.estop, NAME)
-                for message in resets[robot].messages():
-                    self._publish(message.topic, message.payload, message.qos)
+        mine = [robot for robot in self._robots if robot.stopped_by is None or robot.stopped_by.by == NAME]
+        reset_at, resets = time.monotonic(), {robot: Reset(robot.estop, NAME) for robot in mine}
+        for reset in resets.values():
+            self._publish_all(reset.messages())
         self._wait(_RESET_S)
         self._hold(_FORWARD, _AFTER_S)
         ended = self._drive(STOP)
@@ -335,8 +325,6 @@ class Operator:
         for robot, reset in resets.items():
             confirmed_s, free = sender.robots[robot.base].confirmed_s, bool(reset.shown) and reset.free
             self._complete(CompletedStop(robot.name, began, pressed, confirmed_s, reset_at, free, ended))
-
-    # -- a script
 
     def _take_over(self, robots: Sequence[DiscoveredRobot]) -> None:
         """Let each robot with scripts follow a tag, and overrule the script for a moment."""
@@ -353,7 +341,7 @@ class Operator:
             self._wait(0.0)
 
     def _follow(self, robot: DiscoveredRobot) -> CompletedFollow:
-        """What goes wrong is for the assessment."""
+        """Start the script, drive for a moment, and wait until it has arrived. Failures are for the assessment."""
         seen: deque[TagData] = deque(maxlen=1)
 
         def receive(message: Message) -> None:
@@ -362,24 +350,6 @@ class Operator:
 
         def command(what: AutonomyCommand) -> None:
             self._publish(AUTONOMY_COMMAND.topic(robot.base), codec.encode(AUTONOMY_COMMAND, what))
-
-        self._note(f"STARTS: {FOLLOW}, {robot.name} plays {CLIP} and drives to tag {TAG_ID} by itself")
-        config = {"tag_id": TAG_ID, "tag_size_m": TAG_SIZE_M, "target_distance_m": DISTANCE_M}
-        sound = codec.encode(SOUNDBOARD_COMMAND, SoundboardCommand(action="play", file=CLIP))
-        with closing(self._transport.subscribe(APRILTAG_DATA.topic(robot.base), receive)):
-            began = time.monotonic()
-            try:
-                command(AutonomyCommand(action="start", file=FOLLOW, config=config))
-                self._publish(SOUNDBOARD_COMMAND.topic(robot.base), sound)
-                took_over, released = self._overrule(robot, seen)
-                ended = time.monotonic()
-            finally:
-                command(AutonomyCommand(action="stop"))
-        self._wait(_FOLLOWED_REST_S)
-        return CompletedFollow(robot.name, began, took_over, mix(_BACK.x, _BACK.z), released, ended, CLIP)
-
-    def _overrule(self, robot: DiscoveredRobot, seen: Sequence[TagData]) -> tuple[float, float]:
-        """Drive, and wait until the script has arrived: when the first command was sent, and the zero after them."""
 
         def scripted() -> bool:
             """Whether the robot reports that no person goes before its script, as after the steps before."""
@@ -390,25 +360,26 @@ class Operator:
             """From the tag; infinite if the robot does not see it."""
             return math.inf if not seen or seen[0].distance_m is None else seen[0].distance_m
 
-        self._until(lambda: bool(seen) and scripted(), _START_S)
-        self._wait(_APPROACH_S)
-        self._note(f"TAKES OVER: drives {robot.name}, {FOLLOW} is overruled")
-        took_over = time.monotonic()
-        self._hold(_BACK, _OVERRIDE_S)
-        released = self._drive(STOP)
-        self._note(f"LETS GO: {robot.name} waits {HOLD_S:.0f} s for another command")
-        self._until(scripted, HOLD_S + _STATUS_S)
-        self._note(f"GIVES BACK: {FOLLOW} drives {robot.name} again")
-        self._until(lambda: abs(distance_m() - DISTANCE_M) <= TOLERANCE_M, _ARRIVAL_S, _STEADY_S)
-        self._note(f"ENDS: {FOLLOW}, {robot.name} sees tag {TAG_ID} at {distance_m():.2f} m")
-        return took_over, released
-
-    def _until(self, condition: Callable[[], bool], timeout: float, steady_s: float = 0.0) -> None:
-        """Wait until the condition has held for ``steady_s``, at most for ``timeout``."""
-        since = time.monotonic()
-        end = since + timeout
-        while (now := time.monotonic()) < end:
-            since = since if condition() else now
-            if since < now - steady_s:
-                return
-            self._wait(_POLL_S)
+        self.show(f"STARTS: {FOLLOW}, {robot.name} plays {CLIP} and drives to tag {TAG_ID} by itself")
+        config = {"tag_id": TAG_ID, "tag_size_m": TAG_SIZE_M, "target_distance_m": DISTANCE_M}
+        sound = codec.encode(SOUNDBOARD_COMMAND, SoundboardCommand(action="play", file=CLIP))
+        with ExitStack() as stack:
+            stack.callback(self._transport.subscribe(APRILTAG_DATA.topic(robot.base), receive).close)
+            stack.callback(command, AutonomyCommand(action="stop"))
+            began = time.monotonic()
+            command(AutonomyCommand(action="start", file=FOLLOW, config=config))
+            self._publish(SOUNDBOARD_COMMAND.topic(robot.base), sound)
+            self._until(lambda: bool(seen) and scripted(), _START_S)
+            self._wait(_APPROACH_S)
+            self.show(f"TAKES OVER: drives {robot.name}, {FOLLOW} is overruled")
+            took_over = time.monotonic()
+            self._hold(_BACK, _OVERRIDE_S)
+            released = self._drive(STOP)
+            self.show(f"LETS GO: {robot.name} waits {HOLD_S:.0f} s for another command")
+            self._until(scripted, HOLD_S + _STATUS_S)
+            self.show(f"GIVES BACK: {FOLLOW} drives {robot.name} again")
+            self._until(lambda: abs(distance_m() - DISTANCE_M) <= TOLERANCE_M, _ARRIVAL_S, _STEADY_S)
+            self.show(f"ENDS: {FOLLOW}, {robot.name} sees tag {TAG_ID} at {distance_m():.2f} m")
+            ended = time.monotonic()
+        self._wait(_FOLLOWED_REST_S)
+        return CompletedFollow(robot.name, began, took_over, mix(_BACK.x, _BACK.z), released, ended, CLIP)
