@@ -57,7 +57,6 @@ class Broker(Program):
 
     def _answers(self) -> bool:
         with socket.socket() as probe:
-            probe.settimeout(0.2)
             return probe.connect_ex((_HOST, self.port)) == 0
 
 
@@ -98,10 +97,9 @@ def free_port() -> int:
 
 
 class _Subscriptions(dict[str, Any]):
-    """A dictionary that may grow during an iteration, which amqtt (0.12.1) interrupts to let other tasks run.
+    """May grow during an iteration, which amqtt (0.12.1) interrupts to let other tasks run.
 
-    Else a filter that is added meanwhile ends the service of a client, or a message misses subscribers: one in five
-    runs of the demo lost its sound.
+    Else a filter that is added meanwhile ends the service of a client, or a message misses subscribers.
     """
 
     def __iter__(self) -> Iterator[str]:

@@ -24,8 +24,7 @@ P = TypeVar("P", bound=Program)
 class Processes:
     """Ends all of them with its ``with`` block, those of a kind at the same time; then deletes the folder.
 
-    A subclass starts what it consists of in :meth:`start`; what is to be closed before all processes goes to
-    ``closing``. The block does not begin if that fails.
+    A subclass starts what it consists of in :meth:`start`; ``closing`` is closed before all processes end.
     """
 
     ends_s: ClassVar[tuple[float, ...]] = (4.0, 6.0, 2.0, 2.0)  # what is left of each kind after that is killed
@@ -39,11 +38,10 @@ class Processes:
         self._kinds: dict[Program, int] = {}
 
     def __enter__(self) -> Self:
-        try:
+        with ExitStack() as failed:
+            failed.push(self)
             self.start()
-        except BaseException:
-            self.__exit__()
-            raise
+            failed.pop_all()
         return self
 
     def start(self) -> None:

@@ -11,20 +11,16 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
 from pebble.errors import PebbleError
 from pebble.runtime.parent import tied_to_parent
 
-Wrap = Callable[[Sequence[str]], Sequence[str]]
-"""Extends a command, so that it runs in another network."""
-
-Each = Callable[[bytes], object]
-"""Gets one line of a program's standard output."""
-
+Wrap = Callable[[Sequence[str]], Sequence[str]]  # extends a command, so that it runs in another network
+Each = Callable[[bytes], object]  # gets one line of a program's standard output
 _STEP_S = 0.01
-_END_S = 4.0  # for workers
 _TAIL = 2000  # characters of a log that are shown
 
 
@@ -72,7 +68,7 @@ class Program:
 
     def tail(self) -> str:
         """The end of its log."""
-        return self.log.read_text(errors="replace").strip()[-_TAIL:] if self.log.exists() else ""
+        return self.log.read_text(errors="replace").strip()[-_TAIL:]
 
     def freeze(self) -> None:
         """SIGSTOP: its connections stay, and it answers nothing. A process that has ended stays so."""
@@ -117,13 +113,12 @@ class Worker(Program):
 
     def answer(self, timeout: float) -> dict[str, Any]:
         """The next answer. Raises PebbleError with its log if it ends, or does not answer within ``timeout`` s."""
-        try:
-            answer = self._answers.get(timeout=timeout)
-        except queue.Empty:
-            raise PebbleError(f"{self.name} did not answer within {timeout:.0f} s\n{self.tail()}".rstrip()) from None
-        if answer is None:
-            raise PebbleError(f"{self.name} ended with code {self._process.wait()}\n{self.tail()}".rstrip())
-        return answer
+        why = f"did not answer within {timeout:.0f} s"
+        with suppress(queue.Empty):
+            if (answer := self._answers.get(timeout=timeout)) is not None:
+                return answer
+            why = f"ended with code {self._process.wait()}"
+        raise PebbleError(f"{self.name} {why}\n{self.tail()}".rstrip())
 
     def send(self, line: str) -> None:
         """Writes a line to standard input. Ignored if the process has ended: :meth:`answer` reports that."""
@@ -147,7 +142,7 @@ class Worker(Program):
 
 
 def end_all(programs: Iterable[Program], within_s: float) -> None:
-    """Send SIGTERM to all of them, and kill those that still run after ``within_s``, with their children."""
+    """Send SIGTERM to all (to workers: the end of input); kill those that still run after it, with their children."""
     programs, deadline = list(programs), time.monotonic() + within_s
     for program in programs:
         program.ask_to_end()
@@ -159,16 +154,11 @@ def end_all(programs: Iterable[Program], within_s: float) -> None:
             program._process.wait()
 
 
-def end_workers(workers: Iterable[Worker]) -> None:
-    """Close the input of all workers, and kill those that still run seconds later."""
-    end_all(workers, _END_S)
+end_workers = partial(end_all, within_s=4.0)
 
 
 def children(pid: int) -> list[int]:
-    """The direct children of a process; none if it has ended.
-
-    Reads the parent of every process: not every kernel has ``/proc/<pid>/task/<tid>/children``.
-    """
+    """The direct children of a process; none if it has ended. Not every kernel has /proc/PID/task/TID/children."""
     found = []
     for process in Path("/proc").glob("[0-9]*"):
         with suppress(FileNotFoundError, ProcessLookupError):  # it has ended meanwhile

@@ -31,23 +31,19 @@ if TYPE_CHECKING:
     from pebble.simulation.mcu import Snapshot
 
 KINDS = ("mqtt", "zenoh")
-LAUNCHER, BROKER = "launcher", "mosquitto"
 NAME = "rover"
 BASE = Identity("pebble", "robots", NAME).base
 _HOST = "127.0.0.1"
 MCU_START_S = 15.0
-_COMM_BYTES = 15  # of a process's name in the kernel
-_REPORTS = 600  # a minute of reports
-_ENTRIES = 5_000  # minutes of commands
 
 Config = Mapping[str, Any]
 
 
 class SimulatedRobot:
-    """A robot on this machine. ``entries()`` and ``mcu_reports`` are what its MCU measured, independent of telemetry.
+    """A robot on this machine, whose processes are among ``running``, and end with them.
 
-    Its processes are among ``running``, and end with them. ``stop_s``: how long its wheels may turn after the last
-    command, its own watchdog included.
+    ``entries()`` and ``mcu_reports`` are what its MCU measured, independent of telemetry. ``stop_s``: how long its
+    wheels may turn after the last command, its own watchdog included.
     """
 
     runs_on: str
@@ -58,10 +54,10 @@ class SimulatedRobot:
     def __init__(self, running: Processes, name: str, folder: Path) -> None:
         self.running, self.name, self.folder = running, name, folder
         self.folder.mkdir(exist_ok=True)
-        self.mcu_reports: deque[Snapshot] = deque(maxlen=_REPORTS)
+        self.mcu_reports: deque[Snapshot] = deque(maxlen=600)  # a minute
         self.programs: list[Program] = []  # all that were started for it
         self._trace, self._trace_read = folder / "trace.jsonl", 0
-        self._entries: deque[Entry] = deque(maxlen=_ENTRIES)
+        self._entries: deque[Entry] = deque(maxlen=5_000)  # minutes of commands
 
     def entries(self) -> list[Entry]:
         """The lines that the MCU received and the changes of its motors, oldest first."""
@@ -81,9 +77,8 @@ class SimulatedRobot:
         self.programs.append(Program(name, command, self.folder / log, each))
         return self.running.add(self.programs[-1], kind)
 
-    def _start_mcu(self, module: str, *options: object) -> Program:
-        """The MCU of its motors, whose reports are collected."""
-        return self._add(f"{self.name}'s MCU", python(module, *options, "--report"), MCUS, "mcu.log", self._collect)
+    def _start_mcu(self, module: str, *options: object, name: str = "MCU", each: Each | None = None) -> Program:
+        return self._add(f"{self.name}'s {name}", python(module, *options), MCUS, f"{name}.log", each)
 
     def _collect(self, line: bytes) -> None:
         from pebble.simulation.mcu import Snapshot
@@ -141,10 +136,28 @@ class Robot(SimulatedRobot):
                 self.local_broker.wait()
         self._trace.touch()
         self._start_motors().wait_until(self.port.exists, MCU_START_S, ending)
-        self.config.write_text(json.dumps(self._contents(), indent=1))
+        connections: dict[str, Any] = {
+            "transport": {"run_dir": str(self.run_dir), "state_dir": str(self.folder / "state")},
+            "local_mqtt": None if self.local_port is None else {"host": "localhost", "port": self.local_port},
+            "services": {
+                "mqtt_bridge": {"remote_mqtt": {"host": self._remote_host, "port": self.remote_port}},
+                "serial_mcu_bridge": {"serial": {"port": str(self.port)}},
+            },
+        }
+        services = {name: {"enabled": True, **fields} for name, fields in self._services.items()}
+        contents = deep_merge(deep_merge(self._own, {"services": services}), connections)
+        self.config.write_text(json.dumps(contents, indent=1))
 
     def launch(self) -> None:
         self.start(f"the {self.kind} robot", python("pebble.cli", "up", self.config))
+
+    def start(self, name: str, command: Sequence[str]) -> None:
+        """One of the robot's own processes."""
+        self._started.append(self._add(name, self._wrap(command), ROBOTS, "robot.log"))
+
+    def _start_motors(self) -> Program:
+        options = [*board("goob", self.port, self._trace), *(["--trace-said"] if self.reports else [])]
+        return self._start_mcu("pebble.simulation.mcu", *options)
 
     def lines(self, since_ns: int) -> list[Entry]:
         """What the MCU received, did and (with ``reports``) sent after ``since_ns`` (CLOCK_MONOTONIC)."""
@@ -152,13 +165,13 @@ class Robot(SimulatedRobot):
 
     # -- its processes, once it is launched
 
-    def log(self) -> str:
-        """The end of the robot's log."""
-        return self.launcher.tail()
-
     @property
     def launcher(self) -> Program:
         return self._started[0]
+
+    def log(self) -> str:
+        """The end of the robot's log."""
+        return self.launcher.tail()
 
     def pids(self) -> list[int]:
         """Of the launcher, its children (including a hub), and the local broker, if there is one."""
@@ -167,17 +180,20 @@ class Robot(SimulatedRobot):
 
     def processes(self) -> dict[str, int]:
         """The same by name."""
-        names = {name[:_COMM_BYTES]: name for name in self._programs_of()}
-        found = {LAUNCHER: self.launcher.pid}
+        names = {name[:15]: name for name in self._programs()}  # as long as they are in the kernel
+        found = {"launcher": self.launcher.pid}
         for pid in children(self.launcher.pid):
             with suppress(OSError):  # it has just ended
                 comm = Path(f"/proc/{pid}/comm").read_text().strip()
                 found[names.get(comm, comm)] = pid
-        return found if self.local_broker is None else found | {BROKER: self.local_broker.pid}
+        return found if self.local_broker is None else found | {"mosquitto": self.local_broker.pid}
 
     def complete(self) -> bool:
         """Whether all its programs run, including those started on demand."""
-        return self._programs_of() <= self.processes().keys()
+        return self._programs() <= self.processes().keys()
+
+    def _programs(self) -> set[str]:
+        return {program.name for program in programs(load(self.config))}
 
     def expect(self, condition: Callable[[], bool], what: str, timeout: float) -> None:
         """Waits for the condition. Raises PebbleError with the robot's log after ``timeout`` seconds, or if it ends."""
@@ -185,32 +201,6 @@ class Robot(SimulatedRobot):
             self.launcher.wait_until(condition, timeout)
         except PebbleError as error:
             raise PebbleError(f"{what}: {error}\n{self.log()}") from None
-
-    def _programs_of(self) -> set[str]:
-        return {program.name for program in programs(load(self.config))}
-
-    def start(self, name: str, command: Sequence[str]) -> None:
-        """One of the robot's own processes."""
-        self._started.append(self._add(name, self._wrap(command), ROBOTS, "robot.log"))
-
-    def _start_motors(self) -> Program:
-        options = [*board("goob", self.port, self._trace), *(["--trace-said"] if self.reports else [])]
-        return self._add(f"{self.name}'s MCU", python("pebble.simulation.mcu", *options), MCUS, "mcu.log")
-
-    def _contents(self) -> Config:
-        """Of its config file: its own, with the addresses and paths of this robot."""
-        services = {name: {"enabled": True, **fields} for name, fields in self._services.items()}
-        connections: dict[str, Any] = {
-            "transport": {"run_dir": str(self.run_dir), "state_dir": str(self.folder / "state")},
-            "services": {
-                "mqtt_bridge": {"remote_mqtt": {"host": self._remote_host, "port": self.remote_port}},
-                "serial_mcu_bridge": {"serial": {"port": str(self.port)}},
-            },
-        }
-        if self.local_port is not None:
-            connections["local_mqtt"] = {"host": "localhost", "port": self.local_port}
-        contents: Config = deep_merge(deep_merge(self._own, {"services": services}), connections)
-        return contents
 
 
 def board(kind: str, port: Path, trace: Path) -> tuple[object, ...]:

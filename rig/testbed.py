@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+import struct
 import threading
 import time
-from array import array
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ from pebble.media.sound_file import write_wav
 from pebble.media.world.world_file import read_world
 from pebble.rig.broker import BrokerKind
 from pebble.rig.operator import CLIP, TAG_ID, Operator
-from pebble.rig.processes import MCUS, OPERATORS, Processes, python
+from pebble.rig.processes import OPERATORS, Processes, python
 from pebble.rig.programs import Program
 from pebble.rig.robot import MCU_START_S, MEDIA, Robot, SimulatedRobot, board
 from pebble.simulation.loudspeaker import playbacks
@@ -45,12 +45,9 @@ _PAGE_START_S = 15.0  # it takes a while to import on a small machine
 _DRIVABLE_S = 30.0
 _RESTART = ["sh", "-c", "kill $PPID"]  # the bridge alone, which runs it: the demo would take more for a failure
 _RATE = 16_000
-_HORN = array("h", ([8000] * 20 + [-8000] * 20) * 400).tobytes()  # 1 s of 400 Hz
+_HORN = struct.pack("<40h", *[8000] * 20, *[-8000] * 20) * 400  # 1 s of 400 Hz
 #: After the first round of driving Goob looks at the tag, and has space for further rounds wherever it is then.
 _START = {"goob": {"kind": "goob", "x": -0.3, "y": 0.2, "heading_deg": 0.0}}
-
-
-# -- the robots
 
 
 class LinuxRobot(Robot):
@@ -64,16 +61,13 @@ class LinuxRobot(Robot):
         own = json.loads((files("pebble") / "configs" / f"{name}.json").read_text())
         remote, folder = (_HOST, running.broker_port), running.folder / name
         super().__init__(running, own["transport"]["kind"], remote, name=name, folder=folder)
-        self.has_imu = name == "goob"
-        self.local_port = running.local_broker.port
+        self.has_imu, self.local_port = name == "goob", running.local_broker.port
         self.voice = folder / "voice"  # where its loudspeaker records what it plays of operators' voices
-        self._devices = {instance: folder / instance for instance in _DEVICES if name == "goob"}  # their serial ports
+        self._devices = {device: folder / device for device in _DEVICES if name == "goob"}  # their serial ports
         self._own = own | {"services": own["services"] | {"av_daemon": {}}}
         raw = ["-t", "raw", "-f", "S16_LE", "-c", "{channels}", "-r", "{rate}", "-"]
-        instances = {
-            instance: {"protocol": "pebble_serial_v1", "serial": {"port": str(port)}}
-            for instance, port in self._devices.items()
-        }
+        ports = {device: {"port": str(port)} for device, port in self._devices.items()}
+        instances = {device: {"protocol": "pebble_serial_v1", "serial": port} for device, port in ports.items()}
         self._services = {
             "mqtt_bridge": {
                 "service_restart_control": {"command": _RESTART},
@@ -85,18 +79,17 @@ class LinuxRobot(Robot):
 
     def bring_up(self, ending: threading.Event) -> None:
         """Start the MCUs first, so that their ports exist, then the robot."""
+        for device, port in self._devices.items():
+            kind, *more = _DEVICES[device]
+            options = *board(kind, port, self.folder / f"{device}.jsonl"), *more
+            mcu = self._start_mcu("pebble.simulation.mcu", *options, name=device)
+            mcu.wait_until(port.exists, MCU_START_S, ending)
         self.prepare(ending)
-        starting = []
-        for instance, port in self._devices.items():
-            kind, *options = _DEVICES[instance]
-            command = python("pebble.simulation.mcu", *board(kind, port, self.folder / f"{instance}.jsonl"), *options)
-            starting.append((self._add(f"{self.name}'s {instance}", command, MCUS, f"{instance}.log"), port))
-        for program, port in starting:
-            program.wait_until(port.exists, MCU_START_S, ending)
         self.start(self.name, python("pebble.cli", "up", self.config))
 
     def _start_motors(self) -> Program:
-        return self._start_mcu("pebble.simulation.mcu", *board(self.name, self.port, self._trace))
+        options = board(self.name, self.port, self._trace)
+        return self._start_mcu("pebble.simulation.mcu", *options, "--report", each=self._collect)
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,9 +103,9 @@ class Outcome:
 
 
 class RoomRobot(LinuxRobot):
-    """Goob: its MCU is part of a simulated room, its camera sees the room, and a simulated loudspeaker records.
+    """Goob in the room that comes with Pebble, alone, with a tag on each wall: its MCU is part of the room.
 
-    The room is the one that comes with Pebble, with a tag on each wall and Goob alone in it.
+    Its camera sees the room, and a simulated loudspeaker records.
     """
 
     has_scripts, has_counter = True, False
@@ -124,8 +117,8 @@ class RoomRobot(LinuxRobot):
         room = json.loads((files("pebble.simulation.world") / "room.json").read_text())
         self._room.write_text(json.dumps(room | {"robots": _START}, indent=1))
         sounds = self.folder / "sounds"
+        (sounds / "signals").mkdir(parents=True)
         for clip, seconds in {CLIP: 1.0, "signals/beep.wav": 0.15, "signals/long.wav": 0.6}.items():
-            (sounds / clip).parent.mkdir(parents=True, exist_ok=True)
             write_wav(sounds / clip, _HORN[: 2 * round(seconds * _RATE)], _RATE)
         playback = {"directory": str(sounds), "player_command": _loudspeaker(self._record)}
         self._services |= {
@@ -144,7 +137,8 @@ class RoomRobot(LinuxRobot):
         return Outcome(math.hypot(dx, dy), bearing, max(played, default=0) / len(_HORN), 1.0)
 
     def _start_motors(self) -> Program:
-        return self._start_mcu("pebble.simulation.world", self._room, "--folder", self.folder, "--trace")
+        options = (self._room, "--folder", self.folder, "--trace", "--report")
+        return self._start_mcu("pebble.simulation.world", *options, each=self._collect)
 
     def _collect(self, line: bytes) -> None:
         seen = msgspec.json.decode(line, type=WorldSnapshot)
@@ -165,12 +159,9 @@ class McuRobot(SimulatedRobot):
         self.runs_on, self._broker = _BOARDS[name], f"{_HOST}:{running.broker_port}"
 
     def bring_up(self, ending: threading.Event) -> None:
-        options = ("--kind", self.name, "--trace", self._trace, "--broker", self._broker)
-        mcu = self._start_mcu("pebble.simulation.networked", *options)
+        options = ("--kind", self.name, "--trace", self._trace, "--broker", self._broker, "--report")
+        mcu = self._start_mcu("pebble.simulation.networked", *options, each=self._collect)
         mcu.wait_until(lambda: bool(self.mcu_reports), MCU_START_S, ending)
-
-
-# -- all of them, and the page
 
 
 class PageServer(Program):
@@ -200,11 +191,11 @@ class Testbed(Processes):
     """
 
     ends_s = (1.0, 2.5, 1.0, 1.0)  # with the operator's disconnect: every process ends within five seconds
+    keep = True
     server: PageServer  # the newest
 
     def __init__(self, ending: threading.Event, names: Sequence[str] = ROBOTS, *, room: bool = True) -> None:
         super().__init__("pebble-demo-")
-        self.keep = True
         self.robots: dict[str, LinuxRobot | McuRobot] = {}
         self._ending, self._names, self._room = ending, names, room
 
@@ -239,9 +230,11 @@ class Stage(Testbed):
     ``settings`` are fields of WebSettings. ``url`` of the page ends with a slash. Raises PebbleError.
     """
 
+    keep = False
+
     def __init__(self, *names: str, room: bool = True, **settings: Any) -> None:
         super().__init__(threading.Event(), names or ROBOTS, room=room)
-        self.keep, self._settings = False, settings
+        self._settings = settings
 
     def start(self) -> None:
         self.start_brokers()
@@ -262,8 +255,6 @@ class Stage(Testbed):
 
     def robot_url(self, name: str) -> str:
         return f"{self.url}r/{self.ref(name)}"
-
-    # -- the motors
 
     def motors(self, name: str) -> list[tuple[int, tuple[float, float]]]:
         """Every change of its motors, oldest first: monotonic ns, left and right."""

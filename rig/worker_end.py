@@ -36,5 +36,5 @@ def serve_on_thread(handle: Handle, end: Callable[[], object] = lambda: None) ->
         ended.set()
         end()
 
-    threading.Thread(target=run, name="lines", daemon=True).start()
+    threading.Thread(target=run, daemon=True).start()
     return ended
