@@ -34,7 +34,7 @@ KINDS = ("mqtt", "zenoh")
 NAME = "rover"
 BASE = Identity("pebble", "robots", NAME).base
 _HOST = "127.0.0.1"
-MCU_START_S = 15.0
+START_S = 15.0  # of an MCU or the page's server, on a small machine
 
 Config = Mapping[str, Any]
 
@@ -79,6 +79,11 @@ class SimulatedRobot:
 
     def _start_mcu(self, module: str, *options: object, name: str = "MCU", each: Each | None = None) -> Program:
         return self._add(f"{self.name}'s {name}", python(module, *options), MCUS, f"{name}.log", each)
+
+    def _start_board(self, kind: str, port: Path, trace: Path, *options: object, **more: Any) -> Program:
+        """An MCU on a pty."""
+        where = ("--kind", kind, "--link", port, "--trace", trace)
+        return self._start_mcu("pebble.simulation.mcu", *where, *options, **more)
 
     def _collect(self, line: bytes) -> None:
         from pebble.simulation.mcu import Snapshot
@@ -135,7 +140,7 @@ class Robot(SimulatedRobot):
             if self._wrap is unchanged:  # else it is in another network
                 self.local_broker.wait()
         self._trace.touch()
-        self._start_motors().wait_until(self.port.exists, MCU_START_S, ending)
+        self._start_motors().wait_until(self.port.exists, START_S, ending)
         connections: dict[str, Any] = {
             "transport": {"run_dir": str(self.run_dir), "state_dir": str(self.folder / "state")},
             "local_mqtt": None if self.local_port is None else {"host": "localhost", "port": self.local_port},
@@ -156,8 +161,7 @@ class Robot(SimulatedRobot):
         self._started.append(self._add(name, self._wrap(command), ROBOTS, "robot.log"))
 
     def _start_motors(self) -> Program:
-        options = [*board("goob", self.port, self._trace), *(["--trace-said"] if self.reports else [])]
-        return self._start_mcu("pebble.simulation.mcu", *options)
+        return self._start_board("goob", self.port, self._trace, *(["--trace-said"] if self.reports else []))
 
     def lines(self, since_ns: int) -> list[Entry]:
         """What the MCU received, did and (with ``reports``) sent after ``since_ns`` (CLOCK_MONOTONIC)."""
@@ -201,11 +205,6 @@ class Robot(SimulatedRobot):
             self.launcher.wait_until(condition, timeout)
         except PebbleError as error:
             raise PebbleError(f"{what}: {error}\n{self.log()}") from None
-
-
-def board(kind: str, port: Path, trace: Path) -> tuple[object, ...]:
-    """The options of a simulated MCU."""
-    return "--kind", kind, "--link", port, "--trace", trace
 
 
 def synthetic_media(camera: tuple[int, int, int], published: tuple[int, int, int]) -> dict[str, Config]:

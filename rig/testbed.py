@@ -25,7 +25,7 @@ from pebble.rig.broker import BrokerKind
 from pebble.rig.operator import CLIP, TAG_ID, Operator
 from pebble.rig.processes import OPERATORS, Processes, python
 from pebble.rig.programs import Program
-from pebble.rig.robot import MCU_START_S, MEDIA, Robot, SimulatedRobot, board
+from pebble.rig.robot import MEDIA, START_S, Robot, SimulatedRobot
 from pebble.simulation.loudspeaker import playbacks
 from pebble.simulation.mcu import Snapshot
 from pebble.simulation.motion import Pose
@@ -41,8 +41,6 @@ _BOARDS = {"minilamp": "ESP32-C6", "benjr": "ESP8266"}
 #: Self-describing MCUs that Goob has besides, by their instance of the serial bridge: kind and options.
 _DEVICES = {"imu": ("goob_imu",), OUTLETS: ("outlets", "--unreachable", "o4")}
 _HOST = "127.0.0.1"
-_PAGE_START_S = 15.0  # it takes a while to import on a small machine
-_DRIVABLE_S = 30.0
 _RESTART = ["sh", "-c", "kill $PPID"]  # the bridge alone, which runs it: the demo would take more for a failure
 _RATE = 16_000
 _HORN = struct.pack("<40h", *[8000] * 20, *[-8000] * 20) * 400  # 1 s of 400 Hz
@@ -80,16 +78,14 @@ class LinuxRobot(Robot):
     def bring_up(self, ending: threading.Event) -> None:
         """Start the MCUs first, so that their ports exist, then the robot."""
         for device, port in self._devices.items():
-            kind, *more = _DEVICES[device]
-            options = *board(kind, port, self.folder / f"{device}.jsonl"), *more
-            mcu = self._start_mcu("pebble.simulation.mcu", *options, name=device)
-            mcu.wait_until(port.exists, MCU_START_S, ending)
+            kind, *options = _DEVICES[device]
+            mcu = self._start_board(kind, port, self.folder / f"{device}.jsonl", *options, name=device)
+            mcu.wait_until(port.exists, START_S, ending)
         self.prepare(ending)
         self.start(self.name, python("pebble.cli", "up", self.config))
 
     def _start_motors(self) -> Program:
-        options = board(self.name, self.port, self._trace)
-        return self._start_mcu("pebble.simulation.mcu", *options, "--report", each=self._collect)
+        return self._start_board(self.name, self.port, self._trace, "--report", each=self._collect)
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,8 +124,8 @@ class RoomRobot(LinuxRobot):
 
     def outcome(self, at: float) -> Outcome:
         """Where the tag was then, and what the loudspeaker has played of the clip."""
-        unknown = Pose(math.nan, math.nan)
-        pose = next((one.board.pose for one in reversed(self.mcu_reports) if one.ns <= at * 1e9), unknown)
+        poses = (one.board.pose for one in reversed(self.mcu_reports) if one.ns <= at * 1e9)
+        pose = next(poses, Pose(math.nan, math.nan))
         tag = next(tag for tag in read_world(self._room).tags if tag.id == TAG_ID)
         dx, dy = tag.x - pose.x_mm / 1000, tag.y - pose.y_mm / 1000
         bearing = math.remainder(math.atan2(dy, dx) - pose.heading_rad, math.tau)
@@ -161,7 +157,7 @@ class McuRobot(SimulatedRobot):
     def bring_up(self, ending: threading.Event) -> None:
         options = ("--kind", self.name, "--trace", self._trace, "--broker", self._broker, "--report")
         mcu = self._start_mcu("pebble.simulation.networked", *options, each=self._collect)
-        mcu.wait_until(lambda: bool(self.mcu_reports), MCU_START_S, ending)
+        mcu.wait_until(lambda: bool(self.mcu_reports), START_S, ending)
 
 
 class PageServer(Program):
@@ -177,7 +173,7 @@ class PageServer(Program):
 
     def wait(self, ending: threading.Event | None = None) -> None:
         """Wait until the page can be opened at ``url``, or ``ending``. Raises PebbleError if it cannot."""
-        self.wait_until(lambda: bool(self.url), _PAGE_START_S, ending)
+        self.wait_until(lambda: bool(self.url), START_S, ending)
 
     def _take(self, line: bytes) -> None:
         self.url = msgspec.json.decode(line, type=Ready).url
@@ -244,7 +240,7 @@ class Stage(Testbed):
         self.url = self.server.url
         with closing(Operator(self.broker_port, "stage")) as operator:
             operator.connect()
-            operator.wait_until_ready(len(self.robots), _DRIVABLE_S, self.unexpected_exits)
+            operator.wait_until_ready(len(self.robots), 30.0, self.unexpected_exits)
 
     def restart_server(self) -> None:
         """Start it again at the same address; ends the old one if it runs."""
