@@ -11,7 +11,6 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
-from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -21,6 +20,7 @@ from pebble.runtime.parent import tied_to_parent
 Wrap = Callable[[Sequence[str]], Sequence[str]]  # extends a command, so that it runs in another network
 Each = Callable[[bytes], object]  # gets one line of a program's standard output
 _STEP_S = 0.01
+_END_S = 4.0  # for workers
 _TAIL = 2000  # characters of a log that are shown
 
 
@@ -154,7 +154,8 @@ def end_all(programs: Iterable[Program], within_s: float) -> None:
             program._process.wait()
 
 
-end_workers = partial(end_all, within_s=4.0)
+def end_workers(workers: Iterable[Worker]) -> None:
+    end_all(workers, _END_S)
 
 
 def children(pid: int) -> list[int]:
