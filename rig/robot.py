@@ -74,8 +74,8 @@ class SimulatedRobot:
         raise NotImplementedError
 
     def _add(self, name: str, command: Sequence[str], kind: int, log: str, each: Each | None = None) -> Program:
-        self.programs.append(Program(name, command, self.folder / log, each))
-        return self.running.add(self.programs[-1], kind)
+        self.programs.append(self.running.add(Program(name, command, self.folder / log, each), kind))
+        return self.programs[-1]
 
     def _start_mcu(self, module: str, *options: object, name: str = "MCU", each: Each | None = None) -> Program:
         return self._add(f"{self.name}'s {name}", python(module, *options), MCUS, f"{name}.log", each)
@@ -96,7 +96,7 @@ class Robot(SimulatedRobot):
 
     It connects to a broker for operators at ``remote``, host and port. ``services``: fields of its services' configs
     besides these connections; one that is named is enabled. ``reports``: whether every report of its MCU is recorded
-    and forwarded, 50 a second; None: as is usual. ``wrap`` extends the commands of all processes that use the network.
+    and forwarded, 50 a second. ``wrap`` extends the commands of all processes that use the network.
     """
 
     def __init__(
@@ -120,12 +120,9 @@ class Robot(SimulatedRobot):
         self.local_port: int | None = None  # of the local broker, which may be that of several robots
         self.reports, self._wrap = reports, wrap
         self._started: list[Program] = []
-        self._services = dict(services or {})
-        motors: dict[str, Any] = {"enabled": True, "serial": {"baud": 460_800}}
-        if reports is not None:
-            motors["telemetry"] = {"publish_touch_sensors": reports}
-        own = {"mqtt_bridge": {"enabled": True}, "serial_mcu_bridge": motors}
-        self._own: Config = {"robot": {"id": name}, "transport": {"kind": kind}, "services": own}
+        motors = {"serial": {"baud": 460_800}, "telemetry": {"publish_touch_sensors": reports}}
+        self._services: dict[str, Config] = {"mqtt_bridge": {}, "serial_mcu_bridge": motors, **(services or {})}
+        self._own: Config = {"robot": {"id": name}, "transport": {"kind": kind}}
 
     def prepare(self, ending: threading.Event | None = None) -> None:
         """Starts what the robot needs and writes its config, or waits no longer once ``ending`` is set.
