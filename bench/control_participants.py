@@ -222,12 +222,7 @@ def write(writer: Writer, switch: Switch) -> None:
         switch.wait()
         due = time.monotonic()
         while switch.on:
-            frame = writer.begin()
-            if frame is not None:
-                np.copyto(frame, picture)
-                writer.send()
-                switch.pictures += 1
-            del frame
+            switch.pictures += writer.write(lambda frame: np.copyto(frame, picture))
             due += 1 / PICTURES_HZ
             time.sleep(max(0.0, due - time.monotonic()))
     writer.close()
