@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     from playwright.sync_api import Page
 
 Samples = Iterator[tuple[str, float]]  # each with the key of its row
-Measure = Callable[[Rig, float], Samples]  # the second argument scales the number of samples
 
 _FLOW_S = 4.0  # until the camera is running and every viewer has a key frame
 _PICTURE_S = 10.0
@@ -51,29 +50,6 @@ _HIDE = """() => {
   document.dispatchEvent(new Event("visibilitychange"));
   return at;
 }"""
-
-
-class Row(NamedTuple):
-    """What is measured, and its goal: bounds of the median and of the 95th percentile."""
-
-    key: str
-    p50: float = math.inf
-    p95: float = math.inf
-    unit: str = "ms"
-
-    @property
-    def goal(self) -> str:
-        """In words; empty without one."""
-        bounds = ["–" if math.isinf(bound) else f"{bound:g}" for bound in (self.p50, self.p95)]
-        return "" if bounds == ["–", "–"] else f"≤ {' / '.join(bounds)}"
-
-    def met(self, samples: Sequence[float]) -> bool:
-        return percentile(samples, 50) <= self.p50 and percentile(samples, 95) <= self.p95
-
-    def best(self, tries: Sequence[list[float]]) -> list[float]:
-        """The try that comes nearest to the goal; no samples if all failed."""
-        percent = 50 if math.isinf(self.p95) else 95
-        return min(filter(None, tries), key=lambda samples: percentile(samples, percent), default=[])
 
 
 def keys(rig: Rig, scale: float) -> Samples:
@@ -103,30 +79,25 @@ def interruptions(rig: Rig, scale: float) -> Samples:
         session.send("Debugger.enable")
         return partial(session.send, "Debugger.pause")
 
-    def stalled(_page: Page) -> Callable[[], object]:
-        """The browser's process for the network stands still."""
-        pid = _network_process()
+    def signalled(pid: int, number: signal.Signals) -> Callable[[], object]:
         undo.callback(os.kill, pid, signal.SIGCONT)
-        return partial(os.kill, pid, signal.SIGSTOP)
-
-    def server(act: Callable[[], object]) -> Callable[[], object]:
-        undo.callback(rig.stage.restart_server)
-        undo.callback(rig.stage.server.thaw)
-        return act
+        return partial(os.kill, pid, number)
 
     prepared: dict[str, Callable[[Page], Callable[[], object]]] = {
         "blur to stop": lambda page: partial(page.evaluate, _BLUR),
         "hidden to stop": lambda page: partial(page.evaluate, _HIDE),
         "frozen to stop": frozen,
         "closed to stop": lambda page: page.close,
-        "stalled to stop": stalled,
-        "server frozen to stop": lambda _: server(rig.stage.server.freeze),
-        "server killed to stop": lambda _: server(rig.stage.server.kill),
+        "stalled to stop": lambda _: signalled(_network_process(), signal.SIGSTOP),
+        "server frozen to stop": lambda _: signalled(rig.stage.server.pid, signal.SIGSTOP),
+        "server killed to stop": lambda _: signalled(rig.stage.server.pid, signal.SIGKILL),
     }
     for name in [name for name in prepared for _ in range(max(1, round(8 * scale)))]:
         page = rig.page(ROBOT)
         rig.hold(page)
         with undo:
+            if name.startswith("server"):
+                undo.callback(rig.stage.restart_server)
             act, began = prepared[name](page), time.monotonic()
             stamp = act()  # the page's, of its own events
             at = monotonic(stamp) if isinstance(stamp, float) else began
@@ -135,7 +106,7 @@ def interruptions(rig: Rig, scale: float) -> Samples:
 
 
 def _network_process() -> int:
-    """The process of our browser that has its connections."""
+    """The browser's process that has its connections."""
     pids = [os.getpid()]
     for pid in pids:
         if b"network.mojom.NetworkService" in Path(f"/proc/{pid}/cmdline").read_bytes():
@@ -286,7 +257,7 @@ def far_link(rig: Rig, scale: float) -> Samples:
     page.keyboard.up(KEY)
     rig.pause(page, 1.0)
     sent = page.evaluate("bench.sent")
-    arrived = {round(axes.get("y", 0.0), 3): at for at, base, axes in rig.drives if base == rig.ref(ROBOT)}
+    arrived = {round(axes.get("y", 0.0), 3): at for at, axes in rig.drives}
     late = [1000 * (arrived[round(y, 3)] - monotonic(at)) for y, at in sent if round(y, 3) in arrived]
     yield from (("256 kbit/s: drive", one) for one in late)
     yield "256 kbit/s: drive, arrived", 100 * len(late) / max(1, len(sent))
@@ -295,10 +266,19 @@ def far_link(rig: Rig, scale: float) -> Samples:
 # -- the comparison
 
 
+class Row(NamedTuple):
+    """What is measured, and its goal: bounds of the median and of the 95th percentile."""
+
+    key: str
+    p50: float = math.inf
+    p95: float = math.inf
+    unit: str = "ms"
+
+
 class PageCase(NamedTuple):
     """Rows that are measured together."""
 
-    measure: Measure
+    measure: Callable[[Rig, float], Samples]  # the second argument scales the number of samples
     setting: Callable[[], AbstractContextManager[Rig]]
     rows: Sequence[Row]
 
@@ -355,16 +335,19 @@ def measure(case: Case) -> Iterator[Cell]:
 
 
 def goals(cells: Sequence[Cell]) -> Iterator[str | Judged]:
-    """The goals as aims, each judged by the best try."""
+    """The goals as aims, each judged by the try that comes nearest to it."""
     for cell in cells:
         row = ROWS[cell.measure]
-        best = row.best(cell.rounds)
-        measured = f"{figure(percentile(best, 50))} / {figure(percentile(best, 95))} {row.unit}"
-        if row.goal:
-            what = f"{row.key}, p50 / p95 {row.goal} {row.unit}"
-            yield Judged(what=what, outcome=outcome(row.met(best), judged=bool(best)), measured=measured)
-        else:
+        percent = 50 if math.isinf(row.p95) else 95
+        best = min(filter(None, cell.rounds), key=lambda one: percentile(one, percent), default=[])
+        p50, p95 = percentile(best, 50), percentile(best, 95)
+        goal = " / ".join("–" if math.isinf(bound) else f"{bound:g}" for bound in (row.p50, row.p95))
+        measured = f"{figure(p50)} / {figure(p95)} {row.unit}"
+        if goal == "– / –":
             yield f"{row.key}: {measured}"
+        else:
+            met = outcome(p50 <= row.p50 and p95 <= row.p95, judged=bool(best))
+            yield Judged(what=f"{row.key}, p50 / p95 ≤ {goal} {row.unit}", outcome=met, measured=measured)
 
 
 PAGE = Comparison(

@@ -32,7 +32,7 @@ from pebble.rig.testbed import ROBOTS, Stage
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
 
-Drives = list[tuple[float, str, dict[str, float]]]  # time, base topic, and axes
+Drives = list[tuple[float, dict[str, float]]]  # time and axes
 Test = str | Callable[[], Any]  # an expression of the page, or a function
 
 ROBOT, KEY = "goob", "KeyW"  # that are driven, by default
@@ -110,7 +110,7 @@ _REASON = """() => {
 
 
 class Rig:
-    """One stage and one browser. ``drives`` are the commands that the broker has delivered so far."""
+    """One stage and one browser. ``drives`` are the commands to the robot that the broker has delivered so far."""
 
     def __init__(self, stage: Stage, browser: Browser, drives: Drives) -> None:
         self.stage, self.ref, self.drives, self._browser = stage, stage.ref, drives, browser
@@ -166,8 +166,7 @@ class Rig:
         """When the broker delivered the first command that moves the robot after ``since``."""
 
         def found() -> list[float]:
-            ours = [(at, axes) for at, base, axes in self.drives if base == self.ref(ROBOT) and at > since]
-            return [at for at, axes in ours if axes.get("x") or axes.get("z")]
+            return [at for at, axes in self.drives if at > since and (axes.get("x") or axes.get("z"))]
 
         return float(self.until(page, found, "no command reached the broker", _STOPPED_S)[0])
 
@@ -205,11 +204,11 @@ def rig(*names: str, program: str | None = None, flags: tuple[str, ...] = (), **
     drives: Drives = []
 
     def receive(line: bytes) -> None:
-        at, topic, axes = line.split(b" ", 2)
-        drives.append((monotonic(1000 * float(at)), topic.decode().removesuffix(f"/{DRIVE.suffix}"), json.loads(axes)))
+        at, axes = line.split(b" ", 1)
+        drives.append((monotonic(1000 * float(at)), json.loads(axes)))
 
     with Stage(*(names or ROBOTS), **settings) as stage, chromium(*flags, program=program) as browser:
-        options = ["-h", "127.0.0.1", "-p", str(stage.broker_port), "-t", DRIVE.filter("+/+/+"), "-F", "%U %t %p"]
+        options = ["-h", "127.0.0.1", "-p", str(stage.broker_port), "-t", DRIVE.topic(stage.ref(ROBOT)), "-F", "%U %p"]
         log = stage.folder / "subscriber.log"
         subscriber = stage.add(Program("subscriber", ["mosquitto_sub", *options], log, each=receive), OPERATORS)
         yield Rig(stage, browser, drives)

@@ -58,17 +58,13 @@ _DIFFERENCES: Final = (
     "a range as of stamps of whole seconds",
 )
 _OUTAGES, _LATENCY, _BANDWIDTH = "outages of heartbeats", "latency of heartbeats", "bandwidth"
-#: Of the paper: number, robot and content.
+#: The paper's Figures 4.1 to 4.6: robot and content.
 _FIGURES: Final = (
-    ("4.1", "goob", _OUTAGES),
-    ("4.2", "goob", _LATENCY),
-    ("4.3", "minilamp", _BANDWIDTH),
-    ("4.4", "minilamp", _OUTAGES),
-    ("4.5", "benjr", _LATENCY),
-    ("4.6", "minilamp", _LATENCY),
-)
+    ("goob", _OUTAGES), ("goob", _LATENCY), ("minilamp", _BANDWIDTH),
+    ("minilamp", _OUTAGES), ("benjr", _LATENCY), ("minilamp", _LATENCY),
+)  # fmt: skip
 
-Robots = dict[str, RobotTraffic]  # by name
+[str, RobotTraffic]  # by name
 
 
 def prepare(_run: Run) -> None:
@@ -115,23 +111,25 @@ def _use(operator: Operator, port: int, seconds: float) -> None:
         robots = [robot.base for robot in operator.discovery.all_robots() if robot.offers("video")]
         receivers = [stack.enter_context(closing(MediaReceiver(viewer, base))) for base in robots]
 
-        def poll(seconds: float, until: Callable[[], bool] = lambda: False) -> None:
-            end = time.monotonic() + seconds
-            while time.monotonic() < end and not until():
-                time.sleep(_POLL_S)
-                operator.completed.clear()  # nothing is assessed here
-                for receiver in receivers:
-                    receiver.poll()
+        def poll() -> None:
+            time.sleep(_POLL_S)
+            operator.completed.clear()  # nothing is assessed here
+            for receiver in receivers:
+                receiver.poll()
 
         for receiver in receivers:
             receiver.wait_for_capabilities(_READY_S)
             receiver.viewer.request("video", "json")
             receiver.viewer.request("audio", "pcm")
-        poll(_READY_S, lambda: all(len(one.encoding) == 2 for one in receivers))
-        if missing := [one.name for one in receivers if len(one.encoding) < 2]:
-            raise PebbleError(f"no pictures or no sound came from {', '.join(missing)}")
+        end = time.monotonic() + _READY_S
+        while silent := [one.name for one in receivers if len(one.encoding) < 2]:
+            poll()
+            if time.monotonic() > end:
+                raise PebbleError(f"no pictures or no sound came from {', '.join(silent)}")
         operator.begin()
-        poll(seconds)
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            poll()
 
 
 # -- cells
@@ -184,19 +182,15 @@ def tables(cells: Sequence[Cell]) -> Iterator[Table]:
 
 
 def assessment(cells: Sequence[Cell]) -> Iterator[str | Judged]:
-    yield _sound(robots_of(cells))
-    yield from _DIFFERENCES
-
-
-def _sound(robots: Robots) -> Judged:
-    """Packets of a second may be received in the next one: only the median of many seconds is the rate."""
-    sounds = {name: one for name, robot in robots.items() if (one := robot.of(AUDIO)) is not None}
+    """Packets of a second may be received in the next one: only the median of many seconds is the rate of sound."""
+    sounds = {name: one for name, robot in robots_of(cells).items() if (one := robot.of(AUDIO)) is not None}
     same = all(abs(one.median_kbps / MONO_PCM_KBPS - 1) <= _SAME for one in sounds.values())
-    return Judged(
+    yield Judged(
         what=f"PCM, one channel at 16 kHz, takes the paper's {MONO_PCM_KBPS:.1f} kbit/s within 1 %",
         outcome=outcome(bool(sounds) and same, judged=all(one.seconds >= LEAST_SECONDS for one in sounds.values())),
         measured=", ".join(f"{name} {one.median_kbps:.1f} kbit/s" for name, one in sounds.items()) or "no sound",
     )
+    yield from _DIFFERENCES
 
 
 def figures(results: Results) -> list[Picture]:
@@ -205,7 +199,7 @@ def figures(results: Results) -> list[Picture]:
     from pebble.recordings.traffic.figures import draw_bandwidth, draw_latency, draw_outages
 
     robots = robots_of(results.cells)
-    shown = [one for one in _FIGURES if one[1] in robots]
+    shown = [(number, name, what) for number, (name, what) in enumerate(_FIGURES, 1) if name in robots]
 
     def make() -> Figure:
         heading = "Traffic of simulated robots: the paper's Figures 4.1 to 4.6"
@@ -218,7 +212,7 @@ def figures(results: Results) -> list[Picture]:
                 draw_outages(axes, robot)
             elif robot.latency is not None:
                 draw_latency(axes, robot.latency)
-            title = f"Figure {number}: {name}, {what}"
+            title = f"Figure 4.{number}: {name}, {what}"
             axes.set_title(title, loc="left", pad=22.0, weight="bold")  # points for the legend between panel and title
         return figure
 
