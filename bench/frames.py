@@ -13,7 +13,7 @@ from pebble.bench import null
 from pebble.bench.comparison import Budget, Case, Comparison, Option, Run, of_known, rounds, seconds, variants
 from pebble.bench.pictures import ecdf, null_ratios, tails
 from pebble.bench.ratios import LEAST_ROUNDS, paired
-from pebble.bench.results import Cell
+from pebble.bench.results import Cell, Value
 from pebble.bench.tables import COUNT, LOST, Column, Grid, percentile_column
 from pebble.bench.usage import cpu_s, pss_mb
 from pebble.errors import PebbleError
@@ -34,6 +34,7 @@ _READY_S = 20.0
 _STARTUP_S = 0.1  # from the last process ready to the first counted frame
 _LATE_S = 0.15  # how long to wait for the last frames after the window
 _ANSWER_S = 10.0
+_CPU, _MEMORY = ("cpu_writer", "cpu_reader", "cpu_broker"), ("memory_writer_mb", "memory_reader_mb")
 
 
 def prepare(run: Run) -> None:
@@ -85,24 +86,18 @@ def measure(case: Case) -> Iterator[Cell]:
         writer, *readers = (worker.ask("", _ANSWER_S) for worker in workers)
         memory_mb = [pss_mb(worker.pid) for worker in workers]
     latencies_us = [latency for reader in readers for latency in reader["latencies_us"]]
-    own = {
+    figures: dict[str, Value] = {
         "cpu_writer": cpu[0],
         "cpu_reader": statistics.fmean(cpu[1 : len(workers)]),
+        "cpu_broker": None if broker is None else cpu[-1],
         "memory_writer_mb": memory_mb[0],
         "memory_reader_mb": statistics.fmean(memory_mb[1:]),
         "sent": writer["sent"] * len(readers),  # each frame to each reader
     }
     if case.variant == "memcpy":  # has no writer; it times copies, so there is no number of sent ones
-        own = {"cpu_reader": sum(latencies_us) / 1e4 / seconds / len(readers)}
-    yield case.cell(
-        "frame",
-        "us",
-        latencies_us,
-        **own,
-        cpu_broker=None if broker is None else cpu[-1],
-        torn=sum(reader["torn"] for reader in readers),
-        fallbacks=writer["fallbacks"],  # frames that did not go through shared memory, since the start
-    )
+        figures = {"cpu_reader": sum(latencies_us) / 1e4 / seconds / len(readers)}
+    figures |= {"torn": sum(reader["torn"] for reader in readers), "fallbacks": writer["fallbacks"]}
+    yield case.cell("frame", "us", latencies_us, None, **figures)
 
 
 # -- the report
@@ -127,8 +122,9 @@ def faults(cells: Sequence[Cell]) -> Iterator[str]:
 
 def complete(cells: Sequence[Cell]) -> bool:
     """Whether every case has results, of enough of its rounds to judge."""
-    least = (LEAST_ROUNDS if len(cell.rounds) >= LEAST_ROUNDS else 1 for cell in cells)
-    return all(sum(map(bool, cell.rounds)) >= enough for cell, enough in zip(cells, least, strict=True))
+    return all(
+        sum(map(bool, cell.rounds)) >= (LEAST_ROUNDS if len(cell.rounds) >= LEAST_ROUNDS else 1) for cell in cells
+    )
 
 
 def _conditions(cell: Cell) -> str:
@@ -174,18 +170,14 @@ FRAMES = Comparison(
     measures=("frame",),
     figures={
         **dict.fromkeys(("torn", "fallbacks"), sum),
-        **dict.fromkeys(
-            ("cpu_writer", "cpu_reader", "cpu_broker", "memory_writer_mb", "memory_reader_mb"),
-            of_known(statistics.median, 2),
-        ),
+        **dict.fromkeys((*_CPU, *_MEMORY), of_known(statistics.median, 2)),
     },
     tables=(
         Grid(
             title="{size} BGR at 30 Hz, readers: {readers}", each=("size", "readers"), rows=("variant",),
             columns=(
                 percentile_column(50, "p50 µs"), percentile_column(99, "p99 µs"), percentile_column(100, "max µs"),
-                _column("CPU %", "cpu_writer", "cpu_reader", "cpu_broker"),
-                _column("PSS MB", "memory_writer_mb", "memory_reader_mb"), LOST, COUNT,
+                _column("CPU %", *_CPU), _column("PSS MB", *_MEMORY), LOST, COUNT,
             ),
             caption="CPU: writer / each reader / broker; PSS: writer / each reader",
         ),

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from playwright.sync_api import Page
 
 Samples = Iterator[tuple[str, float]]  # each with the key of its row
+Act = Callable[[], Any]  # may return the page's stamp of it
 
 _FLOW_S = 4.0  # until the camera is running and every viewer has a key frame
 _PICTURE_S = 10.0
@@ -72,18 +73,18 @@ def interruptions(rig: Rig, scale: float) -> Samples:
     """A key is held, and something happens to the page, the connection or the server."""
     undo = ExitStack()
 
-    def frozen(page: Page) -> Callable[[], object]:
+    def frozen(page: Page) -> Act:
         """Its script stands still; Page.setWebLifecycleState has no effect on visible pages, as all here are."""
         session = page.context.new_cdp_session(page)
         undo.callback(session.detach)
         session.send("Debugger.enable")
         return partial(session.send, "Debugger.pause")
 
-    def signalled(pid: int, number: signal.Signals) -> Callable[[], object]:
+    def signalled(pid: int, number: signal.Signals) -> Act:
         undo.callback(os.kill, pid, signal.SIGCONT)
         return partial(os.kill, pid, number)
 
-    prepared: dict[str, Callable[[Page], Callable[[], object]]] = {
+    prepared: dict[str, Callable[[Page], Act]] = {
         "blur to stop": lambda page: partial(page.evaluate, _BLUR),
         "hidden to stop": lambda page: partial(page.evaluate, _HIDE),
         "frozen to stop": frozen,
@@ -99,9 +100,8 @@ def interruptions(rig: Rig, scale: float) -> Samples:
             if name.startswith("server"):
                 undo.callback(rig.stage.restart_server)
             act, began = prepared[name](page), time.monotonic()
-            stamp = act()  # the page's, of its own events
-            at = monotonic(stamp) if isinstance(stamp, float) else began
-            yield name, 1000 * (rig.stopped(None) - at)
+            stamp = act()
+            yield name, 1000 * (rig.stopped(None) - (monotonic(stamp) if stamp else began))
         page.context.close()
 
 
@@ -117,28 +117,27 @@ def _network_process() -> int:
 
 def stops(rig: Rig, scale: float) -> Samples:
     """STOP is clicked while other operators drive."""
-    estop = "pebble.store.get(ref, 'web/estop')?.value"
     with others_drive(rig.stage.broker_port) as driver:
         for what, names, button in (("STOP", (ROBOT,), "stop-one"), ("STOP ALL", ROBOTS, "stop-all")):
-            page, refs = rig.page(ROBOT if what == "STOP" else ""), tuple(map(rig.ref, names))
-            every = f"{json.dumps(refs)}.every((ref) => "
+            page, bases = rig.page(ROBOT if what == "STOP" else ""), tuple(map(rig.ref, names))
+            refs = json.dumps(bases)
             page.locator(f"[data-test={button}]").wait_for()
             for _ in range(max(1, round(10 * scale))):
-                driver.choose(refs)
+                driver.choose(bases)
                 for name in names:
                     rig.until(page, partial(rig.stage.wheels_turning, name), f"{name} does not move")
                 rig.pause(page, HELD_S)
-                page.evaluate("refs => bench.confirmed(refs)", refs)
+                page.evaluate(f"bench.confirmed({refs})")
                 page.locator(f"[data-test={button}]").click()
                 pressed = rig.stamp(page, "pointerdown")
                 yield from ((f"{what} to motors", 1000 * (rig.stopped(page, name) - pressed)) for name in names)
                 driver.choose(())
                 confirmed = monotonic(rig.until(page, "bench.mark", "the stop was not confirmed"))
                 yield f"{what} to confirmed", 1000 * (confirmed - pressed)
-                rig.until(page, f"{every}{estop}.latched)", "not shown")
+                rig.until(page, f"{refs}.every((ref) => bench.stop(ref).latched)", "not shown")
                 rig.pause(page, 0.6)  # robots refuse a reset of those who still drive
-                page.evaluate(f"{json.dumps(refs)}.forEach((ref) => pebble.commands.reset(ref, {estop}.owners))")
-                rig.until(page, f"{every}!{estop}.latched)", "the stops were not reset")
+                page.evaluate(f"{refs}.forEach((ref) => pebble.commands.reset(ref, bench.stop(ref).owners))")
+                rig.until(page, f"{refs}.every((ref) => !bench.stop(ref).latched)", "the stops were not reset")
                 rig.pause(page, 0.7)
             page.context.close()
 

@@ -77,15 +77,11 @@ bench.film = () => {
     bench.drawn.push([info.encoding, info.frame, info.capturedMs, now()]); // in ms
   };
 };
-bench.confirmed = (refs) => {
-  const before = pebble.estop.pressed;
-  const done = (ref) => {
-    const view = pebble.store.get(ref, "web/estop")?.value;
-    const { pressed } = pebble.estop;
-    return pressed !== before && view?.stop === pressed.stop && view.sending === "confirmed";
-  };
-  const shown = () => (bench.mark = now());
-  const mark = () => requestAnimationFrame(refs.every(done) ? shown : mark);
+bench.stop = (ref) => pebble.store.get(ref, "web/estop")?.value;
+bench.confirmed = (refs, before = pebble.estop.pressed) => {
+  const confirmed = (view) => view?.stop === pebble.estop.pressed.stop && view.sending === "confirmed";
+  const done = () => pebble.estop.pressed !== before && refs.every((ref) => confirmed(bench.stop(ref)));
+  const mark = () => requestAnimationFrame(done() ? () => (bench.mark = now()) : mark);
   bench.mark = 0;
   mark();
 };

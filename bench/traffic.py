@@ -8,7 +8,7 @@ from __future__ import annotations
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing
 from importlib.util import find_spec
 from itertools import chain
@@ -28,7 +28,6 @@ from pebble.client.media_receiver import MediaReceiver
 from pebble.errors import PebbleError
 from pebble.recordings.library import FOREVER_NS
 from pebble.recordings.traffic.results import AUDIO, IDLE, SESSION, VIDEO, RobotTraffic, Traffic
-from pebble.recordings.traffic.tables import BRIEF_MS
 from pebble.rig.operator import Operator
 from pebble.rig.processes import OPERATORS, python
 from pebble.rig.programs import Program, end_all
@@ -63,8 +62,6 @@ _FIGURES: Final = (
     ("goob", _OUTAGES), ("goob", _LATENCY), ("minilamp", _BANDWIDTH),
     ("minilamp", _OUTAGES), ("benjr", _LATENCY), ("minilamp", _LATENCY),
 )  # fmt: skip
-
-[str, RobotTraffic]  # by name
 
 
 def prepare(_run: Run) -> None:
@@ -149,7 +146,7 @@ def cells_of(traffic: Traffic) -> list[Cell]:
     return cells
 
 
-def robots_of(cells: Sequence[Cell]) -> Robots:
+def robots_of(cells: Sequence[Cell]) -> dict[str, RobotTraffic]:
     """The analysis of each robot, by its name."""
     found = {cell.variant: cell.figures[_ANALYSIS] for cell in cells if _ANALYSIS in cell.figures}
     return {name: msgspec.json.decode(str(text), type=RobotTraffic) for name, text in found.items()}
@@ -169,14 +166,11 @@ def tables(cells: Sequence[Cell]) -> Iterator[Table]:
         table.add_row(name, "paper", *(f"{value:.2f}" for value in paper))
         table.add_row("", "here", *chain(*shown))
     yield table
-    heads = ["robot", "heartbeats", "every ms", "outages", "below 300 ms", "shared", "latency p1", "p50", "p95 ms"]
-    table = plain_table("Heartbeats", heads)
+    table = plain_table("Heartbeats", ["robot", "heartbeats", "every ms", "outages", "latency p50", "p95 ms"])
     for name, robot in robots.items():
         if robot.intervals is not None and robot.latency is not None:
-            latency, brief = robot.latency, sum(one.length_ms < BRIEF_MS for one in robot.outages)
-            shared = sum(one.cause != "robot" for one in robot.outages)  # of several robots at once or of the recorder
-            counts = (latency.count, round(robot.intervals.median_ms), len(robot.outages), brief, shared)
-            times = (latency.floor_ms, latency.median_ms, latency.p95_ms)
+            counts = (robot.latency.count, round(robot.intervals.median_ms), len(robot.outages))
+            times = (robot.latency.median_ms, robot.latency.p95_ms)
             table.add_row(name, *map(str, counts), *(f"{time:.1f}" for time in times))
     yield table
 

@@ -5,6 +5,7 @@ Nothing is sent. Bytes are the same in every run with the same programs, so ther
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
 from collections.abc import Iterator, Sequence
@@ -256,31 +257,24 @@ def measure_sound(case: Case) -> Iterator[Cell]:
     speech = Speech(RATE).samples(0, round(case.run["seconds"] * RATE))
     pcm = speak(speech, "pcm")
     yield _cell(replace(case, role="pcm"), "kbit/s", pcm, pcm)
-    for bitrate in case.run["bitrates"]:
-        for bundle in range(1, BUNDLE_LIMIT + 1):
-            packet = "1 part" if bundle == 1 else f"{bundle} parts"
-            params: dict[str, Value] = {"bitrate": f"{bitrate // 1000} kbit/s", "packet": packet}
-            opus = speak(speech, "opus", bitrate, bundle)
-            yield _cell(replace(case, role="opus"), "kbit/s", opus, pcm, params)
+    for bitrate, bundle in itertools.product(case.run["bitrates"], range(1, BUNDLE_LIMIT + 1)):
+        packet = "1 part" if bundle == 1 else f"{bundle} parts"
+        params: dict[str, Value] = {"bitrate": f"{bitrate // 1000} kbit/s", "packet": packet}
+        yield _cell(replace(case, role="opus"), "kbit/s", speak(speech, "opus", bitrate, bundle), pcm, params)
 
 
 def speak(speech: np.ndarray, name: str, bitrate: int = 24_000, bundle: int = 1) -> Coded:
     """Encodes and decodes the speech."""
     encoder = make_sound_encoder(name, rate=RATE, channels=1, chunk_ms=_CHUNK_MS, bitrate=bitrate, bundle=bundle)
     size, decoder, packets = RATE * _CHUNK_MS // 1000, SoundDecoder(), list[bytes]()
-    began = time.process_time()
     for at in range(0, len(speech), size):
         packets += encoder.encode(to_bytes(speech[at : at + size]), round(1000 * at / RATE))
-    encoded = time.process_time()
     received = sum(len(one.samples) for one in map(decoder.feed, packets) if one is not None)
-    decoded = time.process_time()
     lasts_s = received / encoder.rate
     return {
         "wire": sum(wire_bytes(len(packet)) for packet in packets) / lasts_s * 8 / 1000,
         "packets_per_s": len(packets) / lasts_s,
         "payload_kbits": sum(map(len, packets)) * 8 / 1000 / lasts_s,
-        "encode_cpu": (encoded - began) / lasts_s,  # share of one core
-        "decode_cpu": (decoded - encoded) / lasts_s,
     }
 
 
@@ -302,9 +296,8 @@ SOUND = Comparison(
             columns=(
                 single_column("pack./s", "packets_per_s", ".1f"), single_column("payload", "payload_kbits", ".1f"),
                 percentile_column(50, "wire"), single_column("× PCM", "ratio", ".3f"),
-                single_column("enc.", "encode_cpu", ".1%"), single_column("dec.", "decode_cpu", ".1%"),
             ),
-            caption=f"payload, wire: kbit/s, topic {TOPIC}; enc., dec.: CPU",
+            caption=f"payload, wire: kbit/s, topic {TOPIC}",
         ),
     ),
     assessment=(
