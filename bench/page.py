@@ -320,15 +320,15 @@ ROWS = {row.key: row for case in CASES.values() for row in case.rows}
 
 def measure(case: Case) -> Iterator[Cell]:
     """One try. One that fails is noted, and its rows are empty."""
-    about, notes, name = CASES[str(case.condition["case"])], case.run.notes, f"{case.condition['case']}, try"
-    samples: list[tuple[str, float]] = []
-    notes.append(f"{name} {case.number + 1}: load {os.getloadavg()[0]:.2f}")
+    about, run, samples = CASES[str(case.condition["case"])], case.run, list[tuple[str, float]]()
+    note = f"{case.condition['case']}, try {case.number + 1}"
+    run.notes.append(f"{note}: load {os.getloadavg()[0]:.2f}")
     try:
         with about.setting() as made:
-            samples = list(about.measure(made, case.run["scale"]))
+            samples = list(about.measure(made, run["scale"]))
     except PebbleError as error:
-        notes.append(f"{name} {case.number + 1}: {error}")
-        case.run.console.print(notes[-1], style="red", highlight=False, markup=False)
+        run.notes.append(f"{note}: {error}")
+        run.console.print(run.notes[-1], style="red", highlight=False, markup=False)
     for row in about.rows:
         yield case.cell(row.key, row.unit, [value for key, value in samples if key == row.key])
 
@@ -355,9 +355,7 @@ PAGE = Comparison(
     what="What a driver feels in a browser, and what the page's server costs, beside the goals.",
     help="""The operator page in a browser: what a driver feels, and what its server costs.
 
-    From a key to the motors of a simulated robot, from whatever interrupts a driver to their stop, from the camera to
-    the screen; many viewers, many robots, a slow link. Needs mosquitto and its clients, chromium, the extra dev, and
-    root for the link.
+    Needs mosquitto and its clients, chromium, the extra dev, and root for a slow link.
     """,
     options=(
         Option(name="only", sets="cases", many=True, known=list(CASES), metavar="NAMES",

@@ -48,13 +48,10 @@ _LAST_S = 0.5  # until what was published last is recorded
 _END_S = 10.0  # for the recorder to finish its files
 #: What differs from the paper, and why.
 _DIFFERENCES: Final = (
-    f"Goob's sound takes {TABLE_4_1['goob'][2]:.1f} kbit/s in the paper, as much as two channels: 50 packets of 1,304 "
-    "bytes a second; here Goob has one channel",
-    "Video differs from the paper's: a simulated camera shows other things, and Table 4.1 names neither encoding, size "
-    "nor rate",
-    "Heartbeats go over loopback here. The paper's are of archived operation, over the internet: most outages are "
-    "shorter than 300 ms; latencies of Goob are mostly 20 to 40 ms, those of BenJr and MiniLAMP about 100 to 1100 ms, "
-    "a range as of stamps of whole seconds",
+    f"Goob's sound takes {TABLE_4_1['goob'][2]:.1f} kbit/s in the paper, as much as two channels; here it has one",
+    "Video differs: a simulated camera shows other things, and Table 4.1 names neither encoding, size nor rate",
+    "Heartbeats go over loopback here. The paper's went over the internet: most outages are shorter than 300 ms; "
+    "latencies of Goob are mostly 20 to 40 ms, those of BenJr and MiniLAMP 100 to 1100 ms, as of stamps in seconds",
 )
 _OUTAGES, _LATENCY, _BANDWIDTH = "outages of heartbeats", "latency of heartbeats", "bandwidth"
 #: The paper's Figures 4.1 to 4.6: robot and content.
@@ -223,8 +220,7 @@ TRAFFIC = Comparison(
     "seconds, outages of heartbeats, and their latency from stamp to reception.",
     help="""Traffic of the demo's robots as in the paper's section 4.1: bandwidth, outages and latency.
 
-    Records four simulated robots at a real broker, idle, then driven and watched, and analyses the recording as
-    pebble analyse does. Needs mosquitto and the packages of the extra "archive".
+    Needs mosquitto and the packages of the extra "archive".
     """,
     full=Budget(140, idle_s=40.0, session_s=80.0),
     quick=Budget(19, idle_s=7.0, session_s=6.0),
