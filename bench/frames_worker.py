@@ -68,7 +68,7 @@ def write(writer: Writer, size: int, slower_us: float) -> None:
     def fill(frame: np.ndarray) -> None:
         """As a camera does: pixels, then the time."""
         np.copyto(frame, picture)
-        for place in (8, size - 8):
+        for place in (8, len(frame) - 8):
             struct.pack_into("<q", frame, place, len(stamps))
         stamps.append(time.monotonic_ns())
         struct.pack_into("<q", frame, 0, stamps[-1])

@@ -16,7 +16,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, ExitStack, suppress
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 from urllib.parse import urlencode, urlsplit
 
 from pebble.bench.aims import outcome
@@ -32,11 +32,7 @@ from pebble.errors import PebbleError
 from pebble.rig.programs import children
 from pebble.rig.testbed import ROBOTS
 
-if TYPE_CHECKING:
-    from playwright.sync_api import Page
-
 Samples = Iterator[tuple[str, float]]  # each with the key of its row
-Act = Callable[[], Any]  # may return the page's stamp of it
 
 _FLOW_S = 4.0  # until the camera is running and every viewer has a key frame
 _PICTURE_S = 10.0
@@ -71,37 +67,30 @@ def keys(rig: Rig, scale: float) -> Samples:
 
 def interruptions(rig: Rig, scale: float) -> Samples:
     """A key is held, and something happens to the page, the connection or the server."""
-    undo = ExitStack()
-
-    def frozen(page: Page) -> Act:
-        """Its script stands still; Page.setWebLifecycleState has no effect on visible pages, as all here are."""
-        session = page.context.new_cdp_session(page)
-        undo.callback(session.detach)
-        session.send("Debugger.enable")
-        return partial(session.send, "Debugger.pause")
-
-    def signalled(pid: int, number: signal.Signals) -> Act:
-        undo.callback(os.kill, pid, signal.SIGCONT)
-        return partial(os.kill, pid, number)
-
-    prepared: dict[str, Callable[[Page], Act]] = {
-        "blur to stop": lambda page: partial(page.evaluate, _BLUR),
-        "hidden to stop": lambda page: partial(page.evaluate, _HIDE),
-        "frozen to stop": frozen,
-        "closed to stop": lambda page: page.close,
-        "stalled to stop": lambda _: signalled(_network_process(), signal.SIGSTOP),
-        "server frozen to stop": lambda _: signalled(rig.stage.server.pid, signal.SIGSTOP),
-        "server killed to stop": lambda _: signalled(rig.stage.server.pid, signal.SIGKILL),
-    }
-    for name in [name for name in prepared for _ in range(max(1, round(8 * scale)))]:
-        page = rig.page(ROBOT)
+    for name in [row.key for row in CASES["interruptions"].rows for _ in range(max(1, round(8 * scale)))]:
+        page, server = rig.page(ROBOT), rig.stage.server
         rig.hold(page)
-        with undo:
-            if name.startswith("server"):
-                undo.callback(rig.stage.restart_server)
-            act, began = prepared[name](page), time.monotonic()
-            stamp = act()
+        session, network = page.context.new_cdp_session(page), _network_process()
+        acts: dict[str, Callable[[], Any]] = {
+            "blur to stop": partial(page.evaluate, _BLUR),
+            "hidden to stop": partial(page.evaluate, _HIDE),
+            # Its script stands still; Page.setWebLifecycleState has no effect on visible pages, as all here are.
+            "frozen to stop": partial(session.send, "Debugger.pause"),
+            "closed to stop": page.close,
+            "stalled to stop": partial(os.kill, network, signal.SIGSTOP),
+            "server frozen to stop": server.freeze,
+            "server killed to stop": server.kill,
+        }
+        if name == "frozen to stop":
+            session.send("Debugger.enable")
+        try:
+            began, stamp = time.monotonic(), acts[name]()  # the page's stamp, if it did it
             yield name, 1000 * (rig.stopped(None) - (monotonic(stamp) if stamp else began))
+        finally:
+            os.kill(network, signal.SIGCONT)
+        if name.startswith("server"):
+            server.thaw()
+            rig.stage.restart_server()
         page.context.close()
 
 

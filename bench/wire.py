@@ -223,10 +223,11 @@ VIDEO = Comparison(
         Grid(
             title=f"Video on the wire at equal SSIM, {WIDTH}x{HEIGHT}, {FPS} fps", rows=("scene", "variant"),
             heads=("scene", "encoding"),
-            columns=(percentile_column(50, "kB/s"), *(single_column(*words) for words in (
-                ("quality", "quality", ".1f"), ("ratio", "ratio", ".3f"), ("SSIM", "ssim", ".4f"),
-                ("enc ms", "encode_ms", ".2f"), ("dec ms", "decode_ms", ".2f"),
-            ))),
+            columns=(
+                percentile_column(50, "kB/s"), single_column("quality", "quality", ".1f"),
+                single_column("ratio", "ratio", ".3f"), single_column("SSIM", "ssim", ".4f"),
+                single_column("enc ms", "encode_ms", ".2f"), single_column("dec ms", "decode_ms", ".2f"),
+            ),
         ),
     ),
     assessment=(unequal, *(
