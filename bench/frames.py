@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import statistics
 import subprocess
 import time
@@ -14,13 +13,12 @@ from pebble.bench import null
 from pebble.bench.comparison import Budget, Case, Comparison, Option, Run, of_known, rounds, seconds, variants
 from pebble.bench.pictures import ecdf, null_ratios, tails
 from pebble.bench.ratios import LEAST_ROUNDS, paired
-from pebble.bench.results import Cell
+from pebble.bench.results import Cell, Value
 from pebble.bench.tables import COUNT, LOST, Column, Grid, percentile_column
 from pebble.bench.usage import cpu_s, pss_mb
 from pebble.errors import PebbleError
-from pebble.rig.broker import Broker, mosquitto_path
+from pebble.rig.broker import mosquitto_path
 from pebble.rig.processes import Processes, python
-from pebble.rig.programs import Worker
 
 VARIANTS = ("zenoh-shm", "zenoh-copy", "zenoh-net", "mqtt", "gstreamer-shm", "memcpy")
 OURS = "zenoh-shm"
@@ -36,6 +34,7 @@ _READY_S = 20.0
 _STARTUP_S = 0.1  # from the last process ready to the first counted frame
 _LATE_S = 0.15  # how long to wait for the last frames after the window
 _ANSWER_S = 10.0
+_CPU, _MEMORY = ("cpu_writer", "cpu_reader", "cpu_broker"), ("memory_writer_mb", "memory_reader_mb")
 
 
 def prepare(run: Run) -> None:
@@ -47,21 +46,20 @@ def missing(variant: str) -> str | None:
     """Why this variant cannot run on this machine, with what installs it; None if it can."""
     if variant == "mqtt" and mosquitto_path() is None:
         return "mosquitto is not installed: apt-get install -y --no-install-recommends mosquitto"
-    return _gstreamer() if variant == "gstreamer-shm" else None
-
-
-@functools.cache
-def _gstreamer() -> str | None:
-    try:
-        subprocess.run([_SYSTEM_PYTHON, _PLAIN_WORKER], capture_output=True, timeout=_PROBE_S, check=True)
-    except (OSError, subprocess.SubprocessError) as error:
-        return f"{_SYSTEM_PYTHON} has no GStreamer ({error}): {INSTALL_GSTREAMER}"
+    if variant == "gstreamer-shm":
+        try:
+            subprocess.run([_SYSTEM_PYTHON, _PLAIN_WORKER], capture_output=True, timeout=_PROBE_S, check=True)
+        except (OSError, subprocess.SubprocessError) as error:
+            return f"{_SYSTEM_PYTHON} has no GStreamer ({error}): {INSTALL_GSTREAMER}"
     return None
 
 
 def measure(case: Case) -> Iterator[Cell]:
-    """Runs one writer and its readers, each as a process. Raises PebbleError if one of them fails."""
-    is_gstreamer = case.variant == "gstreamer-shm"
+    """Runs one writer and its readers, each as a process. Raises PebbleError if one of them fails.
+
+    CPU is in % of one core, memory (PSS) in MB; those of the readers are their mean.
+    """
+    is_gstreamer, seconds = case.variant == "gstreamer-shm", case.run["seconds"]
     program = [_SYSTEM_PYTHON, _PLAIN_WORKER] if is_gstreamer else python("pebble.bench.frames_worker")
     with Processes() as processes:
         broker = processes.broker() if case.variant == "mqtt" else None
@@ -73,40 +71,33 @@ def measure(case: Case) -> Iterator[Cell]:
             worker = processes.command(f"{case}: {role} {number}", [*program, *map(str, options)])
             if is_gstreamer and role == "writer":  # its readers fail without a writer; the others wait
                 worker.answer(_READY_S)
-        for worker in processes.workers[is_gstreamer:]:
+        workers = processes.workers
+        for worker in workers[is_gstreamer:]:
             worker.answer(_READY_S)
-        yield _observed(case, processes.workers, broker)
-
-
-def _observed(case: Case, workers: Sequence[Worker], broker: Broker | None) -> Cell:
-    """CPU is in % of one core, memory (PSS) in MB; those of the readers are their mean."""
-    seconds, readers = case.run["seconds"], len(workers) - 1
-    begin = time.monotonic_ns() + int(_STARTUP_S * 1e9)
-    for worker in workers:
-        worker.send(f"{begin} {begin + int(seconds * 1e9)}")
-    pids = [process.pid for process in (*workers, *([broker] if broker else []))]
-    time.sleep(_STARTUP_S)
-    before = [cpu_s([pid]) for pid in pids]
-    time.sleep(seconds)
-    cpu = [100 * (cpu_s([pid]) - so_far) / seconds for pid, so_far in zip(pids, before, strict=True)]
-    time.sleep(_LATE_S)
-    writer, *answers = (worker.ask("", _ANSWER_S) for worker in workers)
-    latencies_us = [latency for answer in answers for latency in answer["latencies_us"]]
-    memory_mb = [pss_mb(worker.pid) for worker in workers]
-    bare = case.variant == "memcpy"  # has no writer; it times copies, so there is no number of sent ones
-    return case.cell(
-        "frame",
-        "us",
-        latencies_us,
-        cpu_writer=None if bare else cpu[0],
-        cpu_reader=sum(latencies_us) / 1e4 / seconds / readers if bare else statistics.fmean(cpu[1 : 1 + readers]),
-        cpu_broker=None if broker is None else cpu[-1],
-        memory_writer_mb=None if bare else memory_mb[0],
-        memory_reader_mb=None if bare else statistics.fmean(memory_mb[1:]),
-        torn=sum(answer["torn"] for answer in answers),
-        fallbacks=writer["fallbacks"],  # frames that did not go through shared memory, since the start
-        **({} if bare else {"sent": writer["sent"] * readers}),  # each frame to each reader
-    )
+        begin = time.monotonic_ns() + int(_STARTUP_S * 1e9)
+        for worker in workers:
+            worker.send(f"{begin} {begin + int(seconds * 1e9)}")
+        pids = [process.pid for process in (*workers, *([broker] if broker else []))]
+        time.sleep(_STARTUP_S)
+        before = [cpu_s([pid]) for pid in pids]
+        time.sleep(seconds)
+        cpu = [100 * (cpu_s([pid]) - so_far) / seconds for pid, so_far in zip(pids, before, strict=True)]
+        time.sleep(_LATE_S)
+        writer, *readers = (worker.ask("", _ANSWER_S) for worker in workers)
+        memory_mb = [pss_mb(worker.pid) for worker in workers]
+    latencies_us = [latency for reader in readers for latency in reader["latencies_us"]]
+    figures: dict[str, Value] = {
+        "cpu_writer": cpu[0],
+        "cpu_reader": statistics.fmean(cpu[1 : len(workers)]),
+        "cpu_broker": None if broker is None else cpu[-1],
+        "memory_writer_mb": memory_mb[0],
+        "memory_reader_mb": statistics.fmean(memory_mb[1:]),
+        "sent": writer["sent"] * len(readers),  # each frame to each reader
+    }
+    if case.variant == "memcpy":  # has no writer; it times copies, so there is no number of sent ones
+        figures = {"cpu_reader": sum(latencies_us) / 1e4 / seconds / len(readers)}
+    figures |= {"torn": sum(reader["torn"] for reader in readers), "fallbacks": writer["fallbacks"]}
+    yield case.cell("frame", "us", latencies_us, None, **figures)
 
 
 # -- the report
@@ -131,8 +122,9 @@ def faults(cells: Sequence[Cell]) -> Iterator[str]:
 
 def complete(cells: Sequence[Cell]) -> bool:
     """Whether every case has results, of enough of its rounds to judge."""
-    least = (LEAST_ROUNDS if len(cell.rounds) >= LEAST_ROUNDS else 1 for cell in cells)
-    return all(sum(map(bool, cell.rounds)) >= enough for cell, enough in zip(cells, least, strict=True))
+    return all(
+        sum(map(bool, cell.rounds)) >= (LEAST_ROUNDS if len(cell.rounds) >= LEAST_ROUNDS else 1) for cell in cells
+    )
 
 
 def _conditions(cell: Cell) -> str:
@@ -178,18 +170,14 @@ FRAMES = Comparison(
     measures=("frame",),
     figures={
         **dict.fromkeys(("torn", "fallbacks"), sum),
-        **dict.fromkeys(
-            ("cpu_writer", "cpu_reader", "cpu_broker", "memory_writer_mb", "memory_reader_mb"),
-            of_known(statistics.median, 2),
-        ),
+        **dict.fromkeys((*_CPU, *_MEMORY), of_known(statistics.median, 2)),
     },
     tables=(
         Grid(
             title="{size} BGR at 30 Hz, readers: {readers}", each=("size", "readers"), rows=("variant",),
             columns=(
                 percentile_column(50, "p50 µs"), percentile_column(99, "p99 µs"), percentile_column(100, "max µs"),
-                _column("CPU %", "cpu_writer", "cpu_reader", "cpu_broker"),
-                _column("PSS MB", "memory_writer_mb", "memory_reader_mb"), LOST, COUNT,
+                _column("CPU %", *_CPU), _column("PSS MB", *_MEMORY), LOST, COUNT,
             ),
             caption="CPU: writer / each reader / broker; PSS: writer / each reader",
         ),

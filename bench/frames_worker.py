@@ -12,20 +12,21 @@ an empty line with what it measured in that window.
 
 from __future__ import annotations
 
+import struct
 import sys
 import time
 from collections import deque
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 if __package__:
     from pebble.errors import TransportError
     from pebble.rig import worker_end
-    from pebble.transports.frames import FrameInfo, FrameReader, FrameWriter, Slot, shared_memory
+    from pebble.transports.frames import FrameInfo, FrameReader, FrameWriter, shared_memory
 else:  # the system's Python runs plain files
     sys.path.append(str(Path(__file__).parents[1] / "rig"))
     import worker_end  # type: ignore[import-not-found, no-redef]
@@ -39,30 +40,7 @@ _STREAM, _TOPIC = "bench", "pebble/bench/frames"
 _WITHOUT_COPIES = ("zenoh-shm", "memcpy")
 
 Gst: Any = None  # loaded by main(): other Pythons have no gi
-
-
-class Writer(Protocol):
-    """One way of sending frames; ``fallbacks`` did not go through shared memory."""
-
-    fallbacks: int = 0
-
-    def begin(self) -> np.ndarray | None:
-        """The buffer for the next frame's pixels (uint8, 1-D); None if no frame can be sent now."""
-
-    def send(self) -> None: ...
-
-    def close(self) -> None:
-        return
-
-
-class Reader(Protocol):
-    """One way of receiving frames."""
-
-    def read(self, timeout: float) -> np.ndarray | None:
-        """The next frame, or None after ``timeout`` seconds. A view is released as soon as it is deleted."""
-
-    def close(self) -> None:
-        return
+Fill = Callable[[np.ndarray], None]  # writes the pixels of a frame (uint8, 1-D)
 
 
 class Window:
@@ -79,44 +57,36 @@ class Window:
         return None
 
 
-def write(writer: Writer, size: int, *, slower_us: float) -> None:
+def write(writer: Writer, size: int, slower_us: float) -> None:
     """Writes a frame of ``size`` bytes 30 times a second until standard input closes; answers how many of the window.
 
     Each frame is delayed by ``slower_us`` of busy work between its time stamp and its sending.
     """
     picture = np.random.default_rng(1).integers(0, 256, size, dtype=np.uint8)
     stamps: list[int] = []
+
+    def fill(frame: np.ndarray) -> None:
+        """As a camera does: pixels, then the time."""
+        np.copyto(frame, picture)
+        for place in (8, len(frame) - 8):
+            struct.pack_into("<q", frame, place, len(stamps))
+        stamps.append(time.monotonic_ns())
+        struct.pack_into("<q", frame, 0, stamps[-1])
+        end = time.perf_counter_ns() + int(1000 * slower_us)
+        while time.perf_counter_ns() < end:  # as pebble.bench.null.spin, which the system's Python cannot import
+            pass
+
     window = Window(lambda: {"sent": sum(one in window.ns for one in stamps), "fallbacks": writer.fallbacks})
     worker_end.answer({"ready": True})
     due = time.monotonic()
     while not window.ended.is_set():
         due += 1 / RATE_HZ
         window.ended.wait(max(0.0, due - time.monotonic()))
-        frame = writer.begin()
-        if frame is not None:
-            stamps.append(_fill(frame, picture, len(stamps) + 1))
-            _spin(slower_us)
-            writer.send()
+        writer.write(fill)
     writer.close()
 
 
-def _fill(frame: np.ndarray, picture: np.ndarray, number: int) -> int:
-    """Fills the frame as a camera does: pixels, then the time, which is returned."""
-    np.copyto(frame, picture)
-    frame[8:16] = frame[-8:] = np.frombuffer(number.to_bytes(8, "little"), np.uint8)
-    stamp = time.monotonic_ns()
-    frame[:8] = np.frombuffer(stamp.to_bytes(8, "little"), np.uint8)
-    return stamp
-
-
-def _spin(us: float) -> None:
-    """Same as pebble.bench.null.spin, which the system's Python cannot import."""
-    end = time.perf_counter_ns() + int(1000 * us)
-    while time.perf_counter_ns() < end:
-        pass
-
-
-def read(reader: Reader, *, bare_copy: int = 0) -> None:
+def read(reader: Reader, bare_copy: int) -> None:
     """Reads until standard input closes; answers with every latency of the window in µs.
 
     With ``bare_copy``, measures instead the time of a copy of that many bytes between two frames, when the caches hold
@@ -132,8 +102,8 @@ def read(reader: Reader, *, bare_copy: int = 0) -> None:
         if frame is None:
             continue
         now, frames = time.monotonic_ns(), frames + 1
-        stamp, number, last = (int.from_bytes(frame[at:][:8].tobytes(), "little") for at in (0, 8, -8))
-        torn += number != last
+        stamp, number = struct.unpack_from("<qq", frame)
+        torn += struct.unpack_from("<q", frame, len(frame) - 8) != (number,)
         del frame
         if stamp in window.ns:
             if bare_copy:
@@ -147,51 +117,47 @@ def read(reader: Reader, *, bare_copy: int = 0) -> None:
     reader.close()
 
 
-# -- Pebble's frame transport
+# -- Pebble's frame transport. ``write`` sends the frame that ``fill`` writes; false: none can be sent now. ``read``
+#    returns the next frame, or None after a timeout; a view is released as soon as it is deleted.
 
 
-class ZenohWriter(Writer):
+class ZenohWriter:
     """Frames are created in the shared segment, or copied there, or sent as bytes."""
 
+    fallbacks = 0  # frames that did not go through shared memory
+
     def __init__(self, variant: str, folder: Path, size: int) -> None:
-        self._size, self._in_segment, self._info = size, variant in _WITHOUT_COPIES, FrameInfo(format="bgr24")
+        self._in_segment, self._info = variant in _WITHOUT_COPIES, FrameInfo(format="bgr24")
+        self._frame = np.zeros(size, np.uint8)
         self._writer = FrameWriter(folder, _STREAM, capacity=size).open()
         _refuse(self._writer.problem, variant)
-        self._frame = np.zeros(size, np.uint8)
-        self._slot: Slot | None = None
+        self.close = self._writer.close
 
-    def begin(self) -> np.ndarray | None:
+    def write(self, fill: Fill) -> bool:
         if not self._writer.wanted:
-            return None
-        self._slot = self._writer.slot(self._size) if self._in_segment else None
-        return self._frame if self._slot is None else self._slot.array
-
-    def send(self) -> None:
-        if self._slot is not None:
-            self._slot.send(self._info)
-        else:
+            return False
+        slot = self._writer.slot(len(self._frame)) if self._in_segment else None
+        fill(self._frame if slot is None else slot.array)
+        if slot is None:
             self._writer.write(self._frame, self._info)
+        else:
+            slot.send(self._info)
         self.fallbacks = self._writer.counters["fallbacks"]
-
-    def close(self) -> None:
-        self._slot = None
-        self._writer.close()
+        return True
 
 
-class ZenohReader(Reader):
+class ZenohReader:
     """Frames are views into the segment, or copies."""
 
     def __init__(self, variant: str, folder: Path) -> None:
         self._variant = variant
         self._reader = FrameReader(folder, _STREAM, views=variant in _WITHOUT_COPIES).open()
+        self.close = self._reader.close
 
     def read(self, timeout: float) -> np.ndarray | None:
         frame = self._reader.read(timeout)
         _refuse(self._reader.problem, self._variant)
         return None if frame is None else frame.data
-
-    def close(self) -> None:
-        self._reader.close()
 
 
 def _refuse(problem: str, variant: str) -> None:
@@ -203,23 +169,25 @@ def _refuse(problem: str, variant: str) -> None:
 # -- MQTT, QoS 0
 
 
-class MqttWriter(Writer):
+class MqttWriter:
     """The next frame is not begun before the last one is sent."""
+
+    fallbacks = 0
 
     def __init__(self, port: int, size: int) -> None:
         self._client, self._frame, self._leaving = _mqtt(port), bytearray(size), None
         self._client.loop_start()
+        self.close = self._client.disconnect
 
-    def begin(self) -> np.ndarray | None:
+    def write(self, fill: Fill) -> bool:
         if self._leaving is not None and not self._leaving.is_published():
-            return None
-        return np.frombuffer(self._frame, np.uint8)
-
-    def send(self) -> None:
+            return False
+        fill(np.frombuffer(self._frame, np.uint8))
         self._leaving = self._client.publish(_TOPIC, self._frame, qos=0)
+        return True
 
 
-class MqttReader(Reader):
+class MqttReader:
     """Runs paho's network loop in the reading thread, which avoids a handover between threads."""
 
     def __init__(self, port: int) -> None:
@@ -227,6 +195,7 @@ class MqttReader(Reader):
         self._client = _mqtt(port)
         self._client.on_message = lambda _client, _data, message: self._arrived.append(message.payload)
         self._client.subscribe(_TOPIC, qos=0)
+        self.close = self._client.disconnect
 
     def read(self, timeout: float) -> np.ndarray | None:
         end = time.monotonic() + timeout
@@ -252,8 +221,10 @@ def _mqtt(port: int) -> Any:
 # -- GStreamer's shmsink and shmsrc, in the system's Python
 
 
-class GstWriter(Writer):
+class GstWriter:
     """appsrc into shmsink. As in the original Pebble, pictures are created in the shared segment: no copy is made."""
+
+    fallbacks = 0
 
     def __init__(self, socket: str, caps: str, size: int) -> None:
         self._size = size
@@ -269,27 +240,22 @@ class GstWriter(Writer):
         if not sink.get_static_pad("sink").query(query) or not query.get_n_allocation_params():
             raise RuntimeError("shmsink offers no allocator")
         self._allocator = query.parse_nth_allocation_param(0)[0]
-        self._buffer: Any = None
-        self._mapped: Any = None
 
-    def begin(self) -> np.ndarray | None:
-        self._buffer = Gst.Buffer.new_allocate(self._allocator, self._size, None)
-        if self._buffer is None:
-            return None
-        self._mapped = self._buffer.map(Gst.MapFlags.WRITE)
-        return np.frombuffer(self._mapped.__enter__().data, np.uint8)
-
-    def send(self) -> None:
-        self._mapped.__exit__(None, None, None)
-        self._source.push_buffer(self._buffer)
-        self._buffer = self._mapped = None
+    def write(self, fill: Fill) -> bool:
+        buffer = Gst.Buffer.new_allocate(self._allocator, self._size, None)
+        if buffer is None:
+            return False
+        with buffer.map(Gst.MapFlags.WRITE) as mapped:
+            fill(np.frombuffer(mapped.data, np.uint8))
+        self._source.push_buffer(buffer)
+        return True
 
     def close(self) -> None:
         """shmsink removes its socket and its segment."""
         self._pipeline.set_state(Gst.State.NULL)
 
 
-class GstReader(Reader):
+class GstReader:
     """shmsrc into appsink, which holds only the newest buffer; the reader maps it and copies it once."""
 
     def __init__(self, socket: str, caps: str) -> None:
@@ -320,29 +286,27 @@ def _load_gstreamer() -> None:
     Gst = import_module("gi.repository.Gst")
     import_module("gi.repository.GstApp")  # gives appsrc and appsink their methods
     Gst.init(None)
-    for name in ("shmsink", "shmsrc", "appsrc", "appsink"):
-        if not Gst.ElementFactory.find(name):
-            raise RuntimeError(f"GStreamer has no {name}")
+    if not all(map(Gst.ElementFactory.find, ("shmsink", "shmsrc", "appsrc", "appsink"))):
+        raise RuntimeError("GStreamer has no shmsink, shmsrc, appsrc or appsink")
 
 
 # -- the process
+
+Writer = ZenohWriter | MqttWriter | GstWriter
+Reader = ZenohReader | MqttReader | GstReader
 
 
 def writer(variant: str, where: str, size: int, caps: str = "") -> Writer:
     """``size`` in bytes; ``caps``: the format of frames, for GStreamer."""
     if variant == "gstreamer-shm":
         return GstWriter(f"{where}/gst.sock", caps, size)
-    if variant == "mqtt":
-        return MqttWriter(int(where), size)
-    return ZenohWriter(variant, Path(where), size)
+    return MqttWriter(int(where), size) if variant == "mqtt" else ZenohWriter(variant, Path(where), size)
 
 
 def reader(variant: str, where: str, caps: str = "") -> Reader:
     if variant == "gstreamer-shm":
         return GstReader(f"{where}/gst.sock", caps)
-    if variant == "mqtt":
-        return MqttReader(int(where))
-    return ZenohReader(variant, Path(where))
+    return MqttReader(int(where)) if variant == "mqtt" else ZenohReader(variant, Path(where))
 
 
 def main(arguments: list[str]) -> None:
@@ -356,9 +320,9 @@ def main(arguments: list[str]) -> None:
     if variant == "zenoh-net":  # as on a system where memory may not be locked: frames are sent as bytes
         shared_memory.lockable = lambda size: False  # noqa: ARG005
     if role == "writer":
-        write(writer(variant, where, count, caps), count, slower_us=float(slower_us))
+        write(writer(variant, where, count, caps), count, float(slower_us))
     else:
-        read(reader(variant, where, caps), bare_copy=count if variant == "memcpy" else 0)
+        read(reader(variant, where, caps), count if variant == "memcpy" else 0)
 
 
 if __name__ == "__main__":

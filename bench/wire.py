@@ -5,12 +5,14 @@ Nothing is sent. Bytes are the same in every run with the same programs, so ther
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from functools import lru_cache
-from typing import Final, cast
+from functools import lru_cache, partial
+from statistics import fmean
+from typing import Any, Final, cast
 
 import cv2
 import numpy as np
@@ -28,7 +30,7 @@ from pebble.media.opus import BUNDLE_LIMIT
 from pebble.media.pcm import to_bytes
 from pebble.media.sound import SoundDecoder, make_sound_encoder
 from pebble.media.speech import Speech
-from pebble.media.video import VIDEO_ENCODINGS, JsonEncoder, VideoEncoder, make_encoder
+from pebble.media.video import VIDEO_ENCODINGS, JsonEncoder, make_encoder
 
 TOLERANCE: Final = 0.005  # of SSIM
 QUALITY, INTERVAL = 10, 5  # the reference implementation's settings
@@ -42,7 +44,6 @@ _TRIES: Final = 8
 
 TOPIC = AUDIO.topic("pebble/robots/goob")
 AIM = 0.16  # of PCM's bytes
-BITRATES = (16_000, 24_000, 32_000)
 RATE = 16_000
 _HEADERS = 20 + 32  # bytes: IP version 4 without options, TCP with time stamps as Linux sends them
 _CHUNK_MS = 20
@@ -51,8 +52,8 @@ Coded = dict[str, float]  # figures of a clip or of speech in one encoding; "wir
 
 
 def _cell(case: Case, unit: str, coded: Coded, reference: Coded, params: dict[str, Value] | None = None) -> Cell:
-    figures: dict[str, Value] = {name: round(value, 4) for name, value in coded.items() if name != "wire"}
-    figures["ratio"] = round(coded["wire"] / reference["wire"], 4)
+    ratio = coded["wire"] / reference["wire"]
+    figures = {name: round(value, 4) for name, value in {**coded, "ratio": ratio}.items() if name != "wire"}
     return case.cell("wire", unit, [coded["wire"]], params, **figures)
 
 
@@ -65,17 +66,12 @@ class _ReferenceJson(JsonEncoder):
     optimize = False
 
 
-def _encoder(variant: str, quality: float) -> VideoEncoder:
-    if variant == _REFERENCE:
-        return _ReferenceJson(INTERVAL, quality)
-    interval = None if variant == "h264" else INTERVAL
-    return make_encoder(variant.partition(",")[0], fps=FPS, keyframe_interval=interval, quality=quality)
-
-
 def code(pictures: Sequence[Pixels], variant: str, quality: float) -> Coded:
     """Encodes and decodes the clip. Raises PebbleError if a picture cannot be decoded."""
-    encoder, decoder = _encoder(variant, quality), VideoDecoder()
-    likeness: list[float] = []
+    name, interval = variant.partition(",")[0], None if variant == "h264" else INTERVAL
+    options: dict[str, Any] = {"fps": FPS, "keyframe_interval": interval, "quality": quality}
+    encoder = _ReferenceJson(INTERVAL, quality) if name == _REFERENCE else make_encoder(name, **options)
+    decoder, likeness = VideoDecoder(), list[float]()
     sent, encoding, decoding = 0, 0.0, 0.0
     for number, picture in enumerate(pictures):
         began = time.perf_counter()
@@ -89,13 +85,13 @@ def code(pictures: Sequence[Pixels], variant: str, quality: float) -> Coded:
             raise PebbleError(f"{variant}: picture {number} was not decoded: {decoder.problem}")
         if number % _EVERY == 0:
             likeness.append(ssim(picture, shown.picture))
-    n = len(pictures)
+    per_picture = 1 / len(pictures)
     return {
-        "wire": sent * FPS / n / 1000,
+        "wire": sent * per_picture * FPS / 1000,
         "quality": quality,
-        "ssim": sum(likeness) / len(likeness),
-        "encode_ms": encoding / n * 1000,
-        "decode_ms": decoding / n * 1000,
+        "ssim": fmean(likeness),
+        "encode_ms": encoding * per_picture * 1000,
+        "decode_ms": decoding * per_picture * 1000,
     }
 
 
@@ -184,32 +180,29 @@ def _world(random: np.random.Generator) -> Pixels:
     return view
 
 
-# -- the quality of a decoded picture: SSIM (Wang et al. 2004) as the mean of the channels
-
-_C1, _C2 = (0.01 * 255) ** 2, (0.03 * 255) ** 2
+# -- the quality of a decoded picture
 
 
 def ssim(one: Pixels, other: Pixels) -> float:
-    """1 for identical pictures. BGR, of one shape. (Borders are reflected; the paper leaves them out.)"""
+    """SSIM (Wang et al. 2004), the mean of the channels: 1 for identical pictures. BGR, of one shape.
+
+    Borders are reflected; the paper leaves them out.
+    """
+    c1, c2 = (0.01 * 255) ** 2, (0.03 * 255) ** 2
+    smooth = partial(cv2.GaussianBlur, ksize=(11, 11), sigmaX=1.5)  # the paper's window
     x, y = one.astype(np.float32), other.astype(np.float32)
-    mean_x, mean_y = _smooth(x), _smooth(y)
+    mean_x, mean_y = smooth(x), smooth(y)
     both, squares = mean_x * mean_y, mean_x * mean_x + mean_y * mean_y
-    covariance = _smooth(x * y) - both
-    variances = _smooth(x * x + y * y) - squares
-    likeness = (2 * both + _C1) * (2 * covariance + _C2) / ((squares + _C1) * (variances + _C2))
+    covariance, variances = smooth(x * y) - both, smooth(x * x + y * y) - squares
+    likeness = (2 * both + c1) * (2 * covariance + c2) / ((squares + c1) * (variances + c2))
     return float(likeness.mean())
-
-
-def _smooth(values: np.ndarray) -> np.ndarray:
-    return cv2.GaussianBlur(values, (11, 11), 1.5)  # the paper's window
 
 
 def unequal(cells: Sequence[Cell]) -> Iterator[str]:
     """The encodings that did not reach the reference's quality."""
-    likeness = single("ssim")
-    wanted = {cell.params["scene"]: likeness(cell) for cell in cells if cell.variant == _REFERENCE}
+    wanted = {cell.params["scene"]: cell.single("ssim") for cell in cells if cell.variant == _REFERENCE}
     for cell in cells:
-        far = likeness(cell) - wanted[cell.params["scene"]]
+        far = cell.single("ssim") - wanted[cell.params["scene"]]
         if abs(far) > TOLERANCE:
             yield f"{cell.params['scene']}, {cell.variant}: SSIM differs by {far:+.4f}, quality is not equal"
 
@@ -230,10 +223,11 @@ VIDEO = Comparison(
         Grid(
             title=f"Video on the wire at equal SSIM, {WIDTH}x{HEIGHT}, {FPS} fps", rows=("scene", "variant"),
             heads=("scene", "encoding"),
-            columns=(percentile_column(50, "kB/s"), *(single_column(*words) for words in (
-                ("quality", "quality", ".1f"), ("ratio", "ratio", ".3f"), ("SSIM", "ssim", ".4f"),
-                ("enc ms", "encode_ms", ".2f"), ("dec ms", "decode_ms", ".2f"),
-            ))),
+            columns=(
+                percentile_column(50, "kB/s"), single_column("quality", "quality", ".1f"),
+                single_column("ratio", "ratio", ".3f"), single_column("SSIM", "ssim", ".4f"),
+                single_column("enc ms", "encode_ms", ".2f"), single_column("dec ms", "decode_ms", ".2f"),
+            ),
         ),
     ),
     assessment=(unequal, *(
@@ -264,38 +258,28 @@ def measure_sound(case: Case) -> Iterator[Cell]:
     speech = Speech(RATE).samples(0, round(case.run["seconds"] * RATE))
     pcm = speak(speech, "pcm")
     yield _cell(replace(case, role="pcm"), "kbit/s", pcm, pcm)
-    for bitrate in case.run["bitrates"]:
-        for bundle in range(1, BUNDLE_LIMIT + 1):
-            packet = "1 part" if bundle == 1 else f"{bundle} parts"
-            params: dict[str, Value] = {"bitrate": f"{bitrate // 1000} kbit/s", "packet": packet}
-            opus = speak(speech, "opus", bitrate, bundle)
-            yield _cell(replace(case, role="opus"), "kbit/s", opus, pcm, params)
+    for bitrate, bundle in itertools.product(case.run["bitrates"], range(1, BUNDLE_LIMIT + 1)):
+        packet = "1 part" if bundle == 1 else f"{bundle} parts"
+        params: dict[str, Value] = {"bitrate": f"{bitrate // 1000} kbit/s", "packet": packet}
+        yield _cell(replace(case, role="opus"), "kbit/s", speak(speech, "opus", bitrate, bundle), pcm, params)
 
 
 def speak(speech: np.ndarray, name: str, bitrate: int = 24_000, bundle: int = 1) -> Coded:
     """Encodes and decodes the speech."""
     encoder = make_sound_encoder(name, rate=RATE, channels=1, chunk_ms=_CHUNK_MS, bitrate=bitrate, bundle=bundle)
-    size = RATE * _CHUNK_MS // 1000
-    began = time.process_time()
-    packets = []
+    size, decoder, packets = RATE * _CHUNK_MS // 1000, SoundDecoder(), list[bytes]()
     for at in range(0, len(speech), size):
         packets += encoder.encode(to_bytes(speech[at : at + size]), round(1000 * at / RATE))
-    encoded = time.process_time()
-    decoder = SoundDecoder()
     received = sum(len(one.samples) for one in map(decoder.feed, packets) if one is not None)
-    decoded = time.process_time()
     lasts_s = received / encoder.rate
     return {
         "wire": sum(wire_bytes(len(packet)) for packet in packets) / lasts_s * 8 / 1000,
         "packets_per_s": len(packets) / lasts_s,
         "payload_kbits": sum(map(len, packets)) * 8 / 1000 / lasts_s,
-        "encode_cpu": (encoded - began) / lasts_s,  # share of one core
-        "decode_cpu": (decoded - encoded) / lasts_s,
     }
 
 
-_BUDGET = Budget(6, seconds=10.0, bitrates=BITRATES)
-
+_BUDGET = Budget(6, seconds=10.0, bitrates=(16_000, 24_000, 32_000))
 SOUND = Comparison(
     name="sound",
     title="Sound on the wire",
@@ -313,9 +297,8 @@ SOUND = Comparison(
             columns=(
                 single_column("pack./s", "packets_per_s", ".1f"), single_column("payload", "payload_kbits", ".1f"),
                 percentile_column(50, "wire"), single_column("× PCM", "ratio", ".3f"),
-                single_column("enc.", "encode_cpu", ".1%"), single_column("dec.", "decode_cpu", ".1%"),
             ),
-            caption=f"payload, wire: kbit/s, topic {TOPIC}; enc., dec.: CPU",
+            caption=f"payload, wire: kbit/s, topic {TOPIC}",
         ),
     ),
     assessment=(

@@ -73,7 +73,8 @@ def test_frames_in_shared_memory_arrive_whole_at_every_reader(variant: str) -> N
 def test_the_bare_copy_counts_only_the_cpu_of_the_copier() -> None:
     cell = measured("memcpy", 0.5)
     assert cell.samples
-    assert cell.figures["cpu_writer"] is None
+    assert cell.figures["cpu_reader"]
+    assert "cpu_writer" not in cell.figures
 
 
 def test_a_writer_that_is_held_up_is_seen_in_every_latency() -> None:
@@ -120,13 +121,9 @@ def test_what_is_not_installed_is_left_out_with_the_command_that_installs_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(frames, "_SYSTEM_PYTHON", "/nowhere/python3")
-    frames._gstreamer.cache_clear()
     printed = io.StringIO()
     run = FRAMES.run_of(variants=["zenoh-shm", "gstreamer-shm"], console=Console(file=printed, width=80))
-    try:
-        engine._leave_out_missing(run)
-    finally:
-        frames._gstreamer.cache_clear()
+    engine._leave_out_missing(run)
     assert run["variants"] == ["zenoh-shm"]
     assert "gstreamer-shm is left out" in printed.getvalue()
     assert frames.INSTALL_GSTREAMER in printed.getvalue()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Iterator
 from contextlib import nullcontext
 from pathlib import Path
 from typing import cast
@@ -12,49 +13,61 @@ from rich.console import Console
 
 from pebble.bench import engine
 from pebble.bench import page as module
-from pebble.bench.page import CASES, PAGE, PageCase, Row, lost_percent
+from pebble.bench.page import CASES, PAGE, ROWS, PageCase, Row, goals, lost_percent
 from pebble.bench.page_rig import Rig
-from pebble.bench.results import load
+from pebble.bench.results import Cell, Judged, load
 from pebble.errors import PebbleError
 
 KEY = Row("key to MQTT", 2, 5)
 MEMORY = Row("1 viewer, driving: RSS", 60, unit="MB")
 
 
+def setting() -> nullcontext[Rig]:
+    return nullcontext(cast(Rig, None))
+
+
+def goal_of(measure: str, *tries: list[float]) -> Judged:
+    (found,) = goals([Cell(variant="page", measure=measure, unit=ROWS[measure].unit, rounds=list(tries))])
+    assert isinstance(found, Judged)
+    return found
+
+
 def test_tries_are_compared_by_the_95th_percentile_if_it_has_a_goal() -> None:
     calm, even = [1.0] * 9 + [9.0], [3.0] * 10
-    assert KEY.best([calm, [], even]) == even
-    assert Row("CPU", 8, unit="%").best([even, calm]) == calm
-    assert KEY.best([[], []]) == []
+    assert goal_of(KEY.key, calm, [], even).measured == "3.00 / 3.00 ms"
+    assert goal_of("1 viewer, driving: CPU", even, calm).measured == "1.00 / 9.00 %"
+    assert goal_of(KEY.key, [], []).measured == "– / – ms"
 
 
 @pytest.mark.parametrize(
-    ("row", "samples", "expected"),
+    ("measure", "samples", "expected"),
     [
-        (Row("a", 2, 5), [1.0, 2.0, 5.0], True),
-        (Row("a", 2, 5), [1.0, 2.0, 5.1], False),
-        (Row("a", 2, 5), [2.1, 2.2, 2.3], False),
-        (Row("a", p95=300), [299.0], True),
-        (Row("a", 0, 0), [0.0], True),
-        (Row("a", 2, 5), [], False),
+        (KEY.key, [1.0, 2.0, 5.0], "met"),
+        (KEY.key, [1.0, 2.0, 5.1], "missed"),
+        (KEY.key, [2.1, 2.2, 2.3], "missed"),
+        ("frozen to stop", [299.0], "met"),
+        ("scene, json lost", [0.0], "met"),
+        (KEY.key, [], "not judged"),
     ],
 )
-def test_a_goal_is_met_if_all_its_bounds_hold(row: Row, samples: list[float], expected: bool) -> None:
-    assert row.met(samples) is expected
+def test_a_goal_is_met_if_all_its_bounds_hold(measure: str, samples: list[float], expected: str) -> None:
+    assert goal_of(measure, samples).outcome == expected
 
 
 def test_goals_as_text() -> None:
-    assert [row.goal for row in (KEY, Row("a", p95=300), Row("a", 8), Row("a"))] == [
-        "≤ 2 / 5",
-        "≤ – / 300",
-        "≤ 8 / –",
-        "",
+    measures = (KEY.key, "frozen to stop", "1 viewer, driving: CPU")
+    assert [goal_of(measure, [1.0]).what.partition(", p50 / p95 ")[2] for measure in measures] == [
+        "≤ 2 / 5 ms",
+        "≤ – / 300 ms",
+        "≤ 8 / – %",
     ]
+    cell = Cell(variant="page", measure="256 kbit/s: drive, arrived", unit="%", rounds=[[93.0]])
+    assert list(goals([cell])) == ["256 kbit/s: drive, arrived: 93.0 / 93.0 %"], "it has none"
 
 
 def test_the_best_try_is_judged_by_its_goal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    tries = iter([{"key to MQTT": [3.0, 6.0]}, {"key to MQTT": [1.0, 2.0]}])
-    case = PageCase(lambda _rig, _scale: next(tries), (KEY, MEMORY), lambda: nullcontext(cast(Rig, None)))
+    tries = iter([[3.0, 6.0], [1.0, 2.0]])
+    case = PageCase(lambda _rig, _scale: ((KEY.key, one) for one in next(tries)), setting, (KEY, MEMORY))
     monkeypatch.setattr(module, "CASES", {"keys": case})
     console = Console(file=io.StringIO(), width=200)
     assert engine.run(PAGE.run_of(rounds=2, output=tmp_path, console=console)) == 1, "something was not measured"
@@ -68,11 +81,12 @@ def test_the_best_try_is_judged_by_its_goal(tmp_path: Path, monkeypatch: pytest.
 
 
 def test_a_case_that_fails_is_noted_and_costs_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(_rig: Rig, _scale: float) -> dict[str, list[float]]:
+    def fail(_rig: Rig, _scale: float) -> Iterator[tuple[str, float]]:
+        yield MEMORY.key, 1.0
         raise PebbleError("no picture")
 
-    failing = PageCase(fail, (MEMORY,), lambda: nullcontext(cast(Rig, None)))
-    working = failing._replace(measure=lambda _rig, _scale: {KEY.key: [1.0]}, rows=(KEY,))
+    failing = PageCase(fail, setting, (MEMORY,))
+    working = PageCase(lambda _rig, _scale: iter([(KEY.key, 1.0)]), setting, (KEY,))
     monkeypatch.setattr(module, "CASES", {"pictures": failing, "keys": working})
     console = Console(file=io.StringIO(), width=200)
     assert engine.run(PAGE.run_of(quick=True, output=tmp_path, console=console)) == 1
