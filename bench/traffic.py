@@ -20,6 +20,7 @@ from rich.table import Table
 
 from pebble.bench.aims import outcome
 from pebble.bench.comparison import Budget, Case, Comparison, Run
+from pebble.bench.drivers import driving
 from pebble.bench.paper import MONO_PCM_KBPS, TABLE_4_1
 from pebble.bench.pictures import Drawn
 from pebble.bench.results import Cell, Judged, Results, Value
@@ -28,7 +29,6 @@ from pebble.client.media_receiver import MediaReceiver
 from pebble.errors import PebbleError
 from pebble.recordings.library import FOREVER_NS
 from pebble.recordings.traffic.results import AUDIO, IDLE, SESSION, VIDEO, RobotTraffic, Traffic
-from pebble.rig.operator import Operator
 from pebble.rig.processes import OPERATORS, python
 from pebble.rig.programs import Program, end_all
 from pebble.rig.testbed import ROBOTS, Testbed
@@ -85,29 +85,28 @@ def record(folder: Path, idle_s: float, session_s: float) -> None:
         command = python("pebble.cli", "record", "--url", f"mqtt://127.0.0.1:{testbed.broker_port}", "--into", folder)
         recorder = testbed.add(Program("pebble record", command, testbed.folder / "record.log"), OPERATORS)
         recorder.wait_until(lambda: b"Recording" in recorder.log.read_bytes(), _READY_S)  # it is connected
-        with closing(Operator(testbed.broker_port, "pebble-bench-operator")) as operator:
-            operator.connect()
-            testbed.start_robots()
-            operator.wait_until_ready(len(ROBOTS), _READY_S, testbed.unexpected_exits)
-            time.sleep(idle_s)
-            _use(operator, testbed.broker_port, session_s)
-            if problems := testbed.unexpected_exits():
-                raise PebbleError("; ".join(problems))
-            time.sleep(_LAST_S)
+        testbed.start_robots()
+        testbed.wait_until_ready()
+        time.sleep(idle_s)
+        _use(testbed, session_s)
+        if problems := testbed.unexpected_exits():
+            raise PebbleError("; ".join(problems))
+        time.sleep(_LAST_S)
         end_all([recorder], _END_S)
         testbed.keep = False
 
 
-def _use(operator: Operator, port: int, seconds: float) -> None:
+def _use(testbed: Testbed, seconds: float) -> None:
     """Drive all robots while pictures and sound arrive of those that have them. Raises PebbleError."""
-    viewer = create("mqtt", "pebble-bench-viewer", MqttSettings(host="127.0.0.1", port=port))
+    viewer = create("mqtt", "pebble-bench-viewer", MqttSettings(host="127.0.0.1", port=testbed.broker_port))
+    robots = testbed.robots.values()
     with viewer, ExitStack() as stack:
-        robots = [robot.base for robot in operator.discovery.all_robots() if robot.offers("video")]
-        receivers = [stack.enter_context(closing(MediaReceiver(viewer, base))) for base in robots]
+        receivers = [
+            stack.enter_context(closing(MediaReceiver(viewer, robot.base))) for robot in robots if robot.has_media
+        ]
 
         def poll() -> None:
             time.sleep(_POLL_S)
-            operator.completed.clear()  # nothing is assessed here
             for receiver in receivers:
                 receiver.poll()
 
@@ -120,10 +119,10 @@ def _use(operator: Operator, port: int, seconds: float) -> None:
             poll()
             if time.monotonic() > end:
                 raise PebbleError(f"no pictures or no sound came from {', '.join(silent)}")
-        operator.begin()
-        end = time.monotonic() + seconds
-        while time.monotonic() < end:
-            poll()
+        with driving(testbed.broker_port, *(robot.base for robot in robots)):
+            end = time.monotonic() + seconds
+            while time.monotonic() < end:
+                poll()
 
 
 # -- cells

@@ -53,6 +53,7 @@ class SimulatedRobot:
 
     def __init__(self, running: Processes, name: str, folder: Path) -> None:
         self.running, self.name, self.folder = running, name, folder
+        self.base = Identity("pebble", "robots", name).base
         self.folder.mkdir(exist_ok=True)
         self.mcu_reports: deque[Snapshot] = deque(maxlen=600)  # a minute
         self.programs: list[Program] = []  # all that were started for it
@@ -112,7 +113,7 @@ class Robot(SimulatedRobot):
         wrap: Wrap = unchanged,
     ) -> None:
         super().__init__(running, name, folder or running.folder)
-        self.kind, self.base = kind, Identity("pebble", "robots", name).base
+        self.kind = kind
         self._remote_host, self.remote_port = remote
         self.broker_ports = [self.remote_port]  # and that of its own local broker, once it runs
         self.run_dir, self.config, self.port = (self.folder / file for file in ("run", f"{name}.json", "mcu"))

@@ -8,7 +8,6 @@ import struct
 import threading
 import time
 from collections.abc import Sequence
-from contextlib import closing
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -17,12 +16,13 @@ from urllib.parse import urlsplit
 
 import msgspec
 
+from pebble.client.discovery import ALL_OUTGOING, Discovery
 from pebble.config.raw import deep_merge
 from pebble.contract.identity import Identity
+from pebble.errors import PebbleError
 from pebble.media.sound_file import write_wav
 from pebble.media.world.world_file import read_world
 from pebble.rig.broker import BrokerKind
-from pebble.rig.operator import CLIP, TAG_ID, Operator
 from pebble.rig.processes import OPERATORS, Processes, python
 from pebble.rig.programs import Program
 from pebble.rig.robot import MEDIA, START_S, Robot, SimulatedRobot
@@ -31,11 +31,14 @@ from pebble.simulation.mcu import Snapshot
 from pebble.simulation.motion import Pose
 from pebble.simulation.world.program import Snapshot as WorldSnapshot
 from pebble.simulation.world.program import port_path, trace_path
+from pebble.transports import MqttSettings, create
 from pebble.web.extra import require_packages
 from pebble.web.program import Ready
 
 ROBOTS = ("goob", "fred", "minilamp", "benjr")
 OUTLETS = "outlets"
+CLIP = "horn.wav"  # that Goob plays
+TAG_ID = 21  # of the tag that Goob follows, as in the world file
 CAMERA_FPS: int = MEDIA["av_daemon"]["video"]["fps"]
 _BOARDS = {"minilamp": "ESP32-C6", "benjr": "ESP8266"}
 #: Self-describing MCUs that Goob has besides, by their instance of the serial bridge: kind and options.
@@ -43,6 +46,7 @@ _DEVICES = {"imu": ("goob_imu",), OUTLETS: ("outlets", "--unreachable", "o4")}
 _HOST = "127.0.0.1"
 _RESTART = ["sh", "-c", "kill $PPID"]  # the bridge alone, which runs it: the demo would take more for a failure
 _RATE = 16_000
+_POLL_S = 0.02
 _HORN = struct.pack("<40h", *[8000] * 20, *[-8000] * 20) * 400  # 1 s of 400 Hz
 #: After the first round of driving Goob looks at the tag, and has space for further rounds wherever it is then.
 _START = {"goob": {"kind": "goob", "x": -0.3, "y": 0.2, "heading_deg": 0.0}}
@@ -217,6 +221,16 @@ class Testbed(Processes):
         for robot in self.robots.values():
             robot.bring_up(self._ending)
 
+    def wait_until_ready(self, timeout: float = 30.0) -> None:
+        """Wait until all robots can be driven. Raises PebbleError after that time, or if a process ends."""
+        discovery, end = Discovery(), time.monotonic() + timeout
+        with create("mqtt", "testbed", MqttSettings(host=_HOST, port=self.broker_port)) as transport:
+            transport.subscribe(ALL_OUTGOING, lambda one: discovery.receive(one, time.monotonic(), time.time()))
+            while sum(robot.ready(time.monotonic()) for robot in discovery.all_robots()) < len(self.robots):
+                if (problems := self.unexpected_exits()) or time.monotonic() > end:
+                    raise PebbleError("; ".join(problems) or "the robots did not become ready to drive")
+                time.sleep(_POLL_S)
+
 
 class Stage(Testbed):
     """Brokers and the named robots (none: all four), and the page's server; no operator drives them.
@@ -238,9 +252,7 @@ class Stage(Testbed):
         self.start_robots()
         self.server.wait()
         self.url = self.server.url
-        with closing(Operator(self.broker_port, "stage")) as operator:
-            operator.connect()
-            operator.wait_until_ready(len(self.robots), 30.0, self.unexpected_exits)
+        self.wait_until_ready()
 
     def restart_server(self) -> None:
         """Start it again at the same address; ends the old one if it runs."""

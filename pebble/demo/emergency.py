@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from pebble.rig.operator import EMERGENCY_STOP, CompletedStop
+from pebble.demo.operator import EMERGENCY_STOP, CompletedStop
 from pebble.simulation.trace import Entry
 
 _STOPPED_S = 1.0  # until the motors are off

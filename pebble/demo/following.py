@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from pebble.rig.operator import BY_ITSELF, DISTANCE_M, FOLLOW, HOLD_S, TOLERANCE_M, CompletedFollow, Wheels
+from pebble.demo.operator import BY_ITSELF, DISTANCE_M, FOLLOW, HOLD_S, TOLERANCE_M, CompletedFollow, Wheels
 from pebble.rig.testbed import Outcome
 from pebble.simulation.trace import Entry
 

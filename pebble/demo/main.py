@@ -20,12 +20,7 @@ from pebble.demo.machine import Machine
 from pebble.demo.media import ROUND_S as MEDIA_ROUND_S
 from pebble.demo.media import MediaCheck
 from pebble.demo.media_assessment import MediaResult
-from pebble.demo.results import Result, Results
-from pebble.demo.steps import assess
-from pebble.demo.view import View, show_media_results, show_results
-from pebble.errors import PebbleError
-from pebble.rig.broker import BrokerKind, best_kind
-from pebble.rig.operator import (
+from pebble.demo.operator import (
     BY_ITSELF,
     EMERGENCY_S,
     EMERGENCY_STOP,
@@ -37,6 +32,11 @@ from pebble.rig.operator import (
     CompletedStop,
     Operator,
 )
+from pebble.demo.results import Result, Results
+from pebble.demo.steps import assess
+from pebble.demo.view import View, show_media_results, show_results
+from pebble.errors import PebbleError
+from pebble.rig.broker import BrokerKind, best_kind
 from pebble.rig.testbed import ROBOTS, PageServer, Testbed
 from pebble.web.extra import require_packages
 from pebble.web.settings import DEFAULT_PORT

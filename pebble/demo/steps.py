@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
-from pebble.rig.operator import CompletedStep
+from pebble.demo.operator import CompletedStep
 from pebble.simulation.mcu import Snapshot
 from pebble.simulation.motion import FULL_SPEED_MM_S, TRACK_MM
 from pebble.simulation.trace import Entry

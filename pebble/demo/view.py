@@ -20,9 +20,9 @@ from pebble.demo.emergency import StopResult
 from pebble.demo.following import FollowResult
 from pebble.demo.media import MediaCheck
 from pebble.demo.media_assessment import MediaResult
+from pebble.demo.operator import Operator
 from pebble.demo.results import Result
 from pebble.demo.steps import StepResult
-from pebble.rig.operator import Operator
 from pebble.rig.robot import SimulatedRobot
 
 _LINE_PERIOD_S = 1.0

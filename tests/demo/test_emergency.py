@@ -3,7 +3,7 @@
 import pytest
 
 from pebble.demo.emergency import StopResult, assess
-from pebble.rig.operator import CompletedStop
+from pebble.demo.operator import CompletedStop
 from pebble.simulation.trace import Entry
 
 PRESSED, RESET, ENDED = 100.0, 102.0, 104.0

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from pebble.demo.following import FollowResult, assess
-from pebble.rig.operator import DISTANCE_M, CompletedFollow
+from pebble.demo.operator import DISTANCE_M, CompletedFollow
 from pebble.rig.testbed import Outcome
 from pebble.simulation.trace import Entry
 

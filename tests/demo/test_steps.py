@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import pytest
 
+from pebble.demo.operator import COMMAND_PERIOD_S, SCRIPT, CompletedStep, Step
 from pebble.demo.steps import StepResult, assess
-from pebble.rig.operator import COMMAND_PERIOD_S, SCRIPT, CompletedStep, Step
 from pebble.services.serial_mcu_bridge.text.goob_base import STOP, drive_line, lights_line, mix
 from pebble.simulation.board import SimulatedMcu
 from pebble.simulation.mcu import Snapshot

@@ -11,7 +11,7 @@ from pebble.client.discovery import DiscoveredRobot
 from pebble.client.driver_lease import VALID_S
 from pebble.contract import DRIVING, codec
 from pebble.contract.payloads import Driver, Driving
-from pebble.rig.operator import Operator
+from pebble.demo.operator import Operator
 from pebble.transports import Message
 
 GOOB, FRED = (DiscoveredRobot(f"pebble/robots/{name}", name) for name in ("goob", "fred"))

@@ -23,8 +23,9 @@ from pebble.client.estop import StopSender, new_name
 from pebble.client.estop_states import Reset
 from pebble.contract import APRILTAG_DATA, AUTONOMY_COMMAND, DRIVE, DRIVING, SOUNDBOARD_COMMAND, codec
 from pebble.contract.payloads import AutonomyCommand, Drive, LightsFlash, LightsSolid, SoundboardCommand, TagData
-from pebble.errors import PayloadError, PebbleError
+from pebble.errors import PayloadError
 from pebble.motion.arbiter import HOLD_MS
+from pebble.rig.testbed import CLIP, TAG_ID
 from pebble.services.serial_mcu_bridge.text.goob_base import mix
 from pebble.transports import Message, MqttSettings, QoS, create
 
@@ -66,8 +67,7 @@ _FORWARD = Drive(z=0.5)
 
 BY_ITSELF = "by itself"  # a robot follows a tag by a script, and is driven for a moment in between
 FOLLOW = "apriltag-follow"
-TAG_ID, TAG_SIZE_M = 21, 0.25  # of the tag that Goob follows, as in the world file
-CLIP = "horn.wav"
+TAG_SIZE_M = 0.25
 DISTANCE_M, TOLERANCE_M = 0.9, 0.05
 HOLD_S = HOLD_MS / 1000  # scripts are refused this long after a person's last command
 _APPROACH_S, _OVERRIDE_S, _STEADY_S, _FOLLOWED_REST_S = 1.0, 1.0, 0.8, 0.5
@@ -152,14 +152,6 @@ class Operator:
         """Are that many robots online, with a drive topic?"""
         now = time.monotonic()
         return sum(robot.ready(now) for robot in self.discovery.all_robots()) >= wanted
-
-    def wait_until_ready(self, wanted: int, timeout: float, problems: Callable[[], list[str]]) -> None:
-        """Wait until so many robots can be driven. Raises PebbleError after a timeout, or if there are problems."""
-        end = time.monotonic() + timeout
-        while not self.ready(wanted):
-            if (found := problems()) or time.monotonic() > end:
-                raise PebbleError("; ".join(found) or "the robots did not become ready to drive")
-            time.sleep(_POLL_S)
 
     def show(self, event: str) -> None:
         self._doing = event

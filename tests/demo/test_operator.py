@@ -11,7 +11,7 @@ import pytest
 
 from pebble.contract import CAPABILITIES, DRIVE, DRIVING, ESTOP_STATE, ONLINE, codec
 from pebble.contract.payloads import Capabilities, Drive, Driver, Driving, EstopState, Heartbeat
-from pebble.rig.operator import Operator
+from pebble.demo.operator import Operator
 from pebble.transports import Message, MqttSettings, QoS, Transport, create
 from tests.support import Broker, until
 
