@@ -1,1 +1,1 @@
-"""Starts brokers, robots, workers and operators as processes, for the demo, comparisons and tests."""
+"""Starts brokers, robots and workers as processes, for the demo, comparisons and tests."""
