@@ -27,22 +27,13 @@ if TYPE_CHECKING:
     from pebble.bench.pictures import Declared
 
 FOLDER: Final = Path("bench-results")
+_ELSEWHERE: Final = {"video": "wire", "sound": "wire", "impair": "impair.trials"}  # than in the module of their name
+_NAMES: Final = (
+    "control", "bridge", "startup", "cost", "frames", "video", "sound", "estop", "fleet", "traffic", "page", "impair",
+)  # fmt: skip
 #: The module of each comparison, which has it as a constant of the same name; in the order of the report. A module has
 #: its modes, too: CONTROL_NULL.
-MODULES: Final = {
-    "control": "control",
-    "bridge": "bridge",
-    "startup": "startup",
-    "cost": "cost",
-    "frames": "frames",
-    "video": "wire",
-    "sound": "wire",
-    "estop": "estop",
-    "fleet": "fleet",
-    "traffic": "traffic",
-    "page": "page",
-    "impair": "impair.trials",
-}
+MODULES: Final = {name: _ELSEWHERE.get(name, name) for name in _NAMES}
 
 Params = Mapping[str, Value]
 Combine = Callable[[Sequence[Any]], Value]  # the values of all rounds into one
@@ -78,11 +69,10 @@ class Option:
 
     @property
     def key(self) -> str:
-        """The name of its value in budgets and runs."""
         return self.sets or self.name
 
     def check(self, value: Any) -> None:
-        """Raises PebbleError for an invalid value."""
+        """Raises PebbleError."""
         values = list(value) if self.many else [value]
         if unknown := [one for one in values if self.known and one not in self.known]:
             raise PebbleError(f"--{self.name}: unknown {', '.join(unknown)}: there are {', '.join(self.known)}")
@@ -94,14 +84,12 @@ class Option:
 
     def words(self, value: Any, default: Any) -> list[str]:
         """As on the command line; names only if they are not the default ones."""
-        if self.kind is bool:
-            return [f"--{self.name}"] if value else []
-        if value is None or (self.many and list(value) == list(default or ())):
+        if value is None or value is False or (self.many and list(value) == list(default or ())):
             return []
-        return [f"--{self.name}", (self.metavar or self.name.upper()) if self.private else self.as_word(value)]
+        shown = str(self.metavar) if self.private else self.as_word(value)
+        return [f"--{self.name}", *([] if self.kind is bool else [shown])]
 
     def as_word(self, value: Any) -> str:
-        """A value as on the command line."""
         values = value if self.many else [value]
         return ",".join(f"{one:g}" if isinstance(one, float) else str(one) for one in values)
 
@@ -119,11 +107,11 @@ def variants(known: Sequence[str], help_: str = "Some of them, separated by comm
 
 
 class Budget(dict[str, Any]):
-    """The defaults of the options and of what else grows with the time spent; ``takes_s`` is the expected duration."""
+    """The defaults of the options and of what else grows with the time spent."""
 
     def __init__(self, takes_s: int, **values: Any) -> None:
         super().__init__(values)
-        self.takes_s = takes_s
+        self.takes_s = takes_s  # as expected
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -190,9 +178,8 @@ class Comparison:
         self, *, quick: bool = False, output: Path = FOLDER, console: Console | None = None, **given: Any
     ) -> Run:
         """A run with the defaults, and the ``given`` options unless they are None. Raises PebbleError."""
-        values = {**self.full, **(self.quick if quick else {})}
-        if self.variants:
-            values.setdefault("variants", list(self.variants))
+        own = {"variants": list(self.variants)} if self.variants else {}
+        values = {**own, **self.full, **(self.quick if quick else {})}
         values |= {name: value for name, value in given.items() if value is not None}
         for option in self.options:
             if values.get(option.key) is not None:

@@ -7,6 +7,7 @@ import time
 from collections import defaultdict
 from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from importlib.util import find_spec
 from operator import itemgetter
 from pathlib import Path
@@ -31,12 +32,12 @@ _JOINED: Final[Mapping[str, Combine]] = {"sent": sum}
 
 def run(run: Run) -> int:
     """Measures, prints and writes; returns 0 if everything has results of enough rounds. Raises PebbleError."""
-    about, console = run.comparison, run.console
+    about, show = run.comparison, partial(run.console.print, highlight=False, soft_wrap=True)
     check_folder(run.output)
     about.prepare(run)
     _leave_out_missing(run)
     results, since = begin(about.name, run.command, quick=run.quick), time.monotonic()
-    collected, rounds = Collected(about, roles_of(run)), Rounds(run.rounds, console)
+    collected, rounds = Collected(about, roles_of(run)), Rounds(run.rounds, run.console)
     with interrupted_by_signals():
         try:
             _measure(run, collected, rounds)
@@ -45,26 +46,28 @@ def run(run: Run) -> int:
     cells = about.derived(collected.cells())
     results.cells, results.options, results.took_s = cells, run.records(), round(time.monotonic() - since, 1)
     early = str(run.problem or "").partition("\n")[0]
-    lines = [*([early[0].upper() + early[1:]] if early else []), *rounds.notes(), *about.assessed(cells), *run.notes]
+    first = [early[0].upper() + early[1:]] if early else []
+    lines = [*first, *rounds.notes(), *about.assessed(cells), *run.notes]
     results.assessment = [line for line in lines if isinstance(line, str)]
     results.aims = [line for line in lines if isinstance(line, Judged)]
-    for table in about.shown(cells):
-        table.title = f"{table.title}{about.title_suffix.format(**run.records(), quick=', quick' if run.quick else '')}"
-        console.print(table)
-    for line in about.legend(cells):
-        console.print(line, style="dim", highlight=False, soft_wrap=True)
-    for sentence in (*results.assessment, *results.aims):
-        console.print(str(sentence), highlight=False, soft_wrap=True)
     results.complete = run.problem is None and rounds.enough and about.complete(cells)
+    suffix = about.title_suffix.format(**results.options, quick=", quick" if run.quick else "")
+    for table in about.shown(cells):
+        table.title = f"{table.title}{suffix}"
+        run.console.print(table)
+    for line in about.legend(cells):
+        show(line, style="dim")
+    for sentence in (*results.assessment, *results.aims):
+        show(str(sentence))
     written = [run.output / f"{about.name}.json"]
     results.save(written[0])
     if find_spec("matplotlib") is None:
-        console.print("No plots: pip install 'pebble-robot[bench]'", style="dim", highlight=False)
+        show("No plots: pip install 'pebble-robot[bench]'", style="dim")
     else:
         from pebble.bench.pictures import draw
 
         written += draw(results, run.output)
-    console.print(f"Written: {', '.join(map(str, written))}", style="dim", highlight=False, soft_wrap=True)
+    show(f"Written: {', '.join(map(str, written))}", style="dim")
     if run.problem is not None:
         raise run.problem
     return int(not results.complete)
@@ -78,7 +81,7 @@ def _leave_out_missing(run: Run) -> None:
         run.console.print(f"{name} is left out: {reason}", style="yellow", highlight=False, soft_wrap=True)
     if reasons:
         run.options["variants"] = [name for name in named if name not in reasons]
-        if not run.options["variants"]:
+        if not run["variants"]:
             raise PebbleError("no variant can be measured on this machine")
 
 
@@ -106,7 +109,7 @@ def _measure(run: Run, collected: Collected, rounds: Rounds) -> None:
             before = f"round {number + 1} of {run.rounds}: "
             run.show = lambda what, before=before: status.update(escape(before + what))  # type: ignore[misc]
             with rounds.attempt(number):
-                if rounds.last_failed or number % run.options.get("fresh_every", 1) == 0:
+                if rounds.failed(number - 1) or number % run.options.get("fresh_every", 1) == 0:
                     shared.close()
                     env = shared.enter_context(about.environment(run))
                 round_ = Round(run, number, env, roles=collected.roles, planted_us=collected.planted_us)
@@ -165,44 +168,39 @@ class Collected:
             for cell in [*self._cells.values()] or self.pilot
             if not null.is_slowed(cell.variant) and cell.samples and condition.items() <= cell.params.items()
         ]
-        return null.SLOWDOWN * percentile(usual, 50) if usual else 0.0
+        return null.SLOWDOWN * percentile(usual or [0.0], 50)
 
 
 class Rounds:
-    """Counts successful and failed rounds of ``asked``: a failed one is left out and noted, the others still count."""
+    """Counts the failed ones of ``asked`` rounds: they are left out and noted, the others still count."""
 
     def __init__(self, asked: int, console: Console) -> None:
         self._asked, self._console = asked, console
-        self._done = 0
-        self._failed: list[str] = []
-        self.last_failed = False
+        self._failed: dict[int, str] = {}  # by number, from 0
 
     @contextmanager
     def attempt(self, number: int) -> Iterator[None]:
-        """Runs round ``number``, from 0. Raises PebbleError if the first rounds fail, since all would."""
+        """Raises PebbleError if the first rounds fail, since all would."""
         try:
             yield
         except PebbleError as error:
-            self._failed.append(f"round {number + 1}: {error}")
-            if not self._done and len(self._failed) == min(_GIVEN_UP, self._asked):
+            self._failed[number] = f"round {number + 1}: {error}"
+            if len(self._failed) == number + 1 == min(_GIVEN_UP, self._asked):
                 raise
-            self._console.print(self._failed[-1], style="red", highlight=False, markup=False)
-            self.last_failed = True
-        else:
-            self._done += 1
-            self.last_failed = False
+            self._console.print(self._failed[number], style="red", highlight=False, markup=False)
+
+    def failed(self, number: int) -> bool:
+        return number in self._failed
 
     def notes(self) -> list[str]:
         """A sentence for the assessment: how many rounds failed, and why the first of them did."""
-        if not self._failed:
-            return []
-        why = self._failed[0].splitlines()[0]
-        return [f"{len(self._failed)} of {self._asked} rounds failed and were left out; {why}"]
+        whys = [why.splitlines()[0] for why in self._failed.values()]
+        return [f"{len(whys)} of {self._asked} rounds failed and were left out; {whys[0]}"] if whys else []
 
     @property
     def enough(self) -> bool:
         """Whether enough rounds to judge are left, if so many were requested."""
-        return self._done >= LEAST_ROUNDS or self._asked < LEAST_ROUNDS
+        return self._asked < LEAST_ROUNDS or self._asked - len(self._failed) >= LEAST_ROUNDS
 
 
 def check_folder(folder: Path) -> None:

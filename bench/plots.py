@@ -22,6 +22,7 @@ _WIDEST = 13.0  # inches
 _SETTINGS: dict[Any, Any] = {
     "font.size": 9,
     "axes.titlesize": 9,
+    "axes.titlelocation": "left",
     "xtick.labelsize": 8,
     "ytick.labelsize": 8,
     "figure.titlesize": 11,
@@ -94,7 +95,6 @@ def unique(values: Sequence[str]) -> list[str]:
 
 
 def finite(samples: Sequence[float | None]) -> list[float]:
-    """The finite samples, without NaN and None."""
     return [sample for sample in samples if sample is not None and math.isfinite(sample)]
 
 
@@ -111,8 +111,7 @@ def panels(count: int, columns: int, size: tuple[float, float], title: str) -> t
     rows = math.ceil(count / columns)
     width = max(5.5, min(_WIDEST, columns * size[0]))
     figure = Figure(figsize=(width, rows * size[1] + 0.9), dpi=_DPI, layout="constrained")
-    wrapped = "\n".join(textwrap.wrap(title, int(width * 11.5) - 14))  # leaves room for the “quick run” mark
-    figure.suptitle(wrapped, x=0.01, ha="left")
+    figure.suptitle(textwrap.fill(title, int(width * 11.5) - 14), x=0.01, ha="left")  # beside it: “quick run”
     return figure, [figure.add_subplot(rows, columns, number + 1) for number in range(count)]
 
 
@@ -126,9 +125,9 @@ def legend(figure: Figure, entries: dict[str, Style], *, more: Sequence[Line2D] 
             marker=style.marker, markersize=5, markerfacecolor="white" if style.hollow else style.colour,
         )
         for name, style in entries.items()
-    ]  # fmt: skip
-    columns = max(1, min(len([*handles, *more]), int(figure.get_figwidth() // 1.8)))
-    figure.legend(handles=[*handles, *more], loc="outside lower center", ncols=columns, frameon=False)
+    ] + list(more)  # fmt: skip
+    columns = max(1, min(len(handles), int(figure.get_figwidth() // 1.8)))
+    figure.legend(handles=handles, loc="outside lower center", ncols=columns, frameon=False)
 
 
 def save(picture: Picture, path: Path, results: Results) -> None:

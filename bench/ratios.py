@@ -14,8 +14,7 @@ from statistics import NormalDist
 from pebble.bench.results import percentile
 
 LEVEL = 0.99
-#: Fewer rounds than this do not support a 99 % interval: it is computed, but means little.
-LEAST_ROUNDS = 8
+LEAST_ROUNDS = 8  # fewer do not support a 99 % interval: it is computed, but means little
 _RESAMPLES = 20_000
 _INFINITE = 1e15  # stands for infinity where resampling computes differences
 _LARGEST = 1e6  # ratio that is written as a number
@@ -26,10 +25,7 @@ Rounds = Sequence[Sequence[float]]  # the samples of each
 
 @dataclass(frozen=True, slots=True)
 class Interval:
-    """A ratio and its confidence interval at ``level``; NaN if nothing was measured.
-
-    With fewer than ``LEAST_ROUNDS`` the interval is not meaningful.
-    """
+    """A ratio and its confidence interval at ``level``, which few rounds do not support; NaN: nothing was measured."""
 
     ratio: float = math.nan
     low: float = math.nan
@@ -38,10 +34,8 @@ class Interval:
     rounds: int = LEAST_ROUNDS
 
     def __str__(self) -> str:
-        if not self.known:
-            return "–"
         interval = "" if self.few else f" ({_digits(self.low)} to {_digits(self.high)})"
-        return f"{_digits(self.ratio)}{interval}"
+        return f"{_digits(self.ratio)}{interval}" if self.known else "–"
 
     @property
     def known(self) -> bool:
@@ -49,12 +43,10 @@ class Interval:
 
     @property
     def few(self) -> bool:
-        """Whether there are too few rounds to judge."""
         return self.rounds < LEAST_ROUNDS
 
     @property
     def equal(self) -> bool:
-        """Whether the interval includes 1."""
         return self.low <= 1.0 <= self.high
 
     def words(self, ours: str, theirs: str, quantity: str = "time") -> str:
@@ -95,11 +87,9 @@ def _interval(ours: Sequence[float], theirs: Sequence[float], level: float) -> I
     import numpy as np  # importing it earlier than it is needed would change the memory of measured processes
 
     ratio = float(np.median(ours) - np.median(theirs))
-    if rounds < 2:
-        return Interval(math.exp(ratio), 0.0, math.inf, level, rounds)
     random = np.random.default_rng(_SEED)
     a, b = (np.median(random.choice(logs, (_RESAMPLES, len(logs))), axis=1) for logs in (ours, theirs))
-    tail, freedom = (1 - level) / 2, rounds - 1
+    tail, freedom = (1 - level) / 2, max(1, rounds - 1)
     z = NormalDist().inv_cdf(1 - tail)  # half of the width in standard errors; few rounds: Student's t, approximated
     wider = 1 + (z**2 + 1) / (4 * freedom) + (5 * z**4 + 16 * z**2 + 3) / (96 * freedom**2)
     low, high = (ratio + wider * (end - ratio) for end in np.quantile(a - b, [tail, 1 - tail]))
