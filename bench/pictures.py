@@ -64,7 +64,7 @@ class Drawn:
 
 def ecdf(title: str, *, measures: Sequence[str] = ()) -> Declared:
     """For each measure the share of messages within a time; one panel for each condition."""
-    caption = f"{title}: {{measure}}. Share of all messages within the time; lost messages are missing from 100 %"
+    caption = f"{title}: {{measure}}. Share of all messages, lost ones included, within the time"
     return _of_each(measures, caption, _curves, LEAST)
 
 

@@ -89,11 +89,15 @@ def _interval(ours: Sequence[float], theirs: Sequence[float], level: float) -> I
     ratio = float(np.median(ours) - np.median(theirs))
     random = np.random.default_rng(_SEED)
     a, b = (np.median(random.choice(logs, (_RESAMPLES, len(logs))), axis=1) for logs in (ours, theirs))
-    tail, freedom = (1 - level) / 2, max(1, rounds - 1)
-    z = NormalDist().inv_cdf(1 - tail)  # half of the width in standard errors; few rounds: Student's t, approximated
-    wider = 1 + (z**2 + 1) / (4 * freedom) + (5 * z**4 + 16 * z**2 + 3) / (96 * freedom**2)
+    tail, wider = (1 - level) / 2, student(level, rounds) / student(level, math.inf)
     low, high = (ratio + wider * (end - ratio) for end in np.quantile(a - b, [tail, 1 - tail]))
     return Interval(math.exp(ratio), math.exp(low), math.exp(high), level, rounds)
+
+
+def student(level: float, rounds: float) -> float:
+    """Half of an interval's width in standard errors: Student's t, approximated."""
+    z, freedom = NormalDist().inv_cdf((1 + level) / 2), max(1, rounds - 1)
+    return z * (1 + (z**2 + 1) / (4 * freedom) + (5 * z**4 + 16 * z**2 + 3) / (96 * freedom**2))
 
 
 def _digits(ratio: float) -> str:

@@ -12,7 +12,7 @@ import subprocess
 import time
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import distributions
 from pathlib import Path
 from typing import TypeVar
 
@@ -198,21 +198,17 @@ def begin(bench: str, command: Sequence[str], *, quick: bool = False) -> Results
 
 
 def machine() -> dict[str, Value]:
-    """The machine and the versions the results depend on; no names of hosts or users. None: not installed."""
+    """The machine and the versions the results depend on; no names of hosts or users. What is not installed is missing."""
     model = re.search(r"^(?:model name|Model).*?: *(.*?) *$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
-    found: dict[str, Value] = {
+    return {
         "cpu": model[1] if model else platform.machine(),
         "cores": len(os.sched_getaffinity(0)),
         "kernel": platform.release(),
         "system": platform.freedesktop_os_release()["PRETTY_NAME"],
         "python": platform.python_version(),
         "mosquitto": _mosquitto(),
-        **dict.fromkeys(_PACKAGES),
+        **{name: one.version for name in _PACKAGES for one in distributions(name=name)},
     }
-    for package in _PACKAGES:
-        with suppress(PackageNotFoundError):
-            found[package] = version(package)
-    return found
 
 
 def _mosquitto() -> str | None:

@@ -39,26 +39,17 @@ def wake_ups(pids: Iterable[int]) -> int:
     return count
 
 
-def _sum(file: Path, *fields: str) -> int:
-    return sum(int(line.split()[1]) for line in file.read_text().splitlines() if line.startswith(fields))
-
-
 def pss_mb(pid: int) -> float:
-    """Proportional set size: shared pages are divided among their users."""
+    """Proportional set size: shared pages are divided among their users; 0 for a process that has ended."""
     return _memory_mb(pid, "Pss:")
 
 
 def own_mb(pid: int) -> float:
-    """What a process has allocated, without the pages of programs and libraries: only it can make this grow.
-
-    The proportional set size grows too when another process ends with which pages were shared. Shared memory is divided
-    among its users.
-    """
+    """What a process has allocated, and its share of shared memory: unlike its PSS, no other process changes it."""
     return _memory_mb(pid, "Anonymous:", "Pss_Shmem:")
 
 
 def _memory_mb(pid: int, *fields: str) -> float:
-    """0 for a process that has ended. Raises PebbleError if the kernel does not provide it."""
     file = _PROC / str(pid) / "smaps_rollup"
     try:
         return _sum(file, *fields) / 1024
@@ -68,17 +59,14 @@ def _memory_mb(pid: int, *fields: str) -> float:
         return 0.0
 
 
-# -- the time of a wake-up, which every message needs several times
+def _sum(file: Path, *fields: str) -> int:
+    return sum(int(line.split()[1]) for line in file.read_text().splitlines() if line.startswith(fields))
 
 
 def wake_up_us() -> tuple[float, float]:
-    """The time to wake up a waiting process on the same core and on another one, us; alike if there is only one core.
-
-    It is half of the median round trip of a byte through a socket to ``cat``: a round trip is two wake-ups and little
-    else.
-    """
+    """The time to wake up a waiting process, us, on the same core and on another one: half of a round trip to ``cat``."""
     cores = sorted(os.sched_getaffinity(0))
-    os.sched_setaffinity(0, cores[:1])  # only this thread, and processes that it starts meanwhile
+    os.sched_setaffinity(0, cores[:1])  # this thread, and processes that it starts meanwhile
     try:
         return _wake_up_us(cores[0]), _wake_up_us(cores[-1])
     finally:

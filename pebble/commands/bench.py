@@ -1,7 +1,4 @@
-"""``pebble bench``: comparisons, side by side in one run on this machine.
-
-The command of a comparison follows from its declaration.
-"""
+"""``pebble bench``: the command of each comparison, which follows from its declaration, and those for all results."""
 
 from __future__ import annotations
 
@@ -36,8 +33,8 @@ def compare(
 ) -> int:
     """Did anything get worse from A to B, beyond noise? Exit code 1 if so.
 
-    Both files must come from the same comparison, if possible on the same machine with the same options. The ratios of
-    the medians and of the p99 of each cell are tested with confidence intervals over rounds.
+    Both files must come from the same comparison, if possible on the same machine with the same options. Medians, p99
+    and what was lost of each cell are tested with confidence intervals over rounds.
     """
     from pebble.bench.compare import run
 
@@ -62,12 +59,8 @@ def echo(
 def report(
     folder: Annotated[Path, typer.Argument(help="Folder for results, pictures and README.md.", metavar="FOLDER")],
     quick: Quick = False,
-    only: Annotated[
-        str | None, typer.Option(help="Some of them, separated by commas. [default: all]", metavar="NAMES")
-    ] = None,
-    render: Annotated[
-        bool, typer.Option("--render", help="Measure nothing: only write pictures and README.md again.")
-    ] = False,
+    only: Annotated[str | None, typer.Option(help="Some of them, separated by commas.", metavar="NAMES")] = None,
+    render: Annotated[bool, typer.Option("--render", help="Only write pictures and README.md again.")] = False,
 ) -> int:
     """Run all comparisons and pebble impair, one after the other, and write a report.
 
@@ -111,32 +104,24 @@ def command_of(about: Comparison) -> Callable[..., int]:
         mode = next((mode for name, mode in about.modes.items() if wanted.get(name)), about)
         return run_(mode.run_of(quick=quick, output=output, **wanted))
 
-    declared: dict[str, tuple[Any, Any]] = {name: (_annotation(about, one), None) for name, one in options.items()}
+    declared = {name: (_annotation(about, option), None) for name, option in options.items()}
     declared |= {"quick": (Quick, False), "output": (Output, about.folder)}
     run.__doc__ = about.help
     run.__annotations__ = {name: annotation for name, (annotation, _) in declared.items()}
-    run.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
-        [
-            inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
-            for name, (annotation, default) in declared.items()
-        ]
-    )
+    run.__signature__ = inspect.Signature([  # type: ignore[attr-defined]
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+        for name, (annotation, default) in declared.items()
+    ])  # fmt: skip
     return run
 
 
 def _annotation(about: Comparison, option: Option) -> Any:
-    """The option for typer, with its defaults as text: None if it is not given."""
+    """The option for typer, with a default as text: None if it is not given."""
     kind: Any = list[str] if option.many else option.kind
-    full, quick = (budget.get(option.key) for budget in (about.full, about.quick))
-    default = "" if full is None or option.kind is bool else option.as_word(full)
-    if option.key == "variants" or (option.many and full == list(option.known)):
-        default = "all"
-    elif default and quick not in (None, full):
-        default += f"; quick {option.as_word(quick)}"
-    help_ = f"{option.help} [default: {default}]" if default else option.help
-    return Annotated[
-        kind | None, typer.Option(f"--{option.name}", help=help_, metavar=option.metavar, show_default=False)
-    ]
+    default = about.full.get(option.key)
+    shown = "" if default in (None, False) or option.known else f" [default: {option.as_word(default)}]"
+    own = typer.Option(f"--{option.name}", help=option.help + shown, metavar=option.metavar, show_default=False)
+    return Annotated[kind | None, own]
 
 
 def _parsed(option: Option, value: Any) -> Any:

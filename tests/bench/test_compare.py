@@ -146,6 +146,25 @@ def test_more_pictures_per_second_are_better_and_none_is_worst() -> None:
     assert kinds(one([15.0], unit="1/s"), one([0.0], unit="1/s")) == [Kind.NO_SAMPLES]
 
 
+def losing(*lost: int) -> Results:
+    """Of 50 messages in each round."""
+    run = one(*[[1.0] * (50 - count) for count in lost])
+    run.cells[0].figures["sent"] = 50 * len(lost)
+    return run
+
+
+def test_more_that_is_lost_is_worse_and_a_burst_is_noise(tmp_path: Path) -> None:
+    clean, lossy, burst = losing(*[0] * 10), losing(*[1, 2, 3, 2, 1, 2, 3, 1, 2, 3]), losing(*[0] * 9, 20)
+    assert kinds(clean, clean) == [Kind.EQUAL]  # the median
+    assert kinds(clean, lossy) == [Kind.WORSE, Kind.EQUAL]
+    assert kinds(lossy, clean) == [Kind.BETTER, Kind.EQUAL]
+    assert kinds(clean, burst) == [Kind.EQUAL, Kind.EQUAL]
+    assert kinds(losing(0), losing(9)) == [Kind.UNKNOWN, Kind.UNKNOWN]
+    code, printed = report(tmp_path, clean, lossy)
+    assert code == 1
+    assert "lost %" in printed
+
+
 def test_bytes_of_encoders_are_the_same_every_time() -> None:
     assert kinds(one([100.0], unit="kB/s"), one([110.0], unit="kB/s")) == [Kind.WORSE]
     assert kinds(one([100.0], unit="kB/s"), one([101.0], unit="kB/s")) == [Kind.EQUAL]
