@@ -6,7 +6,7 @@ import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from functools import partial
 from importlib.util import find_spec
 from operator import itemgetter
@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Final
 
 import msgspec
-from rich.console import Console
 from rich.markup import escape
 
 from pebble.bench import null
@@ -25,7 +24,7 @@ from pebble.errors import PebbleError
 from pebble.runtime.signals import interrupted_by_signals
 from pebble.transports.segments import sweep
 
-_GIVEN_UP: Final = 2  # failures before the first success until the run is given up
+_GIVEN_UP: Final = 2  # rounds that fail before any has succeeded: then the run ends
 _IN_US: Final = {"us": 1.0, "ms": 1e3, "s": 1e6}
 _JOINED: Final[Mapping[str, Combine]] = {"sent": sum}
 
@@ -37,20 +36,21 @@ def run(run: Run) -> int:
     about.prepare(run)
     _leave_out_missing(run)
     results, since = begin(about.name, run.command, quick=run.quick), time.monotonic()
-    collected, rounds = Collected(about, roles_of(run)), Rounds(run.rounds, run.console)
+    collected = Collected(about, roles_of(run))
     with interrupted_by_signals():
         try:
-            _measure(run, collected, rounds)
+            failed = _measure(run, collected)
         finally:
             sweep()  # Zenoh leaves files behind even after a regular end
     cells = about.derived(collected.cells())
     results.cells, results.options, results.took_s = cells, run.records(), round(time.monotonic() - since, 1)
+    left = f"{len(failed)} of {run.rounds} rounds failed and were left out; {failed[0].splitlines()[0]}" if failed else ""
     early = str(run.problem or "").partition("\n")[0]
-    first = [early[0].upper() + early[1:]] if early else []
-    lines = [*first, *rounds.notes(), *about.assessed(cells), *run.notes]
+    lines = [*filter(None, (early[:1].upper() + early[1:], left)), *about.assessed(cells), *run.notes]
     results.assessment = [line for line in lines if isinstance(line, str)]
     results.aims = [line for line in lines if isinstance(line, Judged)]
-    results.complete = run.problem is None and rounds.enough and about.complete(cells)
+    enough = run.rounds < LEAST_ROUNDS or run.rounds - len(failed) >= LEAST_ROUNDS
+    results.complete = run.problem is None and enough and about.complete(cells)
     suffix = about.title_suffix.format(**results.options, quick=", quick" if run.quick else "")
     for table in about.shown(cells):
         table.title = f"{table.title}{suffix}"
@@ -101,21 +101,32 @@ def roles_of(run: Run) -> Sequence[str]:
     return null.roles(names[0])
 
 
-def _measure(run: Run, collected: Collected, rounds: Rounds) -> None:
-    """Rounds share an environment: a new one every ``fresh_every`` rounds, and after a round that failed."""
-    about, env = run.comparison, None
+def _measure(run: Run, collected: Collected) -> list[str]:
+    """Returns why rounds failed: they are left out. Raises PebbleError if the first ones fail, since all would.
+
+    Rounds share an environment: a new one every ``fresh_every`` rounds, and after a round that failed.
+    """
+    about, env, failed, fresh = run.comparison, None, list[str](), True
     with run.console.status("", refresh_per_second=4) as status, ExitStack() as shared:
         for number in range(run.rounds):
             before = f"round {number + 1} of {run.rounds}: "
             run.show = lambda what, before=before: status.update(escape(before + what))  # type: ignore[misc]
-            with rounds.attempt(number):
-                if rounds.failed(number - 1) or number % run.options.get("fresh_every", 1) == 0:
+            try:
+                if fresh or number % run.options.get("fresh_every", 1) == 0:
                     shared.close()
                     env = shared.enter_context(about.environment(run))
                 round_ = Round(run, number, env, roles=collected.roles, planted_us=collected.planted_us)
                 if about.is_null and about.measure is not None and not collected.pilot:
                     collected.pilot = list(about.measure(next(round_.cases())))
                 collected.add(_round(round_))
+                fresh = False
+            except PebbleError as error:
+                fresh = True
+                failed.append(f"round {number + 1}: {error}")
+                if len(failed) == number + 1 == min(_GIVEN_UP, run.rounds):
+                    raise
+                run.console.print(failed[-1], style="red", highlight=False, markup=False)
+    return failed
 
 
 def _round(round_: Round) -> Iterator[Cell]:
@@ -169,38 +180,6 @@ class Collected:
             if not null.is_slowed(cell.variant) and cell.samples and condition.items() <= cell.params.items()
         ]
         return null.SLOWDOWN * percentile(usual or [0.0], 50)
-
-
-class Rounds:
-    """Counts the failed ones of ``asked`` rounds: they are left out and noted, the others still count."""
-
-    def __init__(self, asked: int, console: Console) -> None:
-        self._asked, self._console = asked, console
-        self._failed: dict[int, str] = {}  # by number, from 0
-
-    @contextmanager
-    def attempt(self, number: int) -> Iterator[None]:
-        """Raises PebbleError if the first rounds fail, since all would."""
-        try:
-            yield
-        except PebbleError as error:
-            self._failed[number] = f"round {number + 1}: {error}"
-            if len(self._failed) == number + 1 == min(_GIVEN_UP, self._asked):
-                raise
-            self._console.print(self._failed[number], style="red", highlight=False, markup=False)
-
-    def failed(self, number: int) -> bool:
-        return number in self._failed
-
-    def notes(self) -> list[str]:
-        """A sentence for the assessment: how many rounds failed, and why the first of them did."""
-        whys = [why.splitlines()[0] for why in self._failed.values()]
-        return [f"{len(whys)} of {self._asked} rounds failed and were left out; {whys[0]}"] if whys else []
-
-    @property
-    def enough(self) -> bool:
-        """Whether enough rounds to judge are left, if so many were requested."""
-        return self._asked < LEAST_ROUNDS or self._asked - len(self._failed) >= LEAST_ROUNDS
 
 
 def check_folder(folder: Path) -> None:

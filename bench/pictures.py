@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -27,8 +27,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-Declared = Callable[[Results], list[Picture]]
+Declared = Callable[[Results], Iterable[Picture]]
 Make = Callable[[Sequence[Cell], str], "Figure"]  # of cells, under a title
+_Judged = Sequence[tuple[Cell, Interval]]
 
 LEAST = 20  # samples for a distribution
 _DARK = "#222"
@@ -58,37 +59,55 @@ class Drawn:
 
     by: str
 
-    def __call__(self, results: Results) -> list[Picture]:
+    def __call__(self, results: Results) -> Iterable[Picture]:
         return cast(Declared, resolve_name(self.by))(results)
 
 
 def ecdf(title: str, *, measures: Sequence[str] = ()) -> Declared:
     """For each measure the share of messages within a time; one panel for each condition."""
     caption = f"{title}: {{measure}}. Share of all messages, lost ones included, within the time"
-    return _of_each(measures, caption, _curves, LEAST)
+    return _declared(_curves, caption, measures=measures, least=LEAST)
 
 
 def bars(title: str, *, measures: Sequence[str] = (), panel: str = "", group: str = "") -> Declared:
     """A bar for each median: one picture for each measure, with a panel or a group for each value of a parameter."""
-    return _of_each(measures, f"{title}: {{measure}}, medians", partial(_amounts, panel=panel, group=group))
+    make = partial(_amounts, panel=panel, group=group)
+    return _declared(make, f"{title}: {{measure}}, medians", measures=measures)
 
 
 def dots(title: str) -> Declared:
     """A dot for each sample, and a line at the median; one panel for each measure."""
     caption = f"{title}: a dot for each launch or late subscriber, a line at the median of the rounds"
-    return lambda results: _picture(results.bench, caption, _measured(results), _dots)
+    return _declared(_dots, caption, name="")
 
 
 def tails(title: str) -> Declared:
     """Bars to the medians, lines to the 99th percentiles; one panel for each condition."""
-    caption = f"{title}: bars to the median, lines to the 99th percentile"
-    return lambda results: _picture(f"{results.bench}-bars", caption, _measured(results), _tails)
+    return _declared(_tails, f"{title}: bars to the median, lines to the 99th percentile", name="bars")
+
+
+def _declared(
+    make: Make, caption: str, *, measures: Sequence[str] = (), least: int = 1, name: str | None = None
+) -> Declared:
+    """A picture for each of these measures, or for all, in a file of its name; or of this name for all together.
+
+    Cells with fewer finite samples than ``least`` are not drawn.
+    """
+
+    def found(results: Results) -> Iterator[Picture]:
+        cells = (cell for cell in results.cells if cell.measure in (measures or (cell.measure,)))
+        known = (cell for cell in cells if len(finite(cell.samples)) >= least)
+        for what, some in grouped(known, lambda cell: cell.measure if name is None else name).items():
+            file = re.sub("[^a-z0-9]+", "-", f"{results.bench}-{what}".lower()).strip("-")
+            yield Picture(file, title := caption.format(measure=what), partial(make, some, title))
+
+    return found
 
 
 def ratios(title: str, baseline: str, *, measures: Sequence[str] = ()) -> Declared:
     """The medians as ratios to the baseline's, with their intervals. No picture without a baseline."""
 
-    def found(results: Results) -> list[Picture]:
+    def found(results: Results) -> Iterator[Picture]:
         cells = [cell for cell in results.cells if cell.measure in (measures or (cell.measure,))]
         based = [(cell, base) for cell in cells if (base := base_of(cell, cells, baseline)) is not None]
         judged = [(cell, paired(cell.rounds, base.rounds)) for cell, base in based]
@@ -103,36 +122,11 @@ def null_ratios(title: str) -> Declared:
     return lambda results: _ratios(results, null.intervals(results.cells), caption, _ITSELF)
 
 
-def _ratios(results: Results, judged: Sequence[tuple[Cell, Interval]], caption: str, baseline: str) -> list[Picture]:
-    judged = [(cell, interval) for cell, interval in judged if math.isfinite(interval.ratio)]
-    few = all(interval.few for _, interval in judged)
-    caption += f"; no intervals: these need {LEAST_ROUNDS} rounds" if few else "; lines: intervals of 99 %"
-    make = partial(_ratio_bars, judged, caption, baseline)
-    return [Picture(f"{results.bench}-ratios", caption, make)] if judged else []
-
-
-def _measured(results: Results, least: int = 1) -> list[Cell]:
-    """The cells with so many finite samples."""
-    return [cell for cell in results.cells if len(finite(cell.samples)) >= least]
-
-
-def _of_each(measures: Sequence[str], caption: str, make: Make, least: int = 1) -> Declared:
-    """A picture for each of these measures, or for all, in files such as ``control-far-one-way-there-0-4-ms``."""
-
-    def found(results: Results) -> list[Picture]:
-        made = list[Picture]()
-        for measure, cells in grouped(_measured(results, least), lambda cell: cell.measure).items():
-            if measure in (measures or (measure,)):
-                name = re.sub("[^a-z0-9]+", "-", f"{results.bench}-{measure}".lower()).strip("-")
-                made += _picture(name, caption.format(measure=measure), cells, make)
-        return made
-
-    return found
-
-
-def _picture(name: str, caption: str, cells: Sequence[Cell], make: Make) -> list[Picture]:
-    """No picture without cells."""
-    return [Picture(name, caption, partial(make, cells, caption))] if cells else []
+def _ratios(results: Results, judged: _Judged, caption: str, baseline: str) -> Iterator[Picture]:
+    if judged := [(cell, interval) for cell, interval in judged if math.isfinite(interval.ratio)]:
+        few = all(interval.few for _, interval in judged)
+        caption += f"; no intervals: these need {LEAST_ROUNDS} rounds" if few else "; lines: intervals of 99 %"
+        yield Picture(f"{results.bench}-ratios", caption, partial(_ratio_bars, judged, caption, baseline))
 
 
 # -- how they are drawn
@@ -189,7 +183,7 @@ class _Bar:
     text: str = ""
 
 
-def _bar_panels(title: str, bars: Sequence[_Bar], width: float, axis: Callable[[Axes], None], *more: str) -> Figure:
+def _bar_panels(title: str, bars: Sequence[_Bar], width: float, axis: Callable[[Axes], object], *more: str) -> Figure:
     """Panels of bars, those of a row below each other; the row of the sum comes last. ``more`` have a style, too."""
     rows = sorted(unique([bar.row for bar in bars]), key=lambda row: row == _SUM)
     by_panel, variants = grouped(bars, lambda bar: bar.panel), unique([bar.variant for bar in bars])
@@ -213,7 +207,7 @@ def _bar_panels(title: str, bars: Sequence[_Bar], width: float, axis: Callable[[
     return figure
 
 
-def _ratio_bars(judged: Sequence[tuple[Cell, Interval]], title: str, baseline: str) -> Figure:
+def _ratio_bars(judged: _Judged, title: str, baseline: str) -> Figure:
     bars = [
         _Bar(cell.measure, cell.conditions(), cell.variant, 1.0, one.ratio,
              (one.ratio, one.ratio) if one.few else (one.low, one.high))
@@ -234,16 +228,12 @@ def _ratio_bars(judged: Sequence[tuple[Cell, Interval]], title: str, baseline: s
 
 def _amounts(cells: Sequence[Cell], title: str, *, panel: str, group: str) -> Figure:
     """A panel for each value of the parameter ``panel``, in which ``group`` names the rows."""
-    bars = [
-        _Bar(str(cell.params.get(panel, "")), str(cell.params[group]) if group else cell.conditions() or cell.variant,
-             cell.variant, 0.0, p50, text=f" {digits(p50)}")
-        for cell, p50 in ((cell, _p(50, cell)) for cell in cells)
-    ]  # fmt: skip
-
-    def axis(axes: Axes) -> None:
-        axes.set(xlim=(0, 1.14 * max(bar.end for bar in bars) or 1.0), xlabel=f"{cells[0].measure}, {_unit(cells)}")
-
-    return _bar_panels(title, bars, 5.2 if panel else 8.5, axis)
+    bars = []
+    for cell, p50 in ((cell, _p(50, cell)) for cell in cells):
+        row = str(cell.params[group]) if group else cell.conditions() or cell.variant
+        bars.append(_Bar(str(cell.params.get(panel, "")), row, cell.variant, 0.0, p50, text=f" {digits(p50)}"))
+    right, label = 1.14 * max(bar.end for bar in bars) or 1.0, f"{cells[0].measure}, {_unit(cells)}"
+    return _bar_panels(title, bars, 5.2 if panel else 8.5, lambda axes: axes.set(xlim=(0, right), xlabel=label))
 
 
 def _tails(cells: Sequence[Cell], title: str) -> Figure:

@@ -74,14 +74,13 @@ _VARIANTS = {
     "#117733": ("h264", "opus"),
     "#6DBE8B": ("h264, key/5",),
 }
-_COLOUR_OF = {name: colour for colour, names in _VARIANTS.items() for name in names}
 _DASHES: tuple[Dash, ...] = ("-", "--", "-.", ":")
 _STYLES = {colour: Style(colour, _DASHES[at % 4], "os^DvPX"[at % 7]) for at, colour in enumerate(_VARIANTS)}
 
 
 def styles(variants: Sequence[str]) -> dict[str, Style]:
     """The fixed style of each known variant, and one from its family's colours for every other."""
-    found = {name: _COLOUR_OF[name] for name in variants if name in _COLOUR_OF}
+    found = {name: colour for colour, names in _VARIANTS.items() for name in names if name in variants}
     for name in variants:
         begin = 0 if name.startswith("zenoh") else 4 if name.startswith(("mqtt", "paho")) else 8
         family = list(_VARIANTS)[begin : begin + 4]

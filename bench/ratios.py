@@ -18,7 +18,6 @@ LEAST_ROUNDS = 8  # fewer do not support a 99 % interval: it is computed, but me
 _RESAMPLES = 20_000
 _INFINITE = 1e15  # stands for infinity where resampling computes differences
 _LARGEST = 1e6  # ratio that is written as a number
-_SEED = 1  # the same samples give the same interval
 
 Rounds = Sequence[Sequence[float]]  # the samples of each
 
@@ -62,10 +61,7 @@ class Interval:
 
 
 def paired(ours: Rounds, theirs: Rounds, percent: float = 50) -> Interval:
-    """The median, over rounds run in turn, of the ratio of their percentiles.
-
-    A sample may be infinite: a message that never arrived. Rounds without samples, or both infinite, do not count.
-    """
+    """The median, over rounds run in turn, of the ratio of their percentiles; where both are infinite, none."""
     pairs = [(percentile(a, percent), percentile(b, percent)) for a, b in zip(ours, theirs, strict=False) if a and b]
     ratios = [min(a, _INFINITE) / min(b, _INFINITE) for a, b in pairs if b > 0 and min(a, b) < math.inf]
     logs = [math.log(ratio) if ratio else -math.inf for ratio in ratios]
@@ -87,7 +83,7 @@ def _interval(ours: Sequence[float], theirs: Sequence[float], level: float) -> I
     import numpy as np  # importing it earlier than it is needed would change the memory of measured processes
 
     ratio = float(np.median(ours) - np.median(theirs))
-    random = np.random.default_rng(_SEED)
+    random = np.random.default_rng(1)  # the same samples give the same interval
     a, b = (np.median(random.choice(logs, (_RESAMPLES, len(logs))), axis=1) for logs in (ours, theirs))
     tail, wider = (1 - level) / 2, student(level, rounds) / student(level, math.inf)
     low, high = (ratio + wider * (end - ratio) for end in np.quantile(a - b, [tail, 1 - tail]))

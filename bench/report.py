@@ -6,7 +6,6 @@ import re
 import shlex
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -71,22 +70,16 @@ def run(comparisons: Sequence[Comparison], folder: Path, *, quick: bool, console
                 line = f"{one.name} {problem}: see {folder / one.name}.txt" if problem else one.name
                 console.print(f"{line}, {_span(time.monotonic() - began)}", soft_wrap=True)
                 failed += bool(problem)
-    except KeyboardInterrupt:
-        with suppress(PebbleError):  # there are no results yet
-            write(folder)
-        raise
-    pack(folder)
-    console.print(f"Written: {write(folder)}", soft_wrap=True)
+    finally:  # also after Ctrl-C
+        pack(folder)
+        console.print(f"Written: {write(folder)}", soft_wrap=True)
     return 1 if failed else 0
 
 
 def _run(comparison: Comparison, folder: Path, quick: bool) -> str:
-    """Runs a comparison's command line; returns why it failed. The process ends with this one.
-
-    Results of an earlier run are deleted, so that a failure is not hidden by them.
-    """
+    """Runs a comparison's command line; returns why it failed. The process ends with this one."""
     results, output = _files(comparison, folder)
-    for path in (results, output):
+    for path in (results, output):  # of an earlier run: they would hide a failure
         path.unlink(missing_ok=True)
     words = python("pebble.cli", *comparison.arguments(quick), "--output", folder)
     until = time.monotonic() + _TIMEOUT_FACTOR * comparison.expected_s(quick) + _TIMEOUT_EXTRA_S
@@ -167,15 +160,12 @@ def text(sections: Sequence[Section]) -> str:
 def _head(measured: Sequence[Results]) -> Iterator[str]:
     quick = any(results.quick for results in measured)
     yield f"{_HEADING} of a quick run" if quick else _HEADING
-    if quick:
-        yield "**Quick: few cases, few and short rounds.** It shows that everything works, and large differences only."
     days = sorted({results.began[:10] for results in measured})
     took = _span(sum(results.took_s for results in measured))
     when = f"Measured on {' to '.join(dict.fromkeys((days[0], days[-1])))}, in {took}. " if days else ""
     yield (
-        f"{when}Everything here, including this text, is made by `make report{' QUICK=1' if quick else ''}`; each "
-        "comparison has a `.json` file with the options and versions of the run; the samples are in `samples.json.xz`, "
-        "at most 2,000 of each case, taken so that percentiles stay as they were."
+        f"{when}All of this is made by `make report{' QUICK=1' if quick else ''}`. Options and versions are in `.json` "
+        "files, at most 2,000 samples of each case in `samples.json.xz`."
     )
 
 
@@ -215,12 +205,8 @@ def _section(section: Section) -> Iterator[str]:
     yield from (f"![{caption}]({file})" for file, caption in section.pictures)
     printed = (line.rstrip() for line in section.output.splitlines() if not line.startswith(_NOT_THE_TABLE))
     tables = "\n".join(line for line in printed if line.strip() not in lines).strip("\n").splitlines()
-    if len(tables) > _LONG:
-        yield f"<details><summary>The tables, {len(tables)} lines</summary>"
-    if tables:
-        yield _fenced(tables)
-    if len(tables) > _LONG:
-        yield "</details>"
+    folded = [f"<details><summary>The tables, {len(tables)} lines</summary>", _fenced(tables), "</details>"]
+    yield from folded if len(tables) > _LONG else folded[1:2] if tables else []
 
 
 def _listed(lines: Iterable[object]) -> str:
@@ -237,18 +223,12 @@ def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 _LIMITS = (
-    "One machine. Intervals are over the rounds of one run; another run, kernel or load on the same host changes medians "
-    "by more than they show.",
-    "No radio. Every byte went over loopback or a veth pair; profiles imitate the effects of Wi-Fi on bandwidth, delay "
-    "and loss, not their cause.",
-    "No second machine. Both ends use the same clock and cores: brokers, operators and the measuring programs compete "
-    "with the robot.",
+    "One machine. Intervals are over the rounds of one run; another run, kernel or load changes medians by more.",
+    "No radio: every byte went over loopback or a veth pair. Profiles imitate effects of Wi-Fi, not their cause.",
+    "No second machine: brokers, operators and the measuring programs compete with the robot for the same cores.",
     "No Raspberry Pi: its cores are slower, and throttle when hot. Ratios between variants transfer better than times.",
-    "No camera, microphone and hardware encoder. A moving scene and speech are synthetic; real ones are noisier, which "
-    "costs bytes. H.264 is x264 on the CPU.",
-    "No MCU. Its end of the serial line is a simulated board on a pty, which has no baud rate: at 115,200 baud a "
-    "command's line of about 15 bytes takes another 1.3 ms, on each transport alike.",
-    "No other language: both ends are Python. No large network: no router between hub and peers, no TLS, no other "
-    "robots on the broker, except in the fleet. No long run.",
+    "No camera, microphone and hardware encoder: real pictures and sounds are noisier than ours, which costs bytes.",
+    "No MCU: its serial line is a pty without a baud rate; at 115,200 baud a command takes another 1.3 ms.",
+    "No other language than Python, no TLS, no large network, and no long run.",
     "A null test shows that a comparison finds no difference where there is none, not the cause of those it finds.",
 )

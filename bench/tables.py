@@ -41,17 +41,14 @@ def medians(cell: Cell) -> list[float]:
 
 
 def spread(cell: Cell) -> str:
-    """``0.34 (0.31 to 0.39)``: the median of the rounds, and their minimum and maximum if there are several."""
+    """``0.34 (0.31 to 0.39)``: the median of the rounds, and the ends if there are several."""
     rounds = medians(cell)
     ends = f" ({figure(min(rounds))} to {figure(max(rounds))})" if len(rounds) > 1 else ""
     return f"{figure(median(rounds))}{ends}" if rounds else "–"
 
 
 def sentence(what: str, cells: Sequence[Cell], *, quantity: str) -> str:
-    """One or two robots in one measure, the baseline first; ``quantity`` as in "takes 0.9× the time".
-
-    They are compared if there are enough rounds for an interval.
-    """
+    """One or two variants, the baseline first; they are compared if there are enough rounds for an interval."""
     values = ", ".join(f"{cell.variant} {spread(cell)} {cell.unit}".strip() for cell in cells)
     if len(cells) < 2 or caveat(cells):
         return f"{what}: {values}"
@@ -66,11 +63,6 @@ def caveat(cells: Sequence[Cell]) -> list[str]:
     needs = f"a {100 * LEVEL:.0f} % interval needs {LEAST_ROUNDS}"
     note = f"{few} round{'s' if few != 1 else ''}, and {needs}: these are medians, with minimum and maximum."
     return [note] if few < LEAST_ROUNDS else []
-
-
-def against(cells: Sequence[Cell]) -> str:
-    """The second robot's value divided by the first's, with an interval if there are enough rounds."""
-    return str(paired(cells[1].rounds, cells[0].rounds))
 
 
 # -- tables and sentences as data
@@ -148,7 +140,7 @@ class Grid:
                 group = groups[row]
                 pair = group if self.ratio else [*filter(None, [base_of(group[0], cells, self.baseline)]), group[0]]
                 shown = [self._value(group, one, column) for one in variants for column in self.columns]
-                shown += [against(pair)] if len(pair) > 1 else []
+                shown += [str(paired(pair[1].rounds, pair[0].rounds))] if len(pair) > 1 else []
                 table.add_row("" if number else name, *row[1:], *shown, style="bold" if self.last in row else None)
         return table
 

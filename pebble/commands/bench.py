@@ -17,13 +17,7 @@ from pebble.errors import PebbleError
 if TYPE_CHECKING:
     from typer._click.core import Command, Context
 
-_NAMES = [name for name in MODULES if name != "impair"]  # that is a command of its own
-_GROUP_HELP = """Comparisons, side by side in one run on this machine.
-
-\b
-    pebble bench frames
-    pebble bench fleet --robots 200
-"""
+_NAMES = [name for name in MODULES if name != "impair"]  # which is a command of its own
 
 
 def compare(
@@ -135,7 +129,8 @@ def _parsed(option: Option, value: Any) -> Any:
 
 
 def register(app: typer.Typer) -> None:
-    group = typer.Typer(cls=Comparisons, help=_GROUP_HELP, rich_markup_mode=None)
+    words = "Comparisons, side by side in one run on this machine."
+    group = typer.Typer(cls=Comparisons, help=words, rich_markup_mode=None)
     for command in (compare, echo, report):
         group.command(command.__name__)(command)
     app.add_typer(group, name="bench")
