@@ -265,9 +265,6 @@ class Round:
                 yield case
 
 
-# -- all comparisons
-
-
 def find(name: str) -> Comparison:
     """Imports its module."""
     module = MODULES.get(name) or MODULES[name.rpartition("-")[0]]

@@ -44,9 +44,10 @@ def run(run: Run) -> int:
             sweep()  # Zenoh leaves files behind even after a regular end
     cells = about.derived(collected.cells())
     results.cells, results.options, results.took_s = cells, run.records(), round(time.monotonic() - since, 1)
-    left = f"{len(failed)} of {run.rounds} rounds failed and were left out; {failed[0].splitlines()[0]}" if failed else ""
-    early = str(run.problem or "").partition("\n")[0]
-    lines = [*filter(None, (early[:1].upper() + early[1:], left)), *about.assessed(cells), *run.notes]
+    notes = [str(run.problem).partition("\n")[0]] if run.problem else []
+    lost = f"{len(failed)} of {run.rounds} rounds failed and were left out"
+    notes += [f"{lost}; {why.splitlines()[0]}" for why in failed[:1]]
+    lines = [*(note[0].upper() + note[1:] for note in notes), *about.assessed(cells), *run.notes]
     results.assessment = [line for line in lines if isinstance(line, str)]
     results.aims = [line for line in lines if isinstance(line, Judged)]
     enough = run.rounds < LEAST_ROUNDS or run.rounds - len(failed) >= LEAST_ROUNDS

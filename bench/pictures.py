@@ -50,9 +50,6 @@ def pictures(results: Results) -> list[Picture]:
     return [picture for one in find(results.bench).pictures for picture in one(results)]
 
 
-# -- what may be declared
-
-
 @dataclass(frozen=True, slots=True)
 class Drawn:
     """A function of results, ``module:function``, whose module is imported when it draws."""
@@ -127,9 +124,6 @@ def _ratios(results: Results, judged: _Judged, caption: str, baseline: str) -> I
         few = all(interval.few for _, interval in judged)
         caption += f"; no intervals: these need {LEAST_ROUNDS} rounds" if few else "; lines: intervals of 99 %"
         yield Picture(f"{results.bench}-ratios", caption, partial(_ratio_bars, judged, caption, baseline))
-
-
-# -- how they are drawn
 
 
 def _curves(cells: Sequence[Cell], title: str) -> Figure:

@@ -8,7 +8,7 @@ import textwrap
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from pebble.bench.results import Results, named
 
@@ -33,15 +33,13 @@ _SETTINGS: dict[Any, Any] = {
     "grid.color": "#e4e4e4",
 }
 
-Dash = Literal["-", "--", "-.", ":", ""]
-
 
 @dataclass(frozen=True, slots=True)
 class Style:
     """The style of a variant in every picture. Dash and marker differ as well, for colour-blind readers."""
 
     colour: str
-    dash: Dash = "-"
+    dash: Any = "-"
     marker: str = "o"
     hollow: bool = False
 
@@ -55,8 +53,8 @@ class Picture:
     make: Callable[[], Figure]
 
 
-#: The variants of each colour. The first four are for other ones of Zenoh, too, the next four of MQTT, the next of all.
-_VARIANTS = {
+#: The variants of each colour. The first four are for other ones of Zenoh, too, the next four of MQTT, the rest of all.
+_VARIANTS: dict[str, tuple[str, ...]] = {
     "#0072B2": ("zenoh", "zenoh-p2p", "zenoh-shm", "zenoh h264 opus"),
     "#2AA198": ("zenoh-hub", "zenoh-copy"),
     "#56B4E9": ("zenoh-net", "zenoh original"),
@@ -66,24 +64,20 @@ _VARIANTS = {
     "#A4133C": ("mqtt5",),
     "#8C510A": ("paho",),
     "#4D4D4D": ("one hop", "memcpy"),
-    "#8A8A8A": ("gstreamer-shm", "json", "pcm"),
-    "#1A1A1A": (),
-    "#B3B3B3": ("reference",),
-    "#CC79A7": ("pbvd",),
-    "#7B4F9E": ("pbvz",),
-    "#117733": ("h264", "opus"),
-    "#6DBE8B": ("h264, key/5",),
+    "#8A8A8A": ("gstreamer-shm",),
+    **dict.fromkeys(("#117733", "#6DBE8B", "#CC79A7", "#7B4F9E", "#1A1A1A", "#B3B3B3"), ()),
 }
-_DASHES: tuple[Dash, ...] = ("-", "--", "-.", ":")
-_STYLES = {colour: Style(colour, _DASHES[at % 4], "os^DvPX"[at % 7]) for at, colour in enumerate(_VARIANTS)}
+_STYLES = {
+    colour: Style(colour, ("-", "--", "-.", ":")[at % 4], "os^DvPX"[at % 7]) for at, colour in enumerate(_VARIANTS)
+}
 
 
 def styles(variants: Sequence[str]) -> dict[str, Style]:
     """The fixed style of each known variant, and one from its family's colours for every other."""
     found = {name: colour for colour, names in _VARIANTS.items() for name in names if name in variants}
     for name in variants:
-        begin = 0 if name.startswith("zenoh") else 4 if name.startswith(("mqtt", "paho")) else 8
-        family = list(_VARIANTS)[begin : begin + 4]
+        begin, end = (0, 4) if name.startswith("zenoh") else (4, 8) if name.startswith(("mqtt", "paho")) else (8, None)
+        family = list(_VARIANTS)[begin:end]
         found.setdefault(name, next((colour for colour in family if colour not in found.values()), family[0]))
     return {name: replace(_STYLES[found[name]], hollow="original" in name) for name in variants}
 
@@ -106,7 +100,7 @@ def panels(count: int, columns: int, size: tuple[float, float], title: str) -> t
     """A figure with ``count`` panels of ``size`` inches each, as many in a row as fit."""
     from matplotlib.figure import Figure
 
-    columns = max(1, min(columns, count))
+    columns = min(columns, count)
     rows = math.ceil(count / columns)
     width = max(5.5, min(_WIDEST, columns * size[0]))
     figure = Figure(figsize=(width, rows * size[1] + 0.9), dpi=_DPI, layout="constrained")

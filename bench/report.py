@@ -49,9 +49,6 @@ class Section:
         return f"[{text}](#{anchor})"
 
 
-# -- measuring
-
-
 def run(comparisons: Sequence[Comparison], folder: Path, *, quick: bool, console: Console | None = None) -> int:
     """Measures and writes; returns 0 if every comparison succeeded. A failed one does not stop the others.
 
@@ -98,9 +95,6 @@ def _files(comparison: Comparison, folder: Path) -> tuple[Path, Path]:
     return folder / f"{comparison.name}.json", folder / f"{comparison.name}.txt"
 
 
-# -- writing
-
-
 def write(folder: Path) -> Path:
     """Writes README.md and the pictures from the results in ``folder``. Raises PebbleError."""
     _check(folder)
@@ -134,9 +128,6 @@ def _section_of(comparison: Comparison, folder: Path) -> Section:
         return Section(comparison=comparison, results=None, output=str(error) if measured.exists() else words)
     pictures = [(path.name, picture.caption) for path, picture in draw(results, folder).items()]
     return Section(comparison=comparison, results=results, output=words, pictures=pictures)
-
-
-# -- the text
 
 
 def text(sections: Sequence[Section]) -> str:
@@ -195,9 +186,8 @@ def _section(section: Section) -> Iterator[str]:
         yield _fenced(section.output.strip().splitlines()[-_TAIL:])
         return
     yield f"    {shlex.join(results.command)}"
-    if results.began:
-        quickly = ", a quick run" if results.quick else ""
-        yield f"Started {results.began[:10]} {results.began[11:16]} UTC, {_span(results.took_s)}{quickly}."
+    quickly = ", a quick run" if results.quick else ""
+    yield f"Started {results.began[:10]} {results.began[11:16]} UTC, {_span(results.took_s)}{quickly}."
     if not results.complete:
         yield "**Something could not be measured.** See its output."
     if lines := [*results.assessment, *map(str, results.aims)]:

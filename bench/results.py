@@ -194,25 +194,21 @@ def begin(bench: str, command: Sequence[str], *, quick: bool = False) -> Results
 
 def machine() -> dict[str, Value]:
     """The machine and the versions the results depend on; no names of hosts or users."""
+    from pebble.rig.broker import mosquitto_path  # not for the processes that only measure
+
     model = re.search(r"^(?:model name|Model).*?: *(.*?) *$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
+    broker = ""
+    if (path := mosquitto_path()) is not None:
+        broker = subprocess.run([path, "-h"], capture_output=True, text=True, check=False).stdout.partition("\n")[0]
     return {
         "cpu": model[1] if model else platform.machine(),
         "cores": len(os.sched_getaffinity(0)),
         "kernel": platform.release(),
         "system": platform.freedesktop_os_release()["PRETTY_NAME"],
         "python": platform.python_version(),
-        "mosquitto": _mosquitto(),
+        "mosquitto": broker.removeprefix("mosquitto version ") or None,
         **{name: one.version for name in _PACKAGES for one in distributions(name=name)},
     }
-
-
-def _mosquitto() -> str | None:
-    from pebble.rig.broker import mosquitto_path  # not for the processes that only measure
-
-    with suppress(OSError, subprocess.SubprocessError):
-        done = subprocess.run([mosquitto_path() or "", "-h"], capture_output=True, text=True, check=False, timeout=5)
-        return done.stdout.partition("\n")[0].removeprefix("mosquitto version ").strip() or None
-    return None
 
 
 def grouped(ones: Iterable[T], key: Callable[[T], K]) -> dict[K, list[T]]:

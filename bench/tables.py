@@ -65,9 +65,6 @@ def caveat(cells: Sequence[Cell]) -> list[str]:
     return [note] if few < LEAST_ROUNDS else []
 
 
-# -- tables and sentences as data
-
-
 @dataclass(frozen=True, slots=True)
 class Column:
     """What a column shows of a row's cell, or with ``measure`` of the row's cell of this measure."""
