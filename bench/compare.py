@@ -10,7 +10,7 @@ import math
 import statistics
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
@@ -48,10 +48,10 @@ _COLOURS = dict(zip(Kind, ("red", "red", "yellow", "yellow", "green"), strict=Fa
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """A percentile of one cell in both runs, as the median over its rounds, or the lost share; NaN: not measured."""
+    """A percentile of one cell in both runs, as the median over its rounds; NaN: not measured."""
 
     cell: Cell
-    percent: int | None  # None: the share that was lost, in %
+    percent: int | None  # None: not a percentile, but the share that was lost, in %
     kind: Kind
     a: float
     b: float
@@ -80,7 +80,7 @@ def compare(a: Results, b: Results, threshold: float = THRESHOLD) -> list[Findin
 
 
 def certainty(figures: int) -> float:
-    """The confidence level of each of ``figures`` intervals."""
+    """The confidence level of each of so many intervals."""
     return 1 - CHANCE / max(1, figures)
 
 
@@ -92,7 +92,7 @@ def differences(a: Results, b: Results) -> list[str]:
 
 
 def _percents(one: Cell, other: Cell) -> Iterator[int | None]:
-    """Those for which most rounds have enough samples; None for the lost share, where it is known."""
+    """Those for which most rounds have enough samples; None: the lost share."""
     yield 50
     if min(statistics.median(filter(None, cell.sizes)) for cell in (one, other)) >= _LEAST_SAMPLES:
         yield 99
@@ -103,13 +103,12 @@ def _percents(one: Cell, other: Cell) -> Iterator[int | None]:
 def _judged(one: Cell, other: Cell, percent: int | None, level: float, threshold: float) -> Finding:
     if percent is None:
         return _lost(one, other, level)
-    ratio, exact = unpaired(other.rounds, one.rounds, percent, level), other.unit in _SAME_EVERY_TIME
-    if exact:
-        ratio = replace(ratio, low=ratio.ratio, high=ratio.ratio)
-    a, b = _figure(one, percent), _figure(other, percent)
+    ratio, a, b = unpaired(other.rounds, one.rounds, percent, level), _figure(one, percent), _figure(other, percent)
+    if other.unit in _SAME_EVERY_TIME:
+        ratio = Interval(ratio.ratio, ratio.ratio, ratio.ratio, level)
     if other.unit in _MORE_IS_BETTER and a > 0 and not b:
         kind = Kind.NO_SAMPLES
-    elif (ratio.few and not exact) or not ratio.known:  # too few rounds, or values that are 0
+    elif ratio.few or not ratio.known:  # too few rounds, or values that are 0
         kind = Kind.UNKNOWN
     elif ratio.equal or 1 / threshold < ratio.ratio < threshold:
         kind = Kind.EQUAL
@@ -139,14 +138,13 @@ def _figure(cell: Cell | None, percent: int) -> float:
 def summary(findings: Sequence[Finding], threshold: float = THRESHOLD) -> list[str]:
     """Counts of the outcomes, and what a change is."""
     count = Counter(finding.kind for finding in findings)
+    worse, better, equal, unknown = (count[kind] for kind in (Kind.WORSE, Kind.BETTER, Kind.EQUAL, Kind.UNKNOWN))
     level = max((finding.ratio.level for finding in findings), default=LEVEL)
-    lines = [
-        f"{count[Kind.WORSE] + count[Kind.BETTER] + count[Kind.EQUAL]} metrics compared: {count[Kind.WORSE]} worse,"
-        f" {count[Kind.BETTER]} better, {count[Kind.EQUAL]} without a difference beyond noise",
+    return [
+        f"{worse + better + equal} metrics compared: {worse} worse, {better} better, {equal} without a difference beyond"
+        f" noise; {unknown} unknown: fewer than {LEAST_ROUNDS} rounds, or zero",
         f"A change is a factor beyond {threshold:g} whose {100 * level:.4g} % interval excludes 1.00",
     ]
-    unknown = f"{count[Kind.UNKNOWN]} unknown: fewer than {LEAST_ROUNDS} rounds, or zero"
-    return [*lines, unknown] if count[Kind.UNKNOWN] else lines
 
 
 def run(a: Path, b: Path, *, everything: bool = False, console: Console | None = None) -> int:
