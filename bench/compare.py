@@ -141,8 +141,8 @@ def summary(findings: Sequence[Finding], threshold: float = THRESHOLD) -> list[s
     worse, better, equal, unknown = (count[kind] for kind in (Kind.WORSE, Kind.BETTER, Kind.EQUAL, Kind.UNKNOWN))
     level = max((finding.ratio.level for finding in findings), default=LEVEL)
     return [
-        f"{worse + better + equal} metrics compared: {worse} worse, {better} better, {equal} without a difference beyond"
-        f" noise; {unknown} unknown: fewer than {LEAST_ROUNDS} rounds, or zero",
+        f"{worse + better + equal} metrics compared: {worse} worse, {better} better, {equal} without a difference "
+        f"beyond noise; {unknown} unknown: fewer than {LEAST_ROUNDS} rounds, or zero",
         f"A change is a factor beyond {threshold:g} whose {100 * level:.4g} % interval excludes 1.00",
     ]
 
