@@ -65,8 +65,8 @@ class Aim:
 class RatioAim:
     """A bound for the ratio of a percentile of some cells to that of the variant ``to`` under the same conditions.
 
-    It is judged by the ratio's interval: met if all of it is within the bound, missed if all of it is beyond, and not
-    judged in between. Lost messages are infinitely late. ``what`` is as in :class:`Aim`.
+    Met if all of the ratio's interval is within the bound, missed if all is beyond, else not judged. Lost messages are
+    infinitely late. ``what`` is as in :class:`Aim`.
     """
 
     what: str

@@ -60,9 +60,8 @@ def sentence(what: str, cells: Sequence[Cell], *, quantity: str) -> str:
 def caveat(cells: Sequence[Cell]) -> list[str]:
     """A note below sentences without intervals."""
     few = min((len(medians(cell)) for cell in cells), default=LEAST_ROUNDS)
-    needs = f"a {100 * LEVEL:.0f} % interval needs {LEAST_ROUNDS}"
-    note = f"{few} round{'s' if few != 1 else ''}, and {needs}: these are medians, with minimum and maximum."
-    return [note] if few < LEAST_ROUNDS else []
+    rounds = f"{few} round{'s' if few != 1 else ''}, and a {100 * LEVEL:.0f} % interval needs {LEAST_ROUNDS}"
+    return [f"{rounds}: these are medians, with minimum and maximum."] if few < LEAST_ROUNDS else []
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,9 +97,7 @@ class Grid:
     """A table: a row for each value of the ``rows`` (parameters, ``conditions``, ``measure``, ``unit`` or ``variant``).
 
     The columns are repeated side by side for each variant, unless it is one of the rows. The last one is with ``ratio``
-    that of the second variant to the first, with ``baseline`` that of the row's variant to this one. A row of the name
-    ``last`` comes last, in bold. There is one table for all values of ``each`` of these parameters, which the title may
-    name; none without cells.
+    that of the second variant to the first, with ``baseline`` that of the row's variant to this one.
     """
 
     title: str
@@ -110,9 +107,9 @@ class Grid:
     of: Callable[[Cell], bool] = lambda _cell: True
     ratio: bool = False
     baseline: str = ""
-    last: str | None = None
+    last: str | None = None  # the row of this name comes last, in bold
     caption: str = ""
-    each: Sequence[str] = ()
+    each: Sequence[str] = ()  # a table for all values of each of these parameters, which the title may name
 
     def __call__(self, cells: Sequence[Cell]) -> Iterator[Table]:
         for names, some in grouped(filter(self.of, cells), lambda cell: _fields(cell, self.each)).items():

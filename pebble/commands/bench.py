@@ -25,10 +25,9 @@ def compare(
     b: Annotated[Path, typer.Argument(help="Results of the newer run.", metavar="B.json", show_default=False)],
     everything: Annotated[bool, typer.Option("--all", help="Also list what did not change.")] = False,
 ) -> int:
-    """Did anything get worse from A to B, beyond noise? Exit code 1 if so.
+    """Did medians, p99 or losses get worse from A to B, beyond noise? Exit code 1 if so.
 
-    Both files must come from the same comparison, if possible on the same machine with the same options. Medians, p99
-    and what was lost of each cell are tested with confidence intervals over rounds.
+    Both files come from the same comparison, if possible on the same machine with the same options.
     """
     from pebble.bench.compare import run
 
@@ -40,11 +39,7 @@ def echo(
     password_file: PasswordFile = None,
     ca_cert: CaCert = None,
 ) -> int:
-    """Send back what `pebble bench control --far` sends, until Ctrl-C. Runs on the other machine.
-
-    \b
-        pebble bench echo mqtt://broker.local
-    """
+    """Send back what `pebble bench control --far` sends, until Ctrl-C. Runs on the other machine."""
     from pebble.bench.control_far import serve, settings_of
 
     return serve(settings_of(url, password_file, ca_cert))
@@ -60,10 +55,6 @@ def report(
 
     Takes an hour and a half, with --quick less than five minutes. If a comparison fails, the others still run, and
     the exit code is 1. Without root, comparisons that need it are left out.
-
-    \b
-        pebble bench report docs/results
-        pebble bench report bench-results --only control,control-null
     """
     from pebble.bench.report import run, write
 
