@@ -96,7 +96,8 @@ def _percents(one: Cell, other: Cell) -> Iterator[int | None]:
     yield 50
     if min(statistics.median(filter(None, cell.sizes)) for cell in (one, other)) >= _LEAST_SAMPLES:
         yield 99
-    if one.lost is not None and other.lost is not None and one.lost + other.lost > 0:
+    losses = [cell.lost for cell in (one, other) if cell.lost is not None and cell.lost >= 0]
+    if len(losses) == 2 and any(losses):
         yield None
 
 
