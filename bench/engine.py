@@ -34,9 +34,8 @@ def run(run: Run) -> int:
     about, show = run.comparison, partial(run.console.print, highlight=False, soft_wrap=True)
     check_folder(run.output)
     about.prepare(run)
-    _leave_out_missing(run)
-    results, since = begin(about.name, run.command, quick=run.quick), time.monotonic()
     collected = Collected(about, roles_of(run))
+    results, since = begin(about.name, run.command, quick=run.quick), time.monotonic()
     with interrupted_by_signals():
         try:
             failed = _measure(run, collected)
@@ -74,32 +73,19 @@ def run(run: Run) -> int:
     return int(not results.complete)
 
 
-def _leave_out_missing(run: Run) -> None:
-    """Prints why a variant cannot be measured on this machine. Raises PebbleError if none can."""
-    named = _named(run)
-    reasons = {name: reason for name in named if (reason := run.comparison.missing(name)) is not None}
-    for name, reason in reasons.items():
-        run.console.print(f"{name} is left out: {reason}", style="yellow", highlight=False, soft_wrap=True)
-    if reasons:
-        run.options["variants"] = [name for name in named if name not in reasons]
-        if not run["variants"]:
-            raise PebbleError("no variant can be measured on this machine")
-
-
-def _named(run: Run) -> Sequence[str]:
-    """The variants that were asked for; a null test may have an option for its only one."""
-    null_of = run.options.get("null")
-    return [null_of] if isinstance(null_of, str) and run.comparison.is_null else run.options.get("variants") or ()
-
-
 def roles_of(run: Run) -> Sequence[str]:
-    """The variants, or the roles of the only one in a null test. Raises PebbleError if several are named."""
-    names = [*(_named(run) or [""]), *run.comparison.references]
-    if not run.comparison.is_null:
-        return names
-    if len(names) != 1 or len(run.comparison.conditions(run)) != 1:
+    """The variants that this machine can measure, or the roles of the only one in a null test. Raises PebbleError."""
+    about, null_of = run.comparison, run.options.get("null")
+    asked = [null_of] if about.is_null and isinstance(null_of, str) else run.options.get("variants") or [""]
+    reasons = {name: why for name in asked if name and (why := about.missing(name)) is not None}
+    for name, why in reasons.items():
+        run.console.print(f"{name} is left out: {why}", style="yellow", highlight=False, soft_wrap=True)
+    if len(reasons) == len(asked):
+        raise PebbleError("no variant can be measured on this machine")
+    names = [*(name for name in asked if name not in reasons), *about.references]
+    if about.is_null and (len(names) != 1 or len(about.conditions(run)) != 1):
         raise PebbleError("--null takes one variant, one size and one of everything else")
-    return null.roles(names[0])
+    return null.roles(names[0]) if about.is_null else names
 
 
 def _measure(run: Run, collected: Collected) -> list[str]:
