@@ -89,7 +89,7 @@ def command_of(about: Comparison) -> Callable[..., int]:
         mode = next((mode for name, mode in about.modes.items() if wanted.get(name)), about)
         return run_(mode.run_of(quick=quick, output=output, **wanted))
 
-    declared = {name: (_annotation(about, option), None) for name, option in options.items()}
+    declared: dict[str, tuple[Any, Any]] = {name: (_annotation(about, one), None) for name, one in options.items()}
     declared |= {"quick": (Quick, False), "output": (Output, about.folder)}
     run.__doc__ = about.help
     run.__annotations__ = {name: annotation for name, (annotation, _) in declared.items()}
