@@ -19,7 +19,6 @@ def with_lost(percent: float) -> Callable[[Cell], float]:
 
 
 def single(name: str) -> Callable[[Cell], float]:
-    """A single value of a cell; NaN without one."""
     return lambda cell: cell.single(name)
 
 
@@ -50,14 +49,12 @@ class Aim:
     def __call__(self, cells: Sequence[Cell]) -> Iterator[Judged]:
         found = [cell for cell in cells if self.of(cell)]
         for cell in [max(found, key=self._beyond)] if self.worst and found else found:
-            value = self.value(cell)
+            value, bound = self.value(cell), self.at_most if self.at_least is None else self.at_least
             words = self.never if math.isinf(value) else f"{self.shown(value)} {self.unit}".strip()
+            words = "nothing arrived" if math.isnan(value) else words
             enough = len(cell.samples) + (cell.lost or 0) >= self.least and len(cell.rounds) >= self.least_rounds
-            yield Judged(
-                what=_what(self.what, cell, self.at_most if self.at_least is None else self.at_least),
-                outcome=outcome(self._beyond(cell) <= 0, judged=enough),
-                measured=f"{'nothing arrived' if math.isnan(value) else words}{self.beside(cell)}",
-            )
+            met = outcome(self._beyond(cell) <= 0, judged=enough)
+            yield Judged(what=_what(self.what, cell, bound), outcome=met, measured=words + self.beside(cell))
 
     def _beyond(self, cell: Cell) -> float:
         value = self.value(cell)
@@ -68,8 +65,8 @@ class Aim:
 class RatioAim:
     """A bound for the ratio of a percentile of some cells to that of the variant ``to`` under the same conditions.
 
-    It is judged by the ratio's interval: met if all of it is within the bound, missed if all of it is beyond, and not
-    judged in between. Lost messages are infinitely late. ``what`` is as in :class:`Aim`.
+    Met if all of the ratio's interval is within the bound, missed if all is beyond, else not judged. Lost messages are
+    infinitely late. ``what`` is as in :class:`Aim`.
     """
 
     what: str
@@ -91,11 +88,8 @@ class RatioAim:
                 why = ", too few samples in a round"
             elif interval.low <= self.at_most < interval.high:
                 why = ", the interval includes the bound"
-            yield Judged(
-                what=_what(self.what, cell, self.at_most),
-                outcome=outcome(interval.high <= self.at_most, judged=not why),
-                measured=f"{interval}{why}",
-            )
+            met = outcome(interval.high <= self.at_most, judged=not why)
+            yield Judged(what=_what(self.what, cell, self.at_most), outcome=met, measured=f"{interval}{why}")
 
 
 def _what(words: str, cell: Cell, bound: float | None) -> str:

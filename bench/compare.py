@@ -9,14 +9,14 @@ from __future__ import annotations
 import math
 import statistics
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
 from rich.console import Console
 
-from pebble.bench.ratios import LEAST_ROUNDS, LEVEL, Interval, unpaired
+from pebble.bench.ratios import LEAST_ROUNDS, LEVEL, Interval, student, unpaired
 from pebble.bench.results import OVER_TIME, Cell, Results, load, percentile
 from pebble.bench.tables import figure, plain_table
 from pebble.errors import PebbleError
@@ -28,6 +28,7 @@ THRESHOLD = 1.05
 _SAME_EVERY_TIME = ("kB/s", "kbit/s")  # encoder output is deterministic: one value is exact
 _MORE_IS_BETTER = ("1/s",)
 _LEAST_SAMPLES = 100  # of a round: with fewer, p99 is the maximum
+_LOSS = 0.005  # share of what was sent: smaller changes are ignored
 
 
 class Kind(StrEnum):
@@ -50,7 +51,7 @@ class Finding:
     """A percentile of one cell in both runs, as the median over its rounds; NaN: not measured."""
 
     cell: Cell
-    percent: int
+    percent: int | None  # None: not a percentile, but the share that was lost, in %
     kind: Kind
     a: float
     b: float
@@ -79,7 +80,7 @@ def compare(a: Results, b: Results, threshold: float = THRESHOLD) -> list[Findin
 
 
 def certainty(figures: int) -> float:
-    """The confidence level of each of ``figures`` intervals."""
+    """The confidence level of each of so many intervals."""
     return 1 - CHANCE / max(1, figures)
 
 
@@ -90,26 +91,43 @@ def differences(a: Results, b: Results) -> list[str]:
     return [f"{name}: {one.get(name)} in A, {other.get(name)} in B" for name in changed]
 
 
-def _percents(one: Cell, other: Cell) -> tuple[int, ...]:
-    """Those for which most rounds have enough samples."""
-    sizes = [statistics.median(filter(None, cell.sizes)) for cell in (one, other)]
-    return (50, 99) if min(sizes) >= _LEAST_SAMPLES else (50,)
+def _percents(one: Cell, other: Cell) -> Iterator[int | None]:
+    """Those for which most rounds have enough samples; None: the lost share."""
+    yield 50
+    if min(statistics.median(filter(None, cell.sizes)) for cell in (one, other)) >= _LEAST_SAMPLES:
+        yield 99
+    losses = [cell.lost for cell in (one, other) if cell.lost is not None and cell.lost >= 0]
+    if len(losses) == 2 and any(losses):
+        yield None
 
 
-def _judged(one: Cell, other: Cell, percent: int, level: float, threshold: float) -> Finding:
-    ratio, exact = unpaired(other.rounds, one.rounds, percent, level), other.unit in _SAME_EVERY_TIME
-    if exact:
-        ratio = replace(ratio, low=ratio.ratio, high=ratio.ratio)
-    a, b = _figure(one, percent), _figure(other, percent)
+def _judged(one: Cell, other: Cell, percent: int | None, level: float, threshold: float) -> Finding:
+    if percent is None:
+        return _lost(one, other, level)
+    ratio, a, b = unpaired(other.rounds, one.rounds, percent, level), _figure(one, percent), _figure(other, percent)
+    if other.unit in _SAME_EVERY_TIME:
+        ratio = Interval(ratio.ratio, ratio.ratio, ratio.ratio, level)
     if other.unit in _MORE_IS_BETTER and a > 0 and not b:
         kind = Kind.NO_SAMPLES
-    elif (ratio.few and not exact) or not ratio.known:  # too few rounds, or values that are 0
+    elif ratio.few or not ratio.known:  # too few rounds, or values that are 0
         kind = Kind.UNKNOWN
     elif ratio.equal or 1 / threshold < ratio.ratio < threshold:
         kind = Kind.EQUAL
     else:
         kind = Kind.WORSE if (ratio.ratio > 1) != (other.unit in _MORE_IS_BETTER) else Kind.BETTER
     return Finding(other, percent, kind, a, b, ratio)
+
+
+def _lost(one: Cell, other: Cell, level: float) -> Finding:
+    """Judged by the variance between rounds: losses come in bursts. Each round sends equally many."""
+    sizes = [(cell.single("sent"), [size for size in cell.sizes if size]) for cell in (one, other)]
+    arrived = [[size * len(some) / sent for size in some] for sent, some in sizes]
+    rounds, (a, b), kind = min(map(len, arrived)), map(statistics.fmean, arrived), Kind.UNKNOWN
+    if rounds >= LEAST_ROUNDS:
+        error = math.sqrt(sum(statistics.variance(some) / len(some) for some in arrived))
+        changed = abs(b - a) > max(_LOSS, student(level, rounds) * error)
+        kind = Kind.EQUAL if not changed else Kind.WORSE if b < a else Kind.BETTER
+    return Finding(other, None, kind, 100 * (1 - a), 100 * (1 - b), Interval(level=level, rounds=rounds))
 
 
 def _figure(cell: Cell | None, percent: int) -> float:
@@ -121,38 +139,34 @@ def _figure(cell: Cell | None, percent: int) -> float:
 def summary(findings: Sequence[Finding], threshold: float = THRESHOLD) -> list[str]:
     """Counts of the outcomes, and what a change is."""
     count = Counter(finding.kind for finding in findings)
+    worse, better, equal, unknown = (count[kind] for kind in (Kind.WORSE, Kind.BETTER, Kind.EQUAL, Kind.UNKNOWN))
     level = max((finding.ratio.level for finding in findings), default=LEVEL)
-    lines = [
-        f"{count[Kind.WORSE] + count[Kind.BETTER] + count[Kind.EQUAL]} metrics compared: {count[Kind.WORSE]} worse,"
-        f" {count[Kind.BETTER]} better, {count[Kind.EQUAL]} without a difference beyond noise",
+    return [
+        f"{worse + better + equal} metrics compared: {worse} worse, {better} better, {equal} without a difference "
+        f"beyond noise; {unknown} unknown: fewer than {LEAST_ROUNDS} rounds, or zero",
         f"A change is a factor beyond {threshold:g} whose {100 * level:.4g} % interval excludes 1.00",
     ]
-    unknown = f"{count[Kind.UNKNOWN]} unknown: fewer than {LEAST_ROUNDS} rounds, or zero"
-    return [*lines, unknown] if count[Kind.UNKNOWN] else lines
 
 
 def run(a: Path, b: Path, *, everything: bool = False, console: Console | None = None) -> int:
     """0 if nothing got worse, 1 if something did. Raises PebbleError for files that cannot be compared."""
-    console, before, after = console or Console(), load(a), load(b)
+    console, before, after = console or Console(highlight=False), load(a), load(b)
     if before.bench != after.bench:
-        raise PebbleError(
-            f"{a} is of bench {before.bench}, {b} of bench {after.bench}: compare two runs of the same bench"
-        )
+        raise PebbleError(f"{a} is of bench {before.bench}, {b} of bench {after.bench}: compare two runs of the same")
     for line in differences(before, after):
-        console.print(f"not the same: {line}", style="yellow", highlight=False, markup=False, soft_wrap=True)
+        console.print(f"not the same: {line}", style="yellow", markup=False, soft_wrap=True)
     with console.status("comparing"):  # hundreds of intervals take a few seconds
         findings = compare(before, after)
     table = plain_table(f"{before.bench}: B against A", ("what", "metric", "A", "B", "B / A", ""), left=2)
     table.columns[0].no_wrap = False  # long names wrap, so that the outcome is never cut off
     table.columns[-1].justify = "left"
-    for finding in findings:
-        cell, kind = finding.cell, finding.kind
-        if everything or finding.changed:
-            where = ", ".join(filter(None, (cell.variant, cell.measure, cell.conditions())))
-            figures = (figure(finding.a), figure(finding.b), str(finding.ratio))
-            table.add_row(where, f"p{finding.percent} {cell.unit}", *figures, kind, style=_COLOURS.get(kind))
+    for one in findings if everything else filter(lambda one: one.changed, findings):
+        where = ", ".join(filter(None, (one.cell.variant, one.cell.measure, one.cell.conditions())))
+        metric = "lost %" if one.percent is None else f"p{one.percent} {one.cell.unit}"
+        figures = (figure(one.a), figure(one.b), str(one.ratio))
+        table.add_row(where, metric, *figures, one.kind, style=_COLOURS.get(one.kind))
     if table.row_count:
         console.print(table)
     for line in summary(findings):
-        console.print(line, highlight=False, soft_wrap=True)
+        console.print(line, soft_wrap=True)
     return int(any(finding.kind in (Kind.WORSE, Kind.NO_SAMPLES) for finding in findings))

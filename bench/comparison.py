@@ -1,7 +1,7 @@
 """What a comparison is: a declaration from which its command, its run, its pictures and its part of the report follow.
 
-The module of a declaration is imported for the help of its command, too, and by the process that measures: what is
-large (numpy is not needed: see :mod:`pebble.bench.ratios`) is imported where it is used.
+Its module is imported for the help of its command, too, and by the process that measures: what is large is imported
+where it is used.
 """
 
 from __future__ import annotations
@@ -14,35 +14,23 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from rich.console import Console
 from rich.table import Table
 
 from pebble.bench import null
-from pebble.bench.results import LONGEST_S, Cell, Judged, Value
+from pebble.bench.results import LONGEST_S, Cell, Judged, Results, Value
 from pebble.errors import PebbleError
 
-if TYPE_CHECKING:
-    from pebble.bench.pictures import Declared
-
 FOLDER: Final = Path("bench-results")
+_ELSEWHERE: Final = {"video": "wire", "sound": "wire", "impair": "impair.trials"}  # than in the module of their name
+_NAMES: Final = (
+    "control", "bridge", "startup", "cost", "frames", "video", "sound", "estop", "fleet", "traffic", "page", "impair",
+)  # fmt: skip
 #: The module of each comparison, which has it as a constant of the same name; in the order of the report. A module has
 #: its modes, too: CONTROL_NULL.
-MODULES: Final = {
-    "control": "control",
-    "bridge": "bridge",
-    "startup": "startup",
-    "cost": "cost",
-    "frames": "frames",
-    "video": "wire",
-    "sound": "wire",
-    "estop": "estop",
-    "fleet": "fleet",
-    "traffic": "traffic",
-    "page": "page",
-    "impair": "impair.trials",
-}
+MODULES: Final = {name: _ELSEWHERE.get(name, name) for name in _NAMES}
 
 Params = Mapping[str, Value]
 Combine = Callable[[Sequence[Any]], Value]  # the values of all rounds into one
@@ -52,12 +40,7 @@ Assess = Callable[[Sequence[Cell]], Iterable[str | Judged]]
 
 def of_known(how: Callable[[Sequence[float]], float], digits: int) -> Combine:
     """Joins the values of the rounds that have one; None without any."""
-
-    def combine(values: Sequence[float | None]) -> float | None:
-        known = [one for one in values if one is not None]
-        return round(how(known), digits) if known else None
-
-    return combine
+    return lambda values: round(how(known), digits) if (known := [x for x in values if x is not None]) else None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,11 +61,9 @@ class Option:
 
     @property
     def key(self) -> str:
-        """The name of its value in budgets and runs."""
         return self.sets or self.name
 
     def check(self, value: Any) -> None:
-        """Raises PebbleError for an invalid value."""
         values = list(value) if self.many else [value]
         if unknown := [one for one in values if self.known and one not in self.known]:
             raise PebbleError(f"--{self.name}: unknown {', '.join(unknown)}: there are {', '.join(self.known)}")
@@ -94,14 +75,12 @@ class Option:
 
     def words(self, value: Any, default: Any) -> list[str]:
         """As on the command line; names only if they are not the default ones."""
-        if self.kind is bool:
-            return [f"--{self.name}"] if value else []
-        if value is None or (self.many and list(value) == list(default or ())):
+        if value is None or value is False or (self.many and list(value) == list(default or ())):
             return []
-        return [f"--{self.name}", (self.metavar or self.name.upper()) if self.private else self.as_word(value)]
+        shown = str(self.metavar) if self.private else self.as_word(value)
+        return [f"--{self.name}", *([] if self.kind is bool else [shown])]
 
     def as_word(self, value: Any) -> str:
-        """A value as on the command line."""
         values = value if self.many else [value]
         return ",".join(f"{one:g}" if isinstance(one, float) else str(one) for one in values)
 
@@ -119,11 +98,11 @@ def variants(known: Sequence[str], help_: str = "Some of them, separated by comm
 
 
 class Budget(dict[str, Any]):
-    """The defaults of the options and of what else grows with the time spent; ``takes_s`` is the expected duration."""
+    """The defaults of the options and of what else grows with the time spent."""
 
     def __init__(self, takes_s: int, **values: Any) -> None:
         super().__init__(values)
-        self.takes_s = takes_s
+        self.takes_s = takes_s  # as expected
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -131,7 +110,6 @@ class Comparison:
     """The engine calls ``measure`` for each case, or ``measure_round`` for each round, which calls :meth:`Round.cases`.
 
     Both return the cells of one round; cells of the same variant, conditions and measure are joined over the rounds.
-    ``environment`` is entered before a round, and after every ``fresh_every``-th one again.
     """
 
     name: str
@@ -148,7 +126,7 @@ class Comparison:
     conditions: Callable[[Run], Sequence[Params]] = lambda _run: ({},)
     prepare: Callable[[Run], None] = lambda _run: None  # checks what is needed, and notes; raises PebbleError
     missing: Callable[[str], str | None] = lambda _variant: None  # why a variant is left out
-    environment: Callable[[Run], AbstractContextManager[Any]] = lambda _run: nullcontext()
+    environment: Callable[[Run], AbstractContextManager[Any]] = lambda _run: nullcontext()  # of ``fresh_every`` rounds
     measure: Callable[[Case], Iterable[Cell]] | None = None
     measure_round: Callable[[Round], Iterable[Cell]] | None = None
     alone: bool = False  # a case that fails leaves an empty round of its own cells, not of all
@@ -161,7 +139,7 @@ class Comparison:
     legend: Callable[[Sequence[Cell]], Iterable[str]] = lambda _cells: ()
     assessment: Sequence[Assess] = ()  # Claims, Aims and functions, the most important first
     complete: Callable[[Sequence[Cell]], bool] = lambda cells: all(cell.samples for cell in cells)  # else exit code 1
-    pictures: Sequence[Declared] = ()
+    pictures: Sequence[Callable[[Results], Iterable[Any]]] = ()  # see pebble.bench.pictures
 
     folder: Path = FOLDER  # of the results, by default
     is_null: bool = False  # one variant in three roles: see pebble.bench.null
@@ -187,13 +165,12 @@ class Comparison:
         return (self.quick if quick else self.full).takes_s
 
     def run_of(
-        self, *, quick: bool = False, output: Path = FOLDER, console: Console | None = None, **given: Any
+        self, *, quick: bool = False, output: Path = FOLDER, console: Console | None = None, **options: Any
     ) -> Run:
-        """A run with the defaults, and the ``given`` options unless they are None. Raises PebbleError."""
-        values = {**self.full, **(self.quick if quick else {})}
-        if self.variants:
-            values.setdefault("variants", list(self.variants))
-        values |= {name: value for name, value in given.items() if value is not None}
+        """A run with these options; for None, with the defaults. Raises PebbleError for an invalid value."""
+        given = {name: value for name, value in options.items() if value is not None}
+        own = {"variants": list(self.variants)} if self.variants else {}
+        values = {**own, **self.full, **(self.quick if quick else {}), **given}
         for option in self.options:
             if values.get(option.key) is not None:
                 option.check(values[option.key])
@@ -232,8 +209,8 @@ class Run:
 
     def records(self) -> dict[str, Value | list[Value]]:
         """All options that affect the results."""
-        unrecorded = {"variants"} | {one.key for one in self.comparison.options if one.private or not one.recorded}
-        values = {name: value for name, value in self.options.items() if name not in unrecorded}
+        others = {"variants", *(one.key for one in self.comparison.options if one.private or not one.recorded)}
+        values = {name: value for name, value in self.options.items() if name not in others}
         return {**values, **self.comparison.constants, **self.recorded}
 
 
@@ -288,11 +265,8 @@ class Round:
                 yield case
 
 
-# -- all comparisons
-
-
 def find(name: str) -> Comparison:
-    """Imports its module. Raises KeyError for an unknown name."""
+    """Imports its module."""
     module = MODULES.get(name) or MODULES[name.rpartition("-")[0]]
     found: Comparison = getattr(import_module(f"pebble.bench.{module}"), name.upper().replace("-", "_"))
     return found
@@ -305,10 +279,7 @@ def reported() -> list[Comparison]:
 
 
 def chosen(names: Sequence[str]) -> list[Comparison]:
-    """The comparisons of these names, in the report's order; without names all that this user may run.
-
-    Raises PebbleError for unknown names.
-    """
+    """Those of these names, in the report's order; without names all that this user may run. Raises PebbleError."""
     known = {one.name: one for one in reported()}
     if unknown := [name for name in names if name not in known]:
         raise PebbleError(f"there is no {', '.join(unknown)} in the report: there are {', '.join(known)}")

@@ -6,14 +6,14 @@ import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
+from functools import partial
 from importlib.util import find_spec
 from operator import itemgetter
 from pathlib import Path
 from typing import Final
 
 import msgspec
-from rich.console import Console
 from rich.markup import escape
 
 from pebble.bench import null
@@ -24,95 +24,96 @@ from pebble.errors import PebbleError
 from pebble.runtime.signals import interrupted_by_signals
 from pebble.transports.segments import sweep
 
-_GIVEN_UP: Final = 2  # failures before the first success until the run is given up
+_GIVEN_UP: Final = 2  # rounds that fail before any has succeeded: then the run ends
 _IN_US: Final = {"us": 1.0, "ms": 1e3, "s": 1e6}
 _JOINED: Final[Mapping[str, Combine]] = {"sent": sum}
 
 
 def run(run: Run) -> int:
     """Measures, prints and writes; returns 0 if everything has results of enough rounds. Raises PebbleError."""
-    about, console = run.comparison, run.console
+    about, show = run.comparison, partial(run.console.print, highlight=False, soft_wrap=True)
     check_folder(run.output)
     about.prepare(run)
-    _leave_out_missing(run)
+    collected = Collected(about, roles_of(run))
     results, since = begin(about.name, run.command, quick=run.quick), time.monotonic()
-    collected, rounds = Collected(about, roles_of(run)), Rounds(run.rounds, console)
     with interrupted_by_signals():
         try:
-            _measure(run, collected, rounds)
+            failed = _measure(run, collected)
         finally:
             sweep()  # Zenoh leaves files behind even after a regular end
     cells = about.derived(collected.cells())
     results.cells, results.options, results.took_s = cells, run.records(), round(time.monotonic() - since, 1)
-    early = str(run.problem or "").partition("\n")[0]
-    lines = [*([early[0].upper() + early[1:]] if early else []), *rounds.notes(), *about.assessed(cells), *run.notes]
+    notes = [str(run.problem).partition("\n")[0]] if run.problem else []
+    lost = f"{len(failed)} of {run.rounds} rounds failed and were left out"
+    notes += [f"{lost}; {why.splitlines()[0]}" for why in failed[:1]]
+    lines = [*(note[0].upper() + note[1:] for note in notes), *about.assessed(cells), *run.notes]
     results.assessment = [line for line in lines if isinstance(line, str)]
     results.aims = [line for line in lines if isinstance(line, Judged)]
+    enough = run.rounds < LEAST_ROUNDS or run.rounds - len(failed) >= LEAST_ROUNDS
+    results.complete = run.problem is None and enough and about.complete(cells)
+    suffix = about.title_suffix.format(**results.options, quick=", quick" if run.quick else "")
     for table in about.shown(cells):
-        table.title = f"{table.title}{about.title_suffix.format(**run.records(), quick=', quick' if run.quick else '')}"
-        console.print(table)
+        table.title = f"{table.title}{suffix}"
+        run.console.print(table)
     for line in about.legend(cells):
-        console.print(line, style="dim", highlight=False, soft_wrap=True)
+        show(line, style="dim")
     for sentence in (*results.assessment, *results.aims):
-        console.print(str(sentence), highlight=False, soft_wrap=True)
-    results.complete = run.problem is None and rounds.enough and about.complete(cells)
+        show(str(sentence))
     written = [run.output / f"{about.name}.json"]
     results.save(written[0])
     if find_spec("matplotlib") is None:
-        console.print("No plots: pip install 'pebble-robot[bench]'", style="dim", highlight=False)
+        show("No plots: pip install 'pebble-robot[bench]'", style="dim")
     else:
         from pebble.bench.pictures import draw
 
         written += draw(results, run.output)
-    console.print(f"Written: {', '.join(map(str, written))}", style="dim", highlight=False, soft_wrap=True)
+    show(f"Written: {', '.join(map(str, written))}", style="dim")
     if run.problem is not None:
         raise run.problem
     return int(not results.complete)
 
 
-def _leave_out_missing(run: Run) -> None:
-    """Prints why a variant cannot be measured on this machine. Raises PebbleError if none can."""
-    named = _named(run)
-    reasons = {name: reason for name in named if (reason := run.comparison.missing(name)) is not None}
-    for name, reason in reasons.items():
-        run.console.print(f"{name} is left out: {reason}", style="yellow", highlight=False, soft_wrap=True)
-    if reasons:
-        run.options["variants"] = [name for name in named if name not in reasons]
-        if not run.options["variants"]:
-            raise PebbleError("no variant can be measured on this machine")
-
-
-def _named(run: Run) -> Sequence[str]:
-    """The variants that were asked for; a null test may have an option for its only one."""
-    null_of = run.options.get("null")
-    return [null_of] if isinstance(null_of, str) and run.comparison.is_null else run.options.get("variants") or ()
-
-
 def roles_of(run: Run) -> Sequence[str]:
-    """The variants, or the roles of the only one in a null test. Raises PebbleError if several are named."""
-    names = [*(_named(run) or [""]), *run.comparison.references]
-    if not run.comparison.is_null:
-        return names
-    if len(names) != 1 or len(run.comparison.conditions(run)) != 1:
+    """The variants that this machine can measure, or the roles of the only one in a null test. Raises PebbleError."""
+    about, null_of = run.comparison, run.options.get("null")
+    asked = [null_of] if about.is_null and isinstance(null_of, str) else run.options.get("variants") or [""]
+    reasons = {name: why for name in asked if name and (why := about.missing(name)) is not None}
+    for name, why in reasons.items():
+        run.console.print(f"{name} is left out: {why}", style="yellow", highlight=False, soft_wrap=True)
+    if len(reasons) == len(asked):
+        raise PebbleError("no variant can be measured on this machine")
+    names = [*(name for name in asked if name not in reasons), *about.references]
+    if about.is_null and (len(names) != 1 or len(about.conditions(run)) != 1):
         raise PebbleError("--null takes one variant, one size and one of everything else")
-    return null.roles(names[0])
+    return null.roles(names[0]) if about.is_null else names
 
 
-def _measure(run: Run, collected: Collected, rounds: Rounds) -> None:
-    """Rounds share an environment: a new one every ``fresh_every`` rounds, and after a round that failed."""
-    about, env = run.comparison, None
+def _measure(run: Run, collected: Collected) -> list[str]:
+    """Returns why rounds failed: they are left out. Raises PebbleError if the first ones fail, since all would.
+
+    Rounds share an environment: a new one every ``fresh_every`` rounds, and after a round that failed.
+    """
+    about, env, failed, fresh = run.comparison, None, list[str](), True
     with run.console.status("", refresh_per_second=4) as status, ExitStack() as shared:
         for number in range(run.rounds):
             before = f"round {number + 1} of {run.rounds}: "
             run.show = lambda what, before=before: status.update(escape(before + what))  # type: ignore[misc]
-            with rounds.attempt(number):
-                if rounds.last_failed or number % run.options.get("fresh_every", 1) == 0:
+            try:
+                if fresh or number % run.options.get("fresh_every", 1) == 0:
                     shared.close()
                     env = shared.enter_context(about.environment(run))
                 round_ = Round(run, number, env, roles=collected.roles, planted_us=collected.planted_us)
                 if about.is_null and about.measure is not None and not collected.pilot:
                     collected.pilot = list(about.measure(next(round_.cases())))
                 collected.add(_round(round_))
+                fresh = False
+            except PebbleError as error:
+                fresh = True
+                failed.append(f"round {number + 1}: {error}")
+                if len(failed) == number + 1 == min(_GIVEN_UP, run.rounds):
+                    raise
+                run.console.print(failed[-1], style="red", highlight=False, markup=False)
+    return failed
 
 
 def _round(round_: Round) -> Iterator[Cell]:
@@ -165,44 +166,7 @@ class Collected:
             for cell in [*self._cells.values()] or self.pilot
             if not null.is_slowed(cell.variant) and cell.samples and condition.items() <= cell.params.items()
         ]
-        return null.SLOWDOWN * percentile(usual, 50) if usual else 0.0
-
-
-class Rounds:
-    """Counts successful and failed rounds of ``asked``: a failed one is left out and noted, the others still count."""
-
-    def __init__(self, asked: int, console: Console) -> None:
-        self._asked, self._console = asked, console
-        self._done = 0
-        self._failed: list[str] = []
-        self.last_failed = False
-
-    @contextmanager
-    def attempt(self, number: int) -> Iterator[None]:
-        """Runs round ``number``, from 0. Raises PebbleError if the first rounds fail, since all would."""
-        try:
-            yield
-        except PebbleError as error:
-            self._failed.append(f"round {number + 1}: {error}")
-            if not self._done and len(self._failed) == min(_GIVEN_UP, self._asked):
-                raise
-            self._console.print(self._failed[-1], style="red", highlight=False, markup=False)
-            self.last_failed = True
-        else:
-            self._done += 1
-            self.last_failed = False
-
-    def notes(self) -> list[str]:
-        """A sentence for the assessment: how many rounds failed, and why the first of them did."""
-        if not self._failed:
-            return []
-        why = self._failed[0].splitlines()[0]
-        return [f"{len(self._failed)} of {self._asked} rounds failed and were left out; {why}"]
-
-    @property
-    def enough(self) -> bool:
-        """Whether enough rounds to judge are left, if so many were requested."""
-        return self._done >= LEAST_ROUNDS or self._asked < LEAST_ROUNDS
+        return null.SLOWDOWN * percentile(usual or [0.0], 50)
 
 
 def check_folder(folder: Path) -> None:

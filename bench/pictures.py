@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from pkgutil import resolve_name
 from statistics import median
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 from pebble.bench import null, plots
 from pebble.bench.comparison import find
@@ -27,8 +27,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-Declared = Callable[[Results], list[Picture]]
+Declared = Callable[[Results], Iterable[Picture]]
 Make = Callable[[Sequence[Cell], str], "Figure"]  # of cells, under a title
+_Judged = Sequence[tuple[Cell, Interval]]
 
 LEAST = 20  # samples for a distribution
 _DARK = "#222"
@@ -49,35 +50,61 @@ def pictures(results: Results) -> list[Picture]:
     return [picture for one in find(results.bench).pictures for picture in one(results)]
 
 
-# -- what may be declared
-
-
 @dataclass(frozen=True, slots=True)
 class Drawn:
     """A function of results, ``module:function``, whose module is imported when it draws."""
 
     by: str
 
-    def __call__(self, results: Results) -> list[Picture]:
-        found: list[Picture] = resolve_name(self.by)(results)
-        return found
+    def __call__(self, results: Results) -> Iterable[Picture]:
+        return cast(Declared, resolve_name(self.by))(results)
 
 
 def ecdf(title: str, *, measures: Sequence[str] = ()) -> Declared:
     """For each measure the share of messages within a time; one panel for each condition."""
+    caption = f"{title}: {{measure}}. Share of all messages, lost ones included, within the time"
+    return _declared(_curves, caption, measures=measures, least=LEAST)
 
-    def caption(measure: str, cells: Sequence[Cell]) -> str:
-        about = title if measure in title.lower() else f"{title}: {measure}"
-        lost = "; lost messages are missing from 100 %" if any((cell.lost or 0) > 0 for cell in cells) else ""
-        return f"{about}. Share of all messages within the time on the x-axis{lost}"
 
-    return _of_each(measures, caption, _curves, LEAST)
+def bars(title: str, *, measures: Sequence[str] = (), panel: str = "", group: str = "") -> Declared:
+    """A bar for each median: one picture for each measure, with a panel or a group for each value of a parameter."""
+    make = partial(_amounts, panel=panel, group=group)
+    return _declared(make, f"{title}: {{measure}}, medians", measures=measures)
+
+
+def dots(title: str) -> Declared:
+    """A dot for each sample, and a line at the median; one panel for each measure."""
+    caption = f"{title}: a dot for each launch or late subscriber, a line at the median of the rounds"
+    return _declared(_dots, caption, name="")
+
+
+def tails(title: str) -> Declared:
+    """Bars to the medians, lines to the 99th percentiles; one panel for each condition."""
+    return _declared(_tails, f"{title}: bars to the median, lines to the 99th percentile", name="bars")
+
+
+def _declared(
+    make: Make, caption: str, *, measures: Sequence[str] = (), least: int = 1, name: str | None = None
+) -> Declared:
+    """A picture for each of these measures, or for all, in a file of its name; or of this name for all together.
+
+    Cells with fewer finite samples than ``least`` are not drawn.
+    """
+
+    def found(results: Results) -> Iterator[Picture]:
+        cells = (cell for cell in results.cells if cell.measure in (measures or (cell.measure,)))
+        known = (cell for cell in cells if len(finite(cell.samples)) >= least)
+        for what, some in grouped(known, lambda cell: cell.measure if name is None else name).items():
+            file = re.sub("[^a-z0-9]+", "-", f"{results.bench}-{what}".lower()).strip("-")
+            yield Picture(file, title := caption.format(measure=what), partial(make, some, title))
+
+    return found
 
 
 def ratios(title: str, baseline: str, *, measures: Sequence[str] = ()) -> Declared:
     """The medians as ratios to the baseline's, with their intervals. No picture without a baseline."""
 
-    def found(results: Results) -> list[Picture]:
+    def found(results: Results) -> Iterator[Picture]:
         cells = [cell for cell in results.cells if cell.measure in (measures or (cell.measure,))]
         based = [(cell, base) for cell in cells if (base := base_of(cell, cells, baseline)) is not None]
         judged = [(cell, paired(cell.rounds, base.rounds)) for cell, base in based]
@@ -92,69 +119,16 @@ def null_ratios(title: str) -> Declared:
     return lambda results: _ratios(results, null.intervals(results.cells), caption, _ITSELF)
 
 
-def dots(title: str) -> Declared:
-    """A dot for each sample, and a line at the median; one panel for each measure."""
-    caption = f"{title}: a dot for each launch or late subscriber, a line at the median of the rounds"
-    return lambda results: _picture(results.bench, caption, _measured(results), _dots)
-
-
-def bars(title: str, *, measures: Sequence[str] = (), panel: str = "", group: str = "") -> Declared:
-    """A bar for each median: one picture for each measure, with a panel or a group for each value of a parameter."""
-    make = partial(_amounts, panel=panel, group=group)
-    return _of_each(measures, lambda measure, _cells: f"{title}: {measure}, medians", make)
-
-
-def tails(title: str) -> Declared:
-    """Bars to the medians, lines to the 99th percentiles; one panel for each condition."""
-    caption = f"{title}: bars to the median, lines to the 99th percentile"
-    return lambda results: _picture(f"{results.bench}-bars", caption, _measured(results), _tails)
-
-
-def _measured(results: Results, least: int = 1) -> list[Cell]:
-    """The cells with so many finite samples."""
-    return [cell for cell in results.cells if len(finite(cell.samples)) >= least]
-
-
-def _of_each(
-    measures: Sequence[str], caption: Callable[[str, Sequence[Cell]], str], make: Make, least: int = 1
-) -> Declared:
-    """A picture for each of these measures, or for all."""
-
-    def found(results: Results) -> list[Picture]:
-        made = list[Picture]()
-        for measure, cells in grouped(_measured(results, least), lambda cell: cell.measure).items():
-            if not measures or measure in measures:
-                made += _picture(_file_name(results.bench, measure), caption(measure, cells), cells, make)
-        return made
-
-    return found
-
-
-def _file_name(bench: str, measure: str) -> str:
-    """Of text such as ``one-way there, ± 0.4 ms``."""
-    return f"{bench}-{re.sub(r'[^a-z0-9]+', '-', measure.lower()).strip('-')}"
-
-
-def _picture(name: str, caption: str, cells: Sequence[Cell], make: Make) -> list[Picture]:
-    """No picture without cells."""
-    return [Picture(name, caption, partial(make, cells, caption))] if cells else []
-
-
-def _ratios(results: Results, judged: Sequence[tuple[Cell, Interval]], caption: str, baseline: str) -> list[Picture]:
-    judged = [(cell, interval) for cell, interval in judged if math.isfinite(interval.ratio)]
-    if not judged:
-        return []
-    few = all(interval.few for _, interval in judged)
-    caption += f"; no intervals: these need {LEAST_ROUNDS} rounds" if few else "; lines: intervals of 99 %"
-    return [Picture(f"{results.bench}-ratios", caption, partial(_ratio_bars, judged, caption, baseline))]
-
-
-# -- how they are drawn
+def _ratios(results: Results, judged: _Judged, caption: str, baseline: str) -> Iterator[Picture]:
+    if judged := [(cell, interval) for cell, interval in judged if math.isfinite(interval.ratio)]:
+        few = all(interval.few for _, interval in judged)
+        caption += f"; no intervals: these need {LEAST_ROUNDS} rounds" if few else "; lines: intervals of 99 %"
+        yield Picture(f"{results.bench}-ratios", caption, partial(_ratio_bars, judged, caption, baseline))
 
 
 def _curves(cells: Sequence[Cell], title: str) -> Figure:
     """The curves end below 100 % by the lost share; the slowest few are cut off."""
-    by_place, style_of = grouped(cells, Cell.conditions), _styles(cells)
+    by_place, style_of = grouped(cells, Cell.conditions), plots.styles([cell.variant for cell in cells])
     figure, every = plots.panels(len(by_place), 3, (3.9, 2.7), title)
     positive = [[sample for sample in finite(cell.samples) if sample > 0] for cell in cells]
     ends = plots.around([percentile(some, percent) for some in positive for percent in (0.1, 99.8)])
@@ -165,8 +139,7 @@ def _curves(cells: Sequence[Cell], title: str) -> Figure:
             shares = [step * count for count in range(1, len(times) + 1)]
             axes.plot(times, shares, color=style.colour, linestyle=style.dash)
         plots.log_axis(axes, "x", f"latency, {_unit(cells)}", *ends)
-        axes.set_ylim(0, 101)
-        axes.set_title(short(place, 44), loc="left")
+        axes.set(ylim=(0, 101), title=short(place, 44))
         for percent in (50, 99):
             plots.guide(axes, percent, f"p{percent}")
     plots.legend(figure, {name: replace(style, marker="") for name, style in style_of.items()})
@@ -174,7 +147,8 @@ def _curves(cells: Sequence[Cell], title: str) -> Figure:
 
 
 def _dots(cells: Sequence[Cell], title: str) -> Figure:
-    kinds, style_of = grouped(cells, lambda cell: f"{cell.measure}\n{cell.conditions()}".strip()), _styles(cells)
+    kinds = grouped(cells, lambda cell: f"{cell.measure}\n{cell.conditions()}".strip())
+    style_of = plots.styles([cell.variant for cell in cells])
     figure, every = plots.panels(len(kinds), 3, (3.6, 2.9), title)
     for axes, (kind, shown) in zip(every, kinds.items(), strict=True):
         for at, cell in enumerate(shown):
@@ -184,11 +158,9 @@ def _dots(cells: Sequence[Cell], title: str) -> Figure:
             axes.plot([at - 0.3, at + 0.3], [middle, middle], color=_DARK, linewidth=1.5)
             axes.annotate(digits(middle), (at + 0.32, middle), fontsize=8, va="center", annotation_clip=False)
         axes.set_xticks(range(len(shown)), [short(cell.variant, 14) for cell in shown])
-        axes.set_xlim(-0.6, len(shown) - 0.2)
-        axes.set_ylim(0, 1.08 * max(sample for cell in shown for sample in finite(cell.samples)) or 1.0)
+        top = 1.08 * max(sample for cell in shown for sample in finite(cell.samples)) or 1.0
+        axes.set(xlim=(-0.6, len(shown) - 0.2), ylim=(0, top), title=short(kind, 40), ylabel=f"time, {_unit(shown)}")
         axes.grid(visible=False, axis="x")
-        axes.set_title(short(kind, 40), loc="left")
-        axes.set_ylabel(f"time, {_unit(shown)}")
     return figure
 
 
@@ -205,12 +177,12 @@ class _Bar:
     text: str = ""
 
 
-def _bar_panels(title: str, bars: Sequence[_Bar], width: float, axis: Callable[[Axes], None], *more: str) -> Figure:
+def _bar_panels(title: str, bars: Sequence[_Bar], width: float, axis: Callable[[Axes], object], *more: str) -> Figure:
     """Panels of bars, those of a row below each other; the row of the sum comes last. ``more`` have a style, too."""
     rows = sorted(unique([bar.row for bar in bars]), key=lambda row: row == _SUM)
     by_panel, variants = grouped(bars, lambda bar: bar.panel), unique([bar.variant for bar in bars])
     height = 0.9 + 0.17 * max(map(len, by_panel.values())) + 0.15 * len(rows)
-    style_of = plots.styles(unique([*more, *variants]))
+    style_of = plots.styles([*more, *variants])
     figure, every = plots.panels(len(by_panel), 2, (width, height), title)
     for axes, (panel, some) in zip(every, by_panel.items(), strict=True):
         for at, row in enumerate(rows):
@@ -222,15 +194,14 @@ def _bar_panels(title: str, bars: Sequence[_Bar], width: float, axis: Callable[[
                 axes.plot(bar.line, [y] * len(bar.line), color=_DARK, linewidth=1.1, marker="|", markersize=6)
                 axes.annotate(bar.text, (max((bar.end, *bar.line)), y), fontsize=8, va="center")
         axes.set_yticks(range(len(rows)), [short(row or "all", 34) for row in rows])
-        axes.set_ylim(len(rows) - 0.4, -0.6)
+        axes.set(ylim=(len(rows) - 0.4, -0.6), title=short(panel, 50))
         axes.grid(visible=False, axis="y")
-        axes.set_title(short(panel, 50), loc="left")
         axis(axes)
     plots.legend(figure, {name: Style(style_of[name].colour, "", "s") for name in variants})
     return figure
 
 
-def _ratio_bars(judged: Sequence[tuple[Cell, Interval]], title: str, baseline: str) -> Figure:
+def _ratio_bars(judged: _Judged, title: str, baseline: str) -> Figure:
     bars = [
         _Bar(cell.measure, cell.conditions(), cell.variant, 1.0, one.ratio,
              (one.ratio, one.ratio) if one.few else (one.low, one.high))
@@ -251,18 +222,12 @@ def _ratio_bars(judged: Sequence[tuple[Cell, Interval]], title: str, baseline: s
 
 def _amounts(cells: Sequence[Cell], title: str, *, panel: str, group: str) -> Figure:
     """A panel for each value of the parameter ``panel``, in which ``group`` names the rows."""
-    bars = [
-        _Bar(str(cell.params.get(panel, "")), str(cell.params[group]) if group else cell.conditions() or cell.variant,
-             cell.variant, 0.0, p50, text=f" {digits(p50)}")
-        for cell in cells
-        for p50 in [_p(50, cell)]
-    ]  # fmt: skip
-
-    def axis(axes: Axes) -> None:
-        axes.set_xlim(0, 1.14 * max(bar.end for bar in bars) or 1.0)
-        axes.set_xlabel(f"{cells[0].measure}, {_unit(cells)}")
-
-    return _bar_panels(title, bars, 5.2 if panel else 8.5, axis)
+    bars = []
+    for cell, p50 in ((cell, _p(50, cell)) for cell in cells):
+        row = str(cell.params[group]) if group else cell.conditions() or cell.variant
+        bars.append(_Bar(str(cell.params.get(panel, "")), row, cell.variant, 0.0, p50, text=f" {digits(p50)}"))
+    right, label = 1.14 * max(bar.end for bar in bars) or 1.0, f"{cells[0].measure}, {_unit(cells)}"
+    return _bar_panels(title, bars, 5.2 if panel else 8.5, lambda axes: axes.set(xlim=(0, right), xlabel=label))
 
 
 def _tails(cells: Sequence[Cell], title: str) -> Figure:
@@ -282,7 +247,3 @@ def _p(percent: float, cell: Cell) -> float:
 
 def _unit(cells: Sequence[Cell]) -> str:
     return "µs" if cells[0].unit == "us" else cells[0].unit
-
-
-def _styles(cells: Sequence[Cell]) -> dict[str, Style]:
-    return plots.styles(unique([cell.variant for cell in cells]))

@@ -8,7 +8,7 @@ import textwrap
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from pebble.bench.results import Results, named
 
@@ -20,19 +20,10 @@ if TYPE_CHECKING:
 _DPI = 150
 _WIDEST = 13.0  # inches
 _SETTINGS: dict[Any, Any] = {
-    "font.size": 9,
-    "axes.titlesize": 9,
-    "xtick.labelsize": 8,
-    "ytick.labelsize": 8,
-    "figure.titlesize": 11,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.color": "#e4e4e4",
-}
-
-Dash = Literal["-", "--", "-.", ":", ""]
+    "font.size": 9, "axes.titlesize": 9, "figure.titlesize": 11, "xtick.labelsize": 8, "ytick.labelsize": 8,
+    "axes.spines.top": False, "axes.spines.right": False, "axes.titlelocation": "left",
+    "axes.grid": True, "axes.axisbelow": True, "grid.color": "#e4e4e4",
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +31,7 @@ class Style:
     """The style of a variant in every picture. Dash and marker differ as well, for colour-blind readers."""
 
     colour: str
-    dash: Dash = "-"
+    dash: Any = "-"
     marker: str = "o"
     hollow: bool = False
 
@@ -54,8 +45,8 @@ class Picture:
     make: Callable[[], Figure]
 
 
-#: The variants of each colour. The first four are for other ones of Zenoh, too, the next four of MQTT, the next of all.
-_VARIANTS = {
+#: The variants of each colour. The first four are for other ones of Zenoh, too, the next four of MQTT, the rest of all.
+_VARIANTS: dict[str, tuple[str, ...]] = {
     "#0072B2": ("zenoh", "zenoh-p2p", "zenoh-shm", "zenoh h264 opus"),
     "#2AA198": ("zenoh-hub", "zenoh-copy"),
     "#56B4E9": ("zenoh-net", "zenoh original"),
@@ -65,25 +56,20 @@ _VARIANTS = {
     "#A4133C": ("mqtt5",),
     "#8C510A": ("paho",),
     "#4D4D4D": ("one hop", "memcpy"),
-    "#8A8A8A": ("gstreamer-shm", "json", "pcm"),
-    "#1A1A1A": (),
-    "#B3B3B3": ("reference",),
-    "#CC79A7": ("pbvd",),
-    "#7B4F9E": ("pbvz",),
-    "#117733": ("h264", "opus"),
-    "#6DBE8B": ("h264, key/5",),
+    "#8A8A8A": ("gstreamer-shm",),
+    **dict.fromkeys(("#117733", "#6DBE8B", "#CC79A7", "#7B4F9E", "#1A1A1A", "#B3B3B3"), ()),
 }
-_COLOUR_OF = {name: colour for colour, names in _VARIANTS.items() for name in names}
-_DASHES: tuple[Dash, ...] = ("-", "--", "-.", ":")
-_STYLES = {colour: Style(colour, _DASHES[at % 4], "os^DvPX"[at % 7]) for at, colour in enumerate(_VARIANTS)}
+_STYLES = {
+    colour: Style(colour, ("-", "--", "-.", ":")[at % 4], "os^DvPX"[at % 7]) for at, colour in enumerate(_VARIANTS)
+}
 
 
 def styles(variants: Sequence[str]) -> dict[str, Style]:
     """The fixed style of each known variant, and one from its family's colours for every other."""
-    found = {name: _COLOUR_OF[name] for name in variants if name in _COLOUR_OF}
+    found = {name: colour for colour, names in _VARIANTS.items() for name in names if name in variants}
     for name in variants:
-        begin = 0 if name.startswith("zenoh") else 4 if name.startswith(("mqtt", "paho")) else 8
-        family = list(_VARIANTS)[begin : begin + 4]
+        begin, end = (0, 4) if name.startswith("zenoh") else (4, 8) if name.startswith(("mqtt", "paho")) else (8, None)
+        family = list(_VARIANTS)[begin:end]
         found.setdefault(name, next((colour for colour in family if colour not in found.values()), family[0]))
     return {name: replace(_STYLES[found[name]], hollow="original" in name) for name in variants}
 
@@ -94,7 +80,6 @@ def unique(values: Sequence[str]) -> list[str]:
 
 
 def finite(samples: Sequence[float | None]) -> list[float]:
-    """The finite samples, without NaN and None."""
     return [sample for sample in samples if sample is not None and math.isfinite(sample)]
 
 
@@ -107,12 +92,11 @@ def panels(count: int, columns: int, size: tuple[float, float], title: str) -> t
     """A figure with ``count`` panels of ``size`` inches each, as many in a row as fit."""
     from matplotlib.figure import Figure
 
-    columns = max(1, min(columns, count))
+    columns = min(columns, count)
     rows = math.ceil(count / columns)
     width = max(5.5, min(_WIDEST, columns * size[0]))
     figure = Figure(figsize=(width, rows * size[1] + 0.9), dpi=_DPI, layout="constrained")
-    wrapped = "\n".join(textwrap.wrap(title, int(width * 11.5) - 14))  # leaves room for the “quick run” mark
-    figure.suptitle(wrapped, x=0.01, ha="left")
+    figure.suptitle(textwrap.fill(title, int(width * 11.5) - 14), x=0.01, ha="left")  # beside it: “quick run”
     return figure, [figure.add_subplot(rows, columns, number + 1) for number in range(count)]
 
 
@@ -126,9 +110,9 @@ def legend(figure: Figure, entries: dict[str, Style], *, more: Sequence[Line2D] 
             marker=style.marker, markersize=5, markerfacecolor="white" if style.hollow else style.colour,
         )
         for name, style in entries.items()
-    ]  # fmt: skip
-    columns = max(1, min(len([*handles, *more]), int(figure.get_figwidth() // 1.8)))
-    figure.legend(handles=[*handles, *more], loc="outside lower center", ncols=columns, frameon=False)
+    ] + list(more)  # fmt: skip
+    columns = max(1, min(len(handles), int(figure.get_figwidth() // 1.8)))
+    figure.legend(handles=handles, loc="outside lower center", ncols=columns, frameon=False)
 
 
 def save(picture: Picture, path: Path, results: Results) -> None:

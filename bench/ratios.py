@@ -14,22 +14,17 @@ from statistics import NormalDist
 from pebble.bench.results import percentile
 
 LEVEL = 0.99
-#: Fewer rounds than this do not support a 99 % interval: it is computed, but means little.
-LEAST_ROUNDS = 8
+LEAST_ROUNDS = 8  # fewer do not support a 99 % interval: it is computed, but means little
 _RESAMPLES = 20_000
 _INFINITE = 1e15  # stands for infinity where resampling computes differences
 _LARGEST = 1e6  # ratio that is written as a number
-_SEED = 1  # the same samples give the same interval
 
 Rounds = Sequence[Sequence[float]]  # the samples of each
 
 
 @dataclass(frozen=True, slots=True)
 class Interval:
-    """A ratio and its confidence interval at ``level``; NaN if nothing was measured.
-
-    With fewer than ``LEAST_ROUNDS`` the interval is not meaningful.
-    """
+    """A ratio and its confidence interval at ``level``, which few rounds do not support; NaN: nothing was measured."""
 
     ratio: float = math.nan
     low: float = math.nan
@@ -38,10 +33,8 @@ class Interval:
     rounds: int = LEAST_ROUNDS
 
     def __str__(self) -> str:
-        if not self.known:
-            return "–"
         interval = "" if self.few else f" ({_digits(self.low)} to {_digits(self.high)})"
-        return f"{_digits(self.ratio)}{interval}"
+        return f"{_digits(self.ratio)}{interval}" if self.known else "–"
 
     @property
     def known(self) -> bool:
@@ -49,12 +42,10 @@ class Interval:
 
     @property
     def few(self) -> bool:
-        """Whether there are too few rounds to judge."""
         return self.rounds < LEAST_ROUNDS
 
     @property
     def equal(self) -> bool:
-        """Whether the interval includes 1."""
         return self.low <= 1.0 <= self.high
 
     def words(self, ours: str, theirs: str, quantity: str = "time") -> str:
@@ -70,10 +61,7 @@ class Interval:
 
 
 def paired(ours: Rounds, theirs: Rounds, percent: float = 50) -> Interval:
-    """The median, over rounds run in turn, of the ratio of their percentiles.
-
-    A sample may be infinite: a message that never arrived. Rounds without samples, or both infinite, do not count.
-    """
+    """The median, over rounds run in turn, of the ratio of their percentiles; where both are infinite, none."""
     pairs = [(percentile(a, percent), percentile(b, percent)) for a, b in zip(ours, theirs, strict=False) if a and b]
     ratios = [min(a, _INFINITE) / min(b, _INFINITE) for a, b in pairs if b > 0 and min(a, b) < math.inf]
     logs = [math.log(ratio) if ratio else -math.inf for ratio in ratios]
@@ -95,15 +83,17 @@ def _interval(ours: Sequence[float], theirs: Sequence[float], level: float) -> I
     import numpy as np  # importing it earlier than it is needed would change the memory of measured processes
 
     ratio = float(np.median(ours) - np.median(theirs))
-    if rounds < 2:
-        return Interval(math.exp(ratio), 0.0, math.inf, level, rounds)
-    random = np.random.default_rng(_SEED)
+    random = np.random.default_rng(1)  # the same samples give the same interval
     a, b = (np.median(random.choice(logs, (_RESAMPLES, len(logs))), axis=1) for logs in (ours, theirs))
-    tail, freedom = (1 - level) / 2, rounds - 1
-    z = NormalDist().inv_cdf(1 - tail)  # half of the width in standard errors; few rounds: Student's t, approximated
-    wider = 1 + (z**2 + 1) / (4 * freedom) + (5 * z**4 + 16 * z**2 + 3) / (96 * freedom**2)
+    tail, wider = (1 - level) / 2, student(level, rounds) / student(level, math.inf)
     low, high = (ratio + wider * (end - ratio) for end in np.quantile(a - b, [tail, 1 - tail]))
     return Interval(math.exp(ratio), math.exp(low), math.exp(high), level, rounds)
+
+
+def student(level: float, rounds: float) -> float:
+    """Half of an interval's width in standard errors: Student's t, approximated."""
+    z, freedom = NormalDist().inv_cdf((1 + level) / 2), max(1, rounds - 1)
+    return z * (1 + (z**2 + 1) / (4 * freedom) + (5 * z**4 + 16 * z**2 + 3) / (96 * freedom**2))
 
 
 def _digits(ratio: float) -> str:

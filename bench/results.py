@@ -12,7 +12,7 @@ import subprocess
 import time
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import distributions
 from pathlib import Path
 from typing import TypeVar
 
@@ -71,20 +71,17 @@ class Cell(msgspec.Struct, kw_only=True):
         return self.counts or [len(one) for one in self.rounds]
 
     def single(self, name: str) -> float:
-        """A single value; NaN without one."""
+        """One of the ``figures``; NaN without it."""
         found = self.figures.get(name)
         return float(found) if isinstance(found, (int, float)) else math.nan
 
     def percentile(self, percent: float) -> float:
-        """A percentile of all samples; NaN without samples."""
+        """Of all samples; NaN without samples."""
         known = self.percentiles.get(f"{percent:g}")
         return percentile(self.samples, percent) if known is None else known
 
     def thinned(self) -> Cell:
-        """At most 2,000 samples, or 100 of each round: the last of 100, 200, … equal parts, so that percentiles stay.
-
-        Those of a round are sorted, except in a curve.
-        """
+        """At most 2,000 samples, or 100 of each round: the last of 100, 200, … equal parts: percentiles stay."""
         most, rounds = max(100, _MOST // max(1, len(self.rounds)) // 100 * 100), []
         for one in self.rounds:
             ordered, parts = one if self.measure.endswith(OVER_TIME) else sorted(one), min(most, len(one))
@@ -148,10 +145,7 @@ def named(path: Path) -> Iterator[None]:
 
 
 def pack(folder: Path) -> None:
-    """Moves the samples of all results in a folder into one small file, thinned. Raises PebbleError.
-
-    It holds the differences of neighbours, which compress well.
-    """
+    """Moves the samples of all results in a folder into one small file, thinned. Raises PebbleError."""
     packed: dict[str, list[list[list[int]]]] = {}
     for path in sorted(folder.glob("*.json")):
         with suppress(PebbleError):  # of another version, or not of a comparison
@@ -164,6 +158,7 @@ def pack(folder: Path) -> None:
 
 
 def _steps(samples: Sequence[float]) -> list[int]:
+    """The differences of neighbours, which compress well."""
     whole = [round(sample * 10**_DIGITS) for sample in samples]
     return [one - before for before, one in itertools.pairwise([0, *whole])]
 
@@ -198,31 +193,22 @@ def begin(bench: str, command: Sequence[str], *, quick: bool = False) -> Results
 
 
 def machine() -> dict[str, Value]:
-    """The machine and the versions the results depend on; no names of hosts or users. None: not installed."""
+    """The machine and the versions the results depend on; no names of hosts or users."""
+    from pebble.rig.broker import mosquitto_path  # not for the processes that only measure
+
     model = re.search(r"^(?:model name|Model).*?: *(.*?) *$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
-    found: dict[str, Value] = {
+    broker = ""
+    if (path := mosquitto_path()) is not None:
+        broker = subprocess.run([path, "-h"], capture_output=True, text=True, check=False).stdout.partition("\n")[0]
+    return {
         "cpu": model[1] if model else platform.machine(),
         "cores": len(os.sched_getaffinity(0)),
         "kernel": platform.release(),
         "system": platform.freedesktop_os_release()["PRETTY_NAME"],
         "python": platform.python_version(),
-        "mosquitto": _mosquitto(),
-        **dict.fromkeys(_PACKAGES),
+        "mosquitto": broker.removeprefix("mosquitto version ") or None,
+        **{name: one.version for name in _PACKAGES for one in distributions(name=name)},
     }
-    for package in _PACKAGES:
-        with suppress(PackageNotFoundError):
-            found[package] = version(package)
-    return found
-
-
-def _mosquitto() -> str | None:
-    from pebble.rig.broker import mosquitto_path  # not for the processes that only measure
-
-    with suppress(OSError, subprocess.SubprocessError):
-        command = [mosquitto_path() or "", "-h"]
-        answer = subprocess.run(command, capture_output=True, text=True, check=False, timeout=5).stdout
-        return answer.partition("\n")[0].removeprefix("mosquitto version ").strip() or None
-    return None
 
 
 def grouped(ones: Iterable[T], key: Callable[[T], K]) -> dict[K, list[T]]:

@@ -22,13 +22,6 @@ def plain_table(title: str, columns: Sequence[str], *, left: int = 1) -> Table:
     return table
 
 
-def latency_table(title: str, cells: Sequence[Cell], baseline: str) -> Table:
-    """Rows in the order of the cells. Last column: ratio of the median to ``baseline``'s under the same conditions."""
-    first = percentile_column(50, f"p50 {cells[0].unit}")
-    columns = (first, *map(percentile_column, (95, 99, 100)), COUNT, LOST)
-    return next(Grid(title=title, rows=("conditions", "variant"), columns=columns, baseline=baseline)(cells))
-
-
 def base_of(cell: Cell, cells: Sequence[Cell], baseline: str) -> Cell | None:
     """The baseline's cell under the same conditions; None for a cell of the baseline."""
     same = (one for one in cells if one.variant == baseline and one.case == cell.case)
@@ -48,45 +41,27 @@ def medians(cell: Cell) -> list[float]:
 
 
 def spread(cell: Cell) -> str:
-    """``0.34 (0.31 to 0.39)``: the median of the rounds, and their minimum and maximum if there are several."""
+    """``0.34 (0.31 to 0.39)``: the median of the rounds, and the ends if there are several."""
     rounds = medians(cell)
     ends = f" ({figure(min(rounds))} to {figure(max(rounds))})" if len(rounds) > 1 else ""
     return f"{figure(median(rounds))}{ends}" if rounds else "–"
 
 
 def sentence(what: str, cells: Sequence[Cell], *, quantity: str) -> str:
-    """One or two robots in one measure, the baseline first; ``quantity`` as in "takes 0.9× the time".
-
-    They are compared if there are enough rounds for an interval.
-    """
-    unit = f" {cells[0].unit}" if cells[0].unit else ""
-    values = ", ".join(f"{cell.variant} {spread(cell)}{unit}" for cell in cells)
-    if len(cells) < 2 or not enough(cells):
+    """One or two variants, the baseline first; they are compared if there are enough rounds for an interval."""
+    values = ", ".join(f"{cell.variant} {spread(cell)} {cell.unit}".strip() for cell in cells)
+    if len(cells) < 2 or caveat(cells):
         return f"{what}: {values}"
     theirs, ours = cells
     words = paired(ours.rounds, theirs.rounds).words(ours.variant, theirs.variant, quantity)
     return f"{what}: {words}; {values}"
 
 
-def against(cells: Sequence[Cell]) -> str:
-    """The second robot's value divided by the first's, with an interval if there are enough rounds."""
-    return str(paired(cells[1].rounds, cells[0].rounds))
-
-
-def enough(cells: Sequence[Cell]) -> bool:
-    """Whether there are enough rounds for an interval."""
-    return all(len(medians(cell)) >= LEAST_ROUNDS for cell in cells)
-
-
 def caveat(cells: Sequence[Cell]) -> list[str]:
     """A note below sentences without intervals."""
-    if enough(cells):
-        return []
-    few, needs = min(len(medians(cell)) for cell in cells), f"a {100 * LEVEL:.0f} % interval needs {LEAST_ROUNDS}"
-    return [f"{few} round{'s' if few != 1 else ''}, and {needs}: these are medians, with minimum and maximum."]
-
-
-# -- tables and sentences as data
+    few = min((len(medians(cell)) for cell in cells), default=LEAST_ROUNDS)
+    rounds = f"{few} round{'s' if few != 1 else ''}, and a {100 * LEVEL:.0f} % interval needs {LEAST_ROUNDS}"
+    return [f"{rounds}: these are medians, with minimum and maximum."] if few < LEAST_ROUNDS else []
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,9 +97,7 @@ class Grid:
     """A table: a row for each value of the ``rows`` (parameters, ``conditions``, ``measure``, ``unit`` or ``variant``).
 
     The columns are repeated side by side for each variant, unless it is one of the rows. The last one is with ``ratio``
-    that of the second variant to the first, with ``baseline`` that of the row's variant to this one. A row of the name
-    ``last`` comes last, in bold. There is one table for all values of ``each`` of these parameters, which the title may
-    name; none without cells.
+    that of the second variant to the first, with ``baseline`` that of the row's variant to this one.
     """
 
     title: str
@@ -134,9 +107,9 @@ class Grid:
     of: Callable[[Cell], bool] = lambda _cell: True
     ratio: bool = False
     baseline: str = ""
-    last: str | None = None
+    last: str | None = None  # the row of this name comes last, in bold
     caption: str = ""
-    each: Sequence[str] = ()
+    each: Sequence[str] = ()  # a table for all values of each of these parameters, which the title may name
 
     def __call__(self, cells: Sequence[Cell]) -> Iterator[Table]:
         for names, some in grouped(filter(self.of, cells), lambda cell: _fields(cell, self.each)).items():
@@ -158,10 +131,10 @@ class Grid:
             if len(groups) > len(blocks):
                 table.add_section()
             for number, row in enumerate(sorted(rows, key=lambda row: self.last in row)):
-                shown = [self._value(groups[row], one, column) for one in variants for column in self.columns]
-                first = groups[row][0]
-                pair = groups[row] if self.ratio else [*filter(None, [base_of(first, cells, self.baseline)]), first]
-                shown += [against(pair)] if len(pair) > 1 else []
+                group = groups[row]
+                pair = group if self.ratio else [*filter(None, [base_of(group[0], cells, self.baseline)]), group[0]]
+                shown = [self._value(group, one, column) for one in variants for column in self.columns]
+                shown += [str(paired(pair[1].rounds, pair[0].rounds))] if len(pair) > 1 else []
                 table.add_row("" if number else name, *row[1:], *shown, style="bold" if self.last in row else None)
         return table
 
@@ -191,8 +164,8 @@ class Claims:
 
     def __call__(self, cells: Sequence[Cell]) -> Iterator[str]:
         for group in grouped(filter(self.of, cells), lambda cell: cell.case).values():
-            quantity = self.quantity.get(group[0].measure, "time")
+            measure, quantity = group[0].measure, self.quantity.get(group[0].measure, "time")
             group.sort(key=lambda cell: self.order.index(cell.variant) if self.order else 0)
-            what = self.what.format(measure=group[0].measure, quantity=quantity, **group[0].params)
+            what = self.what.format(measure=measure, quantity=quantity, **group[0].params)
             yield sentence(what, group, quantity=quantity)
         yield from caveat([cell for cell in cells if self.judged(cell)])

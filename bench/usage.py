@@ -11,9 +11,6 @@ from contextlib import suppress
 from pathlib import Path
 from statistics import median_low
 
-from pebble.errors import PebbleError
-
-_PROC = Path("/proc")
 _PINGS = 60
 _PERIOD_S = 0.005  # as messages at 200 Hz: cores go idle in between
 
@@ -32,53 +29,32 @@ def cpu_s(pids: Iterable[int]) -> float:
 
 def wake_ups(pids: Iterable[int]) -> int:
     """How often threads of these processes have been woken up so far; 0 for processes that have ended."""
-    count = 0
-    for status in (found for pid in pids for found in _PROC.glob(f"{pid}/task/*/status")):
-        with suppress(FileNotFoundError, ProcessLookupError):  # it has ended meanwhile
-            count += _sum(status, "voluntary_ctxt_switches:")
-    return count
-
-
-def _sum(file: Path, *fields: str) -> int:
-    return sum(int(line.split()[1]) for line in file.read_text().splitlines() if line.startswith(fields))
+    threads = (found for pid in pids for found in Path("/proc").glob(f"{pid}/task/*/status"))
+    return _sum(threads, "voluntary_ctxt_switches:")
 
 
 def pss_mb(pid: int) -> float:
-    """Proportional set size: shared pages are divided among their users."""
-    return _memory_mb(pid, "Pss:")
+    """Proportional set size: shared pages are divided among their users; 0 for a process that has ended."""
+    return _sum([Path(f"/proc/{pid}/smaps_rollup")], "Pss:") / 1024
 
 
 def own_mb(pid: int) -> float:
-    """What a process has allocated, without the pages of programs and libraries: only it can make this grow.
-
-    The proportional set size grows too when another process ends with which pages were shared. Shared memory is divided
-    among its users.
-    """
-    return _memory_mb(pid, "Anonymous:", "Pss_Shmem:")
+    """What a process has allocated, and its share of shared memory: unlike its PSS, no other process changes it."""
+    return _sum([Path(f"/proc/{pid}/smaps_rollup")], "Anonymous:", "Pss_Shmem:") / 1024
 
 
-def _memory_mb(pid: int, *fields: str) -> float:
-    """0 for a process that has ended. Raises PebbleError if the kernel does not provide it."""
-    file = _PROC / str(pid) / "smaps_rollup"
-    try:
-        return _sum(file, *fields) / 1024
-    except OSError as error:
-        if file.parent.exists() and not isinstance(error, ProcessLookupError):
-            raise PebbleError(f"{file}: {error.strerror}: memory cannot be measured without it") from None
-        return 0.0
-
-
-# -- the time of a wake-up, which every message needs several times
+def _sum(files: Iterable[Path], *fields: str) -> int:
+    total = 0
+    for file in files:
+        with suppress(FileNotFoundError, ProcessLookupError):  # the process has ended
+            total += sum(int(line.split()[1]) for line in file.read_text().splitlines() if line.startswith(fields))
+    return total
 
 
 def wake_up_us() -> tuple[float, float]:
-    """The time to wake up a waiting process on the same core and on another one, us; alike if there is only one core.
-
-    It is half of the median round trip of a byte through a socket to ``cat``: a round trip is two wake-ups and little
-    else.
-    """
+    """The time to wake up a waiting process on the same core and on another one, us: half of a round trip to cat."""
     cores = sorted(os.sched_getaffinity(0))
-    os.sched_setaffinity(0, cores[:1])  # only this thread, and processes that it starts meanwhile
+    os.sched_setaffinity(0, cores[:1])  # this thread, and processes that it starts meanwhile
     try:
         return _wake_up_us(cores[0]), _wake_up_us(cores[-1])
     finally:

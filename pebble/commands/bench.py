@@ -1,7 +1,4 @@
-"""``pebble bench``: comparisons, side by side in one run on this machine.
-
-The command of a comparison follows from its declaration.
-"""
+"""``pebble bench``: the command of each comparison, which follows from its declaration, and those for all results."""
 
 from __future__ import annotations
 
@@ -20,13 +17,7 @@ from pebble.errors import PebbleError
 if TYPE_CHECKING:
     from typer._click.core import Command, Context
 
-_NAMES = [name for name in MODULES if name != "impair"]  # that is a command of its own
-_GROUP_HELP = """Comparisons, side by side in one run on this machine.
-
-\b
-    pebble bench frames
-    pebble bench fleet --robots 200
-"""
+_NAMES = [name for name in MODULES if name != "impair"]  # which is a command of its own
 
 
 def compare(
@@ -34,10 +25,9 @@ def compare(
     b: Annotated[Path, typer.Argument(help="Results of the newer run.", metavar="B.json", show_default=False)],
     everything: Annotated[bool, typer.Option("--all", help="Also list what did not change.")] = False,
 ) -> int:
-    """Did anything get worse from A to B, beyond noise? Exit code 1 if so.
+    """Did medians, p99 or losses get worse from A to B, beyond noise? Exit code 1 if so.
 
-    Both files must come from the same comparison, if possible on the same machine with the same options. The ratios of
-    the medians and of the p99 of each cell are tested with confidence intervals over rounds.
+    Both files come from the same comparison, if possible on the same machine with the same options.
     """
     from pebble.bench.compare import run
 
@@ -49,11 +39,7 @@ def echo(
     password_file: PasswordFile = None,
     ca_cert: CaCert = None,
 ) -> int:
-    """Send back what `pebble bench control --far` sends, until Ctrl-C. Runs on the other machine.
-
-    \b
-        pebble bench echo mqtt://broker.local
-    """
+    """Send back what `pebble bench control --far` sends, until Ctrl-C. Runs on the other machine."""
     from pebble.bench.control_far import serve, settings_of
 
     return serve(settings_of(url, password_file, ca_cert))
@@ -62,21 +48,13 @@ def echo(
 def report(
     folder: Annotated[Path, typer.Argument(help="Folder for results, pictures and README.md.", metavar="FOLDER")],
     quick: Quick = False,
-    only: Annotated[
-        str | None, typer.Option(help="Some of them, separated by commas. [default: all]", metavar="NAMES")
-    ] = None,
-    render: Annotated[
-        bool, typer.Option("--render", help="Measure nothing: only write pictures and README.md again.")
-    ] = False,
+    only: Annotated[str | None, typer.Option(help="Some of them, separated by commas.", metavar="NAMES")] = None,
+    render: Annotated[bool, typer.Option("--render", help="Only write pictures and README.md again.")] = False,
 ) -> int:
     """Run all comparisons and pebble impair, one after the other, and write a report.
 
     Takes an hour and a half, with --quick less than five minutes. If a comparison fails, the others still run, and
     the exit code is 1. Without root, comparisons that need it are left out.
-
-    \b
-        pebble bench report docs/results
-        pebble bench report bench-results --only control,control-null
     """
     from pebble.bench.report import run, write
 
@@ -115,28 +93,20 @@ def command_of(about: Comparison) -> Callable[..., int]:
     declared |= {"quick": (Quick, False), "output": (Output, about.folder)}
     run.__doc__ = about.help
     run.__annotations__ = {name: annotation for name, (annotation, _) in declared.items()}
-    run.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
-        [
-            inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
-            for name, (annotation, default) in declared.items()
-        ]
-    )
+    run.__signature__ = inspect.Signature([  # type: ignore[attr-defined]
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+        for name, (annotation, default) in declared.items()
+    ])  # fmt: skip
     return run
 
 
 def _annotation(about: Comparison, option: Option) -> Any:
-    """The option for typer, with its defaults as text: None if it is not given."""
+    """The option for typer, with a default as text: None if it is not given."""
     kind: Any = list[str] if option.many else option.kind
-    full, quick = (budget.get(option.key) for budget in (about.full, about.quick))
-    default = "" if full is None or option.kind is bool else option.as_word(full)
-    if option.key == "variants" or (option.many and full == list(option.known)):
-        default = "all"
-    elif default and quick not in (None, full):
-        default += f"; quick {option.as_word(quick)}"
-    help_ = f"{option.help} [default: {default}]" if default else option.help
-    return Annotated[
-        kind | None, typer.Option(f"--{option.name}", help=help_, metavar=option.metavar, show_default=False)
-    ]
+    default = about.full.get(option.key)
+    shown = "" if default in (None, False) or option.known else f" [default: {option.as_word(default)}]"
+    own = typer.Option(f"--{option.name}", help=option.help + shown, metavar=option.metavar, show_default=False)
+    return Annotated[kind | None, own]
 
 
 def _parsed(option: Option, value: Any) -> Any:
@@ -150,7 +120,8 @@ def _parsed(option: Option, value: Any) -> Any:
 
 
 def register(app: typer.Typer) -> None:
-    group = typer.Typer(cls=Comparisons, help=_GROUP_HELP, rich_markup_mode=None)
+    words = "Comparisons, side by side in one run on this machine."
+    group = typer.Typer(cls=Comparisons, help=words, rich_markup_mode=None)
     for command in (compare, echo, report):
         group.command(command.__name__)(command)
     app.add_typer(group, name="bench")

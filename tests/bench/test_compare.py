@@ -62,7 +62,7 @@ def test_a_planted_slowdown_is_found_and_named(tmp_path: Path) -> None:
 def test_the_same_twice_is_no_change(tmp_path: Path) -> None:
     code, printed = report(tmp_path, results(1), results(2))
     assert code == 0
-    assert printed.startswith("12 metrics compared: 0 worse, 0 better, 12 without a difference beyond noise")
+    assert printed.startswith("12 metrics compared: 0 worse, 0 better, 12 without a difference beyond noise; 0 unknown")
     assert "99.92 %" in printed
 
 
@@ -129,7 +129,7 @@ def test_few_rounds_are_not_judged() -> None:
     assert kinds(one(*[[1.0]] * 8), one(*[[5.0]] * 8)) == [Kind.WORSE]
     assert kinds(one(*[[1.0]] * 7, []), one(*[[5.0]] * 8)) == [Kind.UNKNOWN]
     assert kinds(one(*[[0.0]] * 8), one(*[[5.0]] * 8)) == [Kind.UNKNOWN]
-    assert "1 unknown: fewer than 8 rounds" in summary(compare(one([1.0]), one([5.0])))[-1]
+    assert "1 unknown: fewer than 8 rounds" in summary(compare(one([1.0]), one([5.0])))[0]
 
 
 def test_p99_is_compared_where_rounds_have_hundreds_of_samples() -> None:
@@ -144,6 +144,25 @@ def test_more_pictures_per_second_are_better_and_none_is_worst() -> None:
     assert kinds(twenty, fifteen) == [Kind.WORSE]
     assert kinds(fifteen, none) == [Kind.NO_SAMPLES]
     assert kinds(one([15.0], unit="1/s"), one([0.0], unit="1/s")) == [Kind.NO_SAMPLES]
+
+
+def losing(*lost: int) -> Results:
+    """Of 50 messages in each round."""
+    run = one(*[[1.0] * (50 - count) for count in lost])
+    run.cells[0].figures["sent"] = 50 * len(lost)
+    return run
+
+
+def test_more_that_is_lost_is_worse_and_a_burst_is_noise(tmp_path: Path) -> None:
+    clean, lossy, burst = losing(*[0] * 10), losing(*[1, 2, 3, 2, 1, 2, 3, 1, 2, 3]), losing(*[0] * 9, 20)
+    assert kinds(clean, clean) == [Kind.EQUAL]  # the median
+    assert kinds(clean, lossy) == [Kind.WORSE, Kind.EQUAL]
+    assert kinds(lossy, clean) == [Kind.BETTER, Kind.EQUAL]
+    assert kinds(clean, burst) == [Kind.EQUAL, Kind.EQUAL]
+    assert kinds(losing(0), losing(9)) == [Kind.UNKNOWN, Kind.UNKNOWN]
+    code, printed = report(tmp_path, clean, lossy)
+    assert code == 1
+    assert "lost %" in printed
 
 
 def test_bytes_of_encoders_are_the_same_every_time() -> None:

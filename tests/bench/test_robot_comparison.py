@@ -1,7 +1,7 @@
 """Results of two robots in words: what is claimed, and what is not."""
 
 from pebble.bench.results import Cell
-from pebble.bench.tables import against, caveat, sentence, spread
+from pebble.bench.tables import caveat, sentence, spread
 
 
 def cells(mqtt: list[float], zenoh: list[float]) -> list[Cell]:
@@ -24,7 +24,6 @@ def test_a_spread_is_the_median_and_both_ends() -> None:
 def test_enough_rounds_give_an_interval() -> None:
     pair = cells([10.0 + n / 100 for n in range(8)], [20.0 + n / 100 for n in range(8)])
     assert sentence("M", pair, quantity="time").startswith("M: zenoh takes 2.00× the time of mqtt (99 % interval ")
-    assert against(pair).startswith("2.00 (")
     assert caveat(pair) == []
 
 
@@ -37,7 +36,6 @@ def test_few_rounds_give_no_interval_and_a_note() -> None:
     low, high = [1.0, 2.0, 3.0, 4.0, 5.0], [6.0, 7.0, 8.0, 9.0, 10.0]
     assert printed(low, high) == "M: mqtt 3.00 (1.00 to 5.00) ms, zenoh 8.00 (6.00 to 10.0) ms"
     pair = cells([1.0, 2.0], [2.0, 4.0])
-    assert against(pair) == "2.00"
     (line,) = caveat(pair)
     assert line.startswith("2 rounds, and a 99 % interval needs 8")
 

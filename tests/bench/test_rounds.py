@@ -12,44 +12,53 @@ from rich.console import Console
 
 from pebble.bench import cost, startup
 from pebble.bench.bridge import BRIDGE
-from pebble.bench.comparison import Case, Round
+from pebble.bench.comparison import Budget, Case, Comparison, Round
 from pebble.bench.cost import COST, IDLE, Reading
-from pebble.bench.engine import Rounds, run
-from pebble.bench.results import Cell, load
+from pebble.bench.engine import run
+from pebble.bench.results import Cell, Results, load
 from pebble.errors import PebbleError
 
 
-def attempted(outcomes: str, printed: io.StringIO | None = None) -> Rounds:
+def attempted(outcomes: str, folder: Path, printed: io.StringIO | None = None) -> Results:
     """One round for each letter: ``x`` fails."""
-    rounds = Rounds(len(outcomes), Console(file=printed or io.StringIO(), width=80))
-    for number, outcome in enumerate(outcomes):
-        with rounds.attempt(number):
-            if outcome == "x":
-                raise PebbleError("the robot is not up\nits last [words]")
-    return rounds
+
+    def measure(case: Case) -> Iterator[Cell]:
+        if outcomes[case.number] == "x":
+            raise PebbleError("the robot is not up\nits last [words]")
+        yield case.cell("way", "us", [1.0])
+
+    budget = Budget(1, rounds=len(outcomes))
+    about = Comparison(name="wake-up", title="Waking up", what="", full=budget, quick=budget, measure=measure)
+    code = run(about.run_of(output=folder, console=Console(file=printed or io.StringIO(), width=80)))
+    results = load(folder / "wake-up.json")
+    assert code == int(not results.complete)
+    return results
 
 
 @pytest.mark.parametrize("outcomes", [10 * ".", "..x......x", ".x", "x.", "........x"])
-def test_enough_rounds_are_left(outcomes: str) -> None:
-    assert attempted(outcomes).enough
+def test_enough_rounds_are_left(outcomes: str, tmp_path: Path) -> None:
+    results = attempted(outcomes, tmp_path)
+    assert results.complete
+    assert len(results.cells[0].rounds) == outcomes.count(".")
 
 
 @pytest.mark.parametrize("outcomes", [".x.x.x....", "x......."])
-def test_too_few_rounds_are_left_where_enough_were_asked_for(outcomes: str) -> None:
-    assert not attempted(outcomes).enough
+def test_too_few_rounds_are_left_where_enough_were_asked_for(outcomes: str, tmp_path: Path) -> None:
+    assert not attempted(outcomes, tmp_path).complete
 
 
-def test_a_failed_round_is_noted_and_shown_at_once() -> None:
+def test_a_failed_round_is_noted_and_shown_at_once(tmp_path: Path) -> None:
     printed = io.StringIO()
-    assert attempted(".xx", printed).notes() == ["2 of 3 rounds failed and were left out; round 2: the robot is not up"]
+    noted = ["2 of 3 rounds failed and were left out; round 2: the robot is not up"]
+    assert attempted(".xx", tmp_path, printed).assessment == noted
     assert "round 3: the robot is not up\nits last [words]" in printed.getvalue()
-    assert attempted("..").notes() == []
+    assert attempted("..", tmp_path).assessment == []
 
 
 @pytest.mark.parametrize("outcomes", ["x", "xx."])
-def test_two_failures_at_the_start_end_the_run(outcomes: str) -> None:
+def test_two_failures_at_the_start_end_the_run(outcomes: str, tmp_path: Path) -> None:
     with pytest.raises(PebbleError, match="the robot is not up"):
-        attempted(outcomes)
+        attempted(outcomes, tmp_path)
 
 
 # -- a robot that does not become ready costs its round, not the run
