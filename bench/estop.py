@@ -9,7 +9,7 @@ from __future__ import annotations
 import random
 import time
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 from pebble.bench import drivers
 from pebble.bench.aims import Aim, single, with_lost
@@ -34,10 +34,10 @@ STOP, ZERO = "emergency stop", "plain zero"
 ALL, BOARD = "all together", "board"
 _BY = "bench"
 _STARTED_S = 90.0  # boards start one after the other
-_CONFIRMED_S, _MOVING_S, _ANSWER_S = 10.0, 10.0, 5.0
+_ANSWER_S = 10.0
 _WATCH_S = 0.3  # after a stop, while driving goes on; the fleet writes its trace ten times a second
 _POLL_S = 0.05
-_LONGEST_WAIT_S = 0.25
+_TICK_S = 0.01  # late at most is a repeated stop
 _REACHED = 3  # what is noted of a robot that is stopped
 _QUIET_S = 0.8  # after a reset: motor owners publish few states a second, so a stop at once is confirmed later
 
@@ -65,43 +65,6 @@ def sample(measure: str, robot: str, variant: str, began: int, ended: int | None
 def send(transport: Transport, messages: Iterable[Message]) -> None:
     for message in messages:
         transport.publish(message.topic, message.payload, qos=message.qos, urgent=True)
-
-
-def stop(
-    transport: Transport,
-    bases: Collection[str],
-    timeout: float,
-    *,
-    every: bool,
-    start: Callable[[], object] | None = None,
-) -> tuple[int, dict[str, list[int]]]:
-    """Stops these robots, or ``every`` one as ``--all`` does, and waits until these have confirmed it.
-
-    It is held for those that ``start`` starts. Returns when it began, and for each robot when its first message, the
-    first state that says it is stopped, and its confirmation arrived (CLOCK_MONOTONIC, ns). Raises PebbleError after
-    ``timeout`` seconds.
-    """
-    began, end, times = time.monotonic_ns(), time.monotonic() + timeout, defaultdict[str, list[int]](list)
-    named, hold = None if every else bases, start is not None
-    sender = StopSender(new_name(), by=_BY, why="", now=began / 1e9, robots=named, hold=hold)
-    send(transport, sender.tick(time.monotonic()))
-    filters = [ALL_OUTGOING] if every else [one.filter(base) for one in (ESTOP_STATE, CAPABILITIES) for base in bases]
-    listener = Listener(transport, filters)
-    if start is not None:
-        start()
-    while any(len(times[base]) < _REACHED for base in bases):
-        if time.monotonic() > end:
-            missing = [f"{base}: {robot.why}" for base, robot in sender.robots.items() if robot.why]
-            raise PebbleError(f"a stop was not confirmed within {timeout:.0f} s: {'; '.join(missing)}")
-        left = _LONGEST_WAIT_S if sender.due is None else min(_LONGEST_WAIT_S, sender.due - time.monotonic())
-        while (message := listener.next(left)) is not None:
-            now, left, base = time.monotonic_ns(), 0.0, message.topic.partition("/outgoing/")[0]
-            sender.receive(message, now / 1e9)
-            if (robot := sender.robots.get(base)) is not None:
-                reached = 1 + bool(robot.estop.latched) + (robot.confirmed_s is not None)
-                times[base] += [now] * (reached - len(times[base]))
-        send(transport, sender.tick(time.monotonic()))
-    return began, times
 
 
 class Robots(Processes):
@@ -137,8 +100,7 @@ class Robots(Processes):
     def hold(self, robot: str, start: Callable[[], object], bases: Sequence[str]) -> Iterator[Cell]:
         """Start these robots while a stop of all robots is held."""
         self.started += bases
-        with connected(self._target) as (transport, _):
-            _, times = stop(transport, self.started, _STARTED_S, every=True, start=start)
+        _, times = self._stop(self.started, every=True, start=start)
         for base in bases:
             received, latched, _ = times[base]
             yield sample(HOLD, robot, STOP, received, latched)
@@ -147,40 +109,69 @@ class Robots(Processes):
     def stop(self, robot: str, bases: Sequence[str]) -> Iterator[Cell]:
         """Stop driven robots by an emergency stop: one, or all that run."""
         self._drive(bases)
-        with connected(self._target) as (transport, _):
-            began, times = stop(transport, bases, _CONFIRMED_S, every=robot == ALL)
+        began, times = self._stop(bases, every=robot == ALL)
         yield self._rest(robot, STOP, bases, began)
         yield sample(CONFIRMED, robot, STOP, began, max(times[base][-1] for base in bases))
         self._reset(bases)
 
     def stop_by_zero(self, kind: str) -> Iterator[Cell]:
         """Stop a driven robot by a plain zero as a stock client sends it."""
-        base = self.linux[kind].base
-        self._drive([base])
+        bases = [self.linux[kind].base]
+        self._drive(bases)
         client = drivers.StockClient(at_once=False).open(self._port)
         client.wait()
         began = time.monotonic_ns()
-        client.paho.publish(DRIVE.topic(base), drivers.ZERO, qos=DRIVE.default_qos).wait_for_publish(_ANSWER_S)
+        client.send(DRIVE, *bases, drivers.ZERO).wait_for_publish(_ANSWER_S)
         client.close()
-        yield self._rest(kind, ZERO, [base], began)
-        self._release([base])
+        yield self._rest(kind, ZERO, bases, began)
+        self._drive(bases, on=False)
 
     # -- how
 
-    def _drive(self, bases: Sequence[str]) -> None:
-        """Drive these robots from now on; returns at a random moment after all of them move."""
-        self._driver.send(" ".join(bases))
-        _wait(lambda: all(map(is_moving, self._moves(bases))), "not all robots moved when they were driven", _MOVING_S)
-        time.sleep(random.random() / drivers.RATE_HZ)  # noqa: S311  (no secret)
+    def _stop(
+        self, bases: Sequence[str], *, every: bool, start: Callable[[], object] | None = None
+    ) -> tuple[int, dict[str, list[int]]]:
+        """Stops these robots, or ``every`` one as ``--all`` does, and waits until these have confirmed it.
 
-    def _release(self, bases: Sequence[str]) -> None:
-        """Drive no robot."""
-        self._driver.send("")
-        _wait(lambda: not any(map(is_moving, self._moves(bases))), "not all robots came to rest", _MOVING_S)
+        It is held for those that ``start`` starts. Returns when it began, and for each robot when its first message,
+        the first state that says it is stopped, and its confirmation arrived (CLOCK_MONOTONIC, ns). Raises PebbleError
+        if one does not confirm it.
+        """
+        hold, times = start is not None, defaultdict[str, list[int]](list)
+        filters = (
+            [ALL_OUTGOING] if every else [one.filter(base) for one in (ESTOP_STATE, CAPABILITIES) for base in bases]
+        )
+        with connected(self._target) as (transport, _):
+            began, timeout = time.monotonic_ns(), _STARTED_S if hold else _ANSWER_S
+            named = None if every else bases
+            sender = StopSender(new_name(), by=_BY, why="", now=began / 1e9, robots=named, hold=hold)
+            send(transport, sender.tick(time.monotonic()))
+            listener = Listener(transport, filters)
+            if start is not None:
+                start()
+            while any(len(times[base]) < _REACHED for base in bases):
+                if time.monotonic_ns() - began > timeout * 1e9:
+                    missing = [f"{base}: {robot.why}" for base, robot in sender.robots.items() if robot.why]
+                    raise PebbleError(f"a stop was not confirmed within {timeout:.0f} s: {'; '.join(missing)}")
+                left = _TICK_S
+                while (message := listener.next(left)) is not None:
+                    now, left, base = time.monotonic_ns(), 0.0, message.topic.partition("/outgoing/")[0]
+                    sender.receive(message, now / 1e9)
+                    if (robot := sender.robots.get(base)) is not None:
+                        reached = 1 + bool(robot.estop.latched) + (robot.confirmed_s is not None)
+                        times[base] += [now] * (reached - len(times[base]))
+                send(transport, sender.tick(time.monotonic()))
+        return began, times
+
+    def _drive(self, bases: Sequence[str], *, on: bool = True) -> None:
+        """Drive these robots from now on, or none; returns at a random moment after all of them move, or rest."""
+        self._driver.send(" ".join(bases) if on else "")
+        _wait(lambda: {on} == set(map(is_moving, self._moves(bases))), "not all robots moved or came to rest")
+        time.sleep(random.random() / drivers.RATE_HZ)  # noqa: S311  (no secret)
 
     def _reset(self, bases: Sequence[str]) -> None:
         """Let these robots, which are stopped, move again. Raises PebbleError if one does not confirm it."""
-        self._release(bases)
+        self._drive(bases, on=False)
         robots = [RobotEstop(base) for base in bases]
         with connected(self._target) as (transport, _):
             for robot in robots:
@@ -195,11 +186,9 @@ class Robots(Processes):
         """When the last of these robots came to rest, and whether one of them moved again meanwhile."""
         time.sleep(_WATCH_S)
         times, again = zip(*(rest(moves, began) for moves in self._moves(bases)), strict=True)
-        known = [ns for ns in times if ns is not None]
-        last = max(known) if len(known) == len(times) else None
-        return sample(REST, robot, variant, began, last, again=any(again))
+        return sample(REST, robot, variant, began, None if None in times else max(times), again=any(again))
 
-    def _moves(self, bases: Collection[str]) -> list[list[Moved]]:
+    def _moves(self, bases: Sequence[str]) -> list[list[Moved]]:
         """Every change of their motors so far, by robot."""
         changes = read_moves(self._trace) if self._trace.exists() else {}
         for robot in self.linux.values():
@@ -208,19 +197,19 @@ class Robots(Processes):
         return [changes.get(base.rpartition("/")[2], []) for base in bases]
 
 
-def _wait(condition: Callable[[], bool], problem: str, seconds: float = _ANSWER_S) -> None:
-    end = time.monotonic() + seconds
+def _wait(condition: Callable[[], bool], problem: str) -> None:
+    end = time.monotonic() + _ANSWER_S
     while not condition():
         if time.monotonic() > end:
-            raise PebbleError(f"{problem} within {seconds:.0f} s")
+            raise PebbleError(f"{problem} within {_ANSWER_S:.0f} s")
         time.sleep(_POLL_S)
 
 
 def measure(round_: Round) -> Iterator[Cell]:
     """One round, with processes of its own. Raises PebbleError."""
     run, env = round_.run, round_.env
-    run.show("Linux robots start while a stop is held")
     for kind, robot in env.linux.items():
+        run.show(f"{kind}: the robot starts while a stop is held")
         yield from env.hold(kind, robot.launch, [robot.base])
     for number in range(run["stops"]):
         run.show(f"stop {number + 1} of {run['stops']} of one robot")
