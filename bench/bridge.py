@@ -7,14 +7,14 @@ import socket
 import struct
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from itertools import pairwise
+from itertools import pairwise, product
 from statistics import fmean
 
 from pebble.bench import null
 from pebble.bench.aims import Aim, RatioAim, with_lost
-from pebble.bench.bridge_operator import ALL, HOP, STAND_IN, DrivenRobot, Turn, Wheels, driven_robot, wheels_of
+from pebble.bench.bridge_operator import ALL, HOP, STAND_IN, Arrived, DrivenRobot, Turn, Wheels, driven_robot, wheels_of
 from pebble.bench.comparison import Budget, Case, Comparison, Option, Round, Run, of_known, rounds, seconds, variants
 from pebble.bench.drivers import RATE_HZ
 from pebble.bench.pictures import bars, ecdf, null_ratios, ratios
@@ -49,25 +49,29 @@ def prepare(run: Run) -> None:
         raise PebbleError(f"{' and '.join(named)} are different runs: give one of them")
 
 
+@contextmanager
+def running(kinds: Iterable[str], *, media: bool = False, reports: bool = True) -> Iterator[dict[str, DrivenRobot]]:
+    """Fresh robots, which are ready; with ``reports`` they forward those of their MCUs."""
+    with ExitStack() as stack:
+        driven = {kind: stack.enter_context(driven_robot(kind, media=media, reports=reports)) for kind in kinds}
+        for one in driven.values():
+            one.wait_until_ready()
+        time.sleep(_STARTUP_S)
+        yield driven
+
+
 def measure(round_: Round) -> Iterator[Cell]:
     """Fresh robots that forward reports, also with media; and fresh ones that do not. In turn, the other way round."""
     run = round_.run
     for load in (COMMANDS, UNLOADED) if round_.number % 2 else (UNLOADED, COMMANDS):
         reports, media = load == UNLOADED, load == UNLOADED and bool(run.options.get("with-media"))
-        with ExitStack() as stack:
-            run.show("starting the robots")
-            driven = {
-                kind: stack.enter_context(driven_robot(kind, media=media and kind in KINDS, reports=reports))
-                for kind in (*run["variants"], *([HOP] if reports else []))
-            }
-            for one in driven.values():
-                one.wait_until_ready()
-            time.sleep(_STARTUP_S)
+        run.show("starting the robots")
+        with running([*run["variants"], *([HOP] if reports else [])], media=media, reports=reports) as driven:
             yield from _in_turns(round_, load, driven, _TURN_S, RATE_HZ)
             for case in round_.cases([{"load": LOADED}], 1) if media else ():
                 if case.variant in KINDS:  # the stand-in has no media
                     turn = driven[case.variant].drive_with_media(min(run["seconds"], _LOADED_S))
-                    yield from cells_of(case, turn)
+                    yield from cells_of(case, turn, driven[case.variant].arrived([turn]))
 
 
 def _in_turns(
@@ -80,46 +84,31 @@ def _in_turns(
         if (robot := driven.get(case.variant)) is not None:
             turns.append((case, robot.drive(turn_s, rate_hz, work_us=case.planted_us, slowed=case.slowed)))
     for name, own in grouped(turns, lambda one: one[0].variant).items():
-        driven[name].match_arrivals([turn for _, turn in own])
+        arrived = driven[name].arrived([turn for _, turn in own])
         for case, turn in own:
-            yield from cells_of(case, turn)
+            yield from cells_of(case, turn, arrived)
 
 
-def cells_of(case: Case, turn: Turn) -> Iterator[Cell]:
+def cells_of(case: Case, turn: Turn, arrived: Arrived) -> Iterator[Cell]:
     load, took_s = case.condition["load"], (turn.ended - turn.began) / 1e9
     figures = {"cpu_percent": 100 * turn.cpu_s[ALL] / took_s} if ALL in turn.cpu_s else {}
-    down = [(ns - turn.sent[wheels]) / 1e6 for wheels, ns in turn.arrived.items()]
+    down = [(arrived.commands[one] - ns) / 1e6 for one, ns in turn.sent.items() if one in arrived.commands]
     yield case.cell(DOWN, "ms", down, sent=len(turn.sent), **figures)
     if case.run.comparison.is_null:
         return
     if load != COMMANDS and case.variant != HOP:
-        up = [(ns - sent) / 1e6 for sent, ns in turn.reports if ns is not None]
-        yield case.cell(UP, "ms", up, sent=len(turn.reports))
+        own = [(sent, ns) for sent, ns in arrived.reports if turn.began <= sent <= turn.ended]
+        yield case.cell(UP, "ms", [(ns - sent) / 1e6 for sent, ns in own if ns is not None], sent=len(own))
+    forwarded = len(down) + sum(turn.began <= ns <= turn.ended for ns, _ in arrived.received)
     for part, cpu_s in turn.cpu_s.items():
         if part != ALL and load != LOADED:
-            each = [1e6 * cpu_s / turn.forwarded] if turn.forwarded else []
-            yield case.cell(CPU, "us", each, {"process": part})
-
-
-# -- the null test, of one robot for all roles and rounds: fresh ones would differ by more than the planted difference
-
-
-@contextmanager
-def running(kind: str) -> Iterator[DrivenRobot]:
-    with driven_robot(kind) as driven:
-        driven.wait_until_ready()
-        time.sleep(_STARTUP_S)
-        yield driven
+            yield case.cell(CPU, "us", [1e6 * cpu_s / forwarded] if forwarded else [], {"process": part})
 
 
 def pilot(case: Case) -> Iterator[Cell]:
-    """The usual latency."""
-    turn = case.env.drive(_PILOT_S, _NULL_RATE_HZ)
-    case.env.match_arrivals([turn])
-    return cells_of(case, turn)
-
-
-# -- the profile
+    """The usual latency, for the null test of one robot: fresh ones would differ by more than what is planted."""
+    turn = case.env[case.variant].drive(_PILOT_S, _NULL_RATE_HZ)
+    return cells_of(case, turn, case.env[case.variant].arrived([turn]))
 
 
 def trace_commands(case: Case) -> Iterator[Cell]:
@@ -128,16 +117,17 @@ def trace_commands(case: Case) -> Iterator[Cell]:
         wire = socket.socket(socket.AF_PACKET, socket.SOCK_DGRAM)  # no protocol: it receives nothing yet
     except OSError as error:
         raise PebbleError(f"--profile captures packets on loopback, which requires root: {error.strerror}") from None
-    with wire, running(case.variant) as driven:
+    with wire, running([case.variant]) as robots:
         wire.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, _BUFFER)
         wire.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
         wire.setblocking(False)
         wire.bind(("lo", _ETH_P_IP))
+        driven = robots[case.variant]
         turn = driven.drive(case.run["seconds"])
-        driven.match_arrivals([turn])  # waits for the last ones
+        arrived = driven.arrived([turn])  # waits for the last ones
         found = passed(wire)
         ends = [found[port, end] for port in driven.robot.broker_ports for end in ("to", "from")]
-        times = hops(turn.sent, [*ends, turn.arrived])
+    times = hops(turn.sent, [*ends, arrived.commands])
     for name, each in zip(HOPS[case.variant], times, strict=True):
         yield case.cell("hop", "ms", each, {"hop": name})
 
@@ -169,44 +159,37 @@ def commands(packet: bytes) -> list[tuple[int, int, Wheels]]:
     return [(source, destination, wheels_of(found)) for found in _COMMAND.findall(packet)]
 
 
-# -- the report
-
-
 def _of(measure: str, kinds: Sequence[str], **params: str) -> Callable[[Cell], bool]:
     return lambda cell: cell.measure == measure and cell.variant in kinds and params.items() <= cell.params.items()
 
 
-AIMS = (
-    *(
-        Aim(
+def _aims() -> Iterator[Aim | RatioAim]:
+    alone, both, forwards = "command to the wheels, commands only", "commands and reports", {"load": UNLOADED}
+    ways = (
+        (DOWN, UNLOADED, "command to the wheels"),
+        (UP, UNLOADED, "report to the operator"),
+        (DOWN, COMMANDS, alone),
+    )
+    for (measure_, load, what), (percent, ms, least) in product(ways, ((50, 0.7, 1), (99, 2.0, 300))):
+        yield Aim(
             what=f"{{variant}}, {what}, p{percent} at most {{bound:g}} ms", of=_of(measure_, KINDS, load=load),
-            value=with_lost(percent), at_most=ms, unit="ms", least=least, least_rounds=LEAST_ROUNDS,
-            never="not within 1 s",
-        )
-        for measure_, load, what in (
-            (DOWN, UNLOADED, "command to the wheels"),
-            (UP, UNLOADED, "report to the operator"),
-            (DOWN, COMMANDS, "command to the wheels, commands only"),
-        )
-        for percent, ms, least in ((50, 0.7, 1), (99, 2.0, 300))  # with fewer samples, hardly any lie beyond p99
-    ),
-    *(
-        RatioAim(
-            what=f"{{variant}}, command to the wheels, commands only, p{percent} at most {{bound:.2f}} of {STAND_IN}'s",
-            of=_of(DOWN, [kind], load=COMMANDS), to=STAND_IN, percent=percent, at_most=at_most, least=least,
-        )
-        for percent, bounds, least in ((50, (1.0, 1.05), 1), (99, (0.5, 0.5), 100))  # as above, in each round
-        for kind, at_most in zip(KINDS, bounds, strict=True)
-    ),
-    *(
-        RatioAim(
-            what=f"{{variant}}, {CPU} of the {process}, commands and reports, at most {{bound:.2f}} of {STAND_IN}'s",
-            of=_of(CPU, [kind], load=UNLOADED, process=process), to=STAND_IN, at_most=at_most,
-        )
-        for process, bounds in (("bridge", (1.0, 1.1)), ("serial bridge", (1.1, 1.4)))
-        for kind, at_most in zip(KINDS, bounds, strict=True)
-    ),
-)  # fmt: skip
+            value=with_lost(percent), at_most=ms, unit="ms", never="not within 1 s",
+            least=least, least_rounds=LEAST_ROUNDS,  # with fewer samples, hardly any lie beyond p99
+        )  # fmt: skip
+    beside = (
+        (f"{alone}, p50", DOWN, {"load": COMMANDS}, 50, 1, (1.0, 1.05)),
+        (f"{alone}, p99", DOWN, {"load": COMMANDS}, 99, 100, (0.5, 0.5)),
+        (f"{CPU} of the bridge, {both},", CPU, {**forwards, "process": "bridge"}, 50, 1, (1.0, 1.1)),
+        (f"{CPU} of the serial bridge, {both},", CPU, {**forwards, "process": "serial bridge"}, 50, 1, (1.1, 1.4)),
+    )
+    for what, measure_, params, percent, least, bounds in beside:
+        for kind, at_most in zip(KINDS, bounds, strict=True):
+            yield RatioAim(
+                what=f"{{variant}}, {what} at most {{bound:.2f}} of {STAND_IN}'s", of=_of(measure_, [kind], **params),
+                to=STAND_IN, percent=percent, at_most=at_most, least=least,
+            )  # fmt: skip
+
+
 LATENCIES = Grid(
     title="Commands down, reports up; and the load on the robot, % of a core", rows=("conditions", "variant"),
     columns=(
@@ -242,11 +225,9 @@ BRIDGE_NULL = Comparison(
     variants=KINDS[1:],
     conditions=lambda _run: [{"load": UNLOADED}],
     prepare=prepare,
-    environment=lambda run: running(run["variants"][0]),
+    environment=lambda run: running(run["variants"]),
     measure=pilot,
-    measure_round=lambda round_: _in_turns(
-        round_, UNLOADED, {round_.run["variants"][0]: round_.env}, _NULL_TURN_S, _NULL_RATE_HZ
-    ),
+    measure_round=lambda round_: _in_turns(round_, UNLOADED, round_.env, _NULL_TURN_S, _NULL_RATE_HZ),
     tables=(LATENCIES,),
     assessment=(null.assessment,),
     words=("bench", "bridge"),
@@ -301,7 +282,7 @@ BRIDGE = Comparison(
             what="Median, {measure}, load {load}", judged=lambda cell: cell.params["load"] == UNLOADED,
             of=lambda cell: cell.measure != CPU and cell.variant in KINDS,
         ),
-        *AIMS,
+        *_aims(),
     ),
     modes={"null": BRIDGE_NULL, "profile": BRIDGE_PROFILE},
     summary_lines=3,

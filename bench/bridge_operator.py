@@ -16,9 +16,8 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from paho.mqtt.client import MQTTMessage
 
@@ -47,27 +46,23 @@ _UP_S, _STARTUP_S, _ANSWER_S = 30.0, 1.0, 5.0
 _ARRIVE_S = 1.0  # commands and reports that take longer count as lost
 
 Wheels = tuple[float, float]
-Reports = Sequence[tuple[int, int | None]]  # when each was sent, and when it was received; None: it was not
-Received = Sequence[tuple[int, Touch]]  # all reports that were received, with their times
 
 
-@dataclass(slots=True, kw_only=True)
-class Turn:
+class Turn(NamedTuple):
     """One turn of driving. All times are CLOCK_MONOTONIC, ns."""
 
-    began: int = 0
-    ended: int = 0
-    sent: dict[Wheels, int] = field(default_factory=dict)  # when each command was, by its wheel speeds
-    cpu_s: Mapping[str, float] = field(default_factory=dict)  # of the robot's processes: of all, and of its bridges
-    arrived: Mapping[Wheels, int] = field(default_factory=dict)  # when commands reached the MCU
-    reports: Reports = ()  # of its MCU
-    forwarded: int = 0  # commands and reports that arrived
+    began: int
+    ended: int
+    sent: Mapping[Wheels, int]  # when each command was, by its wheel speeds
+    cpu_s: Mapping[str, float]  # of the robot's processes: of all, and of its bridges
 
-    def match(self, commands: Mapping[Wheels, int], reports: Reports, received: Received = ()) -> None:
-        """Takes what belongs to the turn; ``received`` has reports of equal values, too."""
-        self.arrived = {wheels: commands[wheels] for wheels in self.sent if wheels in commands}
-        self.reports = [one for one in reports if self.began <= one[0] <= self.ended]
-        self.forwarded = len(self.arrived) + sum(self.began <= ns <= self.ended for ns, _ in received)
+
+class Arrived(NamedTuple):
+    """What arrived in several turns."""
+
+    commands: Mapping[Wheels, int]  # when each reached the MCU
+    reports: Sequence[tuple[int, int | None]]  # of the MCU: when each was sent, and received; None: it was not
+    received: Sequence[tuple[int, Touch]]  # all reports, also those of equal values
 
 
 def wheels(number: int) -> Wheels:
@@ -81,15 +76,12 @@ def wheels_of(payload: bytes | bytearray) -> Wheels:
     return round(wanted["z"] + wanted["x"], _DIGITS), round(wanted["z"] - wanted["x"], _DIGITS)
 
 
-# -- what arrived
-
-
 def arrivals(entries: Sequence[Entry]) -> dict[Wheels, int]:
     """Maps each command to the time at which it first reached the MCU."""
     return {line.drive: line.ns for line in reversed(entries) if line.drive is not None}
 
 
-def matched(entries: Sequence[Entry], received: Received) -> list[tuple[int, int | None]]:
+def matched(entries: Sequence[Entry], received: Sequence[tuple[int, Touch]]) -> list[tuple[int, int | None]]:
     """Pairs the time each report was sent with the time it was received; None if it was not.
 
     A report is identified by its values: while the wheels turn, the sensors never report the same values for long.
@@ -101,9 +93,6 @@ def matched(entries: Sequence[Entry], received: Received) -> list[tuple[int, int
     wanted = {touch: ns for ns, touch in published if times[touch] == 1}
     first = {touch: ns for ns, touch in reversed(received) if touch in wanted and ns >= wanted[touch]}
     return [(ns, first.get(touch)) for touch, ns in wanted.items()]
-
-
-# -- what is driven
 
 
 class DrivenRobot(StockClient):
@@ -142,31 +131,30 @@ class DrivenRobot(StockClient):
         """
         groups = {ALL: self.robot.pids(), **self._parts}
         before = {name: cpu_s(pids) for name, pids in groups.items()}
-        turn, due = Turn(began=time.monotonic_ns()), time.monotonic()
+        sent: dict[Wheels, int] = {}
+        began, due = time.monotonic_ns(), time.monotonic()
         for _ in range(round(seconds * rate_hz)):
             self._number += 1
             left, right = wheels(self._number)
             spin(0.0 if slowed else work_us)
-            turn.sent[left, right] = time.monotonic_ns()
+            sent[left, right] = time.monotonic_ns()
             spin(work_us if slowed else 0.0)
             self.send(contract.DRIVE, BASE, {"x": (left - right) / 2, "z": (left + right) / 2})
             due += 1 / rate_hz
             time.sleep(max(0.0, due - time.monotonic()))
-        turn.ended = time.monotonic_ns()
-        turn.cpu_s = {name: cpu_s(pids) - before[name] for name, pids in groups.items() if pids}
-        if min(turn.cpu_s.values(), default=1.0) <= 0:
+        ended = time.monotonic_ns()
+        used = {name: cpu_s(pids) - before[name] for name, pids in groups.items() if pids}
+        if min(used.values(), default=1.0) <= 0:
             raise PebbleError(f"{self.robot.kind}: a process ended while it was driven\n{self.robot.log()}")
-        return turn
+        return Turn(began, ended, sent, used)
 
-    def match_arrivals(self, turns: Sequence[Turn]) -> None:
-        """Waits until the last commands and reports have arrived or count as lost; adds to each turn what arrived."""
+    def arrived(self, turns: Sequence[Turn]) -> Arrived:
+        """Waits until the last commands and reports have arrived or count as lost."""
         time.sleep(max(0.0, turns[-1].ended / 1e9 + _ARRIVE_S - time.monotonic()))
         since = turns[0].began
         entries = self.robot.lines(since)
         received = [(ns, Touch(**json.loads(raw)["value"])) for ns, raw in self._received.copy() if ns >= since]
-        commands, reports = arrivals(entries), matched(entries, received)
-        for turn in turns:
-            turn.match(commands, reports, received)
+        return Arrived(arrivals(entries), matched(entries, received), received)
 
     def drive_with_media(self, seconds: float) -> Turn:
         """The same with its camera and microphone in use: a program on the robot reads frames, an operator gets both.
@@ -193,7 +181,6 @@ class DrivenRobot(StockClient):
         for worker in workers:
             robot.running.end(worker)
         robot.expect(lambda: len(robot.pids()) <= at_rest, "its media do not end", _UP_S)
-        self.match_arrivals([turn])
         return turn
 
     def _allow_media(self, wanted: bool) -> None:
@@ -252,9 +239,6 @@ def driven_robot(kind: str, *, media: bool = False, reports: bool = True) -> Ite
         robot.launch()
         with closing(DrivenRobot(robot)) as driven:
             yield driven
-
-
-# -- programs beside the robot
 
 
 def frames(run_dir: str) -> None:

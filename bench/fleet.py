@@ -102,9 +102,6 @@ def longest_gap_s(robots: Sequence[Sequence[int]], began: int, ended: int) -> fl
     return max(b - a for own in robots for a, b in itertools.pairwise([began, *own, ended])) / 1e9
 
 
-# -- the operator
-
-
 def drive_fleet(port: int, seconds: float, ids: Sequence[str]) -> None:
     """Drives a whole fleet in :data:`STEPS`, evenly spread, and subscribes to all heartbeats.
 
