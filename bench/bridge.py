@@ -26,9 +26,6 @@ from pebble.rig.robot import KINDS
 
 UNLOADED, COMMANDS, LOADED = "none", "commands", "media"  # unloaded: 20 commands and 50 reports a second
 DOWN, UP, CPU = "down", "up", "CPU per message"
-_TURN_S = 1.0  # of driving one robot before the next one
-_NULL_TURN_S = 0.05  # very short, so that a disturbance of the machine hits all roles
-_NULL_RATE_HZ = 100.0  # more than an operator's 20 a second, to shorten the test
 _STARTUP_S = 1.0  # for start-up work to finish
 _LOADED_S = 4.0  # at most, of driving each robot while media flow
 _PILOT_S = 2.0
@@ -67,22 +64,21 @@ def measure(round_: Round) -> Iterator[Cell]:
         reports, media = load == UNLOADED, load == UNLOADED and bool(run.options.get("with-media"))
         run.show("starting the robots")
         with running([*run["variants"], *([HOP] if reports else [])], media=media, reports=reports) as driven:
-            yield from _in_turns(round_, load, driven, _TURN_S, RATE_HZ)
+            yield from _in_turns(round_, load, driven)
             for case in round_.cases([{"load": LOADED}], 1) if media else ():
                 if case.variant in KINDS:  # the stand-in has no media
                     turn = driven[case.variant].drive_with_media(min(run["seconds"], _LOADED_S))
                     yield from cells_of(case, turn, driven[case.variant].arrived([turn]))
 
 
-def _in_turns(
-    round_: Round, load: str, driven: Mapping[str, DrivenRobot], turn_s: float, rate_hz: float
-) -> Iterator[Cell]:
+def _in_turns(round_: Round, load: str, driven: Mapping[str, DrivenRobot]) -> Iterator[Cell]:
     """Drives each of them for the seconds of a round, in turns of about ``turn_s``."""
-    passes = max(1, round(round_.run["seconds"] / turn_s))
-    turn_s, turns = round_.run["seconds"] / passes, []
+    run, turns = round_.run, []
+    passes = max(1, round(run["seconds"] / run["turn_s"]))
     for case in round_.cases([{"load": load}], passes):
         if (robot := driven.get(case.variant)) is not None:
-            turns.append((case, robot.drive(turn_s, rate_hz, work_us=case.planted_us, slowed=case.slowed)))
+            turn = robot.drive(run["seconds"] / passes, run["rate_hz"], work_us=case.planted_us, slowed=case.slowed)
+            turns.append((case, turn))
     for name, own in grouped(turns, lambda one: one[0].variant).items():
         arrived = driven[name].arrived([turn for _, turn in own])
         for case, turn in own:
@@ -107,7 +103,7 @@ def cells_of(case: Case, turn: Turn, arrived: Arrived) -> Iterator[Cell]:
 
 def pilot(case: Case) -> Iterator[Cell]:
     """The usual latency, for the null test of one robot: fresh ones would differ by more than what is planted."""
-    turn = case.env[case.variant].drive(_PILOT_S, _NULL_RATE_HZ)
+    turn = case.env[case.variant].drive(_PILOT_S, case.run["rate_hz"])
     return cells_of(case, turn, case.env[case.variant].arrived([turn]))
 
 
@@ -123,7 +119,7 @@ def trace_commands(case: Case) -> Iterator[Cell]:
         wire.setblocking(False)
         wire.bind(("lo", _ETH_P_IP))
         driven = robots[case.variant]
-        turn = driven.drive(case.run["seconds"])
+        turn = driven.drive(case.run["seconds"], case.run["rate_hz"])
         arrived = driven.arrived([turn])  # waits for the last ones
         found = passed(wire)
         ends = [found[port, end] for port in driven.robot.broker_ports for end in ("to", "from")]
@@ -210,24 +206,23 @@ _OPTIONS = (
     Option(name="null", kind=bool, recorded=False, help="One robot against itself, also slowed down by a fifth."),
     Option(name="profile", kind=bool, recorded=False, help="Latency of a command hop by hop."),
 )
-_OURS = variants(KINDS, "mqtt or zenoh.")
 
 BRIDGE_NULL = Comparison(
     name="bridge-null",
     title="Operator to wheels: the null test",
     what="One robot in three roles that take turns: plain, again, and with a fifth of the usual latency planted by "
     "the operator. The first interval must include 1.00, the second must lie above it.",
-    options=(*_OPTIONS, _OURS),
-    full=Budget(150, null=True, rounds=10, seconds=4.0, fresh_every=10_000),
+    options=(*_OPTIONS, variants(KINDS)),
+    # many messages, and very short turns, so that a disturbance of the machine hits all roles
+    full=Budget(150, null=True, rounds=10, seconds=4.0, turn_s=0.05, rate_hz=100.0, fresh_every=10_000),
     quick=Budget(14, rounds=4, seconds=0.5),
-    constants={"rate_hz": _NULL_RATE_HZ},
     is_null=True,
     variants=KINDS[1:],
     conditions=lambda _run: [{"load": UNLOADED}],
     prepare=prepare,
     environment=lambda run: running(run["variants"]),
     measure=pilot,
-    measure_round=lambda round_: _in_turns(round_, UNLOADED, round_.env, _NULL_TURN_S, _NULL_RATE_HZ),
+    measure_round=lambda round_: _in_turns(round_, UNLOADED, round_.env),
     tables=(LATENCIES,),
     assessment=(null.assessment,),
     words=("bench", "bridge"),
@@ -239,10 +234,9 @@ BRIDGE_PROFILE = Comparison(
     title="Operator to wheels: where the time goes",
     what="The same path of a command, hop by hop, from the time stamps of its packets on loopback: for a typical "
     "command, and for the slowest ones.",
-    options=(*_OPTIONS, _OURS),
-    full=Budget(60, profile=True, rounds=3, seconds=10.0),
+    options=(*_OPTIONS, variants(KINDS)),
+    full=Budget(60, profile=True, rounds=3, seconds=10.0, rate_hz=RATE_HZ),
     quick=Budget(12, rounds=1, seconds=2.0),
-    constants={"rate_hz": RATE_HZ},
     variants=KINDS,
     prepare=prepare,
     measure=trace_commands,
@@ -267,9 +261,8 @@ BRIDGE = Comparison(
     help="Drive commands from an operator to the wheels of a whole simulated robot, and its telemetry back: on MQTT, "
     "Zenoh and plain paho, compared with one hop through a stock broker. Needs mosquitto.",
     options=(*_OPTIONS, variants((STAND_IN, *KINDS), "paho, mqtt, zenoh; --null: one of ours, zenoh by default.")),
-    full=Budget(1900, rounds=10, seconds=25.0),
+    full=Budget(1900, rounds=10, seconds=25.0, turn_s=1.0, rate_hz=RATE_HZ),
     quick=Budget(22, rounds=2, seconds=0.5),
-    constants={"rate_hz": RATE_HZ},
     variants=(STAND_IN, *KINDS),
     references=(HOP,),
     prepare=prepare,

@@ -116,9 +116,7 @@ class DrivenRobot(StockClient):
         """Raises PebbleError if it does not become so."""
         robot = self.robot
         with closing(RobotSubscriber(robot.remote_port, BASE)) as seen:
-            robot.expect(
-                lambda: None not in (seen.ready_ns, seen.first_heartbeat_ns), f"{robot.kind}: not ready", _UP_S
-            )
+            robot.expect(lambda: None not in (seen.ready_ns, seen.first_heartbeat_ns), "it is not ready", _UP_S)
         running = robot.processes()
         self._parts = {part: [running[name]] for part, name in SERVICES.items() if name in running}
         if running and len(self._parts) < len(SERVICES):
