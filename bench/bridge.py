@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from itertools import pairwise, product
 from statistics import fmean
+from typing import Any
 
 from pebble.bench import null
 from pebble.bench.aims import Aim, RatioAim, with_lost
@@ -87,7 +88,7 @@ def _in_turns(round_: Round, load: str, driven: Mapping[str, DrivenRobot]) -> It
 
 def cells_of(case: Case, turn: Turn, arrived: Arrived) -> Iterator[Cell]:
     load, took_s = case.condition["load"], (turn.ended - turn.began) / 1e9
-    figures = {"cpu_percent": 100 * turn.cpu_s[ALL] / took_s} if ALL in turn.cpu_s else {}
+    figures: dict[str, Any] = {"cpu_percent": 100 * turn.cpu_s[ALL] / took_s} if ALL in turn.cpu_s else {}
     down = [(arrived.commands[one] - ns) / 1e6 for one, ns in turn.sent.items() if one in arrived.commands]
     yield case.cell(DOWN, "ms", down, sent=len(turn.sent), **figures)
     if case.run.comparison.is_null:

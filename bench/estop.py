@@ -11,6 +11,7 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
+from typing import Any
 
 from pebble.bench import drivers
 from pebble.bench.aims import Aim, single, with_lost
@@ -54,7 +55,7 @@ def is_moving(moves: Sequence[Moved]) -> bool:
     return bool(moves) and any(moves[-1].motors)
 
 
-def cell_of(case: Case, measure: str, began: int, ended: int | None, **figures: int) -> Cell:
+def cell_of(case: Case, measure: str, began: int, ended: int | None, **figures: Any) -> Cell:
     """One time (CLOCK_MONOTONIC, ns). None: it did not happen."""
     return case.cell(measure, "ms", [] if ended is None else [(ended - began) / 1e6], sent=1, **figures)
 
@@ -116,7 +117,7 @@ class Robots(Processes):
         client = drivers.StockClient(at_once=False).open(self._port)
         client.wait()
         began = time.monotonic_ns()
-        client.send(DRIVE, *self._bases[robots], drivers.ZERO).wait_for_publish(_ANSWER_S)
+        client.send(DRIVE, self._bases[robots][0], drivers.ZERO).wait_for_publish(_ANSWER_S)
         client.close()
         yield self._rest(case, robots, began)
         self._drive(robots, on=False)
