@@ -203,8 +203,7 @@ class StandIn(Robot):
     """What a user would have without us."""
 
     def launch(self) -> None:
-        local = 0 if self.local_broker is None else self.local_broker.port
-        rest = (local, self.remote_port, self.base, self.port, *(["--reports"] if self.reports else []))
+        rest = (*self.broker_ports[::-1], self.base, self.port, *(["--reports"] if self.reports else []))
         for part in ("bridge", "serial"):
             self.start(f"the stand-in's {part}", python("pebble.bench.stand_in", part, *rest))
 

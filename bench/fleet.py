@@ -23,7 +23,7 @@ from paho.mqtt.client import MQTTMessage
 from pebble.bench.comparison import Budget, Case, Comparison, Option, seconds
 from pebble.bench.drivers import MANY, StockClient
 from pebble.bench.pictures import ecdf
-from pebble.bench.results import Cell, grouped, percentile, rounded
+from pebble.bench.results import Cell, grouped, rounded
 from pebble.bench.tables import COUNT, LOST, Grid, percentile_column, single_column
 from pebble.bench.usage import cpu_s, pss_mb
 from pebble.contract import DRIVE, ONLINE
@@ -66,12 +66,10 @@ def cell_of(case: Case, found: dict[str, Any], moves: dict[str, list[Moved]], co
     robots, sent = case.run["robots"], found["sent"]
     began, ended = min(map(min, sent.values())), max(map(max, sent.values()))
     heartbeats = [[ns for ns in own if began <= ns <= ended] for own in found["heartbeats"]]
-    rates = [(len(own) - 1) / (own[-1] - own[0]) * 1e9 for own in heartbeats if len(own) > 1]
     return case.cell(
         "command to pins", "ms", latencies_ms(sent, moves), {"robots": robots, "rate": f"{RATE_HZ:g} Hz"},
         sent=sum(map(len, sent.values())),
         late=found["late"],
-        beats_median_hz=rounded(percentile(rates, 50), 3),
         longest_gap_s=rounded(longest_gap_s(heartbeats, began, ended), 3),
         mb_per_robot=rounded(cost.pop("mb") / robots, 3),
         **{f"cpu_{name}": rounded(share, 1) for name, share in cost.items()},
@@ -137,8 +135,8 @@ def drive_fleet(port: int, seconds: float, ids: Sequence[str]) -> None:
 
 
 _COLUMNS = {
-    "sent": "sent", "late": "late", "beats/s": "beats_median_hz", "gap s": "longest_gap_s", "broker": "cpu_broker",
-    "fleet": "cpu_fleet", "operator": "cpu_operator", "MB": "mb_per_robot",
+    "sent": "sent", "late": "late", "gap, s": "longest_gap_s",
+    "broker": "cpu_broker", "fleet": "cpu_fleet", "operator": "cpu_operator", "MB": "mb_per_robot",
 }  # fmt: skip
 FLEET = Comparison(
     name="fleet",
@@ -157,7 +155,7 @@ FLEET = Comparison(
     measure=measure,
     tables=(
         Grid(
-            title="Command to pins, ms; a robot's heartbeats and longest time without; CPU, % of a core; MB of each",
+            title="Command to pins, ms; longest gap between heartbeats; CPU, % of a core; memory of each robot",
             rows=("robots", "rate"),
             columns=(
                 *map(percentile_column, (50, 95, 99, 100)), COUNT, LOST,

@@ -104,7 +104,7 @@ def test_a_small_fleet_is_measured() -> None:
     assert cell.figures["sent"] == 500
     assert cell.lost is not None
     assert cell.lost <= 0.8 * 500  # overtaken, where a busy machine let several wait
-    assert cell.figures["beats_median_hz"] == pytest.approx(4.0, rel=0.25)
+    assert 0.2 < cell.single("longest_gap_s") < 2.0  # of heartbeats at 4 Hz
     assert cell.percentile(50) < 200
     assert {"cpu_broker", "cpu_fleet", "cpu_operator"} <= cell.figures.keys()
     assert 0 < cell.figures["mb_per_robot"] < 20
