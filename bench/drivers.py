@@ -50,9 +50,7 @@ class StockClient:
         self.paho.on_subscribe = lambda *_: self._ready.set()
         self.paho.on_message = lambda _client, _data, message: receive(message)
         if at_once:
-            self.paho.on_socket_open = lambda _client, _data, sock: sock.setsockopt(
-                socket.IPPROTO_TCP, socket.TCP_NODELAY, 1
-            )
+            self.paho.on_socket_open = _send_at_once
 
     def open(self, port: int) -> Self:
         """Connects and starts the network thread; returns before anything was subscribed."""
@@ -84,6 +82,10 @@ class StockClient:
             self.paho.subscribe(self._subscriptions)
         else:
             self._ready.set()
+
+
+def _send_at_once(_client: Client, _data: Any, sock: Any) -> None:
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
 
 class Driver(StockClient):

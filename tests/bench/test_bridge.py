@@ -134,12 +134,13 @@ def turn_of(down: Sequence[float] = (), up: Sequence[float] = (), sent: int = 1,
         **{"began": 0, "ended": MS, "sent": {wheels(number): 0 for number in range(sent)}, "cpu_s": {}, **known}
     )
     commands_ = {wheels(number): round(ms * MS) for number, ms in enumerate(down)}
-    reports = [(0, round(ms * MS)) for ms in up] or [(0, None)]
+    reports = [(0, None)] if not up else [(0, round(ms * MS)) for ms in up]
     return turn, Arrived(commands_, reports, [])
 
 
 def test_cells_have_a_list_of_samples_for_each_round() -> None:
-    case, took = case_of("zenoh", LOADED), {"ended": 500 * MS, "cpu_s": {ALL: 0.1}}
+    case = case_of("zenoh", LOADED)
+    took: dict[str, Any] = {"ended": 500 * MS, "cpu_s": {ALL: 0.1}}
     first = [*cells_of(case, *turn_of([1.0], [2.0], **took)), *cells_of(case, *turn_of([1.5], **took))]
     second = cells_of(case, *turn_of([3.0], [2.5], 2, **took))
     down, up = collected([first, [*second]])
@@ -282,7 +283,7 @@ def test_shared_memory_is_swept_however_it_ends(
 
     swept: list[bool] = []
     monkeypatch.setattr(bridge, "driven_robot", fail)
-    monkeypatch.setattr(bridge.socket, "socket", lambda *_: io.BytesIO())
+    monkeypatch.setattr("pebble.bench.bridge.socket.socket", lambda *_: io.BytesIO())
     monkeypatch.setattr(engine, "sweep", lambda: swept.append(True))
     with pytest.raises(PebbleError, match="no robot today"):
         engine.run(about.run_of(rounds=1, output=tmp_path, console=Console(file=io.StringIO())))
