@@ -134,7 +134,7 @@ def turn_of(down: Sequence[float] = (), up: Sequence[float] = (), sent: int = 1,
         **{"began": 0, "ended": MS, "sent": {wheels(number): 0 for number in range(sent)}, "cpu_s": {}, **known}
     )
     commands_ = {wheels(number): round(ms * MS) for number, ms in enumerate(down)}
-    reports = [(0, None)] if not up else [(0, round(ms * MS)) for ms in up]
+    reports: list[tuple[int, int | None]] = [(0, None)] if not up else [(0, round(ms * MS)) for ms in up]
     return turn, Arrived(commands_, reports, [])
 
 
