@@ -14,11 +14,10 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from contextlib import closing
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from paho.mqtt.client import MQTTMessage
 
@@ -27,18 +26,16 @@ from pebble.bench.drivers import RATE_HZ, StockClient
 from pebble.bench.null import spin
 from pebble.bench.subscribers import RobotSubscriber
 from pebble.bench.usage import cpu_s
-from pebble.contract import DRIVE, ONLINE, STATUS, TOUCH_SENSORS
 from pebble.errors import PebbleError
-from pebble.rig.processes import Processes, python
-from pebble.rig.robot import BASE, Robot, synthetic_media
+from pebble.rig.processes import python
+from pebble.rig.robot import BASE, Robot, one_robot, synthetic_media
 from pebble.rig.worker_end import serve, serve_on_thread
 from pebble.services.serial_mcu_bridge.text.goob_base import Touch, parse
 from pebble.simulation.trace import Entry, Trace
 
 STAND_IN, HOP = "paho", "one hop"  # paho: two plain programs in place of a robot of ours, see stand_in
-ALL, FORWARDER, SERIAL = "all", "bridge", "serial bridge"  # processes of a robot
-FLOWS = ("frames", "video", "audio")
-_SERVICES = {FORWARDER: "mqtt_bridge", SERIAL: "serial_mcu_bridge"}
+ALL = "all"  # processes of a robot; and those that forward, by the names of their services
+SERVICES = {"bridge": "mqtt_bridge", "serial bridge": "serial_mcu_bridge"}
 _MODULE = "pebble.bench.bridge_operator"
 _MEDIA: Final = synthetic_media((1920, 1080, 30), (640, 360, 15))
 _DIGITS = 3  # of a wheel's speed on the serial line
@@ -47,38 +44,25 @@ _READ_S = 0.2
 _EVERY = 16  # bytes: one in so many of a picture's is read
 _UP_S, _STARTUP_S, _ANSWER_S = 30.0, 1.0, 5.0
 _ARRIVE_S = 1.0  # commands and reports that take longer count as lost
-_POLL_S = 0.05
 
 Wheels = tuple[float, float]
-Reports = Sequence[tuple[int, int | None]]  # when each was sent, and when it was received; None: it was not
-Received = Sequence[tuple[int, Touch]]  # all reports that were received, with their times
 
 
-@dataclass(slots=True, kw_only=True)
-class Turn:
-    """One turn of driving. ``sent`` maps each pair of wheel speeds to the time of its command: CLOCK_MONOTONIC, ns."""
+class Turn(NamedTuple):
+    """One turn of driving. All times are CLOCK_MONOTONIC, ns."""
 
-    began: int = 0
-    ended: int = 0
-    sent: dict[Wheels, int] = field(default_factory=dict)
-    cpu_s: Mapping[str, float] = field(default_factory=dict)  # of the robot's processes: of all, and of its bridges
-    down: Sequence[float] = ()  # latencies of commands, ms
-    up: Sequence[float] = ()  # and of reports
-    reports: int = 0  # that were sent
-    forwarded: int = 0  # commands and reports that arrived
+    began: int
+    ended: int
+    sent: Mapping[Wheels, int]  # when each command was, by its wheel speeds
+    cpu_s: Mapping[str, float]  # of the robot's processes: of all, and of its bridges
 
-    def match(self, commands: Mapping[Wheels, int], reports: Reports, received: Received = ()) -> bool:
-        """Takes what belongs to the turn; ``received`` has reports of equal values, too.
 
-        Returns whether the last command and report arrived. What is missing then was overtaken or lost: order is kept.
-        """
-        arrived = sorted((commands[wheels], sent) for wheels, sent in self.sent.items() if wheels in commands)
-        own = [one for one in reports if self.began <= one[0] <= self.ended]
-        self.down = [(ns - sent) / 1e6 for ns, sent in arrived]
-        self.up = [(ns - sent) / 1e6 for sent, ns in own if ns is not None]
-        self.reports = len(own)
-        self.forwarded = len(arrived) + sum(self.began <= ns <= self.ended for ns, _ in received)
-        return all(last in commands for last in [*self.sent][-1:]) and (not own or own[-1][1] is not None)
+class Arrived(NamedTuple):
+    """What arrived in several turns."""
+
+    commands: Mapping[Wheels, int]  # when each reached the MCU
+    reports: Sequence[tuple[int, int | None]]  # of the MCU: when each was sent, and received; None: it was not
+    received: Sequence[tuple[int, Touch]]  # all reports, also those of equal values
 
 
 def wheels(number: int) -> Wheels:
@@ -92,15 +76,12 @@ def wheels_of(payload: bytes | bytearray) -> Wheels:
     return round(wanted["z"] + wanted["x"], _DIGITS), round(wanted["z"] - wanted["x"], _DIGITS)
 
 
-# -- what arrived
-
-
 def arrivals(entries: Sequence[Entry]) -> dict[Wheels, int]:
     """Maps each command to the time at which it first reached the MCU."""
     return {line.drive: line.ns for line in reversed(entries) if line.drive is not None}
 
 
-def matched(entries: Sequence[Entry], received: Received) -> list[tuple[int, int | None]]:
+def matched(entries: Sequence[Entry], received: Sequence[tuple[int, Touch]]) -> list[tuple[int, int | None]]:
     """Pairs the time each report was sent with the time it was received; None if it was not.
 
     A report is identified by its values: while the wheels turn, the sensors never report the same values for long.
@@ -114,129 +95,106 @@ def matched(entries: Sequence[Entry], received: Received) -> list[tuple[int, int
     return [(ns, first.get(touch)) for touch, ns in wanted.items()]
 
 
-# -- what is driven
+class DrivenRobot(StockClient):
+    """A robot, and its operator on one MQTT connection to the remote broker, with the TCP options of our own clients.
 
-
-class DrivenRobot(Processes):
-    """A robot and its operator: starts both in ``with``. With ``reports`` it forwards those of its MCU.
-
-    The operator has one MQTT connection to the remote broker, with the TCP options of our own clients. TCP_NODELAY: see
-    :class:`StockClient`. TCP_QUICKACK: otherwise a stock broker delays a report by up to 40 ms while its answer to a
-    command is not acknowledged. Without them the comparison would measure that.
+    TCP_NODELAY: see :class:`StockClient`. TCP_QUICKACK: otherwise a stock broker delays a report by up to 40 ms while
+    its answer to a command is not acknowledged. Without them the comparison would measure that.
     """
 
-    def __init__(self, kind: str, *, media: bool = False, reports: bool = True) -> None:
-        super().__init__()
-        self.kind, self._media, self._reports = kind, media, reports
+    def __init__(self, robot: Robot) -> None:
+        channels = (contract.STATUS, contract.ONLINE, contract.TOUCH_SENSORS)
+        super().__init__(self._on_message, [(channel.topic(BASE), 1) for channel in channels])
+        self.paho.on_publish = self._acknowledge
+        self.robot = robot
         self._number = 0  # of the last command
         self._received: list[tuple[int, bytes]] = []  # reports
         self._parts: dict[str, list[int]] = {}  # the processes that forward
+        self.open(robot.remote_port)
 
-    def start(self) -> None:
-        """Raises PebbleError if something does not start."""
-        make, services = {STAND_IN: StandIn, HOP: OneHop}.get(self.kind, Robot), _MEDIA if self._media else {}
-        broker = self.broker("remote")
-        self.subject = make(self, self.kind, ("127.0.0.1", broker.port), services=services, reports=self._reports)
-        broker.wait()
-        self.subject.prepare()
-        self.subject.launch()
-        channels = (STATUS, ONLINE, TOUCH_SENSORS)
-        self._client = StockClient(self._on_message, [(channel.topic(BASE), 1) for channel in channels])
-        self._client.paho.on_publish = self._acknowledge
-        self.closing.enter_context(closing(self._client.open(broker.port)))
-
-    def wait(self) -> None:
-        """Until it is ready. Raises PebbleError if it does not become so."""
-        with closing(RobotSubscriber(self.subject.remote_port, BASE)) as subscriber:
-            self.subject.expect(
-                lambda: subscriber.ready_ns is not None and subscriber.first_heartbeat_ns is not None,
-                f"{self.kind}: the robot is not ready", _UP_S,
-            )  # fmt: skip
-        running = self.subject.processes()
-        self._parts = {part: [running[name]] for part, name in _SERVICES.items() if name in running}
-        if running and len(self._parts) < len(_SERVICES):
-            raise PebbleError(f"{self.kind}: a bridge is not running\n{self.subject.log()}")
+    def wait_until_ready(self) -> None:
+        """Raises PebbleError if it does not become so."""
+        robot = self.robot
+        with closing(RobotSubscriber(robot.remote_port, BASE)) as seen:
+            robot.expect(lambda: None not in (seen.ready_ns, seen.first_heartbeat_ns), "it is not ready", _UP_S)
+        running = robot.processes()
+        self._parts = {part: [running[name]] for part, name in SERVICES.items() if name in running}
+        if running and len(self._parts) < len(SERVICES):
+            raise PebbleError(f"{robot.kind}: a bridge is not running\n{robot.log()}")
 
     def drive(self, seconds: float, rate_hz: float = RATE_HZ, *, work_us: float = 0.0, slowed: bool = False) -> Turn:
         """The operator works for ``work_us`` before each command: before it reads the clock, or, if ``slowed``, after.
 
         Raises PebbleError if one of the two bridges has ended.
         """
-        groups = {ALL: self.subject.pids(), **self._parts}
+        groups = {ALL: self.robot.pids(), **self._parts}
         before = {name: cpu_s(pids) for name, pids in groups.items()}
-        turn, due = Turn(began=time.monotonic_ns()), time.monotonic()
+        sent: dict[Wheels, int] = {}
+        began, due = time.monotonic_ns(), time.monotonic()
         for _ in range(round(seconds * rate_hz)):
             self._number += 1
             left, right = wheels(self._number)
             spin(0.0 if slowed else work_us)
-            turn.sent[left, right] = time.monotonic_ns()
+            sent[left, right] = time.monotonic_ns()
             spin(work_us if slowed else 0.0)
-            self._client.send(DRIVE, BASE, {"x": (left - right) / 2, "z": (left + right) / 2})
+            self.send(contract.DRIVE, BASE, {"x": (left - right) / 2, "z": (left + right) / 2})
             due += 1 / rate_hz
             time.sleep(max(0.0, due - time.monotonic()))
-        turn.ended = time.monotonic_ns()
-        turn.cpu_s = {name: cpu_s(pids) - before[name] for name, pids in groups.items() if pids}
-        if min(turn.cpu_s.values(), default=1.0) <= 0:
-            raise PebbleError(f"{self.kind}: a process ended while it was driven\n{self.subject.log()}")
-        return turn
+        ended = time.monotonic_ns()
+        used = {name: cpu_s(pids) - before[name] for name, pids in groups.items() if pids}
+        if min(used.values(), default=1.0) <= 0:
+            raise PebbleError(f"{self.robot.kind}: a process ended while it was driven\n{self.robot.log()}")
+        return Turn(began, ended, sent, used)
 
-    def match_arrivals(self, turns: Sequence[Turn]) -> None:
-        """Waits for the last commands and reports, or until they count as lost, and adds to each turn what arrived."""
-        since, end = min(turn.began for turn in turns), time.monotonic() + _ARRIVE_S
-        late = False
-        while not late:
-            late = time.monotonic() > end
-            entries = self.subject.lines(since)
-            received = [(ns, Touch(**json.loads(raw)["value"])) for ns, raw in self._received.copy() if ns >= since]
-            commands, reports = arrivals(entries), matched(entries, received)
-            if [turn.match(commands, reports, received) for turn in turns][-1]:
-                return
-            time.sleep(_POLL_S)
+    def arrived(self, turns: Sequence[Turn]) -> Arrived:
+        """Waits until the last commands and reports have arrived or count as lost."""
+        time.sleep(max(0.0, turns[-1].ended / 1e9 + _ARRIVE_S - time.monotonic()))
+        since = turns[0].began
+        entries = self.robot.lines(since)
+        received = [(ns, Touch(**json.loads(raw)["value"])) for ns, raw in self._received.copy() if ns >= since]
+        return Arrived(arrivals(entries), matched(entries, received), received)
 
-    def drive_with_media(self, seconds: float) -> tuple[Turn, dict[str, int]]:
+    def drive_with_media(self, seconds: float) -> Turn:
         """The same with its camera and microphone in use: a program on the robot reads frames, an operator gets both.
 
-        Returns what arrived, and how many frames and packets were received meanwhile. Raises PebbleError without any.
+        Raises PebbleError if these do not flow before it or meanwhile.
         """
-        robot, before = self.subject, len(self.subject.pids())
+        robot, at_rest = self.robot, len(self.robot.pids())
         workers = [
-            self.worker("frame reader", _MODULE, "frames", robot.run_dir),
-            self.worker("media operator", _MODULE, "media", robot.remote_port, BASE),
+            robot.running.worker("frame reader", _MODULE, "frames", robot.run_dir),
+            robot.running.worker("media operator", _MODULE, "media", robot.remote_port, BASE),
         ]
 
-        def counts() -> dict[str, int]:
-            for worker in workers:
-                worker.send("")
-            return {name: count for worker in workers for name, count in worker.answer(_ANSWER_S).items()}
+        def counts() -> list[int]:
+            return [count for worker in workers for count in worker.ask("", _ANSWER_S).values()]
 
         self._allow_media(True)
-        robot.expect(lambda: all(counts().values()), "its media do not flow", _UP_S)
+        robot.expect(lambda: all(counts()), "its media do not flow", _UP_S)
         time.sleep(_STARTUP_S)
-        first = counts()
+        before = counts()
         turn = self.drive(seconds)
-        flowed = {name: count - first[name] for name, count in counts().items()}
+        if any(now == then for now, then in zip(counts(), before, strict=True)):
+            raise PebbleError(f"{self.robot.kind}: its media stopped\n{robot.log()}")
         self._allow_media(False)
         for worker in workers:
-            self.end(worker)
-        robot.expect(lambda: len(robot.pids()) <= before, "its media do not end", _UP_S)
-        self.match_arrivals([turn])
-        return turn, flowed
+            robot.running.end(worker)
+        robot.expect(lambda: len(robot.pids()) <= at_rest, "its media do not end", _UP_S)
+        return turn
 
     def _allow_media(self, wanted: bool) -> None:
-        """Allows and requests video and audio, or stops both."""
         for flag in (contract.MQTT_VIDEO, contract.MQTT_AUDIO):
-            self._client.send(flag, BASE, wanted)
+            self.send(flag, BASE, wanted)
         for request in (contract.VIDEO_CONTROL, contract.AUDIO_CONTROL):
-            self._client.send(request, BASE, {"enabled": wanted})
+            self.send(request, BASE, {"enabled": wanted})
 
     def _on_message(self, message: MQTTMessage) -> None:
-        if message.topic.endswith(TOUCH_SENSORS.suffix):
+        if message.topic.endswith(contract.TOUCH_SENSORS.suffix):
             self._received.append((time.monotonic_ns(), bytes(message.payload)))
         self._acknowledge()
 
     def _acknowledge(self, *_: object) -> None:
         """Sets TCP_QUICKACK. The kernel resets it whenever we send, so this is called after every message."""
-        sock: Any = self._client.paho.socket()
+        sock: Any = self.paho.socket()
         if sock is not None:
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
 
@@ -245,14 +203,13 @@ class StandIn(Robot):
     """What a user would have without us."""
 
     def launch(self) -> None:
-        local = 0 if self.local_broker is None else self.local_broker.port
-        rest = (local, self.remote_port, self.base, self.port, *(["--reports"] if self.reports else []))
+        rest = (*self.broker_ports[::-1], self.base, self.port, *(["--reports"] if self.reports else []))
         for part in ("bridge", "serial"):
             self.start(f"the stand-in's {part}", python("pebble.bench.stand_in", part, *rest))
 
     def processes(self) -> dict[str, int]:
         """Its two programs, by the names of the services that they stand for."""
-        return {name: one.pid for name, one in zip(_SERVICES.values(), self._started, strict=False)}
+        return {name: one.pid for name, one in zip(SERVICES.values(), self._started, strict=False)}
 
 
 class OneHop(Robot):
@@ -271,7 +228,14 @@ class OneHop(Robot):
         return []
 
 
-# -- programs beside the robot
+@contextmanager
+def driven_robot(kind: str, *, media: bool = False, reports: bool = True) -> Iterator[DrivenRobot]:
+    """Launches a robot and connects its operator; with ``reports`` it forwards those of its MCU. Raises PebbleError."""
+    make, services = {STAND_IN: StandIn, HOP: OneHop}.get(kind, Robot), _MEDIA if media else {}
+    with one_robot(kind, make, services=services, reports=reports) as robot:
+        robot.launch()
+        with closing(DrivenRobot(robot)) as driven:
+            yield driven
 
 
 def frames(run_dir: str) -> None:
@@ -281,20 +245,18 @@ def frames(run_dir: str) -> None:
     ended = serve_on_thread(lambda _line: counts)
     with FrameReader(Path(run_dir), "camera", views=True) as reader:
         while not ended.is_set():
-            frame = reader.read(_READ_S)
-            if frame is not None:
+            if (frame := reader.read(_READ_S)) is not None:
                 counts["frames"] += bool(frame.data[::_EVERY].any())
                 frame.release()
 
 
 def media(port: str, base: str) -> None:
-    names = {contract.CAMERA.topic(base): "video", contract.AUDIO.topic(base): "audio"}
-    counts = dict.fromkeys(names.values(), 0)
+    counts = {channel.topic(base): 0 for channel in (contract.CAMERA, contract.AUDIO)}
 
     def count(message: MQTTMessage) -> None:
-        counts[names[message.topic]] += 1
+        counts[message.topic] += 1
 
-    with closing(StockClient(count, [(topic, 0) for topic in names], at_once=False).open(int(port))):
+    with closing(StockClient(count, [(topic, 0) for topic in counts], at_once=False).open(int(port))):
         serve(lambda _line: counts)
 
 
@@ -305,10 +267,11 @@ def hop(port: str, base: str, path: str) -> None:
         ns = time.monotonic_ns()
         trace.add(Entry(ns, "line", "M {:.3f} {:.3f}".format(*wheels_of(message.payload))))
 
-    client = StockClient(receive, [(DRIVE.topic(base), DRIVE.default_qos)], at_once=False).open(int(port))
+    drive = contract.DRIVE.topic(base), contract.DRIVE.default_qos
+    client = StockClient(receive, [drive], at_once=False).open(int(port))
     client.wait()
-    client.send(STATUS, base, {"value": {"services": {HOP: {"state": "ready"}}}})
-    client.send(ONLINE, base, {})
+    client.send(contract.STATUS, base, {"value": {"services": {HOP: {"state": "ready"}}}})
+    client.send(contract.ONLINE, base, {})
     signal.pause()
 
 

@@ -10,13 +10,12 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import closing
 from typing import Any, Final, Self
 
-from paho.mqtt.client import Client, MQTTMessage
+from paho.mqtt.client import Client, MQTTMessage, MQTTMessageInfo
 from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
-from paho.mqtt.subscribeoptions import SubscribeOptions
 
 from pebble.contract import DRIVE, Channel
 from pebble.errors import PebbleError
@@ -24,27 +23,28 @@ from pebble.rig.worker_end import serve
 
 RATE_HZ: Final = 20.0  # of each robot
 MANY: Final = 65_535  # messages in flight
-AHEAD: Final = json.dumps({"x": 0.0, "z": 0.5}).encode()
-ZERO: Final = json.dumps({"x": 0.0, "z": 0.0}).encode()
+AHEAD: Final = {"x": 0.0, "z": 0.5}
+ZERO: Final = {"x": 0.0, "z": 0.0}
 _ANSWER_S = 10.0
 
 
 class StockClient:
     """One paho client on loopback with its own network thread, on which ``receive`` runs.
 
-    ``at_once`` sets TCP_NODELAY, as Pebble's own clients do. Without it, a client that receives as much as it sends
-    delays a command in a hundred by 40 ms, until the broker's delayed ACK.
+    ``subscriptions`` are topics with a QoS or with options. ``at_once`` sets TCP_NODELAY, as Pebble's own clients do.
+    Without it, a client that receives as much as it sends delays a command in a hundred by 40 ms, until the broker's
+    delayed ACK.
     """
 
     def __init__(
         self,
         receive: Callable[[MQTTMessage], None] = lambda _: None,
-        subscriptions: Sequence[tuple[str, int]] | Sequence[tuple[str, SubscribeOptions]] = (),
+        subscriptions: Sequence[tuple[str, Any]] = (),
         *,
         at_once: bool = True,
         protocol: MQTTProtocolVersion = MQTTProtocolVersion.MQTTv311,
     ) -> None:
-        self._ready, self._subscriptions = threading.Event(), subscriptions
+        self._ready, self._subscriptions = threading.Event(), list(subscriptions)
         self.paho = Client(CallbackAPIVersion.VERSION2, protocol=protocol)
         self.paho.on_connect = self._on_connect
         self.paho.on_subscribe = lambda *_: self._ready.set()
@@ -73,14 +73,13 @@ class StockClient:
         self.paho.disconnect()
         self.paho.loop_stop()
 
-    def send(self, channel: Channel, base: str, body: Any) -> None:
+    def send(self, channel: Channel, base: str, body: Any) -> MQTTMessageInfo:
         """Publishes ``body`` as JSON, with the QoS and the retain flag of the channel."""
-        payload = body if isinstance(body, bytes) else json.dumps(body)
-        self.paho.publish(channel.topic(base), payload, qos=channel.default_qos, retain=channel.default_retain)
+        return self.paho.publish(channel.topic(base), json.dumps(body), channel.default_qos, channel.default_retain)
 
-    def _on_connect(self, client: Client, *_: Any) -> None:
+    def _on_connect(self, *_: Any) -> None:
         if self._subscriptions:
-            client.subscribe(list(self._subscriptions))  # type: ignore[arg-type]
+            self.paho.subscribe(self._subscriptions)
         else:
             self._ready.set()
 
@@ -92,12 +91,14 @@ def _send_at_once(_client: Client, _data: Any, sock: Any) -> None:
 class Driver(StockClient):
     """Drives the chosen robots at :data:`RATE_HZ`, spread evenly. Those that begin or end to be driven get a zero."""
 
-    def __init__(self, port: int) -> None:
+    def __init__(self, port: int, *bases: str) -> None:
         super().__init__()
         self._lock, self._closed = threading.Lock(), threading.Event()
         self._bases: tuple[str, ...] = ()
         self.paho.max_inflight_messages_set(MANY)
         self.open(port)
+        self.choose(bases)
+        threading.Thread(target=self._run, name="driver", daemon=True).start()
 
     def choose(self, bases: tuple[str, ...]) -> None:
         """Drive these robots, and no others."""
@@ -106,8 +107,7 @@ class Driver(StockClient):
                 self.send(DRIVE, base, ZERO)
             self._bases = bases
 
-    def run(self) -> None:
-        """Drive until it is closed."""
+    def _run(self) -> None:
         number, due = 0, time.monotonic()
         while not self._closed.wait(max(0.0, due - time.monotonic())):
             with self._lock:
@@ -122,13 +122,9 @@ class Driver(StockClient):
         super().close()
 
 
-@contextmanager
-def driving(port: int, *bases: str) -> Iterator[Driver]:
+def driving(port: int, *bases: str) -> closing[Driver]:
     """Drives these robots during the ``with`` block, whether or not they receive it."""
-    with closing(Driver(port)) as driver:
-        threading.Thread(target=driver.run, name="driver", daemon=True).start()
-        driver.choose(bases)
-        yield driver
+    return closing(Driver(port, *bases))
 
 
 if __name__ == "__main__":

@@ -9,11 +9,13 @@ from __future__ import annotations
 import random
 import time
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
+from typing import Any
 
 from pebble.bench import drivers
 from pebble.bench.aims import Aim, single, with_lost
-from pebble.bench.comparison import Budget, Comparison, Round, rounds
+from pebble.bench.comparison import Budget, Case, Comparison, Round, rounds
 from pebble.bench.fleet import read_moves
 from pebble.bench.pictures import ecdf
 from pebble.bench.results import Cell
@@ -34,10 +36,10 @@ STOP, ZERO = "emergency stop", "plain zero"
 ALL, BOARD = "all together", "board"
 _BY = "bench"
 _STARTED_S = 90.0  # boards start one after the other
-_CONFIRMED_S, _MOVING_S, _ANSWER_S = 10.0, 10.0, 5.0
+_ANSWER_S = 10.0
 _WATCH_S = 0.3  # after a stop, while driving goes on; the fleet writes its trace ten times a second
 _POLL_S = 0.05
-_LONGEST_WAIT_S = 0.25
+_TICK_S = 0.01  # late at most is a stop that is repeated
 _REACHED = 3  # what is noted of a robot that is stopped
 _QUIET_S = 0.8  # after a reset: motor owners publish few states a second, so a stop at once is confirmed later
 
@@ -53,13 +55,9 @@ def is_moving(moves: Sequence[Moved]) -> bool:
     return bool(moves) and any(moves[-1].motors)
 
 
-def sample(measure: str, robot: str, variant: str, began: int, ended: int | None, *, again: bool = False) -> Cell:
-    """One time (CLOCK_MONOTONIC, ns); ``robot`` is a Linux robot's transport, BOARD or ALL. None: it did not happen."""
-    return Cell(
-        variant=variant, params={"robot": robot}, measure=measure, unit="ms",
-        rounds=[[] if ended is None else [(ended - began) / 1e6]],
-        figures={"sent": 1, "again": int(again)},  # again: wheels turned while the robot was stopped
-    )  # fmt: skip
+def cell_of(case: Case, measure: str, began: int, ended: int | None, **figures: Any) -> Cell:
+    """One time (CLOCK_MONOTONIC, ns). None: it did not happen."""
+    return case.cell(measure, "ms", [] if ended is None else [(ended - began) / 1e6], sent=1, **figures)
 
 
 def send(transport: Transport, messages: Iterable[Message]) -> None:
@@ -67,54 +65,18 @@ def send(transport: Transport, messages: Iterable[Message]) -> None:
         transport.publish(message.topic, message.payload, qos=message.qos, urgent=True)
 
 
-def stop(
-    transport: Transport,
-    bases: Collection[str],
-    timeout: float,
-    *,
-    every: bool,
-    start: Callable[[], object] | None = None,
-) -> tuple[int, dict[str, list[int]]]:
-    """Stops these robots, or ``every`` one as ``--all`` does, and waits until these have confirmed it.
-
-    It is held for those that ``start`` starts. Returns when it began, and for each robot when its first message, the
-    first state that says it is stopped, and its confirmation arrived (CLOCK_MONOTONIC, ns). Raises PebbleError after
-    ``timeout`` seconds.
-    """
-    began, end, times = time.monotonic_ns(), time.monotonic() + timeout, defaultdict[str, list[int]](list)
-    named, hold = None if every else bases, start is not None
-    sender = StopSender(new_name(), by=_BY, why="", now=began / 1e9, robots=named, hold=hold)
-    send(transport, sender.tick(time.monotonic()))
-    filters = [ALL_OUTGOING] if every else [one.filter(base) for one in (ESTOP_STATE, CAPABILITIES) for base in bases]
-    listener = Listener(transport, filters)
-    if start is not None:
-        start()
-    while any(len(times[base]) < _REACHED for base in bases):
-        if time.monotonic() > end:
-            missing = [f"{base}: {robot.why}" for base, robot in sender.robots.items() if robot.why]
-            raise PebbleError(f"a stop was not confirmed within {timeout:.0f} s: {'; '.join(missing)}")
-        left = _LONGEST_WAIT_S if sender.due is None else min(_LONGEST_WAIT_S, sender.due - time.monotonic())
-        while (message := listener.next(left)) is not None:
-            now, left, base = time.monotonic_ns(), 0.0, message.topic.partition("/outgoing/")[0]
-            sender.receive(message, now / 1e9)
-            if (robot := sender.robots.get(base)) is not None:
-                reached = 1 + bool(robot.estop.latched) + (robot.confirmed_s is not None)
-                times[base] += [now] * (reached - len(times[base]))
-        send(transport, sender.tick(time.monotonic()))
-    return began, times
-
-
 class Robots(Processes):
     """Two Linux robots, one of each kind, and boards; what drives and stops them, and each way of stopping, measured.
 
-    Each measurement ends with the stopped robots reset. Every stop has a connection of its own, which is open before.
+    ``robots`` are a Linux robot's transport, BOARD, or ALL that run. Each measurement ends with them reset. Every stop
+    has a connection of its own, which is open before.
     """
 
     def __init__(self, boards: int) -> None:
         super().__init__()
-        self.linux: dict[str, Robot] = {}
-        self.boards = [identity.base for _, identity in members(boards)]
-        self.started: list[str] = []  # the bases of those that run
+        self._linux: list[Robot] = []
+        self._bases: dict[str, list[str]] = {ALL: [], BOARD: [identity.base for _, identity in members(boards)]}
+        self._starts: dict[str, Callable[[], object]] = {}
         self._trace = self.folder / "trace.jsonl"
 
     def start(self) -> None:
@@ -124,117 +86,126 @@ class Robots(Processes):
         self._port, self._target = broker.port, Target(url=f"mqtt://127.0.0.1:{broker.port}")
         for kind in KINDS:
             name, folder = f"rover-{kind}", self.folder / kind
-            self.linux[kind] = Robot(self, kind, ("127.0.0.1", broker.port), name=name, folder=folder)
-            self.linux[kind].prepare()
+            robot = Robot(self, kind, ("127.0.0.1", broker.port), name=name, folder=folder)
+            robot.prepare()
+            self._linux.append(robot)
+            self._bases[kind], self._starts[kind] = [robot.base], robot.launch
+        where = ("--robots", len(self._bases[BOARD]), "--broker", f"127.0.0.1:{broker.port}", "--trace", self._trace)
+        self._starts[BOARD] = partial(self.robot, "the fleet", "pebble.simulation.fleet_program", *where)
         self._driver = self.worker("driver", "pebble.bench.drivers", broker.port)
 
-    def start_boards(self) -> None:
-        where = ("--broker", f"127.0.0.1:{self._port}", "--trace", self._trace)
-        self.robot("the fleet", "pebble.simulation.fleet_program", "--robots", len(self.boards), *where)
-
-    # -- what is measured
-
-    def hold(self, robot: str, start: Callable[[], object], bases: Sequence[str]) -> Iterator[Cell]:
+    def hold(self, case: Case, robots: str) -> Iterator[Cell]:
         """Start these robots while a stop of all robots is held."""
-        self.started += bases
-        with connected(self._target) as (transport, _):
-            _, times = stop(transport, self.started, _STARTED_S, every=True, start=start)
-        for base in bases:
+        self._bases[ALL] += self._bases[robots]
+        _, times = self._stop(ALL, self._starts[robots])
+        for base in self._bases[robots]:
             received, latched, _ = times[base]
-            yield sample(HOLD, robot, STOP, received, latched)
-        self._reset(self.started)
+            yield cell_of(case, HOLD, received, latched)
+        self._reset(ALL)
 
-    def stop(self, robot: str, bases: Sequence[str]) -> Iterator[Cell]:
-        """Stop driven robots by an emergency stop: one, or all that run."""
-        self._drive(bases)
-        with connected(self._target) as (transport, _):
-            began, times = stop(transport, bases, _CONFIRMED_S, every=robot == ALL)
-        yield self._rest(robot, STOP, bases, began)
-        yield sample(CONFIRMED, robot, STOP, began, max(times[base][-1] for base in bases))
-        self._reset(bases)
+    def stop(self, case: Case, robots: str) -> Iterator[Cell]:
+        """Stop driven robots by an emergency stop."""
+        self._drive(robots)
+        began, times = self._stop(robots)
+        yield self._rest(case, robots, began)
+        yield cell_of(case, CONFIRMED, began, max(times[base][-1] for base in self._bases[robots]))
+        self._reset(robots)
 
-    def stop_by_zero(self, kind: str) -> Iterator[Cell]:
+    def stop_by_zero(self, case: Case, robots: str) -> Iterator[Cell]:
         """Stop a driven robot by a plain zero as a stock client sends it."""
-        base = self.linux[kind].base
-        self._drive([base])
+        self._drive(robots)
         client = drivers.StockClient(at_once=False).open(self._port)
         client.wait()
         began = time.monotonic_ns()
-        client.paho.publish(DRIVE.topic(base), drivers.ZERO, qos=DRIVE.default_qos).wait_for_publish(_ANSWER_S)
+        client.send(DRIVE, self._bases[robots][0], drivers.ZERO).wait_for_publish(_ANSWER_S)
         client.close()
-        yield self._rest(kind, ZERO, [base], began)
-        self._release([base])
+        yield self._rest(case, robots, began)
+        self._drive(robots, on=False)
 
-    # -- how
+    def _stop(self, robots: str, start: Callable[[], object] | None = None) -> tuple[int, dict[str, list[int]]]:
+        """Stops robots, ALL of them as ``--all`` does, and waits until they have confirmed it.
 
-    def _drive(self, bases: Sequence[str]) -> None:
-        """Drive these robots from now on; returns at a random moment after all of them move."""
-        self._driver.send(" ".join(bases))
-        _wait(lambda: all(map(is_moving, self._moves(bases))), "not all robots moved when they were driven", _MOVING_S)
+        It is held for those that ``start`` starts. Returns when it began, and for each robot when its first message,
+        the first state that says it is stopped, and its confirmation arrived (CLOCK_MONOTONIC, ns). Raises PebbleError
+        if one does not confirm it.
+        """
+        bases, every, hold = self._bases[robots], robots == ALL, start is not None
+        times, timeout = defaultdict[str, list[int]](list), _STARTED_S if hold else _ANSWER_S
+        with connected(self._target) as (transport, _):
+            began, named = time.monotonic_ns(), None if every else bases
+            sender = StopSender(new_name(), by=_BY, why="", now=began / 1e9, robots=named, hold=hold)
+            send(transport, sender.tick(time.monotonic()))
+            own = [channel.filter(base) for channel in (ESTOP_STATE, CAPABILITIES) for base in bases]
+            listener = Listener(transport, [ALL_OUTGOING] if every else own)
+            if start is not None:
+                start()
+            while any(len(times[base]) < _REACHED for base in bases):
+                if time.monotonic_ns() - began > timeout * 1e9:
+                    missing = [f"{base}: {robot.why}" for base, robot in sender.robots.items() if robot.why]
+                    raise PebbleError(f"a stop was not confirmed within {timeout:.0f} s: {'; '.join(missing)}")
+                left = _TICK_S
+                while (message := listener.next(left)) is not None:
+                    now, left, base = time.monotonic_ns(), 0.0, message.topic.partition("/outgoing/")[0]
+                    sender.receive(message, now / 1e9)
+                    if (robot := sender.robots.get(base)) is not None:
+                        reached = 1 + bool(robot.estop.latched) + (robot.confirmed_s is not None)
+                        times[base] += [now] * (reached - len(times[base]))
+                send(transport, sender.tick(time.monotonic()))
+        return began, times
+
+    def _drive(self, robots: str, *, on: bool = True) -> None:
+        """Drive only these robots from now on, or none; returns at a random moment after all of them move, or rest."""
+        self._driver.send(" ".join(self._bases[robots]) if on else "")
+        _wait(lambda: {on} == set(map(is_moving, self._moves(robots))), "not all robots moved or came to rest")
         time.sleep(random.random() / drivers.RATE_HZ)  # noqa: S311  (no secret)
 
-    def _release(self, bases: Sequence[str]) -> None:
-        """Drive no robot."""
-        self._driver.send("")
-        _wait(lambda: not any(map(is_moving, self._moves(bases))), "not all robots came to rest", _MOVING_S)
-
-    def _reset(self, bases: Sequence[str]) -> None:
+    def _reset(self, robots: str) -> None:
         """Let these robots, which are stopped, move again. Raises PebbleError if one does not confirm it."""
-        self._release(bases)
-        robots = [RobotEstop(base) for base in bases]
+        self._drive(robots, on=False)
+        stopped = [RobotEstop(base) for base in self._bases[robots]]
         with connected(self._target) as (transport, _):
-            for robot in robots:
+            for robot in stopped:
                 robot.subscribe(transport)
-            _wait(lambda: all(robot.has_capabilities and robot.latched for robot in robots), "no stop to reset")
-            resets = [Reset(robot, _BY) for robot in robots]
+            _wait(lambda: all(robot.has_capabilities and robot.latched for robot in stopped), "no stop to reset")
+            resets = [Reset(robot, _BY) for robot in stopped]
             send(transport, (message for reset in resets for message in reset.messages()))
             _wait(lambda: all(reset.free for reset in resets), "a reset was not obeyed")
         time.sleep(_QUIET_S)
 
-    def _rest(self, robot: str, variant: str, bases: Sequence[str], began: int) -> Cell:
+    def _rest(self, case: Case, robots: str, began: int) -> Cell:
         """When the last of these robots came to rest, and whether one of them moved again meanwhile."""
         time.sleep(_WATCH_S)
-        times, again = zip(*(rest(moves, began) for moves in self._moves(bases)), strict=True)
-        known = [ns for ns in times if ns is not None]
-        last = max(known) if len(known) == len(times) else None
-        return sample(REST, robot, variant, began, last, again=any(again))
+        times, again = zip(*(rest(moves, began) for moves in self._moves(robots)), strict=True)
+        return cell_of(case, REST, began, None if None in times else max(times), again=int(any(again)))
 
-    def _moves(self, bases: Collection[str]) -> list[list[Moved]]:
+    def _moves(self, robots: str) -> list[list[Moved]]:
         """Every change of their motors so far, by robot."""
         changes = read_moves(self._trace) if self._trace.exists() else {}
-        for robot in self.linux.values():
+        for robot in self._linux:
             own = [(one.ns, one.motors) for one in robot.lines(0) if one.motors is not None]
             changes[robot.name] = [Moved(ns, robot.name, motors) for ns, motors in own]
-        return [changes.get(base.rpartition("/")[2], []) for base in bases]
+        return [changes.get(base.rpartition("/")[2], []) for base in self._bases[robots]]
 
 
-def _wait(condition: Callable[[], bool], problem: str, seconds: float = _ANSWER_S) -> None:
-    end = time.monotonic() + seconds
+def _wait(condition: Callable[[], bool], problem: str) -> None:
+    end = time.monotonic() + _ANSWER_S
     while not condition():
         if time.monotonic() > end:
-            raise PebbleError(f"{problem} within {seconds:.0f} s")
+            raise PebbleError(f"{problem} within {_ANSWER_S:.0f} s")
         time.sleep(_POLL_S)
 
 
 def measure(round_: Round) -> Iterator[Cell]:
     """One round, with processes of its own. Raises PebbleError."""
     run, env = round_.run, round_.env
-    run.show("Linux robots start while a stop is held")
-    for kind, robot in env.linux.items():
-        yield from env.hold(kind, robot.launch, [robot.base])
-    for number in range(run["stops"]):
-        run.show(f"stop {number + 1} of {run['stops']} of one robot")
-        for kind in KINDS[:: -1 if number % 2 else 1]:
-            yield from env.stop(kind, [env.linux[kind].base])
-            yield from env.stop_by_zero(kind)
-    run.show(f"{run['boards']} boards start while a stop is held")
-    yield from env.hold(BOARD, env.start_boards, env.boards)
-    for number in range(run["all_stops"]):
-        run.show(f"stop {number + 1} of {run['all_stops']} of all robots")
-        yield from env.stop(ALL, env.started)
-
-
-# -- the report
+    hold, stop, zero = {STOP: env.hold}, {STOP: env.stop}, {ZERO: env.stop_by_zero}
+    plan = (
+        (KINDS, 1, hold), (KINDS, run["stops"], stop | zero), ([BOARD], 1, hold), ([ALL], run["all_stops"], stop)
+    )  # fmt: skip
+    for robots, times, ways in plan:
+        for case in round_.cases([{"robot": one} for one in robots], times):
+            if case.variant in ways:
+                yield from ways[case.variant](case, case.condition["robot"])
 
 
 def _aim(measure_: str, at_most: float, *robots_: str) -> Aim:
@@ -255,6 +226,7 @@ ESTOP = Comparison(
     full=Budget(600, rounds=10, boards=50, stops=12, all_stops=3),
     quick=Budget(90, rounds=2, stops=3, all_stops=2),
     constants={"rate_hz": drivers.RATE_HZ},
+    variants=(STOP, ZERO),
     environment=lambda run: Robots(run["boards"]),
     measure_round=measure,
     measures=MEASURES,

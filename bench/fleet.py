@@ -1,8 +1,8 @@
 """Measures a fleet of simulated MCU robots on one broker: heartbeats, command latency and cost, with one operator.
 
 Three processes on this machine: a stock mosquitto, the fleet (real firmware files, real TCP), and the operator:
-``python -m pebble.bench.fleet PORT SECONDS RATE_HZ ID…``. It writes a JSON line when every robot is online, and the
-results when it has driven for ``SECONDS``.
+``python -m pebble.bench.fleet PORT SECONDS ID…``. It writes a JSON line when every robot is online, and the results
+when it has driven for ``SECONDS``.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from paho.mqtt.client import MQTTMessage
 from pebble.bench.comparison import Budget, Case, Comparison, Option, seconds
 from pebble.bench.drivers import MANY, StockClient
 from pebble.bench.pictures import ecdf
-from pebble.bench.results import Cell, grouped, percentile, rounded
+from pebble.bench.results import Cell, grouped, rounded
 from pebble.bench.tables import COUNT, LOST, Grid, percentile_column, single_column
 from pebble.bench.usage import cpu_s, pss_mb
 from pebble.contract import DRIVE, ONLINE
@@ -35,12 +35,12 @@ from pebble.simulation.wireless import KINDS
 
 #: Wheel speeds, left and right, in sequence: no robot gets the same command twice within eight commands.
 STEPS: Final = ((1, 1), (-1, -1), (1, 0), (-1, 0), (1, -1), (0, 1), (-1, 1), (0, -1))
-_SPREAD = {"min": 0, "median": 50, "max": 100}
-_ONLINE_S, _UP_S, _ARRIVE_S, _POLL_S = 60.0, 90.0, 1.0, 0.05
+RATE_HZ: Final = 10.0  # of each robot
+_UP_S, _ARRIVE_S, _POLL_S = 90.0, 1.0, 0.05
 
 
 def measure(case: Case) -> Iterator[Cell]:
-    """One fleet, with processes of its own. Raises PebbleError if a process does not start."""
+    """One fleet, with processes of its own. Raises PebbleError if a process does not start, or not all are online."""
     run, count = case.run, case.run["robots"]
     ids = [identity.id for _, identity in members(count, KINDS)]
     with Processes() as processes:
@@ -48,37 +48,31 @@ def measure(case: Case) -> Iterator[Cell]:
         broker.wait()
         where = ("--kinds", ",".join(KINDS), "--broker", f"127.0.0.1:{broker.port}", "--trace", trace)
         fleet = processes.robot("fleet", "pebble.simulation.fleet_program", "--robots", count, *where)
-        operator = processes.worker("operator", "pebble.bench.fleet", broker.port, run["seconds"], run["rate"], *ids)
+        operator = processes.worker("operator", "pebble.bench.fleet", broker.port, run["seconds"], *ids)
         run.show(f"{count} robots are connecting")
-        online = operator.answer(_UP_S)["online"]
-        run.show(f"{online} robots are online and driven")
+        operator.answer(_UP_S)
+        run.show(f"{count} robots are online and driven")
         pids = {"broker": broker.pid, "fleet": fleet.pid, "operator": operator.pid}
         began, before = time.monotonic(), {name: cpu_s([pid]) for name, pid in pids.items()}
         found = operator.answer(run["seconds"] + _UP_S)
         took = time.monotonic() - began
         cpu = {name: 100 * (cpu_s([pid]) - before[name]) / took for name, pid in pids.items()}
         time.sleep(_ARRIVE_S)  # commands in flight arrive, or count as lost
-        yield cell_of(case, online, found, read_moves(trace), cpu, pss_mb(fleet.pid))
+        yield cell_of(case, found, read_moves(trace), {**cpu, "mb": pss_mb(fleet.pid)})
 
 
-def cell_of(
-    case: Case, online: int, found: dict[str, Any], moves: dict[str, list[Moved]], cpu: dict[str, float], mb: float
-) -> Cell:
-    """Latencies in ms, rates in Hz, CPU in % of one core; ``found`` is the operator's answer."""
+def cell_of(case: Case, found: dict[str, Any], moves: dict[str, list[Moved]], cost: dict[str, float]) -> Cell:
+    """``found`` is the operator's answer; ``cost`` has the CPU by process, % of a core, and the fleet's memory, MB."""
     robots, sent = case.run["robots"], found["sent"]
     began, ended = min(map(min, sent.values())), max(map(max, sent.values()))
     heartbeats = [[ns for ns in own if began <= ns <= ended] for own in found["heartbeats"]]
-    rates = [(len(own) - 1) / (own[-1] - own[0]) * 1e9 for own in heartbeats if len(own) > 1]
     return case.cell(
-        "command to pins", "ms", latencies_ms(sent, moves), {"robots": robots, "rate": f"{case.run['rate']:g} Hz"},
+        "command to pins", "ms", latencies_ms(sent, moves), {"robots": robots, "rate": f"{RATE_HZ:g} Hz"},
         sent=sum(map(len, sent.values())),
-        online=online,
         late=found["late"],
-        **{f"beats_{name}_hz": rounded(percentile(rates, at), 3) for name, at in _SPREAD.items()},
         longest_gap_s=rounded(longest_gap_s(heartbeats, began, ended), 3),
-        **{f"cpu_{name}": rounded(share, 1) for name, share in cpu.items()},
-        fleet_mb=rounded(mb, 1),
-        mb_per_robot=rounded(mb / robots, 3),
+        mb_per_robot=rounded(cost.pop("mb") / robots, 3),
+        **{f"cpu_{name}": rounded(share, 1) for name, share in cost.items()},
     )  # fmt: skip
 
 
@@ -106,10 +100,7 @@ def longest_gap_s(robots: Sequence[Sequence[int]], began: int, ended: int) -> fl
     return max(b - a for own in robots for a, b in itertools.pairwise([began, *own, ended])) / 1e9
 
 
-# -- the operator
-
-
-def drive_fleet(port: int, seconds: float, rate_hz: float, ids: Sequence[str]) -> None:
+def drive_fleet(port: int, seconds: float, ids: Sequence[str]) -> None:
     """Drives a whole fleet in :data:`STEPS`, evenly spread, and subscribes to all heartbeats.
 
     It answers when each robot's commands were published (CLOCK_MONOTONIC, ns) and its heartbeats arrived, and how many
@@ -117,6 +108,7 @@ def drive_fleet(port: int, seconds: float, rate_hz: float, ids: Sequence[str]) -
     """
     bases = [Identity("pebble", "robots", name).base for name in ids]
     heartbeats: dict[str, list[int]] = {ONLINE.topic(base): [] for base in bases}
+    sent: dict[str, list[int]] = {name: [] for name in ids}
     topics = [DRIVE.topic(base) for base in bases]
     bodies = [json.dumps({"x": (left - right) / 2, "z": (left + right) / 2}) for left, right in STEPS]
 
@@ -127,24 +119,25 @@ def drive_fleet(port: int, seconds: float, rate_hz: float, ids: Sequence[str]) -
     client = StockClient(receive, [(topic, 0) for topic in heartbeats])
     client.paho.max_inflight_messages_set(MANY)
     client.open(port)
-    end = time.monotonic() + _ONLINE_S
-    while not all(heartbeats.values()) and time.monotonic() < end:
+    while not all(heartbeats.values()):
         time.sleep(_POLL_S)
-    answer({"online": sum(map(bool, heartbeats.values()))})
-    sent: dict[str, list[int]] = {name: [] for name in ids}
-    began, late, gap = time.monotonic(), 0, 1 / rate_hz / len(ids)
-    for number in range(round(seconds * rate_hz) * len(ids)):
+    answer({})
+    began, late, gap = time.monotonic(), 0, 1 / RATE_HZ / len(ids)
+    for number in range(round(seconds * RATE_HZ) * len(ids)):
         step, robot = divmod(number, len(ids))
         left = began + number * gap - time.monotonic()
-        if left > 0:
-            time.sleep(left)
-        late += left < -1 / rate_hz
+        time.sleep(max(0.0, left))
+        late += left < -1 / RATE_HZ
         sent[ids[robot]].append(time.monotonic_ns())
         client.paho.publish(topics[robot], bodies[step % len(STEPS)], qos=DRIVE.default_qos)
     answer({"late": late, "sent": sent, "heartbeats": list(heartbeats.values())})
     client.close()
 
 
+_COLUMNS = {
+    "sent": "sent", "late": "late", "gap, s": "longest_gap_s",
+    "broker": "cpu_broker", "fleet": "cpu_fleet", "operator": "cpu_operator", "MB": "mb_per_robot",
+}  # fmt: skip
 FLEET = Comparison(
     name="fleet",
     title="A fleet on one broker",
@@ -155,34 +148,25 @@ FLEET = Comparison(
     options=(
         Option(name="robots", kind=int, least=1, most=MOST, help="How many robots with Wi-Fi."),
         seconds("Driving time.", least=1),
-        Option(name="rate", kind=float, least=0.1, most=20, help="Commands a second to each robot."),
     ),
-    full=Budget(35, robots=200, seconds=60.0, rate=10.0),
+    full=Budget(35, robots=200, seconds=60.0),
     quick=Budget(12, robots=30, seconds=5.0),
     variants=("mqtt",),
     measure=measure,
     tables=(
         Grid(
-            title="Command to pins, ms", rows=("robots", "rate"),
+            title="Command to pins, ms; longest gap between heartbeats; CPU, % of a core; memory of each robot",
+            rows=("robots", "rate"),
             columns=(
                 *map(percentile_column, (50, 95, 99, 100)), COUNT, LOST,
-                *(single_column(name, name) for name in ("sent", "late", "online")),
+                *(single_column(head, name) for head, name in _COLUMNS.items()),
             ),
         ),
-        Grid(
-            title="Heartbeats of a robot, Hz; CPU, % of a core; memory, MB", rows=("robots",),
-            columns=tuple(single_column(*words) for words in (
-                ("least", "beats_min_hz"), ("median", "beats_median_hz"), ("most", "beats_max_hz"),
-                ("longest gap, s", "longest_gap_s"), ("broker", "cpu_broker"), ("fleet", "cpu_fleet"),
-                ("operator", "cpu_operator"), ("fleet, MB", "fleet_mb"), ("each", "mb_per_robot"),
-            )),
-        ),
     ),
-    complete=lambda cells: all(cell.samples and cell.figures["online"] == cell.params["robots"] for cell in cells),
     pictures=(ecdf("Fleet"),),
     reported_full=("--robots", "100", "--seconds", "20"),
 )  # fmt: skip
 
 if __name__ == "__main__":
     serve_on_thread(lambda _line: None, lambda: os._exit(0))
-    drive_fleet(int(sys.argv[1]), float(sys.argv[2]), float(sys.argv[3]), sys.argv[4:])
+    drive_fleet(int(sys.argv[1]), float(sys.argv[2]), sys.argv[3:])

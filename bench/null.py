@@ -14,21 +14,21 @@ from pebble.bench.ratios import Interval, paired
 from pebble.bench.results import Cell, Judged
 from pebble.bench.tables import base_of
 
-AGAIN, SLOWED = " again", " +20 %"
+_AGAIN, _SLOWED = " again", " +20 %"
 SLOWDOWN = 0.2
 
 
 def roles(variant: str) -> tuple[str, str, str]:
     """Names of the plain, the repeated and the slowed role."""
-    return variant, variant + AGAIN, variant + SLOWED
+    return variant, variant + _AGAIN, variant + _SLOWED
 
 
 def variant_of(role: str) -> str:
-    return role.removesuffix(AGAIN).removesuffix(SLOWED)
+    return role.removesuffix(_AGAIN).removesuffix(_SLOWED)
 
 
 def is_slowed(role: str) -> bool:
-    return role.endswith(SLOWED)
+    return role.endswith(_SLOWED)
 
 
 def spin(us: float) -> None:
@@ -45,17 +45,11 @@ def intervals(cells: Sequence[Cell]) -> list[tuple[Cell, Interval]]:
 
 
 def assessment(cells: Sequence[Cell]) -> Iterator[Judged]:
-    """The aim of a null test; few rounds are not judged."""
+    """The aim: the repeated role is equal and the slowed one slower. Few rounds are not judged."""
     found = intervals(cells)
-    judged = not any(interval.few for _, interval in found)
+    passed = [one.low > 1.0 if is_slowed(cell.variant) else one.equal for cell, one in found]
     yield Judged(
         what="no difference found where there is none, and the planted 20 % found",
-        outcome=outcome(passed(cells), judged=judged),
-        measured=", ".join(f"{cell.variant} {interval}" for cell, interval in found),
+        outcome=outcome(all(passed), judged=bool(found) and not any(one.few for _, one in found)),
+        measured=", ".join(f"{cell.variant} {one}" for cell, one in found),
     )
-
-
-def passed(cells: Sequence[Cell]) -> bool:
-    """Whether the repeated role was equal and the slowed one slower; False without cells."""
-    found = intervals(cells)
-    return bool(found) and all(one.low > 1.0 if is_slowed(cell.variant) else one.equal for cell, one in found)

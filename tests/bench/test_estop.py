@@ -3,7 +3,7 @@
 import io
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -12,18 +12,21 @@ import pytest
 from rich.console import Console
 
 from pebble.bench import engine
+from pebble.bench.comparison import Case, Round
 from pebble.bench.engine import Collected, run
 from pebble.bench.estop import (
     ALL,
+    BOARD,
     CONFIRMED,
     ESTOP,
     HOLD,
     REST,
     STOP,
     ZERO,
+    cell_of,
     is_moving,
+    measure,
     rest,
-    sample,
 )
 from pebble.bench.pictures import pictures
 from pebble.bench.results import Cell, Results, load
@@ -63,13 +66,42 @@ def test_a_robot_moves_after_its_last_change() -> None:
 # -- cells and assessment
 
 
+def case_of(robots: str, variant: str = STOP) -> Case:
+    return Case(run=ESTOP.run_of(), number=0, variant=variant, role=variant, condition={"robot": robots})
+
+
 def one_round(stop_ms: float, *, again: bool = False, lost: bool = False) -> Iterator[Cell]:
     for variant, ms in ((STOP, stop_ms), (ZERO, 1.0)):
         for _ in range(2):
-            yield sample(REST, "mqtt", variant, 5 * MS, round((5 + ms) * MS), again=again and variant == STOP)
-    yield sample(REST, ALL, STOP, 0, None if lost else round(100 * MS))
-    yield sample(CONFIRMED, "mqtt", STOP, 0, 600 * MS)
-    yield sample(HOLD, "mqtt", STOP, 0, 3 * MS)
+            twice = int(again and variant == STOP)
+            yield cell_of(case_of("mqtt", variant), REST, 5 * MS, round((5 + ms) * MS), again=twice)
+    yield cell_of(case_of(ALL), REST, 0, None if lost else round(100 * MS), again=0)
+    yield cell_of(case_of("mqtt"), CONFIRMED, 0, 600 * MS)
+    yield cell_of(case_of("mqtt"), HOLD, 0, 3 * MS)
+
+
+class FakeRobots:
+    """In place of robots: remembers in which way each was stopped."""
+
+    def __init__(self) -> None:
+        self.stopped: list[tuple[str, str]] = []
+
+    def __getattr__(self, way: str) -> Callable[[Case, str], list[Cell]]:
+        def note(_case: Case, robots: str) -> list[Cell]:
+            self.stopped.append((way, robots))
+            return []
+
+        return note
+
+
+def test_robots_are_stopped_in_turn() -> None:
+    env = FakeRobots()
+    run_ = ESTOP.run_of(rounds=1)
+    run_.options |= {"stops": 2, "all_stops": 1}
+    assert list(measure(Round(run_, 0, env, roles=(STOP, ZERO), planted_us=lambda _: 0.0))) == []
+    both = [("stop", "mqtt"), ("stop_by_zero", "mqtt"), ("stop", "zenoh"), ("stop_by_zero", "zenoh")]
+    assert env.stopped[:2] == [("hold", "mqtt"), ("hold", "zenoh")]
+    assert env.stopped[2:] == [*both, *both[::-1], ("hold", BOARD), ("stop", ALL)]
 
 
 def cells(*rounds: Iterator[Cell]) -> list[Cell]:

@@ -115,7 +115,7 @@ def test_the_bridge_goes_on_and_counts_no_half_of_a_round(tmp_path: Path) -> Non
                 raise PebbleError("zenoh: the robot is not up after 30 s")
             yield case.cell("down", "ms", [1.0], sent=1)
 
-    about = replace(BRIDGE, measure_round=measure)
+    about = replace(BRIDGE, measure_round=measure, conditions=lambda _run: [{"load": "none"}])
     assert run(about.run_of(rounds=3, output=tmp_path, console=Console(file=io.StringIO()))) == 0
     results = load(tmp_path / "bridge.json")
     assert {len(cell.rounds) for cell in results.cells} == {2}
