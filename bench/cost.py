@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
+from typing import NamedTuple
 
 from pebble.bench.comparison import Budget, Case, Comparison, rounds, seconds, variants
 from pebble.bench.drivers import RATE_HZ, driving
@@ -26,6 +26,7 @@ from pebble.rig.robot import BASE, KINDS, Robot
 
 ALL = "all"  # the processes of a robot together
 MEMORY, CPU, THREADS = "PSS", "CPU", "threads"
+_UNITS = {MEMORY: "MB", CPU: "%", THREADS: ""}  # CPU: per cent of one core
 PICTURES, PER_PICTURE = "pictures", "CPU per picture"
 IDLE, DRIVING = "idle", "driving"
 #: The encodings requested in each media phase, by the name of the phase.
@@ -37,14 +38,11 @@ _STARTUP_S = 0.5  # for start-up work, or a change of the streams, to finish
 _FIRST = 5  # pictures and sound packets until a stream counts as flowing
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Reading:
-    """One robot in one phase. By process: memory in MB, CPU in per cent of one core, threads."""
+class Reading(NamedTuple):
+    """One robot in one phase."""
 
     phase: str
-    memory: Mapping[str, float]
-    cpu: Mapping[str, float]
-    threads: Mapping[str, float]
+    values: Mapping[str, Mapping[str, float]]  # by measure and process, in the unit of the measure
     pictures_per_s: float | None = None  # delivered to the operator; None: none were requested
 
 
@@ -83,26 +81,22 @@ def _read(robot: Robot, subscriber: RobotSubscriber, phase: str, seconds: float)
     arrived = subscriber.arrived[form] - pictures
     if robot.processes() != processes:
         raise PebbleError(f"{phase}: processes of the robot ended or started meanwhile\n{robot.log()}")
-    return Reading(
-        phase=phase,
-        memory={name: pss_mb(pid) for name, pid in processes.items()},
-        cpu=cpu,
-        threads={name: len(list(Path(f"/proc/{pid}/task").iterdir())) for name, pid in processes.items()},
-        pictures_per_s=arrived / took if phase in STREAMS else None,
-    )
+    memory = {name: pss_mb(pid) for name, pid in processes.items()}
+    threads = {name: len(list(Path(f"/proc/{pid}/task").iterdir())) for name, pid in processes.items()}
+    values = {MEMORY: memory, CPU: cpu, THREADS: threads}
+    return Reading(phase, values, arrived / took if phase in STREAMS else None)
 
 
 def cells_of(case: Case, reading: Reading) -> Iterator[Cell]:
     """By measure and process; and by picture the CPU time of the whole robot, including its sound."""
-    found = ((MEMORY, "MB", reading.memory), (CPU, "%", reading.cpu), (THREADS, "", reading.threads))
-    for measure_, unit, values in found:
-        for process, value in {**values, ALL: sum(values.values())}.items():
-            figures = {"processes": len(values)} if process == ALL else {}
-            yield case.cell(measure_, unit, [value], {"phase": reading.phase, "process": process}, **figures)
-    if (rate := reading.pictures_per_s) is not None:
-        params = {"phase": reading.phase, "process": ALL}
+    params, rate = {"phase": reading.phase, "process": ALL}, reading.pictures_per_s
+    for measure_, values in reading.values.items():
+        for process, value in values.items():
+            yield case.cell(measure_, _UNITS[measure_], [value], {**params, "process": process})
+        yield case.cell(measure_, _UNITS[measure_], [sum(values.values())], params, processes=len(values))
+    if rate is not None:
         yield case.cell(PICTURES, "1/s", [rate], params)
-        yield case.cell(PER_PICTURE, "ms", [10 * sum(reading.cpu.values()) / rate] if rate else [], params)
+        yield case.cell(PER_PICTURE, "ms", [10 * sum(reading.values[CPU].values()) / rate] if rate else [], params)
 
 
 COST = Comparison(
