@@ -11,17 +11,16 @@ from __future__ import annotations
 import math
 import secrets
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
-from statistics import median
 from typing import NamedTuple
 
 from rich.console import Console
 
 from pebble.bench import control_worker as ends
-from pebble.bench.comparison import Case, Combine, Run, of_known
+from pebble.bench.comparison import Case, Run
 from pebble.bench.control_worker import ROUND_TRIP, Clock, Desk, Exchange, Sender, SliceSpec
-from pebble.bench.results import Cell, Value, percentile, rounded
+from pebble.bench.results import Cell, percentile, rounded
 from pebble.bench.tables import LOST, Grid, percentile_column, single_column
 from pebble.client.connection import password
 from pebble.client.url import settings_of as url_settings
@@ -88,10 +87,6 @@ def estimate(exchanges: Sequence[Exchange]) -> Offset:
 # -- the side that measures
 
 
-def conditions(run: Run) -> list[dict[str, Value]]:
-    return [ends.condition(size, rate) for size in run["sizes"] for rate in run["rates"]]
-
-
 def prepare(run: Run) -> None:
     if run["variants"] != [VARIANT] or run["loads"] or run.options.get("null"):
         raise PebbleError("--variants, --loads and --null have no use with --far: there is one variant")
@@ -128,11 +123,6 @@ def measure(case: Case) -> Iterator[Cell]:
         yield case.cell(name, "ms", times if known else [], clock_offset_ms=offset_ms, clock_error_ms=error_ms)
 
 
-JOINED: Mapping[str, Combine] = {
-    "late": sum,
-    "clock_offset_ms": of_known(median, 6),  # ns
-    "clock_error_ms": of_known(max, 6),
-}
 TABLE = Grid(
     title="Between two machines, ms; how far ahead the far clock is, ± the error of one-way times",
     rows=("size", "rate", "measure"),

@@ -51,7 +51,7 @@ Handler = Callable[[str, bytes, int], None]  # topic, payload, and when the tran
 Clock = Callable[[], int]  # ns
 
 
-class SliceSpec(msgspec.Struct, frozen=True, kw_only=True):
+class SliceSpec(msgspec.Struct, frozen=True):
     """One slice: messages of this size at this rate."""
 
     size: int
@@ -64,13 +64,8 @@ class SliceSpec(msgspec.Struct, frozen=True, kw_only=True):
     def of(case: Case) -> SliceSpec:
         """The slice of a case with a :func:`condition`."""
         (number, unit), (rate, _) = (str(case.condition[name]).split() for name in ("size", "rate"))
-        return SliceSpec(
-            size=int(number) * (1024 if unit == "KB" else 1),
-            rate=float(rate),
-            seconds=case.run["seconds"],
-            work_us=case.planted_us,
-            slowed=case.slowed,
-        )
+        size = int(number) * (1024 if unit == "KB" else 1)
+        return SliceSpec(size, float(rate), case.run["seconds"], case.planted_us, case.slowed)
 
 
 def condition(size: int, rate: float) -> dict[str, Value]:

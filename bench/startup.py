@@ -84,19 +84,15 @@ def _late(case: Case, robot: Robot) -> Iterator[Cell]:
 
 def _retained_topics(transport: Transport) -> set[str]:
     """The topics with a retained message. Waits for a pause, since no message is marked as the last."""
-    found: set[str] = set()
-
-    def on_message(message: Message) -> None:
-        if message.retain:
-            found.add(message.topic)
-
+    found: list[Message] = []
     with transport:
-        transport.subscribe(_EVERYTHING, on_message, direct=True)
-        before = -1
-        while before < len(found):
-            before = len(found)
+        transport.subscribe(_EVERYTHING, found.append, direct=True)
+        topics, before = set[str](), -1
+        while before < len(topics):
+            before = len(topics)
             time.sleep(_QUIET_S)
-    return found
+            topics = {message.topic for message in found if message.retain}
+    return topics
 
 
 def _late_ms(topics: Set[str], make: Callable[[_Receive], StockClient | Transport], port: int) -> float:
@@ -183,10 +179,6 @@ STARTUP = Comparison(
 
     And how fast an operator or a service that connects later receives all retained messages, and how long an operator
     waits for the first picture in each encoding. Every launch is a new simulated robot. Needs mosquitto.
-
-    \b
-        pebble bench startup
-        pebble bench startup --quick
     """,
     options=(rounds("Launches of each variant."), variants(KINDS, "mqtt or zenoh.")),
     full=Budget(156, rounds=10, joins=5),
