@@ -215,7 +215,7 @@ def assessment(cells: Sequence[Cell]) -> Iterator[str | Judged]:
     }
     for percent, _, (_, load) in AIMS:
         mqtt = [found[key] for key in found if key[1] == load and VARIANTS[key[0]].kind != "zenoh"]
-        if any(cell.samples for cell in mqtt):
+        if mqtt:
             found[BETTER, load] = min(mqtt, key=lambda cell: cell.percentile(percent))
     intervals = {
         (percent, ours, theirs): paired(found[ours].rounds, found[theirs].rounds, percent)
