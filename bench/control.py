@@ -163,7 +163,6 @@ TABLE = Grid(
             for percent in (50, 99)
         ),
         Column("lost/\nlate", lambda cell: f"{cell.lost}/{cell.figures['late']}"),
-        single_column("pictures\nper s", "pictures_hz", ".1f"),
     ),
     baseline="mqtt",
 )
@@ -227,6 +226,9 @@ def assessment(cells: Sequence[Cell]) -> Iterator[str | Judged]:
     for (percent, *both), interval in intervals.items():
         names = (found[key].variant + (f" with {key[1]}" if key[1] != NONE else "") for key in both)
         yield f"p{percent}: {interval.words(*names)}"
+    streams = {name: cell.single("pictures_hz") for (name, load), cell in found.items() if load == MEDIA}
+    if rates := ", ".join(f"{name} {rate:.1f}" for name, rate in streams.items() if name != BETTER):
+        yield f"With media, pictures received per second, of 30: {rates}"
     for compared, (what, bound, of) in AIMS.items():
         if compared in intervals:
             yield _judged(what, bound, found[compared[1]].percentile(compared[0]), intervals[compared], of)

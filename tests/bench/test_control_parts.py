@@ -335,10 +335,9 @@ def test_too_much_lost_in_few_rounds_fails_an_aim() -> None:
     assert "at most 0.35: missed (0.20" in lines_of([cell("mqtt", "media", 5000.0), ours])[-1]
 
 
-def test_concurrent_pictures_are_in_the_table() -> None:
-    lines = shown([cell("mqtt", "media", 900.0, pictures=29.9), cell("zenoh-p2p", "media", 300.0, pictures=20.0)])
-    mqtt, zenoh = ([word for word in line.split() if word in ("29.9", "20.0")] for line in lines.splitlines()[-3:-1])
-    assert (mqtt, zenoh) == (["29.9"], ["20.0"])
+def test_concurrent_pictures_are_reported() -> None:
+    cells = [cell("mqtt", "media", 900.0, pictures=29.9), cell("zenoh-p2p", "media", 300.0, pictures=20.0)]
+    assert any(line.endswith("of 30: mqtt 29.9, zenoh-p2p 20.0") for line in lines_of(cells))
 
 
 def test_the_tables_of_all_variants_fit_100_columns() -> None:
