@@ -155,7 +155,7 @@ def stock(port: int) -> Connection:
     client.wait()
 
     def subscribe(filter_: str, handler: Handler) -> None:
-        client.paho.on_message = lambda _client, _data, one: handler(one.topic, one.payload, time.monotonic_ns())
+        client.paho.on_message = lambda _client, _data, one: handler(one.topic, bytes(one.payload), time.monotonic_ns())
         client.subscribe(filter_, _QOS)
 
     return Connection(subscribe, partial(client.paho.publish, qos=_QOS), client.close)
