@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from statistics import fmean, median
 from typing import Any, NamedTuple
 
@@ -16,19 +16,18 @@ from pebble.bench import control_far as far
 from pebble.bench import null
 from pebble.bench.aims import outcome, rounds_with_lost
 from pebble.bench.comparison import Budget, Case, Comparison, Option, Run, of_known, rounds, seconds, variants
-from pebble.bench.control_worker import ONE_WAY, PICTURES_HZ, ROUND_TRIP, SMALLEST, Slice, SliceSpec, condition
+from pebble.bench.control_worker import ONE_WAY, ROUND_TRIP, SMALLEST, Slice, SliceSpec, condition
 from pebble.bench.engine import roles_of
 from pebble.bench.pictures import ecdf, null_ratios, ratios
 from pebble.bench.ratios import Interval, paired
 from pebble.bench.results import Cell, Judged, Value, percentile, rounded
-from pebble.bench.tables import Column, Grid, figure, percentile_column, single_column
+from pebble.bench.tables import Column, Grid, percentile_column, single_column
 from pebble.bench.usage import wake_up_us, wake_ups
 from pebble.rig.processes import BROKERS, OPERATORS, Processes, python
 from pebble.rig.programs import Program, Worker
 from pebble.transports import MqttSettings, ZenohSettings
 
 NONE, MEDIA, HOG = LOADS = ("none", "media", "hog")
-AIM_P50, AIM_MEDIA_P99 = 0.70, 0.35
 _JUDGED = condition(40, 200)
 _LOADED_RATES = 2  # the first ones
 _READY_S = 40.0
@@ -51,71 +50,70 @@ VARIANTS = {
     "zenoh-hub": Variant("zenoh", {"client": True}),  # everything goes through the hub
 }
 P2P, HUB, NODELAY = "zenoh-p2p", "zenoh-hub", "mqtt-nodelay"
-MQTT = tuple(name for name, variant in VARIANTS.items() if variant.kind != "zenoh")
 
 
 class Participants(Processes):
-    """The processes of each role: a broker or a hub, two ends, and a stream of pictures if that is one of the loads.
+    """The processes of each role: a broker or a hub, and two ends, which are ready when the ``with`` block begins."""
 
-    They are ready when the ``with`` block begins.
-    """
-
-    def __init__(self, roles: Sequence[str], loads: Sequence[str]) -> None:
+    def __init__(self, roles: Sequence[str]) -> None:
         super().__init__()
-        self._roles, self._loads = roles, loads
-        self._backbones: dict[str, Program] = {}
-        self._workers: dict[str, list[Worker]] = {}  # sender, echo, writer and reader
+        self._roles = roles
+        #: By role: broker or hub, where pictures flow (as frames_worker names it), sender and echo.
+        self._parts: dict[str, tuple[Program, tuple[str, object], list[Worker]]] = {}
 
     def start(self) -> None:
         for number, role in enumerate(self._roles):
-            folder, variant = self.folder / str(number), VARIANTS[null.variant_of(role)]
+            folder, (kind, settings, lines) = self.folder / str(number), VARIANTS[null.variant_of(role)]
             folder.mkdir()
-            begin = self._hub if variant.kind == "zenoh" else self._broker
-            self._backbones[role], settings, stream = begin(folder, variant)
-            ends = {name: (variant.kind, _json(settings)) for name in ("sender", "echo")}
-            streams = {name: stream for name in ("writer", "reader") if MEDIA in self._loads}
-            self._workers[role] = [
-                self.worker(f"{role}: {name}", "pebble.bench.control_worker", name, *where)
-                for name, where in {**ends, **streams}.items()
+            if kind == "zenoh":
+                where: Any = ZenohSettings(run_dir=folder / "z", **settings)  # short: paths of Unix sockets
+                own = _json(ZenohSettings(run_dir=where.run_dir))
+                backbone = self.add(Program("hub", python("pebble.runtime.hub", own), folder / "hub.log"), BROKERS)
+                backbone.wait_until((where.run_dir / "hub.sock").exists, _READY_S)
+                stream: tuple[str, object] = ("zenoh-shm", where.run_dir)
+            else:
+                backbone = broker = self.broker(extra=lines, folder=folder)
+                broker.wait()
+                where = MqttSettings(host="127.0.0.1", port=broker.port, **settings)
+                stream = ("mqtt", broker.port)
+            ends = [
+                self.worker(f"{role}: {name}", "pebble.bench.control_worker", name, kind, _json(where))
+                for name in ("sender", "echo")
             ]
+            self._parts[role] = backbone, stream, ends
         for worker in self.workers:
             worker.answer(_READY_S)
-
-    def _hub(self, folder: Path, variant: Variant) -> tuple[Program, ZenohSettings, tuple[str, Path]]:
-        run_dir = folder / "z"  # short, as the folder's name: paths of Unix sockets begin with it
-        command = python("pebble.runtime.hub", _json(ZenohSettings(run_dir=run_dir)))
-        hub = self.add(Program("hub", command, folder / "hub.log"), BROKERS)
-        hub.wait_until((run_dir / "hub.sock").exists, _READY_S)
-        return hub, ZenohSettings(run_dir=run_dir, **variant.settings), ("zenoh-shm", run_dir)
-
-    def _broker(self, folder: Path, variant: Variant) -> tuple[Program, MqttSettings, tuple[str, int]]:
-        broker = self.broker(extra=variant.broker, folder=folder)
-        broker.wait()
-        return broker, MqttSettings(host="127.0.0.1", port=broker.port, **variant.settings), ("mqtt", broker.port)
 
     def run(self, role: str, spec: SliceSpec, load: str) -> tuple[Slice, dict[str, float]]:
         """Runs one slice; returns its results, and the wake-ups in a round trip and pictures per second, by name.
 
         Raises PebbleError if a process ended, or no pictures flow.
         """
-        sender, echo, *stream = self._workers[role]
-        pids = {"wake_ups": [sender.pid, echo.pid], "broker_wake_ups": [self._backbones[role].pid]}
+        backbone, stream, (sender, echo) = self._parts[role]
+        beside = self._begin(load, *stream)
+        pids = {"wake_ups": [sender.pid, echo.pid], "broker_wake_ups": [backbone.pid]}
+        before, began_ns = {name: wake_ups(some) for name, some in pids.items()}, time.monotonic_ns()
         if load == MEDIA:
-            stream[0].ask("1", _ANSWER_S)
-            begun = stream[1].ask("", _ANSWER_S)
-        elif load == HOG:
-            loop = ["sh", "-c", "while :; do :; done"]
-            hog = self.add(Program("hog", loop, self.folder / "hog.log"), OPERATORS)
-        before = {name: wake_ups(some) for name, some in pids.items()}
+            beside[0].send(f"{began_ns} {1 << 62}")
         done = msgspec.convert(sender.ask(_json(spec), spec.seconds + _ANSWER_S), Slice)
         used = {name: (wake_ups(some) - before[name]) / done.trips for name, some in pids.items()}
         if load == MEDIA:
-            ended = stream[1].ask("", _ANSWER_S)
-            stream[0].ask("0", _ANSWER_S)
-            used["pictures_hz"] = (ended["pictures"] - begun["pictures"]) / (ended["s"] - begun["s"])
-        elif load == HOG:
-            self.end(hog)
+            pictures = beside[0].ask("", _ANSWER_S)["latencies_us"]
+            used["pictures_hz"] = 1e9 * len(pictures) / (time.monotonic_ns() - began_ns)
+        for program in beside:
+            self.end(program)
         return done, used
+
+    def _begin(self, load: str, kind: str, where: object) -> Sequence[Any]:
+        """Starts the load: nothing, a busy loop, or a reader and a writer of pictures, which flow afterwards."""
+        if load == HOG:
+            loop = ["sh", "-c", "while :; do :; done"]
+            return [self.add(Program("hog", loop, self.folder / "hog.log"), OPERATORS)]
+        names = ("reader", "writer") if load == MEDIA else ()
+        ends = [self.worker(name, "pebble.bench.frames_worker", kind, name, where, "640x480", 0) for name in names]
+        for end in ends:
+            end.answer(_READY_S)
+        return ends
 
 
 def _json(what: MqttSettings | ZenohSettings | SliceSpec) -> str:
@@ -183,88 +181,65 @@ HOPS = Grid(
 )
 
 
-# -- the assessment
+# -- the assessment, of 40 B at 200 Hz, one way
 
-_Key = tuple[str | None, str]  # variant and load
-_ByKey = Mapping[_Key, Cell]
-
-
-def _judged(cells: Sequence[Cell]) -> _ByKey:
-    return {(cell.variant, str(cell.params["load"])): cell for cell in cells if _is_judged(cell)}
+_Key = tuple[str, str]  # variant and load
+_Compared = tuple[int, _Key, _Key]  # a percentile, and whose to whose
+BETTER = "better MQTT"  # the variant with the lowest percentile
+#: What is judged, the bound, and whether it is one of the interval's upper end or of the ratio, as it was set.
+AIMS: Mapping[_Compared, tuple[str, float, str]] = {
+    (50, (P2P, NONE), (BETTER, NONE)): (f"{P2P} / {BETTER}, p50, upper end of the interval", 0.70, "high"),
+    (99, (P2P, MEDIA), (BETTER, MEDIA)): (f"{P2P} / {BETTER} with media, p99", 0.35, "ratio"),
+}
+_COMPARED: Sequence[_Compared] = (
+    *AIMS,
+    (50, (HUB, NONE), (P2P, NONE)),
+    *((percent, (P2P, HOG), (P2P, NONE)) for percent in (50, 99)),
+    *((percent, (slow, NONE), (NODELAY, NONE)) for slow in ("paho", "mqtt") for percent in (50, 99)),
+    (50, ("mqtt5", NONE), (NODELAY, NONE)),
+)
 
 
 def wake_up_cost(_cells: Sequence[Cell]) -> Iterator[str]:
     same_us, other_us = wake_up_us()
-    yield (
-        f"Waking up a waiting process takes {same_us:.0f} us on the same core, {other_us:.0f} us on another; "
-        "the last table counts the wake-ups of a round trip."
-    )
+    yield f"Waking up a waiting process takes {same_us:.0f} us on the same core, {other_us:.0f} us on another."
 
 
 def assessment(cells: Sequence[Cell]) -> Iterator[str | Judged]:
-    """One sentence for each comparison that was measured, and the aims."""
-    by_key = _judged(cells)
-    best, best_loaded = _better(by_key, NONE, 50), _better(by_key, MEDIA, 99)
-    compared: list[tuple[int, _Key, _Key]] = [
-        (50, (P2P, NONE), (best, NONE)),
-        (99, (P2P, MEDIA), (best_loaded, MEDIA)),
-        (50, (HUB, NONE), (P2P, NONE)),
-        *((percent, (name, HOG), (name, NONE)) for name in (P2P, best) for percent in (50, 99)),
-        *((percent, (slow, NONE), (NODELAY, NONE)) for slow in ("paho", "mqtt") for percent in (50, 99)),
-        (50, ("mqtt5", NONE), (NODELAY, NONE)),
-    ]
-    lines = [
-        f"p{percent}: {interval.words(_name(ours), _name(theirs))}"
-        for percent, ours, theirs in compared
-        if (interval := _ratio(by_key, ours, theirs, percent)) is not None
-    ]
-    if lines:
+    """A sentence for each comparison that was measured, and the aims. Lost messages are infinitely late."""
+    found = {
+        (cell.variant, str(cell.params["load"])): msgspec.structs.replace(cell, rounds=rounds_with_lost(cell))
+        for cell in cells
+        if _is_judged(cell)
+    }
+    for percent, _, (_, load) in AIMS:
+        mqtt = [found[key] for key in found if key[1] == load and VARIANTS[key[0]].kind != "zenoh"]
+        if mqtt:
+            found[BETTER, load] = min(mqtt, key=lambda cell: cell.percentile(percent))
+    intervals = {
+        (percent, ours, theirs): paired(found[ours].rounds, found[theirs].rounds, percent)
+        for percent, ours, theirs in _COMPARED
+        if ours in found and theirs in found
+    }
+    if intervals:
         yield f"One way, 40 B at 200 Hz; {P2P} is compared with the better MQTT variant."
-    yield from lines
-    rates = {cell.variant: figure(cell.single("pictures_hz")) for (_, load), cell in by_key.items() if load == MEDIA}
-    if rates:
-        shown = ", ".join(f"{name} {rate}" for name, rate in rates.items())
-        yield f"With media, pictures received per second, of {PICTURES_HZ:g}: {shown}"
-    yield from _aims(by_key)
+    for (percent, *both), interval in intervals.items():
+        names = (found[key].variant + (f" with {key[1]}" if key[1] != NONE else "") for key in both)
+        yield f"p{percent}: {interval.words(*names)}"
+    streams = {name: cell.single("pictures_hz") for (name, load), cell in found.items() if load == MEDIA}
+    if rates := ", ".join(f"{name} {rate:.1f}" for name, rate in streams.items() if name != BETTER):
+        yield f"With media, pictures received per second, of 30: {rates}"
+    for compared, (what, bound, of) in AIMS.items():
+        if compared in intervals:
+            yield _judged(what, bound, found[compared[1]].percentile(compared[0]), intervals[compared], of)
 
 
-def _name(key: _Key) -> str:
-    return str(key[0]) if key[1] == NONE else f"{key[0]} with {key[1]}"
-
-
-def _better(by_key: _ByKey, load: str, percent: float) -> str | None:
-    """The MQTT variant with the lowest percentile."""
-    there = [by_key[name, load] for name in MQTT if (name, load) in by_key and by_key[name, load].samples]
-    return min(there, key=lambda cell: cell.percentile(percent)).variant if there else None
-
-
-def _ratio(by_key: _ByKey, ours: _Key, theirs: _Key, percent: float) -> Interval | None:
-    """None if one of the two was not measured."""
-    if ours not in by_key or theirs not in by_key:
-        return None
-    return paired(by_key[ours].rounds, by_key[theirs].rounds, percent)
-
-
-def _aims(by_key: _ByKey) -> Iterator[Judged]:
-    """The aim for p50 applies to the upper end of the interval, the one for p99 to the ratio, as they were set.
-
-    If too many messages were lost in total, the aim is missed even if few rounds lost them.
-    """
-    by_key = {key: msgspec.structs.replace(cell, rounds=rounds_with_lost(cell)) for key, cell in by_key.items()}
-    without = _ratio(by_key, (P2P, NONE), (_better(by_key, NONE, 50), NONE), 50)
-    if without is not None:
-        yield _aim(f"{P2P} / better MQTT, p50, upper end of the interval", without.high, AIM_P50, without)
-    media = _ratio(by_key, (P2P, MEDIA), (_better(by_key, MEDIA, 99), MEDIA), 99)
-    if media is not None:
-        value = media.ratio if math.isfinite(by_key[P2P, MEDIA].percentile(99)) else math.inf
-        yield _aim(f"{P2P} / better MQTT with media, p99", value, AIM_MEDIA_P99, media)
-
-
-def _aim(what: str, value: float, aim: float, interval: Interval) -> Judged:
-    """A ratio that is equal to 1 within noise does not meet an aim."""
+def _judged(what: str, bound: float, percentile_us: float, interval: Interval, of: str) -> Judged:
+    """Too much that was lost in total misses an aim, even in few rounds; so does a ratio equal to 1 within noise."""
+    value = getattr(interval, of) if math.isfinite(percentile_us) else math.inf
     why = f" of {interval.rounds} rounds" if interval.few else ", too much was lost" if math.isinf(value) else ""
-    met = outcome(value <= aim and not interval.equal, judged=not interval.few)
-    return Judged(what=f"{what}, at most {aim:.2f}", outcome=met, measured=f"{interval}{why}")
+    met = outcome(value <= bound and not interval.equal, judged=not interval.few)
+    return Judged(what=f"{what}, at most {bound:.2f}", outcome=met, measured=f"{interval}{why}")
 
 
 # -- the declarations
@@ -277,19 +252,9 @@ _OPTIONS = (
     Option(name="loads", many=True, known=LOADS, metavar="NAMES", help="Some of none, media and hog."),
     seconds("Duration of one case in a round."),
     rounds("Rounds of all cases."),
-    Option(
-        name="null", kind=bool, recorded=False, help="One variant against itself, and against itself slowed by a fifth."
-    ),
+    Option(name="null", kind=bool, recorded=False, help="One variant against itself, also slowed by a fifth."),
     Option(name="far", metavar="URL", private=True, help="Measure against `pebble bench echo` on another machine."),
-    Option(
-        name="password-file", kind=Path, metavar="FILE", private=True,
-        help="File with the broker's password; else $PEBBLE_PASSWORD.",
-    ),
-    Option(
-        name="ca-cert", kind=Path, metavar="FILE", private=True,
-        help="Certificate authority to trust with mqtts://.",
-    ),
-)  # fmt: skip
+)
 _ONE = {"sizes": [40], "rates": [200.0]}
 _ALL = {"sizes": [40, 1024], "rates": [20.0, 200.0, 1000.0], "loads": LOADS}
 
@@ -303,11 +268,11 @@ CONTROL_FAR = Comparison(
     ),
     quick=Budget(5, **_ONE, seconds=1.0, rounds=4),
     variants=(far.VARIANT,),
-    conditions=far.conditions,
+    conditions=lambda run: [condition(size, rate) for size in run["sizes"] for rate in run["rates"]],
     prepare=far.prepare,
     environment=far.environment,
     measure=far.measure,
-    figures=far.JOINED,
+    figures={"late": sum, "clock_offset_ms": of_known(median, 6), "clock_error_ms": of_known(max, 6)},  # to ns
     tables=(far.TABLE,),
     complete=lambda cells: all(cell.samples for cell in cells if cell.measure == ROUND_TRIP),
     words=("bench", "control"),
@@ -323,8 +288,7 @@ _CONTROL = Comparison(
     help="""Round trips between two services: MQTT and Zenoh; unloaded, with camera frames, beside a busy process.
 
     Each round starts two processes and a broker or hub for each variant. Needs mosquitto.
-    With --null: one variant (zenoh-p2p), 40 B at 200 Hz. The run fails if it finds a difference where there is none,
-    or misses the planted one.
+    With --null: one variant (zenoh-p2p), 40 B at 200 Hz.
 
     \b
         pebble bench control
@@ -337,7 +301,7 @@ _CONTROL = Comparison(
     quick=Budget(40, **_ONE, loads=[NONE, MEDIA], seconds=0.3, rounds=4, passes=1, fresh_every=2),
     variants=tuple(VARIANTS),
     conditions=conditions,
-    environment=lambda run: Participants(roles_of(run), run["loads"]),
+    environment=lambda run: Participants(roles_of(run)),
     measure=measure,
     measures=(ONE_WAY, ROUND_TRIP),
     figures={

@@ -11,29 +11,19 @@ from __future__ import annotations
 import math
 import secrets
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
-from pathlib import Path
-from statistics import median
 from typing import NamedTuple
 
 from rich.console import Console
 
-from pebble.bench.comparison import Case, Combine, Run, of_known
-from pebble.bench.control_worker import (
-    ROUND_TRIP,
-    Clock,
-    Connection,
-    Desk,
-    Exchange,
-    Sender,
-    SliceSpec,
-    condition,
-    echo,
-    opened,
-)
-from pebble.bench.results import Cell, Value, percentile, rounded
+from pebble.bench import control_worker as ends
+from pebble.bench.comparison import Case, Run
+from pebble.bench.control_worker import ROUND_TRIP, Clock, Desk, Exchange, Sender, SliceSpec
+from pebble.bench.results import Cell, percentile, rounded
 from pebble.bench.tables import LOST, Grid, percentile_column, single_column
+from pebble.client.connection import password
+from pebble.client.url import settings_of as url_settings
 from pebble.errors import PebbleError
 from pebble.runtime.signals import interrupted_by_signals
 from pebble.transports import MqttSettings, create
@@ -46,15 +36,17 @@ LEAST = 8  # exchanges, to compare two clocks
 _WARM_UP, _ANSWER_S = 10, 10.0  # messages
 
 
-def settings_of(url: str, password_file: Path | None, ca_cert: Path | None) -> MqttSettings:
+def settings_of(url: str) -> MqttSettings:
     """Raises PebbleError for another kind of URL."""
-    from pebble.client.connection import password
-    from pebble.client.url import settings_of
-
-    _, settings = settings_of(url, password=password(password_file), ca_cert=ca_cert)
+    _, settings = url_settings(url, password=password(None))
     if not isinstance(settings, MqttSettings):
         raise PebbleError(f"{url}: between machines only MQTT is measured: mqtt://HOST[:PORT] or mqtts://HOST[:PORT]")
     return settings
+
+
+def opened(url: str, what: str, desk: Desk) -> ends.Connection:
+    """With a client id of its own: several runs may share one broker. Raises PebbleError."""
+    return ends.opened(create("mqtt", f"bench-{what}-{secrets.token_hex(4)}", settings_of(url)), desk)
 
 
 def wall_clock() -> Clock:
@@ -63,19 +55,14 @@ def wall_clock() -> Clock:
     return lambda: time.clock_gettime_ns(time.CLOCK_MONOTONIC_RAW) + since
 
 
-def serve(settings: MqttSettings, clock: Clock | None = None) -> int:
+def serve(url: str, clock: Clock | None = None) -> int:
     """Runs an echo until Ctrl-C. Raises PebbleError without a broker."""
     desk = Desk()
-    with interrupted_by_signals(), closing(_connection(settings, "echo", desk)) as connection:
-        echo(connection, "+", clock or wall_clock())
-        Console().print(f"Echo through {settings.host}:{settings.port}, until Ctrl-C", highlight=False)
+    with interrupted_by_signals(), closing(opened(url, "echo", desk)) as connection:
+        ends.echo(connection, "+", clock or wall_clock())
+        Console().print(f"Echo through {url}, until Ctrl-C", highlight=False)
         while True:
             desk.turn()
-
-
-def _connection(settings: MqttSettings, what: str, desk: Desk) -> Connection:
-    """Opens a connection with a client id of its own: several runs may share one broker."""
-    return opened(create("mqtt", f"bench-{what}-{secrets.token_hex(4)}", settings), desk)
 
 
 class Offset(NamedTuple):
@@ -97,40 +84,24 @@ def estimate(exchanges: Sequence[Exchange]) -> Offset:
     return Offset(round((most + least) / 2), round(error) + 1) if least <= most else Offset()  # 1: for rounding
 
 
-def one_way_ns(exchange: Exchange, offset: Offset) -> tuple[float, float]:
-    """The times there and back, each ± the offset's error."""
-    return exchange.t2 - exchange.t1 - offset.ns, exchange.t4 - exchange.t3 + offset.ns
-
-
 # -- the side that measures
-
-
-def conditions(run: Run) -> list[dict[str, Value]]:
-    return [condition(size, rate) for size in run["sizes"] for rate in run["rates"]]
 
 
 def prepare(run: Run) -> None:
     if run["variants"] != [VARIANT] or run["loads"] or run.options.get("null"):
         raise PebbleError("--variants, --loads and --null have no use with --far: there is one variant")
-    _settings(run)
-
-
-def _settings(run: Run) -> MqttSettings:
-    return settings_of(run["far"], run.options.get("password-file"), run.options.get("ca-cert"))
+    settings_of(run["far"])
 
 
 @contextmanager
 def environment(run: Run) -> Iterator[Sender]:
     """A sender whose echo answers. Raises PebbleError without an echo."""
-    settings, desk = _settings(run), Desk()
-    with closing(_connection(settings, "sender", desk)) as connection:
+    desk = Desk()
+    with closing(opened(run["far"], "sender", desk)) as connection:
         sender = Sender(connection, secrets.token_hex(4), wall_clock(), desk)
         run.show("waiting for the echo")
         if not sender.warm_up(_WARM_UP, _ANSWER_S):
-            raise PebbleError(
-                f"no echo answers through {settings.host}:{settings.port}: "
-                "run `pebble bench echo URL` on the other machine"
-            )
+            raise PebbleError("no echo answers there: run `pebble bench echo URL` on the other machine")
         yield sender
 
 
@@ -144,18 +115,12 @@ def measure(case: Case) -> Iterator[Cell]:
     offset = estimate(done.exchanges)
     trips = [(one.t4 - one.t1 - (one.t3 - one.t2)) / 1e6 for one in done.exchanges]
     yield case.cell(ROUND_TRIP, "ms", trips, sent=done.sent, late=done.late)
+    there = [(one.t2 - one.t1 - offset.ns) / 1e6 for one in done.exchanges]
+    back = [(one.t4 - one.t3 + offset.ns) / 1e6 for one in done.exchanges]
     offset_ms, error_ms = (rounded(ns / 1e6, 6) for ns in offset)
-    for way, name in enumerate((THERE, BACK)):
-        times = [one_way_ns(one, offset)[way] / 1e6 for one in done.exchanges]
+    for name, times in ((THERE, there), (BACK, back)):
         known = percentile(times, 50) > offset.error_ns / 1e6
         yield case.cell(name, "ms", times if known else [], clock_offset_ms=offset_ms, clock_error_ms=error_ms)
-
-
-JOINED: Mapping[str, Combine] = {
-    "late": sum,
-    "clock_offset_ms": of_known(median, 6),  # ns
-    "clock_error_ms": of_known(max, 6),
-}
 
 
 TABLE = Grid(

@@ -1,12 +1,10 @@
-"""The programs of the control comparison: its two ends, which use a transport as services do, and a load.
+"""The two ends of the control comparison, which use a transport as services do.
 
 A service handles a drive command on the transport's thread that brings it, if it is idle; else its inbox keeps the
 command for its own thread (decision 24). The ends do the same. Stock paho calls its handler on its network thread.
 
 ``python -m pebble.bench.control_worker echo|sender paho|mqtt|zenoh SETTINGS`` (JSON, of the transport). A sender
-receives slices as JSON and answers each. ``… writer|reader mqtt|zenoh-shm WHERE``: one end of a stream of raw 640x480
-pictures at 30 Hz, as in ``pebble bench frames``. Line ``1`` switches the writer on, ``0`` off. To any line a reader
-answers when some more pictures have arrived: how many so far, and when.
+receives slices as JSON and answers each.
 """
 
 from __future__ import annotations
@@ -14,7 +12,6 @@ from __future__ import annotations
 import math
 import struct
 import sys
-import threading
 import time
 from collections.abc import Callable
 from contextlib import closing
@@ -34,23 +31,17 @@ from pebble.transports import Message, MqttSettings, QoS, State, Transport, Zeno
 
 if TYPE_CHECKING:
     from pebble.bench.comparison import Case
-    from pebble.bench.frames_worker import Reader, Writer
     from pebble.bench.results import Value
 
 ONE_WAY, ROUND_TRIP = "one-way", "round trip"  # measures
 REQUESTS, REPLIES = "pebble/bench/echo", "pebble/bench/echoed"  # followed by the sender's name
-PICTURES_HZ = 30.0  # as in bench/frames_worker.py
 _QOS = QoS(DRIVE.default_qos)
 _LEAD_S = 0.1  # messages at the start of a slice do not count: caches are cold after a pause
 _LAST_S = 1.0  # how long to wait for the last replies of a slice
 _POLL_S = 0.01
-_FLOWING = 3  # pictures received until the stream counts as flowing
 _CONNECT_S = 10.0
 _WHO = "bench"  # the sender's name
 _WARM_UP, _WARM_UP_S = 20, 15.0  # messages
-_PICTURE = 640 * 480 * 3  # bytes
-_READ_S = 1.0
-_EVERY = 64  # bytes: one in each cache line is read
 
 _FORM = struct.Struct("<Qqqq")  # of a message: its number and t1 to t3; padding follows
 _ECHOED, _ECHOED_AT = struct.Struct("<qq"), 16  # t2 and t3
@@ -60,7 +51,7 @@ Handler = Callable[[str, bytes, int], None]  # topic, payload, and when the tran
 Clock = Callable[[], int]  # ns
 
 
-class SliceSpec(msgspec.Struct, frozen=True, kw_only=True):
+class SliceSpec(msgspec.Struct, frozen=True):
     """One slice: messages of this size at this rate."""
 
     size: int
@@ -73,13 +64,8 @@ class SliceSpec(msgspec.Struct, frozen=True, kw_only=True):
     def of(case: Case) -> SliceSpec:
         """The slice of a case with a :func:`condition`."""
         (number, unit), (rate, _) = (str(case.condition[name]).split() for name in ("size", "rate"))
-        return SliceSpec(
-            size=int(number) * (1024 if unit == "KB" else 1),
-            rate=float(rate),
-            seconds=case.run["seconds"],
-            work_us=case.planted_us,
-            slowed=case.slowed,
-        )
+        size = int(number) * (1024 if unit == "KB" else 1)
+        return SliceSpec(size, float(rate), case.run["seconds"], case.planted_us, case.slowed)
 
 
 def condition(size: int, rate: float) -> dict[str, Value]:
@@ -169,10 +155,7 @@ def stock(port: int) -> Connection:
     client.wait()
 
     def subscribe(filter_: str, handler: Handler) -> None:
-        def on_message(_client: Any, _data: Any, message: Any) -> None:
-            handler(message.topic, message.payload, time.monotonic_ns())
-
-        client.paho.on_message = on_message
+        client.paho.on_message = lambda _client, _data, one: handler(one.topic, bytes(one.payload), time.monotonic_ns())
         client.subscribe(filter_, _QOS)
 
     return Connection(subscribe, partial(client.paho.publish, qos=_QOS), client.close)
@@ -276,61 +259,5 @@ def run_end(role: str, kind: str, settings: str) -> None:
             serve(lambda line: msgspec.json.encode(sender.run(msgspec.json.decode(line, type=SliceSpec))))
 
 
-# -- the load of pictures
-
-
-def write(writer: Writer) -> None:
-    import numpy as np  # only these processes need it
-
-    on, due = threading.Event(), 0.0
-
-    def switch(line: str) -> dict[str, Any]:
-        (on.set if line == "1" else on.clear)()
-        return {}
-
-    picture = np.random.default_rng(1).integers(0, 256, _PICTURE, dtype=np.uint8)
-    ended = serve_on_thread(switch, on.set)
-    answer({"ready": True})
-    while on.wait() and not ended.is_set():
-        frame = writer.begin()
-        if frame is not None:
-            np.copyto(frame, picture)
-            writer.send()
-        del frame
-        now = time.monotonic()
-        due = max(due, now - 1 / PICTURES_HZ) + 1 / PICTURES_HZ
-        time.sleep(max(0.0, due - now))
-
-
-def read(reader: Reader) -> None:
-    """Reads even while no pictures are sent: a client whose network loop does not run loses its connection."""
-    pictures = 0
-
-    def count(_line: str) -> dict[str, Any]:
-        enough = pictures + _FLOWING
-        while pictures < enough:
-            time.sleep(_POLL_S)
-        return {"pictures": pictures, "s": time.monotonic()}
-
-    ended = serve_on_thread(count)
-    answer({"ready": True})
-    while not ended.is_set():
-        frame = reader.read(_READ_S)
-        if frame is not None:
-            pictures += bool(frame[::_EVERY].any())
-            del frame
-
-
-def run_stream(role: str, kind: str, where: str) -> None:
-    from pebble.bench import frames_worker
-
-    if role == "writer":
-        with closing(frames_worker.writer(kind, where, _PICTURE)) as writer:
-            write(writer)
-    else:
-        with closing(frames_worker.reader(kind, where)) as reader:
-            read(reader)
-
-
 if __name__ == "__main__":
-    (run_stream if sys.argv[1] in ("writer", "reader") else run_end)(*sys.argv[1:])
+    run_end(*sys.argv[1:])

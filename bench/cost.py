@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -26,6 +25,7 @@ from pebble.rig.robot import BASE, KINDS, Robot
 
 ALL = "all"  # the processes of a robot together
 MEMORY, CPU, THREADS = "PSS", "CPU", "threads"
+_UNITS = {MEMORY: "MB", CPU: "%", THREADS: ""}  # CPU: per cent of one core
 PICTURES, PER_PICTURE = "pictures", "CPU per picture"
 IDLE, DRIVING = "idle", "driving"
 #: The encodings requested in each media phase, by the name of the phase.
@@ -37,72 +37,54 @@ _STARTUP_S = 0.5  # for start-up work, or a change of the streams, to finish
 _FIRST = 5  # pictures and sound packets until a stream counts as flowing
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Reading:
-    """One robot in one phase. By process: memory in MB, CPU in per cent of one core, threads."""
-
-    phase: str
-    memory: Mapping[str, float]
-    cpu: Mapping[str, float]
-    threads: Mapping[str, float]
-    pictures_per_s: float | None = None  # delivered to the operator; None: none were requested
-
-
 def measure(case: Case) -> Iterator[Cell]:
-    for reading in read(case.variant, case.run["seconds"]):
-        yield from cells_of(case, reading)
-
-
-def read(kind: str, seconds: float) -> Iterator[Reading]:
     """All phases of a fresh robot. Raises PebbleError with its log if a phase does not start."""
-    with ready_robot(kind) as (robot, subscriber):
-        yield _read(robot, subscriber, IDLE, seconds)
+    with ready_robot(case.variant) as (robot, subscriber):
+        yield from _phase(case, robot, subscriber, IDLE)
         with driving(robot.remote_port, BASE):
-            yield _read(robot, subscriber, DRIVING, seconds)
+            yield from _phase(case, robot, subscriber, DRIVING)
         for name, forms in STREAMS.items():
             if "h264" in forms and find_spec("av") is None:
                 continue
             subscriber.ask_for(*forms)
             robot.expect(partial(_flow, robot, subscriber, forms), f"{name} does not flow", _FLOW_S)
-            yield _read(robot, subscriber, name, seconds)
+            yield from _phase(case, robot, subscriber, name)
 
 
 def _flow(robot: Robot, subscriber: RobotSubscriber, forms: Sequence[str]) -> bool:
     return all(subscriber.arrived[form] >= _FIRST for form in forms) and robot.complete()
 
 
-def _read(robot: Robot, subscriber: RobotSubscriber, phase: str, seconds: float) -> Reading:
+def _phase(case: Case, robot: Robot, subscriber: RobotSubscriber, phase: str) -> Iterator[Cell]:
     """Measures the robot's processes for some seconds; memory is read afterwards."""
     time.sleep(_STARTUP_S)
     processes, form = robot.processes(), STREAMS.get(phase, ("no pictures",))[0]
     before = {name: cpu_s([pid]) for name, pid in processes.items()}
     pictures, began = subscriber.arrived[form], time.monotonic()
-    time.sleep(seconds)
+    time.sleep(case.run["seconds"])
     took = time.monotonic() - began
     cpu = {name: 100 * (cpu_s([pid]) - before[name]) / took for name, pid in processes.items()}
-    arrived = subscriber.arrived[form] - pictures
+    rate = (subscriber.arrived[form] - pictures) / took if phase in STREAMS else None
     if robot.processes() != processes:
         raise PebbleError(f"{phase}: processes of the robot ended or started meanwhile\n{robot.log()}")
-    return Reading(
-        phase=phase,
-        memory={name: pss_mb(pid) for name, pid in processes.items()},
-        cpu=cpu,
-        threads={name: len(list(Path(f"/proc/{pid}/task").iterdir())) for name, pid in processes.items()},
-        pictures_per_s=arrived / took if phase in STREAMS else None,
-    )
+    memory = {name: pss_mb(pid) for name, pid in processes.items()}
+    threads = {name: len(list(Path(f"/proc/{pid}/task").iterdir())) for name, pid in processes.items()}
+    yield from cells_of(case, phase, {MEMORY: memory, CPU: cpu, THREADS: threads}, rate)
 
 
-def cells_of(case: Case, reading: Reading) -> Iterator[Cell]:
-    """By measure and process; and by picture the CPU time of the whole robot, including its sound."""
-    found = ((MEMORY, "MB", reading.memory), (CPU, "%", reading.cpu), (THREADS, "", reading.threads))
-    for measure_, unit, values in found:
-        for process, value in {**values, ALL: sum(values.values())}.items():
-            figures = {"processes": len(values)} if process == ALL else {}
-            yield case.cell(measure_, unit, [value], {"phase": reading.phase, "process": process}, **figures)
-    if (rate := reading.pictures_per_s) is not None:
-        params = {"phase": reading.phase, "process": ALL}
-        yield case.cell(PICTURES, "1/s", [rate], params)
-        yield case.cell(PER_PICTURE, "ms", [10 * sum(reading.cpu.values()) / rate] if rate else [], params)
+def cells_of(
+    case: Case, phase: str, found: Mapping[str, Mapping[str, float]], pictures_per_s: float | None = None
+) -> Iterator[Cell]:
+    """Of what was ``found`` by measure and process, and by picture the CPU time of the whole robot, with its sound."""
+    params = {"phase": phase, "process": ALL}
+    for name, values in found.items():
+        for process, value in values.items():
+            yield case.cell(name, _UNITS[name], [value], {**params, "process": process})
+        yield case.cell(name, _UNITS[name], [sum(values.values())], params, processes=len(values))
+    if pictures_per_s is not None:
+        per_picture = [10 * sum(found[CPU].values()) / pictures_per_s] if pictures_per_s else []
+        yield case.cell(PICTURES, "1/s", [pictures_per_s], params)
+        yield case.cell(PER_PICTURE, "ms", per_picture, params)
 
 
 COST = Comparison(
@@ -115,16 +97,8 @@ COST = Comparison(
 
     Idle, driven 20 times a second, and sending pictures (640x480, 15 per second) and sound to an operator in two
     forms. Whole simulated robots; needs mosquitto.
-
-    \b
-        pebble bench cost
-        pebble bench cost --variants zenoh --seconds 10
     """,
-    options=(
-        rounds("Robots of each variant."),
-        seconds("Length of each phase.", least=0.4),
-        variants(KINDS, "mqtt or zenoh."),
-    ),
+    options=(rounds("Robots of each variant."), seconds("Of each phase.", least=0.4), variants(KINDS)),
     full=Budget(180, rounds=8, seconds=1.5),
     quick=Budget(20, rounds=1, seconds=0.7),
     constants={"rate_hz": RATE_HZ},

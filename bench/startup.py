@@ -1,16 +1,13 @@
-"""Measures a robot's start-up, how fast a late subscriber receives all retained messages, and the first picture.
-
-On MQTT and on Zenoh. Every launch is a fresh robot: launcher, hub or local broker, bridges, a simulated MCU, a remote
-broker; for the first pictures another one, with a camera.
-"""
+"""Measures a robot's start-up, how fast a late subscriber receives all retained messages, and the first picture."""
 
 from __future__ import annotations
 
 import threading
 import time
 from collections.abc import Callable, Iterator, Set
-from contextlib import closing, contextmanager
+from contextlib import closing
 from functools import partial
+from typing import Any
 
 from pebble.bench.comparison import Budget, Case, Comparison, rounds, variants
 from pebble.bench.drivers import RATE_HZ, StockClient, driving
@@ -38,19 +35,18 @@ _REST_S, _PICTURE_S = 10.0, 15.0
 _EVERYTHING = f"{BASE}/#"
 _POLL_S = 0.02  # how often an operator looks whether a key frame is missing
 
-_Receive = Callable[[str], None]  # is called with the topic of each message
-_Client = tuple[StockClient | Transport, Callable[[], object]]  # and what opens it
+_Receive = Callable[[Any], None]  # is called with each message
 
 
 def measure(case: Case) -> Iterator[Cell]:
-    """One launch, and in some rounds the first pictures. Raises PebbleError with the robot's log."""
+    """One launch, and in some rounds the first pictures, of fresh robots. Raises PebbleError with the robot's log."""
     yield from launch(case)
     if case.number % PICTURES_EVERY == 0:
         yield from first_pictures(case)
 
 
 def launch(case: Case) -> Iterator[Cell]:
-    """Measures one robot from its start to its end. Seconds count from just before its launcher is started."""
+    """Seconds count from just before the launcher is started."""
     with one_robot(case.variant) as robot, closing(RobotSubscriber(robot.remote_port, BASE)) as subscriber:
         subscriber.wait()
         with driving(robot.remote_port, BASE):
@@ -62,7 +58,7 @@ def launch(case: Case) -> Iterator[Cell]:
         times = (subscriber.first_heartbeat_ns or 0, subscriber.ready_ns or 0, _obeyed(robot, began_ns)[0])
         for name, at_ns in zip(STARTED, times, strict=True):
             yield case.cell(name, "s", [(at_ns - began_ns) / 1e9])
-        yield from _late(case, robot, subscriber)
+        yield from _late(case, robot)
 
 
 def _obeyed(robot: Robot, since_ns: int) -> list[int]:
@@ -73,65 +69,50 @@ def _obeyed(robot: Robot, since_ns: int) -> list[int]:
 # -- late subscribers, operators and services, wait for all retained messages of a running robot
 
 
-def _late(case: Case, robot: Robot, subscriber: RobotSubscriber) -> Iterator[Cell]:
-    local, port = partial(local_transport, load(robot.config)), robot.remote_port
-    inside = _retained_topics(local("retained-topics"))  # meanwhile start-up work finishes
-    outside = set(subscriber.retained)
-    late: dict[str, tuple[set[str], Callable[[_Receive], _Client]]] = {
-        "late service": (inside, lambda receive: _pebble(local("late-service"), receive)),
-        "late operator": (outside, lambda receive: _pebble(_connection(port), receive)),
-        "late operator, paho": (outside, lambda receive: _paho(port, receive)),
+def _late(case: Case, robot: Robot) -> Iterator[Cell]:
+    port, local = robot.remote_port, partial(local_transport, load(robot.config))
+    inside, outside = map(_retained_topics, (local("retained-topics"), _connection(port)))  # start-up work finishes
+    late: dict[str, tuple[Set[str], Callable[[_Receive], StockClient | Transport]]] = {
+        "late service": (inside, lambda _receive: local("late-service")),
+        "late operator": (outside, lambda _receive: _connection(port)),
+        "late operator, paho": (outside, lambda receive: StockClient(receive, [(_EVERYTHING, 1)], at_once=False)),
     }
     for name, (topics, make) in late.items():
-        yield case.cell(name, "ms", [_late_ms(topics, make) for _ in range(case.run["joins"])], topics=len(topics))
+        samples = [_late_ms(topics, make, port) for _ in range(case.run["joins"])]
+        yield case.cell(name, "ms", samples, topics=len(topics))
 
 
 def _retained_topics(transport: Transport) -> set[str]:
     """The topics with a retained message. Waits for a pause, since no message is marked as the last."""
-    found: set[str] = set()
-
-    def on_message(message: Message) -> None:
-        if message.retain:
-            found.add(message.topic)
-
+    found: list[Message] = []
     with transport:
-        transport.subscribe(_EVERYTHING, on_message, direct=True)
-        before = -1
-        while before < len(found):
-            before = len(found)
+        transport.subscribe(_EVERYTHING, found.append, direct=True)
+        topics, before = set[str](), -1
+        while before < len(topics):
+            before = len(topics)
             time.sleep(_QUIET_S)
-    return found
+            topics = {message.topic for message in found if message.retain}
+    return topics
 
 
-def _paho(port: int, receive: _Receive) -> _Client:
-    client = StockClient(lambda message: receive(message.topic), [(_EVERYTHING, 1)], at_once=False)
-    return client, lambda: client.open(port)
-
-
-def _pebble(transport: Transport, receive: _Receive) -> _Client:
-    def begin() -> None:
-        """As a service does."""
-        transport.open(timeout=0.0)
-        transport.subscribe(_EVERYTHING, lambda message: receive(message.topic), direct=True)
-
-    return transport, begin
-
-
-def _late_ms(topics: Set[str], make: Callable[[_Receive], _Client]) -> float:
+def _late_ms(topics: Set[str], make: Callable[[_Receive], StockClient | Transport], port: int) -> float:
     """Milliseconds from opening a client until messages of all topics have arrived. Raises PebbleError."""
     missing, complete, ended_ns = set(topics), threading.Event(), 0
 
-    def receive(topic: str) -> None:
+    def receive(message: Any) -> None:
         nonlocal ended_ns
-        missing.discard(topic)
+        missing.discard(message.topic)
         if not missing and not complete.is_set():
             ended_ns = time.monotonic_ns()
             complete.set()
 
-    client, begin = make(receive)
-    with closing(client):
+    with closing(make(receive)) as client:
         began_ns = time.monotonic_ns()
-        begin()
+        if isinstance(client, StockClient):
+            client.open(port)
+        else:  # as a service does
+            client.open(timeout=0.0)
+            client.subscribe(_EVERYTHING, receive, direct=True)
         complete.wait(_LATE_S)
     if missing:
         raise PebbleError(f"a late subscriber did not receive {', '.join(missing)} within {_LATE_S:.0f} s")
@@ -171,20 +152,21 @@ class _Operator(MediaReceiver):
 
 
 def first_pictures(case: Case) -> Iterator[Cell]:
-    """The wait with the camera at rest, and that of a second operator, of a fresh robot in each encoding."""
+    """The wait with the camera at rest, and that of a second operator, of a fresh robot in each encoding.
+
+    Both are connected beforehand, as operators who have the robot's page open.
+    """
     with ready_robot(case.variant) as (robot, _):
         for encoding in ALL_VIDEO:
             robot.expect(lambda: _CAMERA not in robot.processes(), "the camera does not rest", _REST_S)
-            with _operator(robot, encoding) as first, _operator(robot, encoding) as second:
+            with (
+                _connection(robot.remote_port) as one,
+                _connection(robot.remote_port) as other,
+                closing(_Operator(one, encoding)) as first,
+                closing(_Operator(other, encoding)) as second,
+            ):
                 yield case.cell(f"picture, {encoding}, at rest", "ms", [first.wait_ms()])
                 yield case.cell(f"picture, {encoding}, running", "ms", [second.wait_ms()])
-
-
-@contextmanager
-def _operator(robot: Robot, encoding: str) -> Iterator[_Operator]:
-    """Connected beforehand, as an operator who has the robot's page open."""
-    with _connection(robot.remote_port) as transport, closing(_Operator(transport, encoding)) as operator:
-        yield operator
 
 
 STARTUP = Comparison(
@@ -197,10 +179,6 @@ STARTUP = Comparison(
 
     And how fast an operator or a service that connects later receives all retained messages, and how long an operator
     waits for the first picture in each encoding. Every launch is a new simulated robot. Needs mosquitto.
-
-    \b
-        pebble bench startup
-        pebble bench startup --quick
     """,
     options=(rounds("Launches of each variant."), variants(KINDS, "mqtt or zenoh.")),
     full=Budget(156, rounds=10, joins=5),

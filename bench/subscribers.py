@@ -9,8 +9,6 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
 
 from paho.mqtt.client import MQTTMessage
-from paho.mqtt.enums import MQTTProtocolVersion
-from paho.mqtt.subscribeoptions import SubscribeOptions
 
 from pebble.bench.drivers import StockClient
 from pebble.contract import AUDIO, AUDIO_CONTROL, CAMERA, MQTT_AUDIO, MQTT_VIDEO, ONLINE, STATUS, VIDEO_CONTROL
@@ -22,20 +20,14 @@ UP_S = 20.0  # for a robot to start
 
 
 class RobotSubscriber(StockClient):
-    """Records when and how much a robot publishes at the remote broker.
-
-    One MQTT 5 connection, since only MQTT 5 shows which live messages are published as retained. Times are
-    CLOCK_MONOTONIC, in ns; None: not yet.
-    """
+    """Records when and how much a robot publishes at the remote broker: CLOCK_MONOTONIC, in ns; None: not yet."""
 
     def __init__(self, port: int, base: str) -> None:
         self._base = base
         self.first_heartbeat_ns: int | None = None
         self.ready_ns: int | None = None  # every service is ready
-        self.retained: set[str] = set()  # the topics below the base with a retained message
         self.arrived: Counter[str] = Counter()  # pictures and sound packets, by encoding: "json", "h264", "pcm", "opus"
-        everything = SubscribeOptions(qos=1, retainAsPublished=True)
-        super().__init__(self._on_message, [(f"{base}/#", everything)], protocol=MQTTProtocolVersion.MQTTv5)
+        super().__init__(self._on_message, [(f"{base}/#", 1)])
         self.open(port)
 
     def ask_for(self, video: str, audio: str) -> None:
@@ -46,8 +38,6 @@ class RobotSubscriber(StockClient):
 
     def _on_message(self, message: MQTTMessage) -> None:
         now, topic = time.monotonic_ns(), message.topic.removeprefix(f"{self._base}/")
-        if message.retain:
-            (self.retained.add if message.payload else self.retained.discard)(message.topic)
         if topic in (CAMERA.suffix, AUDIO.suffix):
             self.arrived[encoding_of(bytes(message.payload))] += 1
         elif topic == ONLINE.suffix and self.first_heartbeat_ns is None:

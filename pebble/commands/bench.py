@@ -11,7 +11,7 @@ import typer
 from typer.core import TyperGroup
 
 from pebble.bench.comparison import FOLDER, MODULES, Comparison, Option, chosen, find
-from pebble.commands.options import CaCert, Output, PasswordFile, Quick, split_names
+from pebble.commands.options import Output, Quick, split_names
 from pebble.errors import PebbleError
 
 if TYPE_CHECKING:
@@ -36,13 +36,11 @@ def compare(
 
 def echo(
     url: Annotated[str, typer.Argument(help="mqtt://HOST[:PORT] or mqtts://HOST[:PORT]", show_default=False)],
-    password_file: PasswordFile = None,
-    ca_cert: CaCert = None,
 ) -> int:
     """Send back what `pebble bench control --far` sends, until Ctrl-C. Runs on the other machine."""
-    from pebble.bench.control_far import serve, settings_of
+    from pebble.bench.control_far import serve
 
-    return serve(settings_of(url, password_file, ca_cert))
+    return serve(url)
 
 
 def report(

@@ -26,9 +26,8 @@ SHIFT_NS = 1_500_000_000
 ECHO = f"""
 import sys
 from pebble.bench.control_far import serve, wall_clock
-from pebble.transports import MqttSettings
 wall = wall_clock()
-serve(MqttSettings(host="127.0.0.1", port=int(sys.argv[1])), lambda: wall() + {SHIFT_NS})
+serve(sys.argv[1], lambda: wall() + {SHIFT_NS})
 """
 
 
@@ -94,7 +93,7 @@ def test_ctrl_c_leaves_nothing(temporary: Path, tmp_path: Path) -> None:
         stderr=subprocess.DEVNULL,
     )  # fmt: skip
     try:
-        assert until(lambda: len(children(bench.pid)) == 10, 30)
+        assert until(lambda: len(children(bench.pid)) == 8, 30)  # two are the pictures
         started = children(bench.pid)
         bench.send_signal(signal.SIGINT)
         assert bench.wait(30) == 130
@@ -106,7 +105,7 @@ def test_ctrl_c_leaves_nothing(temporary: Path, tmp_path: Path) -> None:
 
 
 def test_a_process_that_dies_is_named() -> None:
-    with Participants(["mqtt"], ["none"]) as participants:
+    with Participants(["mqtt"]) as participants:
         lines = {pid: Path(f"/proc/{pid}/cmdline").read_text() for pid in children(os.getpid())}
         os.kill(next(pid for pid, line in lines.items() if "\0sender\0" in line), signal.SIGKILL)
         with pytest.raises(PebbleError, match="mqtt: sender ended with code -9"):
@@ -129,9 +128,9 @@ def url(broker: Broker) -> str:
 
 
 @pytest.fixture
-def echo(broker: Broker) -> Iterator[Child]:
+def echo(url: str) -> Iterator[Child]:
     """A process whose clock is ahead."""
-    child = Child([sys.executable, "-c", ECHO, str(broker.port)], cwd=ROOT, stdout=subprocess.PIPE)
+    child = Child([sys.executable, "-c", ECHO, url], cwd=ROOT, stdout=subprocess.PIPE)
     assert b"until Ctrl-C" in child.stdout.readline()
     yield child
     child.kill()
@@ -155,8 +154,8 @@ def test_a_far_clock_is_found_within_its_error(url: str, tmp_path: Path) -> None
     assert f"{offset:+.3f}" in printed
 
 
-def test_the_echo_ends_with_ctrl_c(broker: Broker) -> None:
-    line = [sys.executable, "-m", "pebble.cli", "bench", "echo", f"mqtt://127.0.0.1:{broker.port}"]
+def test_the_echo_ends_with_ctrl_c(url: str) -> None:
+    line = [sys.executable, "-m", "pebble.cli", "bench", "echo", url]
     with Child(line, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as echo:
         assert b"until Ctrl-C" in echo.stdout.readline()
         echo.send_signal(signal.SIGINT)
@@ -197,6 +196,13 @@ def shown(cells: Sequence[Cell]) -> str:
     printed = io.StringIO()
     Console(file=printed, width=100).print(*CONTROL_FAR.shown(cells))
     return printed.getvalue()
+
+
+def test_the_two_ways_add_up_to_the_round_trip(monkeypatch: pytest.MonkeyPatch) -> None:
+    cells = far_cells([Exchange(0, 5_000_010, 5_000_017, 40)], monkeypatch, Offset(5_000_000, 5))
+    round_trip, there, back = (one.samples[0] for one in cells)
+    assert there == pytest.approx(10e-6)
+    assert there + back == pytest.approx(round_trip)
 
 
 def test_one_way_times_that_the_clocks_error_hides_are_unknown(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Self
 import pytest
 from rich.console import Console
 
-from pebble.bench import control, control_worker, engine, null
+from pebble.bench import control, engine, null
 from pebble.bench.comparison import Case, Comparison
 from pebble.bench.control import CONTROL, CONTROL_NULL, VARIANTS, assessment
 from pebble.bench.control_worker import (
@@ -29,7 +29,6 @@ from pebble.bench.control_worker import (
     condition,
     echo,
 )
-from pebble.bench.frames_worker import MqttReader
 from pebble.bench.results import Cell, load
 from pebble.errors import PebbleError
 from pebble.rig import broker as rig_broker
@@ -179,7 +178,7 @@ class FakeParticipants:
     calls: ClassVar[list[tuple[str, SliceSpec, str]]] = []
     started: ClassVar[list[tuple[str, ...]]] = []
 
-    def __init__(self, roles: tuple[str, ...], _loads: tuple[str, ...]) -> None:
+    def __init__(self, roles: tuple[str, ...]) -> None:
         self.started.append(roles)
 
     def __enter__(self) -> Self:
@@ -362,28 +361,3 @@ def test_another_server_on_the_broker_s_port_is_not_the_broker(tmp_path: Path, m
         assert until(lambda: broker.ended)
         with pytest.raises(PebbleError, match="broker ended at once"):
             broker.wait()
-
-
-class Ended:
-    """Standard input, which closes after a while."""
-
-    checks = 0
-
-    def is_set(self) -> bool:
-        self.checks += 1
-        return self.checks > 3
-
-
-def test_a_reader_without_pictures_still_runs_its_network_loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    broker, looped = Broker("broker", BrokerKind.MOSQUITTO, tmp_path), []
-    monkeypatch.setattr(control_worker, "serve_on_thread", lambda _count: Ended())
-    monkeypatch.setattr(control_worker, "_READ_S", 0.01)
-    try:
-        broker.wait()
-        reader = MqttReader(broker.port)
-        loop = reader._client.loop
-        monkeypatch.setattr(reader._client, "loop", lambda timeout: (looped.append(timeout), loop(timeout)))
-        control_worker.read(reader)
-    finally:
-        end_all([broker], 5.0)
-    assert len(looped) >= 3

@@ -9,22 +9,19 @@ from rich.console import Console
 
 from pebble.bench import cost
 from pebble.bench.comparison import Case
-from pebble.bench.cost import COST, IDLE, Reading
+from pebble.bench.cost import COST, CPU, IDLE, MEMORY, THREADS
 from pebble.bench.engine import Collected
 from pebble.bench.results import Cell
 from pebble.bench.subscribers import encoding_of
 from pebble.contract.packets import Codec, Picture, PictureKind, Sound
 
+Reading = tuple[str, dict[str, dict[str, float]], float | None]  # phase, values by measure and process, pictures
+
 
 def reading(phase: str, scale: float, broker: str, pictures_per_s: float | None = None) -> Reading:
+    each = {MEMORY: 10.0 * scale, CPU: 1.0 * scale, THREADS: 2.0}
     names = ("launcher", "mqtt_bridge", broker)
-    return Reading(
-        phase=phase,
-        memory=dict.fromkeys(names, 10.0 * scale),
-        cpu=dict.fromkeys(names, 1.0 * scale),
-        threads=dict.fromkeys(names, 2),
-        pictures_per_s=pictures_per_s,
-    )
+    return phase, {measure: dict.fromkeys(names, value) for measure, value in each.items()}, pictures_per_s
 
 
 def robot(scale: float, broker: str) -> list[Reading]:
@@ -36,7 +33,7 @@ def cells_of(rounds: dict[str, list[list[Reading]]]) -> list[Cell]:
     for number in range(max(map(len, rounds.values()))):
         for kind, robots in rounds.items():
             case = Case(run=run, number=number, variant=kind, role=kind, condition={})
-            collected.add(cell for reading in robots[number] for cell in cost.cells_of(case, reading))
+            collected.add(cell for reading in robots[number] for cell in cost.cells_of(case, *reading))
     return collected.cells()
 
 

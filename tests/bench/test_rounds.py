@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from pebble.bench import cost, startup
+from pebble.bench import startup
 from pebble.bench.bridge import BRIDGE
 from pebble.bench.comparison import Budget, Case, Comparison, Round
-from pebble.bench.cost import COST, IDLE, Reading
+from pebble.bench.cost import COST, IDLE, MEMORY, cells_of
 from pebble.bench.engine import run
 from pebble.bench.results import Cell, Results, load
 from pebble.errors import PebbleError
@@ -93,16 +93,16 @@ def test_startup_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     assert results.assessment[0] == "1 of 3 rounds failed and were left out; round 2: zenoh: no heartbeat"
 
 
-def test_cost_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cost_goes_on(tmp_path: Path) -> None:
     robots = iter([1.0, None, 3.0])
 
-    def read(kind: str, _seconds: float) -> Iterator[Reading]:
+    def measure(case: Case) -> Iterator[Cell]:
         if (mb := next(robots)) is None:
-            raise PebbleError(f"{kind}: a process ended")
-        yield Reading(phase=IDLE, memory={"launcher": mb}, cpu={"launcher": mb}, threads={"launcher": 1})
+            raise PebbleError(f"{case.variant}: a process ended")
+        yield from cells_of(case, IDLE, {MEMORY: {"launcher": mb}})
 
-    monkeypatch.setattr(cost, "read", read)
-    assert run(COST.run_of(rounds=3, variants=["mqtt"], output=tmp_path, console=Console(file=io.StringIO()))) == 0
+    about = replace(COST, measure=measure)
+    assert run(about.run_of(rounds=3, variants=["mqtt"], output=tmp_path, console=Console(file=io.StringIO()))) == 0
     results = load(tmp_path / "cost.json")
     assert results.cells[0].rounds == [[1.0], [3.0]]
     assert results.assessment[0] == "1 of 3 rounds failed and were left out; round 2: mqtt: a process ended"
