@@ -35,7 +35,7 @@ from typing import Any, Self
 
 import msgspec
 
-from pebble.bench.impair.conditions import Condition, Schedule, Shape
+from pebble.bench.impair.conditions import Condition, Shape, arrival
 from pebble.errors import PebbleError
 from pebble.rig.processes import python
 from pebble.rig.programs import Worker, end_workers
@@ -101,20 +101,13 @@ class NamespaceNetwork(Worker):
                 raise UnavailableError(spaces["unavailable"])
             robot, remote = (f"/proc/{self.pid}/fd/{spaces[side]}" for side in ("robot", "remote"))
             self._robot, self._remote = _Side(robot, ROBOT_HOST, REMOTE_HOST), _Side(remote, REMOTE_HOST, ROBOT_HOST)
+            self.on_robot, self.on_remote = self._robot.inside, self._remote.inside  # the latter is the broker's side
             self._robot.batch("ip", f"link add {_WIRE} type veth peer name {_WIRE} netns {remote}")
             self._robot.set_up()
             self._remote.set_up()
         except BaseException:
             self.close()
             raise
-
-    def on_robot(self, command: Sequence[str]) -> list[str]:
-        """Wraps a command so that it runs on the robot's side. The process is replaced: pid and signals stay."""
-        return self._robot.inside(command)
-
-    def on_remote(self, command: Sequence[str]) -> list[str]:
-        """Wraps a command so that it runs on the broker's side."""
-        return self._remote.inside(command)
 
     def apply(self, condition: Condition) -> None:
         """Applies a condition. Connections stay; the condition's time starts at 0."""
@@ -156,6 +149,7 @@ class _Side:
         self._path, self._address, self._peer = path, address, peer
 
     def inside(self, command: Sequence[str]) -> list[str]:
+        """Wraps a command so that it runs on this side. The process is replaced: pid and signals stay."""
         return [_program("nsenter"), f"--net={self._path}", "--", *command]
 
     def set_up(self) -> None:
@@ -258,7 +252,7 @@ class Packets:
         self.apply(Shape())
 
     def apply(self, shape: Shape) -> None:
-        self._began, self._schedule = time.monotonic(), Schedule(shape, self._seed)
+        self._began, self._shape = time.monotonic(), shape
 
     @property
     def due(self) -> float:
@@ -280,12 +274,12 @@ class Packets:
                 self.dropped += 1
 
     def _send(self, packet: bytes) -> None:
-        arrival = self._schedule.arrival(time.monotonic() - self._began)
-        if arrival is None or len(self._in_flight) >= _ROOM:
+        at = arrival(self._shape, self._seed, time.monotonic() - self._began)
+        if at is None or len(self._in_flight) >= _ROOM:
             self.dropped += 1
             return
         last = self._in_flight[-1][0] if self._in_flight else 0.0
-        self._in_flight.append((max(last, self._began + arrival), packet))
+        self._in_flight.append((max(last, self._began + at), packet))
 
 
 def main() -> int:
