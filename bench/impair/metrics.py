@@ -262,12 +262,9 @@ def _pictures(trial: Trial) -> Iterator[Cell]:
 
 def _heartbeats(trial: Trial) -> Iterator[Cell]:
     heartbeats, driven = trial.record.heartbeats, trial.record.driven
-    gaps = gaps_s([one.arrived_ns for one in heartbeats], driven)
-    longest_offline_s = max(offline_s(heartbeats, driven), default=0.0)
-    yield trial.cell(
-        HEARTBEAT_GAP, "s", gaps,
-        window_s=driven.seconds, longest_gap_s=max(gaps), longest_offline_s=longest_offline_s,
-    )  # fmt: skip
+    gaps, offline = gaps_s([one.arrived_ns for one in heartbeats], driven), offline_s(heartbeats, driven)
+    longest = {"longest_gap_s": max(gaps), "longest_offline_s": max(offline, default=0.0)}
+    yield trial.cell(HEARTBEAT_GAP, "s", gaps, window_s=driven.seconds, **longest)
     yield trial.cell(HEARTBEAT_DELAY, "ms", [one.ms for one in heartbeats if driven.holds(one.arrived_ns)])
 
 

@@ -120,15 +120,12 @@ def start(subject: str, run: Run, processes: Processes) -> ImpairedRobot:
 def _services(folder: Path) -> dict[str, Config]:
     """The original's keys and values where it has them; the loudspeaker records into the folder."""
     sound: Config = {"rate": _AUDIO_RATE, "channels": 1}
-    publishers = {
-        "video_publisher": {"keyframe_interval": 5, "jpeg_quality": 10},
-        "audio_publisher": {**sound, "chunk_ms": 20},
-    }
+    video, audio = {"keyframe_interval": 5, "jpeg_quality": 10}, {**sound, "chunk_ms": 20}
     loudspeaker = [sys.executable, "-m", "pebble.simulation.loudspeaker", "--record", str(folder)]
     (sounds := folder / "sounds").mkdir()
     write_wav(sounds / CLIP, to_bytes(Speech(_AUDIO_RATE).samples(0, round(CLIP_S * _AUDIO_RATE))), _AUDIO_RATE)
     own = {
-        "mqtt_bridge": {"media": publishers},
+        "mqtt_bridge": {"media": {"video_publisher": video, "audio_publisher": audio}},
         "av_daemon": {"audio": sound},
         "soundboard_handler": {"playback": {"directory": str(sounds), "player_command": loudspeaker}},
     }
@@ -160,8 +157,7 @@ def conditions(run: Run) -> list[Condition]:
 
 def groups(run: Run, every: Sequence[ImpairedRobot]) -> list[list[ImpairedRobot]]:
     """Those that run at the same time: the transports of one form, to limit the load on small machines; or all."""
-    forms = grouped(every, lambda robot: robot.subject.partition(" ")[2])
-    return [list(every)] if run["all_at_once"] else list(forms.values())
+    return [*grouped(every, lambda robot: run["all_at_once"] or robot.subject.partition(" ")[2]).values()]
 
 
 def measure(round_: Round) -> Iterator[Cell]:
@@ -301,16 +297,13 @@ def behind_media(cells: Sequence[Cell]) -> Iterator[Judged]:
 
 
 AIMS = (
-    _aim(paper.NARROW, "sound delivered", metrics.SOUND, "delivered_percent", "%",
-         at_least=paper.NARROW_SOUND_PERCENT),
+    _aim(paper.NARROW, "sound delivered", metrics.SOUND, "delivered_percent", "%", at_least=paper.NARROW_SOUND_PERCENT),
     _aim(paper.NARROW, "sound p95", metrics.SOUND, _p95, "ms", at_most=paper.NARROW_SOUND_P95_MS),
     _aim(paper.NARROW, "longest time without a new picture", metrics.PICTURES, "longest_gap_s", "s",
          at_most=paper.NARROW_PICTURE_GAP_S),
-    _aim(paper.WORST, "sound delivered", metrics.SOUND, "delivered_percent", "%",
-         at_least=paper.WORST_SOUND_PERCENT),
+    _aim(paper.WORST, "sound delivered", metrics.SOUND, "delivered_percent", "%", at_least=paper.WORST_SOUND_PERCENT),
     _aim(paper.WORST, "drive p95", metrics.DRIVE, _p95, "ms", at_most=paper.WORST_DRIVE_P95_MS),
-    _aim(paper.WORST, "seen offline", metrics.HEARTBEAT_GAP, "longest_offline_s", "s",
-         at_most=paper.WORST_OFFLINE_S),
+    _aim(paper.WORST, "seen offline", metrics.HEARTBEAT_GAP, "longest_offline_s", "s", at_most=paper.WORST_OFFLINE_S),
     behind_media,
 )  # fmt: skip
 
