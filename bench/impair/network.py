@@ -42,7 +42,6 @@ from pebble.rig.worker_end import answer
 
 ROBOT_HOST, REMOTE_HOST = "10.77.0.1", "10.77.0.2"
 _WIRE, _TIMED = "wire", "timed"  # the devices of a namespace; packets of the second one pass through the process
-_PREFIX = 30
 _MTU = 1500
 _ETHERNET = 14  # bytes of header that packets of a TUN device lack, but would have on a wire
 _BURST = 1600  # bytes: one packet, so that the rate also holds over short times
@@ -76,7 +75,8 @@ class Traffic:
 class NamespaceNetwork(Worker):
     """One robot's network: the process that holds its namespaces, whose end cuts all connections.
 
-    Several may be open at the same time, independent; ``name`` is for messages. Raises PebbleError.
+    ``on_robot`` and ``on_remote`` wrap a command so that it runs on the robot's or the broker's side. Several networks
+    may be open at the same time, independent; ``name`` is for messages. Raises PebbleError.
     """
 
     def __init__(self, name: str = "") -> None:
@@ -90,7 +90,7 @@ class NamespaceNetwork(Worker):
                 raise PebbleError(spaces["unavailable"])
             robot, remote = (f"/proc/{self.pid}/fd/{spaces[side]}" for side in ("robot", "remote"))
             self._robot, self._remote = _Side(robot, ROBOT_HOST, REMOTE_HOST), _Side(remote, REMOTE_HOST, ROBOT_HOST)
-            self.on_robot, self.on_remote = self._robot.inside, self._remote.inside  # the latter is the broker's side
+            self.on_robot, self.on_remote = self._robot.inside, self._remote.inside
             self._robot.batch("ip", f"link add {_WIRE} type veth peer name {_WIRE} netns {remote}")
             self._robot.set_up()
             self._remote.set_up()
@@ -138,11 +138,11 @@ class _Side:
         self._path, self._address, self._peer = path, address, peer
 
     def inside(self, command: Sequence[str]) -> list[str]:
-        """Wraps a command so that it runs on this side. The process is replaced: pid and signals stay."""
+        """The command on this side. The process is replaced: pid and signals stay."""
         return ["nsenter", f"--net={self._path}", "--", *command]
 
     def set_up(self) -> None:
-        self.batch("ip", "link set lo up", f"address add {self._address}/{_PREFIX} dev {_WIRE}")
+        self.batch("ip", "link set lo up", f"address add {self._address}/30 dev {_WIRE}")
         for device in (_WIRE, _TIMED):
             self.batch(
                 "ip",

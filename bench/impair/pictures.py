@@ -106,8 +106,7 @@ def _trials(cells: Sequence[Cell], title: str, height: float, shown: Sequence[Pa
         axes.set_xticks(range(len(trials)), [])
     every[-1].set_xticks(range(len(trials)), trials, rotation=40, ha="right", rotation_mode="anchor")
     every[-1].set_xlabel("trial: condition of the network, in the order of the run")
-    crossed = any(panel.crosses for panel in shown)
-    legend(figure, style_of, more=[Line2D([], [], **_CROSS)] if crossed else [])
+    legend(figure, style_of, more=[Line2D([], [], **_CROSS)] if any(panel.crosses for panel in shown) else [])
     return figure
 
 
