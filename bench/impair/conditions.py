@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from random import Random
 
 _JITTER_STEP_S = 0.01  # the jitter is constant for this long: packets sent together arrive together
@@ -80,34 +81,24 @@ CONDITIONS = (
 )
 
 
-class Schedule:
-    """Computes when a packet sent now arrives; depends only on shape, seed and time, not on traffic."""
+def arrival(shape: Shape, seed: str, sent: float) -> float | None:
+    """When a packet sent now arrives; the caller preserves the order. None: it is lost in a gap.
 
-    def __init__(self, shape: Shape, seed: str) -> None:
-        self._shape, self._seed = shape, seed
-        self._step, self._jitter_s = -1, 0.0
+    Takes and returns seconds since the condition began; depends on nothing else, so not on traffic.
+    """
+    extra_ms = 0.0
+    if shape.handover and sent >= shape.handover.first_s:
+        since = (sent - shape.handover.first_s) % shape.handover.every_s - shape.handover.gap_ms / 1000
+        if since < 0:
+            return None
+        extra_ms = max(0.0, 1 - since / shape.handover.recovery_s) * shape.handover.extra_ms
+    jitter_ms = shape.jitter_ms * _jitter(seed, int(sent / _JITTER_STEP_S)) if shape.jitter_ms else 0.0
+    arrived = sent + max(0.0, shape.delay_ms + extra_ms + jitter_ms) / 1000
+    beacon_s = shape.beacon_ms / 1000
+    return math.ceil(arrived / beacon_s) * beacon_s if beacon_s else arrived
 
-    def arrival(self, sent: float) -> float | None:
-        """Takes and returns seconds since the condition began; None: lost in a gap. The caller preserves the order."""
-        shape = self._shape
-        extra = 0.0
-        if shape.handover:
-            since = (sent - shape.handover.first_s) % shape.handover.every_s - shape.handover.gap_ms / 1000
-            if sent >= shape.handover.first_s:
-                if since < 0:
-                    return None
-                extra = max(0.0, 1 - since / shape.handover.recovery_s) * shape.handover.extra_ms / 1000
-        arrival = sent + max(0.0, shape.delay_ms / 1000 + extra + self._jitter(sent))
-        if not shape.beacon_ms:
-            return arrival
-        beacon_s = shape.beacon_ms / 1000
-        return math.ceil(arrival / beacon_s) * beacon_s
 
-    def _jitter(self, sent: float) -> float:
-        if not self._shape.jitter_ms:
-            return 0.0
-        step = int(sent / _JITTER_STEP_S)
-        if step != self._step:
-            self._step = step
-            self._jitter_s = Random(f"{self._seed} {step}").uniform(-1, 1) * self._shape.jitter_ms / 1000  # noqa: S311
-        return self._jitter_s
+@lru_cache(maxsize=4)  # the present step of each direction
+def _jitter(seed: str, step: int) -> float:
+    """From -1 to 1, the same for each packet of a step."""
+    return Random(f"{seed} {step}").uniform(-1, 1)  # noqa: S311

@@ -16,7 +16,7 @@ import msgspec
 
 from pebble.bench.bridge_operator import arrivals
 from pebble.bench.impair.network import Traffic
-from pebble.bench.results import OVER_TIME, Cell, Value, grouped, rounded
+from pebble.bench.results import OVER_TIME, Cell, grouped, rounded
 from pebble.client.discovery import Liveness
 from pebble.simulation.loudspeaker import Playback
 from pebble.simulation.trace import Entry
@@ -208,25 +208,22 @@ class Trial:
     traffic: dict[str, tuple[Traffic, Traffic]]
     playbacks: Sequence[Playback] = ()  # of the robot's loudspeaker, in any trial
 
-    def cell(self, measure: str, unit: str, samples: list[float], **more: Value) -> Cell:
-        figures = {name: rounded(value, 3) if isinstance(value, float) else value for name, value in more.items()}
-        about: dict[str, Value] = {"trial": self.name}
-        return Cell(variant=self.subject, params=about, measure=measure, unit=unit, rounds=[samples], figures=figures)
+    def cell(self, measure: str, unit: str, samples: list[float], **figures: float | None) -> Cell:
+        return Cell(
+            variant=self.subject, params={"trial": self.name}, measure=measure, unit=unit, rounds=[samples],
+            figures={name: rounded(value, 3) for name, value in figures.items()},
+        )  # fmt: skip
 
-    def wire(self, phase: str) -> dict[str, Value]:
+    def wire(self, phase: str) -> dict[str, float]:
         """What the robot sent in a phase, and what the network dropped of it."""
         (before, after), seconds = self.traffic[phase], self.record.windows[phase].seconds
         sent, dropped = after.bytes_up - before.bytes_up, after.dropped_up - before.dropped_up
         return {"window_s": seconds, "bytes_up": sent, "dropped_up": dropped, "kbit_up": 8e-3 * sent / seconds}
 
 
-def cells_of(trials: Iterable[Trial], fps: float) -> list[Cell]:
-    """The cells of all trials; ``fps`` is the configured rate of pictures."""
-    return [
-        cell
-        for trial in trials
-        for cell in (_sound(trial), *_pictures(trial, fps), *_heartbeats(trial), *_drive(trial), *_afterwards(trial))
-    ]
+def cells_of(trials: Iterable[Trial]) -> list[Cell]:
+    parts = (_sound, _pictures, _heartbeats, _drive, _afterwards)
+    return [cell for trial in trials for part in parts for cell in part(trial)]
 
 
 def over_time(trials: Iterable[Trial], began_ns: int) -> list[Cell]:
@@ -242,23 +239,22 @@ def over_time(trials: Iterable[Trial], began_ns: int) -> list[Cell]:
     return cells
 
 
-def _sound(trial: Trial) -> Cell:
+def _sound(trial: Trial) -> Iterator[Cell]:
     sounds, window = trial.record.sounds, trial.record.windows["audio"]
     packets, delivered = received(sounds, window), sound_percent(sounds, window)
-    return trial.cell(
+    yield trial.cell(
         SOUND, "ms", [packet.ms for packet in packets],
         sent=max(len(packets), round(100 * len(packets) / delivered)) if packets else None,  # as far as can be told
         delivered_percent=delivered, on_time_percent=sound_percent(sounds, window, ON_TIME_S), **trial.wire("audio"),
     )  # fmt: skip
 
 
-def _pictures(trial: Trial, wanted_fps: float) -> Iterator[Cell]:
+def _pictures(trial: Trial) -> Iterator[Cell]:
     window = trial.record.windows["video"]
     pictures = [picture for picture in trial.record.pictures if window.holds(picture.arrived_ns)]
-    gaps, fps = gaps_s([picture.arrived_ns for picture in pictures], window), len(pictures) / window.seconds
+    gaps = gaps_s([picture.arrived_ns for picture in pictures], window)
     yield trial.cell(
-        PICTURES, "ms", [picture.ms for picture in pictures],
-        fps=fps, delivered_percent=min(100.0, 100 * fps / wanted_fps),
+        PICTURES, "ms", [picture.ms for picture in pictures], fps=len(pictures) / window.seconds,
         frozen_s=sum((gap for gap in gaps if gap > FROZEN_S), 0.0), longest_gap_s=max(gaps), **trial.wire("video"),
     )  # fmt: skip
     yield trial.cell(PICTURE_GAP, "s", gaps)
@@ -292,7 +288,6 @@ def _afterwards(trial: Trial) -> Iterator[Cell]:
     record = trial.record
     for measure, phase in ((AFTER_VIDEO, "video off"), (AFTER_AUDIO, "audio off")):
         gaps = gaps_s([heartbeat.arrived_ns for heartbeat in record.heartbeats], record.windows[phase])
-        longest = {"heartbeats": len(gaps) - 1, "longest_gap_s": max(gaps)}
-        yield trial.cell(measure, "s", gaps, **longest, **trial.wire(phase))
+        yield trial.cell(measure, "s", gaps, heartbeats=len(gaps) - 1, longest_gap_s=max(gaps), **trial.wire(phase))
     played = [(one.began_ns - record.clip_ns) / 1e6 for one in trial.playbacks if one.began_ns >= record.clip_ns]
     yield trial.cell(CLIP, "ms", sorted(played)[:1], sent=1)

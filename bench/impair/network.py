@@ -17,7 +17,6 @@ import json
 import math
 import os
 import select
-import shutil
 import signal
 import stat
 import struct
@@ -35,7 +34,7 @@ from typing import Any, Self
 
 import msgspec
 
-from pebble.bench.impair.conditions import Condition, Schedule, Shape
+from pebble.bench.impair.conditions import Condition, Shape, arrival
 from pebble.errors import PebbleError
 from pebble.rig.processes import python
 from pebble.rig.programs import Worker, end_workers
@@ -43,7 +42,6 @@ from pebble.rig.worker_end import answer
 
 ROBOT_HOST, REMOTE_HOST = "10.77.0.1", "10.77.0.2"
 _WIRE, _TIMED = "wire", "timed"  # the devices of a namespace; packets of the second one pass through the process
-_PREFIX = 30
 _MTU = 1500
 _ETHERNET = 14  # bytes of header that packets of a TUN device lack, but would have on a wire
 _BURST = 1600  # bytes: one packet, so that the rate also holds over short times
@@ -51,7 +49,6 @@ _QUEUE_S = 0.3  # the queue of a home router's modem, with tail drop
 _QUEUE_PACKETS = 4  # at least; at 64 kbit/s 0.3 s hold fewer than two
 _COMMAND_S = _ANSWER_S = 10.0
 _SBIN = "/usr/local/sbin:/usr/sbin:/sbin"  # not in the PATH of users
-_PACKAGES = {"nsenter": "util-linux", "ip": "iproute2", "tc": "iproute2", "nft": "nftables"}
 
 _TUN = Path("/dev/net/tun")
 _CLONE_NEWNET = 0x40000000
@@ -61,11 +58,7 @@ _ROOM = 1000  # packets in flight per direction; 100 ms at 100 Mbit/s are 800
 _AT_ONCE = 64  # packets read before others are written
 _NICE = -10  # must not wait while the robot encodes pictures
 
-_TABLE = """table ip impair {
-    counter lost { }
-    chain arriving { type filter hook prerouting priority raw; }
-}
-"""
+_TABLE = "table ip impair { counter lost { }; chain arriving { type filter hook prerouting priority raw; }; }"
 
 
 @dataclass(frozen=True)
@@ -79,15 +72,11 @@ class Traffic:
     dropped_up: int = 0
 
 
-class UnavailableError(PebbleError):
-    """This machine or user does not permit such a network."""
-
-
 class NamespaceNetwork(Worker):
     """One robot's network: the process that holds its namespaces, whose end cuts all connections.
 
-    Several may be open at the same time, independent; ``name`` is for messages. Raises UnavailableError if the process
-    cannot make one.
+    ``on_robot`` and ``on_remote`` wrap a command so that it runs on the robot's or the broker's side. Several networks
+    may be open at the same time, independent; ``name`` is for messages. Raises PebbleError.
     """
 
     def __init__(self, name: str = "") -> None:
@@ -98,23 +87,16 @@ class NamespaceNetwork(Worker):
         try:
             spaces = self.answer(_ANSWER_S)
             if "unavailable" in spaces:
-                raise UnavailableError(spaces["unavailable"])
+                raise PebbleError(spaces["unavailable"])
             robot, remote = (f"/proc/{self.pid}/fd/{spaces[side]}" for side in ("robot", "remote"))
             self._robot, self._remote = _Side(robot, ROBOT_HOST, REMOTE_HOST), _Side(remote, REMOTE_HOST, ROBOT_HOST)
+            self.on_robot, self.on_remote = self._robot.inside, self._remote.inside
             self._robot.batch("ip", f"link add {_WIRE} type veth peer name {_WIRE} netns {remote}")
             self._robot.set_up()
             self._remote.set_up()
         except BaseException:
             self.close()
             raise
-
-    def on_robot(self, command: Sequence[str]) -> list[str]:
-        """Wraps a command so that it runs on the robot's side. The process is replaced: pid and signals stay."""
-        return self._robot.inside(command)
-
-    def on_remote(self, command: Sequence[str]) -> list[str]:
-        """Wraps a command so that it runs on the broker's side."""
-        return self._remote.inside(command)
 
     def apply(self, condition: Condition) -> None:
         """Applies a condition. Connections stay; the condition's time starts at 0."""
@@ -156,10 +138,11 @@ class _Side:
         self._path, self._address, self._peer = path, address, peer
 
     def inside(self, command: Sequence[str]) -> list[str]:
-        return [_program("nsenter"), f"--net={self._path}", "--", *command]
+        """The command on this side. The process is replaced: pid and signals stay."""
+        return ["nsenter", f"--net={self._path}", "--", *command]
 
     def set_up(self) -> None:
-        self.batch("ip", "link set lo up", f"address add {self._address}/{_PREFIX} dev {_WIRE}")
+        self.batch("ip", "link set lo up", f"address add {self._address}/30 dev {_WIRE}")
         for device in (_WIRE, _TIMED):
             self.batch(
                 "ip",
@@ -196,18 +179,14 @@ class _Side:
         self._run(program, "-batch", "-", stdin="".join(f"{line}\n" for line in lines))
 
     def _run(self, program: str, *arguments: str, stdin: str = "") -> str:
-        command, what = self.inside([_program(program), *arguments]), f"{program} {' '.join(arguments)}"
-        env = {**os.environ, "LC_ALL": "C"}  # its messages are read below
+        command, what = self.inside([program, *arguments]), f"{program} {' '.join(arguments)}"
+        env = {**os.environ, "PATH": f"{os.environ.get('PATH', os.defpath)}:{_SBIN}"}
         try:
-            done = subprocess.run(
-                command, input=stdin, capture_output=True, text=True, timeout=_COMMAND_S, check=True, env=env
-            )
-        except subprocess.TimeoutExpired:
-            raise PebbleError(f"{what} did not end within {_COMMAND_S:.0f} s") from None
-        except subprocess.CalledProcessError as error:
-            why = error.stderr.strip().partition("\n")[0] or f"code {error.returncode}"
-            refused = "not permitted" in why or "Permission denied" in why
-            raise (UnavailableError if refused else PebbleError)(f"{what}: {why}") from None
+            done = subprocess.run(command, input=stdin, capture_output=True, text=True, timeout=_COMMAND_S, env=env)
+        except (OSError, subprocess.TimeoutExpired) as error:
+            raise PebbleError(f"{what}: {error}") from None
+        if done.returncode:
+            raise PebbleError(f"{what}: {(done.stderr.strip() or f'code {done.returncode}').splitlines()[0]}")
         return done.stdout
 
 
@@ -220,28 +199,16 @@ def _queue(kbit: float | None, device: str) -> str:
     return f"tbf rate {round(kbit * 1000)}bit burst {round(max(_BURST, rate * 0.005))} limit {round(limit)}"
 
 
-def _program(name: str) -> str:
-    found = shutil.which(name, path=f"{os.environ.get('PATH', '')}:{_SBIN}")
-    if found is None:
-        raise UnavailableError(f"{name} is not installed: apt-get install {_PACKAGES[name]}")
-    return found
-
-
 @cache
 def why_no_namespaces() -> str | None:
-    """What prevents such networks; None: nothing. Tested with every feature a condition may use.
-
-    Raises PebbleError if namespaces are permitted, but fail.
-    """
+    """What prevents such networks; None: nothing. Tested with every feature a condition may use."""
     everything = Shape(kbit=1000, loss=0.01, delay_ms=1)
     try:
         with NamespaceNetwork("on trial") as network:
             network.apply(Condition("trial", everything, everything))
             network.traffic()
-    except UnavailableError as error:
-        return str(error)
     except PebbleError as error:
-        raise PebbleError(f"network namespaces do not work here: {error}") from None
+        return str(error)
     return None
 
 
@@ -258,7 +225,7 @@ class Packets:
         self.apply(Shape())
 
     def apply(self, shape: Shape) -> None:
-        self._began, self._schedule = time.monotonic(), Schedule(shape, self._seed)
+        self._began, self._shape = time.monotonic(), shape
 
     @property
     def due(self) -> float:
@@ -268,7 +235,13 @@ class Packets:
         """Reads the packets available at the source."""
         with suppress(BlockingIOError):
             for _ in range(_AT_ONCE):
-                self._send(os.read(self._source, _PACKET))
+                packet = os.read(self._source, _PACKET)
+                at = arrival(self._shape, self._seed, time.monotonic() - self._began)
+                if at is None or len(self._in_flight) >= _ROOM:
+                    self.dropped += 1
+                else:
+                    last = self._in_flight[-1][0] if self._in_flight else 0.0
+                    self._in_flight.append((max(last, self._began + at), packet))
 
     def deliver(self) -> None:
         """Writes the packets that are due."""
@@ -278,14 +251,6 @@ class Packets:
                 os.write(self._sink, self._in_flight.popleft()[1])
             except OSError:  # the kernel's queue is full: the packet is lost
                 self.dropped += 1
-
-    def _send(self, packet: bytes) -> None:
-        arrival = self._schedule.arrival(time.monotonic() - self._began)
-        if arrival is None or len(self._in_flight) >= _ROOM:
-            self.dropped += 1
-            return
-        last = self._in_flight[-1][0] if self._in_flight else 0.0
-        self._in_flight.append((max(last, self._began + arrival), packet))
 
 
 def main() -> int:

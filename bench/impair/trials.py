@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 
 import msgspec
@@ -121,15 +120,12 @@ def start(subject: str, run: Run, processes: Processes) -> ImpairedRobot:
 def _services(folder: Path) -> dict[str, Config]:
     """The original's keys and values where it has them; the loudspeaker records into the folder."""
     sound: Config = {"rate": _AUDIO_RATE, "channels": 1}
-    publishers = {
-        "video_publisher": {"keyframe_interval": 5, "jpeg_quality": 10},
-        "audio_publisher": {**sound, "chunk_ms": 20},
-    }
+    video, audio = {"keyframe_interval": 5, "jpeg_quality": 10}, {**sound, "chunk_ms": 20}
     loudspeaker = [sys.executable, "-m", "pebble.simulation.loudspeaker", "--record", str(folder)]
     (sounds := folder / "sounds").mkdir()
     write_wav(sounds / CLIP, to_bytes(Speech(_AUDIO_RATE).samples(0, round(CLIP_S * _AUDIO_RATE))), _AUDIO_RATE)
     own = {
-        "mqtt_bridge": {"media": publishers},
+        "mqtt_bridge": {"media": {"video_publisher": video, "audio_publisher": audio}},
         "av_daemon": {"audio": sound},
         "soundboard_handler": {"playback": {"directory": str(sounds), "player_command": loudspeaker}},
     }
@@ -161,25 +157,22 @@ def conditions(run: Run) -> list[Condition]:
 
 def groups(run: Run, every: Sequence[ImpairedRobot]) -> list[list[ImpairedRobot]]:
     """Those that run at the same time: the transports of one form, to limit the load on small machines; or all."""
-    forms = grouped(every, lambda robot: robot.subject.partition(" ")[2])
-    return [list(every)] if run["all_at_once"] else list(forms.values())
+    return [*grouped(every, lambda robot: run["all_at_once"] or robot.subject.partition(" ")[2]).values()]
 
 
 def measure(round_: Round) -> Iterator[Cell]:
     """All trials; one that fails ends them, and the earlier ones count. Raises PebbleError if there are none."""
-    run, every, cases = round_.run, round_.env, round_.cases()
-    began_ns, trials, marks = time.monotonic_ns(), list[Trial](), list[str]()
+    run, every = round_.run, round_.env
+    began_ns, trials, marks = time.monotonic_ns(), list[Trial](), dict[str, float]()
     with ThreadPoolExecutor(len(every), thread_name_prefix="subject") as pool:
         try:
-            list(pool.map(lambda robot: robot.next_report(), every))
+            list(pool.map(ImpairedRobot.next_report, every))
             for number, condition in enumerate(conditions(run)):
                 name, turn = condition.name, slice(None, None, -1 if number % 2 else 1)
-                list(islice(cases, len(every)))  # for the progress that is shown
-                for place, group in enumerate(one[turn] for one in groups(run, every)[turn]):
+                for group in (one[turn] for one in groups(run, every)[turn]):
                     run.show(f"{name}: {', '.join(robot.subject for robot in group)}")
-                    list(pool.map(lambda robot: robot.recover(), group))
-                    if not place:
-                        marks.append(f"{name}@{(time.monotonic_ns() - began_ns) / 1e9:.1f}")
+                    list(pool.map(ImpairedRobot.recover, group))
+                    marks.setdefault(name, (time.monotonic_ns() - began_ns) / 1e9)
                     list(pool.map(lambda robot, now=condition: robot.network.apply(now), group))
                     trials += list(pool.map(lambda robot, name=name: robot.trial(name), group))
                     list(pool.map(lambda robot: robot.network.apply(CLEAN), group))
@@ -190,8 +183,8 @@ def measure(round_: Round) -> Iterator[Cell]:
         finally:
             for robot in every:
                 robot.operator.ask_to_end()  # unblocks threads that wait for it
-    run.recorded["marks"] = ";".join(marks)
-    yield from cells_of(trials, FPS)
+    run.recorded["marks"] = ";".join(f"{name}@{second:.1f}" for name, second in marks.items())
+    yield from cells_of(trials)
     yield from over_time(trials, began_ns)
 
 
@@ -304,16 +297,13 @@ def behind_media(cells: Sequence[Cell]) -> Iterator[Judged]:
 
 
 AIMS = (
-    _aim(paper.NARROW, "sound delivered", metrics.SOUND, "delivered_percent", "%",
-         at_least=paper.NARROW_SOUND_PERCENT),
+    _aim(paper.NARROW, "sound delivered", metrics.SOUND, "delivered_percent", "%", at_least=paper.NARROW_SOUND_PERCENT),
     _aim(paper.NARROW, "sound p95", metrics.SOUND, _p95, "ms", at_most=paper.NARROW_SOUND_P95_MS),
     _aim(paper.NARROW, "longest time without a new picture", metrics.PICTURES, "longest_gap_s", "s",
          at_most=paper.NARROW_PICTURE_GAP_S),
-    _aim(paper.WORST, "sound delivered", metrics.SOUND, "delivered_percent", "%",
-         at_least=paper.WORST_SOUND_PERCENT),
+    _aim(paper.WORST, "sound delivered", metrics.SOUND, "delivered_percent", "%", at_least=paper.WORST_SOUND_PERCENT),
     _aim(paper.WORST, "drive p95", metrics.DRIVE, _p95, "ms", at_most=paper.WORST_DRIVE_P95_MS),
-    _aim(paper.WORST, "seen offline", metrics.HEARTBEAT_GAP, "longest_offline_s", "s",
-         at_most=paper.WORST_OFFLINE_S),
+    _aim(paper.WORST, "seen offline", metrics.HEARTBEAT_GAP, "longest_offline_s", "s", at_most=paper.WORST_OFFLINE_S),
     behind_media,
 )  # fmt: skip
 
@@ -383,14 +373,12 @@ IMPAIR = Comparison(
         "soundboard": f"a wav file of {CLIP_S:g} s, played by a simulated loudspeaker",
     },
     variants=SUBJECTS,
-    conditions=lambda run: [{"trial": condition.name} for condition in conditions(run)],
     prepare=prepare,
     environment=robots,
     measure_round=measure,
     figures={"sent": lambda values: values[-1]},  # of the only round; None if nothing arrived
     tables=TABLES,
     title_suffix=", over {link_words}, windows of {window_s:g} s{quick}",
-    legend=lambda _cells: paper.QUOTED,
     assessment=(*AIMS, encodings, trips, transports),
     complete=lambda _cells: True,  # in the worst trials nothing may arrive
     pictures=(Drawn("pebble.bench.impair.pictures:over_trials"), Drawn("pebble.bench.impair.pictures:over_time")),

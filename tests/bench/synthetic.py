@@ -195,8 +195,7 @@ def impair(trials: tuple[str, ...] = TRIALS) -> Results:
                      rounds=latencies(middle * bad, 50, 1), figures=more)
                 for measure, unit, middle, more in (
                     ("audio latency", "ms", 45, figures),
-                    ("video latency", "ms", 60, {"fps": 15 / bad, "window_s": 8.0}),
-                    ("picture gap", "s", 0.07, {"frozen_s": bad - 1.0, "longest_gap_s": 0.1 * bad}),
+                    ("video latency", "ms", 60, {"fps": 15 / bad, "frozen_s": bad - 1.0, "longest_gap_s": 0.1 * bad}),
                     ("heartbeat gap", "s", 1.0, {"longest_offline_s": bad - 1.0}),
                     ("drive alone", "ms", 2, {"sent": 50}),
                     ("drive during video", "ms", 2.1, {}),

@@ -1,5 +1,6 @@
 """Impaired networks, where the machine permits them."""
 
+import re
 from collections.abc import Iterator
 
 import pytest
@@ -9,8 +10,9 @@ from pebble.bench.impair.network import NamespaceNetwork, why_no_namespaces
 
 @pytest.fixture
 def namespaces_permitted() -> None:
-    """Skips without permission; checked only when a test needs it, by creating them."""
+    """Skips without permission or programs, and fails for another reason; checked only when a test needs it."""
     if obstacle := why_no_namespaces():
+        assert re.search("run it as root|not permitted|Permission denied|failed to execute", obstacle), obstacle
         pytest.skip(f"no namespaces: {obstacle}")
 
 

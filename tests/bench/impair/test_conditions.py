@@ -2,7 +2,7 @@
 
 import pytest
 
-from pebble.bench.impair.conditions import CONDITIONS, Handover, Schedule, Shape
+from pebble.bench.impair.conditions import CONDITIONS, Handover, Shape, arrival
 from pebble.bench.impair.trials import IMPAIR, conditions
 from pebble.errors import PebbleError
 
@@ -38,13 +38,13 @@ def test_some_trials_can_be_chosen() -> None:
 
 
 def test_without_delay_everything_arrives_as_it_is_sent() -> None:
-    assert Schedule(Shape(), "up").arrival(1.5) == 1.5
+    assert arrival(Shape(), "up", 1.5) == 1.5
 
 
 def test_jitter_stays_in_its_band_and_is_the_same_for_the_same_seed() -> None:
     shape, times = Shape(delay_ms=20, jitter_ms=5), [n * 0.013 for n in range(500)]
-    one, same, other = ([Schedule(shape, seed).arrival(t) for t in times] for seed in ("up", "up", "down"))
-    delays = [arrival - sent for arrival, sent in zip(one, times, strict=True) if arrival is not None]
+    one, same, other = ([arrival(shape, seed, t) for t in times] for seed in ("up", "up", "down"))
+    delays = [at - sent for at, sent in zip(one, times, strict=True) if at is not None]
     assert len(delays) == 500
     assert 0.015 - 1e-9 <= min(delays) < 0.016
     assert 0.024 < max(delays) <= 0.025 + 1e-9
@@ -53,18 +53,17 @@ def test_jitter_stays_in_its_band_and_is_the_same_for_the_same_seed() -> None:
 
 @pytest.mark.parametrize("handover", [5.0, 20.0, 35.0])
 def test_a_handover_is_a_gap_and_then_a_longer_way_for_a_while(handover: float) -> None:
-    schedule = Schedule(SATELLITE, "up")
-    assert schedule.arrival(handover + 0.05) is None
+    assert arrival(SATELLITE, "up", handover + 0.05) is None
     times = [handover - 0.01, handover + 0.1001, handover + 0.6, handover + 1.2]
-    delays_ms = [((schedule.arrival(sent) or 0) - sent) * 1000 for sent in times]
+    delays_ms = [((arrival(SATELLITE, "up", sent) or 0) - sent) * 1000 for sent in times]
     assert delays_ms == pytest.approx([25, 65, 45, 25], abs=0.1)
 
 
 def test_no_handover_before_the_first() -> None:
-    assert Schedule(SATELLITE, "up").arrival(0.0) == pytest.approx(0.025)
+    assert arrival(SATELLITE, "up", 0.0) == pytest.approx(0.025)
 
 
 def test_power_save_holds_everything_until_a_beacon() -> None:
-    schedule = Schedule(Shape(delay_ms=2, beacon_ms=100), "down")
-    arrivals = [schedule.arrival(sent) for sent in (0.001, 0.05, 0.097, 0.099, 0.15)]
+    shape = Shape(delay_ms=2, beacon_ms=100)
+    arrivals = [arrival(shape, "down", sent) for sent in (0.001, 0.05, 0.097, 0.099, 0.15)]
     assert arrivals == pytest.approx([0.1, 0.1, 0.1, 0.2, 0.2])

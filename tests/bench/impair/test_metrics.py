@@ -81,9 +81,9 @@ def test_packets_at_the_edges_count_for_their_part_in_the_window() -> None:
 
 
 def test_packets_sent_are_as_many_as_the_windows_sound_would_be() -> None:
-    half = of(cells_of([trial(sounds=[packet(number) for number in range(0, 250, 2)])], fps=10), metrics.SOUND)
+    half = of(cells_of([trial(sounds=[packet(number) for number in range(0, 250, 2)])]), metrics.SOUND)
     assert (half.figures["sent"], half.lost) == (250, 125)
-    nothing = of(cells_of([trial(sounds=[])], fps=10), metrics.SOUND)
+    nothing = of(cells_of([trial(sounds=[])]), metrics.SOUND)
     assert nothing.figures["sent"] is None
 
 
@@ -210,7 +210,7 @@ def of(found: list[Cell], measure: str) -> Cell:
 
 
 def test_a_good_trial_has_all_its_cells() -> None:
-    found = cells_of([trial()], fps=10)
+    found = cells_of([trial()])
     assert len({cell.measure for cell in found}) == len(found) == 12
     sound, video = of(found, metrics.SOUND), of(found, metrics.PICTURES)
     assert sound.figures["delivered_percent"] == sound.figures["on_time_percent"] == 100
@@ -227,7 +227,7 @@ def test_a_good_trial_has_all_its_cells() -> None:
 
 
 def test_what_is_sent_without_media_is_counted() -> None:
-    found = cells_of([trial(heartbeats=[heartbeat(number / 4) for number in range(77)])], fps=10)
+    found = cells_of([trial(heartbeats=[heartbeat(number / 4) for number in range(77)])])
     video, audio = of(found, metrics.AFTER_VIDEO), of(found, metrics.AFTER_AUDIO)
     assert (video.figures["heartbeats"], video.figures["longest_gap_s"], video.figures["bytes_up"]) == (
         8,
@@ -238,17 +238,17 @@ def test_what_is_sent_without_media_is_counted() -> None:
 
 
 def test_a_clip_is_timed_from_its_command_to_its_first_sample() -> None:
-    clip = of(cells_of([trial()], fps=10), metrics.CLIP)
+    clip = of(cells_of([trial()]), metrics.CLIP)
     assert (clip.samples, clip.lost) == ([70], 0)
     never = trial(name="64k", clip_ns=21 * S)
-    found = cells_of([trial(), never], fps=10)
+    found = cells_of([trial(), never])
     (silent,) = (cell for cell in found if cell.measure == metrics.CLIP and cell.params["trial"] == "64k")
     assert (silent.samples, silent.lost) == ([], 1)
 
 
 def test_a_trial_in_which_nothing_arrived_has_metrics_too() -> None:
     nothing = trial(pictures=[], sounds=[], heartbeats=[])
-    found = cells_of([nothing], fps=10)
+    found = cells_of([nothing])
     assert of(found, metrics.SOUND).figures["delivered_percent"] == 0
     assert math.isnan(of(found, metrics.SOUND).percentile(95))
     assert of(found, metrics.PICTURES).figures["frozen_s"] == 7
@@ -267,7 +267,7 @@ def test_series_over_time_are_ordered_and_begin_with_the_run() -> None:
 
 def test_the_aims_are_met_or_missed_by_so_much() -> None:
     good, bad = trial("mqtt h264 opus"), trial("zenoh h264 opus", late_ms=500)
-    lines = lines_of(cells_of([good, bad], fps=10))
+    lines = lines_of(cells_of([good, bad]))
     aim, window = "h264 opus at 256k, sound p95 at most 400 ms", "window of 10 s"
     assert f"aim: mqtt {aim}: met (50.0 ms, {window})" in lines
     assert f"aim: zenoh {aim}: missed (500 ms, {window})" in lines
@@ -275,39 +275,39 @@ def test_the_aims_are_met_or_missed_by_so_much() -> None:
 
 
 def test_lost_messages_are_infinitely_late() -> None:
-    few = lines_of(cells_of([trial(sounds=[packet(number) for number in range(250) if number % 50])], fps=10))
-    many = lines_of(cells_of([trial(sounds=[packet(number) for number in range(250) if number % 10])], fps=10))
+    few = lines_of(cells_of([trial(sounds=[packet(number) for number in range(250) if number % 50])]))
+    many = lines_of(cells_of([trial(sounds=[packet(number) for number in range(250) if number % 10])]))
     aim = "aim: zenoh h264 opus at 256k, sound p95 at most 400 ms"
     assert f"{aim}: met (50.0 ms, 2.00 % lost, window of 10 s)" in few
     assert f"{aim}: missed (too much was lost, 10.0 % lost, window of 10 s)" in many
 
 
 def test_commands_that_were_overtaken_or_lost_count_for_the_aim() -> None:
-    cells = cells_of([trial(name="64k+5%", reached=slice(None, None, 10))], fps=10)
+    cells = cells_of([trial(name="64k+5%", reached=slice(None, None, 10))])
     assert of(cells, metrics.DRIVE).figures["delivered_percent"] == 10
-    lines = lines_of(cells + cells_of([trial("mqtt h264 opus", "64k+5%", reached=slice(100))], fps=10))
+    lines = lines_of(cells + cells_of([trial("mqtt h264 opus", "64k+5%", reached=slice(100))]))
     aim = "h264 opus at 64k+5%, drive p95 at most 500 ms"
     assert f"aim: zenoh {aim}: missed (910 ms, 4.50 % lost, window of 20 s)" in lines
     assert f"aim: mqtt {aim}: missed (too much was lost, 50.0 % lost, window of 20 s)" in lines
 
 
 def test_rest_times_show_a_robot_that_nothing_reached() -> None:
-    (line,) = (line for line in lines_of(cells_of([trial(reached=slice(0))], fps=10)) if line.startswith("Stops"))
+    (line,) = (line for line in lines_of(cells_of([trial(reached=slice(0))])) if line.startswith("Stops"))
     assert "zenoh h264 opus 0 (wheels at rest for 19.9 of 20.0 s)" in line
 
 
 def test_transports_are_compared_where_both_were_tried() -> None:
     both = [trial(f"{kind} original", name, late_ms=50) for name in QUICK for kind in ("mqtt", "zenoh")]
-    lines = lines_of(cells_of(both, fps=10))
+    lines = lines_of(cells_of(both))
     assert any("original, sound p50 over 4 trials: zenoh / mqtt = 1.00" in sentence for sentence in lines)
     assert not any(sentence.startswith("aim:") for sentence in lines)
-    assert not any("zenoh and mqtt" in sentence for sentence in lines_of(cells_of(both[::2], fps=10)))
+    assert not any("zenoh and mqtt" in sentence for sentence in lines_of(cells_of(both[::2])))
 
 
 def test_the_tables_fit_a_terminal() -> None:
     tried = [trial(name, condition) for condition in ("wifi-power-save", "64k+5%") for name in SUBJECTS]
     console = Console(file=io.StringIO(), width=80)
-    shown = IMPAIR.shown(cells_of(tried, fps=10))
+    shown = IMPAIR.shown(cells_of(tried))
     assert len(shown) == 4
     for table in shown:
         assert console.measure(table).maximum <= 80

@@ -1,6 +1,7 @@
 """Rate, loss and packet size of networks of namespaces."""
 
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -10,7 +11,6 @@ import pytest
 from pebble.bench.impair import network as networks
 from pebble.bench.impair.conditions import Condition, Shape
 from pebble.bench.impair.network import NamespaceNetwork
-from pebble.errors import PebbleError
 from tests.bench.impair.peers import ProbeConnection, largest_packet
 from tests.support import ROOT, until
 
@@ -72,16 +72,16 @@ def test_the_namespaces_have_no_other_connection() -> None:
             assert devices == {"lo", "wire", "timed"}
 
 
-def test_a_missing_program_is_named_with_its_package(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_program_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "nsenter").symlink_to(str(shutil.which("nsenter")))
     monkeypatch.setattr(networks, "_SBIN", "/nowhere")
-    monkeypatch.setenv("PATH", "/nowhere")
-    assert networks.why_no_namespaces.__wrapped__() == "ip is not installed: apt-get install iproute2"
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert "failed to execute ip: No such file" in str(networks.why_no_namespaces.__wrapped__())
 
 
-def test_namespaces_that_fail_are_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_namespaces_that_fail_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(networks, "_TABLE", "nonsense")
-    with pytest.raises(PebbleError, match="namespaces do not work here: nft -f -: "):
-        networks.why_no_namespaces.__wrapped__()
+    assert str(networks.why_no_namespaces.__wrapped__()).startswith("nft -f -: ")
 
 
 def test_a_user_without_permission_gets_the_reason() -> None:
