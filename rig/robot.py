@@ -219,11 +219,11 @@ MEDIA = synthetic_media((640, 480, 15), (640, 480, 15))
 
 
 @contextmanager
-def one_robot(kind: str, **options: Any) -> Iterator[Robot]:
+def one_robot(kind: str, make: type[Robot] = Robot, **options: Any) -> Iterator[Robot]:
     """A robot of its own with a remote broker of its own, ready to be launched. Raises PebbleError."""
     with Processes() as processes:
         broker = processes.broker("remote")
-        robot = Robot(processes, kind, (_HOST, broker.port), **options)
+        robot = make(processes, kind, (_HOST, broker.port), **options)
         broker.wait()
         robot.prepare()
         yield robot
