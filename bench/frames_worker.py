@@ -69,9 +69,9 @@ def write(writer: Writer, size: int, slower_us: float) -> None:
         """As a camera does: pixels, then the time."""
         np.copyto(frame, picture)
         for place in (8, len(frame) - 8):
-            struct.pack_into("<q", frame, place, len(stamps))
+            struct.pack_into("<q", frame.data, place, len(stamps))
         stamps.append(time.monotonic_ns())
-        struct.pack_into("<q", frame, 0, stamps[-1])
+        struct.pack_into("<q", frame.data, 0, stamps[-1])
         end = time.perf_counter_ns() + int(1000 * slower_us)
         while time.perf_counter_ns() < end:  # as pebble.bench.null.spin, which the system's Python cannot import
             pass
@@ -102,8 +102,8 @@ def read(reader: Reader, bare_copy: int) -> None:
         if frame is None:
             continue
         now, frames = time.monotonic_ns(), frames + 1
-        stamp, number = struct.unpack_from("<qq", frame)
-        torn += struct.unpack_from("<q", frame, len(frame) - 8) != (number,)
+        stamp, number = struct.unpack_from("<qq", frame.data)
+        torn += struct.unpack_from("<q", frame.data, len(frame) - 8) != (number,)
         del frame
         if stamp in window.ns:
             if bare_copy:
