@@ -201,7 +201,8 @@ class Run:
     @property
     def command(self) -> list[str]:
         """The command line that repeats the run."""
-        about, defaults = self.comparison, {**self.comparison.full, "variants": self.comparison.variants}
+        about = self.comparison
+        defaults = {**about.full, **(about.quick if self.quick else {}), "variants": about.variants}
         words = ["pebble", *(about.words or ("bench", about.name))]
         for option in about.options:
             words += option.words(self.options.get(option.key), defaults.get(option.key, ()))
