@@ -18,9 +18,8 @@ from pebble.bench.results import Cell
 from pebble.bench.tables import COUNT, LOST, Column, Grid, percentile_column
 from pebble.bench.usage import cpu_s, pss_mb
 from pebble.errors import PebbleError
-from pebble.rig.broker import Broker, mosquitto_path
-from pebble.rig.processes import Processes, python
-from pebble.rig.programs import Worker
+from pebble.rig.broker import mosquitto_path
+from pebble.rig.processes import Broker, Processes, Worker, python
 
 VARIANTS = ("zenoh-shm", "zenoh-copy", "zenoh-net", "mqtt", "gstreamer-shm", "memcpy")
 OURS = "zenoh-shm"
