@@ -23,8 +23,7 @@ from pebble.bench.ratios import Interval, paired
 from pebble.bench.results import Cell, Judged, Value, percentile, rounded
 from pebble.bench.tables import Column, Grid, percentile_column, single_column
 from pebble.bench.usage import wake_up_us, wake_ups
-from pebble.rig.processes import BROKERS, OPERATORS, Processes, python
-from pebble.rig.programs import Program, Worker
+from pebble.rig.processes import BROKERS, OPERATORS, Processes, Program, Worker, python
 from pebble.transports import MqttSettings, ZenohSettings
 
 NONE, MEDIA, HOG = LOADS = ("none", "media", "hog")

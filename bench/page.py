@@ -29,7 +29,7 @@ from pebble.bench.tables import figure
 from pebble.bench.usage import cpu_s
 from pebble.contract.encodings import ALL_VIDEO
 from pebble.errors import PebbleError
-from pebble.rig.programs import children
+from pebble.rig.processes import children
 from pebble.rig.testbed import ROBOTS
 
 Samples = Iterator[tuple[str, float]]  # each with the key of its row

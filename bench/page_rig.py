@@ -25,8 +25,7 @@ from pebble.bench.impair.network import ROBOT_HOST as SERVER
 from pebble.bench.impair.network import NamespaceNetwork, why_no_namespaces
 from pebble.contract import DRIVE
 from pebble.errors import PebbleError
-from pebble.rig.processes import OPERATORS
-from pebble.rig.programs import Program
+from pebble.rig.processes import OPERATORS, Program
 from pebble.rig.testbed import ROBOTS, Stage
 
 if TYPE_CHECKING:

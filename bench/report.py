@@ -17,8 +17,7 @@ from pebble.bench.comparison import Comparison, reported
 from pebble.bench.engine import check_folder
 from pebble.bench.results import Results, load, named, pack
 from pebble.errors import PebbleError
-from pebble.rig.processes import python
-from pebble.rig.programs import Program, end_all
+from pebble.rig.processes import Program, end_all, python
 from pebble.runtime.signals import interrupted_by_signals
 
 NAME = "README.md"

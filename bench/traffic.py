@@ -29,8 +29,7 @@ from pebble.client.media_receiver import MediaReceiver
 from pebble.errors import PebbleError
 from pebble.recordings.library import FOREVER_NS
 from pebble.recordings.traffic.results import AUDIO, IDLE, SESSION, VIDEO, RobotTraffic, Traffic
-from pebble.rig.processes import OPERATORS, python
-from pebble.rig.programs import Program, end_all
+from pebble.rig.processes import OPERATORS, Program, end_all, python
 from pebble.rig.testbed import ROBOTS, Testbed
 from pebble.transports import MqttSettings, create
 

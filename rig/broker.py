@@ -10,7 +10,6 @@ import os
 import shutil
 import socket
 import sys
-import threading
 from collections.abc import Iterator, Sequence
 from enum import StrEnum
 from importlib.util import find_spec
@@ -18,46 +17,14 @@ from pathlib import Path
 from typing import Any
 
 from pebble.errors import PebbleError
-from pebble.rig.programs import Program, Wrap, unchanged
 
-_HOST = "127.0.0.1"
+HOST = "127.0.0.1"
 _SBIN = "/usr/sbin:/usr/local/sbin"  # where Debian puts brokers, outside users' PATH
-_START_S = 15.0  # amqtt takes a while to import on a small machine
 
 
 class BrokerKind(StrEnum):
     MOSQUITTO = "mosquitto"
     EMBEDDED = "embedded"
-
-
-class Broker(Program):
-    """A broker, from its construction on."""
-
-    def __init__(
-        self,
-        name: str,
-        kind: BrokerKind,
-        folder: Path,
-        extra: Sequence[str] = (),
-        port: int = 0,
-        *,
-        host: str = _HOST,
-        wrap: Wrap = unchanged,
-    ) -> None:
-        """``extra``: more lines for mosquitto's configuration; amqtt has none. ``port`` 0 is a free one."""
-        self.port = port or free_port()
-        command = [sys.executable, "-m", "pebble.rig.broker", str(self.port)]
-        if kind is BrokerKind.MOSQUITTO:
-            command = mosquitto_command(self.port, folder / name, extra, host)
-        super().__init__(name, wrap(command), folder / f"{name}.log")
-
-    def wait(self, ending: threading.Event | None = None) -> None:
-        """Wait until it answers, or ``ending``. Raises PebbleError on timeout, or if the broker has ended."""
-        self.wait_until(lambda: self._answers() and not self.ended, _START_S, ending)
-
-    def _answers(self) -> bool:
-        with socket.socket() as probe:
-            return probe.connect_ex((_HOST, self.port)) == 0
 
 
 def best_kind() -> BrokerKind:
@@ -76,7 +43,7 @@ def mosquitto_path() -> str | None:
     return shutil.which("mosquitto") or shutil.which("mosquitto", path=_SBIN)
 
 
-def mosquitto_command(port: int, stem: Path, extra: Sequence[str] = (), host: str = _HOST) -> list[str]:
+def mosquitto_command(port: int, stem: Path, extra: Sequence[str] = (), host: str = HOST) -> list[str]:
     """The command of a mosquitto on ``port``; writes its configuration to ``stem`` plus ``.conf``."""
     path = mosquitto_path()
     if path is None:
@@ -113,7 +80,7 @@ async def serve_amqtt(port: int) -> None:
     """Run amqtt on loopback until the task is cancelled."""
     from amqtt.broker import Broker as AmqttBroker  # optional
 
-    listeners = {"default": {"type": "tcp", "bind": f"{_HOST}:{port}"}}
+    listeners = {"default": {"type": "tcp", "bind": f"{HOST}:{port}"}}
     plugins = {"amqtt.plugins.authentication.AnonymousAuthPlugin": {"allow_anonymous": True}}
     broker = AmqttBroker({"listeners": listeners, "plugins": plugins})
     broker._subscriptions = _Subscriptions()

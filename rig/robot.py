@@ -21,9 +21,7 @@ from pebble.config.raw import deep_merge
 from pebble.contract.identity import Identity
 from pebble.errors import PebbleError
 from pebble.launcher.programs import programs
-from pebble.rig.broker import Broker
-from pebble.rig.processes import MCUS, ROBOTS, Processes, python
-from pebble.rig.programs import Each, Program, Wrap, children, unchanged
+from pebble.rig.processes import MCUS, ROBOTS, Broker, Each, Processes, Program, Wrap, children, python, unchanged
 from pebble.simulation.trace import Entry, read_trace
 
 if TYPE_CHECKING:

@@ -23,8 +23,7 @@ from pebble.errors import PebbleError
 from pebble.media.sound_file import write_wav
 from pebble.media.world.world_file import read_world
 from pebble.rig.broker import BrokerKind
-from pebble.rig.processes import OPERATORS, Processes, python
-from pebble.rig.programs import Program
+from pebble.rig.processes import OPERATORS, Processes, Program, python
 from pebble.rig.robot import MEDIA, START_S, Robot, SimulatedRobot
 from pebble.simulation.loudspeaker import playbacks
 from pebble.simulation.mcu import Snapshot

@@ -1,4 +1,4 @@
-"""The other end of a worker (pebble.rig.programs): lines from standard input, answers in JSON lines.
+"""The other end of a worker (pebble.rig.processes): lines from standard input, answers in JSON lines.
 
 It needs only the standard library: the system's Python, which has GStreamer, imports it as a plain file.
 """

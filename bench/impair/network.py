@@ -36,8 +36,7 @@ import msgspec
 
 from pebble.bench.impair.conditions import Condition, Shape, arrival
 from pebble.errors import PebbleError
-from pebble.rig.processes import python
-from pebble.rig.programs import Worker, end_workers
+from pebble.rig.processes import Worker, end_workers, python
 from pebble.rig.worker_end import answer
 
 ROBOT_HOST, REMOTE_HOST = "10.77.0.1", "10.77.0.2"

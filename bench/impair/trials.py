@@ -30,8 +30,7 @@ from pebble.errors import PebbleError
 from pebble.media.pcm import to_bytes
 from pebble.media.sound_file import write_wav
 from pebble.media.speech import Speech
-from pebble.rig.processes import BROKERS, Processes
-from pebble.rig.programs import Program, Worker
+from pebble.rig.processes import BROKERS, Processes, Program, Worker
 from pebble.rig.robot import BASE, Config, Robot, synthetic_media
 from pebble.simulation.loudspeaker import playbacks
 

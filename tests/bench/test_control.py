@@ -19,7 +19,7 @@ from pebble.bench.control_far import BACK, THERE, Offset
 from pebble.bench.control_worker import ONE_WAY, ROUND_TRIP, Exchange, Slice, SliceSpec
 from pebble.bench.results import Cell, load
 from pebble.errors import PebbleError
-from pebble.rig.programs import children
+from pebble.rig.processes import children
 from tests.support import ROOT, Broker, Child, until
 
 SHIFT_NS = 1_500_000_000

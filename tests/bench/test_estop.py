@@ -31,7 +31,7 @@ from pebble.bench.estop import (
 from pebble.bench.pictures import pictures
 from pebble.bench.results import Cell, Results, load
 from pebble.errors import PebbleError
-from pebble.rig.programs import Worker, end_workers
+from pebble.rig.processes import Worker, end_workers
 from pebble.simulation.fleet import Moved
 from pebble.transports import Message, MqttSettings, QoS, create
 from tests.support import Broker, until

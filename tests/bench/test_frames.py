@@ -17,7 +17,7 @@ from pebble.bench.comparison import Case
 from pebble.bench.frames import FRAMES
 from pebble.bench.results import Cell, load
 from pebble.errors import PebbleError
-from pebble.rig.programs import children
+from pebble.rig.processes import children
 from tests.support import ROOT, gone, until
 
 

@@ -20,7 +20,7 @@ from pebble.bench.report import Section, text
 from pebble.bench.results import Judged, Results
 from pebble.commands import bench, impair
 from pebble.errors import PebbleError
-from pebble.rig.programs import children
+from pebble.rig.processes import children
 from tests.bench import synthetic
 from tests.support import ROOT, Child, gone, until
 

@@ -10,7 +10,7 @@ import pytest
 
 from pebble.bench.usage import cpu_s, own_mb, pss_mb, wake_up_us, wake_ups
 from pebble.errors import PebbleError
-from pebble.rig.programs import Worker, children
+from pebble.rig.processes import Worker, children
 from tests.support import Child, until
 
 GONE = 1 << 22  # above the largest pid

@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 
 from pebble.errors import PebbleError
-from pebble.rig.processes import BROKERS, MCUS, OPERATORS, ROBOTS, Processes
-from pebble.rig.programs import Program, children
+from pebble.rig.processes import BROKERS, MCUS, OPERATORS, ROBOTS, Processes, Program, children
 from tests.support import until
 
 WORKER = """

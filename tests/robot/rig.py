@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from pebble.rig.programs import children
+from pebble.rig.processes import children
 from pebble.simulation.trace import Entry, read_trace
 from tests.robot.operator import Operator
 from tests.support import ROOT, Broker, gone, process_name, until

@@ -16,7 +16,7 @@ from pebble.bench.bridge_operator import HOP, SERVICES, STAND_IN
 from pebble.bench.engine import run
 from pebble.bench.results import Cell, load
 from pebble.errors import PebbleError
-from pebble.rig.programs import children
+from pebble.rig.processes import children
 from pebble.rig.robot import KINDS
 from tests.robot.rig import Rig, descendants
 from tests.support import until

@@ -16,7 +16,7 @@ from pebble.bench.bridge import BRIDGE, COMMANDS, CPU, DOWN, UNLOADED, UP
 from pebble.bench.bridge_operator import STAND_IN
 from pebble.bench.engine import run
 from pebble.bench.results import load
-from pebble.rig.programs import children
+from pebble.rig.processes import children
 from pebble.rig.robot import KINDS
 from tests.robot.rig import Rig, descendants
 from tests.support import ROOT, Child, until

@@ -17,7 +17,7 @@ from pebble.bench.impair import metrics
 from pebble.bench.impair.network import why_no_namespaces
 from pebble.bench.impair.trials import IMPAIR
 from pebble.bench.results import load
-from pebble.rig.programs import children
+from pebble.rig.processes import children
 from tests.robot.rig import Rig, descendants
 from tests.support import ROOT, until
 

@@ -352,6 +352,33 @@ def test_what_a_frozen_broker_found_when_it_woke_up_never_arrives(tmp_path: Path
     broker.stop()
 
 
+def test_what_others_sent_to_a_broker_that_stood_still_is_no_younger(
+    tmp_path: Path, clients: Clients, topic: str
+) -> None:
+    """It reads a packet of each client in turn, so all of our pings may be answered before it has read the last."""
+    broker = Broker(tmp_path)
+    robot, ages, stops, each = clients(broker.port, "robot"), list[tuple[float, float]](), 5, 22
+
+    def receive(message: Message) -> None:
+        ages.append((clock.since_boot() - float(message.payload), message.waited_s))
+
+    robot.subscribe(topic, receive, direct=True)
+    operator = clients(broker.port, "operator")
+    for _ in range(stops):
+        broker.freeze()
+        for _ in range(each):
+            operator.publish(topic, b"%.6f" % clock.since_boot(), qos=DELIVERED)
+            time.sleep(0.05)
+        broker.thaw()
+        time.sleep(1.0)
+    assert len(ages) == stops * each
+    assert [age for age, waited in ages if age > 0.9 and waited < 0.5] == []
+    operator.publish(topic, b"%.6f" % clock.since_boot(), qos=DELIVERED)
+    assert until(lambda: len(ages) == stops * each + 1)
+    assert ages[-1][1] < 0.3
+    broker.stop()
+
+
 def test_what_came_while_the_machine_was_suspended_never_arrives(
     broker: Broker, clients: Clients, topic: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -87,6 +87,20 @@ class TestBrokerDelay:
         delay.answered(5.1)
         assert self.at(delay, 5.2) == 0
 
+    def test_what_others_sent_meanwhile_may_come_after_all_answers(self, delay: BrokerDelay) -> None:
+        """A broker that stood still reads a packet of each client in turn."""
+        assert self.at(delay, 0.9) == 0
+        for sent_at in (1.0, 1.5, 2.0):
+            delay.asked(sent_at, clear=True)
+        assert self.at(delay, 2.5) == 1.4
+        for _ in range(3):
+            delay.answered(2.5)
+        assert self.at(delay, 2.51) == self.at(delay, 2.69) == 1.4
+        delay.asked(2.51, clear=True)
+        delay.answered(2.52)
+        assert self.at(delay, 2.6) == 1.4
+        assert self.at(delay, 2.71) == 0
+
     def test_a_long_way_is_none(self, delay: BrokerDelay) -> None:
         delay.asked(1.0, clear=True)
         delay.answered(2.0)
@@ -118,6 +132,7 @@ class TestBrokerDelay:
     def test_a_later_acknowledgement_shows_that_an_answer_is_lost(self, delay: BrokerDelay) -> None:
         delay.asked(1.0, clear=True)
         delay.asked(1.5, clear=True)
+        assert self.at(delay, 1.6) == 0.5
         delay.acknowledged(1.2, 1.6)
         assert self.at(delay, 2.3) == 0.7
         delay.answered(2.4)

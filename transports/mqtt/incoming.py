@@ -18,6 +18,7 @@ else:
 
 _FAR_S = 1.0  # no round trip of a usable link is longer
 _NOTICED_S = 0.1
+_BACKLOG_S = 0.2  # after a stall, for what others had sent to the broker meanwhile
 _NEAR_S = 0.05  # of a broker further away PUBACKs must show what is lost
 _LOST = 8  # prompt answers in a row
 _UPLINK_S = 0.5  # TCP's round trips may be so much longer than usual: more may as well be the way to us
@@ -55,6 +56,10 @@ class BrokerDelay:
     A ping of which the way there took long itself, behind our own data, says nothing. What is usual is no delay: the
     shortest answer of this connection, and TCP's own round trips, which do not wait for the broker.
 
+    A broker that stood still reads what its clients have sent meanwhile a packet of each in turn: it may have answered
+    all of our pings before it has read the last old message of another client. So if nothing at all has come since an
+    overdue ping was sent, what comes in the next moment counts as having waited as long.
+
     Answers carry no number, and mosquitto drops them where a client's queue is full. A later PUBACK shows that, and so
     do answers that always come right after the newest ping, which is not sent at regular intervals.
     """
@@ -64,6 +69,9 @@ class BrokerDelay:
         self._asked: deque[tuple[float, float, bool]] = deque()
         self._shortest = _FAR_S
         self._newest = 0.0  # seconds until the newest answer
+        self._came_at = 0.0  # when something was received last
+        self._stall = 0.0  # how long the newest one took, which counts
+        self._until = 0.0  # then
         self._prompt = 0  # answers in a row that came right after the newest of several pings
 
     def usual(self, seconds: float) -> None:
@@ -98,11 +106,16 @@ class BrokerDelay:
         self._newest = min(self._newest, now - sent_at)
 
     def seconds(self, now: float, round_trip_s: Callable[[], float]) -> float:
-        """``round_trip_s`` asks for TCP's present one, if that matters."""
+        """Of what is received at ``now``; ``round_trip_s`` asks for TCP's present round trip, if that matters."""
         waited = self._newest
         if self._asked:
-            oldest = next((since for since, _, clear in self._asked if clear), now)
+            oldest, sent_at = next(((since, sent_at) for since, sent_at, clear in self._asked if clear), (now, now))
             waited = max(waited, now - oldest)
+            if self._came_at <= sent_at and now - sent_at > self._shortest + _NOTICED_S:
+                self._stall, self._until = now - sent_at, now + _BACKLOG_S
+        self._came_at = now
+        if now < self._until:
+            waited = max(waited, self._stall)
         if waited <= self._shortest + _NOTICED_S:
             return 0.0
         return waited - max(self._shortest, min(round_trip_s(), self._shortest + _UPLINK_S))

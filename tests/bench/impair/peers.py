@@ -8,7 +8,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from pebble.bench.impair.network import REMOTE_HOST, NamespaceNetwork
-from pebble.rig.programs import Worker, end_workers
+from pebble.rig.processes import Worker, end_workers
 
 _ANSWER_S = 40.0
 _PEER = [sys.executable, "-I", str(Path(__file__).with_name("peer.py"))]

@@ -10,7 +10,7 @@ import pytest
 from pebble.bench.impair.conditions import CONDITIONS, Condition, Shape
 from pebble.bench.impair.network import NamespaceNetwork
 from pebble.errors import PebbleError
-from pebble.rig.programs import children
+from pebble.rig.processes import children
 from tests.bench.impair.peers import ProbeConnection
 from tests.support import ROOT, Child, gone, until
 

@@ -8,8 +8,7 @@ import pytest
 from pebble.bench.impair.network import REMOTE_HOST, NamespaceNetwork
 from pebble.bench.impair.trials import SUBJECTS, ImpairedRobot
 from pebble.errors import PebbleError
-from pebble.rig.processes import BROKERS, Processes
-from pebble.rig.programs import Program
+from pebble.rig.processes import BROKERS, Processes, Program
 from pebble.rig.robot import Robot
 from tests.support import until
 
