@@ -136,7 +136,6 @@ class Comparison:
     derived: Callable[[list[Cell]], list[Cell]] = lambda cells: cells  # what all rounds together make of the cells
     tables: Sequence[Tables] = ()  # see pebble.bench.tables
     title_suffix: str = ""  # of all tables; may name recorded options and {quick}: ", over {link}"
-    legend: Callable[[Sequence[Cell]], Iterable[str]] = lambda _cells: ()
     assessment: Sequence[Assess] = ()  # Claims, Aims and functions, the most important first
     complete: Callable[[Sequence[Cell]], bool] = lambda cells: all(cell.samples for cell in cells)  # else exit code 1
     pictures: Sequence[Callable[[Results], Iterable[Any]]] = ()  # see pebble.bench.pictures

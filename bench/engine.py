@@ -14,7 +14,10 @@ from pathlib import Path
 from typing import Final
 
 import msgspec
+from rich.console import Console
 from rich.markup import escape
+from rich.measure import Measurement
+from rich.table import Table
 
 from pebble.bench import null
 from pebble.bench.comparison import Combine, Comparison, Round, Run
@@ -24,6 +27,7 @@ from pebble.errors import PebbleError
 from pebble.runtime.signals import interrupted_by_signals
 from pebble.transports.segments import sweep
 
+_WIDEST: Final = 200  # characters of a table
 _GIVEN_UP: Final = 2  # rounds that fail before any has succeeded: then the run ends
 _IN_US: Final = {"us": 1.0, "ms": 1e3, "s": 1e6}
 _JOINED: Final[Mapping[str, Combine]] = {"sent": sum}
@@ -54,9 +58,7 @@ def run(run: Run) -> int:
     suffix = about.title_suffix.format(**results.options, quick=", quick" if run.quick else "")
     for table in about.shown(cells):
         table.title = f"{table.title}{suffix}"
-        run.console.print(table)
-    for line in about.legend(cells):
-        show(line, style="dim")
+        _print_whole(table, run.console)
     for sentence in (*results.assessment, *results.aims):
         show(str(sentence))
     written = [run.output / f"{about.name}.json"]
@@ -71,6 +73,14 @@ def run(run: Run) -> int:
     if run.problem is not None:
         raise run.problem
     return int(not results.complete)
+
+
+def _print_whole(table: Table, console: Console) -> None:
+    """In a narrow terminal its lines are broken, but no figure is cut off."""
+    width = console.width
+    console.width = max(width, Measurement.get(console, console.options.update(max_width=_WIDEST), table).maximum)
+    console.print(table)
+    console.width = width
 
 
 def roles_of(run: Run) -> Sequence[str]:

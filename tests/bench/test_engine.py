@@ -223,7 +223,7 @@ def test_the_variant_of_a_null_test_may_be_missing_too(tmp_path: Path) -> None:
     null_ = Option(name="null", known=("pipe", "socket"), help="Only this one.")
     about = declared(
         is_null=True, variants=(), options=(null_,), full=Budget(1, null="pipe"), conditions=lambda _run: SIZES[:1],
-        missing=lambda name: "no sockets here" if name == "socket" else None, legend=lambda _cells: (),
+        missing=lambda name: "no sockets here" if name == "socket" else None,
     )  # fmt: skip
     assert {cell.variant for cell in measured(about, tmp_path).cells} == set(null.roles("pipe"))
     with pytest.raises(PebbleError, match="no variant can be measured"):

@@ -147,7 +147,7 @@ def test_invalid_options_are_refused_before_anything_starts(given: dict[str, Any
 
 def test_the_command_line_of_results_repeats_them() -> None:
     assert " ".join(FRAMES.run_of(quick=True, variants=["mqtt"]).command) == (
-        "pebble bench frames --seconds 0.5 --rounds 2 --size 640x480 --readers 1 --variants mqtt --quick"
+        "pebble bench frames --seconds 0.5 --rounds 2 --variants mqtt --quick"
     )
 
 
