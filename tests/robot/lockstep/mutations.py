@@ -100,7 +100,9 @@ MUTATIONS = {
         schedule=48,
     ),
     "every command is a person's": Mutation(
-        f"{_MOTORS}.motion.motion_inbox", "    if not drive.signed:\n        return PERSON\n", "    return PERSON\n"
+        f"{_MOTORS}.motion.motion_inbox",
+        "    if drive.source != SCRIPT:\n        return PERSON\n",
+        "    return PERSON\n",
     ),
     # -- every service
     "retained commands are obeyed": Mutation(

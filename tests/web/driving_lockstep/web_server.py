@@ -35,9 +35,6 @@ class _Time:
     def monotonic(self) -> float:
         return self.clock()
 
-    def clock_gettime(self, _clock: int) -> float:
-        return self.clock()
-
     def time(self) -> float:
         return EPOCH + self.clock()
 
@@ -75,8 +72,10 @@ def virtual() -> Iterator[None]:
         token_hex=lambda size: f"{next(numbers):0{2 * size}x}", token_urlsafe=lambda _: f"token-{next(numbers)}"
     )
     with ExitStack() as stack:
-        for module in (server, robots, control, broker, message_clock):
+        for module in (server, robots, control, broker):
             stack.enter_context(patch.object(module, "time", TIME))
+        for module, name in ((server, "clock"), (control, "clock"), (message_clock, "since_boot")):
+            stack.enter_context(patch.object(module, name, TIME.monotonic))
         for module in (server, control, broker):
             stack.enter_context(patch.object(module, "secrets", secrets))
         stack.enter_context(patch.object(server, "MediaHub", _Nothing))
