@@ -17,6 +17,12 @@ from pebble.errors import PebbleError
 if TYPE_CHECKING:
     from typer._click.core import Command, Context
 
+_GROUP_HELP = """Comparisons, side by side in one run on this machine.
+
+\b
+    pebble bench frames
+    pebble bench compare before/frames.json after/frames.json
+"""
 _NAMES = [name for name in MODULES if name != "impair"]  # which is a command of its own
 
 
@@ -118,7 +124,7 @@ def _parsed(option: Option, value: Any) -> Any:
 
 
 def register(app: typer.Typer) -> None:
-    words = "Comparisons, side by side in one run on this machine."
+    words = _GROUP_HELP
     group = typer.Typer(cls=Comparisons, help=words, rich_markup_mode=None)
     for command in (compare, echo, report):
         group.command(command.__name__)(command)

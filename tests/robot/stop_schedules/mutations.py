@@ -11,7 +11,7 @@ from pathlib import Path
 
 from tests.support import ROOT
 
-_COPIED = ("pebble", "bench", "configs", "firmware", "services", "simulation", "tests", "tools", "transports")
+_COPIED = ("pebble", "bench", "configs", "firmware", "rig", "services", "simulation", "tests", "tools", "transports")
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +57,7 @@ MUTATIONS = (
         "a person's zero bars no run",
         "two",
         _ARBITER,
-        "if not moves and (final or self._script):",
+        "if not moves and (final or self._scripted):",
         "if final and moves:",
     ),
     Mutation(
