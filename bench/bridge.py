@@ -9,15 +9,15 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import replace
 from itertools import pairwise, product
 from statistics import fmean
 from typing import Any
 
-from pebble.bench import null
 from pebble.bench.aims import Aim, RatioAim, with_lost
 from pebble.bench.bridge_operator import ALL, HOP, STAND_IN, Arrived, DrivenRobot, Turn, Wheels, driven_robot, wheels_of
+from pebble.bench.clients import RATE_HZ
 from pebble.bench.comparison import Budget, Case, Comparison, Option, Round, Run, of_known, rounds, seconds, variants
-from pebble.bench.drivers import RATE_HZ
 from pebble.bench.pictures import bars, ecdf, null_ratios, ratios
 from pebble.bench.ratios import LEAST_ROUNDS
 from pebble.bench.results import Cell, grouped
@@ -207,35 +207,14 @@ _OPTIONS = (
     Option(name="null", kind=bool, recorded=False, help="One robot against itself, also slowed down by a fifth."),
     Option(name="profile", kind=bool, recorded=False, help="Latency of a command hop by hop."),
 )
+_OURS = (*_OPTIONS, variants(KINDS))
 
-BRIDGE_NULL = Comparison(
-    name="bridge-null",
-    title="Operator to wheels: the null test",
-    what="One robot in three roles that take turns: plain, again, and with a fifth of the usual latency planted by "
-    "the operator. The first interval must include 1.00, the second must lie above it.",
-    options=(*_OPTIONS, variants(KINDS)),
-    # many messages, and very short turns, so that a disturbance of the machine hits all roles
-    full=Budget(150, null=True, rounds=10, seconds=4.0, turn_s=0.05, rate_hz=100.0, fresh_every=10_000),
-    quick=Budget(14, rounds=4, seconds=0.5),
-    is_null=True,
-    variants=KINDS[1:],
-    conditions=lambda _run: [{"load": UNLOADED}],
-    prepare=prepare,
-    environment=lambda run: running(run["variants"]),
-    measure=pilot,
-    measure_round=lambda round_: _in_turns(round_, UNLOADED, round_.env),
-    tables=(LATENCIES,),
-    assessment=(null.assessment,),
-    words=("bench", "bridge"),
-    reported=("--null",),
-    pictures=(null_ratios("Null test of bridge"), ecdf("Null test of bridge")),
-)
 BRIDGE_PROFILE = Comparison(
     name="bridge-profile",
     title="Operator to wheels: where the time goes",
     what="The same path of a command, hop by hop, from the time stamps of its packets on loopback: for a typical "
     "command, and for the slowest ones.",
-    options=(*_OPTIONS, variants(KINDS)),
+    options=_OURS,
     full=Budget(60, profile=True, rounds=3, seconds=10.0, rate_hz=RATE_HZ),
     quick=Budget(12, rounds=1, seconds=2.0),
     variants=KINDS,
@@ -252,7 +231,7 @@ BRIDGE_PROFILE = Comparison(
     reported=("--profile",),
     pictures=(ecdf("Operator to wheels, hop by hop"),),
 )  # fmt: skip
-BRIDGE = Comparison(
+_BRIDGE = Comparison(
     name="bridge",
     title="Operator to wheels, and back",
     what="A whole robot of each kind, with a stock broker between it and the operator. Down is from the operator's "
@@ -278,7 +257,6 @@ BRIDGE = Comparison(
         ),
         *_aims(),
     ),
-    modes={"null": BRIDGE_NULL, "profile": BRIDGE_PROFILE},
     summary_lines=3,
     reported_full=("--with-media",),
     pictures=(
@@ -287,3 +265,21 @@ BRIDGE = Comparison(
         bars("Operator to wheels and back", measures=(CPU,), panel="load", group="process"),
     ),
 )  # fmt: skip
+BRIDGE_NULL = _BRIDGE.null_test(
+    "One robot in three roles that take turns: plain, again, and with a fifth of the usual latency planted by the "
+    "operator. The first interval must include 1.00, the second must lie above it.",
+    options=_OURS,
+    # many messages, and very short turns, so that a disturbance of the machine hits all roles
+    full=Budget(150, null=True, rounds=10, seconds=4.0, turn_s=0.05, rate_hz=100.0, fresh_every=10_000),
+    quick=Budget(14, rounds=4, seconds=0.5),
+    variants=KINDS[1:],
+    references=(),
+    conditions=lambda _run: [{"load": UNLOADED}],
+    environment=lambda run: running(run["variants"]),
+    measure=pilot,
+    measure_round=lambda round_: _in_turns(round_, UNLOADED, round_.env),
+    tables=(LATENCIES,),
+    reported_full=(),
+    pictures=(null_ratios("Null test of bridge"), ecdf("Null test of bridge")),
+)
+BRIDGE = replace(_BRIDGE, modes={"null": BRIDGE_NULL, "profile": BRIDGE_PROFILE})

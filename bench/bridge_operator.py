@@ -22,9 +22,8 @@ from typing import Any, Final, NamedTuple
 from paho.mqtt.client import MQTTMessage
 
 from pebble import contract
-from pebble.bench.drivers import RATE_HZ, StockClient
+from pebble.bench.clients import RATE_HZ, RobotSubscriber, StockClient
 from pebble.bench.null import spin
-from pebble.bench.subscribers import RobotSubscriber
 from pebble.bench.usage import cpu_s
 from pebble.errors import PebbleError
 from pebble.rig.processes import python
@@ -168,24 +167,18 @@ class DrivenRobot(StockClient):
         def counts() -> list[int]:
             return [count for worker in workers for count in worker.ask("", _ANSWER_S).values()]
 
-        self._allow_media(True)
+        self.request_media(BASE)
         robot.expect(lambda: all(counts()), "its media do not flow", _UP_S)
         time.sleep(_STARTUP_S)
         before = counts()
         turn = self.drive(seconds)
         if any(now == then for now, then in zip(counts(), before, strict=True)):
             raise PebbleError(f"{self.robot.kind}: its media stopped\n{robot.log()}")
-        self._allow_media(False)
+        self.request_media(BASE, False)
         for worker in workers:
             robot.running.end(worker)
         robot.expect(lambda: len(robot.pids()) <= at_rest, "its media do not end", _UP_S)
         return turn
-
-    def _allow_media(self, wanted: bool) -> None:
-        for flag in (contract.MQTT_VIDEO, contract.MQTT_AUDIO):
-            self.send(flag, BASE, wanted)
-        for request in (contract.VIDEO_CONTROL, contract.AUDIO_CONTROL):
-            self.send(request, BASE, {"enabled": wanted})
 
     def _on_message(self, message: MQTTMessage) -> None:
         if message.topic.endswith(contract.TOUCH_SENSORS.suffix):

@@ -11,7 +11,7 @@ import math
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Final
@@ -135,7 +135,6 @@ class Comparison:
 
     derived: Callable[[list[Cell]], list[Cell]] = lambda cells: cells  # what all rounds together make of the cells
     tables: Sequence[Tables] = ()  # see pebble.bench.tables
-    title_suffix: str = ""  # of all tables; may name recorded options and {quick}: ", over {link}"
     assessment: Sequence[Assess] = ()  # Claims, Aims and functions, the most important first
     complete: Callable[[Sequence[Cell]], bool] = lambda cells: all(cell.samples for cell in cells)  # else exit code 1
     pictures: Sequence[Callable[[Results], Iterable[Any]]] = ()  # see pebble.bench.pictures
@@ -148,6 +147,12 @@ class Comparison:
     reported_full: Sequence[str] = ()  # more of them, of the full run
     summary_lines: int = 0  # of the sentences in the report's summary; the most important come first
     root: bool = False  # needs root
+
+    def null_test(self, what: str, **changes: Any) -> Comparison:
+        """Its mode that compares one variant with itself, and with a slower self. It has no interval to summarise."""
+        own = {"name": f"{self.name}-null", "title": f"{self.title}: the null test", "is_null": True}
+        shown = {"assessment": (null.assessment,), "words": ("bench", self.name), "summary_lines": 0}
+        return replace(self, what=what, **{**own, **shown, "reported": ("--null",), **changes})
 
     def arguments(self, quick: bool) -> list[str]:
         """The command line in a report, without ``pebble``."""

@@ -157,7 +157,7 @@ TABLE = Grid(
     rows=("size", "rate", "load", "variant"),
     columns=(
         *(
-            replace(percentile_column(percent, f"{measure} p{percent}".replace(" ", "\n")), measure=measure)
+            percentile_column(percent, f"{measure} p{percent}".replace(" ", "\n"), measure)
             for measure in (ONE_WAY, ROUND_TRIP)
             for percent in (50, 99)
         ),
@@ -313,22 +313,14 @@ _CONTROL = Comparison(
     summary_lines=5,
     pictures=(ecdf("Service to service"), ratios("Service to service", "mqtt")),
 )
-CONTROL_NULL = replace(
-    _CONTROL,
-    name="control-null",
-    title="Service to service: the null test",
-    what="One variant against itself, and against itself with a fifth of its usual latency planted by the sender. "
+CONTROL_NULL = _CONTROL.null_test(
+    "One variant against itself, and against itself with a fifth of its usual latency planted by the sender. "
     "The first interval must include 1.00, the second must lie above it; otherwise the comparison above finds "
     "differences that do not exist, or misses some that do.",
     full=Budget(180, **_ONE, loads=[NONE], null=True, seconds=0.3, rounds=30, passes=2, fresh_every=1),
     quick=Budget(10, seconds=0.25, rounds=4, passes=1, fresh_every=2),
-    is_null=True,
     variants=(P2P,),
     tables=(replace(TABLE, baseline=""), HOPS),
-    assessment=(null.assessment,),
-    words=("bench", "control"),
-    reported=("--null",),
-    summary_lines=0,
     pictures=(null_ratios("Null test of control"), ecdf("Null test of control")),
 )
 CONTROL = replace(_CONTROL, modes={"far": CONTROL_FAR, "null": CONTROL_NULL})

@@ -149,7 +149,7 @@ def opened(transport: Transport, desk: Desk) -> Connection:
 
 def stock(port: int) -> Connection:
     """Stock paho with its own network thread and no socket options, as in the original program."""
-    from pebble.bench.drivers import StockClient  # only these ends import paho
+    from pebble.bench.clients import StockClient  # only these ends import paho
 
     client = StockClient(at_once=False).open(port)
     client.wait()

@@ -13,11 +13,10 @@ from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 
+from pebble.bench.clients import RATE_HZ, RobotSubscriber, driving, ready_robot
 from pebble.bench.comparison import Budget, Case, Comparison, rounds, seconds, variants
-from pebble.bench.drivers import RATE_HZ, driving
 from pebble.bench.pictures import bars
 from pebble.bench.results import Cell
-from pebble.bench.subscribers import RobotSubscriber, ready_robot
 from pebble.bench.tables import Claims, Grid, median_column
 from pebble.bench.usage import cpu_s, pss_mb
 from pebble.errors import PebbleError
@@ -46,7 +45,7 @@ def measure(case: Case) -> Iterator[Cell]:
         for name, forms in STREAMS.items():
             if "h264" in forms and find_spec("av") is None:
                 continue
-            subscriber.ask_for(*forms)
+            subscriber.request_media(BASE, True, *forms)
             robot.expect(partial(_flow, robot, subscriber, forms), f"{name} does not flow", _FLOW_S)
             yield from _phase(case, robot, subscriber, name)
 

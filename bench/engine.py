@@ -55,9 +55,7 @@ def run(run: Run) -> int:
     results.aims = [line for line in lines if isinstance(line, Judged)]
     enough = run.rounds < LEAST_ROUNDS or run.rounds - len(failed) >= LEAST_ROUNDS
     results.complete = run.problem is None and enough and about.complete(cells)
-    suffix = about.title_suffix.format(**results.options, quick=", quick" if run.quick else "")
     for table in about.shown(cells):
-        table.title = f"{table.title}{suffix}"
         _print_whole(table, run.console)
     for sentence in (*results.assessment, *results.aims):
         show(str(sentence))

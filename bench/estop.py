@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from typing import Any
 
-from pebble.bench import drivers
+from pebble.bench import clients
 from pebble.bench.aims import Aim, single, with_lost
 from pebble.bench.comparison import Budget, Case, Comparison, Round, rounds
 from pebble.bench.fleet import read_moves
@@ -49,10 +49,6 @@ def rest(moves: Sequence[Moved], since: int) -> tuple[int | None, bool]:
     after = [move for move in moves if move.ns >= since]
     off = next((move.ns for move in after if not any(move.motors)), None)
     return off, off is not None and any(any(move.motors) for move in after if move.ns > off)
-
-
-def is_moving(moves: Sequence[Moved]) -> bool:
-    return bool(moves) and any(moves[-1].motors)
 
 
 def cell_of(case: Case, measure: str, began: int, ended: int | None, **figures: Any) -> Cell:
@@ -92,7 +88,7 @@ class Robots(Processes):
             self._bases[kind], self._starts[kind] = [robot.base], robot.launch
         where = ("--robots", len(self._bases[BOARD]), "--broker", f"127.0.0.1:{broker.port}", "--trace", self._trace)
         self._starts[BOARD] = partial(self.robot, "the fleet", "pebble.simulation.fleet_program", *where)
-        self._driver = self.worker("driver", "pebble.bench.drivers", broker.port)
+        self._driver = self.worker("driver", "pebble.bench.clients", broker.port)
 
     def hold(self, case: Case, robots: str) -> Iterator[Cell]:
         """Start these robots while a stop of all robots is held."""
@@ -114,10 +110,10 @@ class Robots(Processes):
     def stop_by_zero(self, case: Case, robots: str) -> Iterator[Cell]:
         """Stop a driven robot by a plain zero as a stock client sends it."""
         self._drive(robots)
-        client = drivers.StockClient(at_once=False).open(self._port)
+        client = clients.StockClient(at_once=False).open(self._port)
         client.wait()
         began = time.monotonic_ns()
-        client.send(DRIVE, self._bases[robots][0], drivers.ZERO).wait_for_publish(_ANSWER_S)
+        client.send(DRIVE, self._bases[robots][0], clients.ZERO).wait_for_publish(_ANSWER_S)
         client.close()
         yield self._rest(case, robots, began)
         self._drive(robots, on=False)
@@ -156,8 +152,9 @@ class Robots(Processes):
     def _drive(self, robots: str, *, on: bool = True) -> None:
         """Drive only these robots from now on, or none; returns at a random moment after all of them move, or rest."""
         self._driver.send(" ".join(self._bases[robots]) if on else "")
-        _wait(lambda: {on} == set(map(is_moving, self._moves(robots))), "not all robots moved or came to rest")
-        time.sleep(random.random() / drivers.RATE_HZ)  # noqa: S311  (no secret)
+        problem = "not all robots moved or came to rest"
+        _wait(lambda: {on} == {bool(one) and any(one[-1].motors) for one in self._moves(robots)}, problem)
+        time.sleep(random.random() / clients.RATE_HZ)  # noqa: S311  (no secret)
 
     def _reset(self, robots: str) -> None:
         """Let these robots, which are stopped, move again. Raises PebbleError if one does not confirm it."""
@@ -225,7 +222,7 @@ ESTOP = Comparison(
     options=(rounds("How often robots are started."),),
     full=Budget(600, rounds=10, boards=50, stops=12, all_stops=3),
     quick=Budget(90, rounds=2, stops=3, all_stops=2),
-    constants={"rate_hz": drivers.RATE_HZ},
+    constants={"rate_hz": clients.RATE_HZ},
     variants=(STOP, ZERO),
     environment=lambda run: Robots(run["boards"]),
     measure_round=measure,

@@ -20,8 +20,8 @@ from typing import Any, Final
 import msgspec
 from paho.mqtt.client import MQTTMessage
 
+from pebble.bench.clients import MANY, StockClient
 from pebble.bench.comparison import Budget, Case, Comparison, Option, seconds
-from pebble.bench.drivers import MANY, StockClient
 from pebble.bench.pictures import ecdf
 from pebble.bench.results import Cell, grouped, rounded
 from pebble.bench.tables import COUNT, LOST, Grid, percentile_column, single_column
@@ -31,6 +31,7 @@ from pebble.contract.identity import Identity
 from pebble.rig.processes import Processes
 from pebble.rig.worker_end import answer, serve_on_thread
 from pebble.simulation.fleet import MOST, Moved, members
+from pebble.simulation.trace import complete_lines
 from pebble.simulation.wireless import KINDS
 
 #: Wheel speeds, left and right, in sequence: no robot gets the same command twice within eight commands.
@@ -90,9 +91,8 @@ def latencies_ms(sent: Mapping[str, Sequence[int]], moves: Mapping[str, Sequence
 
 
 def read_moves(trace: Path) -> dict[str, list[Moved]]:
-    raw = trace.read_bytes()
-    lines = raw[: raw.rfind(b"\n") + 1].splitlines()
-    return grouped((msgspec.json.decode(line, type=Moved) for line in lines), lambda moved: moved.robot)
+    moves = (msgspec.json.decode(line, type=Moved) for line in complete_lines(trace)[0])
+    return grouped(moves, lambda moved: moved.robot)
 
 
 def longest_gap_s(robots: Sequence[Sequence[int]], began: int, ended: int) -> float:

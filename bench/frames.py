@@ -17,8 +17,7 @@ from pebble.bench.results import Cell, Value
 from pebble.bench.tables import COUNT, LOST, Column, Grid, percentile_column
 from pebble.bench.usage import cpu_s, pss_mb
 from pebble.errors import PebbleError
-from pebble.rig.broker import mosquitto_path
-from pebble.rig.processes import Processes, python
+from pebble.rig.processes import Processes, mosquitto_path, python
 
 VARIANTS = ("zenoh-shm", "zenoh-copy", "zenoh-net", "mqtt", "gstreamer-shm", "memcpy")
 OURS = "zenoh-shm"
@@ -187,20 +186,14 @@ FRAMES = Comparison(
     summary_lines=4,
     pictures=(tails("Frames between processes"), ecdf("Frames between processes")),
 )  # fmt: skip
-FRAMES_NULL = replace(
-    FRAMES,
-    name="frames-null",
-    title="Camera frames: the null test",
-    what="One frame transport against itself, and with a fifth of its usual latency planted by the writer. The "
+FRAMES_NULL = FRAMES.null_test(
+    "One frame transport against itself, and with a fifth of its usual latency planted by the writer. The "
     "first interval must include 1.00, the second must lie above it.",
     full=Budget(130, seconds=0.4, rounds=30, size=("640x480",), readers=(1,), null=OURS),
     quick=Budget(8, rounds=2),
-    is_null=True,
     variants=(),
     assessment=(null.assessment, faults),
-    words=("bench", "frames"),
     reported=("--null", OURS),
-    summary_lines=0,
     pictures=(null_ratios("Null test of frames"), ecdf("Null test of frames")),
 )
 FRAMES = replace(FRAMES, modes={"null": FRAMES_NULL})

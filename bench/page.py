@@ -20,8 +20,8 @@ from typing import Any, NamedTuple
 from urllib.parse import urlencode, urlsplit
 
 from pebble.bench.aims import outcome
+from pebble.bench.clients import driving as others_drive
 from pebble.bench.comparison import Budget, Case, Comparison, Option, rounds
-from pebble.bench.drivers import driving as others_drive
 from pebble.bench.impair.conditions import Condition, Shape
 from pebble.bench.page_rig import HELD_S, KEY, ROBOT, Rig, linked, monotonic, rig
 from pebble.bench.results import Cell, Judged, percentile
@@ -43,9 +43,7 @@ _FAR = Condition("256 kbit/s, 100 ms, 2 %", up=Shape(kbit=256, loss=0.02, delay_
 _BLUR = "() => { const at = bench.now(); dispatchEvent(new Event('blur')); return at; }"
 _HIDE = """() => {
   Object.defineProperty(document, "hidden", { configurable: true, get: () => true });
-  const at = bench.now();
-  document.dispatchEvent(new Event("visibilitychange"));
-  return at;
+  const at = bench.now(); document.dispatchEvent(new Event('visibilitychange')); return at;
 }"""
 
 

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 from pebble.bench.impair.conditions import Condition
 from pebble.bench.impair.network import ROBOT_HOST as SERVER
-from pebble.bench.impair.network import NamespaceNetwork, why_no_namespaces
+from pebble.bench.impair.network import NamespaceNetwork, require_namespaces
 from pebble.contract import DRIVE
 from pebble.errors import PebbleError
 from pebble.rig.processes import OPERATORS, Program
@@ -243,11 +243,10 @@ def linked(condition: Condition, *names: str, flags: tuple[str, ...] = ()) -> It
 
     So is this thread meanwhile. Needs root. Raises PebbleError.
     """
-    if problem := why_no_namespaces():
-        raise PebbleError(f"no network namespaces: {problem}")
+    require_namespaces()
     secure = f"--unsafely-treat-insecure-origin-as-secure=http://{SERVER}:{_PORT}"  # as https would be
     libc = ctypes.CDLL(None, use_errno=True)
-    with NamespaceNetwork() as network, tempfile.TemporaryDirectory() as folder:
+    with closing(NamespaceNetwork()) as network, tempfile.TemporaryDirectory() as folder:
         program, robot_side = Path(folder) / "chromium", network.on_robot(())[1].removeprefix("--net=")
         program.write_text(f'#!/bin/sh\nexec {shlex.join(network.on_remote(["chromium"]))} "$@"\n')
         program.chmod(0o700)

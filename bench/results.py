@@ -194,7 +194,7 @@ def begin(bench: str, command: Sequence[str], *, quick: bool = False) -> Results
 
 def machine() -> dict[str, Value]:
     """The machine and the versions the results depend on; no names of hosts or users."""
-    from pebble.rig.broker import mosquitto_path  # not for the processes that only measure
+    from pebble.rig.processes import mosquitto_path  # not for the processes that only measure
 
     model = re.search(r"^(?:model name|Model).*?: *(.*?) *$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
     broker = ""

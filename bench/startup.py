@@ -9,11 +9,10 @@ from contextlib import closing
 from functools import partial
 from typing import Any
 
+from pebble.bench.clients import RATE_HZ, UP_S, RobotSubscriber, StockClient, driving, ready_robot
 from pebble.bench.comparison import Budget, Case, Comparison, rounds, variants
-from pebble.bench.drivers import RATE_HZ, StockClient, driving
 from pebble.bench.pictures import dots
 from pebble.bench.results import Cell
-from pebble.bench.subscribers import UP_S, RobotSubscriber, ready_robot
 from pebble.bench.tables import SPREAD, Claims, Grid
 from pebble.client.media_receiver import MediaReceiver
 from pebble.config import load

@@ -73,8 +73,9 @@ class Column:
     measure: str | None = None
 
 
-def percentile_column(percent: float, head: str = "") -> Column:
-    return Column(head or ("max" if percent == 100 else f"p{percent:g}"), lambda cell: figure(cell.percentile(percent)))
+def percentile_column(percent: float, head: str = "", measure: str | None = None) -> Column:
+    head = head or ("max" if percent == 100 else f"p{percent:g}")
+    return Column(head, lambda cell: figure(cell.percentile(percent)), measure)
 
 
 def single_column(head: str, name: str, how: str = "g") -> Column:

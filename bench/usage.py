@@ -38,11 +38,6 @@ def pss_mb(pid: int) -> float:
     return _sum([Path(f"/proc/{pid}/smaps_rollup")], "Pss:") / 1024
 
 
-def own_mb(pid: int) -> float:
-    """What a process has allocated, and its share of shared memory: unlike its PSS, no other process changes it."""
-    return _sum([Path(f"/proc/{pid}/smaps_rollup")], "Anonymous:", "Pss_Shmem:") / 1024
-
-
 def _sum(files: Iterable[Path], *fields: str) -> int:
     total = 0
     for file in files:

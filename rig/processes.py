@@ -19,18 +19,19 @@ from pathlib import Path
 from typing import Any, ClassVar, Self, TypeVar
 
 from pebble.errors import PebbleError
-from pebble.rig.broker import HOST, BrokerKind, free_port, mosquitto_command
 from pebble.runtime.parent import tied_to_parent
 
 #: In this order they end: robots while the brokers to which they report it still run, MCUs after what they move.
 OPERATORS, ROBOTS, MCUS, BROKERS = range(4)
 
+HOST = "127.0.0.1"  # of brokers
+SBIN = "/usr/local/sbin:/usr/sbin:/sbin"  # where Debian puts brokers and network tools, not in the PATH of users
 _LONGEST_FOLDER = 40  # characters: Unix sockets live below, and their paths end at 108 bytes
 
 Wrap = Callable[[Sequence[str]], Sequence[str]]  # extends a command, so that it runs in another network
 Each = Callable[[bytes], object]  # gets one line of a program's standard output
 _STEP_S = 0.01
-_END_S = 4.0  # for workers
+_END_S = 4.0  # for workers and operators
 _BROKER_START_S = 15.0  # amqtt takes a while to import on a small machine
 _TAIL = 2000  # characters of a log that are shown
 
@@ -152,25 +153,48 @@ class Worker(Program):
         self._answers.put(None)
 
 
+def mosquitto_path() -> str | None:
+    """None if it is not installed."""
+    return shutil.which("mosquitto") or shutil.which("mosquitto", path=SBIN)
+
+
+def mosquitto_command(port: int, stem: Path, extra: Sequence[str] = (), host: str = HOST) -> list[str]:
+    """The command of a mosquitto on ``port``; writes its configuration to ``stem`` plus ``.conf``."""
+    path = mosquitto_path()
+    if path is None:
+        raise PebbleError("mosquitto is not installed: apt install mosquitto")
+    config = stem.with_suffix(".conf")
+    lines = [f"listener {port} {host}", "allow_anonymous true", "log_dest stderr", *extra]
+    if os.geteuid() == 0:
+        lines.append("user root")  # a change of user would undo the parent-death signal that Program sets
+    config.write_text("\n".join(lines) + "\n")
+    return [path, "-c", str(config)]
+
+
+def free_port() -> int:
+    """An unused TCP port, also where there is no loopback device; in a new network namespace every port is unused."""
+    with socket.socket() as probe:
+        probe.bind(("", 0))
+        return int(probe.getsockname()[1])
+
+
 class Broker(Program):
     """A broker, from its construction on."""
 
     def __init__(
         self,
         name: str,
-        kind: BrokerKind,
         folder: Path,
         extra: Sequence[str] = (),
-        port: int = 0,
         *,
         host: str = HOST,
         wrap: Wrap = unchanged,
+        program: str | None = None,
     ) -> None:
-        """``extra``: more lines for mosquitto's configuration; amqtt has none. ``port`` 0 is a free one."""
-        self.port = port or free_port()
-        command = [sys.executable, "-m", "pebble.rig.broker", str(self.port)]
-        if kind is BrokerKind.MOSQUITTO:
-            command = mosquitto_command(self.port, folder / name, extra, host)
+        """``extra``: more lines for mosquitto's configuration. ``program``: a module that is one, in its place."""
+        self.port = free_port()
+        stem = folder / name
+        command = python(program, self.port) if program else mosquitto_command(self.port, stem, extra, host)
         super().__init__(name, wrap(command), folder / f"{name}.log")
 
     def wait(self, ending: threading.Event | None = None) -> None:
@@ -191,7 +215,7 @@ class Processes:
     A subclass starts what it consists of in :meth:`start`; ``closing`` is closed before all processes end.
     """
 
-    ends_s: ClassVar[tuple[float, ...]] = (4.0, 6.0, 2.0, 2.0)  # what is left of each kind after that is killed
+    ends_s: ClassVar[tuple[float, ...]] = (_END_S, 6.0, 2.0, 2.0)  # what is left of each kind after that is killed
     keep = False  # the folder
 
     def __init__(self, prefix: str = "pbl-") -> None:
@@ -243,11 +267,9 @@ class Processes:
         """One or more robots."""
         return self.add(Program(name, python(module, *arguments), self.folder / f"{name}.log"), ROBOTS)
 
-    def broker(
-        self, name: str = "broker", kind: BrokerKind = BrokerKind.MOSQUITTO, *, folder: Path | None = None, **more: Any
-    ) -> Broker:
+    def broker(self, name: str = "broker", folder: Path | None = None, **more: Any) -> Broker:
         """A broker that is starting: wait for it."""
-        return self.add(Broker(name, kind, folder or self.folder, **more), BROKERS)
+        return self.add(Broker(name, folder or self.folder, **more), BROKERS)
 
 
 def python(module: str, *arguments: object) -> list[str]:
@@ -255,7 +277,7 @@ def python(module: str, *arguments: object) -> list[str]:
     return [sys.executable, "-m", module, *map(str, arguments)]
 
 
-def end_all(programs: Iterable[Program], within_s: float) -> None:
+def end_all(programs: Iterable[Program], within_s: float = _END_S) -> None:
     """Send SIGTERM to all (to workers: the end of input); kill those that still run after it, with their children."""
     programs, deadline = list(programs), time.monotonic() + within_s
     for program in programs:
@@ -266,10 +288,6 @@ def end_all(programs: Iterable[Program], within_s: float) -> None:
         except subprocess.TimeoutExpired:
             os.killpg(program.pid, signal.SIGKILL)
             program._process.wait()
-
-
-def end_workers(workers: Iterable[Worker]) -> None:
-    end_all(workers, _END_S)
 
 
 def children(pid: int) -> list[int]:

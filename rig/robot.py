@@ -22,10 +22,9 @@ from pebble.contract.identity import Identity
 from pebble.errors import PebbleError
 from pebble.launcher.programs import programs
 from pebble.rig.processes import MCUS, ROBOTS, Broker, Each, Processes, Program, Wrap, children, python, unchanged
-from pebble.simulation.trace import Entry, read_trace
+from pebble.simulation.trace import Entry, complete_lines, read_trace
 
 if TYPE_CHECKING:
-    from pebble.rig.testbed import Outcome
     from pebble.simulation.mcu import Snapshot
 
 KINDS = ("mqtt", "zenoh")
@@ -60,17 +59,9 @@ class SimulatedRobot:
 
     def entries(self) -> list[Entry]:
         """The lines that the MCU received and the changes of its motors, oldest first."""
-        with self._trace.open("rb") as file:
-            file.seek(self._trace_read)
-            new = file.read()
-        complete = new[: new.rfind(b"\n") + 1]
-        self._trace_read += len(complete)
-        self._entries.extend(msgspec.json.decode(line, type=Entry) for line in complete.splitlines())
+        lines, self._trace_read = complete_lines(self._trace, self._trace_read)
+        self._entries.extend(msgspec.json.decode(line, type=Entry) for line in lines)
         return list(self._entries)
-
-    def outcome(self, at: float) -> Outcome:
-        """What came of a script that ended at ``at``; only a robot with scripts knows."""
-        raise NotImplementedError
 
     def _add(self, name: str, command: Sequence[str], kind: int, log: str, each: Each | None = None) -> Program:
         self.programs.append(self.running.add(Program(name, command, self.folder / log, each), kind))

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import json
-import math
 import struct
 import threading
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -21,13 +19,9 @@ from pebble.config.raw import deep_merge
 from pebble.contract.identity import Identity
 from pebble.errors import PebbleError
 from pebble.media.sound_file import write_wav
-from pebble.media.world.world_file import read_world
-from pebble.rig.broker import BrokerKind
 from pebble.rig.processes import OPERATORS, Processes, Program, python
 from pebble.rig.robot import MEDIA, START_S, Robot, SimulatedRobot
-from pebble.simulation.loudspeaker import playbacks
 from pebble.simulation.mcu import Snapshot
-from pebble.simulation.motion import Pose
 from pebble.simulation.world.program import Snapshot as WorldSnapshot
 from pebble.simulation.world.program import port_path, trace_path
 from pebble.transports import MqttSettings, create
@@ -46,7 +40,7 @@ _HOST = "127.0.0.1"
 _RESTART = ["sh", "-c", "kill $PPID"]  # the bridge alone, which runs it: the demo would take more for a failure
 _RATE = 16_000
 _POLL_S = 0.02
-_HORN = struct.pack("<40h", *[8000] * 20, *[-8000] * 20) * 400  # 1 s of 400 Hz
+HORN = struct.pack("<40h", *[8000] * 20, *[-8000] * 20) * 400  # the clip: 1 s of 400 Hz
 #: After the first round of driving Goob looks at the tag, and has space for further rounds wherever it is then.
 _START = {"goob": {"kind": "goob", "x": -0.3, "y": 0.2, "heading_deg": 0.0}}
 
@@ -91,52 +85,32 @@ class LinuxRobot(Robot):
         return self._start_board(self.name, self.port, self._trace, "--report", each=self._collect)
 
 
-@dataclass(frozen=True, slots=True)
-class Outcome:
-    """The true state at the end, known to the world and the loudspeaker."""
-
-    distance_m: float  # between camera and tag
-    bearing_rad: float  # of the tag, positive to the left
-    played_s: float
-    clip_s: float
-
-
 class RoomRobot(LinuxRobot):
     """Goob in the room that comes with Pebble, alone, with a tag on each wall: its MCU is part of the room.
 
-    Its camera sees the room, and a simulated loudspeaker records.
+    Its camera sees the ``room``, and a simulated loudspeaker records what it ``played``.
     """
 
     has_scripts, has_counter = True, False
 
     def __init__(self, running: Testbed, name: str) -> None:
         super().__init__(running, name)
-        self._room, self._record = self.folder / "room.json", self.folder / "played"
+        self.room, self.played = self.folder / "room.json", self.folder / "played"
         self.port, self._trace = port_path(self.folder, name), trace_path(self.folder, name)
         room = json.loads((files("pebble.simulation.world") / "room.json").read_text())
-        self._room.write_text(json.dumps(room | {"robots": _START}, indent=1))
+        self.room.write_text(json.dumps(room | {"robots": _START}, indent=1))
         sounds = self.folder / "sounds"
         (sounds / "signals").mkdir(parents=True)
         for clip, seconds in {CLIP: 1.0, "signals/beep.wav": 0.15, "signals/long.wav": 0.6}.items():
-            write_wav(sounds / clip, _HORN[: 2 * round(seconds * _RATE)], _RATE)
-        playback = {"directory": str(sounds), "player_command": _loudspeaker(self._record)}
+            write_wav(sounds / clip, HORN[: 2 * round(seconds * _RATE)], _RATE)
+        playback = {"directory": str(sounds), "player_command": _loudspeaker(self.played)}
         self._services |= {
-            "av_daemon": deep_merge(MEDIA["av_daemon"], {"video": {"device": f"{self._room}#{name}"}}),
+            "av_daemon": deep_merge(MEDIA["av_daemon"], {"video": {"device": f"{self.room}#{name}"}}),
             "soundboard_handler": {"playback": playback},
         }
 
-    def outcome(self, at: float) -> Outcome:
-        """Where the tag was then, and what the loudspeaker has played of the clip."""
-        poses = (one.board.pose for one in reversed(self.mcu_reports) if one.ns <= at * 1e9)
-        pose = next(poses, Pose(math.nan, math.nan))
-        tag = next(tag for tag in read_world(self._room).tags if tag.id == TAG_ID)
-        dx, dy = tag.x - pose.x_mm / 1000, tag.y - pose.y_mm / 1000
-        bearing = math.remainder(math.atan2(dy, dx) - pose.heading_rad, math.tau)
-        played = [len(one.frames()) for one in playbacks(self._record) if _HORN.startswith(one.frames())]
-        return Outcome(math.hypot(dx, dy), bearing, max(played, default=0) / len(_HORN), 1.0)
-
     def _start_motors(self) -> Program:
-        options = (self._room, "--folder", self.folder, "--trace", "--report")
+        options = (self.room, "--folder", self.folder, "--trace", "--report")
         return self._start_mcu("pebble.simulation.world", *options, each=self._collect)
 
     def _collect(self, line: bytes) -> None:
@@ -198,9 +172,10 @@ class Testbed(Processes):
         self.robots: dict[str, LinuxRobot | McuRobot] = {}
         self._ending, self._names, self._room = ending, names, room
 
-    def start_brokers(self, kind: BrokerKind = BrokerKind.MOSQUITTO) -> None:
-        """Start the operators' remote broker and Fred's local one. Raises PebbleError if one fails."""
-        self.remote_broker, self.local_broker = self.broker("remote-broker", kind), self.broker("freds-broker", kind)
+    def start_brokers(self, program: str | None = None) -> None:
+        """Start the operators' remote broker and Fred's local one, see Broker. Raises PebbleError if one fails."""
+        names = "remote-broker", "freds-broker"
+        self.remote_broker, self.local_broker = (self.broker(name, program=program) for name in names)
         for broker in (self.remote_broker, self.local_broker):
             broker.wait(self._ending)
         self.broker_port = self.remote_broker.port

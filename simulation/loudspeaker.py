@@ -20,6 +20,8 @@ from typing import BinaryIO, Literal
 
 import msgspec
 
+from pebble.simulation.trace import complete_lines
+
 _CHUNK_S = 0.02
 _DELAY_LIMIT_S = 0.1  # what it is late by, it catches up, but never more than this
 _EVENTS = "events.jsonl"
@@ -65,8 +67,8 @@ class Playback(msgspec.Struct, frozen=True):
 def playbacks(folder: Path) -> list[Playback]:
     """The playbacks that a loudspeaker recorded in ``folder``, oldest first."""
     path = folder / _EVENTS
-    raw = path.read_bytes() if path.exists() else b""
-    events = [msgspec.json.decode(line, type=Event) for line in raw[: raw.rfind(b"\n") + 1].splitlines()]
+    lines = complete_lines(path)[0] if path.exists() else []
+    events = [msgspec.json.decode(line, type=Event) for line in lines]
     ends = {event.recording: event for event in events if event.event == "end"}
     return [_playback(folder, event, ends.get(event.recording)) for event in events if event.event == "begin"]
 

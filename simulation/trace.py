@@ -81,8 +81,14 @@ class Trace:
 
 
 def read_trace(path: Path, start: int = 0) -> list[Entry]:
-    """Read the entries of a trace file from byte ``start`` on, without a last line that is incomplete."""
+    """Read the entries of a trace file from byte ``start`` on."""
+    return [msgspec.json.decode(line, type=Entry) for line in complete_lines(path, start)[0]]
+
+
+def complete_lines(path: Path, start: int = 0) -> tuple[list[bytes], int]:
+    """The lines of a file from byte ``start`` on, without a last one that is incomplete, and where that one begins."""
     with path.open("rb") as file:
         file.seek(start)
         raw = file.read()
-    return [msgspec.json.decode(line, type=Entry) for line in raw[: raw.rfind(b"\n") + 1].splitlines()]
+    end = raw.rfind(b"\n") + 1
+    return raw[:end].splitlines(), start + end

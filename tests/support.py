@@ -14,8 +14,8 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pebble.rig.broker import free_port as free_port
-from pebble.rig.broker import mosquitto_command
+from pebble.rig.processes import free_port as free_port
+from pebble.rig.processes import mosquitto_command
 from pebble.runtime.parent import tied_to_parent
 
 #: The checkout: tests that start programs of ours start them here.
@@ -217,7 +217,7 @@ class AmqttBroker:
         self.start()
 
     def start(self) -> None:
-        command = [sys.executable, "-m", "pebble.rig.broker", str(self.port)]
+        command = [sys.executable, "-m", "pebble.demo.brokers", str(self.port)]
         self._process = Child(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         assert until(lambda: listening(self.port), 20), "amqtt did not start"
 

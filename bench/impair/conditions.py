@@ -3,12 +3,11 @@
 The paper limits the rate of, or drops packets on, the robot's uplink only. The profiles impair both directions:
 
 ``starlink``
-    A median round trip of 50 ms, 40 to 60 ms between the quartiles (APNIC blog, 28 Nov 2022, measured in Belgium). The
-    satellite changes every 15 s; round trips differ by 6.7 ms from one to the next, and by another 30 ms and more after
-    a handover, 30 to 80 ms at worst (Huston, APNIC blog, 17 May 2024, as quoted by The Register). Handovers lose up to
-    half of the packets (Kassem et al., "A browser-side view of Starlink connectivity", IMC 2022, abstract). Hence per
-    direction 25 ms ± 5 ms, and every 15 s a gap, after which additional delay decays. Our choices: a gap of 100 ms,
-    25 ms that decay within a second, the first gap after 5 s, and no rate limit, which does not constrain a robot.
+    Round trips of 50 ms at the median, quartiles 40 and 60 (APNIC blog, 28 Nov 2022, Belgium). The satellite changes
+    every 15 s; then they take 30 ms and more longer, at worst 80 (Huston, APNIC blog, 17 May 2024, as quoted by The
+    Register), and up to half of the packets are lost (Kassem et al., "A browser-side view of Starlink connectivity",
+    IMC 2022, abstract). Hence per direction 25 ms ± 5 ms, and every 15 s a gap. Our choices: a gap of 100 ms, 25 ms
+    more that decay within a second, the first gap after 5 s, and no rate limit, which does not constrain a robot.
 ``wifi-power-save``
     A Raspberry Pi with default settings: the access point holds packets for the robot until a beacon, every 102.4 ms
     (100 time units of 1.024 ms), while the robot may send at any time. With power save on, pings had a p50 of 49 to

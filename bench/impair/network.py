@@ -26,17 +26,17 @@ import time
 import weakref
 from collections import deque
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import msgspec
 
 from pebble.bench.impair.conditions import Condition, Shape, arrival
 from pebble.errors import PebbleError
-from pebble.rig.processes import Worker, end_workers, python
+from pebble.rig.processes import SBIN, Worker, end_all, python
 from pebble.rig.worker_end import answer
 
 ROBOT_HOST, REMOTE_HOST = "10.77.0.1", "10.77.0.2"
@@ -47,7 +47,6 @@ _BURST = 1600  # bytes: one packet, so that the rate also holds over short times
 _QUEUE_S = 0.3  # the queue of a home router's modem, with tail drop
 _QUEUE_PACKETS = 4  # at least; at 64 kbit/s 0.3 s hold fewer than two
 _COMMAND_S = _ANSWER_S = 10.0
-_SBIN = "/usr/local/sbin:/usr/sbin:/sbin"  # not in the PATH of users
 
 _TUN = Path("/dev/net/tun")
 _CLONE_NEWNET = 0x40000000
@@ -121,13 +120,7 @@ class NamespaceNetwork(Worker):
 
     def close(self) -> None:
         """May be called repeatedly."""
-        end_workers([self])
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
+        end_all([self])
 
 
 class _Side:
@@ -179,7 +172,7 @@ class _Side:
 
     def _run(self, program: str, *arguments: str, stdin: str = "") -> str:
         command, what = self.inside([program, *arguments]), f"{program} {' '.join(arguments)}"
-        env = {**os.environ, "PATH": f"{os.environ.get('PATH', os.defpath)}:{_SBIN}"}
+        env = {**os.environ, "PATH": f"{os.environ.get('PATH', os.defpath)}:{SBIN}"}
         try:
             done = subprocess.run(command, input=stdin, capture_output=True, text=True, timeout=_COMMAND_S, env=env)
         except (OSError, subprocess.TimeoutExpired) as error:
@@ -203,12 +196,18 @@ def why_no_namespaces() -> str | None:
     """What prevents such networks; None: nothing. Tested with every feature a condition may use."""
     everything = Shape(kbit=1000, loss=0.01, delay_ms=1)
     try:
-        with NamespaceNetwork("on trial") as network:
+        with closing(NamespaceNetwork("on trial")) as network:
             network.apply(Condition("trial", everything, everything))
             network.traffic()
     except PebbleError as error:
         return str(error)
     return None
+
+
+def require_namespaces() -> None:
+    """Raises PebbleError if there are none."""
+    if why := why_no_namespaces():
+        raise PebbleError(f"no network namespaces: {why}")
 
 
 # -- its process

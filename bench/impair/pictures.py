@@ -14,17 +14,26 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from pebble.bench import paper
 from pebble.bench.aims import single, with_lost
-from pebble.bench.impair.trials import arrived
+from pebble.bench.impair import trials
 from pebble.bench.plots import Picture, Style, around, finite, guide, legend, log_axis, panels, short, styles, unique
 from pebble.bench.results import OVER_TIME, Cell, Results, grouped
 
+#: % of the audio delivered, "saturated near" (paper, section 4.2).
+PAPER_BEST_PERCENT: Final = 80.0
+PAPER_WORDS: Final = {"512k": "degraded", "256k": "broken"}
+#: Results of the original program by trial, measured once, elsewhere, through such a network: all but fps of the audio.
+ORIGINAL: Final = {
+    "delivered_percent": {"256k": 40.0, "64k": 5.7},
+    "on_time_percent": {"256k": 3.5},  # within a second
+    "p95_ms": {"256k": 6900.0},
+    "fps": {"256k": 2.2},
+}
 _CROSS: Final[dict[str, Any]] = {
     "color": "#1a1a1a", "marker": "x", "linestyle": "", "markersize": 7, "markeredgewidth": 2,
     "label": "the original program itself, measured once elsewhere",
 }  # fmt: skip
-_NARROW, _WORST = f"aim\nat {paper.NARROW}", f"aim at\n{paper.WORST}"
+_NARROW, _WORST = f"aim\nat {trials.NARROW}", f"aim at\n{trials.WORST}"
 _BANDS = ("#f3f0e7", "#ffffff")
 
 
@@ -44,34 +53,34 @@ class Panel:
 
 def _drive(when: str) -> Panel:
     return Panel(label=f"drive p95\n{when.replace('during', 'with')}, ms", measure=f"drive {when}",
-                 value=with_lost(95), log=True, aim=paper.WORST_DRIVE_P95_MS, aim_text=_WORST)  # fmt: skip
+                 value=with_lost(95), log=True, aim=trials.WORST_DRIVE_P95_MS, aim_text=_WORST)  # fmt: skip
 
 
 #: By name: the caption, the height of a panel in inches, and the panels.
 _OVER_TRIALS: Final[dict[str, tuple[str, float, tuple[Panel, ...]]]] = {
     "audio-delivery": ("Audio delivery over the trials, in the form of the paper's Figure 4.7", 3.5, (
         Panel(label="audio that arrived, %", measure="audio", value=single("delivered_percent"),
-              crosses=paper.ORIGINAL["delivered_percent"], words=paper.PAPER_WORDS,
-              aim=paper.PAPER_BEST_PERCENT, aim_text=f"paper:\nat best\n~{paper.PAPER_BEST_PERCENT:g} %"),
+              crosses=ORIGINAL["delivered_percent"], words=PAPER_WORDS,
+              aim=PAPER_BEST_PERCENT, aim_text=f"paper:\nat best\n~{PAPER_BEST_PERCENT:g} %"),
         Panel(label="audio within 1 s, %", measure="audio", value=single("on_time_percent"),
-              crosses=paper.ORIGINAL["on_time_percent"]),
+              crosses=ORIGINAL["on_time_percent"]),
     )),
     "audio-latency": (
         "Latency of the audio that arrived, over the trials, in the form of the paper's Figure 4.8", 3.3, (
-        Panel(label="audio latency p50, ms", measure="audio latency", value=arrived(50), log=True),
-        Panel(label="audio latency p95, ms", measure="audio latency", value=arrived(95), log=True,
-              crosses=paper.ORIGINAL["p95_ms"], aim=paper.NARROW_SOUND_P95_MS, aim_text=_NARROW),
+        Panel(label="audio latency p50, ms", measure="audio latency", value=trials.arrived(50), log=True),
+        Panel(label="audio latency p95, ms", measure="audio latency", value=trials.arrived(95), log=True,
+              crosses=ORIGINAL["p95_ms"], aim=trials.NARROW_SOUND_P95_MS, aim_text=_NARROW),
     )),
     "video": ("Video over the trials: frame rate, and how long it froze", 2.7, (
-        Panel(label="pictures per second", measure="video", value=single("fps"), crosses=paper.ORIGINAL["fps"]),
+        Panel(label="pictures per second", measure="video", value=single("fps"), crosses=ORIGINAL["fps"]),
         Panel(label="frozen, s\n(gaps over 1 s)", measure="video", value=single("frozen_s")),
         Panel(label="longest gap, s", measure="video", value=single("longest_gap_s"), log=True,
-              aim=paper.NARROW_PICTURE_GAP_S, aim_text=_NARROW),
+              aim=trials.NARROW_PICTURE_GAP_S, aim_text=_NARROW),
     )),
     "drive": ("Drive commands and heartbeat over the trials (no point: more than 5 % of the commands were lost)", 2.3, (
         _drive("alone"), _drive("during video"), _drive("during audio"),
         Panel(label="robot seen offline,\nlongest, s", measure="heartbeat", value=single("longest_offline_s"),
-              aim=paper.WORST_OFFLINE_S, aim_text=_WORST),
+              aim=trials.WORST_OFFLINE_S, aim_text=_WORST),
     )),
 }  # fmt: skip
 
@@ -79,9 +88,9 @@ _OVER_TRIALS: Final[dict[str, tuple[str, float, tuple[Panel, ...]]]] = {
 def over_trials(results: Results) -> list[Picture]:
     """Audio, video and commands over the trials."""
     cells = [cell for cell in results.cells if "trial" in cell.params]
-    options = results.options
-    run = f"; windows of {options.get('window_s', 0):g} s, over {options.get('link_words')}. “original”: this program "
-    run += "with the original's encodings"
+    run = (
+        f"; windows of {results.options.get('window_s', 0):g} s. “original”: this program with the original's encodings"
+    )
     return [
         Picture(f"{results.bench}-{name}", caption + run, partial(_trials, cells, caption + run, height, shown))
         for name, (caption, height, shown) in _OVER_TRIALS.items()
@@ -92,9 +101,9 @@ def over_trials(results: Results) -> list[Picture]:
 def _trials(cells: Sequence[Cell], title: str, height: float, shown: Sequence[Panel]) -> Figure:
     """Logarithmic panels have one scale, to show waiting behind media."""
     figure, every = panels(len(shown), 1, (10.5, height), title)
-    trials = unique([str(cell.params["trial"]) for cell in cells])
+    names = unique([str(cell.params["trial"]) for cell in cells])
     style_of = styles(unique([cell.variant for cell in cells]))
-    seen = [_lines(axes, cells, trials, style_of, panel) for axes, panel in zip(every, shown, strict=True)]
+    seen = [_lines(axes, cells, names, style_of, panel) for axes, panel in zip(every, shown, strict=True)]
     ends = around([one for panel, values in zip(shown, seen, strict=True) if panel.log for one in values])
     for axes, panel, values in zip(every, shown, seen, strict=True):
         top = max([*finite(values), 1.0])
@@ -102,16 +111,16 @@ def _trials(cells: Sequence[Cell], title: str, height: float, shown: Sequence[Pa
             log_axis(axes, "y", panel.label, *ends)
         else:
             axes.set(ylabel=panel.label, ylim=(-0.04 * top, 1.1 * top))
-        axes.set_xlim(-0.6, len(trials) - 0.4)
-        axes.set_xticks(range(len(trials)), [])
-    every[-1].set_xticks(range(len(trials)), trials, rotation=40, ha="right", rotation_mode="anchor")
+        axes.set_xlim(-0.6, len(names) - 0.4)
+        axes.set_xticks(range(len(names)), [])
+    every[-1].set_xticks(range(len(names)), names, rotation=40, ha="right", rotation_mode="anchor")
     every[-1].set_xlabel("trial: condition of the network, in the order of the run")
     legend(figure, style_of, more=[Line2D([], [], **_CROSS)] if any(panel.crosses for panel in shown) else [])
     return figure
 
 
 def _lines(
-    axes: Axes, cells: Sequence[Cell], trials: Sequence[str], style_of: Mapping[str, Style], panel: Panel
+    axes: Axes, cells: Sequence[Cell], names: Sequence[str], style_of: Mapping[str, Style], panel: Panel
 ) -> list[float | None]:
     """Draws one line per subject, and the references; returns all values."""
     value_of: dict[tuple[str, str], float] = {}
@@ -121,15 +130,15 @@ def _lines(
     for number, (subject, style) in enumerate(style_of.items()):
         beside = 0.06 * (number - (len(style_of) - 1) / 2)  # keeps equal values visible
         axes.plot(
-            np.arange(len(trials)) + beside, [value_of.get((subject, trial), math.nan) for trial in trials],
+            np.arange(len(names)) + beside, [value_of.get((subject, trial), math.nan) for trial in names],
             color=style.colour, linestyle=style.dash, marker=style.marker,
             markersize=5, linewidth=1.2, markerfacecolor="white" if style.hollow else style.colour,
         )  # fmt: skip
-    crosses = {trials.index(trial): value for trial, value in panel.crosses.items() if trial in trials}
+    crosses = {names.index(trial): value for trial, value in panel.crosses.items() if trial in names}
     axes.plot([*crosses], [*crosses.values()], zorder=5, **_CROSS)
     if panel.aim is not None:
         guide(axes, panel.aim, panel.aim_text)
-    for at, word in ((trials.index(trial), word) for trial, word in panel.words.items() if trial in trials):
+    for at, word in ((names.index(trial), word) for trial, word in panel.words.items() if trial in names):
         axes.axvspan(at - 0.5, at + 0.5, color="#f2efe6", zorder=0)
         axes.annotate(f"paper:\n{word}", (at, 1.0), xycoords=("data", "axes fraction"), fontsize=8, color="#555",
                       ha="center", va="bottom")  # fmt: skip
@@ -162,9 +171,9 @@ def _series(cells: Sequence[Cell], results: Results, title: str) -> Figure:
     style_of = styles([cell.variant for cell in cells])
     ends = around([latency for cell in cells for latency in cell.rounds[1]])
     last = max(second for cell in cells for second in finite(cell.rounds[0]))
-    trials = [*marks(str(results.options.get("marks", ""))), ("", last)]
+    marked = [*marks(str(results.options.get("marks", ""))), ("", last)]
     for axes, cell in zip(every, cells, strict=True):
-        for number, ((name, begin), (_, until)) in enumerate(pairwise(trials)):
+        for number, ((name, begin), (_, until)) in enumerate(pairwise(marked)):
             axes.axvspan(begin, until, color=_BANDS[number % 2], zorder=0)
             if axes is every[0]:
                 axes.annotate(name, ((begin + until) / 2, 1.02), xycoords=("data", "axes fraction"), fontsize=8,

@@ -77,9 +77,13 @@ class Comparisons(TyperGroup):
     def get_command(self, ctx: Context, cmd_name: str) -> Command | None:
         if cmd_name not in _NAMES:
             return super().get_command(ctx, cmd_name)
-        app = typer.Typer(rich_markup_mode=None, add_completion=False)
-        app.command(cmd_name)(command_of(find(cmd_name)))
-        return typer.main.get_command(app)
+        return command_named(cmd_name)
+
+
+def command_named(name: str) -> Command:
+    app = typer.Typer(rich_markup_mode=None, add_completion=False)
+    app.command(name)(command_of(find(name)))
+    return typer.main.get_command(app)
 
 
 def command_of(about: Comparison) -> Callable[..., int]:
@@ -124,8 +128,7 @@ def _parsed(option: Option, value: Any) -> Any:
 
 
 def register(app: typer.Typer) -> None:
-    words = _GROUP_HELP
-    group = typer.Typer(cls=Comparisons, help=words, rich_markup_mode=None)
+    group = typer.Typer(cls=Comparisons, help=_GROUP_HELP, rich_markup_mode=None)
     for command in (compare, echo, report):
         group.command(command.__name__)(command)
     app.add_typer(group, name="bench")

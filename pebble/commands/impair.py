@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 from typer.core import TyperCommand
 
-from pebble.bench.comparison import find
-from pebble.commands.bench import command_of
+from pebble.commands.bench import command_named
 
 if TYPE_CHECKING:
     from typer._click.core import Command, Context, Parameter
@@ -34,9 +33,7 @@ class _Command(TyperCommand):
 
     @cached_property
     def _declared(self) -> Command:
-        app = typer.Typer(rich_markup_mode=None, add_completion=False)
-        app.command()(command_of(find("impair")))
-        return typer.main.get_command(app)
+        return command_named("impair")
 
     def get_params(self, ctx: Context) -> list[Parameter]:
         return [*self._declared.params, *super().get_params(ctx)]

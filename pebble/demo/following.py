@@ -1,4 +1,4 @@
-"""Judges how Goob followed a tag by itself, by what its MCU received and where it arrived. Pure."""
+"""Judges how Goob followed a tag by itself, by what its MCU received and where it arrived."""
 
 from __future__ import annotations
 
@@ -7,7 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from pebble.demo.operator import BY_ITSELF, DISTANCE_M, FOLLOW, HOLD_S, TOLERANCE_M, CompletedFollow, Wheels
-from pebble.rig.testbed import Outcome
+from pebble.media.world.world_file import read_world
+from pebble.rig.testbed import HORN, TAG_ID, RoomRobot
+from pebble.simulation.loudspeaker import playbacks
+from pebble.simulation.motion import Pose
 from pebble.simulation.trace import Entry
 
 BEARING_RAD = 0.09
@@ -36,6 +39,27 @@ class FollowResult:
     @property
     def wrong(self) -> tuple[str, ...]:
         return tuple(check.wrong for check in self.checks if check.wrong)
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """The true state at the end, known to the world and the loudspeaker."""
+
+    distance_m: float  # between camera and tag
+    bearing_rad: float  # of the tag, positive to the left
+    played_s: float
+    clip_s: float
+
+
+def outcome(robot: RoomRobot, at: float) -> Outcome:
+    """Where the tag was at that time, and what the loudspeaker has played of the clip."""
+    poses = (one.board.pose for one in reversed(robot.mcu_reports) if one.ns <= at * 1e9)
+    pose = next(poses, Pose(math.nan, math.nan))
+    tag = next(tag for tag in read_world(robot.room).tags if tag.id == TAG_ID)
+    dx, dy = tag.x - pose.x_mm / 1000, tag.y - pose.y_mm / 1000
+    bearing = math.remainder(math.atan2(dy, dx) - pose.heading_rad, math.tau)
+    played = [len(one.frames()) for one in playbacks(robot.played) if HORN.startswith(one.frames())]
+    return Outcome(math.hypot(dx, dy), bearing, max(played, default=0) / len(HORN), 1.0)
 
 
 def assess(completed: CompletedFollow, entries: Sequence[Entry], outcome: Outcome) -> FollowResult:

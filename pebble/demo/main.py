@@ -10,12 +10,13 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
 from types import FrameType
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 from rich.console import Console
 
 from pebble.contract.encodings import ALL_VIDEO
 from pebble.demo import emergency, following
+from pebble.demo.brokers import BrokerKind, best_kind
 from pebble.demo.machine import Machine
 from pebble.demo.media import ROUND_S as MEDIA_ROUND_S
 from pebble.demo.media import MediaCheck
@@ -36,8 +37,7 @@ from pebble.demo.results import Result, Results
 from pebble.demo.steps import assess
 from pebble.demo.view import View, show_media_results, show_results
 from pebble.errors import PebbleError
-from pebble.rig.broker import BrokerKind, best_kind
-from pebble.rig.testbed import ROBOTS, PageServer, Testbed
+from pebble.rig.testbed import ROBOTS, PageServer, RoomRobot, Testbed
 from pebble.web.extra import require_packages
 from pebble.web.settings import DEFAULT_PORT
 
@@ -94,7 +94,7 @@ def _run_demo(
 ) -> _Observed:
     """Set up, drive and observe."""
     console.print(f"Two brokers ({kind}): a remote one, and the one that Fred carries.")
-    testbed.start_brokers(kind)
+    testbed.start_brokers(kind.program)
     console.print("Goob on Zenoh and Fred on MQTT, each with a simulated motor MCU, camera and microphone;")
     console.print(
         "Goob also with an inertial sensor that describes itself, a loudspeaker and scripts, in a room with tags."
@@ -208,7 +208,8 @@ def _assess(testbed: Testbed, operator: Operator, completed: CompletedStep | Com
     if isinstance(completed, CompletedStop):
         return emergency.assess(completed, robot.entries())
     if isinstance(completed, CompletedFollow):
-        return following.assess(completed, robot.entries(), robot.outcome(completed.ended))
+        outcome = following.outcome(cast(RoomRobot, robot), completed.ended)  # no other one follows tags
+        return following.assess(completed, robot.entries(), outcome)
     seen = next(seen for seen in operator.discovery.all_robots() if seen.name == completed.robot)
     has_lights = seen.lights_topic(flash=False) is not None
     return assess(completed, list(robot.mcu_reports), robot.entries(), stop_s=robot.stop_s, has_lights=has_lights)

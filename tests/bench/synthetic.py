@@ -208,8 +208,7 @@ def impair(trials: tuple[str, ...] = TRIALS) -> Results:
             cells.append(Cell(variant=subject, measure=f"{what} over time", unit="ms", rounds=[seconds, times]))
     marks = ";".join(f"{trial}@{2 + 24 * number}" for number, trial in enumerate(trials))
     aims = [_aim("mqtt h264 opus at 256k, audio at least 99 %", "met", "99.0 %")]
-    link = {"link": "proxy", "link_words": "a userspace proxy, loss modelled; robot's uplink impaired"}
-    return _results("impair", cells, aims, options={**link, "window_s": 8.0, "marks": marks})
+    return _results("impair", cells, aims, options={"window_s": 8.0, "marks": marks})
 
 
 def broken() -> Results:

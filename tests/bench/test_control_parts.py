@@ -32,7 +32,6 @@ from pebble.bench.control_worker import (
 from pebble.bench.results import Cell, load
 from pebble.errors import PebbleError
 from pebble.rig import processes
-from pebble.rig.broker import BrokerKind
 from pebble.rig.processes import Broker, end_all
 from tests.support import until
 
@@ -347,7 +346,7 @@ def test_the_tables_of_all_variants_fit_100_columns() -> None:
 
 
 def test_the_broker_gets_the_lines_of_its_variant(tmp_path: Path) -> None:
-    broker = Broker("broker", BrokerKind.MOSQUITTO, tmp_path, VARIANTS["mqtt-nodelay"].broker)
+    broker = Broker("broker", tmp_path, VARIANTS["mqtt-nodelay"].broker)
     try:
         assert "set_tcp_nodelay true" in (tmp_path / "broker.conf").read_text().splitlines()
     finally:
@@ -357,7 +356,7 @@ def test_the_broker_gets_the_lines_of_its_variant(tmp_path: Path) -> None:
 def test_another_server_on_the_broker_s_port_is_not_the_broker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with socket.create_server(("127.0.0.1", 0)) as stranger:
         monkeypatch.setattr(processes, "free_port", lambda: stranger.getsockname()[1])
-        broker = Broker("broker", BrokerKind.MOSQUITTO, tmp_path)
+        broker = Broker("broker", tmp_path)
         assert until(lambda: broker.ended)
         with pytest.raises(PebbleError, match="broker ended at once"):
             broker.wait()

@@ -8,11 +8,11 @@ import pytest
 from rich.console import Console
 
 from pebble.bench import cost
+from pebble.bench.clients import encoding_of
 from pebble.bench.comparison import Case
 from pebble.bench.cost import COST, CPU, IDLE, MEMORY, THREADS
 from pebble.bench.engine import Collected
 from pebble.bench.results import Cell
-from pebble.bench.subscribers import encoding_of
 from pebble.contract.packets import Codec, Picture, PictureKind, Sound
 
 Reading = tuple[str, dict[str, dict[str, float]], float | None]  # phase, values by measure and process, pictures

@@ -144,14 +144,6 @@ def test_a_curve_keeps_its_times_and_its_values(tmp_path: Path) -> None:
     assert results.cells[0].rounds == [[0.0, 1.0], [7.0, 8.0]]
 
 
-def test_tables_name_options_of_the_run(tmp_path: Path) -> None:
-    grid, console = Grid(title="times", rows=("size",), columns=(COUNT,)), Console(file=io.StringIO(), width=100)
-    about = declared(tables=(grid,), title_suffix=", for {seconds:g} s{quick}")
-    assert engine.run(about.run_of(quick=True, output=tmp_path, console=console)) == 0
-    assert isinstance(console.file, io.StringIO)
-    assert "times, for 2 s, quick" in console.file.getvalue()
-
-
 def test_a_cell_without_samples_exits_with_1(tmp_path: Path) -> None:
     about = declared(measure=lambda case: [case.cell("way", "us", [] if case.variant == "socket" else [1.0])])
     assert engine.run(about.run_of(output=tmp_path, console=Console(file=io.StringIO()))) == 1

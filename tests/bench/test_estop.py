@@ -24,14 +24,13 @@ from pebble.bench.estop import (
     STOP,
     ZERO,
     cell_of,
-    is_moving,
     measure,
     rest,
 )
 from pebble.bench.pictures import pictures
 from pebble.bench.results import Cell, Results, load
 from pebble.errors import PebbleError
-from pebble.rig.processes import Worker, end_workers
+from pebble.rig.processes import Worker, end_all
 from pebble.simulation.fleet import Moved
 from pebble.transports import Message, MqttSettings, QoS, create
 from tests.support import Broker, until
@@ -55,12 +54,6 @@ def test_wheels_that_turn_again_are_noticed() -> None:
 
 def test_wheels_that_never_rest_have_no_time() -> None:
     assert rest(moves((10, AHEAD), (60, (0.4, 0.5))), 50 * MS) == (None, False)
-
-
-def test_a_robot_moves_after_its_last_change() -> None:
-    assert not is_moving([])
-    assert is_moving(moves((10, OFF), (20, AHEAD)))
-    assert not is_moving(moves((10, AHEAD), (20, OFF)))
 
 
 # -- cells and assessment
@@ -192,7 +185,7 @@ def test_the_driver_sends_a_zero_before_and_after_its_commands(broker: Broker, t
     def note(message: Message) -> None:
         received.append((message.topic.split("/")[2], json.loads(message.payload)["z"]))
 
-    driver = Worker("driver", [sys.executable, "-m", "pebble.bench.drivers", str(broker.port)], tmp_path / "driver.log")
+    driver = Worker("driver", [sys.executable, "-m", "pebble.bench.clients", str(broker.port)], tmp_path / "driver.log")
     with create("mqtt", "test", MqttSettings(host="127.0.0.1", port=broker.port)) as transport:
         try:
             transport.subscribe("+/+/+/incoming/drive-values", note, qos=QoS.DELIVERED, direct=True)
@@ -203,7 +196,7 @@ def test_the_driver_sends_a_zero_before_and_after_its_commands(broker: Broker, t
             count = received.count(("b", 0.5))
             assert until(lambda: received.count(("b", 0.5)) > count)
         finally:
-            end_workers([driver])
+            end_all([driver])
     assert [received.count((name, 0.0)) for name in "ab"] == [2, 1]
     assert next(z for name, z in received if name == "a") == 0.0
     assert [z for name, z in received if name == "a"][-1] == 0.0

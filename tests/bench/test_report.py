@@ -126,7 +126,8 @@ def test_render_writes_all_again_from_what_is_there(tmp_path: Path) -> None:
     assert all((tmp_path / link).exists() for link in links)
     headings = re.findall(r"^## (.+)$", written, re.MULTILINE)
     assert headings[3:] == [
-        "Start-up", "Camera frames: the null test", "Sound on the wire", "What these numbers do not show",
+        "Start-up", "Camera frames inside the robot: the null test", "Sound on the wire",
+        "What these numbers do not show",
     ]  # fmt: skip
     anchors = {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
     assert set(re.findall(r"\]\(#([^)]+)\)", written)) <= anchors

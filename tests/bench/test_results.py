@@ -48,7 +48,7 @@ def test_all_that_repeats_it_is_there(tmp_path: Path) -> None:
 
 
 def test_a_machine_without_a_broker_is_described_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pebble.rig.broker.mosquitto_path", lambda: None)
+    monkeypatch.setattr("pebble.rig.processes.mosquitto_path", lambda: None)
     assert machine()["mosquitto"] is None
 
 

@@ -12,10 +12,9 @@ from rich.console import Console
 from pebble.bench import traffic as comparison
 from pebble.bench.comparison import chosen
 from pebble.bench.engine import run
-from pebble.bench.paper import TABLE_4_1
 from pebble.bench.pictures import pictures
 from pebble.bench.results import load
-from pebble.bench.traffic import TRAFFIC, assessment, cells_of, robots_of, tables
+from pebble.bench.traffic import TABLE_4_1, TRAFFIC, assessment, cells_of, robots_of, tables
 from pebble.errors import PebbleError
 from pebble.recordings.library import FOREVER_NS
 from pebble.recordings.traffic.analysis import analyse

@@ -8,9 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from pebble.bench.usage import cpu_s, own_mb, pss_mb, wake_up_us, wake_ups
+from pebble.bench.usage import cpu_s, pss_mb, wake_up_us, wake_ups
 from pebble.errors import PebbleError
 from pebble.rig.processes import Worker, children
+from tests.own_memory import own_mb
 from tests.support import Child, until
 
 GONE = 1 << 22  # above the largest pid

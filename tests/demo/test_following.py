@@ -6,9 +6,8 @@ from dataclasses import replace
 
 import pytest
 
-from pebble.demo.following import FollowResult, assess
+from pebble.demo.following import FollowResult, Outcome, assess
 from pebble.demo.operator import DISTANCE_M, CompletedFollow
-from pebble.rig.testbed import Outcome
 from pebble.simulation.trace import Entry
 
 STARTED, TOOK_OVER, RELEASED, ENDED = 100.0, 104.0, 105.0, 112.0

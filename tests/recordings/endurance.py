@@ -16,7 +16,7 @@ import time
 from collections import defaultdict
 from pathlib import Path
 
-from pebble.bench.usage import cpu_s, own_mb
+from pebble.bench.usage import cpu_s
 from pebble.client.viewer import Viewer
 from pebble.contract import DRIVE, codec
 from pebble.contract.payloads import Drive
@@ -24,6 +24,7 @@ from pebble.errors import PebbleError
 from pebble.recordings.library import files, merged
 from pebble.rig.testbed import ROBOTS, Stage
 from pebble.transports import Message, MqttSettings, QoS, Transport, create
+from tests.own_memory import own_mb
 from tests.support import quarters, until
 
 ENCODINGS = ("json", "pbvd", "pbvz", "h264")

@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -66,19 +67,24 @@ def test_a_robot_is_driven_and_streams_media_over_a_slow_network(
     assert clip is not None
     assert clip.lost == 0
     assert 0 < clip.samples[0] < 20_000
-    assert "network namespaces" in printed.getvalue()
+    assert "after media were switched off" in printed.getvalue()
     assert "512k@" in str(results.options["marks"])
     assert children(os.getpid()) == []
 
 
 @pytest.mark.thorough
 def test_ctrl_c_leaves_nothing(tmp_path: Path) -> None:
+    with tempfile.TemporaryDirectory(prefix="i-", dir="/tmp") as short:  # as below it are Unix sockets
+        _end_by_ctrl_c(tmp_path, Path(short))
+
+
+def _end_by_ctrl_c(tmp_path: Path, temporary: Path) -> None:
     command = [sys.executable, "-m", "pebble.cli", "impair", "--subjects", "mqtt original", "--output", str(tmp_path)]
     process = subprocess.Popen(
-        command, cwd=ROOT, env={**os.environ, "TMPDIR": str(tmp_path)}, stdout=subprocess.DEVNULL
+        command, cwd=ROOT, env={**os.environ, "TMPDIR": str(temporary)}, stdout=subprocess.DEVNULL
     )
     try:
-        assert until(lambda: len(list(tmp_path.glob("pbl-*/the operator*.log"))) == 1, 60), "the robot does not start"
+        assert until(lambda: len(list(temporary.glob("pbl-*/the operator*.log"))) == 1, 60), "the robot does not start"
         started = descendants(process.pid)
         process.send_signal(signal.SIGINT)
         assert process.wait(30) == 130
@@ -87,4 +93,4 @@ def test_ctrl_c_leaves_nothing(tmp_path: Path) -> None:
         process.wait()
     assert len(started) > 4
     assert until(lambda: not any(map(Rig.alive, started)))
-    assert not list(tmp_path.glob("pbl-*"))
+    assert not list(temporary.glob("pbl-*"))

@@ -11,7 +11,7 @@ import pytest
 # A last block that lives keeps all pages below it, which hold nothing, at the process.
 _TEST = """
 import os
-from pebble.bench.usage import own_mb
+from tests.own_memory import own_mb
 from pebble.runtime.memory import return_free_pages
 
 blocks = [bytes(2000) for _ in range(20_000)]

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterator
+from contextlib import closing
 
 import pytest
 
@@ -18,5 +19,5 @@ def namespaces_permitted() -> None:
 
 @pytest.fixture
 def network(namespaces_permitted: None) -> Iterator[NamespaceNetwork]:
-    with NamespaceNetwork("of a test") as made:
+    with closing(NamespaceNetwork("of a test")) as made:
         yield made

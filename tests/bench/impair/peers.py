@@ -8,7 +8,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from pebble.bench.impair.network import REMOTE_HOST, NamespaceNetwork
-from pebble.rig.processes import Worker, end_workers
+from pebble.rig.processes import Worker, end_all
 
 _ANSWER_S = 40.0
 _PEER = [sys.executable, "-I", str(Path(__file__).with_name("peer.py"))]
@@ -49,7 +49,7 @@ class ProbeConnection:
         return int(self._server.answer(_ANSWER_S)["received"])
 
     def end(self) -> None:
-        end_workers(self._workers)
+        end_all(self._workers)
 
     def __enter__(self) -> Self:
         return self
@@ -75,4 +75,4 @@ def largest_packet(network: NamespaceNetwork, logs: Path) -> Iterator[Callable[[
 
         yield largest
     finally:
-        end_workers([listener])
+        end_all([listener])

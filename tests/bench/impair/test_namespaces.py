@@ -4,6 +4,7 @@ import json
 import shutil
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -23,7 +24,7 @@ _BAND = range(50, 151)  # of 100 on average; five standard deviations
 
 @pytest.mark.parametrize("delay_ms", [0, 1], ids=["wire", "timed"])
 def test_loss_drops_the_configured_share_of_packets(delay_ms: int, tmp_path: Path) -> None:
-    with NamespaceNetwork() as network, ProbeConnection(network, tmp_path) as talk:
+    with closing(NamespaceNetwork()) as network, ProbeConnection(network, tmp_path) as talk:
         before = network.traffic()
         network.apply(Condition("5%", Shape(loss=0.05, delay_ms=delay_ms)))
         talk.send_datagrams(_SENT)
@@ -36,7 +37,7 @@ def test_loss_drops_the_configured_share_of_packets(delay_ms: int, tmp_path: Pat
 
 
 def test_loss_of_the_downlink_is_on_the_robots_side(tmp_path: Path) -> None:
-    with NamespaceNetwork() as network, ProbeConnection(network, tmp_path) as talk:
+    with closing(NamespaceNetwork()) as network, ProbeConnection(network, tmp_path) as talk:
         network.apply(Condition("down", Shape(), Shape(loss=0.2)))
         talk.down(100_000)
         counter = network.on_robot(["nft", "-j", "list", "counter", "ip", "impair", "lost"])
@@ -45,7 +46,7 @@ def test_loss_of_the_downlink_is_on_the_robots_side(tmp_path: Path) -> None:
 
 
 def test_a_full_queue_drops(tmp_path: Path) -> None:
-    with NamespaceNetwork() as network, ProbeConnection(network, tmp_path) as talk:
+    with closing(NamespaceNetwork()) as network, ProbeConnection(network, tmp_path) as talk:
         network.apply(Condition("64k", Shape(kbit=64)))
         talk.send_datagrams(400)
         assert 50 < network.traffic().dropped_up <= 400
@@ -54,7 +55,7 @@ def test_a_full_queue_drops(tmp_path: Path) -> None:
 @pytest.mark.parametrize("kbit", [None, 4000])
 def test_no_packet_is_larger_than_on_a_wire(kbit: float | None, tmp_path: Path) -> None:
     with (
-        NamespaceNetwork() as network,
+        closing(NamespaceNetwork()) as network,
         ProbeConnection(network, tmp_path) as talk,
         largest_packet(network, tmp_path) as largest,
     ):
@@ -65,7 +66,7 @@ def test_no_packet_is_larger_than_on_a_wire(kbit: float | None, tmp_path: Path) 
 
 
 def test_the_namespaces_have_no_other_connection() -> None:
-    with NamespaceNetwork() as network:
+    with closing(NamespaceNetwork()) as network:
         for command in (network.on_robot, network.on_remote):
             shown = subprocess.check_output(command(["cat", "/proc/net/dev"]), text=True)
             devices = {line.split(":")[0].strip() for line in shown.splitlines()[2:]}
@@ -74,7 +75,7 @@ def test_the_namespaces_have_no_other_connection() -> None:
 
 def test_a_missing_program_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "nsenter").symlink_to(str(shutil.which("nsenter")))
-    monkeypatch.setattr(networks, "_SBIN", "/nowhere")
+    monkeypatch.setattr(networks, "SBIN", "/nowhere")
     monkeypatch.setenv("PATH", str(tmp_path))
     assert "failed to execute ip: No such file" in str(networks.why_no_namespaces.__wrapped__())
 
@@ -92,5 +93,5 @@ def test_a_user_without_permission_gets_the_reason() -> None:
 
 
 def test_a_port_is_found_without_a_loopback_device() -> None:
-    asked = [sys.executable, "-c", "from pebble.rig.broker import free_port; print(free_port())"]
+    asked = [sys.executable, "-c", "from pebble.rig.processes import free_port; print(free_port())"]
     assert int(subprocess.check_output(["unshare", "--net", *asked], cwd=ROOT)) > 0

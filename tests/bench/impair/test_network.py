@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -72,8 +73,8 @@ def test_conditions_of_every_kind_can_follow_each_other(network: NamespaceNetwor
 @pytest.mark.usefixtures("namespaces_permitted")
 def test_networks_are_independent(tmp_path: Path) -> None:
     with (
-        NamespaceNetwork() as one,
-        NamespaceNetwork() as other,
+        closing(NamespaceNetwork()) as one,
+        closing(NamespaceNetwork()) as other,
         ProbeConnection(one, tmp_path) as first,
         ProbeConnection(other, tmp_path) as second,
     ):

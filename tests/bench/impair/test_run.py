@@ -84,7 +84,7 @@ def go(monkeypatch: pytest.MonkeyPatch, folder: Path, trials: int) -> tuple[list
     log: list[str] = []
     printed = io.StringIO()
     monkeypatch.setattr("pebble.bench.engine.find_spec", lambda _name: None)  # no plots
-    monkeypatch.setattr("pebble.bench.impair.trials.why_no_namespaces", lambda: None)
+    monkeypatch.setattr("pebble.bench.impair.network.why_no_namespaces", lambda: None)
     run = replace(IMPAIR, environment=fake_robots(log, trials)).run_of(
         trials=["1024k", "5%"],
         variants=["mqtt original", "zenoh original", "mqtt h264 opus"],
@@ -113,7 +113,7 @@ def test_each_group_runs_each_condition_and_then_a_clean_network(
 def test_the_file_records_the_conditions(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     go(monkeypatch, tmp_path, trials=2)
     results = load(tmp_path / "impair.json")
-    assert (results.bench, results.options["link"], results.options["window_s"]) == ("impair", "namespaces", 8.0)
+    assert (results.bench, results.options["window_s"]) == ("impair", 8.0)
     marks = [mark.partition("@")[0] for mark in str(results.options["marks"]).split(";")]
     assert marks == ["1024k", "5%"]
     assert {len(cell.rounds) for cell in results.cells if "trial" in cell.params} == {1}
@@ -121,7 +121,7 @@ def test_the_file_records_the_conditions(monkeypatch: pytest.MonkeyPatch, tmp_pa
 
 
 def test_without_namespaces_it_does_not_begin(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr("pebble.bench.impair.trials.why_no_namespaces", lambda: "not permitted")
+    monkeypatch.setattr("pebble.bench.impair.network.why_no_namespaces", lambda: "not permitted")
     with pytest.raises(PebbleError, match="no network namespaces: not permitted"):
         engine.run(IMPAIR.run_of(output=tmp_path))
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 from rich.console import Console
 from rich.table import Table
 
-from pebble.bench.usage import own_mb
+from tests.own_memory import own_mb
 from tests.robot.operator import Driver, number_of
 from tests.robot.rig import STOP
 from tests.robot.soak.attacks import Attack, attacks, shuffled

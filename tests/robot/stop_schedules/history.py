@@ -10,7 +10,7 @@ from typing import Any
 
 import msgspec
 
-from pebble.simulation.trace import Entry
+from pebble.simulation.trace import Entry, complete_lines
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,12 +65,8 @@ class Wheels:
 
     def read(self) -> list[Turning]:
         """All changes since the last :meth:`forget`, and the state before."""
-        with self._trace.open("rb") as file:
-            file.seek(self._offset)
-            raw = file.read()
-        complete = raw[: raw.rfind(b"\n") + 1]
-        self._offset += len(complete)
-        for line in complete.splitlines():
+        lines, self._offset = complete_lines(self._trace, self._offset)
+        for line in lines:
             entry = msgspec.json.decode(line, type=Entry)
             if entry.motors is not None:
                 self._turned.append(Turning(entry.ns / 1e9, sum(entry.motors) / 2))

@@ -1,6 +1,6 @@
-"""Stock paho clients, of which the comparisons' operators and subscribers are made, and one that drives many robots.
+"""Stock paho clients, of which operators are made; one drives many robots, one watches a robot start and stream.
 
-``python -m pebble.bench.drivers PORT`` drives the robots whose base topics its newest line names, separated by spaces.
+``python -m pebble.bench.clients PORT`` drives the robots whose base topics its newest line names, separated by spaces.
 """
 
 from __future__ import annotations
@@ -10,15 +10,19 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
-from contextlib import closing
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager, suppress
+from itertools import zip_longest
 from typing import Any, Final, Self
 
 from paho.mqtt.client import Client, MQTTMessage, MQTTMessageInfo
 from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
 
-from pebble.contract import DRIVE, Channel
-from pebble.errors import PebbleError
+from pebble import contract
+from pebble.contract.packets import Codec, Picture, PictureKind, Sound
+from pebble.errors import PayloadError, PebbleError
+from pebble.rig.robot import BASE, MEDIA, Robot, one_robot
 from pebble.rig.worker_end import serve
 
 RATE_HZ: Final = 20.0  # of each robot
@@ -26,6 +30,9 @@ MANY: Final = 65_535  # messages in flight
 AHEAD: Final = {"x": 0.0, "z": 0.5}
 ZERO: Final = {"x": 0.0, "z": 0.0}
 _ANSWER_S = 10.0
+UP_S: Final = 20.0  # for a robot to start
+#: Flag and request, of pictures and of sound.
+_MEDIA_CHANNELS = (contract.MQTT_VIDEO, contract.VIDEO_CONTROL), (contract.MQTT_AUDIO, contract.AUDIO_CONTROL)
 
 
 class StockClient:
@@ -73,9 +80,15 @@ class StockClient:
         self.paho.disconnect()
         self.paho.loop_stop()
 
-    def send(self, channel: Channel, base: str, body: Any) -> MQTTMessageInfo:
+    def send(self, channel: contract.Channel, base: str, body: Any) -> MQTTMessageInfo:
         """Publishes ``body`` as JSON, with the QoS and the retain flag of the channel."""
         return self.paho.publish(channel.topic(base), json.dumps(body), channel.default_qos, channel.default_retain)
+
+    def request_media(self, base: str, enabled: bool = True, *encodings: str) -> None:
+        """Allows and requests a robot's pictures and sound, by default as it is configured; or ends both."""
+        for (flag, request), encoding in zip_longest(_MEDIA_CHANNELS, encodings):
+            self.send(flag, base, enabled)
+            self.send(request, base, {"enabled": enabled} | ({"encoding": encoding} if encoding else {}))
 
     def _on_connect(self, *_: Any) -> None:
         if self._subscriptions:
@@ -104,7 +117,7 @@ class Driver(StockClient):
         """Drive these robots, and no others."""
         with self._lock:
             for base in {*self._bases} ^ {*bases}:
-                self.send(DRIVE, base, ZERO)
+                self.send(contract.DRIVE, base, ZERO)
             self._bases = bases
 
     def _run(self) -> None:
@@ -113,7 +126,7 @@ class Driver(StockClient):
             with self._lock:
                 count = len(self._bases)
                 if count:
-                    self.send(DRIVE, self._bases[number % count], AHEAD)
+                    self.send(contract.DRIVE, self._bases[number % count], AHEAD)
             number += 1
             due = max(due + 1 / RATE_HZ / max(1, count), time.monotonic() - 1 / RATE_HZ)
 
@@ -125,6 +138,52 @@ class Driver(StockClient):
 def driving(port: int, *bases: str) -> closing[Driver]:
     """Drives these robots during the ``with`` block, whether or not they receive it."""
     return closing(Driver(port, *bases))
+
+
+class RobotSubscriber(StockClient):
+    """Records when and how much one robot publishes: CLOCK_MONOTONIC, in ns; None: not yet."""
+
+    def __init__(self, port: int, base: str) -> None:
+        self._base = base
+        self.first_heartbeat_ns: int | None = None
+        self.ready_ns: int | None = None  # every service is ready
+        self.arrived: Counter[str] = Counter()  # pictures and sound packets, by encoding: "json", "h264", "pcm", "opus"
+        super().__init__(self._on_message, [(f"{base}/#", 1)])
+        self.open(port)
+
+    def _on_message(self, message: MQTTMessage) -> None:
+        now, topic = time.monotonic_ns(), message.topic.removeprefix(f"{self._base}/")
+        if topic in (contract.CAMERA.suffix, contract.AUDIO.suffix):
+            self.arrived[encoding_of(bytes(message.payload))] += 1
+        elif topic == contract.ONLINE.suffix and self.first_heartbeat_ns is None:
+            self.first_heartbeat_ns = now if json.loads(message.payload).get("online", True) else None
+        elif topic == contract.STATUS.suffix and self.ready_ns is None and _all_ready(message.payload):
+            self.ready_ns = now
+
+
+@contextmanager
+def ready_robot(kind: str) -> Iterator[tuple[Robot, RobotSubscriber]]:
+    """A robot with a camera and a microphone whose services are ready. Raises PebbleError with its log."""
+    with one_robot(kind, services=MEDIA) as robot, closing(RobotSubscriber(robot.remote_port, BASE)) as subscriber:
+        subscriber.wait()
+        robot.launch()
+        robot.expect(lambda: subscriber.ready_ns is not None, "not every service is ready", UP_S)
+        yield robot, subscriber
+
+
+def encoding_of(raw: bytes) -> str:
+    """The encoding of a picture or a sound packet; ``json`` if it has no binary header."""
+    with suppress(PayloadError):
+        return "h264" if Picture.unpack(raw).kind == PictureKind.H264 else "pbvd"
+    with suppress(PayloadError):
+        return "opus" if Sound.unpack(raw).codec == Codec.OPUS else "pcm"
+    return "json"
+
+
+def _all_ready(status: bytes | bytearray) -> bool:
+    """Programs on demand are ``stopped`` until requested; before the robot runs, all are."""
+    states = {service["state"] for service in json.loads(status)["value"]["services"].values()}
+    return "ready" in states and states <= {"ready", "stopped"}
 
 
 if __name__ == "__main__":

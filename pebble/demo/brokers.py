@@ -1,30 +1,31 @@
-"""MQTT brokers on loopback: mosquitto where it is installed, else amqtt from the extra ``demo``.
+"""The demo's brokers: mosquitto where it is installed, else amqtt from the extra ``demo``.
 
-Program: ``python -m pebble.rig.broker PORT`` runs amqtt.
+``python -m pebble.demo.brokers PORT`` runs amqtt on loopback.
 """
 
 from __future__ import annotations
 
 import asyncio
-import os
-import shutil
-import socket
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from enum import StrEnum
 from importlib.util import find_spec
-from pathlib import Path
 from typing import Any
 
 from pebble.errors import PebbleError
+from pebble.rig.processes import HOST, mosquitto_path
 
-HOST = "127.0.0.1"
-_SBIN = "/usr/sbin:/usr/local/sbin"  # where Debian puts brokers, outside users' PATH
+_MODULE = "pebble.demo.brokers"
 
 
 class BrokerKind(StrEnum):
     MOSQUITTO = "mosquitto"
     EMBEDDED = "embedded"
+
+    @property
+    def program(self) -> str | None:
+        """The module that is one; None: it is none of ours."""
+        return _MODULE if self is BrokerKind.EMBEDDED else None
 
 
 def best_kind() -> BrokerKind:
@@ -36,31 +37,6 @@ def best_kind() -> BrokerKind:
     raise PebbleError(
         "no broker: install mosquitto (apt install mosquitto) or amqtt (pip install 'pebble-robot[demo]')"
     )
-
-
-def mosquitto_path() -> str | None:
-    """None if it is not installed."""
-    return shutil.which("mosquitto") or shutil.which("mosquitto", path=_SBIN)
-
-
-def mosquitto_command(port: int, stem: Path, extra: Sequence[str] = (), host: str = HOST) -> list[str]:
-    """The command of a mosquitto on ``port``; writes its configuration to ``stem`` plus ``.conf``."""
-    path = mosquitto_path()
-    if path is None:
-        raise PebbleError("mosquitto is not installed: apt install mosquitto")
-    config = stem.with_suffix(".conf")
-    lines = [f"listener {port} {host}", "allow_anonymous true", "log_dest stderr", *extra]
-    if os.geteuid() == 0:
-        lines.append("user root")  # a change of user would undo the parent-death signal that Program sets
-    config.write_text("\n".join(lines) + "\n")
-    return [path, "-c", str(config)]
-
-
-def free_port() -> int:
-    """An unused TCP port, also where there is no loopback device; in a new network namespace every port is unused."""
-    with socket.socket() as probe:
-        probe.bind(("", 0))
-        return int(probe.getsockname()[1])
 
 
 class _Subscriptions(dict[str, Any]):
