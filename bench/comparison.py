@@ -149,7 +149,7 @@ class Comparison:
     root: bool = False  # needs root
 
     def null_test(self, what: str, **changes: Any) -> Comparison:
-        """Its mode that compares one variant with itself, and with a slower self. It has no interval to summarise."""
+        """The mode of ``--null``: one variant against itself, as it is and slowed down. See pebble.bench.null."""
         own = {"name": f"{self.name}-null", "title": f"{self.title}: the null test", "is_null": True}
         shown = {"assessment": (null.assessment,), "words": ("bench", self.name), "summary_lines": 0}
         return replace(self, what=what, **{**own, **shown, "reported": ("--null",), **changes})

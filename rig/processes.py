@@ -191,7 +191,7 @@ class Broker(Program):
         wrap: Wrap = unchanged,
         program: str | None = None,
     ) -> None:
-        """``extra``: more lines for mosquitto's configuration. ``program``: a module that is one, in its place."""
+        """``extra``: more lines of mosquitto's configuration. ``program``: a module to run at the port in its place."""
         self.port = free_port()
         stem = folder / name
         command = python(program, self.port) if program else mosquitto_command(self.port, stem, extra, host)
