@@ -22,6 +22,7 @@ from pebble.bench.pictures import bars, ecdf, null_ratios, ratios
 from pebble.bench.ratios import LEAST_ROUNDS
 from pebble.bench.results import Cell, grouped
 from pebble.bench.tables import COUNT, LOST, SPREAD, Claims, Grid, percentile_column, single_column
+from pebble.bench.usage import wall_clock_ahead_ns
 from pebble.errors import PebbleError
 from pebble.rig.robot import KINDS
 
@@ -138,7 +139,7 @@ def hops(sent: Mapping[Wheels, int], stations: Sequence[Mapping[Wheels, int]]) -
 
 def passed(wire: socket.socket) -> Mapping[tuple[int, str], Mapping[Wheels, int]]:
     """By port, from or to it: when (CLOCK_MONOTONIC, ns) each command passed first."""
-    offset = time.time_ns() - time.monotonic_ns()  # the kernel stamps packets by the wall clock
+    offset = wall_clock_ahead_ns()  # the kernel stamps packets by it
     found = defaultdict[tuple[int, str], dict[Wheels, int]](dict)
     with suppress(BlockingIOError):
         while True:

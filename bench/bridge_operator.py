@@ -22,7 +22,7 @@ from typing import Any, Final, NamedTuple
 from paho.mqtt.client import MQTTMessage
 
 from pebble import contract
-from pebble.bench.clients import RATE_HZ, RobotSubscriber, StockClient
+from pebble.bench.clients import RATE_HZ, RobotSubscriber, StockClient, axes_of
 from pebble.bench.null import spin
 from pebble.bench.usage import cpu_s
 from pebble.errors import PebbleError
@@ -136,7 +136,7 @@ class DrivenRobot(StockClient):
             spin(0.0 if slowed else work_us)
             sent[left, right] = time.monotonic_ns()
             spin(work_us if slowed else 0.0)
-            self.send(contract.DRIVE, BASE, {"x": (left - right) / 2, "z": (left + right) / 2})
+            self.send(contract.DRIVE, BASE, axes_of(left, right))
             due += 1 / rate_hz
             time.sleep(max(0.0, due - time.monotonic()))
         ended = time.monotonic_ns()

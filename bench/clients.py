@@ -11,13 +11,13 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from itertools import zip_longest
 from typing import Any, Final, Self
 
 from paho.mqtt.client import Client, MQTTMessage, MQTTMessageInfo
-from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
+from paho.mqtt.enums import CallbackAPIVersion
 
 from pebble import contract
 from pebble.contract.packets import Codec, Picture, PictureKind, Sound
@@ -35,6 +35,11 @@ UP_S: Final = 20.0  # for a robot to start
 _MEDIA_CHANNELS = (contract.MQTT_VIDEO, contract.VIDEO_CONTROL), (contract.MQTT_AUDIO, contract.AUDIO_CONTROL)
 
 
+def axes_of(left: float, right: float) -> dict[str, float]:
+    """The axes of the drive command for these wheel speeds."""
+    return {"x": (left - right) / 2, "z": (left + right) / 2}
+
+
 class StockClient:
     """One paho client on loopback with its own network thread, on which ``receive`` runs.
 
@@ -49,10 +54,9 @@ class StockClient:
         subscriptions: Sequence[tuple[str, Any]] = (),
         *,
         at_once: bool = True,
-        protocol: MQTTProtocolVersion = MQTTProtocolVersion.MQTTv311,
     ) -> None:
         self._ready, self._subscriptions = threading.Event(), list(subscriptions)
-        self.paho = Client(CallbackAPIVersion.VERSION2, protocol=protocol)
+        self.paho = Client(CallbackAPIVersion.VERSION2)
         self.paho.on_connect = self._on_connect
         self.paho.on_subscribe = lambda *_: self._ready.set()
         self.paho.on_message = lambda _client, _data, message: receive(message)
@@ -157,7 +161,11 @@ class RobotSubscriber(StockClient):
             self.arrived[encoding_of(bytes(message.payload))] += 1
         elif topic == contract.ONLINE.suffix and self.first_heartbeat_ns is None:
             self.first_heartbeat_ns = now if json.loads(message.payload).get("online", True) else None
-        elif topic == contract.STATUS.suffix and self.ready_ns is None and _all_ready(message.payload):
+        elif (
+            topic == contract.STATUS.suffix
+            and self.ready_ns is None
+            and all_ready(json.loads(message.payload)["value"])
+        ):
             self.ready_ns = now
 
 
@@ -180,9 +188,9 @@ def encoding_of(raw: bytes) -> str:
     return "json"
 
 
-def _all_ready(status: bytes | bytearray) -> bool:
+def all_ready(status: Mapping[str, Any]) -> bool:
     """Programs on demand are ``stopped`` until requested; before the robot runs, all are."""
-    states = {service["state"] for service in json.loads(status)["value"]["services"].values()}
+    states = {service["state"] for service in status.get("services", {}).values()}
     return "ready" in states and states <= {"ready", "stopped"}
 
 

@@ -25,7 +25,7 @@ CHANCE = 0.01
 #: Memory layout and core placement of new processes shift medians by this factor between runs, which no number of
 #: rounds within one run shows.
 THRESHOLD = 1.05
-_SAME_EVERY_TIME = ("kB/s", "kbit/s")  # encoder output is deterministic: one value is exact
+_SAME_EVERY_TIME = ("wire",)  # measures: encoder output is deterministic, one value is exact
 _MORE_IS_BETTER = ("1/s",)
 _LEAST_SAMPLES = 100  # of a round: with fewer, p99 is the maximum
 _LOSS = 0.005  # share of what was sent: smaller changes are ignored
@@ -105,7 +105,7 @@ def _judged(one: Cell, other: Cell, percent: int | None, level: float, threshold
     if percent is None:
         return _lost(one, other, level)
     ratio, a, b = unpaired(other.rounds, one.rounds, percent, level), _figure(one, percent), _figure(other, percent)
-    if other.unit in _SAME_EVERY_TIME:
+    if other.measure in _SAME_EVERY_TIME:
         ratio = Interval(ratio.ratio, ratio.ratio, ratio.ratio, level)
     if other.unit in _MORE_IS_BETTER and a > 0 and not b:
         kind = Kind.NO_SAMPLES

@@ -102,6 +102,7 @@ COST = Comparison(
     quick=Budget(20, rounds=1, seconds=0.7),
     constants={"rate_hz": RATE_HZ},
     variants=KINDS,
+    prepare=lambda run: run.notes.extend([] if find_spec("av") else ["h264+opus is left out: there is no PyAV"]),
     measure=measure,
     tables=(
         Grid(

@@ -47,6 +47,8 @@ def run(run: Run) -> int:
             sweep()  # Zenoh leaves files behind even after a regular end
     cells = about.derived(collected.cells())
     results.cells, results.options, results.took_s = cells, run.records(), round(time.monotonic() - since, 1)
+    results.complete = False
+    results.save(written := run.output / f"{about.name}.json")  # before anything that may fail
     notes = [str(run.problem).partition("\n")[0]] if run.problem else []
     lost = f"{len(failed)} of {run.rounds} rounds failed and were left out"
     notes += [f"{lost}; {why.splitlines()[0]}" for why in failed[:1]]
@@ -59,15 +61,15 @@ def run(run: Run) -> int:
         _print_whole(table, run.console)
     for sentence in (*results.assessment, *results.aims):
         show(str(sentence))
-    written = [run.output / f"{about.name}.json"]
-    results.save(written[0])
+    results.save(written)
+    files = [written]
     if find_spec("matplotlib") is None:
         show("No plots: pip install 'pebble-robot[bench]'", style="dim")
     else:
         from pebble.bench.pictures import draw
 
-        written += draw(results, run.output)
-    show(f"Written: {', '.join(map(str, written))}", style="dim")
+        files += draw(results, run.output)
+    show(f"Written: {', '.join(map(str, files))}", style="dim")
     if run.problem is not None:
         raise run.problem
     return int(not results.complete)
@@ -112,10 +114,10 @@ def _measure(run: Run, collected: Collected) -> list[str]:
                     env = shared.enter_context(about.environment(run))
                 round_ = Round(run, number, env, roles=collected.roles, planted_us=collected.planted_us)
                 if about.is_null and about.measure is not None and not collected.pilot:
-                    collected.pilot = list(about.measure(next(round_.cases())))
+                    collected.pilot = list(about.measure(next(one for one in round_.cases() if not one.slowed)))
                 collected.add(_round(round_))
                 fresh = False
-            except PebbleError as error:
+            except (PebbleError, OSError) as error:
                 fresh = True
                 failed.append(f"round {number + 1}: {error}")
                 if len(failed) == number + 1 == min(_GIVEN_UP, run.rounds):

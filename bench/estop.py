@@ -137,8 +137,10 @@ class Robots(Processes):
                 start()
             while any(len(times[base]) < _REACHED for base in bases):
                 if time.monotonic_ns() - began > timeout * 1e9:
-                    missing = [f"{base}: {robot.why}" for base, robot in sender.robots.items() if robot.why]
-                    raise PebbleError(f"a stop was not confirmed within {timeout:.0f} s: {'; '.join(missing)}")
+                    seen = {base: robot.why or "its state is missing" for base, robot in sender.robots.items()}
+                    lacking = [base for base in bases if len(times[base]) < _REACHED]
+                    why = "; ".join(f"{base}: {seen.get(base, 'it publishes nothing')}" for base in lacking)
+                    raise PebbleError(f"a stop was not confirmed within {timeout:.0f} s: {why}")
                 left = _TICK_S
                 while (message := listener.next(left)) is not None:
                     now, left, base = time.monotonic_ns(), 0.0, message.topic.partition("/outgoing/")[0]
@@ -173,7 +175,7 @@ class Robots(Processes):
         """When the last of these robots came to rest, and whether one of them moved again meanwhile."""
         time.sleep(_WATCH_S)
         times, again = zip(*(rest(moves, began) for moves in self._moves(robots)), strict=True)
-        return cell_of(case, REST, began, None if None in times else max(times), again=int(any(again)))
+        return cell_of(case, REST, began, None if None in times else max(times), again=int(any(again) or None in times))
 
     def _moves(self, robots: str) -> list[list[Moved]]:
         """Every change of their motors so far, by robot."""
@@ -193,7 +195,7 @@ def _wait(condition: Callable[[], bool], problem: str) -> None:
 
 
 def measure(round_: Round) -> Iterator[Cell]:
-    """One round, with processes of its own. Raises PebbleError."""
+    """One round, with processes of its own. A failure counts as a lost sample, ends the round, and is the run's."""
     run, env = round_.run, round_.env
     hold, stop, zero = {STOP: env.hold}, {STOP: env.stop}, {ZERO: env.stop_by_zero}
     plan = (
@@ -201,8 +203,15 @@ def measure(round_: Round) -> Iterator[Cell]:
     )  # fmt: skip
     for robots, times, ways in plan:
         for case in round_.cases([{"robot": one} for one in robots], times):
-            if case.variant in ways:
+            if case.variant not in ways:
+                continue
+            try:
                 yield from ways[case.variant](case, case.condition["robot"])
+            except PebbleError as error:
+                what = HOLD if ways is hold else CONFIRMED if case.variant == STOP else REST
+                yield cell_of(case, what, 0, None)
+                run.problem = error
+                return
 
 
 def _aim(measure_: str, at_most: float, *robots_: str) -> Aim:

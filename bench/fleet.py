@@ -20,7 +20,7 @@ from typing import Any, Final
 import msgspec
 from paho.mqtt.client import MQTTMessage
 
-from pebble.bench.clients import MANY, StockClient
+from pebble.bench.clients import MANY, StockClient, axes_of
 from pebble.bench.comparison import Budget, Case, Comparison, Option, seconds
 from pebble.bench.pictures import ecdf
 from pebble.bench.results import Cell, grouped, rounded
@@ -110,7 +110,7 @@ def drive_fleet(port: int, seconds: float, ids: Sequence[str]) -> None:
     heartbeats: dict[str, list[int]] = {ONLINE.topic(base): [] for base in bases}
     sent: dict[str, list[int]] = {name: [] for name in ids}
     topics = [DRIVE.topic(base) for base in bases]
-    bodies = [json.dumps({"x": (left - right) / 2, "z": (left + right) / 2}) for left, right in STEPS]
+    bodies = [json.dumps(axes_of(left, right)) for left, right in STEPS]
 
     def receive(message: MQTTMessage) -> None:
         if not message.retain and b"true" in message.payload:

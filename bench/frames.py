@@ -93,7 +93,7 @@ def measure(case: Case) -> Iterator[Cell]:
         "memory_reader_mb": statistics.fmean(memory_mb[1:]),
         "sent": writer["sent"] * len(readers),  # each frame to each reader
     }
-    if case.variant == "memcpy":  # has no writer; it times copies, so there is no number of sent ones
+    if case.variant == "memcpy":  # copies are timed, not what was sent
         figures = {"cpu_reader": sum(latencies_us) / 1e4 / seconds / len(readers)}
     figures |= {"torn": sum(reader["torn"] for reader in readers), "fallbacks": writer["fallbacks"]}
     yield case.cell("frame", "us", latencies_us, None, **figures)

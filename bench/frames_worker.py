@@ -63,7 +63,7 @@ def write(writer: Writer, size: int, slower_us: float) -> None:
     Each frame is delayed by ``slower_us`` of busy work between its time stamp and its sending.
     """
     picture = np.random.default_rng(1).integers(0, 256, size, dtype=np.uint8)
-    stamps: list[int] = []
+    stamps: list[int] = []  # of the frames, also of those that could not be sent
 
     def fill(frame: np.ndarray) -> None:
         """As a camera does: pixels, then the time."""
@@ -82,7 +82,8 @@ def write(writer: Writer, size: int, slower_us: float) -> None:
     while not window.ended.is_set():
         due += 1 / RATE_HZ
         window.ended.wait(max(0.0, due - time.monotonic()))
-        writer.write(fill)
+        if not writer.write(fill):
+            stamps.append(time.monotonic_ns())
     writer.close()
 
 

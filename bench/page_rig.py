@@ -21,8 +21,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pebble.bench.impair.conditions import Condition
+from pebble.bench.impair.network import CLONE_NEWNET, NamespaceNetwork, require_namespaces
 from pebble.bench.impair.network import ROBOT_HOST as SERVER
-from pebble.bench.impair.network import NamespaceNetwork, require_namespaces
+from pebble.bench.usage import wall_clock_ahead_ns
 from pebble.contract import DRIVE
 from pebble.errors import PebbleError
 from pebble.rig.processes import OPERATORS, Program
@@ -40,9 +41,7 @@ _AT_REST_S = 0.2  # motors that are off for so long have stopped
 _WAIT_S, _MOVED_S, _STOPPED_S = 20.0, 3.0, 5.0
 _PRESSES = 3
 _STEP_S = 0.01
-_AT_ONCE_S = 2e-5
 _PORT = 8080  # of the page's server, behind an impaired network
-_CLONE_NEWNET = 0x40000000
 
 #: Of several lists the last one counts, so this has what Playwright switches off, too. The popups of the address bar
 #: are pages of their own for each window: without them it opens in 0.28 s instead of 0.39 (Chromium 156, measured).
@@ -185,10 +184,7 @@ class Rig:
 
 def monotonic(page_ms: float) -> float:
     """A stamp of another process on this machine: epoch milliseconds, as time.monotonic()."""
-    while True:
-        before, wall, after = time.monotonic(), time.time(), time.monotonic()
-        if after - before < _AT_ONCE_S:  # else this thread stood still in between
-            return page_ms / 1000 - wall + (before + after) / 2
+    return page_ms / 1000 - wall_clock_ahead_ns() / 1e9
 
 
 @contextmanager
@@ -226,12 +222,15 @@ def chromium(*flags: str, program: str | None = None) -> Iterator[Browser]:
     """Run one with further ``flags``; ``program`` starts it in another way. Raises PebbleError with what to install."""
     if problem := missing():
         raise PebbleError(problem)
-    from playwright.sync_api import sync_playwright  # optional
+    from playwright.sync_api import Error, sync_playwright  # optional
 
     with sync_playwright() as playwright:
         path = program or shutil.which("chromium")
-        with closing(playwright.chromium.launch(executable_path=path, args=[*_FLAGS, *flags])) as browser:
-            yield browser
+        try:
+            with closing(playwright.chromium.launch(executable_path=path, args=[*_FLAGS, *flags])) as browser:
+                yield browser
+        except Error as error:
+            raise PebbleError(f"the browser: {error.message.splitlines()[0]}") from error
 
 
 # -- the browser behind an impaired network
@@ -251,11 +250,11 @@ def linked(condition: Condition, *names: str, flags: tuple[str, ...] = ()) -> It
         program.write_text(f'#!/bin/sh\nexec {shlex.join(network.on_remote(["chromium"]))} "$@"\n')
         program.chmod(0o700)
         with Path("/proc/thread-self/ns/net").open() as own, Path(robot_side).open() as robots:
-            if libc.setns(robots.fileno(), _CLONE_NEWNET):
+            if libc.setns(robots.fileno(), CLONE_NEWNET):
                 raise PebbleError(f"the network namespace cannot be entered: {os.strerror(ctypes.get_errno())}")
             try:
                 with rig(*names, program=str(program), flags=(secure, *flags), host=SERVER, port=_PORT) as made:
                     network.apply(condition)
                     yield made
             finally:
-                libc.setns(own.fileno(), _CLONE_NEWNET)
+                libc.setns(own.fileno(), CLONE_NEWNET)

@@ -155,7 +155,7 @@ def _head(measured: Sequence[Results]) -> Iterator[str]:
     when = f"Measured on {' to '.join(dict.fromkeys((days[0], days[-1])))}, in {took}. " if days else ""
     yield (
         f"{when}All of this is made by `make report{' QUICK=1' if quick else ''}`. Options and versions are in `.json` "
-        "files, at most 2,000 samples of each case in `samples.json.xz`."
+        "files, up to 2,000 samples of each case, or 100 of each round, in `samples.json.xz`."
     )
 
 
@@ -213,7 +213,7 @@ def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 _LIMITS = (
     "One machine. Intervals are over the rounds of one run; another run, kernel or load changes medians by more.",
-    "No radio: every byte went over loopback or a veth pair. Profiles imitate effects of Wi-Fi, not their cause.",
+    "No radio: all went over loopback, veth pairs and TUN devices. Profiles imitate effects of Wi-Fi, not their cause.",
     "No second machine: brokers, operators and the measuring programs compete with the robot for the same cores.",
     "No Raspberry Pi: its cores are slower, and throttle when hot. Ratios between variants transfer better than times.",
     "No camera, microphone and hardware encoder: real pictures and sounds are noisier than ours, which costs bytes.",

@@ -123,16 +123,12 @@ class Results(msgspec.Struct, kw_only=True):
     assessment: list[str] = msgspec.field(name="verdict", default_factory=list)  # sentences
     aims: list[Judged] = []
 
-    def find(self, variant: str, measure: str | None = None, **params: Value) -> Cell | None:
-        same = (one for one in self.cells if one.variant == variant and params.items() <= one.params.items())
-        return next((one for one in same if measure in (None, one.measure)), None)
-
     def save(self, path: Path) -> None:
         """Raises PebbleError if the file cannot be written."""
-        for cell in self.cells:
-            cell.rounds = [[round(sample, _DIGITS) for sample in one] for one in cell.rounds]
+        shorter = [[[round(sample, _DIGITS) for sample in one] for one in cell.rounds] for cell in self.cells]
+        cells = [msgspec.structs.replace(cell, rounds=one) for cell, one in zip(self.cells, shorter, strict=True)]
         with named(path):
-            path.write_bytes(msgspec.json.encode(self) + b"\n")
+            path.write_bytes(msgspec.json.encode(msgspec.structs.replace(self, cells=cells)) + b"\n")
 
 
 @contextmanager
@@ -146,15 +142,18 @@ def named(path: Path) -> Iterator[None]:
 
 def pack(folder: Path) -> None:
     """Moves the samples of all results in a folder into one small file, thinned. Raises PebbleError."""
+    found: dict[Path, Results] = {}
     packed: dict[str, list[list[list[int]]]] = {}
     for path in sorted(folder.glob("*.json")):
         with suppress(PebbleError):  # of another version, or not of a comparison
-            results = load(path)
+            results = found[path] = load(path)
             cells = [cell if cell.counts else cell.thinned() for cell in results.cells]
             packed[results.bench] = [[_steps(one) for one in cell.rounds] for cell in cells]
             results.cells = [msgspec.structs.replace(cell, rounds=[]) for cell in cells]
-            results.save(path)
-    (folder / SAMPLES).write_bytes(lzma.compress(msgspec.json.encode(packed), preset=9))
+    with named(folder / SAMPLES):  # before they are anywhere missing
+        (folder / SAMPLES).write_bytes(lzma.compress(msgspec.json.encode(packed), preset=9))
+    for path, results in found.items():
+        results.save(path)
 
 
 def _steps(samples: Sequence[float]) -> list[int]:

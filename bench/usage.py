@@ -1,18 +1,13 @@
-"""Resource usage of processes, read from the kernel, and the time in which this machine wakes up a process."""
+"""Resource usage of processes and the clocks of this machine, read from the kernel."""
 
 from __future__ import annotations
 
-import os
-import socket
-import subprocess
 import time
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
-from statistics import median_low
 
-_PINGS = 60
-_PERIOD_S = 0.005  # as messages at 200 Hz: cores go idle in between
+_AT_ONCE_NS = 20_000
 
 
 def cpu_s(pids: Iterable[int]) -> float:
@@ -46,26 +41,9 @@ def _sum(files: Iterable[Path], *fields: str) -> int:
     return total
 
 
-def wake_up_us() -> tuple[float, float]:
-    """The time to wake up a waiting process on the same core and on another one, us: half of a round trip to cat."""
-    cores = sorted(os.sched_getaffinity(0))
-    os.sched_setaffinity(0, cores[:1])  # this thread, and processes that it starts meanwhile
-    try:
-        return _wake_up_us(cores[0]), _wake_up_us(cores[-1])
-    finally:
-        os.sched_setaffinity(0, cores)
-
-
-def _wake_up_us(core: int) -> float:
-    near, far = socket.socketpair()
-    with near, far, subprocess.Popen(["cat"], stdin=far.fileno(), stdout=far.fileno()) as cat:
-        os.sched_setaffinity(cat.pid, {core})
-        ways = []
-        for _ in range(_PINGS):
-            time.sleep(_PERIOD_S)
-            sent = time.monotonic_ns()
-            near.send(b".")
-            near.recv(1)
-            ways.append(time.monotonic_ns() - sent)
-        near.shutdown(socket.SHUT_WR)  # it ends when its input closes
-    return median_low(ways) / 2000
+def wall_clock_ahead_ns() -> int:
+    """Ahead of CLOCK_MONOTONIC: a stamp of the wall clock minus this is one of that."""
+    while True:
+        before, wall, after = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
+        if after - before < _AT_ONCE_NS:  # else this thread stood still in between
+            return wall - (before + after) // 2

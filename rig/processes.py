@@ -98,7 +98,8 @@ class Program:
         end, ending = time.monotonic() + timeout, ending or threading.Event()
         while not condition() and not ending.wait(_STEP_S):
             if self.ended:
-                raise PebbleError(f"{self.name} ended at once with code {self.code}: see {self.log}")
+                last = "".join(self.tail().splitlines()[-1:])
+                raise PebbleError(f"{self.name} ended with code {self.code}: {last or 'no output'}; see {self.log}")
             if time.monotonic() > end:
                 raise PebbleError(f"{self.name} was not ready after {timeout:.0f} s: see {self.log}")
 
@@ -210,10 +211,7 @@ P = TypeVar("P", bound=Program)
 
 
 class Processes:
-    """Ends all of them with its ``with`` block, those of a kind at the same time; then deletes the folder.
-
-    A subclass starts what it consists of in :meth:`start`; ``closing`` is closed before all processes end.
-    """
+    """Ends all of them with its ``with`` block, those of a kind at the same time; then deletes the folder."""
 
     ends_s: ClassVar[tuple[float, ...]] = (_END_S, 6.0, 2.0, 2.0)  # what is left of each kind after that is killed
     keep = False  # the folder
@@ -221,7 +219,6 @@ class Processes:
     def __init__(self, prefix: str = "pbl-") -> None:
         usual = tempfile.gettempdir()  # mkdtemp makes a 0700 folder in it
         self.folder = Path(tempfile.mkdtemp(prefix=prefix, dir=usual if len(usual) <= _LONGEST_FOLDER else "/tmp"))  # noqa: S108
-        self.closing = ExitStack()
         self.workers: list[Worker] = []
         self._kinds: dict[Program, int] = {}
 
@@ -233,10 +230,9 @@ class Processes:
         return self
 
     def start(self) -> None:
-        """Called as the ``with`` block begins."""
+        """Starts what a subclass consists of, as the ``with`` block begins."""
 
     def __exit__(self, *_: object) -> None:
-        self.closing.close()
         for kind, within_s in enumerate(self.ends_s):
             end_all([program for program, one in self._kinds.items() if one == kind], within_s)
         if not self.keep:

@@ -21,7 +21,7 @@ from pebble.config.raw import deep_merge
 from pebble.contract.identity import Identity
 from pebble.errors import PebbleError
 from pebble.launcher.programs import programs
-from pebble.rig.processes import MCUS, ROBOTS, Broker, Each, Processes, Program, Wrap, children, python, unchanged
+from pebble.rig.processes import HOST, MCUS, ROBOTS, Broker, Each, Processes, Program, Wrap, children, python, unchanged
 from pebble.simulation.trace import Entry, complete_lines, read_trace
 
 if TYPE_CHECKING:
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 KINDS = ("mqtt", "zenoh")
 NAME = "rover"
 BASE = Identity("pebble", "robots", NAME).base
-_HOST = "127.0.0.1"
 START_S = 15.0  # of an MCU or the page's server, on a small machine
 
 Config = Mapping[str, Any]
@@ -212,7 +211,7 @@ def one_robot(kind: str, make: type[Robot] = Robot, **options: Any) -> Iterator[
     """A robot of its own with a remote broker of its own, ready to be launched. Raises PebbleError."""
     with Processes() as processes:
         broker = processes.broker("remote")
-        robot = make(processes, kind, (_HOST, broker.port), **options)
+        robot = make(processes, kind, (HOST, broker.port), **options)
         broker.wait()
         robot.prepare()
         yield robot

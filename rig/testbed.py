@@ -19,7 +19,7 @@ from pebble.config.raw import deep_merge
 from pebble.contract.identity import Identity
 from pebble.errors import PebbleError
 from pebble.media.sound_file import write_wav
-from pebble.rig.processes import OPERATORS, Processes, Program, python
+from pebble.rig.processes import HOST, OPERATORS, Processes, Program, python
 from pebble.rig.robot import MEDIA, START_S, Robot, SimulatedRobot
 from pebble.simulation.mcu import Snapshot
 from pebble.simulation.world.program import Snapshot as WorldSnapshot
@@ -36,7 +36,6 @@ CAMERA_FPS: int = MEDIA["av_daemon"]["video"]["fps"]
 _BOARDS = {"minilamp": "ESP32-C6", "benjr": "ESP8266"}
 #: Self-describing MCUs that Goob has besides, by their instance of the serial bridge: kind and options.
 _DEVICES = {"imu": ("goob_imu",), OUTLETS: ("outlets", "--unreachable", "o4")}
-_HOST = "127.0.0.1"
 _RESTART = ["sh", "-c", "kill $PPID"]  # the bridge alone, which runs it: the demo would take more for a failure
 _RATE = 16_000
 _POLL_S = 0.02
@@ -54,7 +53,7 @@ class LinuxRobot(Robot):
 
     def __init__(self, running: Testbed, name: str) -> None:
         own = json.loads((files("pebble") / "configs" / f"{name}.json").read_text())
-        remote, folder = (_HOST, running.broker_port), running.folder / name
+        remote, folder = (HOST, running.broker_port), running.folder / name
         super().__init__(running, own["transport"]["kind"], remote, name=name, folder=folder)
         self.has_imu, self.local_port = name == "goob", running.local_broker.port
         self.voice = folder / "voice"  # where its loudspeaker records what it plays of operators' voices
@@ -129,7 +128,7 @@ class McuRobot(SimulatedRobot):
 
     def __init__(self, running: Testbed, name: str) -> None:
         super().__init__(running, name, running.folder / name)
-        self.runs_on, self._broker = _BOARDS[name], f"{_HOST}:{running.broker_port}"
+        self.runs_on, self._broker = _BOARDS[name], f"{HOST}:{running.broker_port}"
 
     def bring_up(self, ending: threading.Event) -> None:
         options = ("--kind", self.name, "--trace", self._trace, "--broker", self._broker, "--report")
@@ -144,7 +143,7 @@ class PageServer(Program):
         """Raises PebbleError without the packages that it needs."""
         require_packages()
         self.url = ""  # with a slash at the end; empty until it can be opened
-        fields = {"broker": {"host": _HOST, "port": broker_port}, "host": _HOST, "server": "demo", **settings}
+        fields = {"broker": {"host": HOST, "port": broker_port}, "host": HOST, "server": "demo", **settings}
         command = python("pebble.web.program", msgspec.json.encode(fields, enc_hook=str).decode())
         super().__init__("the operator page", command, folder / "page.log", self._take)
 
@@ -198,7 +197,7 @@ class Testbed(Processes):
     def wait_until_ready(self, timeout: float = 30.0) -> None:
         """Wait until all robots can be driven. Raises PebbleError after that time, or if a process ends."""
         discovery, end = Discovery(), time.monotonic() + timeout
-        with create("mqtt", "testbed", MqttSettings(host=_HOST, port=self.broker_port)) as transport:
+        with create("mqtt", "testbed", MqttSettings(host=HOST, port=self.broker_port)) as transport:
             transport.subscribe(ALL_OUTGOING, lambda one: discovery.receive(one, time.monotonic(), time.time()))
             while sum(robot.ready(time.monotonic()) for robot in discovery.all_robots()) < len(self.robots):
                 if (problems := self.unexpected_exits()) or time.monotonic() > end:

@@ -49,7 +49,7 @@ _QUEUE_PACKETS = 4  # at least; at 64 kbit/s 0.3 s hold fewer than two
 _COMMAND_S = _ANSWER_S = 10.0
 
 _TUN = Path("/dev/net/tun")
-_CLONE_NEWNET = 0x40000000
+CLONE_NEWNET = 0x40000000
 _TUNSETIFF, _IFF_TUN, _IFF_NO_PI = 0x400454CA, 0x0001, 0x1000
 _PACKET = 65536  # bytes at most
 _ROOM = 1000  # packets in flight per direction; 100 ms at 100 Mbit/s are 800
@@ -287,7 +287,7 @@ def main() -> int:
 def _namespace() -> tuple[int, int]:
     """Enters a new network namespace with a TUN device in it; returns the descriptors of both. Raises OSError."""
     libc = ctypes.CDLL(None, use_errno=True)
-    if libc.unshare(_CLONE_NEWNET):
+    if libc.unshare(CLONE_NEWNET):
         raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
     tun = os.open(_TUN, os.O_RDWR | os.O_NONBLOCK)  # of the namespace it is opened in
     fcntl.ioctl(tun, _TUNSETIFF, struct.pack("16sH22x", _TIMED.encode(), _IFF_TUN | _IFF_NO_PI))

@@ -18,12 +18,14 @@ from typing import Any
 import msgspec
 
 from pebble.bench.bridge_operator import wheels
+from pebble.bench.clients import all_ready, axes_of
 from pebble.bench.impair.metrics import Arrival, Command, Heartbeat, OperatorReport, Plan, Record, Sound, Window
+from pebble.bench.usage import wall_clock_ahead_ns
 from pebble.client.media_receiver import MediaReceiver
 from pebble.client.viewer import Medium
 from pebble.contract import DRIVE, ONLINE, SOUNDBOARD_COMMAND, SOUNDBOARD_STATUS, STATUS, Channel, codec
-from pebble.contract.payloads import Drive, SoundboardCommand
 from pebble.contract.payloads import Heartbeat as Online
+from pebble.contract.payloads import SoundboardCommand
 from pebble.errors import PayloadError, PebbleError
 from pebble.media.decode import Decoded
 from pebble.media.sound import ReceivedSound
@@ -153,7 +155,7 @@ class TrialOperator:
         while not enough.is_set():
             self._number += 1
             left, right = wheels(self._number)
-            payload = codec.encode(DRIVE, Drive(x=(left - right) / 2, z=(left + right) / 2))
+            payload = msgspec.json.encode(axes_of(left, right))
             self._commands.append(Command(left, right, time.monotonic_ns()))
             self._controls.publish(topic, payload, qos=QoS.DELIVERED, urgent=True)
             due += _PERIOD_S
@@ -170,12 +172,11 @@ class TrialOperator:
         self._controls.subscribe(channel.topic(self._base), on_message)
 
     def _on_heartbeat(self, heartbeat: Online) -> None:
-        online = heartbeat.online is not False
-        self._heartbeats.append(Heartbeat(_monotonic_ns(heartbeat.t), time.monotonic_ns(), online))
+        sent_ns, now_ns = _monotonic_ns(heartbeat.t), time.monotonic_ns()
+        self._heartbeats.append(Heartbeat(sent_ns, now_ns, heartbeat.online is not False))
 
     def _on_status(self, status: Any) -> None:
-        states = {service["state"] for service in status.value.get("services", {}).values()}
-        self._ready = bool(states) and states <= {"ready", "stopped"}
+        self._ready = all_ready(status.value)
 
 
 def _wait(condition: Callable[[], bool], seconds: float, meanwhile: Callable[[], None] = lambda: None) -> bool:
@@ -193,7 +194,7 @@ def _pause(seconds: float, meanwhile: Callable[[], None] = lambda: None) -> None
 
 def _monotonic_ns(epoch_ms: int) -> int:
     """Converts a wall-clock time of the robot, which runs on this machine, to the monotonic clock."""
-    return time.monotonic_ns() - (time.time_ns() - epoch_ms * 1_000_000)
+    return epoch_ms * 1_000_000 - wall_clock_ahead_ns()
 
 
 def _write(report: OperatorReport) -> None:

@@ -166,8 +166,9 @@ def test_more_that_is_lost_is_worse_and_a_burst_is_noise(tmp_path: Path) -> None
 
 
 def test_bytes_of_encoders_are_the_same_every_time() -> None:
-    assert kinds(one([100.0], unit="kB/s"), one([110.0], unit="kB/s")) == [Kind.WORSE]
-    assert kinds(one([100.0], unit="kB/s"), one([101.0], unit="kB/s")) == [Kind.EQUAL]
+    assert kinds(one([100.0], unit="kB/s", measure="wire"), one([110.0], unit="kB/s", measure="wire")) == [Kind.WORSE]
+    assert kinds(one([100.0], unit="kB/s", measure="wire"), one([101.0], unit="kB/s", measure="wire")) == [Kind.EQUAL]
+    assert kinds(one([100.0], unit="kbit/s"), one([110.0], unit="kbit/s")) == [Kind.UNKNOWN]
 
 
 def test_curves_over_time_are_not_compared() -> None:

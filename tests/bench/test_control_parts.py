@@ -220,7 +220,6 @@ def test_every_other_round_goes_backwards_and_one_that_fails_is_left_out_for_all
     assert results.assessment[0] == "1 of 4 rounds failed and were left out; round 2: mqtt: echo said nothing"
     assert {cell.lost for cell in results.cells} == {0}
     assert "50.0 74.0 30.0 7.0 3.5" in " ".join(printed.split())
-    assert results.assessment[1].startswith("Waking up a waiting process takes ")
 
 
 @pytest.mark.usefixtures("fake")
@@ -358,5 +357,5 @@ def test_another_server_on_the_broker_s_port_is_not_the_broker(tmp_path: Path, m
         monkeypatch.setattr(processes, "free_port", lambda: stranger.getsockname()[1])
         broker = Broker("broker", tmp_path)
         assert until(lambda: broker.ended)
-        with pytest.raises(PebbleError, match="broker ended at once"):
+        with pytest.raises(PebbleError, match="broker ended with code"):
             broker.wait()

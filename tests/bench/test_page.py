@@ -61,8 +61,8 @@ def test_goals_as_text() -> None:
         "≤ – / 300 ms",
         "≤ 8 / – %",
     ]
-    cell = Cell(variant="page", measure="256 kbit/s: drive, arrived", unit="%", rounds=[[93.0]])
-    assert list(goals([cell])) == ["256 kbit/s: drive, arrived: 93.0 / 93.0 %"], "it has none"
+    cell = Cell(variant="page", measure="256 kbit/s: drive, lost", unit="%", rounds=[[93.0]])
+    assert list(goals([cell])) == ["256 kbit/s: drive, lost: 93.0 / 93.0 %"], "it has none"
 
 
 def test_the_best_try_is_judged_by_its_goal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

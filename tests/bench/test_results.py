@@ -93,16 +93,6 @@ def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
         Results(bench="x").save(Path("/dev/null/x.json"))
 
 
-def test_a_cell_is_found_by_what_it_is() -> None:
-    cells = [a_cell(), a_cell(measure="round trip"), a_cell(params={"size": "1 KB"})]
-    results = Results(bench="x", cells=cells)
-    assert results.find("mqtt") is cells[0]
-    assert results.find("mqtt", "round trip") is cells[1]
-    assert results.find("mqtt", size="1 KB") is cells[2]
-    assert results.find("zenoh") is None
-    assert results.find("mqtt", readers=1) is None
-
-
 def test_lost_is_what_was_sent_and_never_came() -> None:
     assert a_cell(figures={"sent": 5}).lost == 2
     assert a_cell().lost is None

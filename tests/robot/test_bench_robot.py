@@ -18,6 +18,7 @@ from pebble.bench.engine import run
 from pebble.bench.results import load
 from pebble.rig.processes import children
 from pebble.rig.robot import KINDS
+from tests.bench.found import found
 from tests.robot.rig import Rig, descendants
 from tests.support import ROOT, Child, until
 
@@ -42,7 +43,7 @@ def test_startup_of_both_kinds(tmp_path: Path) -> None:
     }
     for kind in KINDS:
         heartbeat, ready, obeyed, operator, paho, service, *pictures = (
-            cell for measure in startup.MEASURES if (cell := results.find(kind, measure)) is not None
+            cell for measure in startup.MEASURES if (cell := found(results, kind, measure)) is not None
         )
         assert all(0 < cell.samples[0] < 60_000 for cell in pictures)
         assert len(pictures) == len(startup.PICTURES)
@@ -69,7 +70,7 @@ def test_cost_of_both_kinds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
             }
             assert {"all", "launcher", "announcer", "serial_mcu_bridge", "mqtt_bridge", "av_daemon", own} <= names
             memory, cpu, threads = (
-                results.find(kind, measure, phase=phase, process="all") for measure in ("PSS", "CPU", "threads")
+                found(results, kind, measure, phase=phase, process="all") for measure in ("PSS", "CPU", "threads")
             )
             assert memory is not None
             assert cpu is not None
@@ -78,7 +79,7 @@ def test_cost_of_both_kinds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
             assert 0 < cpu.samples[0] < 400
             assert threads.samples[0] > 10
         for phase in ("json+pcm", "h264+opus"):
-            pictures = results.find(kind, "pictures", phase=phase)
+            pictures = found(results, kind, "pictures", phase=phase)
             assert pictures is not None
             assert pictures.samples[0] > 0
     assert children(os.getpid()) == []
@@ -93,10 +94,10 @@ def test_the_stand_in_carries_commands_and_reports(tmp_path: Path) -> None:
     results = load(tmp_path / "bridge.json")
     for measure, load_ in ((DOWN, UNLOADED), (UP, UNLOADED), (DOWN, COMMANDS)):
         for kind in (STAND_IN, "mqtt"):
-            cell = results.find(kind, measure, load=load_)
+            cell = found(results, kind, measure, load=load_)
             assert cell is not None
             assert len(cell.samples) >= 10
-    assert results.find("mqtt", UP, load=COMMANDS) is None
+    assert found(results, "mqtt", UP, load=COMMANDS) is None
     each = [cell for cell in results.cells if cell.measure == CPU]
     assert len(each) == 8
     assert all(10 < cell.samples[0] < 100_000 for cell in each)

@@ -19,6 +19,7 @@ from pebble.bench.impair.network import why_no_namespaces
 from pebble.bench.impair.trials import IMPAIR
 from pebble.bench.results import load
 from pebble.rig.processes import children
+from tests.bench.found import found
 from tests.robot.rig import Rig, descendants
 from tests.support import ROOT, until
 
@@ -47,7 +48,7 @@ def test_a_robot_is_driven_and_streams_media_over_a_slow_network(
     assert engine.run(IMPAIR.run_of(quick=True, output=tmp_path, console=console, **given)) == 0
     results = load(tmp_path / "impair.json")
     sound, video, drive, heartbeat, after_video, after_audio, clip = (
-        results.find(subject, measure, trial="512k")
+        found(results, subject, measure, trial="512k")
         for measure in (*MEASURES, metrics.AFTER_VIDEO, metrics.AFTER_AUDIO, metrics.CLIP)
     )
     assert sound is not None

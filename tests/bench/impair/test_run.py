@@ -23,6 +23,7 @@ from pebble.bench.impair.network import Traffic
 from pebble.bench.impair.trials import IMPAIR, SUBJECTS, ImpairedRobot
 from pebble.bench.results import load
 from pebble.errors import PebbleError
+from tests.bench.found import found
 
 S = 1_000_000_000
 PHASES = ("alone", "video", "video off", "audio", "audio off")
@@ -131,7 +132,7 @@ def test_a_robot_that_fails_ends_the_run_and_costs_no_results(monkeypatch: pytes
     assert log[-1].startswith("the trials ended early: ")
     assert log[-1].endswith(" said nothing for 30 s")
     results = load(tmp_path / "impair.json")
-    assert results.find("mqtt h264 opus", trial="1024k") is not None
+    assert found(results, "mqtt h264 opus", trial="1024k") is not None
     assert results.assessment[0] == log[-1].replace("the trials", "The trials")
 
 
