@@ -40,7 +40,7 @@ def test_wake_ups_of_a_waiting_process_are_counted() -> None:
     child.communicate()
 
 
-def test_the_wall_clock_is_ahead_by_what_it_says() -> None:
+def test_how_far_the_wall_clock_is_ahead() -> None:
     assert abs(time.time_ns() - wall_clock_ahead_ns() - time.monotonic_ns()) < 500_000_000
 
 
