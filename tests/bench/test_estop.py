@@ -97,6 +97,21 @@ def test_robots_are_stopped_in_turn() -> None:
     assert env.stopped[2:] == [*both, *both[::-1], ("hold", BOARD), ("stop", ALL)]
 
 
+@pytest.mark.parametrize(("way", "measure_"), [("hold", HOLD), ("stop", CONFIRMED), ("stop_by_zero", REST)])
+def test_a_stop_that_fails_is_a_lost_sample_and_the_runs_problem(way: str, measure_: str) -> None:
+    env, run_ = FakeRobots(), ESTOP.run_of(rounds=1)
+
+    def fail(_case: Case, robots: str) -> Iterator[Cell]:
+        raise PebbleError(f"{robots} does not stop")
+        yield
+
+    setattr(env, way, fail)
+    (lost,) = measure(Round(run_, 0, env, roles=(STOP, ZERO), planted_us=lambda _: 0.0))
+    assert (lost.measure, lost.lost) == (measure_, 1)
+    assert str(run_.problem) == "mqtt does not stop"
+    assert ("stop", ALL) not in env.stopped
+
+
 def cells(*rounds: Iterator[Cell]) -> list[Cell]:
     collected = Collected(ESTOP, [""])
     for one in rounds:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import cv2
@@ -9,8 +10,8 @@ import numpy as np
 import pytest
 
 from pebble.bench.engine import run
-from pebble.bench.results import load
-from pebble.bench.wire import AIMS, SCENES, TOLERANCE, VIDEO, film, ssim
+from pebble.bench.results import Cell, load
+from pebble.bench.wire import AIMS, SCENES, TOLERANCE, VIDEO, film, ratio_at_equal_quality, ssim
 
 
 def test_similarity_of_known_pictures() -> None:
@@ -44,3 +45,14 @@ def test_the_aims_hold(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
             assert abs(ours[name].figures["ssim"] - ours["reference"].figures["ssim"]) <= TOLERANCE
     assert [aim.outcome for aim in results.aims] == ["met"] * len(AIMS)
     assert str(results.aims[0]) in capsys.readouterr().out
+
+
+def test_fewer_bytes_at_another_quality_do_not_count() -> None:
+    def coded(off: float) -> Cell:
+        figures = {"ratio": 0.1, "ssim_off": off}
+        return Cell(
+            variant="h264", params={"scene": "quiet"}, measure="wire", unit="kB/s", rounds=[[1.0]], figures=figures
+        )
+
+    assert ratio_at_equal_quality(coded(TOLERANCE / 2)) == 0.1
+    assert ratio_at_equal_quality(coded(-2 * TOLERANCE)) == math.inf
