@@ -29,7 +29,7 @@ from pebble.rig.robot import KINDS
 UNLOADED, COMMANDS, LOADED = "none", "commands", "media"  # unloaded: 20 commands and 50 reports a second
 DOWN, UP, CPU = "down", "up", "CPU per message"
 _STARTUP_S = 1.0  # for start-up work to finish
-_LOADED_S = 4.0  # at most, of driving each robot while media flow
+_LOADED_S = 2.0  # at most, of driving each robot while media flow
 _PILOT_S = 2.0
 
 #: By transport, in order: the component that holds the command. Results are compared by these names.
@@ -204,7 +204,7 @@ CPU_TABLE = Grid(
 _OPTIONS = (
     Option(name="with-media", kind=bool, help="Also with 1080p pictures and sound, and compare."),
     rounds("How often robots are started."),
-    seconds("Driving time per robot and round, under each load; at most 4 with media."),
+    seconds("Driving time per robot and round, under each load; at most 2 with media."),
     Option(name="null", kind=bool, recorded=False, help="One robot against itself, also slowed down by a fifth."),
     Option(name="profile", kind=bool, recorded=False, help="Latency of a command hop by hop."),
 )
@@ -242,7 +242,7 @@ _BRIDGE = Comparison(
     help="Drive commands from an operator to the wheels of a whole simulated robot, and its telemetry back: on MQTT, "
     "Zenoh and plain paho, compared with one hop through a stock broker. Needs mosquitto.",
     options=(*_OPTIONS, variants((STAND_IN, *KINDS), "paho, mqtt, zenoh; --null: one of ours, zenoh by default.")),
-    full=Budget(1900, rounds=10, seconds=25.0, turn_s=1.0, rate_hz=RATE_HZ),
+    full=Budget(2150, rounds=20, seconds=12.5, turn_s=1.0, rate_hz=RATE_HZ),
     quick=Budget(22, rounds=2, seconds=0.5),
     variants=(STAND_IN, *KINDS),
     references=(HOP,),

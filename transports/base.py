@@ -392,14 +392,13 @@ class Transport(ABC):
         """
         shared = message.topic in self._shared if shared is None else shared
         self._pending.pop(message.topic, None)
-        self._own.pop(message.topic, None)
         self._shared.discard(message.topic)
         if sent and not message.payload:
+            self._own.pop(message.topic, None)
             return True
-        if not self._own.has_room(message.topic, message):
+        if not self._own.put_if_room(message.topic, message):
             self.counters.add("forgotten")
             return False
-        self._own[message.topic] = message
         if shared:
             self._shared.add(message.topic)
         if not sent:

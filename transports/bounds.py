@@ -68,16 +68,11 @@ class BoundedTable(MutableMapping[str, V]):
         return len(self._values)
 
     def __setitem__(self, topic: str, value: V) -> None:
-        with self._lock:
-            if topic in self._values:
-                self._remove(topic)
-            needed = self._needs(topic, value)
-            if needed > self._max_size:
-                return
-            while self._values and not self._fits(needed):
-                self._remove(next(iter(self._values)))
-            self._values[topic] = value
-            self._size += needed
+        self._put(topic, value, forget=True)
+
+    def put_if_room(self, topic: str, value: V) -> bool:
+        """As ``table[topic] = value``, unless another topic would have to be forgotten; whether it is stored."""
+        return self._put(topic, value, forget=False)
 
     def __delitem__(self, topic: str) -> None:
         with self._lock:
@@ -88,15 +83,19 @@ class BoundedTable(MutableMapping[str, V]):
             self._values.clear()
             self._size = 0
 
-    def has_room(self, topic: str, value: V) -> bool:
-        """Whether a value for a new topic fits without any other being forgotten."""
-        return self._fits(self._needs(topic, value))
-
-    def _fits(self, needed: int) -> bool:
-        return len(self._values) < self._max_topics and self._size + needed <= self._max_size
-
-    def _needs(self, topic: str, value: V) -> int:
-        return len(topic) + self._size_of(value)
+    def _put(self, topic: str, value: V, *, forget: bool) -> bool:
+        needed = len(topic) + self._size_of(value)
+        with self._lock:
+            values = self._values
+            if topic in values:
+                self._remove(topic)
+            while len(values) >= self._max_topics or self._size + needed > self._max_size:
+                if not forget or needed > self._max_size:
+                    return False
+                self._remove(next(iter(values)))
+            values[topic] = value
+            self._size += needed
+            return True
 
     def _remove(self, topic: str) -> None:
-        self._size -= self._needs(topic, self._values.pop(topic))
+        self._size -= len(topic) + self._size_of(self._values.pop(topic))

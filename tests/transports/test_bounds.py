@@ -61,9 +61,9 @@ class TestTable:
     def test_what_was_removed_makes_room(self) -> None:
         table = self.made()
         table["a"] = bytes(99)
-        assert not table.has_room("b", b"")
+        assert not table.put_if_room("b", b"")
+        assert dict(table) == {"a": bytes(99)}
         del table["a"]
-        assert table.has_room("b", bytes(99))
-        table["b"] = bytes(99)
+        assert table.put_if_room("b", bytes(99))
         table.clear()
-        assert table.has_room("c", bytes(99))
+        assert table.put_if_room("c", bytes(99))

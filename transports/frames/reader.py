@@ -23,8 +23,8 @@ from pebble.transports.frames.reclaim import WriterMemory
 from pebble.transports.frames.session import METADATA, SharingError, StreamNames, open_reading
 from pebble.transports.peers import prepare_run_dir
 from pebble.transports.wakeup import Wakeup
+from pebble.transports.zenoh.callbacks import direct
 from pebble.transports.zenoh.session import check_process, close_at_exit
-from pebble.transports.zenoh.thread_state import direct
 
 log = logging.getLogger(__name__)
 
@@ -55,6 +55,7 @@ class FrameReader:
         self._names = StreamNames(folder, stream)
         self._views = views
         self.counters = Counters()
+        self._count_received, self._count_shared = map(self.counters.adder, ("received", "shared"))
         self.problem = ""
         self._latest: _LatestFrames[_Arrival] = _LatestFrames(depth)
         self._writers: dict[int, WriterMemory] = {}  # the running ones, and their memory
@@ -170,9 +171,10 @@ class FrameReader:
     def _frame(self, arrival: _Arrival) -> Frame | None:
         info, payload, memory = arrival
         buffer = payload.as_shm()
-        self.counters.add("copied" if buffer is None else "shared")
         if buffer is None:
+            self.counters.add("copied")
             return Frame(info, _copy(bytes(payload)), shared=False)
+        self._count_shared()
         memory = memory or self._writers.get(info.writer)  # its first frame may come before its token
         if memory is None or reclaim.is_reclaimed(memory):
             self.counters.add("torn")  # of a writer that has ended: its memory may have been reclaimed
@@ -189,7 +191,8 @@ class FrameReader:
     # -- on Zenoh's thread
 
     def _on_frame(self, sample: zenoh.Sample) -> None:
-        info = None if sample.attachment is None else decode(bytes(sample.attachment))
+        attachment = sample.attachment
+        info = None if attachment is None else decode(attachment.to_bytes())
         if info is None:
             self.counters.add("refused")
             return
@@ -204,7 +207,7 @@ class FrameReader:
         else:
             self._previous_writer = writer
         self._last = (info.writer, info.sequence)
-        self.counters.add("received")
+        self._count_received()
         if skipped := self._latest.put((info, sample.payload, self._writers.get(info.writer))):
             self.counters.add("skipped", skipped)
 

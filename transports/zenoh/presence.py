@@ -10,6 +10,7 @@ from collections.abc import Callable
 import msgspec
 import zenoh
 
+from pebble.transports.zenoh.callbacks import direct
 from pebble.transports.zenoh.wire import SYNC, UP, pack_number, unpack_number
 
 log = logging.getLogger(__name__)
@@ -98,8 +99,7 @@ class Barrier:
     def __init__(self, session: zenoh.Session, name: str, number: Callable[[], int]) -> None:
         self._session, self._name, self._number = session, name, number
         self._silent: set[str] = set()  # hung or stopped: not waited for again until they answer
-        handler = zenoh.handlers.Callback(self._answer, indirect=False)
-        session.declare_queryable(SYNC + name, handler)
+        session.declare_queryable(SYNC + name, direct(self._answer))
 
     def synchronize(self, expected: Callable[[], dict[str, str]], timeout: float) -> dict[str, int]:
         """Wait up to ``timeout`` seconds for all ``expected`` siblings (name to a description for logs).

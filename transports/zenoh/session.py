@@ -18,12 +18,13 @@ import zenoh
 
 from pebble.errors import TransportError
 from pebble.transports.settings import TlsSettings, ZenohSettings
-from pebble.transports.zenoh import wire
+from pebble.transports.zenoh import callbacks, wire
 
 # By default connections are accepted, opened and read on separate runtimes: a received message wakes a thread that only
 # wakes another one. Measured with 1.10.2 (40 B at 200 Hz, round trip, two cores): 9.6 wake-ups instead of 14, and 0.9
-# of the time. Sending has its own runtime: a callback may send.
-_RUNTIME = "(acc: (handover: rx), net: (handover: rx))"
+# of the time. Sending has its own runtime, because a callback may send. Four threads, because each may be in a callback
+# that waits, and one must wait for the sockets (.callbacks).
+_RUNTIME = "(acc: (handover: rx), net: (handover: rx), rx: (worker_threads: 4))"
 
 HUB_SOCKET = "hub.sock"
 
@@ -81,9 +82,11 @@ def open_session(config: str) -> zenoh.Session:
     # runs Python's handlers (measured: 5 of 200 hubs on a busy machine did not end).
     before = signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())
     try:
-        return zenoh.open(zenoh.Config.from_json5(config))
+        session = zenoh.open(zenoh.Config.from_json5(config))
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    callbacks.use(session)
+    return session
 
 
 def _config(settings: ZenohSettings, mode: str, listen: list[Path], connect: list[Path]) -> dict[str, Any]:

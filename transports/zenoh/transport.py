@@ -22,12 +22,13 @@ from pebble.transports.bounds import BoundedQueue
 from pebble.transports.counters import Counters
 from pebble.transports.peers import PeerRegistry, PresenceLock, new_name, prepare_run_dir
 from pebble.transports.settings import ZenohSettings
+from pebble.transports.topics import is_pattern
 from pebble.transports.zenoh import wire
 from pebble.transports.zenoh.ages import MessageAges
+from pebble.transports.zenoh.callbacks import direct
 from pebble.transports.zenoh.keymap import filter_to_key, key_to_topic, topic_to_key
 from pebble.transports.zenoh.presence import Barrier, HubView, HubWatch
 from pebble.transports.zenoh.session import HUB_SOCKET, check_process, close_at_exit, open_session, session_config
-from pebble.transports.zenoh.thread_state import direct
 
 log = logging.getLogger(__name__)
 
@@ -349,6 +350,8 @@ class ZenohTransport(Transport):
         if subscription in self._subscribers:
             return
         origin = zenoh.Locality.ANY if subscription.echo else zenoh.Locality.REMOTE
+        only = None if is_pattern(subscription.filter) else subscription.filter
+        may_be_ours = subscription.direct and subscription.echo
 
         def take(sample: zenoh.Sample) -> None:
             self.count_received()
@@ -358,10 +361,10 @@ class ZenohTransport(Transport):
             since = stamp.sent_ns / 1e9 if stamp.boot == wire.BOOT else None
             if (since is None or read_at - since > self._late_s) and self._is_late(sample, stamp, read_at):
                 return
-            topic, payload = key_to_topic(str(sample.key_expr)), sample.payload.to_bytes()
+            topic, payload = only or key_to_topic(str(sample.key_expr)), sample.payload.to_bytes()
             qos = min(stamp.qos, subscription.qos)
             message = Message(topic, payload, qos, False, stamp.retain_requested, read_at if since is None else since)
-            if subscription.direct and self._putting == threading.get_ident():
+            if may_be_ours and self._putting == threading.get_ident():
                 self._loopback.put(subscription, message)
             else:
                 subscription.offer(message)
@@ -412,7 +415,7 @@ class ZenohTransport(Transport):
 
         session.get(
             wire.RETAINED + filter_to_key(subscription.filter),
-            zenoh.handlers.Callback(take, answered.set, indirect=False),
+            direct(take, answered.set),
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
             timeout=RETAINED_ANSWER_S,

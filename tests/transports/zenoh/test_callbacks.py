@@ -1,0 +1,136 @@
+from __future__ import annotations
+
+import itertools
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from pebble.transports import Message, QoS, create
+from pebble.transports.zenoh import callbacks
+from tests.support import until
+from tests.transports.zenoh_net import HubProcess
+
+SESSIONS, MESSAGES = 4, 50
+FORKED = """
+import os, sys
+from pathlib import Path
+from pebble.transports import ZenohSettings, create
+environment = {name: value for name, value in os.environ.items() if name != "ZENOH_RUNTIME"}
+import pebble.transports.zenoh.transport
+os.environ.clear()
+os.environ.update(environment)
+settings = ZenohSettings(run_dir=Path(sys.argv[1]))
+with create("zenoh", "one", settings), create("zenoh", "other", settings):
+    print(*{(task / "comm").read_text().split("-")[0].strip() for task in Path("/proc/self/task").iterdir()})
+"""
+
+#: Answers with more than the sockets hold: from its handler, or from a thread for which its handler waits meanwhile.
+ANSWERING = """
+import sys, threading
+from pathlib import Path
+from pebble.transports import QoS, ZenohSettings, create
+
+def answer():
+    for _ in range(int(sys.argv[2])):
+        transport.publish("answer", bytes(int(sys.argv[3])), qos=QoS.DELIVERED)
+
+def answer_alone():
+    with lock:
+        begun.set()
+        answer()
+
+def on_request(message):
+    if message.payload == b"handler":
+        answer()
+    elif message.payload == b"thread":
+        threading.Thread(target=answer_alone).start()
+        begun.wait()
+    else:
+        lock.acquire()
+        lock.release()
+
+lock, begun = threading.Lock(), threading.Event()
+with create("zenoh", "answering", ZenohSettings(run_dir=Path(sys.argv[1]))) as transport:
+    transport.subscribe("request", on_request, direct=True)
+    print(flush=True)
+    sys.stdin.read()
+"""
+ANSWERS, ANSWER_BYTES = 3000, 1000
+
+
+@pytest.mark.parametrize("requests", [[b"handler"], [b"thread", b"lock"]], ids=lambda one: one[0].decode())
+def test_a_handler_may_wait_for_what_is_published(tmp_path: Path, requests: list[bytes]) -> None:
+    """Its thread may be the one that waits for the sockets: the guard has another one do that."""
+    received: list[Message] = []
+    command = [sys.executable, "-c", ANSWERING, str(tmp_path), str(ANSWERS), str(ANSWER_BYTES)]
+    hub = HubProcess(tmp_path).start()
+    try:
+        with (
+            create("zenoh", "asking", hub.settings) as transport,
+            subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as answering,
+        ):
+            assert answering.stdin is not None
+            assert answering.stdout is not None
+            transport.subscribe("answer", received.append, direct=True)
+            answering.stdout.readline()
+            for number in range(1, 4):
+                for request in requests:
+                    assert transport.publish("request", request, qos=QoS.DELIVERED)
+                assert until(lambda enough=number * ANSWERS: len(received) >= enough, 10), len(received)  # type: ignore[misc]
+            answering.stdin.close()
+    finally:
+        hub.end()
+    assert len(received) == 3 * ANSWERS
+
+
+def test_the_guard_rests_without_callbacks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(callbacks, "_LOOK_S", 0.001)
+    guard, calls = callbacks._Guard(), callbacks._Calls()
+    guard.watch(calls)
+    for _ in range(2):
+        calls.begun += 1
+        guard.wake()
+        assert until(lambda: guard.helped > 0, 5)  # it runs
+        assert not guard.rests
+        calls.ended += 1
+        assert until(lambda: guard.rests, 5)
+        guard.helped = 0
+
+
+@pytest.mark.parametrize("most", [0, 1, callbacks.MOST])
+def test_there_are_few_states_however_many_messages_and_sessions(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most: int
+) -> None:
+    """Beyond them everything works as well."""
+    made, received, ensure = list[None](), list[Message](), callbacks._ensure
+    monkeypatch.setattr(callbacks, "_ensure", lambda: (made.append(None), ensure()))
+    monkeypatch.setattr(callbacks, "_numbers", itertools.count())
+    monkeypatch.setattr(callbacks, "_own", threading.local())
+    monkeypatch.setattr(callbacks, "MOST", most)
+    hub = HubProcess(tmp_path).start()
+    try:
+        with create("zenoh", "sender", hub.settings) as sender:
+            for session in range(1, SESSIONS + 1):
+                with create("zenoh", "receiver", hub.settings) as receiver:
+                    receiver.subscribe("a/b", received.append, direct=True)
+                    assert until(
+                        lambda enough=session * MESSAGES: (  # type: ignore[misc]
+                            sender.publish("a/b", b"1", qos=QoS.DELIVERED) and len(received) >= enough
+                        ),
+                        10,
+                    )
+    finally:
+        hub.end()
+    assert min(most, 1) <= len(made) <= most
+
+
+def test_a_service_with_an_environment_of_its_own_reads_on_one_runtime(tmp_path: Path) -> None:
+    """The launcher imports the transport, forks, and sets the service's environment. Else `acc` and `net` wake `rx`."""
+    command = [sys.executable, "-c", FORKED, str(tmp_path)]
+    done = subprocess.run(command, check=True, capture_output=True, text=True, timeout=30)
+    runtimes = set(done.stdout.split())
+    assert "rx" in runtimes
+    assert runtimes.isdisjoint({"acc", "net"})
