@@ -24,6 +24,7 @@ from pebble.transports.counters import Counters
 from pebble.transports.peers import FileLock, PeerRegistry, new_name, prepare_run_dir
 from pebble.transports.settings import ZenohSettings
 from pebble.transports.zenoh import wire
+from pebble.transports.zenoh.callbacks import direct
 from pebble.transports.zenoh.hub.journal import Journal
 from pebble.transports.zenoh.hub.store import HubStore, Record, Retained, StoredWill
 from pebble.transports.zenoh.keymap import topic_to_key
@@ -137,7 +138,7 @@ class HubWorker:
     # -- the thread
 
     def _queued(self, work: Callable[[Any], None]) -> zenoh.handlers.Callback[Any]:
-        return zenoh.handlers.Callback(lambda event: self._tasks.put(lambda: work(event)), indirect=False)
+        return direct(lambda event: self._tasks.put(lambda: work(event)))
 
     def _run(self) -> None:
         while True:
