@@ -24,7 +24,7 @@ from pebble.transports.frames.session import METADATA, SharingError, StreamNames
 from pebble.transports.peers import prepare_run_dir
 from pebble.transports.wakeup import Wakeup
 from pebble.transports.zenoh.callbacks import direct
-from pebble.transports.zenoh.session import check_process, close_at_exit
+from pebble.transports.zenoh.session import check_process, close_at_exit, close_session
 
 log = logging.getLogger(__name__)
 
@@ -112,7 +112,7 @@ class FrameReader:
         session, self._session = self._session, None
         self._declared.clear()
         self._writers.clear()
-        session.close()  # type: ignore[no-untyped-call]
+        close_session(session)
 
     def close(self) -> None:
         with self._changing:

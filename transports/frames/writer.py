@@ -22,7 +22,7 @@ from pebble.transports.frames.frame import FrameInfo, encode
 from pebble.transports.frames.session import METADATA, SharingError, StreamNames, open_writing
 from pebble.transports.frames.shared_memory import MARGIN, Chunk, SharedPool
 from pebble.transports.peers import FileLock, prepare_run_dir
-from pebble.transports.zenoh.session import check_process, close_at_exit
+from pebble.transports.zenoh.session import check_process, close_at_exit, close_session
 
 log = logging.getLogger(__name__)
 
@@ -139,7 +139,7 @@ class FrameWriter:
                 return
             session, self._session = self._session, None
             self._publisher = self._bulk = self._pool = None
-            session.close()  # type: ignore[no-untyped-call]
+            close_session(session)
             self._tokens.clear()
             self._readers.clear()
             lock, self._lock = self._lock, None

@@ -17,7 +17,6 @@ there is room again. So where a callback takes long, a guard lets another of Zen
 from __future__ import annotations
 
 import ctypes
-import itertools
 import logging
 import threading
 import time
@@ -36,16 +35,16 @@ _REST = 100  # looks without a new callback, after which the guard sleeps until 
 _NOTHING = "@pebble/nothing"  # a key
 
 _ensure = ctypes.pythonapi.PyGILState_Ensure
-_numbers = itertools.count()
 
 
 class _Calls:
-    """How many callbacks one thread has begun, how many of these have ended, and how many the guard knows of."""
+    """How many callbacks one thread has begun and ended, and what the guard found when it looked last."""
 
-    __slots__ = ("begun", "ended", "known")
+    __slots__ = ("begun", "ended", "known", "ran")
 
     def __init__(self) -> None:
         self.begun = self.ended = self.known = 0
+        self.ran = False
 
 
 class _Guard:
@@ -62,19 +61,33 @@ class _Guard:
     def use(self, session: zenoh.Session) -> None:
         """Any session will do: Zenoh's threads belong to all of them."""
         with self._lock:
-            self._sessions = [one for one in self._sessions if not one.is_closed()] + [session]
+            self._sessions.append(session)
 
-    def watch(self, calls: _Calls) -> None:
+    def forget(self, session: zenoh.Session) -> None:
+        """To be called before ``session`` is closed: what refers to it keeps its memory and files."""
         with self._lock:
+            self._sessions = [one for one in self._sessions if one is not session]
+
+    def watch(self, calls: _Calls) -> bool:
+        """False if there are enough."""
+        with self._lock:
+            if len(self._calls) >= MOST:
+                return False
             self._calls.append(calls)
+            return True
 
     def wake(self) -> None:
-        self.rests = False
-        self._wakeup.set()
         with self._lock:
             if self._thread is None:
-                self._thread = threading.Thread(target=self._run, name="pebble-guard", daemon=True)
-                self._thread.start()
+                thread = threading.Thread(target=self._run, name="pebble-guard", daemon=True)
+                try:
+                    thread.start()
+                except RuntimeError as error:  # too many threads: the next callback tries again
+                    log.warning("no guard for handlers that wait: %s", error)
+                    return
+                self._thread = thread
+            self.rests = False
+            self._wakeup.set()
 
     def _run(self) -> None:
         quiet = 0
@@ -92,12 +105,11 @@ class _Guard:
         """Whether a callback has begun since the last time, or is still running."""
         found = False
         for calls in self._calls:
-            begun = calls.begun
-            if begun != calls.known:
-                calls.known, found = begun, True
-            elif begun != calls.ended:
-                found = True
+            begun, runs = calls.begun, calls.begun != calls.ended
+            found = found or runs or begun != calls.known
+            if runs and calls.ran:  # the same one, or many without a pause
                 self._help()
+            calls.known, calls.ran = begun, runs
         return found
 
     def _help(self) -> None:
@@ -107,8 +119,8 @@ class _Guard:
         for session in sessions:
             try:  # a query has a time limit, for which Zenoh starts a task; this one does not leave the session
                 session.get(_NOTHING, _nothing, timeout=_LOOK_S / 10, allowed_destination=zenoh.Locality.SESSION_LOCAL)
-            except zenoh.ZError as error:  # closed
-                log.debug("no help from a session: %s", error)
+            except Exception:  # closed meanwhile; whatever it is, the guard goes on
+                log.debug("no help from a session", exc_info=True)
             else:
                 return
 
@@ -116,15 +128,15 @@ class _Guard:
 _guard = _Guard()
 _nothing: zenoh.handlers.Callback[Any] = zenoh.handlers.Callback(lambda _reply: None, indirect=False)
 _own = threading.local()  # part of a thread's state: empty in a new one
-use = _guard.use
+use, forget = _guard.use, _guard.forget
 
 
 def _begin() -> _Calls:
     """The first callback on this thread since it has its state."""
     calls = _own.calls = _Calls()
-    if next(_numbers) < MOST:
+    # A thread of Python's has its state, and waits for no sockets: it publishes to a handler of its own session.
+    if isinstance(threading.current_thread(), threading._DummyThread) and _guard.watch(calls):
         _ensure()
-        _guard.watch(calls)
     return calls
 
 
@@ -137,11 +149,11 @@ def direct(function: Callable[[Any], None], at_end: Callable[[], None] | None = 
     def run(received: Any) -> None:
         calls = _own.calls if hasattr(_own, "calls") else _begin()
         calls.begun += 1
-        if _guard.rests:
-            _guard.wake()
         try:
+            if _guard.rests:
+                _guard.wake()
             function(received)
         finally:
-            calls.ended += 1  # begun may be further: a handler may publish to its own process
+            calls.ended += 1
 
     return zenoh.handlers.Callback(run, at_end, indirect=False)

@@ -28,7 +28,14 @@ from pebble.transports.zenoh.ages import MessageAges
 from pebble.transports.zenoh.callbacks import direct
 from pebble.transports.zenoh.keymap import filter_to_key, key_to_topic, topic_to_key
 from pebble.transports.zenoh.presence import Barrier, HubView, HubWatch
-from pebble.transports.zenoh.session import HUB_SOCKET, check_process, close_at_exit, open_session, session_config
+from pebble.transports.zenoh.session import (
+    HUB_SOCKET,
+    check_process,
+    close_at_exit,
+    close_session,
+    open_session,
+    session_config,
+)
 
 log = logging.getLogger(__name__)
 
@@ -127,7 +134,7 @@ class ZenohTransport(Transport):
     def _begin(self, session: zenoh.Session, name: str) -> bool:
         with self._connection_lock:
             if self._watch.closed:
-                session.close()  # type: ignore[no-untyped-call]
+                close_session(session)
                 return False
             self._name, self._session, self._publishers = name, session, {}
         self._barrier = Barrier(session, name, lambda: self._retained_count)
@@ -162,7 +169,7 @@ class ZenohTransport(Transport):
         except zenoh.ZError as error:
             log.warning("%s could not close in order: %s", self.client_id, error)
         finally:
-            session.close()  # type: ignore[no-untyped-call]
+            close_session(session)
 
     # -- the transport's thread: every time a hub appears a new connection begins
 

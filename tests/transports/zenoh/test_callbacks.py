@@ -1,9 +1,11 @@
 from __future__ import annotations
 
-import itertools
 import subprocess
 import sys
 import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
@@ -48,7 +50,7 @@ def on_request(message):
     elif message.payload == b"thread":
         threading.Thread(target=answer_alone).start()
         begun.wait()
-    else:
+    elif message.payload == b"lock":
         lock.acquire()
         lock.release()
 
@@ -59,31 +61,96 @@ with create("zenoh", "answering", ZenohSettings(run_dir=Path(sys.argv[1]))) as t
     sys.stdin.read()
 """
 ANSWERS, ANSWER_BYTES = 3000, 1000
+OTHERS = 8  # siblings that send meanwhile
+
+
+@contextmanager
+def answering(hub: HubProcess) -> Iterator[None]:
+    """A process that is ready to answer."""
+    command = [sys.executable, "-c", ANSWERING, str(hub.settings.run_dir), str(ANSWERS), str(ANSWER_BYTES)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        process.stdout.readline()
+        yield
+        process.stdin.close()
+
+
+@pytest.fixture
+def hub(tmp_path: Path) -> Iterator[HubProcess]:
+    hub = HubProcess(tmp_path).start()
+    yield hub
+    hub.end()
 
 
 @pytest.mark.parametrize("requests", [[b"handler"], [b"thread", b"lock"]], ids=lambda one: one[0].decode())
-def test_a_handler_may_wait_for_what_is_published(tmp_path: Path, requests: list[bytes]) -> None:
+def test_a_handler_may_wait_for_what_is_published(hub: HubProcess, requests: list[bytes]) -> None:
     """Its thread may be the one that waits for the sockets: the guard has another one do that."""
     received: list[Message] = []
-    command = [sys.executable, "-c", ANSWERING, str(tmp_path), str(ANSWERS), str(ANSWER_BYTES)]
-    hub = HubProcess(tmp_path).start()
-    try:
-        with (
-            create("zenoh", "asking", hub.settings) as transport,
-            subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as answering,
-        ):
-            assert answering.stdin is not None
-            assert answering.stdout is not None
-            transport.subscribe("answer", received.append, direct=True)
-            answering.stdout.readline()
-            for number in range(1, 4):
-                for request in requests:
-                    assert transport.publish("request", request, qos=QoS.DELIVERED)
-                assert until(lambda enough=number * ANSWERS: len(received) >= enough, 10), len(received)  # type: ignore[misc]
-            answering.stdin.close()
-    finally:
-        hub.end()
+    with create("zenoh", "asking", hub.settings) as transport, answering(hub):
+        transport.subscribe("answer", received.append, direct=True)
+        for number in range(1, 4):
+            for request in requests:
+                assert transport.publish("request", request, qos=QoS.DELIVERED)
+            assert until(lambda enough=number * ANSWERS: len(received) >= enough, 10), len(received)  # type: ignore[misc]
     assert len(received) == 3 * ANSWERS
+
+
+def test_the_handlers_of_many_connections_may_wait_at_once(hub: HubProcess) -> None:
+    """Each for the one before it, since a subscription's run one at a time."""
+    received: list[Message] = []
+    with ExitStack() as stack:
+        asking, *others = [
+            stack.enter_context(create("zenoh", f"asking-{number}", hub.settings)) for number in range(1 + OTHERS)
+        ]
+        stack.enter_context(answering(hub))
+        asking.subscribe("answer", received.append, direct=True)
+        assert asking.publish("request", b"handler", qos=QoS.DELIVERED)
+        time.sleep(0.02)  # by then it waits
+        for other in others * 3:
+            assert other.publish("request", b"nothing", qos=QoS.DELIVERED)
+        assert until(lambda: len(received) >= ANSWERS, 10), len(received)
+    assert len(received) == ANSWERS
+
+
+def test_threads_of_python_are_not_watched(hub: HubProcess, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They run callbacks, too: of what they publish to their own session."""
+    guard = callbacks._Guard()
+    monkeypatch.setattr(callbacks, "_guard", guard)
+    monkeypatch.setattr(callbacks, "_own", threading.local())
+    received: list[Message] = []
+    with create("zenoh", "own", hub.settings) as transport:
+        transport.subscribe("a", received.append)
+
+        def publish() -> None:
+            transport.publish("a", b"1", qos=QoS.DELIVERED)
+
+        for _ in range(3):
+            thread = threading.Thread(target=publish)
+            thread.start()
+            thread.join()
+        assert until(lambda: len(received) == 3)
+    assert len(guard._calls) <= 2  # of Zenoh's, for the hub's answers
+
+
+def test_without_a_thread_for_the_guard_messages_are_handled(monkeypatch: pytest.MonkeyPatch) -> None:
+    guard = callbacks._Guard()
+    with monkeypatch.context() as patched:
+        patched.setattr(threading.Thread, "start", _refuse)
+        guard.wake()
+    assert guard.rests
+    guard.wake()
+    assert not guard.rests
+
+
+def _refuse(_thread: threading.Thread) -> None:
+    raise RuntimeError("can't start new thread")
+
+
+def test_a_closed_session_is_forgotten(hub: HubProcess) -> None:
+    with create("zenoh", "one", hub.settings):
+        sessions = len(callbacks._guard._sessions)
+    assert len(callbacks._guard._sessions) == sessions - 1
 
 
 def test_the_guard_rests_without_callbacks(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -107,7 +174,7 @@ def test_there_are_few_states_however_many_messages_and_sessions(
     """Beyond them everything works as well."""
     made, received, ensure = list[None](), list[Message](), callbacks._ensure
     monkeypatch.setattr(callbacks, "_ensure", lambda: (made.append(None), ensure()))
-    monkeypatch.setattr(callbacks, "_numbers", itertools.count())
+    monkeypatch.setattr(callbacks, "_guard", callbacks._Guard())
     monkeypatch.setattr(callbacks, "_own", threading.local())
     monkeypatch.setattr(callbacks, "MOST", most)
     hub = HubProcess(tmp_path).start()

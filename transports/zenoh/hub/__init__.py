@@ -29,7 +29,7 @@ from pebble.transports.zenoh.hub.journal import Journal
 from pebble.transports.zenoh.hub.store import HubStore, Record, Retained, StoredWill
 from pebble.transports.zenoh.keymap import topic_to_key
 from pebble.transports.zenoh.presence import Barrier
-from pebble.transports.zenoh.session import HUB_SOCKET, close_at_exit, open_session, session_config
+from pebble.transports.zenoh.session import HUB_SOCKET, close_at_exit, close_session, open_session, session_config
 
 log = logging.getLogger(__name__)
 
@@ -76,7 +76,7 @@ class ZenohHub:
 
     def close(self) -> None:
         if self._session is not None:
-            self._session.close()  # type: ignore[no-untyped-call]  # no new event from here on
+            close_session(self._session)  # no new event from here on
         if self._worker is not None:
             self._worker.close()
         if self._lock is not None:
