@@ -242,7 +242,7 @@ _BRIDGE = Comparison(
     help="Drive commands from an operator to the wheels of a whole simulated robot, and its telemetry back: on MQTT, "
     "Zenoh and plain paho, compared with one hop through a stock broker. Needs mosquitto.",
     options=(*_OPTIONS, variants((STAND_IN, *KINDS), "paho, mqtt, zenoh; --null: one of ours, zenoh by default.")),
-    full=Budget(2150, rounds=20, seconds=12.5, turn_s=1.0, rate_hz=RATE_HZ),
+    full=Budget(2100, rounds=20, seconds=12.5, turn_s=1.0, rate_hz=RATE_HZ),
     quick=Budget(22, rounds=2, seconds=0.5),
     variants=(STAND_IN, *KINDS),
     references=(HOP,),

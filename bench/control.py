@@ -317,7 +317,7 @@ CONTROL_NULL = _CONTROL.null_test(
     "One variant against itself, and against itself with a fifth of its usual latency planted by the sender. "
     "The first interval must include 1.00, the second must lie above it; otherwise the comparison above finds "
     "differences that do not exist, or misses some that do.",
-    full=Budget(180, **_ONE, loads=[NONE], null=True, seconds=0.3, rounds=30, passes=2, fresh_every=1),
+    full=Budget(120, **_ONE, loads=[NONE], null=True, seconds=0.3, rounds=30, passes=2, fresh_every=1),
     quick=Budget(10, seconds=0.25, rounds=4, passes=1, fresh_every=2),
     variants=(P2P,),
     tables=(replace(TABLE, baseline=""), HOPS),

@@ -158,7 +158,7 @@ FRAMES = Comparison(
             help="Only this one, against itself and against itself slowed by a fifth.",
         ),
     ),
-    full=Budget(330, seconds=0.5, rounds=LEAST_ROUNDS, size=("640x480", "1920x1080"), readers=(1, 3), null=None),
+    full=Budget(300, seconds=0.5, rounds=LEAST_ROUNDS, size=("640x480", "1920x1080"), readers=(1, 3), null=None),
     quick=Budget(20, rounds=2, size=("640x480",), readers=(1,)),
     variants=VARIANTS,
     conditions=lambda run: [{"size": size, "readers": count} for size in run["size"] for count in run["readers"]],

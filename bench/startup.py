@@ -180,7 +180,7 @@ STARTUP = Comparison(
     waits for the first picture in each encoding. Every launch is a new simulated robot. Needs mosquitto.
     """,
     options=(rounds("Launches of each variant."), variants(KINDS, "mqtt or zenoh.")),
-    full=Budget(156, rounds=10, joins=5),
+    full=Budget(100, rounds=10, joins=5),
     quick=Budget(23, rounds=3, joins=3),
     constants={"rate_hz": RATE_HZ},
     variants=KINDS,
