@@ -115,10 +115,10 @@ def trace_commands(case: Case) -> Iterator[Cell]:
         wire = socket.socket(socket.AF_PACKET, socket.SOCK_DGRAM)  # no protocol: it receives nothing yet
     except OSError as error:
         raise PebbleError(f"--profile captures packets on loopback, which requires root: {error.strerror}") from None
+    wire.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, _BUFFER)
+    wire.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)  # later: until then packets get the time of their recvmsg()
+    wire.setblocking(False)
     with wire, running([case.variant]) as robots:
-        wire.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, _BUFFER)
-        wire.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
-        wire.setblocking(False)
         wire.bind(("lo", _ETH_P_IP))
         driven = robots[case.variant]
         turn = driven.drive(case.run["seconds"], case.run["rate_hz"])

@@ -53,6 +53,7 @@ class _Guard:
     def __init__(self) -> None:
         self.rests = True
         self.helped = 0  # times
+        self._warned = False
         self._wakeup, self._lock = Wakeup(), threading.Lock()
         self._thread: threading.Thread | None = None
         self._calls: list[_Calls] = []
@@ -83,7 +84,9 @@ class _Guard:
                 try:
                     thread.start()
                 except RuntimeError as error:  # too many threads: the next callback tries again
-                    log.warning("no guard for handlers that wait: %s", error)
+                    if not self._warned:
+                        log.warning("no guard for handlers that wait: %s", error)
+                    self._warned = True
                     return
                 self._thread = thread
             self.rests = False

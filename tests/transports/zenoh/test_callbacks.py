@@ -133,12 +133,16 @@ def test_threads_of_python_are_not_watched(hub: HubProcess, monkeypatch: pytest.
     assert len(guard._calls) <= 2  # of Zenoh's, for the hub's answers
 
 
-def test_without_a_thread_for_the_guard_messages_are_handled(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_thread_for_the_guard_messages_are_handled(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     guard = callbacks._Guard()
     with monkeypatch.context() as patched:
         patched.setattr(threading.Thread, "start", _refuse)
         guard.wake()
+        guard.wake()
     assert guard.rests
+    assert caplog.text.count("no guard for handlers that wait") == 1  # not once for each message
     guard.wake()
     assert not guard.rests
 
