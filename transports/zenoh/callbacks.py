@@ -30,8 +30,10 @@ from pebble.transports.wakeup import Wakeup
 log = logging.getLogger(__name__)
 
 MOST = 32  # threads of a process that are looked after
-_LOOK_S = 0.05  # a callback that two looks find running takes long
-_REST = 100  # looks without a new callback, after which the guard sleeps until the next one
+_LOOK_S = 0.1  # between two looks for a callback that runs
+_AGAIN_S = 0.02  # the same after one was found; if it still runs, it takes long
+_REST = 5  # looks without a new callback, after which the guard sleeps until the next one
+_HELP_S = 0.005
 _NOTHING = "@pebble/nothing"  # a key
 
 _ensure = ctypes.pythonapi.PyGILState_Ensure
@@ -53,7 +55,7 @@ class _Guard:
     def __init__(self) -> None:
         self.rests = True
         self.helped = 0  # times
-        self._warned = False
+        self._suspects = self._warned = False
         self._wakeup, self._lock = Wakeup(), threading.Lock()
         self._thread: threading.Thread | None = None
         self._calls: list[_Calls] = []
@@ -95,7 +97,7 @@ class _Guard:
     def _run(self) -> None:
         quiet = 0
         while True:
-            time.sleep(_LOOK_S)
+            time.sleep(_AGAIN_S if self._suspects else _LOOK_S)
             quiet = 0 if self._look() else quiet + 1
             if quiet < _REST:
                 continue
@@ -106,12 +108,13 @@ class _Guard:
 
     def _look(self) -> bool:
         """Whether a callback has begun since the last time, or is still running."""
-        found = False
+        found = self._suspects = False
         for calls in self._calls:
             begun, runs = calls.begun, calls.begun != calls.ended
             found = found or runs or begun != calls.known
             if runs and calls.ran:  # the same one, or many without a pause
                 self._help()
+            self._suspects = self._suspects or runs
             calls.known, calls.ran = begun, runs
         return found
 
@@ -121,7 +124,7 @@ class _Guard:
             sessions = self._sessions[::-1]
         for session in sessions:
             try:  # a query has a time limit, for which Zenoh starts a task; this one does not leave the session
-                session.get(_NOTHING, _nothing, timeout=_LOOK_S / 10, allowed_destination=zenoh.Locality.SESSION_LOCAL)
+                session.get(_NOTHING, _nothing, timeout=_HELP_S, allowed_destination=zenoh.Locality.SESSION_LOCAL)
             except Exception:  # closed meanwhile; whatever it is, the guard goes on
                 log.debug("no help from a session", exc_info=True)
             else:
