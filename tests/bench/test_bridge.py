@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, ClassVar
+from unittest.mock import MagicMock
 
 import pytest
 from rich.console import Console
@@ -283,7 +284,7 @@ def test_shared_memory_is_swept_however_it_ends(
 
     swept: list[bool] = []
     monkeypatch.setattr(bridge, "driven_robot", fail)
-    monkeypatch.setattr("pebble.bench.bridge.socket.socket", lambda *_: io.BytesIO())
+    monkeypatch.setattr("pebble.bench.bridge.socket.socket", lambda *_: MagicMock())
     monkeypatch.setattr(engine, "sweep", lambda: swept.append(True))
     with pytest.raises(PebbleError, match="no robot today"):
         engine.run(about.run_of(rounds=1, output=tmp_path, console=Console(file=io.StringIO())))

@@ -210,9 +210,11 @@ def close_at_exit(owner: _Closable) -> None:
     _open.add(owner)
     if not _registered:
         _registered = True
-        threading._register_atexit(_close_all)  # type: ignore[attr-defined]
+        threading._register_atexit(_close_all, os.getpid())  # type: ignore[attr-defined]
 
 
-def _close_all() -> None:
+def _close_all(pid: int) -> None:
+    if pid != os.getpid():
+        return  # a fork has nothing to close, and another thread may have held any lock at that moment
     for owner in list(_open):
         owner.close()

@@ -720,6 +720,11 @@ def test_a_fork_is_refused(robot: Robot) -> None:
     assert (actor.read(), actor.end()) == ("3", 0)
 
 
+def test_a_fork_ends_whatever_its_parent_was_doing(robot: Robot) -> None:
+    actor = robot.actor("forks_with_a_lock")
+    assert (actor.read(), actor.end()) == ("0", 0)
+
+
 # -- the hub
 
 

@@ -115,6 +115,20 @@ def forks(client: Transport) -> None:
     client.close()
 
 
+def forks_with_a_lock(client: Transport) -> None:
+    """The child ends as any program; at that moment another thread of its parent held a lock, for good."""
+    held = threading.Event()
+    threading.Thread(
+        target=lambda: (client._state_lock.acquire(), held.set(), threading.Event().wait()), daemon=True
+    ).start()
+    held.wait()
+    report("up")
+    if child := os.fork():
+        _, status = os.waitpid(child, 0)
+        report(os.waitstatus_to_exitcode(status))
+        os._exit(0)
+
+
 def _refusals(client: Transport) -> int:
     attempts = (
         lambda: client.publish("from/child", b""),
