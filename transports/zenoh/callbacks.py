@@ -33,7 +33,7 @@ MOST = 32  # threads of a process that are looked after
 _LOOK_S = 0.1  # between two looks for a callback that runs
 _AGAIN_S = 0.02  # the same after one was found; if it still runs, it takes long
 _REST = 5  # looks without a new callback, after which the guard sleeps until the next one
-_HELP_S = 0.005
+_HELP_S = 0.005  # the time limit of the query that gives another thread something to do
 _NOTHING = "@pebble/nothing"  # a key
 
 _ensure = ctypes.pythonapi.PyGILState_Ensure
