@@ -244,7 +244,7 @@ def test_a_signal_stops_the_robot_at_once(drive: Drive, lamp: Lamp, number: sign
     assert lamp.halted_after(time.monotonic()) < BUSY_S
     assert console.process.wait(5) == (0 if number == signal.SIGINT else 1)
     assert console.restored
-    assert until(lambda: [command for _, command in lamp.commands[-3:]] == [FINAL] * 3)
+    assert until(lambda: [command for _, command in lamp.commands[-3:]] == [FINAL] * 3), lamp.commands[-8:]
 
 
 def test_a_terminal_that_is_closed_stops_the_robot_at_once(drive: Drive, lamp: Lamp) -> None:
@@ -310,7 +310,7 @@ def test_space_stops_at_once(drive: Drive, lamp: Lamp) -> None:
     console.hold(b"")
     console.type(b" ")
     assert lamp.halted_after(time.monotonic()) < BUSY_S
-    assert until(lambda: [command for _, command in lamp.commands[-3:]] == [FINAL] * 3)
+    assert until(lambda: [command for _, command in lamp.commands[-3:]] == [FINAL] * 3), lamp.commands[-8:]
 
 
 @pytest.mark.parametrize("keys", [b"!", b"\x1b\x1b"])

@@ -16,7 +16,7 @@ from tests.support import until
 
 pytestmark = pytest.mark.alone  # deadlines are checked
 
-STOP_LIMIT_S = 0.85  # after the last command seen at the pty
+STOP_LIMIT_S = 1.0  # after the last command seen at the pty: 0.75, and what a busy machine may add
 AGE_LIMIT_S = 2.5  # no older command ever reaches the pty
 BACK_LIMIT_S = 5.0  # after the fault's end commands reach the wheels again
 

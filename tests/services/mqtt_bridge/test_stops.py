@@ -279,7 +279,7 @@ class TestStates:
         older = saved.read_bytes()
         rig.remote.publish(STOP, b"", retain=True)
         rig.local.publish(STATE, b"free", retain=True)
-        assert until(lambda: rig.remote.payloads(STATE)[-1] == b"free")
+        assert until(lambda: rig.remote.payloads(STATE)[-1] == b"free" and rig.local.payloads(STOP)[-1] == b"")
         before = len(rig.local.on(STOP))
         epoch = rig.bridge._remote_epoch
         rig.remote.transport.close()

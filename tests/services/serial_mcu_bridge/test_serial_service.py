@@ -53,12 +53,14 @@ def test_the_first_and_the_last_line_are_the_stop(bench: Bench) -> None:
 
 @pytest.mark.parametrize("bench", [("goob", {"safety": {"drive_timeout_seconds": 0.2}})], indirect=True)
 def test_the_configured_watchdog_stops_once(bench: Bench) -> None:
+    sent = time.monotonic()
     bench.send("incoming/drive-values", {"z": 0.5})
     assert bench.line("M 0.500 0.500")
     moved = next(entry for entry in bench.mcu.trace.entries() if entry.line == "M 0.500 0.500")
     assert until(lambda: bench.mcu.trace.lines()[-1] == "M 0.000 0.000", 2)
     stopped = bench.mcu.trace.entries()[-1]
-    assert 0.18 <= (stopped.ns - moved.ns) / 1e9 <= 0.3
+    assert stopped.ns / 1e9 - sent >= 0.2
+    assert (stopped.ns - moved.ns) / 1e9 <= 0.5  # the default is 0.75
     time.sleep(0.5)  # two more timeouts: the stop is not repeated
     assert bench.mcu.trace.entries()[-1] == stopped
 
