@@ -90,9 +90,8 @@ def test_a_second_sensor_claims_the_same_channels(rig: Rig, board: PtyMcu) -> No
     assert until(lambda: rig.world.on("mcu/imu-2/imu_fast"), 3)
     time.sleep(0.3)
     count, generic = len(rig.world.on(FAST)), len(rig.world.on(f"mcu/{uid}/imu_fast"))
-    time.sleep(0.5)
+    assert until(lambda: len(rig.world.on(f"mcu/{uid}/imu_fast")) > generic + 30)
     assert len(rig.world.on(FAST)) == count
-    assert len(rig.world.on(f"mcu/{uid}/imu_fast")) > generic + 30
     other.unplug()
     assert until(lambda: len(rig.world.on(FAST)) > count, 3)
 
