@@ -57,7 +57,7 @@ def report(
 ) -> int:
     """Run all comparisons and pebble impair, one after the other, and write a report.
 
-    Takes an hour and a half, with --quick less than five minutes. If a comparison fails, the others still run, and
+    Takes an hour and a half, with --quick some five minutes. If a comparison fails, the others still run, and
     the exit code is 1. Without root, comparisons that need it are left out.
     """
     from pebble.bench.report import run, write
