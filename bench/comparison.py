@@ -30,7 +30,7 @@ _NAMES: Final = (
 )  # fmt: skip
 #: The module of each comparison, which has it as a constant of the same name; in the order of the report. A module has
 #: its modes, too: CONTROL_NULL.
-MODULES: Final = {name: _ELSEWHERE.get(name, name) for name in _NAMES}
+MODULES: Final = {name: _ELSEWHERE.get(name, name.replace("-", "_")) for name in _NAMES}
 
 Params = Mapping[str, Value]
 Combine = Callable[[Sequence[Any]], Value]  # the values of all rounds into one

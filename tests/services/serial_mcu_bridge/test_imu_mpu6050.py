@@ -125,7 +125,7 @@ def test_malformed_lines_are_logged_and_nothing_is_ever_sent(rig: Rig, caplog: p
     running = rig.bridge(protocol="imu_mpu6050_v1")
 
     def received() -> object:
-        mcu.send(b"I n=1\n", b"x" * 5000 + b"\n", FAST + b"\n")
+        mcu.pour(b"I n=1\n" + b"x" * 5000 + b"\n" + FAST + b"\n")  # a pty holds 4 kB until the bridge reads
         time.sleep(0.05)
         logged = [(record.getMessage(), record.levelno) for record in caplog.records]
         return rig.world.payloads("sensors/imu-fast") and ("MCU: I n=1", logging.WARNING) in logged
