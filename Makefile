@@ -56,7 +56,7 @@ test: check
 
 test-running:
 	@echo "pebble: tests"
-	@$(TESTS) --numprocesses 8 -m "not alone and not page$(LESS)" $(addprefix --ignore=,$(COMPUTING)) \
+	@$(TESTS) --numprocesses 6 -m "not alone and not page$(LESS)" $(addprefix --ignore=,$(COMPUTING)) \
 		$(addprefix tests/,web transports services commands scripts script robot launcher) tests
 	@echo "pebble: whole robots and serial lines, two at a time because these tests check deadlines, beside them one with a page"
 	@$(MAKE) --no-print-directory --jobs=2 test-robots test-pages
