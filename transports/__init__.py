@@ -4,6 +4,7 @@ A folder of this package with a ``transport.py`` is a kind of transport: ``mqtt/
 ``TRANSPORT``. Packages of third parties offer theirs through the entry point group ``pebble.transports``.
 """
 
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -48,8 +49,9 @@ def module_of(kind: str) -> str | None:
     return f"{__name__}.{kind}.transport" if kind in _own_kinds() else None
 
 
-def _own_kinds() -> set[str]:
-    return {path.parent.name for path in Path(__file__).parent.glob("*/transport.py")}
+@cache
+def _own_kinds() -> frozenset[str]:
+    return frozenset(path.parent.name for path in Path(__file__).parent.glob("*/transport.py"))
 
 
 def _entry_point(kind: str) -> Any:

@@ -19,7 +19,7 @@ from pebble.launcher.odometry_watch import OdometryWatch
 from pebble.launcher.reactor import Reactor
 from pebble.runtime.addresses import Addresses
 from pebble.runtime.connections import local_transport
-from pebble.runtime.parent import ALIVE_PERIOD_S, Notifier, ProvidedFeatures, set_up_logging
+from pebble.runtime.parent import ALIVE_PERIOD_S, Notifier, ProvidedFeatures, set_log_level, set_up_logging
 from pebble.runtime.process import exit_at_the_latest
 from pebble.transports import Message, State, Transport
 
@@ -128,7 +128,7 @@ def main(arguments: list[str]) -> int:
     except PebbleError as error:
         log.error("%s", error)
         return 1
-    logging.getLogger().setLevel(config.log_level_of("launcher"))
+    set_log_level(config.log_level_of("launcher"))
     topic = Addresses(config)[WHEEL_ODOMETRY].topic
     return run(lambda will: local_transport(config, "launcher", will=will), topic)
 

@@ -13,6 +13,7 @@ from pebble.launcher.forked import become
 from pebble.launcher.programs import Program
 
 _READ_BYTES = 65_536
+_SIGNALS = signal.valid_signals()
 
 
 class Child:
@@ -86,7 +87,7 @@ def _pipe(opened: list[int]) -> tuple[int, int]:
 
 def _fork(run: Callable[[], NoReturn]) -> int:
     """Fork with signals blocked: until ``run`` sets its own handlers, a child would run the launcher's."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
     try:
         pid = os.fork()
         if pid == 0:

@@ -21,6 +21,7 @@ from pebble.runtime.parent import NOTIFY_FD, die_with_launcher
 
 _NOTES = 3  # the descriptor of READY and ALIVE, next after stdin, stdout and stderr
 _PR_SET_NAME, _NAME_BYTES = 15, 15
+_SIGNALS = signal.valid_signals()  # each call makes the set anew
 
 
 def become(
@@ -68,19 +69,21 @@ def _arrange_descriptors(stdin: int, output: int, notes: int) -> None:
 def _reset_signals() -> None:
     """Set signals as in a fresh interpreter. What was ignored (nohup) stays ignored."""
     signal.set_wakeup_fd(-1)
-    for number in signal.valid_signals():
+    for number in _SIGNALS:
         if callable(signal.getsignal(number)):
             signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_SETMASK, ())
 
 
 def _forget_launcher(environment: Mapping[str, str]) -> None:
+    """Touch only what differs: a page that is written to is no longer shared."""
     atexit._clear()
-    root = logging.getLogger()
-    root.handlers.clear()
-    root.setLevel(logging.WARNING)
-    os.environ.clear()
-    os.environ.update(environment)
+    logging.getLogger().handlers.clear()
+    for name in os.environ.keys() - environment.keys():
+        del os.environ[name]
+    for name, value in environment.items():
+        if os.environ.get(name) != value:
+            os.environ[name] = value
 
 
 def _run(program: Program) -> None:

@@ -23,6 +23,9 @@ from pebble.transports.zenoh.hub import ZenohHub
 
 log = logging.getLogger(__name__)
 
+# Made where the launcher imports this module: what msgspec finds out about the fields is then in memory that is shared.
+_decoder = msgspec.json.Decoder(ZenohSettings, dec_hook=lambda _kind, text: Path(text))
+
 
 def main(arguments: list[str]) -> int:
     set_up_logging("INFO")
@@ -57,7 +60,7 @@ def _settings(arguments: list[str]) -> ZenohSettings:
     if len(arguments) != 1:
         raise PebbleError("usage: python -m pebble.runtime.hub SETTINGS (JSON: the fields of ZenohSettings)")
     try:
-        return msgspec.json.decode(arguments[0], type=ZenohSettings, dec_hook=lambda _kind, text: Path(text))
+        return _decoder.decode(arguments[0])
     except msgspec.DecodeError as error:
         raise PebbleError(f"settings of the hub: {error}") from None
 

@@ -33,7 +33,18 @@ log = logging.getLogger(__name__)
 
 def set_up_logging(level: str) -> None:
     """Write log lines to stderr in the format that the launcher forwards."""
-    logging.basicConfig(level=level, format=LOG_FORMAT, datefmt="%H:%M:%S", stream=sys.stderr)
+    new = None if _logs_from(level) else level
+    logging.basicConfig(level=new, format=LOG_FORMAT, datefmt="%H:%M:%S", stream=sys.stderr)
+
+
+def set_log_level(level: str) -> None:
+    """Log from ``level`` on. Setting it writes into each logger, memory that this process shares with its launcher."""
+    if not _logs_from(level):
+        logging.getLogger().setLevel(level)
+
+
+def _logs_from(level: str) -> bool:
+    return logging.getLevelName(logging.getLogger().level) == level
 
 
 def tagged(part: str, pid: int, line: bytes) -> bytes:

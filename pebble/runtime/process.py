@@ -13,7 +13,14 @@ from pebble.config import Config, config_of_process
 from pebble.errors import ConfigError, PebbleError
 from pebble.runtime.connections import local_transport
 from pebble.runtime.environment import withhold
-from pebble.runtime.parent import ALIVE_PERIOD_S, DROPPED_PERIOD_S, DroppedMessages, Notifier, set_up_logging
+from pebble.runtime.parent import (
+    ALIVE_PERIOD_S,
+    DROPPED_PERIOD_S,
+    DroppedMessages,
+    Notifier,
+    set_log_level,
+    set_up_logging,
+)
 from pebble.runtime.service import Service
 
 _STOP_DEADLINE_S = 3.0
@@ -41,7 +48,7 @@ def run(
         config = config_of_process(arguments[0])
         withhold(config.password_variables)
         program = f"{service_class.name}:{instance}" if instance else service_class.name
-        logging.getLogger().setLevel(config.log_level_of(program))
+        set_log_level(config.log_level_of(program))
         view = view_of(config, instance)
         return _serve(service_class if choose is None else choose(view), view, instance)
     except PebbleError as error:

@@ -9,7 +9,7 @@ import sys
 
 from pebble.config import config_of_process
 from pebble.errors import PebbleError
-from pebble.runtime.parent import ALIVE_PERIOD_S, Notifier, set_up_logging
+from pebble.runtime.parent import ALIVE_PERIOD_S, Notifier, set_log_level, set_up_logging
 from pebble.runtime.process import exit_at_the_latest
 from pebble.web.extra import require_packages
 from pebble.web.from_config import ready_settings_of
@@ -25,7 +25,7 @@ def main(arguments: list[str]) -> int:
         return 2
     try:
         config = config_of_process(arguments[0])
-        logging.getLogger().setLevel(config.log_level_of("web_handler"))
+        set_log_level(config.log_level_of("web_handler"))
         settings = ready_settings_of(config)
         require_packages()
         return _Page(settings).run()

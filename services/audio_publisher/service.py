@@ -38,7 +38,7 @@ class AudioPublisher(Service):
             self._options, self._remote, address.topic, QoS(address.qos), self.counters, self._received_at
         )
         self._sender.requested = known_encoding(requested_encoding(), self._options.encoding)
-        self._reader = FrameReader(self.config.run_dir(), "microphone", depth=_DEPTH)
+        self._reader = FrameReader(self.config.run_dir(), "microphone", sharing=False, depth=_DEPTH)
         self._thread = threading.Thread(target=self._read, name="pebble-microphone", daemon=True)
 
     def start(self) -> None:

@@ -38,7 +38,8 @@ _T = TypeVar("_T")
 class FrameReader:
     """One reader of a stream. It may open before the writer, and survives any number of writers.
 
-    ``views``: frames are views of the writer's memory instead of copies. ``depth``: how many frames wait at most, for
+    ``views``: frames are views of the writer's memory instead of copies. ``sharing``: False for sound, which comes as
+    bytes anyway; to be ready for shared memory takes Zenoh 8 MB (1.10.2). ``depth``: how many frames wait at most, for
     sound; it must be below the writer's number of slots. One thread reads; any may close.
 
     Counters: received; missed (gaps in the numbers: lost, or overtaken by a newer one); skipped (replaced by a newer
@@ -47,13 +48,13 @@ class FrameReader:
     again); reopened (stopped using shared memory).
     """
 
-    def __init__(self, folder: Path, stream: str, *, views: bool = False, depth: int = 1) -> None:
+    def __init__(self, folder: Path, stream: str, *, views: bool = False, sharing: bool = True, depth: int = 1) -> None:
         if depth < 1:
             raise TransportError(f"a reader of {stream} with {depth} frames would never get one")
         self._folder = folder
         self._stream = stream
         self._names = StreamNames(folder, stream)
-        self._views = views
+        self._views, self._sharing = views, sharing
         self.counters = Counters()
         self._count_received, self._count_shared = map(self.counters.adder, ("received", "shared"))
         self.problem = ""
@@ -77,7 +78,8 @@ class FrameReader:
         with self._changing:
             self._closed = False
             self._latest.reopen()
-            self.problem = "" if shared_memory.lockable(needed := 2 * METADATA) else self._memlock_problem(needed)
+            lockable = not self._sharing or shared_memory.lockable(2 * METADATA)
+            self.problem = "" if lockable else self._memlock_problem(2 * METADATA)
             self._start()
         close_at_exit(self)
         return self
@@ -88,8 +90,7 @@ class FrameReader:
         session = self._session = self._open_session()
         self._pid = os.getpid()
         if self.shared and self._views:
-            # The self-test takes milliseconds: better now than at the first frame. It takes memory, too, so readers of
-            # sound skip it: that is sent as bytes.
+            # The self-test takes milliseconds: better now than at the first frame.
             views.why_unavailable()
         liveliness = session.liveliness()
         self._declared = [  # called on Zenoh's receiving thread: these must be quick
@@ -99,7 +100,7 @@ class FrameReader:
         ]
 
     def _open_session(self) -> zenoh.Session:
-        if not self.problem:
+        if self.shared:
             try:
                 return open_reading(self._folder, self._names, shared=True)
             except SharingError as error:
@@ -134,8 +135,8 @@ class FrameReader:
 
     @property
     def shared(self) -> bool:
-        """False: frames are sent to this reader as bytes; `problem` explains why."""
-        return not self.problem
+        """False: frames are sent to this reader as bytes; `problem` explains why, unless that is its own choice."""
+        return self._sharing and not self.problem
 
     @property
     def writers(self) -> int:

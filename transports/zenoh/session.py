@@ -28,6 +28,8 @@ _RUNTIME = "(acc: (handover: rx), net: (handover: rx), rx: (worker_threads: 16))
 
 HUB_SOCKET = "hub.sock"
 
+_SIGNALS = signal.valid_signals()
+
 BLOCK_MS = 300  # a publish waits this long for a receiver that accepts nothing; then its connection is closed
 _CONNECT_TIMEOUT_MS = 2000
 # Zenoh accepts this only as a whole.
@@ -80,7 +82,7 @@ def open_session(config: str) -> zenoh.Session:
     os.environ.setdefault("ZENOH_RUNTIME", _RUNTIME)
     # Zenoh's threads inherit this. A signal that the kernel gave to one of them would not wake the main thread, which
     # runs Python's handlers (measured: 5 of 200 hubs on a busy machine did not end).
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
     try:
         session = zenoh.open(zenoh.Config.from_json5(config))
     finally:

@@ -288,6 +288,28 @@ def test_anything_with_bytes_can_be_written(tmp_path: Path) -> None:
         assert writer.counters["fallbacks"] == 1
 
 
+@needs_shared_memory
+def test_a_reader_may_choose_bytes_and_then_maps_nothing(tmp_path: Path) -> None:
+    program = (
+        "import sys; from pathlib import Path; from pebble.transports import segments\n"
+        "from pebble.transports.frames import *\n"
+        "with FrameReader(Path(sys.argv[1]), 'camera', sharing=False) as reader:\n"
+        "    frame = reader.read(10)\n"
+        "    print(frame.data.tobytes() == bytes([7]) * 60_000, frame.shared, reader.shared, repr(reader.problem))\n"
+        "    print(segments.mapped())\n"
+    )
+    with FrameWriter(tmp_path, "camera", capacity=60_000) as writer, FrameReader(tmp_path, "camera") as other:
+        with subprocess.Popen(
+            [sys.executable, "-c", program, str(tmp_path)], stdout=subprocess.PIPE, text=True
+        ) as reader:
+            assert until(lambda: writer.readers == 2, 10)
+            assert writer.write(b"\7" * 60_000, FrameInfo())
+            assert reader.communicate(timeout=20)[0] == "True False False ''\n0\n"
+        frame = other.read(5)
+        assert frame is not None
+        assert frame.shared
+
+
 def test_segments_of_killed_processes_are_swept(net: FramesNet) -> None:
     reader, writer = net.reader(views=True), net.writer(size=VGA)
     reader.has(frames=5)
