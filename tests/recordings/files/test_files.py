@@ -21,10 +21,11 @@ from pebble.recordings.files.scan import Damage, blocks
 from pebble.recordings.files.writer import McapWriter
 from tests.recordings.files.other_readers import Counted, by_mcap, by_mcap_core
 from tests.recordings.messages import START_NS, STEP_NS, contents, is_part_of, write
+from tests.support import cases
 
 MESSAGES = 2000
 #: How many times as many files are damaged as usual.
-TIMES = int(os.environ.get("PEBBLE_DAMAGES", "1"))
+TIMES = int(os.environ.get("PEBBLE_DAMAGES", cases(1, 3)))
 
 
 class TestWhole:
@@ -110,7 +111,7 @@ class TestDamaged:
         again: dict[Path, Counted] = {}
         written = write(path, finish=finished, level=level)
         whole = path.read_bytes()
-        for number in range(12 * TIMES):
+        for number in range(4 * TIMES):
             raw, path = bytearray(whole), tmp_path / f"{number}.mcap"
             damage(raw, rng)
             path.write_bytes(raw)
@@ -155,7 +156,7 @@ class TestDamaged:
         rng, path = random.Random(level), tmp_path / "a.mcap"
         written = write(path, finish=False, level=level)
         whole = path.read_bytes()
-        for _ in range(150 * TIMES):
+        for _ in range(50 * TIMES):
             raw = bytearray(whole)
             flip(raw, rng, 1)
             path.write_bytes(raw)
@@ -188,7 +189,7 @@ class TestDamaged:
         read, size = contents(path), _finish_until_killed(path, math.inf)
         made = finish(path)
         assert size > 1000
-        for number in range(20 * TIMES):
+        for number in range(7 * TIMES):
             path = tmp_path / f"{number}.mcap"
             path.write_bytes(raw)
             _finish_until_killed(path, rng.randrange(size))
