@@ -238,14 +238,12 @@ def test_the_map_follows_goob_while_it_drives(goob: Console, stage: Stage, wire:
 
     pose = stage.robots["goob"].mcu_reports[-1].board.pose
     start = pose.x_mm, pose.y_mm
-    publish()
+    assert goob.tab.until(lambda: publish() >= 0 and bool(rows(goob, "wheel-odometry", "poses")), 20)
     goob.uncover("map")
-    assert goob.tab.until(lambda: publish() >= 0 and bool(rows(goob, "wheel-odometry", "poses")))
     words = goob.test("map-pose").inner_text()
     goob.uncover("stick")
     goob.take()
-    assert goob.drive()
-    assert goob.tab.until(lambda: publish() > 100, 8)
+    assert goob.persists(lambda: goob.down("KeyW"), lambda: publish() > 100, goob.let_go)
     goob.let_go()
     assert goob.rests()
     goob.uncover("map")
