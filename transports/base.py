@@ -32,6 +32,7 @@ _OWN_BYTES = 16 << 20  # the same, with their payloads
 _DELIVERED_TOPICS_LIMIT = 65_536  # topics a subscription remembers as delivered, per connection
 _DELIVERED_TOPICS_BYTES = 4 << 20
 _HANDLER_END_S = 1.0  # how long closing waits for handlers that are running
+_TURN_S = 0.02  # how soon the end of a turn is noticed
 _MATCHED = 512  # topics whose subscriptions are remembered
 _WARNING_PERIOD_S = 5.0  # between two log lines about the same overflowing subscription
 
@@ -234,6 +235,11 @@ class Transport(ABC):
         """What was accepted and is not delivered yet, where the backend can measure it (T20)."""
         return Outgoing()
 
+    @property
+    def untried(self) -> bool:
+        """Whether the name of the broker has addresses that have not had their first turn yet."""
+        return False
+
     def on_state(self, watcher: Watcher) -> None:
         """Call ``watcher`` on every change of state, in order, on a thread of the transport: it must return at once."""
         self._watchers.append(watcher)
@@ -241,6 +247,7 @@ class Transport(ABC):
     def open(self, timeout: float = 5.0) -> Self:
         """Start connecting and wait up to ``timeout`` seconds for success.
 
+        Where a name has several addresses it waits, unless ``timeout`` is 0, until each has had a turn.
         Returns in any case: a robot works without its broker. ``state`` and ``problem`` hold the result.
         Raises TransportError only for settings that can never work.
         """
@@ -252,7 +259,9 @@ class Transport(ABC):
         except TransportError:
             self._set_state(State.CLOSED)
             raise
-        self._connected.wait(timeout)
+        connected = self._connected.wait(timeout)
+        while timeout and not connected and self.untried and self.state is State.CONNECTING:
+            connected = self._connected.wait(_TURN_S)
         return self
 
     def close(self) -> None:

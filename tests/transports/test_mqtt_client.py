@@ -14,6 +14,7 @@ import pytest
 from pebble.transports import MqttSettings
 from pebble.transports.base import Message
 from pebble.transports.counters import Counters
+from pebble.transports.hosts import addresses_of
 from pebble.transports.mqtt import packets
 from pebble.transports.mqtt.client import Client, Opening
 from pebble.transports.mqtt.connection import Connection
@@ -24,6 +25,10 @@ from tests.transports.test_mqtt_packets import Noted, packet
 RECEIVE_MAXIMUM_2 = packet(0x20, b"\0\0\3\x21\0\2")
 
 
+def opening(settings: MqttSettings) -> Opening:
+    return Opening("client", settings, None, None, addresses_of(settings.host, settings.port)[0])
+
+
 class Pair:
     """A client, and the other end of its connection."""
 
@@ -31,7 +36,7 @@ class Pair:
         with socket.create_server(("127.0.0.1", 0)) as server:
             settings = MqttSettings(host="127.0.0.1", port=server.getsockname()[1], protocol=protocol)
             self.noted = Noted()
-            self.client = Client(Opening("client", settings, None, None), self.noted, bridge=False)
+            self.client = Client(opening(settings), self.noted, bridge=False)
             self.client.open()
             self.other, _ = server.accept()
         self.other.settimeout(5)
@@ -178,8 +183,9 @@ def test_a_message_is_acknowledged_when_it_was_handled_even_if_that_failed(fails
     with socket.create_server(("127.0.0.1", 0)) as server, ExitStack() as stack:
         settings = MqttSettings(host="127.0.0.1", port=server.getsockname()[1])
         connection = Connection(
-            Opening("client", settings, None, None),
+            opening(settings),
             Counters(),
+            where="broker",
             as_published=False,
             on_answers=lambda _answers: None,
             skips_retained=lambda _topic: False,

@@ -15,11 +15,11 @@ from contextlib import suppress
 from typing import NamedTuple
 
 from pebble.transports.base import Message
+from pebble.transports.hosts import Address, dial
 from pebble.transports.mqtt import packets
 from pebble.transports.mqtt.packets import Accepted, Filter, Listener, Reader
 from pebble.transports.settings import MqttSettings
 
-CONNECT_TIMEOUT_S = 2.0  # for each of TCP and TLS, and again for the broker's CONNACK (T12)
 SEND_BUFFER = 64 * 1024  # bytes in the kernel for a slow connection: with its default a stream would lag by minutes
 _PIECE = 64 * 1024  # bytes that are read at once
 _MOST_IDS = 65_535
@@ -33,6 +33,7 @@ class Opening(NamedTuple):
     settings: MqttSettings
     context: ssl.SSLContext | None  # None: without TLS
     will: Message | None
+    address: Address  # one of the host's; TLS checks the name of the host
 
 
 class Client:
@@ -44,7 +45,7 @@ class Client:
         self.unwritten = 0  # bytes that the kernel has not accepted yet
         self.drained = True  # `receive` has taken out everything that had come
         self._modern = settings.protocol == "5"
-        self._settings, self._context = settings, opening.context
+        self._address, self._settings, self._context = opening.address, settings, opening.context
         self._hello = packets.connect(
             opening.client_id,
             modern=self._modern,
@@ -70,7 +71,7 @@ class Client:
 
     def open(self) -> None:
         """Connect, and send CONNECT. Raises OSError; ValueError for a host that cannot be a name."""
-        sock = socket.create_connection((self._settings.host, self._settings.port), CONNECT_TIMEOUT_S)
+        sock = dial(self._address)
         try:
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)

@@ -20,12 +20,12 @@ from contextlib import suppress
 from math import ceil, inf
 from typing import TYPE_CHECKING
 
-from pebble.transports import clock
+from pebble.transports import clock, hosts
 from pebble.transports.base import Message, Outgoing, QoS
 from pebble.transports.counters import Counters
 from pebble.transports.mqtt import reasons
 from pebble.transports.mqtt.bridge_mode import Result
-from pebble.transports.mqtt.client import CONNECT_TIMEOUT_S, Client, Opening
+from pebble.transports.mqtt.client import Client, Opening
 from pebble.transports.mqtt.incoming import BrokerDelay, WaitingTime, readable_bytes
 from pebble.transports.mqtt.outgoing import (
     Backlog,
@@ -130,6 +130,7 @@ class Connection:
         opening: Opening,
         counters: Counters,
         *,
+        where: str,
         as_published: bool,
         on_answers: Callable[[Mapping[str, bool]], None],
         skips_retained: Callable[[bytes], bool],
@@ -138,7 +139,7 @@ class Connection:
         self.as_published = as_published
         self.dialling = True  # connect(2) or a TLS handshake may be blocking, and cannot be interrupted
         self.hesitated = False  # the broker took so long to accept us that it may have been suspended
-        self.where = f"broker {settings.host}:{settings.port}"
+        self.where = where  # the broker, in words
         self.max_packet: int | None = None  # bytes, as the broker says on MQTT 5
         #: When there was the last sign that the answers are behind retained messages, or behind a long one.
         self.arriving_at = float("-inf")
@@ -183,7 +184,7 @@ class Connection:
             raise Lost(f"{self.where} cannot be reached: {error}") from None
         self.dialling = False
         self._answered_at = clock.since_boot()
-        deadline = time.monotonic() + CONNECT_TIMEOUT_S
+        deadline = time.monotonic() + hosts.CONNECT_TIMEOUT_S
         try:
             while not self._accepted:
                 if stopping.is_set():

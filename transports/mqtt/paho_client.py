@@ -17,7 +17,9 @@ from paho.mqtt.properties import Properties
 from paho.mqtt.reasoncodes import ReasonCode
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
-from pebble.transports.mqtt.client import CONNECT_TIMEOUT_S, SEND_BUFFER, Opening
+from pebble.transports import hosts
+from pebble.transports.hosts import Address, dial
+from pebble.transports.mqtt.client import SEND_BUFFER, Opening
 from pebble.transports.mqtt.packets import ANY_QOS, HEAD, MAX_PACKET, RETAIN, Accepted, Filter, Listener
 
 _PIECE = 64 * 1024  # bytes that are read at once
@@ -28,6 +30,7 @@ class _Paho(paho.Client):
     """paho, with pings of our own (its keepalive is too slow for T19), and a limit to what it collects."""
 
     listener: Listener
+    address: Address
     ahead = b""  # was taken out of the socket; `begin` of it was read
     begin = 0
 
@@ -37,6 +40,9 @@ class _Paho(paho.Client):
     @property
     def unwritten(self) -> int:
         return sum(packet["to_process"] for packet in self._out_packet)
+
+    def _create_socket_connection(self) -> socket.socket:
+        return dial(self.address)  # paho would try all of the host's in one attempt
 
     def _sock_recv(self, bufsize: int) -> bytes:
         if self.begin == len(self.ahead):
@@ -86,7 +92,7 @@ class PahoClient:
     """See `client.Client`."""
 
     def __init__(self, opening: Opening, listener: Listener, *, bridge: bool) -> None:
-        client_id, settings, context, will = opening
+        client_id, settings, context, will, address = opening
         self.drained = True
         self._settings, self._context, self._listener = settings, context, listener
         self._modern = settings.protocol == "5"
@@ -94,8 +100,8 @@ class PahoClient:
         self._paho = client = _Paho(
             CallbackAPIVersion.VERSION2, client_id=client_id, protocol=protocol, reconnect_on_failure=False
         )
-        client.listener = listener
-        client.connect_timeout = CONNECT_TIMEOUT_S
+        client.listener, client.address = listener, address
+        client.connect_timeout = hosts.CONNECT_TIMEOUT_S
         if not self._modern:
             client.max_inflight_messages_set(_IN_FLIGHT)  # on 5 the broker's Receive Maximum may be paho's 20
             if bridge:

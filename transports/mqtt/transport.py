@@ -14,6 +14,7 @@ from math import ceil
 from pebble.errors import TransportError
 from pebble.transports import clock
 from pebble.transports.base import Message, Outgoing, QoS, State, Subscription, Transport
+from pebble.transports.hosts import Address, Turns
 from pebble.transports.mqtt.bridge_mode import Attempt, BridgeMode, Result
 from pebble.transports.mqtt.client import Opening
 from pebble.transports.mqtt.connection import Connection, Lost, Refused, Silent, ignore
@@ -45,6 +46,8 @@ class MqttTransport(Transport):
         # A broker closes the connection of a client when another connects with its id (MQTT-3.1.4-2), so ours cannot be
         # guessed. It stays the same over reconnects: the broker closes our own half-dead connection at once.
         self._mqtt_client_id = f"{client_id}-{secrets.token_hex(8)}"
+        self._broker = f"broker {settings.host}:{settings.port}"
+        self._turns = Turns(settings.host, settings.port)
         self.as_published = settings.as_published
         self.exact_echo = settings.as_published or settings.protocol == "5"
         self._context: ssl.SSLContext | None = None
@@ -55,11 +58,16 @@ class MqttTransport(Transport):
         self._stopping = threading.Event()
         self._will_on_close: Message | None = None
         self._thread: threading.Thread | None = None
-        self._bridge_mode = BridgeMode()
+        self._bridge_mode = BridgeMode()  # of the broker at this address:
+        self._address: Address | None = None
         self._broker_stalled = False  # the broker may have been suspended, and have old messages to forward first
         self._logged = ("", 0.0)  # the newest problem in the log, and when it went there
         self._own_message_filter = OwnMessageFilter()
         self._refused_messages = RefusedMessages()
+
+    @property
+    def untried(self) -> bool:
+        return self._turns.untried
 
     @property
     def outgoing(self) -> Outgoing:
@@ -144,26 +152,30 @@ class MqttTransport(Transport):
     def _run(self, stopping: threading.Event) -> None:
         failures = 0
         while not stopping.is_set():
-            began = time.monotonic()
+            began, problem = time.monotonic(), "failed unexpectedly"
             try:
                 self._run_connection(stopping)
             except Lost as lost:
                 self._broker_stalled |= isinstance(lost, Silent)
-                if not stopping.is_set():
-                    self._report_problem(str(lost))
+                problem = str(lost)
             except Exception:  # any error must lead to a reconnect, never end the thread
                 log.exception("%s: unexpected failure of the connection", self.client_id)
             if stopping.is_set():
                 return
-            if self._state is State.CONNECTED and time.monotonic() - began > _STEADY_S:
+            held_s = time.monotonic() - began if self._state is State.CONNECTED else 0.0
+            self._note_failure(problem, held_s)
+            if held_s > _STEADY_S:
                 failures = 0
             self._set_state(State.CONNECTING)
+            if self._turns.several and not self._turns.is_over:
+                continue  # the next address
             pause = min(self.settings.reconnect_max_s, _RETRY_S * 2 ** (failures - 1)) if failures else 0.0
             failures = min(failures + 1, 20)
             stopping.wait(pause * random.uniform(0.5, 1.0))  # noqa: S311  (jitter, no secret)
 
     def _run_connection(self, stopping: threading.Event) -> None:
         """Run one connection from its start to its end; raises Lost unless it ends by `close`."""
+        self._address = self._next_address()
         if self._asks_for_bridge_mode and self._bridge_mode.next_attempt is Attempt.PROBE:
             self._probe(stopping)
         plain = self._asks_for_bridge_mode and self._bridge_mode.next_attempt is Attempt.PLAIN
@@ -179,9 +191,34 @@ class MqttTransport(Transport):
             connection.discard()
             self._keep_unconfirmed(connection)
 
+    def _next_address(self) -> Address:
+        self._attempt = None  # a resolver cannot be interrupted
+        try:
+            address = self._turns.address()
+        except (OSError, ValueError) as error:
+            raise Lost(f"{self._broker} cannot be reached: {error}") from None
+        if address != self._address:
+            self._bridge_mode = BridgeMode()
+        return address
+
+    @property
+    def _where(self) -> str:
+        return f"{self._broker} at {self._address.text}" if self._address and self._turns.several else self._broker
+
+    def _note_failure(self, problem: str, held_s: float) -> None:
+        """The turn of the address is over, unless its broker is to be asked once more in another way."""
+        turns = self._turns
+        if not self._asks_for_bridge_mode or self._bridge_mode.next_attempt is Attempt.BRIDGE:
+            failed = turns.failed(problem.removeprefix(f"{self._where} "), held_s)
+            if turns.several:
+                problem = f"{self._broker}: {failed}"
+        self._report_problem(problem, logged=held_s > 0 or turns.is_over or not turns.several)
+
     def _serve(self, connection: Connection, stopping: threading.Event) -> None:
         try:
             self._synchronize(connection, stopping)
+            if failed := self._turns.succeeded():
+                self._log(logging.INFO, f"connected to {connection.where}; before it {failed}")
             while not stopping.is_set():
                 connection.pump(_IDLE_S, self._deliver_all)
                 if self._pending and connection.has_room:
@@ -195,9 +232,11 @@ class MqttTransport(Transport):
             raise
 
     def _make_connection(self, will: Message | None, *, as_published: bool) -> Connection:
+        assert self._address is not None  # noqa: S101 - both callers run at an address
         return Connection(
-            Opening(self._mqtt_client_id, self.settings, self._context, will),
+            Opening(self._mqtt_client_id, self.settings, self._context, will, self._address),
             self.counters,
+            where=self._where,
             as_published=as_published,
             on_answers=self._note_answers,
             skips_retained=lambda topic: self.skips_retained(topic),
@@ -344,12 +383,16 @@ class MqttTransport(Transport):
         size = len(message.payload)
         log.error("%s: a message of %d bytes on %s is not sent: %s", self.client_id, size, message.topic, why)
 
-    def _report_problem(self, problem: str) -> None:
+    def _report_problem(self, problem: str, *, logged: bool) -> None:
         self.problem = problem
+        if logged:
+            self._log(logging.WARNING, problem)
+
+    def _log(self, level: int, line: str) -> None:
         now = time.monotonic()
-        if problem != self._logged[0] or now - self._logged[1] > _REPEAT_LOG_S:
-            self._logged = (problem, now)
-            log.warning("%s: %s", self.client_id, problem)
+        if line != self._logged[0] or now - self._logged[1] > _REPEAT_LOG_S:
+            self._logged = (line, now)
+            log.log(level, "%s: %s", self.client_id, line)
 
 
 TRANSPORT = MqttTransport

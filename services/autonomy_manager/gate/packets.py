@@ -146,6 +146,15 @@ def connack(code: int) -> bytes:
     return bytes((Kind.CONNACK << 4, 2, 0, code))
 
 
+def refusal(answer: bytes) -> str | None:
+    """Why the broker's ``answer`` to CONNECT refuses it, "" if it does not; None: it is not complete."""
+    if answer and answer[0] != Kind.CONNACK << 4:
+        return "it does not speak MQTT"
+    if len(answer) < len(connack(0)):
+        return None
+    return f"code {answer[3]}" if answer[3] else ""
+
+
 def acknowledgement(kind: Kind, packet_id: int) -> bytes:
     """A PUBACK, PUBREC or PUBCOMP."""
     return bytes((kind << 4, 2)) + packet_id.to_bytes(2, "big")

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import socket
 import ssl
 from collections.abc import Callable
 
 from pebble.services.autonomy_manager.gate.answers import AnswerMerger
 from pebble.services.autonomy_manager.gate.client_filter import ClientFilter, Output
-from pebble.services.autonomy_manager.gate.packets import PacketError, connack
+from pebble.services.autonomy_manager.gate.packets import PacketError, connack, refusal
+from pebble.transports.hosts import CONNECT_TIMEOUT_S, Address, addresses_of, told
 
 CHUNK = 64 * 1024  # bytes per read; a receiver with more unsent bytes makes its sender wait
 _CONNECT_S = 5.0  # for a client's CONNECT, and for reaching the broker
@@ -41,7 +43,7 @@ class Relay:
         try:
             output = await self._log_in()
             if self._packets.connected:
-                await self._pass(output, await self._open(broker))
+                await self._pass(output, *await self._open(broker, output))
         except (OSError, TimeoutError, PacketError) as error:
             log.debug("a script's connection ended: %r", error)
         finally:
@@ -60,18 +62,31 @@ class Relay:
             self._on_output(output, self)
         return output
 
-    async def _open(self, broker: Broker) -> Stream:
-        host, port, context = broker
+    async def _open(self, broker: Broker, first: Output) -> tuple[Stream, bytes]:
+        """A connection and what has come by it: the first address that accepts the client, else the last one."""
+        host, port, _context = broker
+        failures: dict[str, str] = {}
+        why = f"{host}:{port}"
         try:
             async with asyncio.timeout(_CONNECT_S):
-                return await asyncio.open_connection(host, port, ssl=context, limit=CHUNK)
+                *others, last = await asyncio.to_thread(addresses_of, host, port)
+            for address in others:
+                try:
+                    return await _accepted(broker, address, first)
+                except (OSError, TimeoutError) as error:
+                    failures[address.text] = str(error) or "no answer"
+            why = f"{host}:{port} at {last.text}" if others else why
+            async with asyncio.timeout(_CONNECT_S):
+                return await _dial(broker, last), b""
         except (OSError, TimeoutError) as error:
-            log.warning("a script cannot reach the robot's broker %s:%d: %s", host, port, error or "no answer")
+            before = f"; {told(failures)}" if failures else ""
+            log.warning("a script cannot reach the robot's broker %s: %s%s", why, error or "no answer", before)
             self._writer.write(connack(_UNAVAILABLE))
             raise
 
-    async def _pass(self, first: Output, broker: Stream) -> None:
-        tasks = [asyncio.create_task(self._up(first, broker[1])), asyncio.create_task(self._down(broker[0]))]
+    async def _pass(self, first: Output, broker: Stream, received: bytes) -> None:
+        down = self._down(broker[0], received)
+        tasks = [asyncio.create_task(self._up(first, broker[1])), asyncio.create_task(down)]
         try:
             await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         finally:
@@ -95,10 +110,45 @@ class Relay:
                 return
             output = self._packets.feed(data)
 
-    async def _down(self, broker: asyncio.StreamReader) -> None:
-        while data := await broker.read(CHUNK):
+    async def _down(self, broker: asyncio.StreamReader, data: bytes) -> None:
+        while data := data or await broker.read(CHUNK):
             self._writer.write(self._answers.feed(data))
             await self._writer.drain()
+            data = b""
+
+
+async def _dial(broker: Broker, address: Address) -> Stream:
+    host, _port, context = broker
+    sock = socket.socket(address.family, socket.SOCK_STREAM)
+    try:
+        sock.setblocking(False)
+        await asyncio.get_running_loop().sock_connect(sock, address.place)
+        name = None if context is None else host
+        return await asyncio.open_connection(sock=sock, ssl=context, server_hostname=name, limit=CHUNK)
+    except BaseException:
+        sock.close()
+        raise
+
+
+async def _accepted(broker: Broker, address: Address, first: Output) -> tuple[Stream, bytes]:
+    """Log in there with what the client has sent, its CONNECT at least. Raises OSError, TimeoutError."""
+    async with asyncio.timeout(2 * CONNECT_TIMEOUT_S):  # TCP and TLS
+        reader, writer = await _dial(broker, address)
+    received = b""
+    try:
+        async with asyncio.timeout(CONNECT_TIMEOUT_S):
+            writer.write(first.upstream)
+            while (refused := refusal(received)) is None:
+                if not (data := await reader.read(CHUNK)):
+                    raise ConnectionError("it hung up")
+                received += data
+        if refused:
+            raise ConnectionError(f"it refused the connection: {refused}")
+    except BaseException:
+        writer.transport.abort()
+        raise
+    first.upstream = bytearray()
+    return (reader, writer), received
 
 
 async def _close(writer: asyncio.StreamWriter) -> None:

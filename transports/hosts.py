@@ -1,0 +1,103 @@
+"""Every address of a broker's name gets its turn, whatever way the one before failed."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+CONNECT_TIMEOUT_S = 2.0  # for each of TCP and TLS, and again for the broker's CONNACK (T12)
+STEADY_S = 30.0  # an address that held a connection for so long is tried once more before the others
+_LONGEST = 8  # addresses whose failures are told one by one
+
+
+class Address(NamedTuple):
+    """Where a socket connects to, as `socket.getaddrinfo` returns it."""
+
+    family: int
+    place: tuple[Any, ...]
+
+    @property
+    def text(self) -> str:
+        return str(self.place[0])
+
+
+def addresses_of(host: str, port: int) -> list[Address]:
+    """All addresses of ``host``, each once. Raises OSError; ValueError for a host that cannot be a name."""
+    found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
+    return list(dict.fromkeys(Address(family, place) for family, _type, _protocol, _name, place in found))
+
+
+def dial(address: Address, timeout: float | None = None) -> socket.socket:
+    """A TCP connection; the same ``timeout`` goes on for what follows, TLS. Raises OSError."""
+    sock = socket.socket(address.family, socket.SOCK_STREAM)
+    try:
+        sock.settimeout(CONNECT_TIMEOUT_S if timeout is None else timeout)
+        sock.connect(address.place)
+    except BaseException:
+        sock.close()
+        raise
+    return sock
+
+
+def told(failures: dict[str, str]) -> str:
+    """One line of bounded length that names addresses and why each failed."""
+    some = [f"{address} {why}" for address, why in list(failures.items())[:_LONGEST]]
+    more = len(failures) - len(some)
+    return "; ".join(some) + (f"; and {more} more" if more else "")
+
+
+class Turns:
+    """Whose turn it is among the addresses of one host. They are resolved anew in each round.
+
+    A round ends when each address has failed once; only then there is a pause.
+    """
+
+    def __init__(self, host: str, port: int, resolve: Callable[[str, int], list[Address]] = addresses_of) -> None:
+        self._host, self._port, self._resolve = host, port, resolve
+        self._left: list[Address] = []  # of this round; the first one has its turn
+        self._steady: Address | None = None  # has lost a connection that held for long, and begins the next round
+        self._is_first = True  # round
+        self._failures: dict[str, str] = {}  # why each address failed last, without a success since
+        self.several = False  # the host had more than one address in this round
+
+    def address(self) -> Address:
+        """The address whose turn it is; may wait for a resolver. Raises OSError, ValueError."""
+        if not self._left:
+            self.several = False
+            found = self._resolve(self._host, self._port)
+            if not found:
+                raise OSError("it has no address")
+            self._left = sorted(found, key=lambda one: one != self._steady)
+            self._steady, self.several = None, len(found) > 1
+            self._failures = {one.text: self._failures[one.text] for one in found if one.text in self._failures}
+        return self._left[0]
+
+    @property
+    def untried(self) -> bool:
+        """Whether one of several addresses has not had its first turn yet."""
+        return self._is_first and self.several
+
+    def succeeded(self) -> str:
+        """The address has a connection; returns which ones failed before it, and how."""
+        failed, self._failures, self._is_first = told(self._failures), {}, False
+        return failed
+
+    def failed(self, why: str, held_s: float = 0.0) -> str:
+        """The connection at the address was not made, or is lost after ``held_s``.
+
+        Returns how each address failed. The next one has its turn; `is_over` says whether that begins a new round.
+        """
+        if not self._left:
+            return why  # the name was not resolved
+        address = self._left.pop(0)
+        self._failures.pop(address.text, None)
+        self._failures[address.text] = why
+        if held_s >= STEADY_S:
+            self._steady, self._left = address, []
+        self._is_first &= bool(self._left)
+        return told(self._failures)
+
+    @property
+    def is_over(self) -> bool:
+        return not self._left
