@@ -68,7 +68,11 @@ class RobotRecorder(Service):
             return
         if bridge.remote is not None or not bridge.remote_mqtt.host:
             raise ConfigError("services.recorder.remote: needs services.mqtt_bridge.remote_mqtt.host")
-        yield "remote", "mqtt", mqtt_settings(bridge.remote_mqtt, reconnect_max_s=REMOTE_RECONNECT_S)
+        yield (
+            "remote",
+            "mqtt",
+            mqtt_settings(bridge.remote_mqtt, reconnect_max_s=REMOTE_RECONNECT_S, program="recorder"),
+        )
 
 
 if __name__ == "__main__":

@@ -101,7 +101,9 @@ class Broker:
         port: int | None = None,
         persistence: bool = False,
         autosave: bool = True,
+        host: str = "127.0.0.1",
     ) -> None:
+        self.host = host
         self.port = port or free_port()
         lines = list(options)
         self.store = folder / f"store-{self.port}"
@@ -114,7 +116,7 @@ class Broker:
                 f"autosave_on_changes {str(autosave).lower()}",
                 f"autosave_interval {int(autosave)}",
             ]
-        self._command = mosquitto_command(self.port, folder / f"mosquitto-{self.port}", lines)
+        self._command = mosquitto_command(self.port, folder / f"mosquitto-{self.port}", lines, host)
         self._process: subprocess.Popen[bytes] | None = None
         self.start()
 
@@ -170,7 +172,7 @@ class Broker:
     def _answers(self) -> bool:
         assert self._process is not None
         assert self._process.poll() is None, "mosquitto exited at once"
-        return listening(self.port)
+        return listening(self.port, self.host)
 
 
 def refusal(rules: Path, filters: Sequence[str]) -> list[str]:

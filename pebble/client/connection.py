@@ -33,6 +33,7 @@ class Target:
     remote: bool = False
     password_file: Path | None = None
     ca_cert: Path | None = None
+    program: str = "tool"  # the end of its client id, where the config sets one: two with one id end each other
 
 
 def target_of(robot: str | None, options: Target) -> Target:
@@ -77,7 +78,7 @@ def _of_config(config: Config, target: Target) -> tuple[str, Any, Names, str]:
     base = config.base if target.robot is None else base_of(target.robot)
     names = Names(base, Addresses(config) if base == config.base else None)
     if target.remote:
-        return *_remote(config), names, f"the remote side of {config.base}"
+        return *_remote(config, target.program), names, f"the remote side of {config.base}"
     if config.transport.kind == "zenoh":
         where = f"the hub of {config.base} in {config.run_dir()} (is the robot up?)"
         return "zenoh", zenoh_settings(config, client=True), names, where
@@ -87,13 +88,13 @@ def _of_config(config: Config, target: Target) -> tuple[str, Any, Names, str]:
     return config.transport.kind, local_settings(config), names, where
 
 
-def _remote(config: Config) -> tuple[str, Any]:
+def _remote(config: Config, program: str) -> tuple[str, Any]:
     bridge = config.services.mqtt_bridge
     if bridge.remote is not None and bridge.remote.kind != "mqtt":
         raise ConfigError("services.mqtt_bridge.remote: --remote uses MQTT only, and this robot's uplink does not")
     if not bridge.remote_mqtt.host:
         raise ConfigError("services.mqtt_bridge.remote_mqtt.host: is not set, so there is no remote side")
-    return "mqtt", mqtt_settings(bridge.remote_mqtt, reconnect_max_s=REMOTE_RECONNECT_S)
+    return "mqtt", mqtt_settings(bridge.remote_mqtt, reconnect_max_s=REMOTE_RECONNECT_S, program=program)
 
 
 def password(file: Path | None) -> str | None:

@@ -71,7 +71,8 @@ def drive(
 
     check_terminal()
     target = target_of(
-        robot, Target(config=config, url=url, remote=remote, password_file=password_file, ca_cert=ca_cert)
+        robot,
+        Target(config=config, url=url, remote=remote, password_file=password_file, ca_cert=ca_cert, program="drive"),
     )
     with connected(target) as (transport, names):
         device = f"terminal on {socket.gethostname()}"

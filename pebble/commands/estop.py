@@ -79,7 +79,8 @@ def estop(
     if robot is None and not all_ and verb != "status":
         raise typer.BadParameter("name the robot" if verb else "nothing was stopped: name the robot, or add --all")
     target = target_of(
-        robot, Target(config=config, url=url, remote=remote, password_file=password_file, ca_cert=ca_cert)
+        robot,
+        Target(config=config, url=url, remote=remote, password_file=password_file, ca_cert=ca_cert, program="estop"),
     )
     if verb == "reset":
         return _reset(target)

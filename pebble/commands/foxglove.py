@@ -54,7 +54,13 @@ def serve(
     from pebble.foxglove.run import run
 
     target = Target(
-        config=config, url=url, robot=robot, remote=config is not None, password_file=password_file, ca_cert=ca_cert
+        config=config,
+        url=url,
+        robot=robot,
+        remote=config is not None,
+        password_file=password_file,
+        ca_cert=ca_cert,
+        program="foxglove",
     )
     _print_end(run(_settings(target, host, port), _print_ready))
     return 0

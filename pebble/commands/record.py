@@ -82,7 +82,9 @@ def record(
         level=level,
         media=media,
     )
-    target = Target(config=config, url=url, remote=remote, password_file=password_file, ca_cert=ca_cert)
+    target = Target(
+        config=config, url=url, remote=remote, password_file=password_file, ca_cert=ca_cert, program="record"
+    )
     kind, transport, names, where = resolve(target)
     chosen = tuple(filters) if filters else (f"{names.base}/#",) if config is not None else EVERYTHING
     for filter_ in chosen:

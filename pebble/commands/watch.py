@@ -130,7 +130,8 @@ def _target(robot: str, url: str | None, password_file: Path | None, ca_cert: Pa
     if not Path(robot).is_file():
         raise PebbleError(f"{robot} is not a config file: name one, or add --url with the broker of the robot {robot}")
     bridge = load(robot).services.mqtt_bridge
-    return Target(config=Path(robot), remote=bool(bridge.remote_mqtt.host) or bridge.remote is not None)
+    remote = bool(bridge.remote_mqtt.host) or bridge.remote is not None
+    return Target(config=Path(robot), remote=remote, program="watch")
 
 
 def register(app: typer.Typer) -> None:

@@ -4,7 +4,7 @@ from typing import Annotated, Any, Literal
 
 from msgspec import Meta, field
 
-from pebble.config.types import CommonName, Endpoint, File, Password, Port, Section, Silence, doc
+from pebble.config.types import ClientId, CommonName, Endpoint, File, Password, Port, Section, Silence, doc
 
 
 class Tls(Section, frozen=True, kw_only=True):
@@ -46,6 +46,13 @@ class RemoteMqtt(Mqtt, frozen=True, kw_only=True):
     """The remote broker, which operators connect to."""
 
     host: Annotated[str, doc("Name or address of the broker; required when the bridge is enabled.")] = ""
+    client_id: Annotated[
+        ClientId | None,
+        doc(
+            "For a broker that admits only client ids it knows: that of the bridge. Other programs have one that "
+            "begins with it. Unset: ids that no other client can guess, and so none can take over."
+        ),
+    ] = None
 
 
 class ZenohSection(Section, frozen=True, kw_only=True):

@@ -26,6 +26,13 @@ Endpoint = Annotated[
     str, Meta(pattern=r"^[a-z0-9-]+/.+", extra={"expected": 'a Zenoh endpoint such as "tls/192.168.1.7:7447"'})
 ]
 CommonName = Annotated[str, Meta(min_length=1, max_length=64, extra={"expected": "the name in a certificate"})]
+ClientId = Annotated[
+    str,
+    Meta(
+        pattern=r"^[!-~]{1,128}$(?!\n)",
+        extra={"expected": "the id that the broker knows: 1 to 128 letters, digits and signs, without blanks"},
+    ),
+]
 LogLevel = Literal["DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL"]
 Port = Annotated[int, Meta(ge=1, le=65535)]
 Qos = Annotated[int, Meta(ge=0, le=1, extra={"expected": "0 or 1"})]

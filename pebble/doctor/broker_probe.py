@@ -2,26 +2,31 @@
 
 from __future__ import annotations
 
-import os
 import socket
 import ssl
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from pebble.errors import TransportError
+from pebble.transports.hosts import Address, addresses_of, dial, told
+from pebble.transports.mqtt import client_ids
 from pebble.transports.settings import MqttSettings
 from pebble.transports.tls import make_context
 
 _CLEAN, _PASSWORD, _USER = 0x02, 0x40, 0x80
 _KEEPALIVE_S = 10
 _CONNACK, _DISCONNECT = 0x20, b"\xe0\x00"
+REFUSED_ID = 2
 #: Return codes of CONNACK (MQTT 3.1.1, table 3.1) that concern the login.
 REFUSED_LOGINS = {4: "user name or password is wrong", 5: "not authorised"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProbeResult:
-    """The result of one login. ``code`` is CONNACK's (0: accepted), None without one; ``problem`` is the reason."""
+    """The result of one login. ``code`` is CONNACK's (0: accepted), None without one; ``problem`` is the reason.
+
+    With a code, ``problem`` names the addresses of the host that were tried before and failed.
+    """
 
     code: int | None = None
     connect_ms: float = 0.0  # TCP alone
@@ -30,10 +35,32 @@ class ProbeResult:
 
 
 def probe(settings: MqttSettings, *, login: bool, timeout_s: float = 3.0) -> ProbeResult:
-    """Connect and disconnect, with the settings' user and password or (``login=False``) anonymously."""
+    """Connect and disconnect, with the settings' user and password or (``login=False``) anonymously.
+
+    Where the host has several addresses, the first one counts that accepts the login, else the last one that answers.
+    """
+    try:
+        addresses = addresses_of(settings.host, settings.port)
+    except UnicodeError:  # a label that is too long as it travels
+        return ProbeResult(problem=f"{settings.host} is no name of a host")
+    except OSError as error:
+        return ProbeResult(problem=error.strerror or str(error))
+    answered, failures = ProbeResult(), {}
+    for address in addresses:
+        found = _probe(settings, address, login=login, timeout_s=timeout_s)
+        if found.code is None:
+            failures[f"{address.text}:"] = found.problem
+        else:
+            answered = found
+        if found.code == 0 or len(addresses) == 1:
+            break
+    return found if len(addresses) == 1 else replace(answered, problem=told(failures))
+
+
+def _probe(settings: MqttSettings, address: Address, *, login: bool, timeout_s: float) -> ProbeResult:
     before = time.monotonic()
     try:
-        with socket.create_connection((settings.host, settings.port), timeout_s) as plain:
+        with dial(address, timeout_s) as plain:
             connect_ms = (time.monotonic() - before) * 1000
             if settings.tls is None:
                 return ProbeResult(code=_log_in(plain, settings, login), connect_ms=connect_ms)
@@ -42,8 +69,6 @@ def probe(settings: MqttSettings, *, login: bool, timeout_s: float = 3.0) -> Pro
                 return ProbeResult(code=code, connect_ms=connect_ms, expires=expires)
     except TransportError as error:
         return ProbeResult(problem=str(error))
-    except UnicodeError:  # a label that is too long as it travels
-        return ProbeResult(problem=f"{settings.host} is no name of a host")
     except OSError as error:  # TLS failures are some of these
         return ProbeResult(problem=getattr(error, "reason", None) or error.strerror or str(error))
 
@@ -64,7 +89,7 @@ def _log_in(connection: socket.socket, settings: MqttSettings, login: bool) -> i
 
 def connect_packet(settings: MqttSettings, *, login: bool) -> bytes:
     """A CONNECT of MQTT 3.1.1 (section 3.1) with a clean session and no will."""
-    flags, fields = _CLEAN, [f"pebble-doctor-{os.getpid()}"]
+    flags, fields = _CLEAN, [settings.client_id or client_ids.unique("pebble-doctor")]
     if login and settings.username is not None:
         flags |= _USER
         fields.append(settings.username)

@@ -19,7 +19,7 @@ from pathlib import Path
 
 from pebble.config import Config, Mqtt
 from pebble.doctor import Finding, Level
-from pebble.doctor.broker_probe import REFUSED_LOGINS, ProbeResult, probe
+from pebble.doctor.broker_probe import REFUSED_ID, REFUSED_LOGINS, ProbeResult, probe
 from pebble.doctor.loudspeaker import loudspeaker
 from pebble.doctor.media import media
 from pebble.doctor.reachable import beyond_loopback, own_addresses
@@ -64,7 +64,7 @@ def _robot(config: Config) -> Iterator[Finding]:
     yield from operator_page(config)
     yield from recorder(config)
     for name, mqtt in _brokers(config):
-        settings = mqtt_settings(mqtt, reconnect_max_s=REMOTE_RECONNECT_S)
+        settings = mqtt_settings(mqtt, reconnect_max_s=REMOTE_RECONNECT_S, program="doctor")
         yield from broker(name, settings)
         if is_loopback(mqtt.host):
             yield from beyond_loopback(name, settings, own_addresses())
@@ -299,6 +299,13 @@ def broker(
         yield Finding(Level.FAIL, what, f"cannot be reached: {own.problem}", start)
         return
     yield _login(what, settings, own)
+    if own.problem and not is_loopback(settings.host):
+        yield Finding(
+            Level.WARN,
+            what,
+            f"has addresses that do not answer: {own.problem}",
+            f"correct the addresses of {settings.host} in your DNS, or start the brokers there",
+        )
     without_login = own if settings.username is None else probe_login(settings, login=False)
     yield _anonymous_logins(what, settings, without_login)
     yield _encryption(what, settings, own, time.time() if now is None else now)
@@ -307,6 +314,9 @@ def broker(
 def _login(what: str, settings: MqttSettings, answer: ProbeResult) -> Finding:
     if answer.code == 0:
         return Finding(Level.OK, what, f"answers, connected in {answer.connect_ms:.1f} ms")
+    if answer.code == REFUSED_ID:
+        fix = "let it admit any client id, or set remote_mqtt.client_id to one that it knows"
+        return Finding(Level.FAIL, what, "refuses the client id", fix)
     why = REFUSED_LOGINS.get(answer.code or 0, f"code {answer.code}")
     if settings.username is None:
         return Finding(Level.FAIL, what, f"refuses the login: {why}", "set username and password_file of this broker")

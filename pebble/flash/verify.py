@@ -27,7 +27,7 @@ def at_broker(config: Config, timeout_s: float = HEARTBEAT_S) -> str:
     broker = config.local_mqtt
     received: queue.Queue[Message] = queue.Queue()
     settings = mqtt_settings(broker, reconnect_max_s=LOCAL_RECONNECT_S)
-    transport = create("mqtt", f"{config.base}-flash", settings)
+    transport = create("mqtt", f"{config.base}/flash", settings)
     with closing(transport.open(BROKER_S)):
         if transport.state is not State.CONNECTED:
             why = transport.problem or f"no answer within {BROKER_S:g} s"

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 from typing import Any
 
-from pebble.config import Config, Mqtt, RemoteConnection, Tls
+from pebble.config import Config, Mqtt, RemoteConnection, RemoteMqtt, Tls
 from pebble.contract import OUTGOING
 from pebble.errors import ConfigError, TransportError
 from pebble.transports import Message, MqttSettings, TlsSettings, Transport, ZenohSettings, check_kind, create
 from pebble.transports.socket_paths import FRAMES_SOCKET, PEER_SOCKET, fits_socket
 
 LOCAL_RECONNECT_S, REMOTE_RECONNECT_S = 0.5, 2.0
+_BRIDGE = "remote-bridge"
 
 
 def local_transport(config: Config, name: str, *, will: Message | None = None, as_published: bool = False) -> Transport:
     """The local transport of the process called ``name``, not yet opened."""
-    return create(config.transport.kind, f"{config.base}-{name}", local_settings(config, as_published), will=will)
+    kind = config.transport.kind
+    return create(kind, _name(config, kind, name), local_settings(config, as_published), will=will)
 
 
 def check_connections(config: Config) -> None:
@@ -59,17 +61,23 @@ def local_settings(config: Config, as_published: bool = False) -> Any:
 def remote_transport(config: Config, name: str, *, will: Message | None = None) -> Transport:
     """The bridge's connection to operators, not yet opened: ``remote`` where it is set, else ``remote_mqtt``."""
     bridge = config.services.mqtt_bridge
-    client_id = f"{config.base}-{name}"
     if bridge.remote is None:
-        settings = mqtt_settings(bridge.remote_mqtt, as_published=True, reconnect_max_s=REMOTE_RECONNECT_S)
-        return create("mqtt", client_id, settings, will=will)
-    return create(bridge.remote.kind, client_id, _remote_settings(config, bridge.remote), will=will)
+        remote, program = bridge.remote_mqtt, "" if name == _BRIDGE else name
+        settings = mqtt_settings(remote, as_published=True, reconnect_max_s=REMOTE_RECONNECT_S, program=program)
+        return create("mqtt", _name(config, "mqtt", name), settings, will=will)
+    kind = bridge.remote.kind
+    return create(kind, _name(config, kind, name), _remote_settings(config, bridge.remote), will=will)
 
 
 def mirror_transport(config: Config, mirror: Mqtt, name: str) -> Transport:
     """The mirror's connection to the broker on the robot, not yet opened."""
     settings = mqtt_settings(mirror, as_published=True, reconnect_max_s=LOCAL_RECONNECT_S)
-    return create("mqtt", f"{config.base}-{name}", settings)
+    return create("mqtt", _name(config, "mqtt", name), settings)
+
+
+def _name(config: Config, kind: str, name: str) -> str:
+    """What the transport of the robot's program ``name`` is called in logs, and of MQTT in client ids."""
+    return f"{config.base}/{name.replace('-', '_')}" if kind == "mqtt" else f"{config.base}-{name}"
 
 
 def _remote_settings(config: Config, remote: RemoteConnection) -> Any:
@@ -105,8 +113,14 @@ def hub_settings(config: Config) -> ZenohSettings:
     )
 
 
-def mqtt_settings(mqtt: Mqtt, *, as_published: bool = False, reconnect_max_s: float) -> MqttSettings:
-    """One broker's section of a config as connection settings."""
+def mqtt_settings(
+    mqtt: Mqtt, *, as_published: bool = False, reconnect_max_s: float, program: str = "tool"
+) -> MqttSettings:
+    """One broker's section of a config as connection settings.
+
+    If it sets a client id that is the bridge's (``program=""``), and others have one of their own that begins with it.
+    """
+    client_id = mqtt.client_id if isinstance(mqtt, RemoteMqtt) else None
     return MqttSettings(
         host=mqtt.host,
         port=mqtt.port,
@@ -114,6 +128,7 @@ def mqtt_settings(mqtt: Mqtt, *, as_published: bool = False, reconnect_max_s: fl
         username=mqtt.username,
         password=mqtt.password,
         tls=tls_settings(mqtt.tls),
+        client_id=f"{client_id}-{program}" if client_id and program else client_id,
         protocol=mqtt.protocol,
         as_published=as_published,
         reconnect_max_s=reconnect_max_s,

@@ -28,7 +28,7 @@ def settings_of(config: Config) -> WebSettings:
     for key in ("certificate", "key", "ca"):
         _check(f"web_interface.tls.{key}", getattr(web.tls, key))
     return WebSettings(
-        broker=mqtt_settings(_broker(config), reconnect_max_s=REMOTE_RECONNECT_S),
+        broker=mqtt_settings(_broker(config), reconnect_max_s=REMOTE_RECONNECT_S, program="web"),
         host=web.host,
         port=web.port,
         names=web.names,

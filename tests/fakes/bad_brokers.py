@@ -12,8 +12,6 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
-from tests.support import ROOT
-
 _RESET = struct.pack("ii", 1, 0)
 _GRANTED = b"\x20\2\0\0"
 
@@ -57,12 +55,15 @@ def _dripping(connection: socket.socket) -> None:
     mute(connection)
 
 
-def _wrong_certificate(connection: socket.socket) -> None:
-    """It names another host than the one that was asked for."""
+def showing(certificate: Path) -> Behaviour:
+    """Speaks TLS with the ``server.pem`` and ``server.key`` in this folder, and says nothing."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    folder = ROOT / "tests" / "data" / "tls"
-    context.load_cert_chain(folder / "server.crt", folder / "server.key")
-    mute(context.wrap_socket(connection, server_side=True))
+    context.load_cert_chain(certificate / "server.pem", certificate / "server.key")
+
+    def serve(connection: socket.socket) -> None:
+        mute(context.wrap_socket(connection, server_side=True))
+
+    return serve
 
 
 #: None: nothing listens there.

@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import socket
+import subprocess
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import replace
 from itertools import permutations
+from pathlib import Path
+from threading import Event
 from typing import Any
 
 import pytest
 
 from pebble.transports import MqttSettings, QoS, State, Transport, create
-from tests.fakes.bad_brokers import BEHAVIOURS, mute, serving
-from tests.support import ROOT, Broker
+from pebble.transports.hosts import STEADY_S, Address, Turns
+from pebble.transports.settings import TlsSettings
+from tests.fakes.bad_brokers import BEHAVIOURS, mute, serving, showing
+from tests.support import ROOT, Broker, free_port, until
 
 NAME = "fleet.test"
 GOOD, BAD, WORSE = "127.0.0.1", "127.0.0.2", "127.0.0.3"
@@ -21,6 +27,17 @@ GOOD, BAD, WORSE = "127.0.0.1", "127.0.0.2", "127.0.0.3"
 UNREACHABLE = {"no route": "2001:db8::1", "nobody's": "240.0.0.1", "a network": "0.0.0.0"}
 CERTS = ROOT / "tests" / "data" / "tls"
 Names = Callable[..., None]
+
+
+def certificate_of(host: str, folder: Path) -> Path:
+    """A folder with ``server.pem`` and ``server.key`` of this host."""
+    folder = folder / host
+    folder.mkdir()
+    command = ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes"]
+    names = ["-subj", f"/CN={host}", "-addext", f"subjectAltName=DNS:{host}"]
+    files = ["-keyout", folder / "server.key", "-out", folder / "server.pem"]
+    subprocess.run([*command, *names, *files], check=True, capture_output=True)
+    return folder
 
 
 @pytest.fixture(scope="module")
@@ -41,9 +58,9 @@ def names(monkeypatch: pytest.MonkeyPatch) -> Names:
     """Gives the name these addresses from now on."""
     real = socket.getaddrinfo
 
-    def give(*addresses: str) -> None:
+    def give(*addresses: str, name: str = NAME) -> None:
         def resolve(host: Any, *more: Any, **options: Any) -> list[Any]:
-            return [info for one in (addresses if host == NAME else [host]) for info in real(one, *more, **options)]
+            return [info for one in (addresses if host == name else [host]) for info in real(one, *more, **options)]
 
         monkeypatch.setattr(socket, "getaddrinfo", resolve)
 
@@ -73,7 +90,7 @@ def works(transport: Transport) -> bool:
     return transport.publish("addresses/works", b"1", qos=QoS.DELIVERED)
 
 
-@pytest.mark.parametrize("order", permutations((GOOD, BAD, WORSE)), ids=" ".join)
+@pytest.mark.parametrize("order", list(permutations((GOOD, BAD, WORSE))), ids=" ".join)
 def test_a_living_address_is_found_among_dead_ones_in_any_order(
     broker: Broker, names: Names, made: Callable[[MqttSettings], Transport], order: tuple[str, ...]
 ) -> None:
@@ -95,3 +112,110 @@ def test_whatever_way_the_first_one_fails(
         assert transport.state is State.CONNECTED, transport.problem
         assert transport.as_published is as_published
         assert works(transport)
+
+
+@pytest.mark.parametrize("failing", ["stalled handshake", "wrong name", "closing", "no TLS"])
+@pytest.mark.parametrize("client", ["ours", "paho"])
+def test_tls_checks_the_name_at_every_address(
+    tmp_path: Path, names: Names, monkeypatch: pytest.MonkeyPatch, failing: str, client: str
+) -> None:
+    """The broker's certificate names localhost, whose addresses are these."""
+    monkeypatch.setenv("PEBBLE_MQTT_CLIENT", client)
+    wrong = certificate_of("elsewhere", tmp_path)
+    behaviour = {"stalled handshake": mute, "wrong name": showing(wrong), "no TLS": BEHAVIOURS["no MQTT"]}
+    files = [f"cafile {CERTS}/ca.crt", f"certfile {CERTS}/server.crt", f"keyfile {CERTS}/server.key"]
+    secured = Broker(tmp_path, *files)
+    names(BAD, GOOD, name="localhost")
+    monkeypatch.setattr("pebble.transports.hosts.CONNECT_TIMEOUT_S", 1.0)
+    trusted = tmp_path / "both.crt"
+    trusted.write_text((CERTS / "ca.crt").read_text() + (wrong / "server.pem").read_text())
+    settings = MqttSettings(host="localhost", port=secured.port, tls=TlsSettings(ca_cert=trusted))
+    failing_server = serving(BAD, secured.port, behaviour.get(failing, BEHAVIOURS["closing"]))
+    with failing_server, create("mqtt", "tool", settings) as transport:
+        assert transport.state is State.CONNECTED, transport.problem
+        assert works(transport)
+    secured.stop()
+
+
+def test_when_all_fail_one_line_names_each_address_and_its_reason(
+    names: Names, caplog: pytest.LogCaptureFixture
+) -> None:
+    port, many = free_port(), [f"127.0.1.{number}" for number in range(1, 13)]
+    names(BAD, WORSE, BAD, *many)
+    with serving(BAD, port, mute), serving(WORSE, port, BEHAVIOURS["server unavailable"]):
+        transport = create("mqtt", "tool", MqttSettings(host=NAME, port=port, reconnect_max_s=20)).open(0.01)
+        transport.close()
+    assert transport.problem.startswith(
+        f"broker {NAME}:{port}: {BAD} accepts connections but does not speak MQTT in time; "
+        f"{WORSE} refused us: server unavailable; 127.0.1.1 cannot be reached: [Errno 111] Connection refused; "
+    )
+    assert transport.problem.endswith("; and 6 more")
+    assert [record.getMessage() for record in caplog.records] == [f"tool: {transport.problem}"]
+
+
+def test_which_addresses_failed_is_told_once_another_works(
+    broker: Broker, names: Names, caplog: pytest.LogCaptureFixture
+) -> None:
+    names(BAD, GOOD)
+    caplog.set_level("INFO")
+    with create("mqtt", "tool", MqttSettings(host=NAME, port=broker.port)) as transport:
+        assert transport.problem == ""
+    why = f"connected to broker {NAME}:{broker.port} at {GOOD}; before it {BAD} cannot be reached"
+    assert [record.getMessage()[: len(why) + 6] for record in caplog.records] == [f"tool: {why}"]
+
+
+def test_a_connection_that_is_lost_is_made_at_another_address(tmp_path: Path, broker: Broker, names: Names) -> None:
+    first = Broker(tmp_path, port=broker.port, host=BAD)
+    names(BAD, GOOD)
+    with create("mqtt", "tool", MqttSettings(host=NAME, port=broker.port, silence_s=0.5)) as transport:
+        first.freeze()
+        assert until(lambda: transport.counters["connected"] == 2)
+        assert works(transport)
+        first.thaw()
+    first.stop()
+
+
+def test_close_does_not_wait_for_a_resolver(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked, go_on = Event(), Event()
+
+    def hang(*_: Any, **__: Any) -> None:
+        asked.set()
+        go_on.wait(10)
+        raise OSError("no answer")
+
+    monkeypatch.setattr(socket, "getaddrinfo", hang)
+    transport = create("mqtt", "tool", MqttSettings(host=NAME)).open(0.0)
+    assert asked.wait(5)
+    began = time.monotonic()
+    transport.close()
+    assert time.monotonic() - began < 1.0
+    go_on.set()
+
+
+A, B, C = (Address(socket.AF_INET, (f"10.0.0.{number}", 1883)) for number in (1, 2, 3))
+
+
+@pytest.mark.parametrize(
+    ("answers", "held", "tried"),
+    [
+        ([[A]], [0, 0, 0], [A, A, A]),
+        ([[A, B, C]], [0, 0, 0, 0], [A, B, C, A]),
+        ([[A, B], [B, C]], [0, 0, 0, 0], [A, B, B, C]),  # resolved anew with each round
+        ([[A, B, C]], [0, STEADY_S, 0, 0, 0], [A, B, B, A, C]),  # it held: once more, then the others
+        ([[A, B, C]], [STEADY_S - 1, 0, 0], [A, B, C]),  # not for long: the next one
+        ([[A, B, C], [A, C]], [0, STEADY_S, 0, 0], [A, B, A, C]),  # the name has lost it
+    ],
+)
+def test_whose_turn_it_is(answers: list[list[Address]], held: list[float], tried: list[Address]) -> None:
+    rounds = iter([*answers, *answers[-1:] * 9])
+    turns, seen = Turns("b", 1883, lambda _host, _port: next(rounds)), []
+    for seconds in held:
+        seen.append(turns.address())
+        assert turns.several is (len(answers[0]) > 1)
+        turns.failed("x", seconds)
+    assert seen == tried
+
+
+def test_a_name_without_addresses_is_a_problem() -> None:
+    with pytest.raises(OSError, match="no address"):
+        Turns("b", 1883, lambda _host, _port: []).address()

@@ -167,6 +167,7 @@ class Connection:
         self._accepted = False
         self._refusal: Refused | None = None
         self._disconnect_reason = ""
+        self._taken_over = True  # may be: MQTT 3.1.1 has no words for it
         self._wake_read, self._wake_write = socket.socketpair()
         self._wake_read.setblocking(False)
         self._wake_write.setblocking(False)
@@ -360,7 +361,10 @@ class Connection:
 
     @property
     def _closed(self) -> str:
-        return self._disconnect_reason or f"{self.where} closed the connection"
+        why, id_ = self._disconnect_reason or f"{self.where} closed the connection", self._settings.client_id
+        if id_ is not None and self._accepted and self._taken_over:
+            why += f' (does another client use the client id "{id_}"? a broker lets in only the newest)'
+        return why
 
     def _write(self) -> None:
         self._client.write()
@@ -533,6 +537,7 @@ class Connection:
 
     def on_disconnect(self, code: int) -> None:
         self._disconnect_reason = f"{self.where} closed the connection: {reasons.words(code)}"
+        self._taken_over = code == reasons.TAKEN_OVER
         self._client.close()
 
     def on_answer(self, mid: int, codes: bytes) -> None:

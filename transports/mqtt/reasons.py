@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 FAILURE: Final = 0x80  # MQTT 5: this code and those above are errors
+TAKEN_OVER: Final = 0x8E
 PROTOCOL_REFUSED: Final = 1  # of 3.1.1: what some brokers answer to bridge mode
 
 _OF_3_1_1 = {1: 0x84, 2: 0x85, 3: 0x88, 4: 0x86, 5: 0x87}  # CONNACK's codes as those of MQTT 5
@@ -24,7 +25,7 @@ _WORDS = {
     0x8B: "server shutting down",
     0x8C: "bad authentication method",
     0x8D: "keep alive timeout",
-    0x8E: "session taken over",
+    TAKEN_OVER: "session taken over",
     0x8F: "topic filter invalid",
     0x90: "topic name invalid",
     0x91: "packet identifier in use",

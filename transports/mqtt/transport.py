@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import random
-import secrets
 import ssl
 import threading
 import time
@@ -15,6 +14,7 @@ from pebble.errors import TransportError
 from pebble.transports import clock
 from pebble.transports.base import Message, Outgoing, QoS, State, Subscription, Transport
 from pebble.transports.hosts import Address, Turns
+from pebble.transports.mqtt import client_ids
 from pebble.transports.mqtt.bridge_mode import Attempt, BridgeMode, Result
 from pebble.transports.mqtt.client import Opening
 from pebble.transports.mqtt.connection import Connection, Lost, Refused, Silent, ignore
@@ -43,9 +43,8 @@ class MqttTransport(Transport):
         if settings.protocol not in ("3.1.1", "5"):
             raise TransportError(f'protocol must be "3.1.1" or "5", not "{settings.protocol}"')
         self.settings = settings
-        # A broker closes the connection of a client when another connects with its id (MQTT-3.1.4-2), so ours cannot be
-        # guessed. It stays the same over reconnects: the broker closes our own half-dead connection at once.
-        self._mqtt_client_id = f"{client_id}-{secrets.token_hex(8)}"
+        # It stays the same over reconnects: the broker closes our own half-dead connection at once.
+        self._mqtt_client_id = client_ids.unique(client_id) if settings.client_id is None else settings.client_id
         self._broker = f"broker {settings.host}:{settings.port}"
         self._turns = Turns(settings.host, settings.port)
         self.as_published = settings.as_published

@@ -1,0 +1,25 @@
+"""Client ids: what names the connection of a program at a broker. Pure but for random digits."""
+
+from __future__ import annotations
+
+import re
+import secrets
+from hashlib import sha256
+
+_OTHER = re.compile(r"[^A-Za-z0-9_-]")  # some brokers refuse dots, blanks or slashes
+
+
+def unique(name: str) -> str:
+    """An id that cannot be guessed and begins with ``name``: ``pebble_robots_goob_remote_bridge-0123456789abcdef``.
+
+    A broker closes the connection of a client when another one connects with its id (MQTT-3.1.4-2).
+    """
+    return f"{_escaped(name)}-{secrets.token_hex(8)}"
+
+
+def _escaped(name: str) -> str:
+    """Of names that differ in more than slashes the results differ, too: by a hash."""
+    text = _OTHER.sub("_", name)
+    if text == name.replace("/", "_"):
+        return text
+    return f"{text}-{sha256(name.encode(errors='surrogatepass')).hexdigest()[:6]}"
