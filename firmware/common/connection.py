@@ -22,6 +22,7 @@ class Connection:
         self.state = "offline"
         self.reason = ""  # of the last loss or failure
         self.losses = 0
+        self.failures = 0  # attempts that failed, and connections lost early: the next address has its turn
         self._since = self._received = self._wait = 0
         self._next_wait = _FIRST_WAIT_MS
 
@@ -61,6 +62,8 @@ class Connection:
     def lost(self, now: int, noise: int) -> None:
         """The connection was lost or not made; ``noise`` 0..255 spreads the next attempts of many robots."""
         self.losses += 1
+        if self.state != "offline" and (self.state != "online" or self._next_wait != _FIRST_WAIT_MS):
+            self.failures += 1
         wait = self._next_wait
         self._next_wait = min(2 * wait, _LONGEST_WAIT_MS)
         self._wait = wait - (wait >> 2) + (wait * noise >> 9)  # 0.75 to 1.25 of it

@@ -12,15 +12,19 @@ def query(host: str, ident: bytes) -> bytes:
     return data + b"\0\0\1\0\1"  # type address, class internet
 
 
-def answer(data: bytes, asked: bytes) -> str | None:
-    """Return the address in ``data``, "" if there is none, None if it is not the answer to the query ``asked``."""
+def answer(data: bytes, asked: bytes, skip: int = 0) -> str | None:
+    """Return the address in ``data``, "" if there is none, None if it is not the answer to the query ``asked``.
+
+    Of several it is the first one with ``skip`` 0. With others it goes by their order as numbers, round and round:
+    servers change the order of their answers, and that of all answers would be needed to try each address.
+    """
     at = len(asked)
     if len(data) < at or data[:2] != asked[:2] or data[12:at].lower() != asked[12:]:
         return None
     if data[2] & 0xF8 != 0x80 or data[4:6] != b"\0\1":  # not a response to a standard query of one question
         return None
-    # Only the first address counts: aliases (CNAME) come before theirs. There is none if there is no such name, or if
-    # the server has trouble
+    # Aliases (CNAME) come before their addresses. There is none if there is no such name, or if the server has trouble
+    found: list[bytes] = []
     for _ in range(data[6] << 8 | data[7]):
         while at < len(data) and 0 < data[at] < 64:  # a name: labels, then 0 or, above 63, where the rest is
             at += data[at] + 1
@@ -30,6 +34,13 @@ def answer(data: bytes, asked: bytes) -> str | None:
         length = data[at + 8] << 8 | data[at + 9]
         # type address, class internet but for mDNS's own bit in it
         if data[at : at + 2] == b"\0\1" and data[at + 2] & 127 == 0 and data[at + 3] == 1 and length == 4:
-            return "%d.%d.%d.%d" % tuple(data[at + 10 : at + 14]) if at + 14 <= len(data) else ""
+            address = data[at + 10 : at + 14]
+            if len(address) == 4 and address not in found:
+                found.append(address)
+            if not skip:
+                break
         at += 10 + length
-    return ""
+    if not found:
+        return ""
+    found.sort()
+    return "%d.%d.%d.%d" % tuple(found[skip % len(found)])

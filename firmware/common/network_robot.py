@@ -109,7 +109,7 @@ class NetworkRobot:
         if due == "drop":
             self._drop(now)
         elif due == "resolve":
-            self._open = query_name(self._host, server, now)  # type: ignore[assignment]
+            self._open = query_name(self._host, server, now, self.connection.failures)  # type: ignore[assignment]
         if self.connection.state == "resolving":
             self._connect(now)
         elif self._open and self._open.ready():

@@ -68,10 +68,11 @@ class Stream:
 class Query:
     """Sends one datagram every second and receives its answers, from its destination only."""
 
-    def __init__(self, host: str, port: int, data: bytes, now: int) -> None:
+    def __init__(self, host: str, port: int, data: bytes, now: int, skip: int = 0) -> None:
         self._host = host
         self._port = port
         self.data = data
+        self._skip = skip
         self._due = now
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.socket.setblocking(False)
@@ -89,12 +90,17 @@ class Query:
 
     def address(self, now: int) -> str | None:
         """Return the address of the queried name; "" if there is none; None: not known yet."""
-        return dns.answer(self.step(now), self.data) if self.data else self._host
+        return dns.answer(self.step(now), self.data, self._skip) if self.data else self._host
 
 
-def query_name(host: str, server: str, now: int) -> Query:
-    """Query the address of ``host`` from ``server``, or by mDNS for names in .local; numbers need no query."""
+def query_name(host: str, server: str, now: int, skip: int = 0) -> Query:
+    """Query the address of ``host`` from ``server``, or by mDNS for names in .local; numbers need no query.
+
+    ``skip``: which one of several, see `dns.answer`.
+    """
     if host.replace(".", "").isdigit():
         return Query(host, 0, b"", now)
     data = dns.query(host, random.getrandbits(16).to_bytes(2, "big"))
-    return Query("224.0.0.251", 5353, data, now) if host.endswith(".local") else Query(server, 53, data, now)
+    if host.endswith(".local"):
+        return Query("224.0.0.251", 5353, data, now, skip)
+    return Query(server, 53, data, now, skip)

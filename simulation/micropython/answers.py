@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import socket
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 NO_SUCH_NAME = 3  # RFC 1035, 4.1.1
 
@@ -13,8 +13,8 @@ _A, _IN, _ANSWER = 1, 1, 0x8180  # a host address; the internet; an answer, recu
 _TTL_S = 60
 
 
-def name_answer(query: bytes, address_of: Callable[[str], str | None]) -> bytes | None:
-    """Answer a DNS query for one IPv4 address; None for any other packet (RFC 1035, 4.1)."""
+def name_answer(query: bytes, addresses_of: Callable[[str], str | Sequence[str] | None]) -> bytes | None:
+    """Answer a DNS query for IPv4 addresses, one or several; None for any other packet (RFC 1035, 4.1)."""
     try:
         name, end = _name(query, 12)
         kind, class_ = struct.unpack_from("!HH", query, end)
@@ -22,12 +22,13 @@ def name_answer(query: bytes, address_of: Callable[[str], str | None]) -> bytes 
         return None
     if len(query) < 12 or query[2] & 0x80 or kind != _A or class_ & 0x7FFF != _IN:  # the top bit: mDNS, by unicast
         return None
-    address = address_of(name)
+    addresses = addresses_of(name)
     question = query[12 : end + 4]
-    if address is None:
+    if addresses is None:
         return query[:2] + struct.pack("!HHHHH", _ANSWER | NO_SUCH_NAME, 1, 0, 0, 0) + question
-    record = struct.pack("!HHHIH", 0xC00C, _A, _IN, _TTL_S, 4) + socket.inet_aton(address)
-    return query[:2] + struct.pack("!HHHHH", _ANSWER, 1, 1, 0, 0) + question + record
+    head = struct.pack("!HHHIH", 0xC00C, _A, _IN, _TTL_S, 4)
+    records = [head + socket.inet_aton(one) for one in ([addresses] if isinstance(addresses, str) else addresses)]
+    return query[:2] + struct.pack("!HHHHH", _ANSWER, 1, len(records), 0, 0) + question + b"".join(records)
 
 
 def time_answer(request: bytes, epoch_s: float) -> bytes | None:

@@ -17,13 +17,14 @@ _DNS: Final[Address] = (ADDRESS[3], 53)
 _MDNS: Final[Address] = ("224.0.0.251", 5353)  # RFC 6762: names that end in .local
 _NTP: Final[Address] = (_TIME_ADDRESS, 123)
 _LONGEST = 1500
+_MOST = 16  # addresses in an answer, which has 512 bytes at most (RFC 1035, 2.3.4)
 
 
 class HostResolver:
     """Resolves names by this machine's resolver without blocking: a later query gets an answer that is not ready."""
 
     def __init__(self) -> None:
-        self._known: dict[str, str | None] = {TIME_HOST: _TIME_ADDRESS}
+        self._known: dict[str, list[str] | None] = {TIME_HOST: [_TIME_ADDRESS]}
         self._asking: set[str] = set()
 
     def known(self, name: str) -> bool:
@@ -35,7 +36,7 @@ class HostResolver:
             threading.Thread(target=self._ask, args=(name,), name=f"look up {name}", daemon=True).start()
         return False
 
-    def address(self, name: str) -> str | None:
+    def addresses(self, name: str) -> list[str] | None:
         found = self._known.get(name)
         if found is None:
             self._known.pop(name, None)  # it may exist at the next query
@@ -44,7 +45,7 @@ class HostResolver:
     def _ask(self, name: str) -> None:
         try:
             found = socket.getaddrinfo(name, None, socket.AF_INET, socket.SOCK_STREAM)
-            self._known[name] = str(found[0][4][0])
+            self._known[name] = list(dict.fromkeys(str(one[4][0]) for one in found))[:_MOST]
         except OSError:
             self._known[name] = None
         self._asking.discard(name)
@@ -86,11 +87,11 @@ class LoopbackServers:
             return None
         unresolved = []
 
-        def address_of(name: str) -> str | None:
+        def addresses_of(name: str) -> list[str] | None:
             unresolved.append(not self._hosts.known(name))
-            return self._hosts.address(name)
+            return self._hosts.addresses(name)
 
-        answer = name_answer(query, address_of)
+        answer = name_answer(query, addresses_of)
         return None if any(unresolved) else answer
 
 

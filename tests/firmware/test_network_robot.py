@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from itertools import permutations
 from types import SimpleNamespace
 from typing import Any
 
@@ -240,6 +241,21 @@ def test_a_certificate_needs_the_date() -> None:
     assert drill.board.rtc == (2023, 11, 14, 1, 22, 13, 20, 0)
     wrapper.set_time(4_200_000_000_000)  # a time server's nonsense
     assert drill.board.rtc[0] == 2023
+
+
+@pytest.mark.parametrize("order", list(permutations(("10.0.0.1", "10.0.0.2", "10.0.0.9"))), ids=" ".join)
+def test_every_address_of_its_broker_has_a_turn_and_the_one_that_worked_comes_again(order: tuple[str, ...]) -> None:
+    drill = Drill("minilamp", 1)
+    drill.network.hosts = {"fleet.test": order, "pool.ntp.org": "10.0.0.3"}  # the broker is the second one
+    settings = {"robot": {"id": "rover"}, "wifi": {"ssid": "home"}, "mqtt": {"host": "fleet.test"}}
+    drill.robot = drill.board.load("minilamp", settings)
+    drill.run(40)
+    assert drill.robot.connection.state == "online"
+    losses = drill.robot.connection.losses
+    assert losses <= 3
+    drill.drop_robot()
+    drill.run(drill.seconds + 5)
+    assert (drill.robot.connection.state, drill.robot.connection.losses) == ("online", losses + 1)
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import socket
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final, Literal
 
@@ -21,7 +21,7 @@ from tests.simulation.virtual_wire import State, Wire
 
 NAME_SERVERS: Final = ((ADDRESS[3], 53), ("224.0.0.251", 5353))
 TIME_PORT = 123
-HOSTS: Final = {"broker.test": "10.0.0.2", "broker.local": "10.0.0.2", "pool.ntp.org": "10.0.0.3"}
+HOSTS: Final[Mapping[str, str]] = {"broker.test": "10.0.0.2", "broker.local": "10.0.0.2", "pool.ntp.org": "10.0.0.3"}
 BROKER: Final = ("10.0.0.2", 1883)
 EPOCH_S = 1_800_000_000.0  # the time server's time at virtual time 0
 
@@ -56,7 +56,7 @@ class VirtualNetwork:
         broker: VirtualBroker,
         *,
         platform: Platform = "esp32",
-        hosts: Mapping[str, str] = HOSTS,
+        hosts: Mapping[str, str | Sequence[str]] = HOSTS,
         uid: bytes = b"",
     ) -> None:
         self.clock, self.broker = clock, broker
@@ -65,7 +65,8 @@ class VirtualNetwork:
         self.arrivals: list[tuple[float, Command]] = []
         self.reads: list[Command] = []
         self.open: list[VirtualTcp | VirtualUdp] = []
-        self._hosts, self._uid = hosts, uid
+        self.hosts: Mapping[str, str | Sequence[str]] = hosts
+        self._uid = uid
         self._wires: list[Wire] = []
 
     def modules(self) -> dict[str, Any]:
@@ -122,7 +123,7 @@ class VirtualNetwork:
         return None
 
     def _names(self, query: bytes) -> bytes | None:
-        known = {} if self.conditions.dns == "no such name" else self._hosts
+        known = {} if self.conditions.dns == "no such name" else self.hosts
         return name_answer(query, known.get)
 
     @staticmethod

@@ -65,6 +65,24 @@ def test_the_loss_of_the_wifi_drops_at_once() -> None:
     assert connection.step(30, True) == "resolve"
 
 
+def test_only_what_fails_passes_the_turn_to_the_next_address() -> None:
+    connection = online()
+    connection.step(5000, True)
+    connection.lost(5000, 0)  # it has worked
+    assert connection.failures == 0
+    connection.step(9000, True)
+    connection.lost(9000, 0)
+    assert connection.failures == 1
+    connection.move("connecting", 20_000)
+    connection.step(20_010, False)
+    connection.lost(20_010, 0)  # without Wi-Fi
+    assert connection.failures == 1
+    connection.step(30_000, True)
+    connection.move("online", 30_000)
+    connection.lost(30_100, 0)  # accepted, and thrown out
+    assert connection.failures == 2
+
+
 def waits(connection: Connection, now: int, noise: int) -> int:
     """How long until the next attempt, after one that failed at ``now``."""
     connection.lost(now, noise)

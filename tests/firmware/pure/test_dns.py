@@ -86,3 +86,17 @@ def test_noise_does_no_harm() -> None:
         found = answer(reply(tail, count=random.getrandbits(16)), ASKED)
         assert found is not None
         assert found == "" or found.count(".") == 3
+
+
+def test_of_several_each_has_its_turn_in_whatever_order_they_come() -> None:
+    one, two, ten = (record(1, bytes((10, 0, 0, last))) for last in (1, 2, 10))
+    assert answer(reply(two, ten, one), ASKED) == "10.0.0.2"  # as it came
+    for records in ((one, two, ten), (ten, one, two), (two, ten, one, two)):
+        found = [answer(reply(*records), ASKED, skip) for skip in range(1, 7)]
+        assert found == ["10.0.0.2", "10.0.0.10", "10.0.0.1"] * 2
+    rotating = ((one, two), (two, one)) * 2
+    assert {answer(reply(*records), ASKED, skip) for skip, records in enumerate(rotating, 1)} == {
+        "10.0.0.1",
+        "10.0.0.2",
+    }
+    assert answer(reply(one, two)[:-1], ASKED, 1) == "10.0.0.1"  # the second one is cut off
