@@ -10,6 +10,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import IO, Any
 
@@ -19,6 +20,7 @@ from pebble.commands import estop
 from pebble.transports import Message, MqttSettings, State, create
 from tests.client.estop_robot import Robot, outgoing
 from tests.commands.command_line import Run, config_file, program
+from tests.fakes.bad_brokers import BEHAVIOURS, resolving, serving
 from tests.support import Broker, until
 from tests.tcp_proxy import TcpProxy
 
@@ -132,6 +134,25 @@ def unread() -> Iterator[IO[str]]:
 
 
 # -- stop
+
+
+def test_a_stop_reaches_a_living_address_behind_dead_ones(robot_on: Make, broker: Broker) -> None:
+    robot, dead = robot_on("mcu"), [f"127.0.0.{last}" for last in (2, 3, 4, 5)]
+    with ExitStack() as opened:
+        for address, how in zip(dead, ("mute", "closing", "server unavailable", "mute"), strict=True):
+            opened.enter_context(serving(address, broker.port, BEHAVIOURS[how]))
+        names = resolving({"fleet.test": [*dead, "127.0.0.1"], "dead.test": dead})
+        stop = program("estop", robot.id, f"--url=mqtt://fleet.test:{broker.port}", env=names)
+        out, err = stop.communicate(timeout=40)
+        assert (stop.returncode, robot.latched) == (0, True), out + err
+        stop = program("estop", robot.id, f"--url=mqtt://dead.test:{broker.port}", env=names)
+        _, err = stop.communicate(timeout=40)
+    mute = "accepts connections but does not speak MQTT in time"
+    assert (stop.returncode, err) == (
+        1,
+        f"pebble: cannot connect to mqtt://dead.test:{broker.port}: broker dead.test:{broker.port}: "
+        f"127.0.0.2 {mute}; 127.0.0.3 hung up on our CONNECT; 127.0.0.4 refused us: server unavailable; 127.0.0.5 {mute}\n",
+    )
 
 
 def test_a_stop_is_confirmed_by_every_owner(run: Run, robot_on: Make, url: str) -> None:
