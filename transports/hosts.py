@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 CONNECT_TIMEOUT_S = 2.0  # for each of TCP and TLS, and again for the broker's CONNACK (T12)
 STEADY_S = 30.0  # an address that held a connection for so long is tried once more before the others
-_LONGEST = 8  # addresses whose failures are told one by one
+_LONGEST = 8  # addresses whose failures are described one by one
 
 
 class Address(NamedTuple):
@@ -40,7 +40,7 @@ def dial(address: Address, timeout: float | None = None) -> socket.socket:
     return sock
 
 
-def told(failures: dict[str, str]) -> str:
+def described(failures: dict[str, str]) -> str:
     """One line of bounded length that names addresses and why each failed."""
     some = [f"{address} {why}" for address, why in list(failures.items())[:_LONGEST]]
     more = len(failures) - len(some)
@@ -80,7 +80,7 @@ class Turns:
 
     def succeeded(self) -> str:
         """The address has a connection; returns which ones failed before it, and how."""
-        failed, self._failures, self._is_first = told(self._failures), {}, False
+        failed, self._failures, self._is_first = described(self._failures), {}, False
         return failed
 
     def failed(self, why: str, held_s: float = 0.0) -> str:
@@ -96,7 +96,7 @@ class Turns:
         if held_s >= STEADY_S:
             self._steady, self._left = address, []
         self._is_first &= bool(self._left)
-        return told(self._failures)
+        return described(self._failures)
 
     @property
     def is_over(self) -> bool:

@@ -8,7 +8,7 @@ import time
 from dataclasses import dataclass, replace
 
 from pebble.errors import TransportError
-from pebble.transports.hosts import Address, addresses_of, dial, told
+from pebble.transports.hosts import Address, addresses_of, described, dial
 from pebble.transports.mqtt import client_ids
 from pebble.transports.settings import MqttSettings
 from pebble.transports.tls import make_context
@@ -54,7 +54,7 @@ def probe(settings: MqttSettings, *, login: bool, timeout_s: float = 3.0) -> Pro
             answered = found
         if found.code == 0 or len(addresses) == 1:
             break
-    return found if len(addresses) == 1 else replace(answered, problem=told(failures))
+    return found if len(addresses) == 1 else replace(answered, problem=described(failures))
 
 
 def _probe(settings: MqttSettings, address: Address, *, login: bool, timeout_s: float) -> ProbeResult:

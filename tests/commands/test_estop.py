@@ -151,7 +151,8 @@ def test_a_stop_reaches_a_living_address_behind_dead_ones(robot_on: Make, broker
     assert (stop.returncode, err) == (
         1,
         f"pebble: cannot connect to mqtt://dead.test:{broker.port}: broker dead.test:{broker.port}: "
-        f"127.0.0.2 {mute}; 127.0.0.3 hung up on our CONNECT; 127.0.0.4 refused us: server unavailable; 127.0.0.5 {mute}\n",
+        f"127.0.0.2 {mute}; 127.0.0.3 hung up on our CONNECT; 127.0.0.4 refused us: server unavailable; "
+        f"127.0.0.5 {mute}\n",
     )
 
 

@@ -153,7 +153,7 @@ def test_when_all_fail_one_line_names_each_address_and_its_reason(
     assert [record.getMessage() for record in caplog.records] == [f"tool: {transport.problem}"]
 
 
-def test_which_addresses_failed_is_told_once_another_works(
+def test_which_addresses_failed_is_logged_once_another_works(
     broker: Broker, names: Names, caplog: pytest.LogCaptureFixture
 ) -> None:
     names(BAD, GOOD)

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pebble.services.autonomy_manager.gate.answers import AnswerMerger
 from pebble.services.autonomy_manager.gate.client_filter import ClientFilter, Output
 from pebble.services.autonomy_manager.gate.packets import PacketError, connack, refusal
-from pebble.transports.hosts import CONNECT_TIMEOUT_S, Address, addresses_of, told
+from pebble.transports.hosts import CONNECT_TIMEOUT_S, Address, addresses_of, described
 
 CHUNK = 64 * 1024  # bytes per read; a receiver with more unsent bytes makes its sender wait
 _CONNECT_S = 5.0  # for a client's CONNECT, and for reaching the broker
@@ -79,7 +79,7 @@ class Relay:
             async with asyncio.timeout(_CONNECT_S):
                 return await _dial(broker, last), b""
         except (OSError, TimeoutError) as error:
-            before = f"; {told(failures)}" if failures else ""
+            before = f"; {described(failures)}" if failures else ""
             log.warning("a script cannot reach the robot's broker %s: %s%s", why, error or "no answer", before)
             self._writer.write(connack(_UNAVAILABLE))
             raise
