@@ -1,15 +1,23 @@
 """Who moves the motors: nobody while latched, people before scripts. Pure; boards and Linux robots share it.
 
 A drive command with all axes 0 is a zero. A person's zero is always judged. Commands of a script carry the number of
-its run, which grows with each start; a run that is barred never moves anything again.
+its run, which grows with each start; a run that is barred never moves anything again. The numbers have no end: after
+LAST_RUN comes 1, so whatever number a stranger sends, the next one is newer.
 """
 
 HOLD_MS = 2000  # so long after a person's last command scripts are refused
 _START_MS = 2000  # so long after the start scripts are refused: their manager first sees that their owner restarted
 
+LAST_RUN = (1 << 30) - 1  # the largest integer for which MicroPython allocates no memory on a 32-bit board
+
 PERSON = 0  # in place of the number of a run
 UNKNOWN_RUN = -1  # a script's zero without a valid number
 REFUSED = -1
+
+
+def newer(run: int, than: int) -> bool:
+    """Whether ``run`` began after ``than``: it is ahead by less than half of all numbers. 0, or less, is no run."""
+    return run > 0 and (than == 0 or 0 < (run - than) & LAST_RUN < 1 << 29)
 
 
 class Arbiter:
@@ -21,7 +29,7 @@ class Arbiter:
         self.barred = 0  # runs up to this number
         self._diff = diff
         self._watchdog_ms = watchdog_ms
-        self._newest = 0  # the highest run received
+        self._newest = 0  # the newest run received: ``barred``, or the one after it
         self._starting = True
         self._started = now
         self._held = False  # by a person
@@ -37,17 +45,17 @@ class Arbiter:
         ``moves``: any axis is not 0. ``run`` may be PERSON, or UNKNOWN_RUN of a zero. ``valid_ms`` < 0: not given.
         """
         self.tick(now)
-        if run > self._newest:  # a later run has begun, even if this command is refused
+        if newer(run, self.barred) and run != self._newest:  # it has begun, even if this command is refused
             self._newest = run
-            self._bar(run - 1)
+            self.bar(run - 1 or LAST_RUN)
         if self.latch.latched:
-            self._bar(run)
+            self.bar(run)
         if self.latch.refuses(moves, run != PERSON, now):
             return REFUSED
         limit = self._watchdog_ms if valid_ms < 0 or valid_ms > self._watchdog_ms else int(valid_ms)
         if run == PERSON:
             self._take(moves, valid_ms == 0, now)
-        elif self._held or self._starting or 0 < run <= self.barred:
+        elif self._held or self._starting or (run > 0 and not newer(run, self.barred)):
             return REFUSED
         else:
             self._scripted = True
@@ -59,7 +67,7 @@ class Arbiter:
         """Latch, and bar all runs so far; False: this stop is known already."""
         if not self.latch.stop(name, by, why, since):
             return False
-        self._bar(self._newest)
+        self.bar(self._newest)
         self._scripted = False
         return True
 
@@ -74,7 +82,7 @@ class Arbiter:
         if self._held and diff(now, self._held_from) >= HOLD_MS:
             self._held = False
             if not self._resumes:  # the person has not let go: the connection was lost
-                self._bar(self._newest)
+                self.bar(self._newest)
 
     def _take(self, moves: bool, final: bool, now: int) -> None:
         """A person's command: scripts wait, or end.
@@ -82,12 +90,15 @@ class Arbiter:
         After the first command of a person no script is in effect: a zero then is the end of the person's own driving.
         """
         if not moves and (final or self._scripted):
-            self._bar(self._newest)
+            self.bar(self._newest)
         self._resumes = not moves and not final
         self._scripted = False
         self._held = True
         self._held_from = now
 
-    def _bar(self, run: int) -> None:
-        if run > self.barred:
+    def bar(self, run: int) -> None:
+        """From now on no run up to this one moves anything."""
+        if newer(run, self.barred):
             self.barred = run
+            if newer(run, self._newest):
+                self._newest = run

@@ -4,13 +4,12 @@ import json
 
 from micropython import const
 
-from common.arbiter import PERSON, UNKNOWN_RUN
+from common.arbiter import LAST_RUN, PERSON, UNKNOWN_RUN
 
 _MAX_BYTES = const(512)
 _MAX_BRACKETS = const(32)  # limits the parser's memory, which grows with depth
 
 
-_LAST_RUN = const((1 << 30) - 1)
 _WATCHDOG_MS = const(60_000)  # longer than any: larger numbers are cut, because they would need memory
 
 _NUMBERS = int, float
@@ -56,7 +55,7 @@ def parse(raw: memoryview | bytes) -> tuple[float, float, float, int, int] | Non
 def _run(body: dict, stops: bool) -> int:
     source = body.get("source")
     run = body.get("run")
-    if run is not None and not (type(run) is int and 1 <= run <= _LAST_RUN):
+    if run is not None and not (type(run) is int and 1 <= run <= LAST_RUN):
         run = UNKNOWN_RUN
     if not stops and (run == UNKNOWN_RUN or not (source is None or isinstance(source, str))):
         raise ValueError

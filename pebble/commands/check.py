@@ -10,6 +10,7 @@ from typing import Annotated, NamedTuple
 import typer
 
 from pebble.config import Config, Mqtt, RemoteConnection, load, resolved
+from pebble.config.web import is_loopback
 from pebble.contract import CHANNELS, MEDIA_STATUS, STATUS, TOUCH_SENSORS, Channel
 from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
 from pebble.errors import ConfigError, TransportError
@@ -144,12 +145,13 @@ def facts(config: Config) -> list[tuple[str, str]]:
     """The transport, the connections and the processes, line by line, without secrets."""
     if config.robot.platform != "linux":
         firmware = f"runs on its own MCU ({config.robot.platform}), not with `pebble up`"
-        return [("platform", firmware), ("broker", _mqtt(config.local_mqtt))]
+        return [("platform", firmware), ("broker", _mqtt(config.local_mqtt)), *_scripts(config)]
     found = [("transport", _transport(config))]
     if config.transport.mqtt_mirror is not None:
         found.append(("mirror", _mqtt(config.transport.mqtt_mirror)))
     if config.services.mqtt_bridge.enabled:
         found.append(("uplink", _uplink(config)))
+    found += _scripts(config)
     found += [("serial", line) for line in _serial_lines(config)]
     table = programs(config)
     found.append(("processes", ", ".join([_LAUNCHER, *(program.name for program in table if not program.on_demand)])))
@@ -207,6 +209,21 @@ def _uplink(config: Config) -> str:
     if bridge.remote is not None and bridge.remote.kind != "mqtt":
         return _remote_connection(bridge.remote)
     return f"mqtt, {_mqtt(bridge.remote_mqtt)}"
+
+
+def _scripts(config: Config) -> list[tuple[str, str]]:
+    """What a script's signature is worth where operators and the robot share a broker: no bridge stands between."""
+    local, bridge = config.local_mqtt, config.services.mqtt_bridge
+    remote = bridge.remote_mqtt if bridge.enabled and bridge.remote is None else None
+    if config.transport.kind != "mqtt" or (bridge.enabled and bridge.remote is not None):
+        return []
+    if remote is not None and _place(remote) != _place(local):
+        return []
+    return [("scripts", f"anybody at broker {local.host}:{local.port} may pose as one, or end one")]
+
+
+def _place(mqtt: Mqtt) -> tuple[str, int]:
+    return "" if is_loopback(mqtt.host) else mqtt.host, mqtt.port
 
 
 def _remote_connection(remote: RemoteConnection) -> str:

@@ -12,6 +12,8 @@ from typing import Annotated, Any, Literal
 from msgspec import UNSET, Meta, Struct, UnsetType, field
 from msgspec.structs import force_setattr
 
+from pebble.motion import arbiter
+
 
 class Payload(Struct, frozen=True, kw_only=True, omit_defaults=False):
     """Base of every JSON payload: refuses NaN and infinities in every number field."""
@@ -32,7 +34,7 @@ def _clamp(payload: Payload, low: float, high: float, *names: str) -> None:
 
 
 SCRIPT = "autonomy"  # the source of a script's drive command; any other source is a person
-LAST_RUN = (1 << 30) - 1  # the largest integer for which MicroPython allocates no memory on a 32-bit board
+LAST_RUN = arbiter.LAST_RUN
 
 
 class Drive(Payload, frozen=True, kw_only=True):
@@ -46,7 +48,7 @@ class Drive(Payload, frozen=True, kw_only=True):
     z: float = 0.0  # throttle, positive is forward
     y: float = 0.0  # auxiliary axis, for example MiniLAMP's grousers
     source: str | UnsetType = UNSET  # "autonomy" of a script; anything else counts as a person
-    run: Annotated[int, Meta(ge=1, le=LAST_RUN)] | UnsetType = UNSET  # of a script: below 2^30, grows with each start
+    run: Annotated[int, Meta(ge=1, le=LAST_RUN)] | UnsetType = UNSET  # of a script: grows until 2^30 - 1, then from 1
     valid_ms: Annotated[int, Meta(ge=0)] | UnsetType = UNSET  # of a zero, 0: the script must not resume
 
     def __post_init__(self) -> None:

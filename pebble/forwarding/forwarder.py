@@ -45,6 +45,7 @@ from pebble.forwarding.event_buffer import EventBuffer
 from pebble.forwarding.loopback_filter import LoopbackFilter
 from pebble.forwarding.reconciliation import Reconciliation, Resolution
 from pebble.forwarding.routing import ONE_SHOT, URGENT, Drop, Forward, Rules, Side, route
+from pebble.forwarding.signatures import unsigned
 from pebble.forwarding.subjects import Subject, Subjects
 from pebble.runtime.rate_limit import RateLimitedLog
 from pebble.transports import Message, QoS, State, Transport
@@ -73,7 +74,7 @@ _RETURN_S = 2.0
 #: Probed at each connection, before they are used.
 _PROBED = (DRIVE, REBOOT, SERVICE_RESTART, GIT_PULL)
 
-_BOUNDS = (Drop.TOO_LARGE, Drop.TOO_MANY, Drop.TOO_OFTEN, Drop.LATE, Drop.CIRCULATES)
+_BOUNDS = (Drop.TOO_LARGE, Drop.TOO_MANY, Drop.TOO_OFTEN, Drop.LATE, Drop.CIRCULATES, Drop.SIGNED)
 _DROPS = {Resolution.KNOWN: Drop.KNOWN, Resolution.HOLD: Drop.HELD}
 
 
@@ -313,6 +314,14 @@ class Forwarder:
             finding = self._examine(side, subject, message)
             if finding is not Finding.PASS and (drop := self._act_on(finding, side, subject, message, forward)):
                 return drop
+        if forward.unsigned:
+            passing = unsigned(message.payload)
+            if passing is not message.payload:
+                self._quiet_log.warning(Drop.SIGNED.name, "%s: %s", message.topic[:_LOGGED], Drop.SIGNED.value)
+                if passing is None:
+                    return Drop.SIGNED
+                message = Message(message.topic, passing, message.qos)
+                self.counters.add(f"{side.value}: zeros of a script, passed as a person's")
         if forward.retain:
             return self._pass_retained(side, subject, message, forward)
         is_event = subject.kind is Kind.EVENT and message.qos is QoS.DELIVERED

@@ -9,7 +9,7 @@ from typing import Final
 
 from msgspec import Struct
 
-from pebble.contract import INCOMING, Kind
+from pebble.contract import DRIVE, INCOMING, Kind
 from pebble.forwarding.subjects import Subject
 from pebble.transports import Message, QoS
 
@@ -49,6 +49,7 @@ class Drop(Enum):
     HELD = "waits for the other side's values"
     CLOSED = "nothing is forwarded now"
     LATE = "waited too long, here or at the broker"
+    SIGNED = "only programs on the robot may sign as a script"
 
 
 class Forward(Struct, frozen=True):
@@ -57,6 +58,7 @@ class Forward(Struct, frozen=True):
     qos: QoS
     retain: bool
     urgent: bool
+    unsigned: bool = False  # a script's signature does not pass (see .signatures)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,7 +102,8 @@ def route(rules: Rules, side: Side, subject: Subject | None, message: Message, *
             return Drop.ONE_WAY
         if not mirroring:
             return Drop.NOT_MIRRORED
-    return Forward(_qos(subject, message), _retain(subject, message), subject.kind in URGENT)
+    unsigned = subject.channel is DRIVE and side is Side.REMOTE and rules.leaves_robot
+    return Forward(_qos(subject, message), _retain(subject, message), subject.kind in URGENT, unsigned)
 
 
 def _qos(subject: Subject, message: Message) -> QoS:

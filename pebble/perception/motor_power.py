@@ -38,7 +38,7 @@ class MotorPower:
     def owner(self, state: EstopState) -> None:
         """Follow the motor owner's state."""
         self._latch.latched = state.latched
-        self._arbiter.barred = max(self._arbiter.barred, state.last_barred)
+        self._arbiter.bar(state.last_barred)
         if state.latched:
             self._power = (0.0, 0.0)
 

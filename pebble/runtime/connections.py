@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
+from msgspec.structs import replace
+
 from pebble.config import Config, Mqtt, RemoteConnection, RemoteMqtt, Tls
-from pebble.contract import OUTGOING
+from pebble.contract import CHANNELS, INCOMING, OUTGOING, Kind
 from pebble.errors import ConfigError, TransportError
+from pebble.runtime.addresses import Addresses
 from pebble.transports import Message, MqttSettings, TlsSettings, Transport, ZenohSettings, check_kind, create
 from pebble.transports.socket_paths import FRAMES_SOCKET, PEER_SOCKET, fits_socket
 
@@ -110,7 +114,19 @@ def hub_settings(config: Config) -> ZenohSettings:
         lease_ms=transport.lease_ms,
         journal=transport.journal,
         reserved=(f"{config.base}/{OUTGOING}",),
+        wills=tuple(dict.fromkeys(_renamed_wills(config))),
     )
+
+
+def _renamed_wills(config: Config) -> Iterator[tuple[str, bool]]:
+    """Whether the hub takes wills on the topics that this config renames, those of every serial line included."""
+    lines = [config.services.serial_mcu_bridge, *config.serial_instances().values()]
+    for line in lines:
+        addresses = Addresses(replace(config, services=replace(config.services, serial_mcu_bridge=line)))
+        for channel in CHANNELS:
+            topic = addresses[channel].topic
+            if channel.direction == INCOMING and topic != channel.filter(config.base):
+                yield topic, channel.kind is Kind.FLAG
 
 
 def mqtt_settings(

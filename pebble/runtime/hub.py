@@ -12,16 +12,27 @@ import signal
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
+from typing import Final
 
 import msgspec
 
+from pebble.contract import CHANNELS, INCOMING, Kind
 from pebble.errors import PebbleError
 from pebble.runtime.parent import ALIVE_PERIOD_S, DROPPED_PERIOD_S, DroppedMessages, Notifier, set_up_logging
 from pebble.transports.settings import ZenohSettings
 from pebble.transports.zenoh.hub import ZenohHub
 
 log = logging.getLogger(__name__)
+
+_ANY: Final = "+/+/+"  # component
+#: What happens once must not be left as a will, neither what the contract names nor what it does not; flags may.
+WILLS: Final = (
+    (f"{_ANY}/{INCOMING}/#", False),
+    (f"{_ANY}/{INCOMING}/flags/#", True),
+    *((channel.filter(_ANY), False) for channel in CHANNELS if channel.kind is Kind.ACTION),
+)
 
 # Made where the launcher imports this module: what msgspec finds out about the fields is then in memory that is shared.
 _decoder = msgspec.json.Decoder(ZenohSettings, dec_hook=lambda _kind, text: Path(text))
@@ -44,14 +55,14 @@ def run_hub(settings: ZenohSettings, stop: threading.Event) -> None:
     """Run a hub until ``stop`` is set. Raises TransportError if it cannot open."""
     notify = Notifier()
     dropped, due = DroppedMessages(notify), time.monotonic()
-    hub = ZenohHub(settings).open()
+    hub = ZenohHub(replace(settings, wills=(*WILLS, *settings.wills))).open()
     try:
         notify.ready()
         while not stop.wait(ALIVE_PERIOD_S):
             notify.alive()
             if time.monotonic() >= due:
                 due += DROPPED_PERIOD_S
-                dropped.report({"no_room": hub.refused})
+                dropped.report({"no_room": hub.refused, "wills": hub.refused_wills})
     finally:
         hub.close()
 

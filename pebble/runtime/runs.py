@@ -1,4 +1,7 @@
-"""Numbers the runs of scripts, so that a motor owner can tell an old run from a new one."""
+"""Numbers the runs of scripts, so that a motor owner can tell an old run from a new one.
+
+Which of two is newer, :func:`pebble.motion.arbiter.newer` decides: the numbers have no end.
+"""
 
 from __future__ import annotations
 
@@ -6,12 +9,14 @@ import fcntl
 import logging
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from functools import reduce
 from pathlib import Path
 
 from pebble.config import Config
 from pebble.contract.payloads import LAST_RUN
 from pebble.errors import PebbleError
+from pebble.motion.arbiter import newer
 
 log = logging.getLogger(__name__)
 
@@ -26,30 +31,41 @@ _TRY_S = 0.005
 _EPOCH_S = 1_735_689_600  # 2025-01-01: counted from here, seconds fit into a run's number until 2059
 
 
-def next_run(config: Config, above: int = 0) -> int:
-    """The number of a run that starts now: above every earlier one of this robot, and ``above`` the given one.
+def newest(runs: Iterable[int]) -> int:
+    """The newest of ``runs``, where 0 stands for none."""
+    return reduce(lambda one, run: run if newer(run, one) else one, runs, 0)
 
-    Several processes may call this at once. Without the file, or with a damaged one, it counts from the clock. Raises
-    PebbleError if there are no numbers left, or if another process does not give the file free.
+
+def following(run: int) -> int:
+    """The number after ``run``."""
+    return run + 1 if run < LAST_RUN else 1
+
+
+def next_run(config: Config, barred: int = 0, seen: int = 0) -> int:
+    """The number of a run that starts now: newer than ``barred``, which motor owners report.
+
+    It is also above ``seen`` and above every earlier run of this robot, unless these are not ahead of ``barred``:
+    then a stranger has sent a number far ahead. Several processes may call this at once. Without the file, or with a
+    damaged one, it counts from the clock. Raises PebbleError if another process does not give the file free.
     """
-    return _next(config.state_file("autonomy-run"), above, time.time)
+    return _next(config.state_file("autonomy-run"), barred, time.time, seen)
 
 
-def _next(path: Path, above: int, wall_clock: Callable[[], float]) -> int:
+def _next(path: Path, barred: int, wall_clock: Callable[[], float], seen: int = 0) -> int:
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK, 0o600)
     except OSError as error:
         log.warning("%s cannot be opened (%s): the run's number is made from the clock", path, error.strerror)
-        return _above(max(above, _from_clock(wall_clock)))
+        return _above(barred, seen, _from_clock(wall_clock))
     try:
         _lock(file, path)
-        number = _above(max(above, _read(file, path, wall_clock)))
+        number = _above(barred, seen, _read(file, path, wall_clock))
         os.pwrite(file, f"{number:0{_DIGITS}d}\n".encode(), 0)
         os.fsync(file)
     except OSError as error:
         log.warning("%s cannot be written (%s): the run's number is made from the clock", path, error.strerror)
-        number = _above(max(above, _from_clock(wall_clock)))
+        number = _above(barred, seen, _from_clock(wall_clock))
     finally:
         os.close(file)
     return number
@@ -70,10 +86,10 @@ def _lock(file: int, path: Path) -> None:
 
 def _read(file: int, path: Path, wall_clock: Callable[[], float]) -> int:
     raw = os.pread(file, 64, 0).strip()
-    if len(raw) == _DIGITS and raw.isdigit() and int(raw) < LAST_RUN:
+    if len(raw) == _DIGITS and raw.isdigit() and int(raw) <= LAST_RUN:
         return int(raw)
     if raw:
-        log.warning("%s is damaged, or its numbers have ended: the run's number is made from the clock", path)
+        log.warning("%s is damaged: the run's number is made from the clock", path)
     return _from_clock(wall_clock)
 
 
@@ -83,7 +99,8 @@ def _from_clock(wall_clock: Callable[[], float]) -> int:
     return seconds if 0 < seconds < LAST_RUN // 2 else 0
 
 
-def _above(number: int) -> int:
-    if number >= LAST_RUN:
-        raise PebbleError(f"run numbers end at {LAST_RUN}: restart the robot's computer")
-    return number + 1
+def _above(barred: int, *used: int) -> int:
+    """The number after the one of ``barred`` and ``used`` that is furthest ahead and still leaves a newer one."""
+    base = barred or newest(used)
+    ahead = ((run - base) & LAST_RUN for run in used if run and newer(following(run), base))
+    return following((base + max(ahead, default=0)) & LAST_RUN)

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from msgspec.structs import replace
 
 from pebble.contract.payloads import SCRIPT, Drive, EstopState
-from pebble.motion.arbiter import HOLD_MS
+from pebble.motion.arbiter import HOLD_MS, newer
 from pebble.runtime.runs import SUPERSEDED
 
 MAX_PER_S = 50
@@ -46,7 +46,7 @@ class DriveSender:
         self._latched: EstopState | None = None
         self._owners: dict[str, EstopState] = {}
         self._barred_at: float | None = None
-        self._superseded_by = 0  # the number of a newer run
+        self._superseded = False  # by a newer run
         self._end = ""  # why this run can never drive again
         self._final = False  # the final zero was published
 
@@ -92,8 +92,8 @@ class DriveSender:
         """A drive command of another sender, that arrives now."""
         if not drive.signed:
             self._person_at = now
-        elif isinstance(drive.run, int) and drive.run > self.run:
-            self._superseded_by = max(self._superseded_by, drive.run)
+        elif isinstance(drive.run, int) and newer(drive.run, self.run):
+            self._superseded = True
 
     def owners(self, states: Mapping[str, EstopState], now: float) -> None:
         """The newest states of all motor owners."""
@@ -103,10 +103,10 @@ class DriveSender:
         before = self._owners if len(self._owners) < _MAX_OWNERS else {}
         self._owners = {**before, **states}  # one that is gone for a while may come back restarted
         self._latched = max((s for s in states.values() if s.latched), key=lambda state: state.since, default=None)
-        barred = max((state.last_barred for state in states.values()), default=0)
-        if barred > self.run:
-            self._superseded_by = max(self._superseded_by, barred)
-        elif barred == self.run and self._barred_at is None:
+        barring = [state.last_barred for state in states.values() if not newer(self.run, state.last_barred)]
+        if any(run != self.run for run in barring):
+            self._superseded = True
+        elif barring and self._barred_at is None:
             self._barred_at = now
 
     # -- what follows
@@ -121,14 +121,14 @@ class DriveSender:
             return self._end
         if self._latched is not None:
             return f"the robot is stopped {_described(self._latched)}"
-        if self._superseded_by or self._barred_at is not None:
+        if self._superseded or self._barred_at is not None:
             return ENDED
         return "a person drives" if self.overridden(now) else ""
 
     def ended(self, now: float) -> str:
         """Why this run can never drive again; empty: it may, or it never wanted to."""
         if not self._end and self._tried:
-            if self._superseded_by:
+            if self._superseded:
                 self._end = SUPERSEDED
             elif self._barred_at is not None and now >= self._barred_at + _GRACE_S:
                 self._end = "stopped by an operator"

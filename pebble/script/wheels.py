@@ -12,6 +12,7 @@ from pebble.contract.payloads import Drive
 from pebble.errors import PayloadError
 from pebble.runtime.addresses import Addresses
 from pebble.runtime.robot_estop import RobotEstop
+from pebble.runtime.runs import newest
 from pebble.script.drive_sender import ENDED, DriveSender
 from pebble.transports import Message, QoS, Transport
 
@@ -102,7 +103,7 @@ class Wheels:
 
     @property
     def _barred(self) -> int:
-        return max((state.last_barred for state in self.estop.states.values()), default=0)
+        return newest(state.last_barred for state in self.estop.states.values())
 
     def _tick(self) -> None:
         """Publish what has waited for its turn, and notice the end of the run, while the script does other things."""

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 
-from pebble.contract.payloads import EstopState
-from pebble.runtime.runs import SUPERSEDED
+from pebble.contract.payloads import LAST_RUN, EstopState
+from pebble.motion.arbiter import newer
+from pebble.runtime.runs import SUPERSEDED, newest
 
 _MOST = 16  # owners; their names come from other processes
 
-#: By owner, its boot and its count of stops.
-Baseline = dict[str, tuple[str, int]]
+#: By owner, its boot, its count of stops, and what it had barred.
+Baseline = dict[str, tuple[str, int, int]]
 
 OVERRIDDEN = "stopped by an operator"
 
@@ -19,7 +20,7 @@ class MotorOwners:
     """The newest state of each motor owner; of those in ``names`` only, where there are any."""
 
     def __init__(self, names: Collection[str]) -> None:
-        self.newest_run = 0  # of all drive commands; an owner bars the run before it
+        self.newest_run = 0  # of all that were heard or used; an owner bars the run before it
         self._names = names
         self._states: dict[str, EstopState] = {}
 
@@ -27,10 +28,24 @@ class MotorOwners:
         if owner in self._names or (not self._names and (owner in self._states or len(self._states) < _MOST)):
             self._states[owner] = state
 
+    def note_run(self, run: int) -> None:
+        """A drive command carries ``run``."""
+        if newer(run, self.newest_run):
+            self.newest_run = run
+
     @property
     def barred(self) -> int:
         """No run up to this one moves anything."""
-        return max((state.last_barred for state in self._states.values()), default=0)
+        return newest(state.last_barred for state in self._states.values())
+
+    def steps_to(self, run: int) -> Iterator[int]:
+        """Numbers by whose zeros every owner comes to take ``run`` as newer.
+
+        One that was away while a stranger sent numbers far ahead may be more than half of all numbers behind.
+        """
+        for state in self._states.values():
+            if not newer(run, state.last_barred):
+                yield state.last_barred + ((run - state.last_barred) & LAST_RUN) // 2 & LAST_RUN or LAST_RUN
 
     @property
     def refusal(self) -> str:
@@ -39,16 +54,17 @@ class MotorOwners:
 
     def baseline(self) -> Baseline:
         """What must not change while a script runs."""
-        return {owner: (state.boot, state.count) for owner, state in self._states.items()}
+        return {owner: (state.boot, state.count, state.last_barred) for owner, state in self._states.items()}
 
     def ending(self, run: int, baseline: Baseline) -> str:
         """Why this run has to end; empty if it may go on. Owners that are new are added to ``baseline``."""
         for owner, state in self._states.items():
-            boot, count = baseline.setdefault(owner, (state.boot, state.count))
+            boot, count, barred = baseline.setdefault(owner, (state.boot, state.count, 0))
             if state.latched or (state.boot == boot and state.count != count):
                 return _stopped(owner, state)
-            if state.last_barred >= run:
-                return SUPERSEDED if max(state.last_barred, self.newest_run) > run else OVERRIDDEN
+            if state.last_barred != barred and not newer(run, state.last_barred):
+                alone = state.last_barred == run and not newer(self.newest_run, run)
+                return OVERRIDDEN if alone else SUPERSEDED
             if state.boot != boot:
                 return f"motor owner {owner} was restarted: start the script again"
         return ""

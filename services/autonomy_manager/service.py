@@ -13,7 +13,6 @@ from msgspec.structs import replace
 
 from pebble.contract import AUTONOMY_COMMAND, AUTONOMY_FILES, AUTONOMY_STATUS, DRIVE, ESTOP_STATE
 from pebble.contract.payloads import (
-    LAST_RUN,
     SCRIPT,
     STOP_WORDS,
     AutonomyCommand,
@@ -27,7 +26,7 @@ from pebble.errors import PebbleError
 from pebble.motion.arbiter import HOLD_MS
 from pebble.runtime.addresses import Addresses
 from pebble.runtime.process import view_of
-from pebble.runtime.runs import next_run
+from pebble.runtime.runs import following, next_run
 from pebble.runtime.service import Service, on
 from pebble.services.autonomy_manager.catalogue import Catalogue, files
 from pebble.services.autonomy_manager.child import Processes, Spawn
@@ -73,7 +72,6 @@ class AutonomyManager(Service):
         self._files: list[dict[str, object]] | None = None
         self._status: AutonomyStatus | None = None
         self._connected_before = False
-        self._last_number = 0  # that has barred a run: a person may have barred it since, as the newest one
         self._gate: tuple[int, Gate] | None = None  # of the present run, if one of its scripts needs it
 
     @property
@@ -158,8 +156,8 @@ class AutonomyManager(Service):
             self.post(self._person_drives, newest_of="person")
             if not drive.moves and drive.valid_ms == 0:
                 self.post(self._person_stops, newest_of="person stops")
-        elif isinstance(drive.run, int) and drive.run > self._owners.newest_run:
-            self._owners.newest_run = drive.run  # only this thread writes it
+        elif isinstance(drive.run, int):
+            self._owners.note_run(drive.run)
 
     def _person_drives(self) -> None:
         now = self.clock()
@@ -185,7 +183,10 @@ class AutonomyManager(Service):
     def begin_run(self) -> tuple[int, Baseline]:
         if refusal := self._owners.refusal:
             raise StartError(refusal)
-        return next_run(self.config, max(self._owners.barred, self._last_number)), self._owners.baseline()
+        run = self._owners.newest_run = next_run(self.config, self._owners.barred, self._owners.newest_run)
+        for step in self._owners.steps_to(run):
+            self.halt(step)
+        return run, self._owners.baseline()
 
     def config_path(self, script: Script, run: int) -> Path:
         if not script.needs_gate:
@@ -204,8 +205,8 @@ class AutonomyManager(Service):
         if self._gate is not None and self._gate[0] == run:
             self._gate[1].close()
             self._gate = None
-        self._last_number = min(run + 1, LAST_RUN)
-        self.halt(self._last_number)  # bars this run: a process of it may have escaped
+        self._owners.note_run(following(run))  # a person may bar it, too, before the next run
+        self.halt(following(run))  # bars this run: a process of it may have escaped
 
     def halt(self, run: int) -> None:
         if self._gate is not None and self._gate[0] == run:

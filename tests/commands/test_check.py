@@ -76,6 +76,25 @@ def test_check_shows_links_processes_and_effective_topics_but_no_secret(run: Run
     assert "hush-hush" not in run.out
 
 
+@pytest.mark.parametrize(
+    ("keys", "shared"),
+    [
+        ({}, True),
+        ({"robot": {"id": "goob", "platform": "esp8266"}}, True),
+        ({"services": {"mqtt_bridge": {"enabled": True, "remote_mqtt": {"host": "127.0.0.1"}}}}, True),
+        ({"services": {"mqtt_bridge": {"enabled": True, "remote_mqtt": {"host": "broker.example"}}}}, False),
+        ({"services": {"mqtt_bridge": {"enabled": True, "remote_mqtt": {"host": "127.0.0.1", "port": 1884}}}}, False),
+        ({"services": {"mqtt_bridge": {"enabled": True, "remote_mqtt": {"host": "localhost"}}}}, True),
+        ({"transport": {"kind": "zenoh"}}, False),
+    ],
+)
+def test_check_warns_where_others_may_pose_as_a_script(
+    run: Run, tmp_path: Path, keys: dict[str, object], shared: bool
+) -> None:
+    assert run("check", config_file(tmp_path, **{"local_mqtt": {"host": "127.0.0.1"}, **keys}), columns=160) == 0
+    assert ("anybody at broker 127.0.0.1:1883 may pose as one, or end one" in run.out) == shared
+
+
 def test_check_shows_what_runs_on_request(run: Run, tmp_path: Path) -> None:
     services = {
         "av_daemon": {"enabled": True},

@@ -6,10 +6,13 @@ import itertools
 import tracemalloc
 from collections.abc import Callable
 from math import inf
+from pathlib import Path
 
 import pytest
+from msgspec import UNSET
 
-from pebble.contract import Kind
+from pebble.config import parse
+from pebble.contract import DRIVE, Kind, codec
 from pebble.contract.codec import MAX_COMMAND_BYTES
 from pebble.forwarding import loopback_filter as loopback_filter
 from pebble.forwarding.admission import MAX_ACTIONS, MAX_UNKNOWN_COMMANDS, MAX_UNKNOWN_FLAGS, Admission
@@ -18,7 +21,7 @@ from pebble.forwarding.forwarder import Forwarder
 from pebble.forwarding.loopback_filter import EXPIRY_S, LoopbackFilter
 from pebble.forwarding.probes import PROBE_REQUEST, Probes, new_probe
 from pebble.forwarding.reconciliation import TOPICS, Reconciliation, Resolution
-from pebble.forwarding.routing import TABLE_A1, Drop, Forward, Side
+from pebble.forwarding.routing import MIRROR, TABLE_A1, Drop, Forward, Rules, Side
 from pebble.forwarding.subjects import Subjects
 from pebble.transports import Message, QoS, State, clock
 from pebble.transports.counters import Counters
@@ -499,6 +502,81 @@ class TestLate:
             )
         assert local.sent == [payload] * (1 + endless)
         assert forwarder.counters[f"remote: {Drop.LATE.value}"] == (not endless)
+
+
+class TestSignatures:
+    """A script's signature counts only from programs on the robot."""
+
+    PERSONS = (
+        *(b'{"z":0.5}', b'{"z":0.5,"source":"page"}', b'{"z":0.5,"source":"autonomy-page","run":7}', b"{", b""),
+        *(b'{"z":0.5,"note":"autonomy"}', b'{"z":0.5,"run":1073741823}', b'{"z":0.5,"source":"p\\u0061ge"}'),
+        *(b'{"z":0.5,"source":"Autonomy"}', b'{"z":0.5,"source":"autonomy ","run":1}', b'{"z":0,"source":null}'),
+        b'{"z":0.5,"value":{"z":0.1,"source":"page"},"source":"autonomy"}',
+        b'{"z":0.5,"source":"autonomy","source":"page","run":1}',
+        b'{"value":{"z":0,"source":7,"run":"autonomy"}}',
+    )
+    MOVING = (
+        *(b"1", b"536870911", b"536870912", b"536870913", b"1073741823", b"1073741824", b"-1", b"0", b"1e999"),
+        *(b"true", b"1.5", b'"7"', b"null", b"[1]", b"{}", b"1,1", b'1,"x":NaN', b'1,"value":7', b'1,"valid_ms":9'),
+    )
+    HIDDEN = (
+        *(b'{"z":0.5,"source":"autonomy"}', b'{"z":"0.5","source":"autonomy","run":1}'),
+        *(b'{"y":1e-9,"source":"autonomy","run":1}', b'{"z":0.5,"source":"\\u0061utonomy","run":1}'),
+        *(b'{"z":0.5,"\\u0073ource":"autonomy","run":1}', b'{"z":0.5,"source":"page","source":"autonomy","run":1}'),
+        b'{"z":0.5,"s\\u006furce":"\\u0061\\u0075tonom\\u0079","run":1}',
+        b'{"value":{"z":0.5,"source":"autonomy","run":1}}',
+        b'{"value":{"z":0.5,"source":"\\u0061utonomy","run":1},"z":0,"source":"page"}',
+        b'{"value":{"z":0},"value":{"z":0.5,"source":"autonomy","run":1}}',
+        b'{"v\\u0061lue":{"z":0.5,"source":"autonomy","run":1}}',
+        b'{"z":0.5,"sour\\ce":"autonom\\y","run":1}',  # boards read it
+    )
+    ZEROS = (
+        *(b"1", b"536870912", b"1073741823", b"1073741824", b"-1", b"true", b"1.5", b'"7"', b"null"),
+        *(b'1,"valid_ms":0', b'1,"valid_ms":400', b'1,"x":"0"', b'1,"x":-0.0', b'1,"value":{"source":"autonomy"}'),
+    )
+
+    @pytest.fixture(params=[{}, {"drive_values": "else/where"}], ids=["usual", "renamed"])
+    def subjects(self, request: pytest.FixtureRequest) -> Subjects:
+        line = {"enabled": True, "serial": {"port": "/dev/ttyACM0"}}
+        other = {**line, "serial": {"port": "/dev/ttyACM1"}, "topics": {"drive_values": "another/{base}"}}
+        services = {"serial_mcu_bridge": {**line, "topics": request.param, "instances": {"arm": other}}}
+        return Subjects(parse({"robot": {"id": "rover"}, "services": services}, folder=Path.cwd(), env={}))
+
+    @staticmethod
+    def passed(subjects: Subjects, payload: bytes, rules: Rules = TABLE_A1) -> tuple[list[bytes], Forwarder]:
+        """What passes to the robot on both of its drive topics, and the forwarder."""
+        local = Wire()
+        forwarder = Forwarder(subjects, rules, {LOCAL: local, REMOTE: Wire()}, winner=REMOTE, clock=Clock())
+        forwarder.open()
+        topics = subjects.topics(DRIVE)
+        assert len(topics) == 2
+        for topic in topics:
+            forwarder.receive(REMOTE, Message(topic, payload, QoS.DELIVERED))
+        return local.sent, forwarder
+
+    @pytest.mark.parametrize("payload", PERSONS)
+    def test_a_persons_command_passes_as_it_is(self, subjects: Subjects, payload: bytes) -> None:
+        assert self.passed(subjects, payload)[0] == [payload, payload]
+
+    @pytest.mark.parametrize(
+        "payload",
+        [*HIDDEN, *(b'{"z":0.5,"source":"autonomy","run":' + run + end for run in MOVING for end in (b"}", b""))],
+    )
+    def test_what_moves_anything_does_not_pass(self, subjects: Subjects, payload: bytes) -> None:
+        sent, forwarder = self.passed(subjects, payload)
+        assert (sent, forwarder.dropped()["signed"]) == ([], 2)
+
+    @pytest.mark.parametrize("run", ZEROS)
+    def test_a_zero_stops_as_a_persons(self, subjects: Subjects, run: bytes) -> None:
+        sent, forwarder = self.passed(subjects, b'{"x":0,"z":0,"source":"\\u0061utonomy","run":' + run + b"}")
+        drives = [codec.decode(DRIVE, raw) for raw in sent]
+        assert [(drive.moves, drive.source, drive.run) for drive in drives] == [(False, UNSET, UNSET)] * 2
+        assert {b"valid_ms" in raw for raw in sent} == {b"valid_ms" in run}
+        assert forwarder.counters["remote: zeros of a script, passed as a person's"] == 2
+
+    def test_the_broker_of_a_mirror_is_on_the_robot(self, subjects: Subjects) -> None:
+        for payload in (b'{"z":0.5,"source":"autonomy","run":1}', b'{"source":"autonomy","run":1}'):
+            assert self.passed(subjects, payload, MIRROR)[0] == [payload, payload]
 
 
 class TestStops:

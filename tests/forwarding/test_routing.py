@@ -39,6 +39,7 @@ def forward(qos: int = 1, *, retain: bool = False, urgent: bool = False) -> Forw
 
 
 COMMAND = forward(urgent=True)
+DRIVE = Forward(QoS.DELIVERED, retain=False, urgent=True, unsigned=True)  # from outside
 FLAG = forward(retain=True, urgent=True)
 ACTION = forward(urgent=True)
 
@@ -103,7 +104,8 @@ class TestRemoteIncoming:
     @pytest.mark.parametrize("suffix", COMMANDS)
     @pytest.mark.parametrize("mirroring", [False, True])
     def test_commands_are_forwarded(self, suffix: str, mirroring: bool) -> None:
-        assert routed(REMOTE, suffix, mirroring=mirroring) == COMMAND
+        expected = DRIVE if suffix == "incoming/drive-values" else COMMAND
+        assert routed(REMOTE, suffix, mirroring=mirroring) == expected
 
     @pytest.mark.parametrize("suffix", ACTIONS)
     def test_actions_are_forwarded_but_not_retained(self, suffix: str) -> None:
@@ -124,7 +126,7 @@ class TestRemoteIncoming:
         assert routed(REMOTE, "incoming/flags/night", retain_requested=False) == forward(urgent=True)
 
     def test_a_known_command_gets_its_quality(self) -> None:
-        assert routed(REMOTE, "incoming/drive-values", qos=0) == COMMAND
+        assert routed(REMOTE, "incoming/drive-values", qos=0) == DRIVE
         assert routed(REMOTE, "incoming/strange", qos=0) == forward(0, urgent=True)
 
     @pytest.mark.parametrize("side", list(Side))
@@ -179,7 +181,7 @@ class TestRetainedOneShots:
         assert routed(side, suffix, rules=rules, retain_requested=True, mirroring=True) is Drop.STALE
 
     def test_executed_where_the_broker_hides_it(self) -> None:
-        assert routed(REMOTE, "incoming/drive-values", retain_requested=None) == COMMAND
+        assert routed(REMOTE, "incoming/drive-values", retain_requested=None) == DRIVE
 
 
 class TestOthers:
@@ -211,7 +213,7 @@ RENAMED = {
     "services.mqtt_bridge.topics.mqtt_video": ("flags/mqtt-video", "site/v", FLAG, LOCAL),
     "services.mqtt_bridge.topics.audio_control": ("audio", "site/audio", COMMAND, REMOTE),
     "services.mqtt_bridge.topics.video_control": ("front-camera", "site/video", COMMAND, REMOTE),
-    "services.serial_mcu_bridge.topics.drive_values": ("drive-values", "site/drive", COMMAND, REMOTE),
+    "services.serial_mcu_bridge.topics.drive_values": ("drive-values", "site/drive", DRIVE, REMOTE),
     "services.serial_mcu_bridge.topics.lights_solid": ("lights-solid", "site/solid", COMMAND, REMOTE),
     "services.serial_mcu_bridge.topics.lights_flash": ("lights-flash", "site/flash", COMMAND, REMOTE),
     "services.serial_mcu_bridge.topics.charging_level": ("charging-level", "site/volts", forward(), LOCAL),
@@ -251,8 +253,8 @@ class TestRenamedTopics:
     def test_an_instances_names_count_too(self) -> None:
         instance = {"enabled": True, "serial": {"port": "/dev/null"}, "topics": {"drive_values": "arm/drive"}}
         subjects = Subjects(config_with("services.serial_mcu_bridge.instances", {"arm": instance}))
-        assert routed(REMOTE, "/arm/drive", subjects=subjects) == COMMAND
-        assert routed(REMOTE, "incoming/drive-values", subjects=subjects) == COMMAND
+        assert routed(REMOTE, "/arm/drive", subjects=subjects) == DRIVE
+        assert routed(REMOTE, "incoming/drive-values", subjects=subjects) == DRIVE
         assert "arm/drive" in subjects.filters(INCOMING)
 
 

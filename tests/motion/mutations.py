@@ -70,12 +70,14 @@ MUTATIONS = {
     "commands do not prolong the wait after a reset": Mutation(
         "latch", "        self._waits_from = now\n        return self._waits\n", "        return self._waits\n"
     ),
-    "a barred run moves": Mutation("arbiter", "0 < run <= self.barred", "0 < run < self.barred"),
-    "an older run moves": Mutation("arbiter", "            self._bar(run - 1)\n", ""),
-    "the newest run may fall": Mutation("arbiter", "if run > self._newest:", "if run > 0:"),
-    "a new run bars itself": Mutation("arbiter", "self._bar(run - 1)", "self._bar(run)"),
-    "a stop bars nothing": Mutation("arbiter", "        self._bar(self._newest)\n        self._scripted = False\n", ""),
-    "a run is not barred while latched": Mutation("arbiter", "            self._bar(run)\n", "            pass\n"),
+    "a barred run moves": Mutation("arbiter", "not newer(run, self.barred))", "not newer(run, self.barred - 1))"),
+    "an older run moves": Mutation("arbiter", "            self.bar(run - 1 or LAST_RUN)\n", ""),
+    "the newest run may fall": Mutation("arbiter", "if newer(run, self.barred) and", "if run > 0 and"),
+    "a new run bars itself": Mutation("arbiter", "self.bar(run - 1 or LAST_RUN)", "self.bar(run)"),
+    "numbers of runs end": Mutation("arbiter", "0 < (run - than) & LAST_RUN < 1 << 29", "run > than"),
+    "the last run moves after run 1": Mutation("arbiter", "self.bar(run - 1 or LAST_RUN)", "self.bar(run - 1)"),
+    "a stop bars nothing": Mutation("arbiter", "        self.bar(self._newest)\n        self._scripted = False\n", ""),
+    "a run is not barred while latched": Mutation("arbiter", "            self.bar(run)\n", "            pass\n"),
     "the hold is too short": Mutation("arbiter", "HOLD_MS = 2000", "HOLD_MS = 1999"),
     "a start waits too shortly": Mutation("arbiter", "_START_MS = 2000", "_START_MS = 1999"),
     "a script's zero takes the wheel from a person": Mutation(

@@ -77,6 +77,7 @@ INBOX_MS = 500
 STATE_MS = 250  # at most four states a second
 FOREVER = 1 << 60
 WRITTEN, SYNCED, RENAMED = 1, 2, 3
+LAST_RUN = (1 << 30) - 1  # after it comes 1
 
 #: Files that are no state; ``None`` stands for what JSON cannot parse.
 CORRUPT: tuple[Any, ...] = (
@@ -92,6 +93,7 @@ class Owner:
         self.world, self.index, self.kind, self.cores = world, index, kind, cores
         self.names = 4 if kind == "B" else 8
         self.diff: Callable[[int, int], int] = cores.diff if kind == "B" else operator.sub
+        self.runs_from = 0 if wrap % 2 else LAST_RUN - 3  # owners receive run 1 as the one after this
         self.offset = (1 << 30) - wrap if kind == "B" else 1_000_000
         self.mask = (1 << 30) - 1 if kind == "B" else (1 << 62) - 1
         self.rules = Rules(self.names)
@@ -107,6 +109,10 @@ class Owner:
 
     def clock(self, now: int) -> int:
         return (now + self.offset) & self.mask
+
+    @property
+    def barred(self) -> int:
+        return (self.arbiter.barred - self.runs_from) % LAST_RUN if self.arbiter.barred else 0
 
     def start(self, now: int) -> None:
         cores = self.cores
@@ -216,13 +222,14 @@ class Owner:
         if moves and now - sent >= STALE_MS:
             return
         self.rules.executes(copy)
-        result = self.arbiter.judge(moves, run, valid, self.clock(now))
+        number = (run - 1 + self.runs_from) % LAST_RUN + 1 if run > 0 else run
+        result = self.arbiter.judge(moves, number, valid, self.clock(now))
         self.rules.judged(moves, run, valid, now, result)
         if result > 0 and 0 < run <= self.rules.barred_before and run not in self.world.rogues:
             check(now < self.managed_until, "a run moves that was barred before a restart its manager has received")
         if result != REFUSED:
             self.slot = (result > 0, now + result)
-        if self.arbiter.barred != self.published_barred:
+        if self.barred != self.published_barred:
             self.publish(now)
 
     # -- state
@@ -241,7 +248,7 @@ class Owner:
             self.unpublished = False
             self.published_at = now
             state = self.latch.state(self.persisted)
-            self.published_barred = state["barred"] = self.arbiter.barred
+            self.published_barred = state["barred"] = self.barred
             state["order"] = self.world.order
             if state["persisted"]:
                 self.rules.saved(MISSING if self.durable == MISSING else self.durable[1], self.kind == "L")
@@ -390,7 +397,7 @@ class World:
                 if owner.until > self.now:
                     owner.rules.moving(self.now, owner.until)
                 owner.arbiter.tick(owner.clock(self.now))
-                owner.rules.ticked(self.now, owner.arbiter.barred)
+                owner.rules.ticked(self.now, owner.barred)
                 owner.flush(self.now)
 
     def do_deliver(self, a: int, b: int) -> None:

@@ -1,8 +1,10 @@
-"""Runs of scripts have numbers that only grow."""
+"""Runs of scripts have numbers that only grow, and no end: whatever a stranger sends, the next run moves."""
 
 from __future__ import annotations
 
 import fcntl
+import operator
+import random
 import subprocess
 import sys
 from pathlib import Path
@@ -11,6 +13,8 @@ import pytest
 
 from pebble.contract.payloads import LAST_RUN
 from pebble.errors import PebbleError
+from pebble.motion.arbiter import PERSON, REFUSED, Arbiter
+from pebble.motion.latch import Latch
 from pebble.runtime import runs
 from pebble.runtime.runs import _next
 from tests.support import ROOT
@@ -67,11 +71,10 @@ def test_where_nothing_can_be_saved_the_clock_counts(tmp_path: Path, caplog: pyt
     assert "cannot be opened" in caplog.text
 
 
-def test_after_the_last_number_in_the_file_the_clock_counts_again(tmp_path: Path) -> None:
-    """Else one command of another program, with the last number, would end scripts for good."""
+def test_after_the_last_number_comes_1(tmp_path: Path) -> None:
     path = tmp_path / "autonomy-run.json"
-    assert _next(path, LAST_RUN - 1, clock) == LAST_RUN
-    assert _next(path, 0, clock) == NOW - 1_735_689_600 + 1
+    path.write_text(f"{LAST_RUN - 1}\n")
+    assert [_next(path, 0, clock) for _ in range(3)] == [LAST_RUN, 1, 2]
 
 
 def test_a_file_that_stays_locked_is_an_error_that_names_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -85,6 +88,54 @@ def test_a_file_that_stays_locked_is_an_error_that_names_it(tmp_path: Path, monk
     assert _next(path, 0, clock) > 0
 
 
-def test_numbers_end(tmp_path: Path) -> None:
-    with pytest.raises(PebbleError, match="run numbers end"):
-        _next(tmp_path / "autonomy-run.json", LAST_RUN, clock)
+HALF = 1 << 29
+#: Numbers that a stranger sends one after the other, as seen from the run that drives (0) or from none yet.
+HOSTILE = [
+    *([one] for one in (1, 2, HALF - 2, HALF - 1, HALF, HALF + 1, LAST_RUN - 1, LAST_RUN)),
+    *([HALF - 1, 1], [HALF - 1, LAST_RUN], [1, HALF, LAST_RUN], [LAST_RUN, HALF, 1], [HALF - 2, LAST_RUN - 2, HALF]),
+    *([HALF - 1, LAST_RUN - 1, HALF - 2, LAST_RUN - 2], [1, HALF - 1, HALF + 1], [HALF - 3, HALF + 3, LAST_RUN - 3]),
+    [random.Random(7).randint(1, LAST_RUN) for _ in range(2000)],
+]
+
+
+class Owner:
+    """A motor owner, after the first seconds in which it refuses scripts; ``barred`` is from an earlier life."""
+
+    def __init__(self, barred: int = 0) -> None:
+        self.arbiter = Arbiter(Latch("00c0ffee", 8, operator.sub), 0, operator.sub, 750)
+        self.arbiter.bar(barred)
+
+    def moves(self, run: int) -> bool:
+        return bool(self.arbiter.judge(True, run, -1, 5000) > 0)
+
+    def end(self) -> None:
+        """A person ends the run that moves, and the hold is over."""
+        self.arbiter.judge(False, PERSON, 0, 5000)
+        self.arbiter.tick(7000)
+
+
+@pytest.mark.parametrize("numbers", HOSTILE)
+@pytest.mark.parametrize("zero", [False, True])
+@pytest.mark.parametrize("during", [False, True])
+@pytest.mark.parametrize("restarted", ["", "manager", "owner"])
+@pytest.mark.parametrize("first", [0, 1, 54_000_000, HALF - 1, HALF, LAST_RUN - 1, LAST_RUN])
+def test_whatever_a_stranger_has_sent_the_next_run_moves_and_no_earlier_one(
+    tmp_path: Path, numbers: list[int], zero: bool, during: bool, restarted: str, first: int
+) -> None:
+    path = tmp_path / "autonomy-run.json"
+    path.write_text(f"{first:010d}\n")
+    owner, own = Owner(), _next(path, 0, clock)
+    if during:
+        assert owner.moves(own)
+    for number in numbers:
+        owner.arbiter.judge(not zero, (own + number) & LAST_RUN or LAST_RUN, -1, 5000)
+    seen = numbers[-1] if restarted != "manager" else 0
+    if restarted == "owner":
+        owner = Owner(owner.arbiter.barred)
+    following = _next(path, owner.arbiter.barred, clock, seen)
+    assert owner.moves(following)
+    if during and len(numbers) < 3:  # with three a stranger may have gone round all numbers
+        assert owner.arbiter.judge(True, own, -1, 5000) == REFUSED
+    owner.end()
+    assert not owner.moves(following), "a person's zero ends it, whatever came before"
+    assert owner.moves(_next(path, owner.arbiter.barred, clock, following))

@@ -139,11 +139,11 @@ def test_of_two_runs_the_newer_one_drives(station: Station) -> None:
 
 
 def test_a_run_by_hand_is_above_what_is_barred(station: Station) -> None:
-    station.publish_state(barred=900_000_000)
+    station.publish_state(barred=500_000_000)
     script = station.driven("robot.drive(z=0.5)\nrobot.sleep(60)")
     run = station.received[-1].drive.run
     assert isinstance(run, int)
-    assert run > 900_000_000
+    assert run > 500_000_000
     ended_by_signal(script)
 
 

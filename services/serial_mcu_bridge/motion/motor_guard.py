@@ -13,7 +13,7 @@ from typing import Any
 from msgspec import UNSET
 
 from pebble.contract.payloads import LAST_RUN, Drive, EstopCommand, EstopReset, EstopState
-from pebble.motion.arbiter import HOLD_MS, PERSON, REFUSED, Arbiter
+from pebble.motion.arbiter import HOLD_MS, PERSON, REFUSED, Arbiter, newer
 from pebble.motion.latch import Latch, stop_of
 from pebble.runtime.rate_limit import RateLimitedLog
 from pebble.services.serial_mcu_bridge.motion.motion_inbox import run_of
@@ -75,7 +75,8 @@ class MotorGuard:
             self._save()  # again: a process that was killed while it wrote may have left what a power cut undoes
         barred = self._barred_file.load()
         if type(barred) is int and 0 < barred <= LAST_RUN:
-            self._arbiter.barred = self._barred = barred
+            self._arbiter.bar(barred)
+            self._barred = barred
         if self.latched:
             self._log.log("stop", logging.WARNING, "still stopped by %s", _described(self._latch.by, self._latch.why))
         self._changed(now)
@@ -181,7 +182,7 @@ class MotorGuard:
             return "the robot is stopped"
         if run == PERSON:
             return "after the reset no zero and no pause was received yet"
-        if run <= self._arbiter.barred:
+        if run > 0 and not newer(run, self._arbiter.barred):
             return f"run {run} has ended"
         return f"run {run} has to wait: a person drives, or this process has just started"
 

@@ -122,11 +122,13 @@ MUTATIONS = {
     ),
     "numbers of runs are used again": Mutation(
         f"{_MANAGER}.service",
-        "        return next_run(self.config, max(self._owners.barred, self._last_number)), self._owners.baseline()\n",
-        "        return max(102, self._owners.barred), self._owners.baseline()\n",
+        "next_run(self.config, self._owners.barred, self._owners.newest_run)",
+        "max(102, self._owners.barred)",
     ),
     "a barred run goes on": Mutation(
-        f"{_MANAGER}.motor_owners", "            if state.last_barred >= run:\n", "            if run < 0:\n"
+        f"{_MANAGER}.motor_owners",
+        "            if state.last_barred != barred and not",
+        "            if run < 0 and not",
     ),
     "a run outlives a restart of the motor owner": Mutation(
         f"{_MANAGER}.motor_owners", "            if state.boot != boot:\n", "            if run < 0:\n"
@@ -166,7 +168,7 @@ MUTATIONS = {
         schedule=193,
     ),
     "a script ignores that its run is barred": Mutation(
-        _SENDER, "        elif barred == self.run and self._barred_at is None:\n", "        elif barred < 0:\n"
+        _SENDER, "        elif barring and self._barred_at is None:\n", "        elif now < 0:\n"
     ),
     # -- the gate
     "the gate signs without the run": Mutation(

@@ -67,7 +67,7 @@ MUTATIONS = (
         "now, drive = self.clock(), received.drive\n",
         "now, drive = self.clock(), received.drive\n        if not drive.moves:\n            return\n",
     ),
-    Mutation("a barred run moves", "two", _ARBITER, " or 0 < run <= self.barred:", ":"),
+    Mutation("a barred run moves", "two", _ARBITER, " or (run > 0 and not newer(run, self.barred)):", ":"),
 )
 
 

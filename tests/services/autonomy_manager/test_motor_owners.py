@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import operator
 from typing import Any
 
 import pytest
 
 from pebble.contract.payloads import EstopState
-from pebble.runtime.runs import SUPERSEDED
+from pebble.motion.arbiter import Arbiter
+from pebble.motion.latch import Latch
+from pebble.runtime.runs import SUPERSEDED, following
 from pebble.services.autonomy_manager.motor_owners import OVERRIDDEN, MotorOwners
 
 
@@ -53,9 +56,10 @@ def test_a_run_ends_with_the_reason(owners: MotorOwners, fields: dict[str, Any],
 
 @pytest.mark.parametrize(("newest_run", "why"), [(8, OVERRIDDEN), (9, SUPERSEDED)])
 def test_a_newer_run_is_no_operator(owners: MotorOwners, newest_run: int, why: str) -> None:
-    owners.newest_run = newest_run
+    owners.note_run(newest_run)
+    baseline = owners.baseline()
     owners.receive("serial", state(barred=8))
-    assert owners.ending(8, owners.baseline()) == why
+    assert owners.ending(8, baseline) == why
 
 
 def test_an_owner_that_appears_during_a_run_must_not_change_from_then_on() -> None:
@@ -75,3 +79,27 @@ def test_states_of_others_count_only_where_no_owner_is_known() -> None:
     for number in range(100):
         unknown.receive(f"o{number}", state(barred=number))
     assert unknown.barred == 15
+
+
+HALF, LAST = 1 << 29, (1 << 30) - 1
+
+
+@pytest.mark.parametrize(
+    "barred",
+    [[7, HALF + 9], [HALF + 9, 7], [7, HALF + 6], [7, LAST], [1, LAST], [0, HALF], [5, LAST // 3, LAST // 3 * 2]],
+)
+def test_every_owner_comes_to_obey_a_run_also_one_that_was_away_while_a_stranger_sent_numbers(
+    barred: list[int],
+) -> None:
+    table, arbiters = MotorOwners([]), []
+    for owner, number in enumerate(barred):
+        table.receive(f"o{owner}", state(barred=number))
+        arbiters.append(Arbiter(Latch("aa", 8, operator.sub), 0, operator.sub, 750))
+        arbiters[-1].bar(number)
+    run, baseline = following(table.barred), table.baseline()
+    zeros = list(table.steps_to(run))
+    for arbiter in arbiters:
+        for number in zeros:
+            arbiter.judge(False, number, -1, 3000)
+        assert arbiter.judge(True, run, -1, 3000) == 750
+    assert table.ending(run, baseline) == "", "what was barred before the start ends nothing"

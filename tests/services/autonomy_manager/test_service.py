@@ -268,9 +268,9 @@ def test_without_a_broker_a_script_that_speaks_mqtt_is_refused(tmp_path: Path) -
 
 
 def test_a_run_is_above_what_motor_owners_have_barred(bench: Bench) -> None:
-    bench.owner(barred=800_000_000)
+    bench.owner(barred=500_000_000)
     bench.quiet()
-    assert run_of(bench.start("walk")) > 800_000_000
+    assert run_of(bench.start("walk")) > 500_000_000
 
 
 def test_an_emergency_stop_ends_the_script_and_refuses_others_until_the_reset(bench: Bench) -> None:
@@ -294,7 +294,7 @@ def test_an_emergency_stop_ends_the_script_and_refuses_others_until_the_reset(be
     [
         ({"count": 1}, "emergency stop of motor owner serial: it was reset since"),
         ({"boot": "bb"}, "motor owner serial was restarted: start the script again"),
-        ({"barred": 1_000_000_000}, SUPERSEDED),
+        ({"barred": 500_000_000}, SUPERSEDED),
     ],
 )
 def test_what_ended_a_run_at_the_motors_ends_its_script(bench: Bench, fields: dict[str, Any], error: str) -> None:

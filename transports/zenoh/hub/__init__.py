@@ -25,6 +25,7 @@ from pebble.transports.peers import FileLock, PeerRegistry, new_name, prepare_ru
 from pebble.transports.settings import ZenohSettings
 from pebble.transports.zenoh import wire
 from pebble.transports.zenoh.callbacks import direct
+from pebble.transports.zenoh.hub.admission import WillAdmission
 from pebble.transports.zenoh.hub.journal import Journal
 from pebble.transports.zenoh.hub.store import HubStore, Record, Retained, StoredWill
 from pebble.transports.zenoh.keymap import topic_to_key
@@ -53,6 +54,11 @@ class ZenohHub:
         self._worker: HubWorker | None = None
         self._token: zenoh.LivelinessToken | None = None
         self._store: HubStore | None = None
+        self._admission = WillAdmission(settings.wills)
+
+    @property
+    def refused_wills(self) -> int:
+        return self._admission.refused
 
     @property
     def refused(self) -> int:
@@ -89,7 +95,7 @@ class ZenohHub:
         journal = None if self._settings.journal is None else Journal(self._settings.journal)
         siblings = PeerRegistry(run_dir).sockets()  # they would connect within 0.5 s; we connect at once
         self._store = store = HubStore(tuple(topic_to_key(topic) + "/" for topic in self._settings.reserved))
-        self._worker = HubWorker(self.name, store, journal, self.counters)
+        self._worker = HubWorker(self.name, store, self._admission, journal, self.counters)
         try:
             config = session_config(self._settings, "router", listen=[run_dir / HUB_SOCKET], connect=siblings)
             self._session = open_session(config)
@@ -103,8 +109,11 @@ class ZenohHub:
 class HubWorker:
     """One thread and one queue for all messages and queries of the hub, so that the order of arrival decides (T8)."""
 
-    def __init__(self, name: str, store: HubStore, journal: Journal | None, counters: Counters) -> None:
+    def __init__(
+        self, name: str, store: HubStore, admission: WillAdmission, journal: Journal | None, counters: Counters
+    ) -> None:
         self._name, self._store, self._journal, self._counters = name, store, journal, counters
+        self._admission = admission
         self._recalled = False  # the records of the journal
         self._received: dict[str, int] = {}  # how many retained messages have arrived, by client
         self._alive_clients: set[str] = set()
@@ -282,6 +291,7 @@ class HubWorker:
     # -- store and journal
 
     def _apply(self, record: Record) -> None:
+        record = self._admission.admitted(record)
         if self._store.apply(record) and self._journal is not None:
             self._journal.append(wire.encode(record))
 
@@ -301,7 +311,7 @@ class HubWorker:
         earlier, decode = self._store.empty(), msgspec.msgpack.Decoder(Record).decode
         for data in loaded:
             try:
-                earlier.apply(decode(data))
+                earlier.apply(self._admission.admitted(decode(data)))
             except msgspec.DecodeError as error:
                 log.warning("journal %s has a record of another kind: %s", journal.path, error)
         for record in self._store.records():

@@ -1,0 +1,33 @@
+"""Takes a script's signature off drive commands from outside. Pure.
+
+A signature names the run that may drive, so it counts only from programs on the robot. From outside a signed command
+that moves anything does not pass, and a signed zero stops the motors as a person's.
+"""
+
+from __future__ import annotations
+
+from msgspec import UNSET
+from msgspec.structs import replace
+
+from pebble.contract import DRIVE, codec
+from pebble.contract.payloads import SCRIPT, Drive
+from pebble.errors import PayloadError
+
+_SCRIPT = SCRIPT.encode()
+
+
+def unsigned(payload: bytes) -> bytes | None:
+    """The drive command ``payload`` as it may pass; None: it may not. Hot: a person's is hardly looked at.
+
+    JSON has no other way to write the letters than as they are or with backslashes. What has either of them and cannot
+    be read does not pass: the parser of a board may be more lenient.
+    """
+    if _SCRIPT not in payload and b"\\" not in payload:
+        return payload
+    try:
+        drive: Drive = codec.decode(DRIVE, payload)
+    except PayloadError:
+        return None
+    if not drive.signed:
+        return payload
+    return None if drive.moves else codec.encode(DRIVE, replace(drive, source=UNSET, run=UNSET))

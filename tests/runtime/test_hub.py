@@ -1,0 +1,135 @@
+"""What a robot's hub takes as a will: nothing that happens once, under whatever name, from whomever."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from pebble.config import parse
+from pebble.runtime.connections import hub_settings
+from pebble.runtime.hub import WILLS
+from pebble.transports import Message, QoS, ZenohSettings, create
+from pebble.transports.zenoh.hub.admission import WillAdmission
+from pebble.transports.zenoh.hub.journal import Journal
+from pebble.transports.zenoh.hub.store import StoredWill
+from pebble.transports.zenoh.wire import Will
+from tests.support import ROOT, Child, until
+from tests.transports.zenoh_net import HubProcess
+
+BASE = "pebble/robots/goob"
+REFUSED = (
+    *(
+        f"{BASE}/incoming/{metric}"
+        for metric in ("drive-values", "estop", "estop-reset", "lights-solid", "audio-stream")
+    ),
+    *(f"{BASE}/incoming/{metric}" for metric in ("autonomy-command", "mcu/arm-1/move", "outlets/o1/power", "mip-raw")),
+    *(f"{BASE}/incoming/{metric}" for metric in ("by/otto/drive-values", "drive-values/", "/drive-values", "%2A")),
+    *(f"{BASE}/incoming/flags/{action}" for action in ("reboot", "service-restart", "git-pull")),
+    *("else/where", "arm/drive", "site/reboot", "site/@stop ?*"),
+    *(f"{BASE}/incoming", "pebble/robots/other/incoming/drive-values", "a/b/c/incoming/drive-values"),
+)
+RAW = (f"{BASE}/incoming/+", f"{BASE}/incoming/#", "+/+/+/incoming/drive-values")  # of clients that are not ours
+TAKEN = (
+    *(f"{BASE}/outgoing/{metric}" for metric in ("online", "status", "incoming/drive-values")),
+    *(f"{BASE}/incoming/flags/{flag}" for flag in ("mqtt-video", "night", "reboot/now")),
+    *("site/video", "will", "incoming/drive-values", f"a/{BASE}/incoming/drive-values"),
+)
+VICTIM = """
+import json, sys, time; from pathlib import Path
+from pebble.transports import Message, QoS, ZenohSettings, create
+run_dir, *topics = json.loads(sys.argv[1])
+clients = [
+    create("zenoh", topic, ZenohSettings(run_dir=Path(run_dir), client=True), will=Message(topic, b'{"z":0.6}', QoS(1)))
+    for topic in topics
+]
+print([client.open(10).state.name for client in clients], flush=True)
+time.sleep(600)
+"""
+
+
+@pytest.fixture
+def settings(tmp_path: Path) -> ZenohSettings:
+    line = {"enabled": True, "serial": {"port": "/dev/ttyACM0"}, "topics": {"drive_values": "else/where"}}
+    arm = {"serial": {"port": "/dev/ttyACM1"}, "topics": {"drive_values": "arm/drive", "lights_solid": "site/@stop ?*"}}
+    services = {
+        "serial_mcu_bridge": {**line, "instances": {"arm": arm}},
+        "mqtt_bridge": {"topics": {"reboot": "site/reboot", "mqtt_video": "site/video"}},
+    }
+    transport = {"kind": "zenoh", "run_dir": str(tmp_path / "run"), "journal": str(tmp_path / "journal")}
+    config = parse({"robot": {"id": "goob"}, "transport": transport, "services": services}, folder=tmp_path, env={})
+    return hub_settings(config)
+
+
+def die(settings: ZenohSettings, *topics: str) -> None:
+    """Be killed as clients that have left a will on each of ``topics``."""
+    arguments = [sys.executable, "-c", VICTIM, json.dumps([str(settings.run_dir), *topics])]
+    victim = Child(arguments, cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    assert victim.stdout is not None
+    assert victim.stdout.readline().count("CONNECTED") == len(topics), "a hello succeeds, whatever the will"
+    victim.kill()
+    victim.wait(10)
+    victim.stdout.close()
+
+
+def test_by_topic(settings: ZenohSettings) -> None:
+    admission = WillAdmission((*WILLS, *settings.wills))
+    assert [topic for topic in (*REFUSED, *RAW, *TAKEN) if admission.takes(topic)] == list(TAKEN)
+    assert [topic for topic in TAKEN if not WillAdmission(WILLS).takes(topic)] == [], "as a hub without a config"
+
+
+def test_those_of_clients_that_are_killed(settings: ZenohSettings) -> None:
+    hub = HubProcess(settings.run_dir)
+    hub.settings = settings
+    hub.start()
+    received: list[str] = []
+    with create("zenoh", "watcher", ZenohSettings(run_dir=settings.run_dir, client=True)) as watcher:
+        watcher.subscribe("#", lambda message: received.append(message.topic))
+        die(settings, *REFUSED, *TAKEN)
+        assert until(lambda: len(received) >= len(TAKEN))
+        die(settings, "the/last")
+        assert until(lambda: received[-1] == "the/last")
+    assert sorted(received) == sorted((*TAKEN, "the/last"))
+    _, printed = hub.end()
+    assert printed.count("refused the will of") == len(REFUSED)
+
+
+@pytest.mark.parametrize("topic", [f"{BASE}/incoming/drive-values", "arm/drive"])
+def test_those_of_a_journal(settings: ZenohSettings, topic: str) -> None:
+    """An earlier hub of another version may have stored it."""
+    assert settings.journal is not None
+    settings.run_dir.mkdir(mode=0o700)
+    journal = Journal(settings.journal)
+    journal.load()
+    wills = {
+        "a": Will(topic, b'{"z":0.6}', QoS.DELIVERED, False, "a"),
+        "b": Will("status", b"gone", QoS.DELIVERED, True),
+    }
+    journal.rewrite(msgspec.msgpack.encode(StoredWill(name, will)) for name, will in wills.items())
+    journal.close()
+    hub = HubProcess(settings.run_dir)
+    hub.settings = settings
+    hub.start()
+    received: list[Message] = []
+    with create("zenoh", "watcher", ZenohSettings(run_dir=settings.run_dir, client=True)) as watcher:
+        watcher.subscribe("#", received.append)
+        assert until(lambda: received)
+        die(settings, "the/last")
+        assert until(lambda: received[-1].topic == "the/last")
+    assert [message.topic for message in received] == ["status", "the/last"]
+    hub.kill()
+    assert topic.encode() not in settings.journal.read_bytes()
+
+
+def test_each_client_is_logged_once_and_a_flood_of_them_not_without_end(caplog: pytest.LogCaptureFixture) -> None:
+    admission = WillAdmission(WILLS)
+    will = Will(f"{BASE}/incoming/drive-values", b"{}", QoS.DELIVERED, False)
+    for number in range(1000):
+        admission.admitted(StoredWill("session", msgspec.structs.replace(will, client=f"evil-{number // 2}")))
+    assert (admission.refused, len(caplog.records)) == (1000, 100)
+    assert "evil-0" in caplog.messages[0]
+    assert caplog.messages[-1].endswith("those of further clients are only counted")
