@@ -16,9 +16,20 @@ _NUMBERS = int, float
 
 
 def load(raw: memoryview | bytes):
-    """Parse JSON of limited size and depth. Raises ValueError, OverflowError or MemoryError."""
-    if len(raw) > _MAX_BYTES:
+    """Parse JSON of limited size and depth. Raises ValueError, OverflowError or MemoryError.
+
+    Around it may be what programs add: a byte order mark, a C string's NUL, white space. All but printable ASCII is
+    left out there, by which every JSON text begins and ends.
+    """
+    last = len(raw)
+    if last > _MAX_BYTES:
         raise ValueError
+    first = 0
+    while first < last and not 0x20 < raw[first] < 0x7F:
+        first += 1
+    while first < last and not 0x20 < raw[last - 1] < 0x7F:
+        last -= 1
+    raw = raw[first:last]
     brackets = highest = 0
     for byte in raw:
         highest = max(highest, byte)
@@ -34,8 +45,9 @@ def load(raw: memoryview | bytes):
 def parse(raw: memoryview | bytes) -> tuple[float, float, float, int, int] | None:
     """Return ``(x, z, y, run, valid_ms)`` from bare or wrapped JSON. None: refused.
 
-    Axes are within -1..1, missing ones 0. ``run`` and ``valid_ms`` are as the arbiter needs them. Wrong ones, or a
-    wrong ``source``, refuse a command that moves anything, but never a stop.
+    Axes are within -1..1; missing ones, and those that are no number, are 0; NaN and infinity are refused. ``run`` and
+    ``valid_ms`` are as the arbiter needs them. Wrong ones, or a wrong ``source``, refuse a command that moves anything,
+    but never a stop.
     """
     try:
         body = load(raw)
@@ -79,20 +91,30 @@ def _valid_ms(body: dict, stops: bool) -> int:
 
 
 def _axis(body: dict, name: str) -> float:
-    value = body.get(name, 0)
+    value = body.get(name)
     if isinstance(value, str):
-        value = value.strip().lower()
-        if not value.split("e")[0].strip("+-."):  # a board's float() reads "." and "e5" as 0
-            raise ValueError
-        for char in value:
-            if char not in "0123456789+-.e":  # it would also accept nan, inf and 1_0
-                raise ValueError
+        value = _number(value.strip(" \t\n\r\v\f").lower())
     elif type(value) not in _NUMBERS:
-        raise ValueError
-    value = float(value)
+        return 0.0
+    value = float(value)  # type: ignore[arg-type]
     if not -1e999 < value < 1e999:  # NaN or infinite; arithmetic would allocate memory
         raise ValueError
     return clamp(value)
+
+
+def _number(text: str) -> float:
+    """0 for what is none, as Linux reads it: a board's float() would also accept 1_0, and "." and "e5" as 0."""
+    if "nan" in text or "inf" in text:
+        raise ValueError
+    for char in text:
+        if char not in "0123456789+-.e":
+            return 0.0
+    if not text.split("e")[0].strip("+-."):
+        return 0.0
+    try:
+        return float(text)
+    except ValueError:
+        return 0.0
 
 
 def clamp(value: float) -> float:

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pebble.client.names import Names
-from pebble.contract import DRIVE, OUTGOING, Channel, Kind, codec
-from pebble.contract.payloads import Drive
+from pebble.contract import OUTGOING, Channel, Kind, codec
 from pebble.errors import PayloadError, PebbleError
 from pebble.transports.topics import check_topic
 
@@ -64,21 +63,7 @@ def _warnings(channel: Channel, payload: bytes) -> list[str]:
         found.append(f"{channel.metric} is an older name of {channel.synonym_of}")
     if payload:
         try:
-            codec.decode(channel, payload)
+            codec.decode(channel, payload, lambda _channel, _sender, text: found.append(text))
         except PayloadError as error:
             found.append(f"robots will refuse this: {error}")
-        else:
-            found += _no_axis(channel, payload)
     return found
-
-
-def _no_axis(channel: Channel, payload: bytes) -> list[str]:
-    """A drive command whose fields are unknown is a stop, most often by mistake."""
-    if channel is not DRIVE:
-        return []
-    raw = codec.plain(channel, payload)
-    fields = raw.get("value", raw) if isinstance(raw, dict) else {}
-    unknown = [] if not isinstance(fields, dict) else [name for name in fields if name not in Drive.__struct_fields__]
-    if not unknown or {"x", "y", "z"} & fields.keys():
-        return []
-    return [f"there is no axis in it (x: steering, z: throttle, y), only {', '.join(unknown)}; so it is a stop"]

@@ -17,6 +17,8 @@ from pebble.contract.payloads import (
     AutonomyCommand,
     Drive,
     EstopCommand,
+    LightsFlash,
+    LightsSolid,
     MediaRequest,
     SoundboardCommand,
 )
@@ -32,6 +34,9 @@ _LATEST_STAMP = 253_402_300_800_000  # the year 10000 in ms: later times are inv
 
 # Narrower than float(): that also takes "1_0", digits of other scripts and the names of NaN and infinity.
 _numeric = re.compile(r"\s*[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?\s*", re.ASCII).fullmatch
+#: All but printable ASCII, by which every JSON text begins and ends: a byte order mark, a C string's NUL, white space.
+_AROUND = bytes(byte for byte in range(256) if not 0x21 <= byte <= 0x7E)
+_KEYS_SHOWN, _SHOWN = 8, 20  # of a payload that is not understood, and characters of each
 _encoder = msgspec.json.Encoder()
 _decoder = msgspec.json.Decoder()
 
@@ -45,11 +50,15 @@ def encode(channel: Channel, value: Any) -> bytes:
     return _encoder.encode(value)
 
 
-def decode(channel: Channel, raw: bytes) -> Any:
+#: Receives a command's channel, its sender as far as that is in it, and what it does that may not be meant.
+Remark = Callable[[Channel, str, str], None]
+
+
+def decode(channel: Channel, raw: bytes, remark: Remark | None = None) -> Any:
     """The payload struct (or bool, or bytes) in ``raw``. Raises PayloadError that describes the problem.
 
     Commands may be bare or wrapped in ``{"value": …}``; boolean controls are ``true``, ``{"value": true}`` or
-    ``{"enabled": true}`` and nothing else.
+    ``{"enabled": true}`` and nothing else. Numbers of drive and light commands may be text.
     """
     if channel.payload is bytes:
         return raw
@@ -61,10 +70,12 @@ def decode(channel: Channel, raw: bytes) -> Any:
     if channel.payload is bool:
         return _boolean(channel, decoded)
     if channel.direction == INCOMING:
-        decoded = _unwrap(channel, decoded)
+        decoded = _unwrap(channel, decoded, remark or _ignore)
     try:
         return msgspec.convert(decoded, channel.payload)
     except (msgspec.ValidationError, ValueError, OverflowError) as error:
+        if issubclass(channel.payload, LightsSolid):
+            return msgspec.convert(decoded | _numbers(channel, decoded, remark or _ignore), channel.payload)
         raise PayloadError(f"{channel.metric}: {error}") from None
 
 
@@ -72,6 +83,7 @@ def plain(channel: Channel, raw: bytes) -> Any:
     """The JSON value in ``raw``, of any shape. Raises PayloadError if it is invalid or beyond the limits."""
     if channel.direction == INCOMING and len(raw) > MAX_COMMAND_BYTES:
         raise PayloadError(f"{channel.metric}: {len(raw)} bytes, more than {MAX_COMMAND_BYTES}")
+    raw = trim(raw)
     if too_deep(raw):
         raise PayloadError(f"{channel.metric}: nested deeper than {MAX_DEPTH}")
     try:
@@ -80,7 +92,17 @@ def plain(channel: Channel, raw: bytes) -> Any:
     except UnicodeDecodeError:
         raise PayloadError(f"{channel.metric}: not UTF-8") from None
     except msgspec.DecodeError as error:
+        if b"\0" in raw:
+            raise PayloadError(f"{channel.metric}: NULs between its characters, as in UTF-16: send UTF-8") from None
         raise PayloadError(f"{channel.metric}: not JSON: {error}") from None
+
+
+def trim(raw: bytes) -> bytes:
+    """``raw`` without the bytes around its JSON that programs of other languages add; the same object if it has none.
+
+    Firmware does the same (firmware/common/payload.py).
+    """
+    return raw.strip(_AROUND)
 
 
 def _stop(channel: Channel, raw: bytes) -> EstopCommand:
@@ -134,7 +156,11 @@ def _boolean(channel: Channel, plain: Any) -> bool:
     raise PayloadError(f'{channel.metric}: only true, false, {{"value": bool}} or {{"enabled": bool}} switch it')
 
 
-def _unwrap(channel: Channel, plain: Any) -> Any:
+def _ignore(_channel: Channel, _sender: str, _text: str) -> None:
+    """The caller wants no remarks."""
+
+
+def _unwrap(channel: Channel, plain: Any, remark: Remark) -> Any:
     """Commands: the object under ``value`` if there is one, else the root (paper A.4.5)."""
     if channel.payload in (SoundboardCommand, AutonomyCommand):
         return _switch(plain)
@@ -143,7 +169,7 @@ def _unwrap(channel: Channel, plain: Any) -> Any:
     if not isinstance(plain, dict):
         raise PayloadError(f"{channel.metric}: an object is needed, not {_name_of(plain)}")
     inner = plain["value"] if isinstance(plain.get("value"), dict) else plain
-    return _drive(channel, inner) if channel.payload is Drive else inner
+    return _drive(channel, inner, remark) if channel.payload is Drive else inner
 
 
 def _switch(plain: Any) -> Any:
@@ -166,12 +192,13 @@ def _request(channel: Channel, plain: Any) -> Any:
     return {**(inner if isinstance(inner, dict) else {}), "enabled": _boolean(channel, inner)}
 
 
-def _drive(channel: Channel, plain: dict[str, Any]) -> dict[str, Any]:
-    """Axes may be numeric strings; anything else that is no finite number is refused.
-
-    A wrong ``source``, ``run`` or ``valid_ms`` refuses a command that moves anything, but never a stop.
-    """
-    axes = {axis: _number(channel, axis, plain[axis]) for axis in ("x", "z", "y") if axis in plain}
+def _drive(channel: Channel, plain: dict[str, Any], remark: Remark) -> dict[str, Any]:
+    """A wrong ``source``, ``run`` or ``valid_ms`` refuses a command that moves anything, but never a stop."""
+    axes = _numbers(channel, plain, remark)
+    if not axes:
+        found = ", ".join([_shown(key) for key in plain][:_KEYS_SHOWN]) or "nothing"
+        expected = 'expected {"x": steering, "z": throttle}, each -1 to 1'
+        remark(channel, _sender(plain), f"none of x, z and y is in it, but {found}: so it is a stop; {expected}")
     moves = any(axes.values())
     more = {key: plain[key] for key in _DRIVE_CHECKS if plain.get(key) is not None}
     wrong = [key for key, value in more.items() if not _DRIVE_CHECKS[key][0](value)]
@@ -207,7 +234,9 @@ _drive_decoder: msgspec.json.Decoder[Any] = msgspec.json.Decoder(
 
 def _usual_drive(raw: bytes) -> Drive | None:
     """A bare command of numbers, which is what nearly all are; None: it is none, or needs a closer look. Hot."""
-    if len(raw) > _USUAL_BYTES or raw.count(b"{") != 1 or b"[" in raw or not raw.isascii():
+    if len(raw) > _USUAL_BYTES or raw.count(b"{") != 1 or not raw.isascii():
+        return None
+    if b'"z"' not in raw and b'"x"' not in raw and b'"y"' not in raw:  # it names no axis, or escapes the name
         return None
     try:
         found = _drive_decoder.decode(raw)
@@ -220,18 +249,55 @@ def _usual_drive(raw: bytes) -> Drive | None:
     return drive if usual else None
 
 
-def _number(channel: Channel, name: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float | str):
-        raise PayloadError(f"{channel.metric}: {name} is {_name_of(value)}, not a number")
-    if isinstance(value, str) and not _numeric(value):
-        raise PayloadError(f"{channel.metric}: {name} is not a number")
+#: The numbers of a command and what one is that cannot be read, by payload.
+_NUMBERS: dict[Any, dict[str, float]] = {
+    Drive: {"x": 0.0, "z": 0.0, "y": 0.0},
+    LightsSolid: {"b": 0.0, "g": 0.0, "r": 0.0},
+    LightsFlash: {"b": 0.0, "g": 0.0, "r": 0.0, "period": LightsFlash().period},
+}
+
+
+def _numbers(channel: Channel, plain: dict[str, Any], remark: Remark) -> dict[str, float]:
+    """Those that are given, as the original reads them: also from text, and a default for what is no number.
+
+    NaN and infinity refuse the command.
+    """
+    found = {}
+    for name, default in _NUMBERS[channel.payload].items():
+        if name in plain:
+            number = _number(channel, name, plain[name])
+            found[name] = default if number is None else number
+            if number is None and plain[name] is not None:
+                what = f"{name} is {_shown(plain[name])}, which is no number: it counts as {default:g}"
+                remark(channel, _sender(plain), what)
+    return found
+
+
+def _number(channel: Channel, name: str, value: Any) -> float | None:
+    """None: it is none. Firmware reads the same (firmware/common/payload.py)."""
+    if isinstance(value, str):
+        if "nan" in (word := value.lower()) or "inf" in word:
+            raise PayloadError(f"{channel.metric}: {name} is not a finite number")
+        if not _numeric(value):
+            return None
+    elif isinstance(value, bool) or not isinstance(value, int | float):
+        return None
     try:
         number = float(value)
-    except (ValueError, OverflowError):
-        raise PayloadError(f"{channel.metric}: {name} is not a number") from None
+    except OverflowError:
+        number = math.inf
     if not math.isfinite(number):
         raise PayloadError(f"{channel.metric}: {name} is not a finite number")
     return number
+
+
+def _sender(plain: dict[str, Any]) -> str:
+    source = plain.get("source")
+    return source if isinstance(source, str) else ""
+
+
+def _shown(value: Any) -> str:
+    return ascii(value[:_SHOWN]) if isinstance(value, str) else _name_of(value)
 
 
 def _name_of(value: Any) -> str:

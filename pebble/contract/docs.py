@@ -36,9 +36,15 @@ _ACCEPTED = """\
 
 * A command may be bare or wrapped: `{"x": 0.2, "z": 0.5}` and `{"value": {"x": 0.2, "z": 0.5}}` mean the same.
 * A boolean is `true`, `{"value": true}` or `{"enabled": true}`; numbers, strings and null switch nothing.
-* Drive values may be numeric strings; a missing axis is 0; everything is clamped to -1..1.
-* Refused, counted and logged: NaN and infinities in any spelling, wrong types, bytes that are not UTF-8, JSON nested
-  deeper than 32 levels, commands larger than 64 KB.
+* Numbers of drive and light commands may be text: `"0.5"`, `" -1e-1 "`. One that is missing, `null` or no number is 0
+  (a `period`: 2); everything is clamped. NaN or infinity, as a number or as text (`"nan"`, `"-inf"`, `"1e999"`),
+  refuses the whole command: the wheels do what they did until their deadline.
+* A drive command without `x`, `z` and `y` is a stop. The motor owner's log names its keys, once a minute for each
+  `source`; boards have no log.
+* Bytes around a payload that are not printable ASCII change nothing: a byte order mark, a C string's NULs, white
+  space. An empty payload still removes what was retained; white space alone is a bridge's probe, and ignored.
+* Refused, counted and logged: NaN and infinities in any spelling, wrong types, bytes that are not UTF-8 (so also
+  UTF-16), JSON nested deeper than 32 levels, commands larger than 64 KB. But on `estop` what cannot be read stops.
 * Unknown fields are ignored. A retained command or action is stale: it is neither executed nor forwarded.
 """
 

@@ -38,7 +38,7 @@ LAST_RUN = arbiter.LAST_RUN
 
 
 class Drive(Payload, frozen=True, kw_only=True):
-    """Wanted motion. Missing axes are 0; everything is clamped to -1..1 (paper A.8.3).
+    """Wanted motion. Axes that are missing or no number are 0; all are clamped to -1..1 (paper A.8.3).
 
     A script signs its commands with ``source`` and ``run``; ``valid_ms`` limits how long this command moves anything.
     Fields that say nothing are not written: old sketches have 256 bytes for the topic and the payload.
@@ -419,6 +419,7 @@ class TagData(Payload, frozen=True, kw_only=True):
     corners_norm: Corners | None = None
     distance_m: float | None = None
     angle_rad: float | None = None
+    of: int | UnsetType = UNSET  # how many tags with this id are in the picture; absent: one
 
 
 class OverlayLabel(Payload, frozen=True, kw_only=True):

@@ -1,6 +1,7 @@
 """JSON Schemas of every payload, generated from the contract, for programs in other languages.
 
-They define what to *send*; Pebble reads more leniently (numeric strings in drive values, a bare boolean for sounds).
+They define what to *send*; Pebble reads more leniently (a bare boolean for sounds, an axis that is no number as 0).
+Numbers of drive and light commands may be sent as text, as forms of web pages do; Pebble itself sends numbers.
 """
 
 from __future__ import annotations
@@ -10,10 +11,12 @@ from typing import Any
 import msgspec
 
 from pebble.contract import CHANNELS, INCOMING, Channel
+from pebble.contract.payloads import Drive, LightsFlash, LightsSolid
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 _REF = "#/$defs/{name}"
 _BOOLEAN = {"type": "boolean"}
+_NUMERIC = r"^\s*[+-]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][+-]?[0-9]+)?\s*$"
 
 
 def schemas() -> dict[str, Any]:
@@ -24,6 +27,10 @@ def schemas() -> dict[str, Any]:
     json_channels = [channel for channel in CHANNELS if channel.payload is not bytes]
     structs = list(dict.fromkeys(channel.payload for channel in json_channels if channel.payload is not bool))
     roots, definitions = msgspec.json.schema_components(structs, ref_template=_REF)
+    for struct in (Drive, LightsSolid, LightsFlash):
+        for field in definitions[struct.__name__]["properties"].values():
+            if field["type"] == "number":
+                field |= {"type": ["number", "string"], "pattern": _NUMERIC}
     root_of = dict(zip(structs, roots, strict=True))
     topics = {channel.suffix: _accepted(channel, root_of.get(channel.payload, _BOOLEAN)) for channel in json_channels}
     return {"$schema": DIALECT, "title": "Pebble payloads", "topics": topics, "$defs": definitions}

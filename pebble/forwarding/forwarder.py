@@ -489,7 +489,7 @@ def barrier(transport: Transport, filter_: str) -> None:
 def _is_json(value: bytes) -> bool:
     """Whether white space may follow ``value`` without changing it."""
     try:
-        msgspec.json.decode(value)
+        msgspec.json.decode(codec.trim(value))
     except msgspec.DecodeError:
         return False
     return True

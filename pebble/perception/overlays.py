@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from msgspec import UNSET
 
 from pebble.contract.payloads import (
     Corners,
@@ -46,8 +47,8 @@ def overlays(source: str, tags: Sequence[Tag], size: Size, timestamp: float) -> 
     )
 
 
-def tag_data(marker_id: int, tag: Tag | None, size: Size, timestamp: float) -> TagData:
-    """The followed tag; without one, ``corners_norm`` is an empty list, as consumers expect."""
+def tag_data(marker_id: int, tag: Tag | None, size: Size, timestamp: float, of: int = 1) -> TagData:
+    """The followed tag, of so many with its id; without one, ``corners_norm`` is an empty list, as consumers expect."""
     if tag is None:
         return TagData(detected=False, marker_id=marker_id, corners_norm=[], timestamp=timestamp)
     return TagData(
@@ -57,18 +58,19 @@ def tag_data(marker_id: int, tag: Tag | None, size: Size, timestamp: float) -> T
         distance_m=tag.distance_m,
         angle_rad=tag.angle_rad,
         timestamp=timestamp,
+        of=of if of > 1 else UNSET,
     )
 
 
-def tag_in(locations: TagLocations, tag_id: int, geometry: TagGeometry) -> Tag | None:
-    """A tag that another program has found; None if it is not among them."""
-    size = locations.frame_width, locations.frame_height
+def tags_in(locations: TagLocations, tag_id: int, geometry: TagGeometry) -> list[Tag]:
+    """The tags with this id that another program has found."""
+    size, tags = (locations.frame_width, locations.frame_height), []
     for detection in locations.detections:
         if detection.marker_id == tag_id and len(detection.corners_norm) == 4 and min(size) > 0:
             corners = np.array(detection.corners_norm) * size
-            place = geometry.place(corners, *size)
-            return None if place is None else Tag(tag_id, corners, place)
-    return None
+            if (place := geometry.place(corners, *size)) is not None:
+                tags.append(Tag(tag_id, corners, place))
+    return tags
 
 
 def _with_corners(tags: Sequence[Tag], size: Size) -> list[tuple[Tag, Corners]]:

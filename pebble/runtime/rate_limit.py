@@ -10,11 +10,12 @@ import time
 class RateLimitedLog:
     """Writes at most ``burst`` lines per ``period_s`` and subject, each with the number of events so far.
 
-    A subject is a name from a fixed set, never text from the wire.
+    A subject is a name from a fixed set, never text from the wire, unless ``most`` bounds how many there are in a
+    period: all beyond share one.
     """
 
-    def __init__(self, log: logging.Logger, *, burst: int = 1, period_s: float = 5.0) -> None:
-        self._log, self._burst, self._period = log, burst, period_s
+    def __init__(self, log: logging.Logger, *, burst: int = 1, period_s: float = 5.0, most: int | None = None) -> None:
+        self._log, self._burst, self._period, self._most = log, burst, period_s, most
         self._lock = threading.Lock()
         self._totals: dict[str, int] = {}
         self._windows: dict[str, tuple[float, int]] = {}  # when it began, lines written in it
@@ -45,6 +46,8 @@ class RateLimitedLog:
         """How often ``subject`` has come up if it may be logged now, else 0."""
         now = time.monotonic()
         with self._lock:
+            if self._most is not None and subject not in self._windows and len(self._windows) >= self._most:
+                subject = self._make_room(subject, now)
             total = self._totals[subject] = self._totals.get(subject, 0) + times
             began, lines = self._windows.get(subject, (float("-inf"), 0))
             if now - began >= self._period:
@@ -53,3 +56,9 @@ class RateLimitedLog:
                 return 0
             self._windows[subject] = (began, lines + 1)
             return total
+
+    def _make_room(self, subject: str, now: float) -> str:
+        """Forget the subjects whose period is over; the subject to count under, which is "" while there is no room."""
+        for one in [one for one, (began, _) in self._windows.items() if one and now - began >= self._period]:
+            del self._windows[one], self._totals[one]
+        return subject if len(self._windows) < (self._most or 0) else ""

@@ -23,6 +23,8 @@ from pebble.transports.counters import Counters, bounds_reached
 
 _QOS = {int(one): one for one in QoS}  # to look one up costs a third of a call of the class
 _ONE_SHOT = (Kind.COMMAND, Kind.ACTION, Kind.FEED)
+_SENDERS = 16  # whose commands are remarked upon one by one
+_SENDER_SHOWN = 40  # characters
 WAIT_LIMIT_S = 0.5  # of a drive command in the inbox; with a transport's silence limit of 2 s, none acts after 2.5 s
 
 Method = TypeVar("Method", bound=Callable[..., None])
@@ -104,6 +106,7 @@ class Service:
         self.counters = Counters()
         self.timers = Timers()
         self._quiet_log = RateLimitedLog(self.log)
+        self._remarks = RateLimitedLog(self.log, period_s=60.0, most=_SENDERS)
         self._inbox = Inbox()
         self._work = WorkLock()
         self._wakes_at = -inf  # when the service's thread looks at its timers, on `clock`; guarded by `_work`
@@ -326,7 +329,7 @@ class Service:
             )
             return
         try:
-            value = codec.decode(channel, message.payload)
+            value = codec.decode(channel, message.payload, self._remark)
         except PayloadError as error:
             if codec.is_blank(message.payload):
                 self.counters.add("blank")
@@ -344,6 +347,11 @@ class Service:
             self._handle(channel, lambda: method(value, **names), min(arrived, self.clock() - message.waited_s))
 
         self._inbox.post(handle, newest_of=message.topic if channel.newest else None)
+
+    def _remark(self, channel: Channel, sender: str, text: str) -> None:
+        """Log what a command does that its sender may not mean, once a minute and sender."""
+        known = f", from {sender[:_SENDER_SHOWN]!a}" if sender else ""
+        self._remarks.warning(channel.metric + known, "%s%s: %s", channel.metric, known, text)
 
     def _on_state(self, state: State) -> None:
         if state is State.CONNECTED:

@@ -69,6 +69,7 @@ def line_of(payload: bytes) -> msgspec.Raw | None:
         return None
     try:
         codec.plain(LOGS, payload)
+        payload = codec.trim(payload)
     except PayloadError:
         payload = msgspec.json.encode(payload.decode(errors="replace"))
     return msgspec.Raw(payload) if len(payload) <= MAX_LINE_BYTES else None

@@ -269,9 +269,12 @@ class Robots:
             self._log(component, message)
         elif not message.payload:
             self._remove_value(component, metric, message)
-        elif self._store(component, metric, channel, message, now):
-            self.recent.receive(ref, metric, message, now)
-            self._interpret(component, metric, channel, message, now)
+        else:
+            if (raw := codec.trim(message.payload)) != message.payload:  # pages get it as it is
+                message = msgspec.structs.replace(message, payload=raw)
+            if self._store(component, metric, channel, message, now):
+                self.recent.receive(ref, metric, message, now)
+                self._interpret(component, metric, channel, message, now)
 
     def forget(self, ref: str) -> None:
         """Remove a component, also one that was never there; it comes back with its next message."""

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests.firmware.micropython import SCRIPTS, compile_all, run
+from tests.support import ROOT
 
 PURE = Path(__file__).parent / "pure"
 
@@ -36,6 +37,8 @@ def outcome(module: str, firmware: Path) -> dict[str, str]:
     root = firmware.parent / module
     shutil.copytree(firmware, root)
     shutil.copy(PURE / f"{module}.py", root)
+    (root / "vectors").mkdir()
+    shutil.copy(ROOT / "tests" / "vectors" / "commands.json", root / "vectors")
     (root / "module.txt").write_text(module)
     done = run(root, SCRIPTS / "run_tests.py")
     assert done.returncode == 0, done.stdout + done.stderr

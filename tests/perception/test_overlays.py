@@ -10,7 +10,7 @@ import pytest
 
 from pebble.contract import APRILTAG_DATA, APRILTAG_LOCATIONS, VIDEO_OVERLAYS, codec
 from pebble.contract.payloads import TagLocations
-from pebble.perception.overlays import locations, overlays, tag_data, tag_in
+from pebble.perception.overlays import locations, overlays, tag_data, tags_in
 from pebble.perception.tags import Place, Tag, TagGeometry
 
 SIZE = (640, 480)
@@ -44,6 +44,8 @@ def test_the_followed_tag_and_none() -> None:
     seen = json.loads(codec.encode(APRILTAG_DATA, tag_data(13, TAG, SIZE, 5.0)))
     assert np.allclose(seen.pop("corners_norm"), NORM)
     assert seen == {"detected": True, "marker_id": 13, "distance_m": 0.74, "angle_rad": -0.11, "timestamp": 5.0}
+    assert b'"of"' not in codec.encode(APRILTAG_DATA, tag_data(13, TAG, SIZE, 5.0, of=1))
+    assert json.loads(codec.encode(APRILTAG_DATA, tag_data(13, TAG, SIZE, 5.0, of=2)))["of"] == 2
     none = json.loads(codec.encode(APRILTAG_DATA, tag_data(13, None, SIZE, 5.0)))
     assert none == {
         "detected": False,
@@ -65,10 +67,9 @@ def test_a_tag_that_another_program_found_has_its_place() -> None:
     half = 0.125 / 2.0 * TagGeometry(0.25)._camera.matrix(*SIZE)[0, 0]
     square = np.array([[-half, -half], [half, -half], [half, half], [-half, half]]) + np.array([319.5, 239.5])
     payload = locations("s", [Tag(13, square, Place(0.0, 0.0))], SIZE, 0.0)
-    tag = tag_in(payload, 13, TagGeometry(0.25))
-    assert tag is not None
+    (tag,) = tags_in(payload, 13, TagGeometry(0.25))
     assert tag.place == pytest.approx((2.0, 0.0), abs=1e-6)
     assert math.isfinite(tag.distance_m)
-    assert tag_in(payload, 14, TagGeometry(0.25)) is None
+    assert tags_in(payload, 14, TagGeometry(0.25)) == []
     empty = TagLocations(source="s", detections=payload.detections, frame_width=0, frame_height=0, timestamp=0.0)
-    assert tag_in(empty, 13, TagGeometry(0.25)) is None
+    assert tags_in(empty, 13, TagGeometry(0.25)) == []

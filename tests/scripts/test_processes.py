@@ -88,6 +88,28 @@ def test_following_by_odometry_uses_what_two_other_scripts_publish(sensors: Sens
     assert until(station.rests)
 
 
+@pytest.mark.parametrize("names", [("apriltag-follow",), ("apriltag-locations", "apriltag-odom-follow")])
+def test_of_two_tags_with_one_id_a_follower_keeps_to_the_one_that_it_has(
+    sensors: Sensors, names: tuple[str, ...]
+) -> None:
+    sensors.subscribe("apriltag-data")
+    scripts = [
+        sensors.start(name, "--marker-size", "0.25") if "follow" in name else sensors.start(name) for name in names
+    ]
+    data = sensors.messages["apriltag-data"]
+    assert until(lambda: sum(one["detected"] for one in data) > 5, 40)
+    assert all("of" not in one for one in data)
+    sensors.two = True
+    assert until(lambda: sum(one.get("of") == 2 for one in data) > 10, 20)
+    distances = {round(one["distance_m"], 1) for one in data if one["detected"]}
+    assert distances == {2.0}, "the farther one"
+    sensors.two = False
+    for script in scripts:
+        script.send_signal(signal.SIGTERM)
+        output, _ = script.communicate(timeout=20)
+        assert output.count("2 tags with id 13: using the one 9 degrees to the right, nearest to the last one") == 1
+
+
 def test_a_topic_of_commands_is_refused(sensors: Sensors) -> None:
     topic = f"{sensors.station.config.base}/incoming/drive-values"
     script = sensors.start("wheel-odometry", "--topic", topic)

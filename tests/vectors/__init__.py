@@ -1,1 +1,1 @@
-"""Recorded packets and what they have to become; each file is made by the script beside it."""
+"""Recorded packets and what they have to become, made by the script beside them; and commands.json, written by hand."""

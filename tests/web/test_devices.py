@@ -115,6 +115,15 @@ def test_a_manifest_of_any_shape_is_read(payload: Any) -> None:
     assert robots.value(BASE, DESCRIBE) is not None
 
 
+@pytest.mark.parametrize("metric", ["status", "online", "capabilities", "charging-level"])
+def test_pages_get_a_value_without_the_bytes_around_it(metric: str) -> None:
+    robots = Robots()
+    robots.receive(Message(f"{BASE}/outgoing/{metric}", b'\xef\xbb\xbf{"t":1,"value":{}}\r\n\0'), 1.0)
+    assert bytes(robots.value(BASE, metric) or b"") == b'{"t":1,"value":{}}'
+    robots.receive(Message(f"{BASE}/outgoing/{metric}", b"\0"), 1.0)  # not even an empty payload
+    assert robots.value(BASE, metric) is not None
+
+
 def test_there_is_an_end_to_aliases() -> None:
     robots = Robots()
     for device in range(4):

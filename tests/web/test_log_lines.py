@@ -52,6 +52,7 @@ def test_a_page_that_is_too_slow_sees_from_where_there_are_lines() -> None:
 def test_plain_text_becomes_a_string() -> None:
     assert bytes(line_of(b"hello [x") or b"") == b'"hello [x"'
     assert bytes(line_of(b"\xff\x00") or b"") == json.dumps("\ufffd\0", ensure_ascii=False).encode()
+    assert bytes(line_of(b'\xef\xbb\xbf{"t":1}\r\n\0') or b"") == b'{"t":1}'  # pages could not read it otherwise
     assert line_of(b"\x01" * (MAX_LINE_BYTES // 2)) is None  # six bytes each, as JSON
 
 

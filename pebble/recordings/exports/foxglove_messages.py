@@ -290,6 +290,7 @@ def as_object(payload: bytes) -> bytes | None:
 
     None for what is no JSON, and for an empty payload.
     """
+    payload = codec.trim(payload)
     try:
         payload.decode()
         value = msgspec.json.decode(payload)

@@ -13,7 +13,8 @@ from pebble.perception.camera_model import HFOV_DEG, CameraModel
 from pebble.perception.follow import Follower, FollowSettings
 from pebble.perception.overlays import overlays, tag_data
 from pebble.perception.rate import Rate
-from pebble.perception.tags import FAMILY, TagFinder
+from pebble.perception.tags import FAMILY, TagChoice, TagFinder
+from pebble.runtime.rate_limit import RateLimitedLog
 
 SOURCE = Path(__file__).parent.name
 
@@ -56,6 +57,7 @@ def main(robot: Robot, options: Options) -> None:
     drawn = renamed(VIDEO_OVERLAYS, options.overlays_topic, robot.config.base)
     camera = CameraModel.find([Path(__file__).parent, robot.config.folder], options.hfov_deg)
     finder = TagFinder(options.tag_size_m, camera, options.marker_dictionary)
+    choice, log = TagChoice(options.tag_id), RateLimitedLog(robot.log, period_s=10.0)
     follower = Follower(convert(options, FollowSettings, from_attributes=True))
     rate, size = Rate(options.control_rate_hz), (0, 0)
     robot.publish_at_end(followed, lambda: tag_data(options.tag_id, None, size, time.time()))
@@ -64,10 +66,12 @@ def main(robot: Robot, options: Options) -> None:
         if not rate.due(time.monotonic()):
             continue
         size = (picture.shape[1], picture.shape[0])
-        tag = next((tag for tag in finder.find(picture) if tag.id == options.tag_id), None)
+        tag = choice.choose(finder.find(picture), time.monotonic())
+        if choice.remark:
+            log.warning("tags", "%s", choice.remark)
         command = follower.step(time.monotonic(), tag and tag.place)
         robot.drive(command.x, command.z)
-        robot.publish(followed, tag_data(options.tag_id, tag, size, time.time()))
+        robot.publish(followed, tag_data(options.tag_id, tag, size, time.time(), choice.count))
         robot.publish(drawn, overlays(SOURCE, [tag] if tag else [], size, time.time()))
 
 

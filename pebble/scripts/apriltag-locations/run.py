@@ -12,7 +12,8 @@ from pebble.contract.renaming import renamed
 from pebble.perception.camera_model import CameraModel
 from pebble.perception.overlays import locations, overlays
 from pebble.perception.rate import Rate
-from pebble.perception.tags import FAMILY, TagFinder
+from pebble.perception.tags import FAMILY, TagFinder, TagOrder
+from pebble.runtime.rate_limit import RateLimitedLog
 
 SOURCE = Path(__file__).parent.name
 
@@ -38,12 +39,15 @@ def main(robot: Robot, options: Options) -> None:
         Rate(options.control_rate_hz),
         (0, 0),
     )
+    order, log = TagOrder(), RateLimitedLog(robot.log, period_s=10.0)
     robot.publish_at_end(found, lambda: locations(SOURCE, [], size, time.time()))
     robot.publish_at_end(drawn, lambda: overlays(SOURCE, [], size, time.time()))
     for picture in robot.camera():
         if rate.due(time.monotonic()):
             size = (picture.shape[1], picture.shape[0])
-            tags, now = finder.find(picture), time.time()
+            tags, now = order.sort(finder.find(picture), time.monotonic()), time.time()
+            for remark in order.remarks:
+                log.warning("tags", "%s", remark)
             robot.publish(found, locations(SOURCE, tags, size, now))
             robot.publish(drawn, overlays(SOURCE, tags, size, now))
 

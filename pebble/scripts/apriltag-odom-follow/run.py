@@ -11,8 +11,9 @@ from pebble.contract import APRILTAG_DATA, APRILTAG_LOCATIONS, WHEEL_ODOMETRY
 from pebble.contract.renaming import renamed
 from pebble.perception.camera_model import CameraModel
 from pebble.perception.odom_follow import OdomFollower, OdomFollowSettings, pose_of
-from pebble.perception.overlays import tag_data, tag_in
-from pebble.perception.tags import TagGeometry
+from pebble.perception.overlays import tag_data, tags_in
+from pebble.perception.tags import Tag, TagChoice, TagGeometry
+from pebble.runtime.rate_limit import RateLimitedLog
 
 POSE_AGE_S = 1.0  # odometry is published twice a second at rest
 
@@ -72,21 +73,25 @@ def main(robot: Robot, options: Options) -> None:
     )
     camera = CameraModel.find([Path(__file__).parent, robot.config.folder])
     geometry = TagGeometry(options.tag_size_m, camera)
+    choice, log = TagChoice(options.tag_id), RateLimitedLog(robot.log, period_s=10.0)
     follower = OdomFollower(convert(options, OdomFollowSettings, from_attributes=True))
     robot.publish_at_end(APRILTAG_DATA, lambda: tag_data(options.tag_id, None, (0, 0), time.time()))
+    tag: Tag | None = None
     seen, due = None, time.monotonic()
     while True:
         now = time.monotonic()
         newest = robot.latest(tags, options.tag_timeout_s)
         pose = pose_of(robot.latest(odometry, POSE_AGE_S))
-        tag = newest and tag_in(newest, options.tag_id, geometry)
         if newest is not seen:
             seen = newest
+            tag = choice.choose(tags_in(newest, options.tag_id, geometry), now) if newest else None
+            if newest and choice.remark:
+                log.warning("tags", "%s", choice.remark)
             follower.see(now, tag and tag.place, pose)
         command = follower.step(now, pose)
         robot.drive(command.x, command.z)
         size = (newest.frame_width, newest.frame_height) if newest else (0, 0)
-        robot.publish(APRILTAG_DATA, tag_data(options.tag_id, tag, size, time.time()))
+        robot.publish(APRILTAG_DATA, tag_data(options.tag_id, tag, size, time.time(), choice.count))
         due = max(due + 1 / options.control_rate_hz, now)
         robot.sleep(due - time.monotonic())
 

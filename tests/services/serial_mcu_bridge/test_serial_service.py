@@ -124,6 +124,49 @@ def test_malformed_commands_are_counted(bench: Bench) -> None:
 # -- emergency stops and scripts
 
 
+@pytest.mark.parametrize(
+    ("metric", "raw", "line"),
+    [
+        ("drive-values", b'\xef\xbb\xbf{"x":0,"z":0}\r\n\0', "M 0.000 0.000"),
+        ("drive-values", b'{"z":"0","y":"abc"}', "M 0.000 0.000"),
+        ("drive-values", b'{"linear":{"x":0.5},"angular":{"z":0}}', "M 0.000 0.000"),
+        ("drive-values", b'{"z":" 2.5e-1 ","x":null}', "M 0.250 0.250"),
+        ("lights-solid", b'{"value":{"b":-1,"g":2,"r":"0.5"}}\0', "L 0.000 1.000 0.500"),
+        ("lights-flash", b'{"b":"1","g":"no","period":"0"}', "F 1.000 0.000 0.000 0.050"),
+    ],
+)
+def test_commands_as_programs_of_other_languages_write_them(bench: Bench, metric: str, raw: bytes, line: str) -> None:
+    bench.send("incoming/drive-values", {"z": 0.5, "valid_ms": 60_000})
+    assert bench.line("M 0.500 0.500")
+    bench.operator.publish(f"{BASE}/incoming/{metric}", raw)
+    assert until(lambda: bench.mcu.trace.lines()[-1] == line, 0.6)  # before the watchdog
+
+
+def test_a_command_with_nan_or_infinity_is_refused_whole(bench: Bench) -> None:
+    for metric, first in (("drive-values", '"x":0.5,"z"'), ("lights-solid", '"g":1,"r"')):
+        for number in ('"NaN"', '"-inf"', "NaN", "1e999"):
+            bench.operator.publish(f"{BASE}/incoming/{metric}", f"{{{first}:{number}}}".encode())
+    assert until(lambda: bench.service.counters["refused"] == 8, 5)
+    assert bench.mcu.trace.lines() == ["M 0.000 0.000"] * 2
+
+
+def test_a_drive_command_without_an_axis_is_logged_once_for_each_sender(
+    bench: Bench, caplog: pytest.LogCaptureFixture
+) -> None:
+    for number in range(60):
+        bench.send("incoming/drive-values", {"linear": {"x": 1}, "source": f"s{number % 3}"})
+        bench.send("incoming/drive-values", {"X": number})
+    for number in range(1000):
+        bench.send("incoming/drive-values", {"Z": 1, "source": f"stranger {number}"})
+    bench.send("incoming/drive-values", {"z": 0.25})
+    assert bench.line("M 0.250 0.250")
+    lines = [record.getMessage() for record in caplog.records if "none of x, z and y" in record.getMessage()]
+    assert [sum(f"from {name!r}" in line for line in lines) for name in ("s0", "s1", "s2")] == [1, 1, 1]
+    assert sum("'X'" in line for line in lines) == 1
+    assert len(lines) == 17  # 16 senders, and all others together
+    assert "'linear', 'source'" in lines[0]
+
+
 def test_after_a_stop_nothing_moves_until_the_reset_also_after_a_restart(bench: Bench) -> None:
     bench.send("incoming/drive-values", {"z": 0.5})
     assert bench.line("M 0.500 0.500")

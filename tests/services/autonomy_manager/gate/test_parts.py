@@ -31,6 +31,7 @@ SIGNATURE = {"source": "autonomy", "run": 7}
     ("sent", "signed", "moves"),
     [
         ({"x": 0.1, "z": 0.5}, {"x": 0.1, "z": 0.5, **SIGNATURE}, True),
+        ({"x": "abc", "z": " .5 "}, {"x": "abc", "z": " .5 ", **SIGNATURE}, True),
         ({"value": {"z": 0.5}, "t": 1}, {"value": {"z": 0.5, **SIGNATURE}, "t": 1}, True),
         ({"x": "0", "z": 0}, {"x": "0", "z": 0, **SIGNATURE}, False),
         ({}, SIGNATURE, False),
@@ -40,13 +41,13 @@ SIGNATURE = {"source": "autonomy", "run": 7}
     ],
 )
 def test_the_signature_is_in_the_object_that_holds_the_axes(sent: Any, signed: Any, moves: bool) -> None:
-    result = sign(json.dumps(sent).encode(), 7)
+    result = sign(b"\xef\xbb\xbf" + json.dumps(sent).encode() + b"\r\n\0", 7)
     assert json.loads(result.payload) == signed
     assert result.moves is moves
 
 
 @pytest.mark.parametrize(
-    "payload", [b"", b"[]", b"1", b'{"z":NaN}', b'{"z":"x"}', b'{"z":1e999}', b'{"z":1,"valid_ms":0}', b"\xff"]
+    "payload", [b"", b"[]", b"1", b'{"z":NaN}', b'{"z":"nan"}', b'{"z":1e999}', b'{"z":1,"valid_ms":0}', b"\xff"]
 )
 def test_what_no_motor_owner_would_obey_is_refused(payload: bytes) -> None:
     with pytest.raises(PayloadError):
