@@ -65,17 +65,22 @@ def audit(
     from rich.table import Table
     from rich.text import Text
 
-    from pebble.commands.show import printable
-
     table = Table(box=None, pad_edge=False, header_style="dim")
     for column in ("time", "what", "robot", "user", "device", "address", "detail"):
         table.add_column(column, no_wrap=column == "time", overflow="fold")
     for entry in entries:
         at = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(entry.at))
-        texts = (entry.what, entry.ref, entry.user, entry.device, entry.address, entry.detail)
-        table.add_row(at, *(Text(printable(text)) for text in texts))
+        until = time.strftime("%H:%M:%S", time.localtime(entry.last))
+        what = entry.what if entry.count == 1 else f"{entry.what} × {entry.count:,} until {until}"
+        texts = (what, entry.ref, entry.user, entry.device, entry.address, entry.detail)
+        table.add_row(at, *(Text(_visible(text)) for text in texts))
     Console(highlight=False).print(table)
     return 0
+
+
+def _visible(text: str) -> str:
+    """On one line, and each character that controls a terminal or hides text by its code: strangers chose it."""
+    return "".join(char if char.isprintable() else f"\\u{ord(char):04x}" for char in text)
 
 
 # -- people

@@ -3,103 +3,163 @@
 from __future__ import annotations
 
 import logging
-import queue
 import sqlite3
 import threading
 import time
-from dataclasses import astuple, dataclass
+from dataclasses import astuple
 from pathlib import Path
 
+from pebble.fleet.audit_rows import Entry, Merging, new
 from pebble.fleet.database import open_database
 
 log = logging.getLogger(__name__)
 
-MAX_ENTRIES = 100_000  # the oldest are deleted beyond that
-_WAITING = 1000
-_MAX_TEXT = 200
-_TRIM_PERIOD = 1000  # entries between two deletions of old ones
-_TABLES = """
-CREATE TABLE IF NOT EXISTS audit (
-    number INTEGER PRIMARY KEY AUTOINCREMENT, at REAL NOT NULL, what TEXT NOT NULL, ref TEXT NOT NULL,
-    user TEXT NOT NULL, device TEXT NOT NULL, address TEXT NOT NULL, detail TEXT NOT NULL);
+MAX_ACTS, MAX_REFUSED = 100_000, 10_000  # rows; beyond, see _TRIM
+_ROUND_S = 0.2  # between two transactions: a row that is repeated is not written each time
+_TRIM_PERIOD = 1000  # rows between two deletions of old ones
+_FIELDS = "at, what, ref, user, device, address, detail, count, last"
+_ADDED = {"count": "INTEGER NOT NULL DEFAULT 1", "last": "REAL NOT NULL DEFAULT 0"}  # to the table of older versions
+_TABLES = "".join(
+    f"CREATE TABLE IF NOT EXISTS {table} ("
+    "number INTEGER PRIMARY KEY AUTOINCREMENT, at REAL NOT NULL, what TEXT NOT NULL, ref TEXT NOT NULL, "
+    "user TEXT NOT NULL, device TEXT NOT NULL, address TEXT NOT NULL, detail TEXT NOT NULL, "
+    + ", ".join(map(" ".join, _ADDED.items()))
+    + ");"
+    for table in ("audit", "refused")
+)
+#: The oldest of whoever has the most rows of a kind: many of one person displace none of another.
+_TRIM = """
+DELETE FROM {table} WHERE number IN (
+    SELECT number FROM (
+        SELECT number, ROW_NUMBER() OVER (PARTITION BY what, {who} ORDER BY number DESC) AS newer FROM {table})
+    ORDER BY newer DESC, number LIMIT MAX(0, (SELECT COUNT(*) FROM {table}) - ?))
 """
 
 
-@dataclass(frozen=True, slots=True)
-class Entry:
-    """One line of the audit log; ``at`` is epoch seconds."""
-
-    at: float
-    what: str
-    ref: str
-    user: str
-    device: str
-    address: str
-    detail: str
-
-
 class Audit:
-    """Thread-safe. ``write`` never blocks; entries that do not fit are counted, and the count is written later."""
+    """Thread-safe. ``write`` never blocks. What anybody can cause is in a table of its own.
+
+    Repeated rows are merged before they wait (:class:`Merging`); rows that do not fit are counted, and the count is
+    written later.
+    """
 
     def __init__(self, path: Path | None) -> None:
         self._database = open_database(path, _TABLES)
         self._lock = threading.Lock()
-        self._waiting: queue.Queue[Entry | None] = queue.Queue(_WAITING)
-        self.dropped = 0
+        with self._lock:
+            _add_columns(self._database)
+        self._changed = threading.Condition()  # guards what follows
+        self._rows = Merging()
+        self._closing = threading.Event()
         self._written = 0
         self._thread = threading.Thread(target=self._run, name="audit", daemon=True)
         self._thread.start()
 
+    @property
+    def dropped(self) -> int:
+        return self._rows.dropped
+
     def write(
-        self, what: str, *, ref: str = "", user: str = "", device: str = "", address: str = "", detail: str = ""
+        self,
+        what: str,
+        *,
+        ref: str = "",
+        user: str = "",
+        device: str = "",
+        address: str = "",
+        detail: str = "",
+        count: int = 1,
     ) -> None:
-        texts = (_storable(text) for text in (what, ref, user, device, address, detail))
-        try:
-            self._waiting.put_nowait(Entry(time.time(), *texts))
-        except queue.Full:
-            self.dropped += 1
+        entry = new(time.time(), what, ref, user, device, address, detail)
+        entry.count = count
+        with self._changed:
+            self._rows.add(entry, time.monotonic())
+            self._changed.notify()
 
     def read(self, limit: int) -> list[Entry]:
-        """The newest entries, the newest last."""
+        """The newest rows of both tables in the order of their first time, the newest last."""
         with self._lock:
             rows = self._database.execute(
-                "SELECT at, what, ref, user, device, address, detail FROM audit ORDER BY number DESC LIMIT ?", (limit,)
+                f"SELECT {_FIELDS}, number FROM audit UNION ALL SELECT {_FIELDS}, number FROM refused "  # noqa: S608
+                "ORDER BY at DESC, number DESC LIMIT ?",
+                (limit,),
             ).fetchall()
         return [Entry(*row) for row in reversed(rows)]
 
     def close(self) -> None:
         """Write what waits, for at most a few seconds."""
-        try:
-            self._waiting.put(None, timeout=2.0)
-        except queue.Full:
+        with self._changed:
+            self._closing.set()
+            self._changed.notify()
+        self._thread.join(7.0)
+        if self._thread.is_alive():
             log.error("audit: entries are lost: the disk is too slow")
-        self._thread.join(5.0)
         with self._lock:
             self._database.close()
 
     def _run(self) -> None:
-        dropped = 0
-        while (entry := self._waiting.get()) is not None:
-            self._insert(entry)
-            if self.dropped != dropped:
+        dropped, failed = 0, False
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._closing.is_set() or self._rows.waits)
+                ends, rows = self._closing.is_set(), self._rows.take()
+            error = self._store(rows)
+            if error is not None and (ends or not failed):
+                log.error("audit: entries %s: %s", "are lost" if ends else "wait to be written", error)
+            failed = error is not None
+            if ends:
+                return
+            if failed:
+                with self._changed:
+                    self._rows.give_back(rows)
+            elif self.dropped != dropped:
                 lost, dropped = self.dropped - dropped, self.dropped
-                self._insert(Entry(time.time(), "audit-dropped", "", "", "", "", f"{lost} entries"))
+                self.write("audit-dropped", count=lost)
+            self._closing.wait(_ROUND_S)
 
-    def _insert(self, entry: Entry) -> None:
+    def _store(self, rows: list[Entry]) -> Exception | None:
+        """All rows or, when this returns an error, none: a full disk must not end the thread."""
+        numbers = []
         try:
             with self._lock:
-                self._database.execute(
-                    "INSERT INTO audit (at, what, ref, user, device, address, detail) VALUES (?, ?, ?, ?, ?, ?, ?)",
-                    astuple(entry),
-                )
-                self._written += 1
-                if self._written % _TRIM_PERIOD == 0:
-                    self._database.execute(
-                        "DELETE FROM audit WHERE number <= (SELECT MAX(number) FROM audit) - ?", (MAX_ENTRIES,)
-                    )
-        except sqlite3.Error as error:  # a full disk must not end the thread
-            log.error("audit: an entry is lost: %s", error)
+                self._database.execute("BEGIN IMMEDIATE")
+                try:
+                    numbers = [self._put(row) for row in rows]
+                    self._written += len(rows)
+                    if self._written >= _TRIM_PERIOD:
+                        self._written = 0
+                        self._database.execute(_TRIM.format(table="audit", who="user"), (MAX_ACTS,))
+                        self._database.execute(_TRIM.format(table="refused", who="address"), (MAX_REFUSED,))
+                    self._database.execute("COMMIT")
+                except sqlite3.Error:
+                    self._database.execute("ROLLBACK")
+                    raise
+        except sqlite3.Error as error:
+            return error
+        for row, number in zip(rows, numbers, strict=True):
+            row.number = number
+        return None
+
+    def _put(self, row: Entry) -> int:
+        table = "refused" if row.refused else "audit"
+        if row.number:
+            self._database.execute(
+                f"UPDATE {table} SET user = ?, address = ?, count = ?, last = ? WHERE number = ?",  # noqa: S608
+                (row.user, row.address, row.count, row.last, row.number),
+            )
+            return row.number
+        cursor = self._database.execute(
+            f"INSERT INTO {table} ({_FIELDS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",  # noqa: S608
+            astuple(row)[:-1],
+        )
+        return cursor.lastrowid or 0
 
 
-def _storable(text: str) -> str:
-    return text[:_MAX_TEXT].encode(errors="replace").decode()
+def _add_columns(database: sqlite3.Connection) -> None:
+    """To a table of an older version: its rows happened once."""
+    database.execute("BEGIN IMMEDIATE")  # another process may do the same
+    found = {row[1] for row in database.execute("PRAGMA table_info(audit)")}
+    for name, kind in _ADDED.items():
+        if name not in found:
+            database.execute(f"ALTER TABLE audit ADD COLUMN {name} {kind}")
+    database.execute("COMMIT")

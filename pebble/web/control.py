@@ -32,7 +32,6 @@ FLUSH_S = 0.05  # between two states
 HELLO_S = 5.0  # to begin with
 CHECK_S = 5.0  # between two looks at whether the session still exists
 _WATCH_COST = 20  # it subscribes to so many topics
-_NOTED_PER_S, _NOTED_BURST = 0.2, 60.0  # entries of one page in the audit: its other entries must not be lost by them
 _WAITING = 64  # messages that wait to be sent, besides the state
 _RELOAD = "This page is older than the server: reload it"
 
@@ -59,7 +58,6 @@ class Control:
         self._interest = Interest(lambda: self._wake.set())
         self._wake = asyncio.Event()
         self._pace = Pace(time.monotonic())
-        self._noted = Pace(time.monotonic(), _NOTED_PER_S, _NOTED_BURST)  # of what is asked of robots, in the audit
         self._waiting: deque[m.ToPage] = deque(maxlen=_WAITING)
         self._drives = True
         self._why_not = ""  # why this page may not drive at all
@@ -188,7 +186,7 @@ class Control:
             case m.StopOp():
                 self._stop(op)
             case m.EstopOp():
-                self._server.stop(op.ref, op.stop, self._session, self._tab.device, op.why)
+                self._server.stop(op.ref, op.stop, self._session, self._tab.device, op.why, self._address())
             case m.EstopEndOp():
                 self._end_stop(op)
             case m.EstopResetOp():
@@ -238,7 +236,7 @@ class Control:
             self._refuse(op, "The server cannot reach the broker")
             return
         self._post(m.Done(cmd=_tag(op), ref=op.ref, n=op.n))
-        if not isinstance(op, m.LightsOp | m.SoundboardOp) and self._noted.allows(time.monotonic()):
+        if not isinstance(op, m.LightsOp | m.SoundboardOp):
             self._audit(_tag(op), op.ref, detail=_detail(op))
 
     def _drive(self, op: m.DriveOp) -> None:
@@ -304,8 +302,10 @@ class Control:
     def _lease(self, op: m.Lease) -> None:
         server = self._server
         if not op.take:
+            lease = server.driving.leases.get(op.ref)
             server.publish(server.driving.release(self._tab, op.ref, clock()))
-            self._audit("release", op.ref)
+            if lease is not None and lease.tab is self._tab:
+                self._audit("release", op.ref)
         elif self._may("drive", op):
             why = self._why_not or ("" if op.ref in server.robots.components else "unknown component")
             if not why:
@@ -329,10 +329,11 @@ class Control:
         self._post(m.Refused(cmd=_tag(op), ref=getattr(op, "ref", ""), why=why, g=g, n=getattr(op, "n", 0)))
 
     def _audit(self, what: str, ref: str, detail: str = "") -> None:
-        client = self._websocket.client
-        address = "" if client is None else client.host
-        session, device = self._session, self._tab.device
+        session, device, address = self._session, self._tab.device, self._address()
         self._server.audit.write(what, ref=ref, user=session.user, device=device, address=address, detail=detail)
+
+    def _address(self) -> str:
+        return "" if self._websocket.client is None else self._websocket.client.host
 
     # -- to the page
 

@@ -7,22 +7,13 @@ BURST = 200.0
 
 
 class Pace:
-    """A bucket of ``burst`` that fills by ``per_s``."""
+    """A bucket of BURST that fills by PER_S."""
 
-    def __init__(self, now: float, per_s: float = PER_S, burst: float = BURST) -> None:
-        self._per_s, self._burst = per_s, burst
-        self._left, self._at = burst, now
+    def __init__(self, now: float) -> None:
+        self._left, self._at = BURST, now
 
     def take(self, cost: float, now: float) -> float:
         """How many seconds to wait before this is done."""
-        self._left = min(self._burst, self._left + self._per_s * (now - self._at)) - cost
+        self._left = min(BURST, self._left + PER_S * (now - self._at)) - cost
         self._at = now
-        return max(0.0, -self._left / self._per_s)
-
-    def allows(self, now: float) -> bool:
-        """Whether this may be done now; what may not costs nothing."""
-        self._left, self._at = min(self._burst, self._left + self._per_s * (now - self._at)), now
-        if self._left < 1:
-            return False
-        self._left -= 1
-        return True
+        return max(0.0, -self._left / PER_S)

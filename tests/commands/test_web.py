@@ -265,14 +265,15 @@ def test_audit(run: Run, state: Path) -> None:
     log = Audit(state / "people.sqlite")
     for number in range(60):
         log.write(f"drive-{number}", ref="pebble/robots/goob", user="alice", device="phone", address="10.0.0.2")
-    log.write("stop", detail="[red]dog[/red] \x1b[2J", user="eve")
+    for _ in range(2000):
+        log.write("login-refused", user="[red]dog[/red] \x1b[2J\x07\n\u202e\u200f\x9b", address="::1")
     log.close()
     assert run("web", "audit", "--limit", "2", columns=200) == 0
     lines = run.out.splitlines()
     assert lines[0].split() == ["time", "what", "robot", "user", "device", "address", "detail"]
     assert lines[1].split()[2:] == ["drive-59", "pebble/robots/goob", "alice", "phone", "10.0.0.2"]
-    assert "[red]dog[/red]" in lines[2]
-    assert "\x1b" not in run.out
+    assert "login-refused × 2,000 until " in lines[2]
+    assert r"[red]dog[/red] \u001b[2J\u0007\u000a\u202e\u200f\u009b" in lines[2]
 
 
 # -- the real server

@@ -14,11 +14,6 @@ def test_a_burst_does_not_wait_and_what_follows_is_paced() -> None:
     assert pace.take(20, 1000.0) == pytest.approx(21 / PER_S)
 
 
-def test_what_may_not_be_done_costs_nothing() -> None:
-    pace = Pace(0.0, 0.5, 2.0)
-    assert [pace.allows(at) for at in (0.0, 0.0, 0.0, 1.0, 2.0, 2.0)] == [True, True, False, False, True, False]
-
-
 def test_it_recovers() -> None:
     pace = Pace(0.0)
     pace.take(BURST, 0.0)
