@@ -6,10 +6,11 @@ The robot remembers the stop; the sender repeats it until each motor owner has p
 from __future__ import annotations
 
 import secrets
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Iterable
 from enum import Enum
 
 from pebble.client.estop_states import RobotEstop
+from pebble.client.rank import Rank, RankedTable
 from pebble.contract import AUTONOMY_COMMAND, DRIVE, ESTOP, Channel, codec
 from pebble.contract.identity import Direction, parse_topic
 from pebble.contract.payloads import AutonomyCommand, Drive, EstopCommand
@@ -19,7 +20,8 @@ from pebble.transports import Message, QoS
 REPEAT_S = 0.5
 COLLECT_S = 3.0  # so long a stop of all robots is sent to further ones
 GIVE_UP_S = 60.0
-MAX_ROBOTS = 1000  # robots beyond are counted, but not stopped: topics may come from other programs
+MAX_ROBOTS = 1000  # to which a stop of all is repeated; one beyond gets it whenever anything arrives from it
+MAX_PASSED = 4096  # robots beyond whose last stop is remembered; where there are more, they get it more often
 
 _ZERO = codec.encode(DRIVE, Drive(valid_ms=0))
 _END_SCRIPT = codec.encode(AUTONOMY_COMMAND, AutonomyCommand(action="stop"))
@@ -43,12 +45,16 @@ class Progress(Enum):
 class RobotStop:
     """The stop of one robot: what is sent to it when, and whether it is confirmed."""
 
-    def __init__(self, base: str, stop: str, payload: bytes, now: float, *, named: bool, hold: bool) -> None:
+    def __init__(
+        self, base: str, stop: str, payload: bytes, now: float, *, named: bool, hold: bool, known: bool = False
+    ) -> None:
         self.estop = RobotEstop(base)
         self.live = False  # anything but retained messages has arrived from it
         self.confirmed_s: float | None = None  # how long it took; None: it is not confirmed
+        self.own_only = False  # topics that its capabilities name are used only if they are incoming ones of its own
         self.next: float = now  # when to send again, unless it is confirmed or spared
         self._stop, self._payload = stop, payload
+        self.rank = Rank(known=known)
         self._named, self._hold = named, hold
         self._began = now
         self._sent_at = float("-inf")
@@ -103,10 +109,12 @@ class RobotStop:
 
     def receive(self, message: Message, now: float) -> None:
         """Update from a message of this robot."""
-        self.live = self.live or not message.retain
+        if not (self.live or message.retain):
+            self.live, self.rank = True, self.rank._replace(live=True)
         known = self.estop.has_capabilities
         if not self.estop.receive(message):
             return
+        self.rank = max(self.rank, Rank.of(self.estop, known=self.rank.known, live=self.live))
         if self.estop.has_capabilities and not known:
             self.next = now  # its drive topic may be another one
         self._boots.update(
@@ -132,7 +140,7 @@ class RobotStop:
             self._script_ended = True
             messages.append(_message(AUTONOMY_COMMAND, self.estop.script_topic, _END_SCRIPT))
         messages.append(_message(DRIVE, self.estop.drive_topic, _ZERO))
-        return messages
+        return [one for one in messages if not self.own_only or _is_incoming(one.topic, self.estop.base)]
 
     def give_up(self) -> None:
         """Send no more."""
@@ -158,29 +166,48 @@ class StopSender:
 
     Publish what ``tick`` returns, pass every message of the robots' ``outgoing/#`` to ``receive``, and call ``tick``
     again after it and at ``due``. Times are seconds of one monotonic clock. A ``hold`` lasts until ``end``.
+
+    A stop of all goes to every robot as soon as anything arrives from it. ``robots`` has those to which it is also
+    repeated without that, and which confirm it; where there are too many, the others count as ``omitted``.
     """
 
     def __init__(
-        self, name: str, *, by: str, why: str, now: float, robots: Collection[str] | None, hold: bool = False
+        self,
+        name: str,
+        *,
+        by: str,
+        why: str,
+        now: float,
+        robots: Collection[str] | None,
+        known: Collection[str] = (),
+        hold: bool = False,
+        own_only: bool = False,
     ) -> None:
-        """``name`` is that of :func:`new_name`; ``robots`` are base topics, None: all robots that publish anything."""
+        """``name`` is that of :func:`new_name`; ``robots`` are base topics, None: all robots that publish anything.
+
+        ``known``: with all robots, those that get it without having published anything. ``own_only``: topics that a
+        robot's capabilities name are used only if they are its own.
+        """
         if not is_name(name):
             raise ValueError(f"{name!r} is not 16 hex digits")
         _, by, why = stop_of({"by": by, "why": why})
         self.name, self.hold = name, hold
-        self.robots: dict[str, RobotStop] = {}
-        self.omitted = 0  # messages of robots beyond MAX_ROBOTS
+        self.robots = RankedTable[RobotStop](MAX_ROBOTS)
+        self.omitted = 0  # messages of robots for which ``robots`` had no room
         self._payload = codec.encode(ESTOP, EstopCommand(stop=name, by=by, why=why))
         self._named = robots is not None
+        self._known, self._own_only = frozenset(known), own_only
         self._began = self._now = now
         self._ended = False
-        for base in robots or ():
-            self._add(base, now)
+        self._passed: dict[str, float] = {}  # when the stop was sent to a robot that is not in ``robots``
+        self._passing: list[Message] = []  # such stops, to be sent now
+        for base in self._known if robots is None else robots:  # whoever has named them answers for their number
+            self.robots[base] = self._stop_of(base, now)
 
     @property
     def collecting(self) -> bool:
         """Whether further robots are stopped when they publish anything."""
-        return not self._named and not self._ended and (self.hold or self._now < self._began + COLLECT_S)
+        return not self._named and not self._ended and (self.hold or self._now < self._began + self._collect_s)
 
     @property
     def finished(self) -> bool:
@@ -200,8 +227,8 @@ class StopSender:
             return None
         times = [robot.next for robot in self.robots.values() if robot.sending]
         if not self.hold:
-            times.append(self._began + (COLLECT_S if self.collecting else GIVE_UP_S))
-        return min(times, default=None)
+            times.append(self._began + (self._collect_s if self.collecting else GIVE_UP_S))
+        return self._now if self._passing else min(times, default=None)
 
     def receive(self, message: Message, now: float) -> None:
         """Update from any message of a robot, retained or not."""
@@ -209,42 +236,76 @@ class StopSender:
         address = parse_topic(message.topic)
         if address is None or address.direction is not Direction.OUTGOING:
             return
-        robot = self.robots.get(address.identity.base)
-        if robot is None and address.identity.is_server:
-            return
-        if robot is None and self.collecting and message.payload:  # an empty one removes what was retained
-            if len(self.robots) >= MAX_ROBOTS:
-                self._make_room(message)
-            robot = self._add(address.identity.base, now)
-        if robot is not None:
+        base = address.identity.base
+        if (robot := self.robots.get(base)) is not None:
             robot.receive(message, now)
+        # An empty message removes what was retained: it is no sign of a robot.
+        elif self.collecting and message.payload and not address.identity.is_server:
+            self._receive_first(base, address.metric, message, now)
 
     def tick(self, now: float) -> list[Message]:
-        """What to publish now; some of it again in 0.5 s."""
+        """What to publish now, to the robots of the highest rank first; some of it again in 0.5 s."""
         self._now = now
         if not self.hold and now >= self._began + GIVE_UP_S:
             self.end()
-        return [message for robot in self.robots.values() for message in robot.tick(now)]
+        due = sorted((one for one in self.robots.values() if one.next <= now), key=lambda one: one.rank, reverse=True)
+        passing, self._passing = self._passing, []
+        return [message for robot in due for message in robot.tick(now)] + passing
+
+    def tick_robot(self, base: str, now: float) -> list[Message]:
+        """What ``tick`` would return of this robot, from which a message was just received."""
+        passing, self._passing = self._passing, []
+        robot = self.robots.get(base)
+        return passing if robot is None else robot.tick(now) + passing
 
     def end(self) -> None:
         """Send no more. Robots that are stopped stay so."""
         self._ended = True
+        self._passing.clear()
         for robot in self.robots.values():
             robot.give_up()
 
-    def _make_room(self, message: Message) -> None:
-        """For a robot that is there, forget one of which there are only old retained messages."""
-        left = (base for base, robot in self.robots.items() if not (robot.live or robot.estop.has_capabilities))
-        if not message.retain and (base := next(left, None)) is not None:
-            del self.robots[base]
-            self.omitted += 1
+    @property
+    def _collect_s(self) -> float:
+        """A robot that is not in ``robots`` gets the stop again only when anything arrives from it: for a minute."""
+        return GIVE_UP_S if self.omitted else COLLECT_S
 
-    def _add(self, base: str, now: float) -> RobotStop | None:
-        if len(self.robots) >= MAX_ROBOTS:
-            self.omitted += 1
-            return None
-        robot = self.robots[base] = RobotStop(base, self.name, self._payload, now, named=self._named, hold=self.hold)
-        return robot
+    def _receive_first(self, base: str, metric: str, message: Message, now: float) -> None:
+        """Take a message of a robot that is not in ``robots``."""
+        full = len(self.robots) >= MAX_ROBOTS
+        self.omitted += full
+        was_sent = now - self._passed.get(base, float("-inf")) < REPEAT_S
+        at_most = Rank.at_most(metric, known=base in self._known, live=not message.retain)
+        if was_sent and self.robots.refuses(at_most):
+            return
+        robot = self._stop_of(base, now)
+        robot.receive(message, now)
+        if self.robots.make_room(robot.rank, self.robots.pop):
+            self.robots[base] = robot
+        elif not was_sent and (messages := robot.tick(now)):
+            self._passing += messages
+            self._passed.pop(base, None)
+            if len(self._passed) >= MAX_PASSED:
+                del self._passed[next(iter(self._passed))]  # the oldest
+            self._passed[base] = now
+
+    def _stop_of(self, base: str, now: float) -> RobotStop:
+        known = base in self._known
+        one = RobotStop(base, self.name, self._payload, now, named=self._named, hold=self.hold, known=known)
+        one.own_only = self._own_only
+        return one
+
+
+def send(publish: Callable[..., bool], messages: Iterable[Message]) -> None:
+    """Publish messages of a stop; those that are refused because too many are not acknowledged, as LATEST ones."""
+    for message in messages:
+        if not publish(message.topic, message.payload, qos=message.qos):
+            publish(message.topic, message.payload, qos=QoS.LATEST)
+
+
+def _is_incoming(topic: str, base: str) -> bool:
+    """Also one that the contract calls otherwise: a stop does no harm there, and it may be what drives this robot."""
+    return topic.startswith(f"{base}/{Direction.INCOMING}/") and not topic.endswith("/")
 
 
 def _message(channel: Channel, topic: str, payload: bytes) -> Message:

@@ -10,13 +10,14 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from typing import Annotated
 
 import typer
 
 from pebble.client.connection import Listener, Target, connected, target_of
 from pebble.client.discovery import ALL_OUTGOING, Discovery
-from pebble.client.estop import Progress, RobotStop, StopSender, new_name
+from pebble.client.estop import Progress, RobotStop, StopSender, new_name, send
 from pebble.client.estop_states import Reset, RobotEstop
 from pebble.client.names import id_of
 from pebble.commands import show
@@ -167,8 +168,7 @@ def _receive(listener: Listener, sender: StopSender) -> None:
 
 
 def _publish(transport: Transport, sender: StopSender) -> None:
-    for message in sender.tick(time.monotonic()):  # the transport waits for no acknowledgement
-        transport.publish(message.topic, message.payload, qos=message.qos, urgent=True)
+    send(partial(transport.publish, urgent=True), sender.tick(time.monotonic()))  # waits for no acknowledgement
 
 
 class _Report:
@@ -199,7 +199,7 @@ class _Report:
         if not sender.robots:
             _echo("no robot was found: NOTHING IS STOPPED")
         if sender.omitted:
-            _echo(f"there are more than {len(sender.robots)} robots: the others are NOT STOPPED")
+            _echo(f"there are more than {len(sender.robots)} robots: the others got the stop, NOT CONFIRMED")
 
     def _print(self, *, patient: bool) -> None:
         for base, robot in list(self._sender.robots.items()):

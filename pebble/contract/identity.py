@@ -31,6 +31,9 @@ class Direction(StrEnum):
     OUTGOING = "outgoing"
 
 
+_DIRECTIONS = {str(direction): direction for direction in Direction}
+
+
 class Identity(Struct, frozen=True):
     """``{system}/{type}/{id}`` of one component. Raises ConfigError for levels that no topic can hold.
 
@@ -101,11 +104,12 @@ def is_of_another(topic: str, base: str) -> bool:
 
 def _parse(topic: str) -> ParsedTopic | None:
     levels = topic.split("/", 4)
-    if len(levels) < 5 or levels[3] not in tuple(Direction) or not levels[4]:
+    if len(levels) < 5 or levels[3] not in _DIRECTIONS or not levels[4]:
         return None
-    if not all(_valid_level(level) for level in levels[:3]):
+    system, type_, id_, direction, metric = levels
+    if not (_valid_level(system) and _valid_level(type_) and _valid_level(id_)):
         return None
-    return ParsedTopic(Identity(*levels[:3]), Direction(levels[3]), levels[4])
+    return ParsedTopic(Identity(system, type_, id_), _DIRECTIONS[direction], metric)
 
 
 _remembered = lru_cache(_REMEMBERED)(_parse)

@@ -106,7 +106,8 @@ class Merging:
 
 def new(at: float, what: str, ref: str, user: str, device: str, address: str, detail: str) -> Entry:
     """An entry whose texts can be stored."""
-    return Entry(at, *(_storable(text) for text in (what, ref, user, device, address, detail)))
+    what, ref, user, device, address, detail = map(_storable, (what, ref, user, device, address, detail))
+    return Entry(at, what, ref, user, device, address, detail)
 
 
 def _merge(row: Entry, entry: Entry) -> None:

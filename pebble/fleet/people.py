@@ -180,8 +180,12 @@ class People:
         found = self._rows("SELECT key, value FROM settings WHERE substr(key, 1, ?) = ?", len(prefix), prefix)
         return {str(key)[len(prefix) :]: str(value) for key, value in found}
 
-    def set(self, key: str, value: str) -> None:
-        self._change("INSERT OR REPLACE INTO settings (key, value) VALUES (?, ?)", key, value)
+    def set(self, key: str, value: str | None) -> None:
+        """None removes it."""
+        if value is None:
+            self._change("DELETE FROM settings WHERE key = ?", key)
+        else:
+            self._change("INSERT OR REPLACE INTO settings (key, value) VALUES (?, ?)", key, value)
 
     # -- inside
 

@@ -29,6 +29,8 @@ class Broker:
         self._watchers: list[Callable[[], None]] = []
         self._arrived = Arrived()
         self._woken = False  # deliver is about to be called
+        #: Whether a topic is one of a robot known from before, for which room is reserved.
+        self.is_known: Callable[[str], bool] = lambda _topic: True
 
     @property
     def loop(self) -> asyncio.AbstractEventLoop:
@@ -94,7 +96,8 @@ class Broker:
         """
 
         def take(message: Message) -> None:
-            if not self._arrived.put(handler, message, time.monotonic(), deferred=deferred):
+            known = self.is_known(message.topic)
+            if not self._arrived.put(handler, message, time.monotonic(), deferred=deferred, known=known):
                 on_refused()
             elif not deferred:
                 self._wake()

@@ -315,6 +315,7 @@ class Control:
             if why:
                 self._refuse(op, why)
                 return
+            server.operated(op.ref)
             self._audit("take over" if op.over else "take", op.ref)
         self._moved.discard(op.ref)
 

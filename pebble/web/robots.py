@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from pebble.client.discovery import Liveness
+from pebble.client.rank import Rank, RankedTable
 from pebble.contract import (
     AUTONOMY_STATUS,
     CAPABILITIES,
@@ -52,6 +53,7 @@ MAX_COMPONENTS, MAX_METRICS, MAX_VALUE_BYTES = 500, 200, 64 * 1024
 _MAX_CLIPS_BYTES = 400 * 1024  # of the list of clips, which has up to 256 KiB of names
 LARGE_BYTES = 16 * 1024  # a value beyond holds up a slow connection: one is sent, then the page has to answer
 MAX_BYTES = 32 * 1024 * 1024  # of all values together
+RESERVED_BYTES = 16 * 1024  # of them for each component, whatever the others send
 MAX_ALIASES = 64  # of one component: topics that its microcontrollers declare besides the contract's
 _SERVERS = "servers"  # the type of other servers of this page: they are no components to be shown
 _SILENT_S = 1.5  # a component is not called silent before
@@ -87,8 +89,8 @@ class _Value(NamedTuple):
 class Component:
     """One component, by the messages it publishes."""
 
-    def __init__(self, ref: str) -> None:
-        self.ref = ref
+    def __init__(self, ref: str, rank: Rank) -> None:
+        self.ref, self.rank = ref, rank
         self.name = ref.rpartition("/")[2]
         self.liveness = Liveness()
         self.estop = RobotEstop(ref)
@@ -97,6 +99,7 @@ class Component:
         self.capabilities: dict[str, Any] = {}
         self.known: dict[str, Message] = {}  # what a stop needs to know of it, by topic
         self.values: dict[str, _Value] = {}
+        self.bytes = 0  # of the values
         self.aliases: dict[str, tuple[str, ...]] = {}  # by metric of the manifest that declares them
         self.sent_online: bool | None = None
         self.refreshed_at = float("-inf")
@@ -119,6 +122,10 @@ class Component:
         self._stamps.append(t_ms)
         self.liveness.heartbeat(now, wall - t_ms / 1000, online=online)
 
+    def update_rank(self, *, known: bool) -> None:
+        """It falls once the component is silent: what was there long ago must not keep out what is there now."""
+        self.rank = Rank.of(self.estop, known=known, live=self.live and self.sent_online is not False)
+
     def view(self, now: float) -> m.Liveness:
         return m.Liveness(
             online=self.online(now),
@@ -128,6 +135,10 @@ class Component:
             interval_ms=_ms(self.liveness.interval_s),
             whole_seconds=len(self._stamps) == _STAMPS and all(stamp % 1000 == 0 for stamp in self._stamps),
         )
+
+    def lists(self, metric: str) -> bool:
+        """Whether this is the state of a motor owner that its capabilities list."""
+        return metric in [ESTOP_STATE.metric.format(owner=owner) for owner in self.estop.owners]
 
     def drives(self) -> bool:
         """Whether it offers driving; without capabilities nothing is assumed (paper A.8.6)."""
@@ -153,7 +164,8 @@ class Robots:
     """All components. Only the event loop calls it."""
 
     def __init__(self) -> None:
-        self.components: dict[str, Component] = {}
+        self.components = RankedTable[Component](MAX_COMPONENTS)
+        self.before: Collection[str] = ()  # robots that are known from before
         self.omitted = 0  # messages of components, metrics and values beyond the limits
         self.interests: set[Interest] = set()
         self.on_message: list[Callable[[Message, float], None]] = []  # of every component, before it is interpreted
@@ -261,7 +273,7 @@ class Robots:
 
         ``channel``: how it is read, if the contract does not have it.
         """
-        component = self.components.get(ref) or self._add(ref, retained=message.retain)
+        component = self.components.get(ref) or self._add(ref, metric, message)
         channel = channel or _channel(metric)
         if component is None or channel is None:
             return
@@ -280,7 +292,7 @@ class Robots:
         """Remove a component, also one that was never there; it comes back with its next message."""
         component = self.components.pop(ref, None)
         if component is not None:
-            self._bytes -= sum(len(bytes(value.raw)) for value in component.values.values())
+            self._bytes -= component.bytes
         self.recent.forget(ref)
         for key in [key for key in self._server if key[0] == ref]:
             del self._server[key]
@@ -293,6 +305,7 @@ class Robots:
 
         What is merely older than before is sent of a third of the components: no page has to draw all of them at once.
         """
+        self.components.ranks_may_have_fallen()
         older: list[Component] = []
         for component in self.components.values():
             if component.online(now) is not component.sent_online or component.refreshed_at == float("-inf"):
@@ -305,35 +318,48 @@ class Robots:
 
     def _refresh(self, component: Component, now: float) -> None:
         component.sent_online, component.refreshed_at = component.online(now), now
+        component.update_rank(known=self._is_known(component.ref))
         self.set_server_metric(component.ref, "web/liveness", component.view(now))
         if ONLINE.metric in component.values:
             self._mark(component.ref, ONLINE.metric)
 
-    def _add(self, ref: str, *, retained: bool) -> Component | None:
-        if len(self.components) >= MAX_COMPONENTS and (retained or not self._make_room()):
-            self.omitted += 1
+    def _is_known(self, ref: str) -> bool:
+        """From before, or to a person who has it open."""
+        return ref in self.before or any(interest.watched == ref for interest in self.interests)
+
+    def _add(self, ref: str, metric: str, message: Message) -> Component | None:
+        known, live = self._is_known(ref), not message.retain
+        self.omitted += len(self.components) >= MAX_COMPONENTS
+        if self.components.refuses(Rank.at_most(metric, known=known, live=live)):
             return None
-        component = self.components[ref] = Component(ref)
+        rank = Rank.of_message(ref, message, known=known, live=live)
+        if not self.components.make_room(rank, self.forget):
+            return None
+        component = self.components[ref] = Component(ref, rank)
         return component
 
-    def _make_room(self) -> bool:
-        """For a component that is there, forget one that was never."""
-        old = next((one.ref for one in self.components.values() if not one.live and not one.capabilities), None)
-        if old is not None:
-            self.forget(old)
+    def _has_room(self, component: Component, metric: str, channel: Channel, grows: int) -> bool:
+        """Whether there is room for a value, if necessary after removing components of a lower rank."""
+        is_new = metric not in component.values
+        if is_new and len(component.values) >= MAX_METRICS and channel.is_pattern and not component.lists(metric):
+            return False
+        if component.bytes + grows <= RESERVED_BYTES:
+            return True
+        while self._bytes + grows > MAX_BYTES - MAX_COMPONENTS * RESERVED_BYTES:
+            lowest = self.components.lowest(component.rank)
+            if lowest is None:
+                return False
+            self.forget(lowest)
             self.omitted += 1
-        return old is not None
+        return True
 
     def _store(self, component: Component, metric: str, channel: Channel, message: Message, now: float) -> bool:
         """Check and store the value; False if it is refused."""
         old = component.values.get(metric)
         size = len(message.payload)
         grows = size - (0 if old is None else len(bytes(old.raw)))
-        if (
-            size > (_MAX_CLIPS_BYTES if channel is SOUNDBOARD_FILES else MAX_VALUE_BYTES)
-            or (old is None and len(component.values) >= MAX_METRICS)
-            or self._bytes + grows > MAX_BYTES
-        ):
+        too_large = size > (_MAX_CLIPS_BYTES if channel is SOUNDBOARD_FILES else MAX_VALUE_BYTES)
+        if too_large or not self._has_room(component, metric, channel, grows):
             self.omitted += 1
             return False
         try:
@@ -341,6 +367,7 @@ class Robots:
         except PayloadError:
             return False
         self._bytes += grows
+        component.bytes += grows
         component.values[metric] = _Value(msgspec.Raw(message.payload), now)
         if channel is not ONLINE:
             self._mark(component.ref, metric)
@@ -351,6 +378,7 @@ class Robots:
         old = component.values.pop(metric, None)
         if old is not None:
             self._bytes -= len(bytes(old.raw))
+            component.bytes -= len(bytes(old.raw))
             self._mark(component.ref, metric)
         component.aliases.pop(metric, None)
         component.known.pop(message.topic, None)
@@ -359,7 +387,8 @@ class Robots:
     def _interpret(self, component: Component, metric: str, channel: Channel, message: Message, now: float) -> None:
         if channel in (CAPABILITIES, ESTOP_STATE, ONLINE):
             component.known[message.topic] = message
-        component.estop.receive(message)
+        if component.estop.receive(message):
+            component.update_rank(known=self._is_known(component.ref))
         if channel is CAPABILITIES:
             component.capabilities = _capabilities(message.payload) or component.capabilities
         elif channel is MCU_DESCRIBE:

@@ -6,6 +6,7 @@ import asyncio
 import logging
 import secrets
 import socket
+import sqlite3
 import time
 from collections.abc import Coroutine
 from contextlib import suppress
@@ -13,6 +14,7 @@ from typing import Any
 
 import msgspec
 
+from pebble.client.estop import send
 from pebble.contract import CAPABILITIES, DRIVE, DRIVING, ONLINE, codec
 from pebble.contract.identity import Identity, parse_topic
 from pebble.contract.payloads import Driver
@@ -27,6 +29,7 @@ from pebble.web import messages as m
 from pebble.web import robot_commands
 from pebble.web.broker import Broker
 from pebble.web.driving import Command, Driving
+from pebble.web.known_robots import KnownRobots
 from pebble.web.media import MediaHub
 from pebble.web.open_components import OpenComponents
 from pebble.web.robot_streams import origin
@@ -44,6 +47,8 @@ _RESET_S = 0.6  # robots refuse whoever has not paused for 0.5 s after a reset
 _ANNOUNCED = 64  # robots in one announcement
 _ESTOP_METRIC = "web/estop"
 _STREAM_ADDRESS = "stream-address "  # what a setting of the server begins with; then the component
+_KNOWN = "known "  # the same
+_DAY_S = 24 * 3600
 
 
 class Server:
@@ -55,12 +60,16 @@ class Server:
         self.id = f"{self.name}-{secrets.token_hex(2)}"
         self.broker = Broker(settings.broker)
         self.robots, self.stops, self.driving = Robots(), Stops(), Driving(self.id)
+        self.known = KnownRobots(people.all(_KNOWN))
+        self.robots.before = self.known
+        self.broker.is_known = lambda topic: "/".join(topic.split("/", 3)[:3]) in self.known
         self.robots.streams.update(people.all(_STREAM_ADDRESS))
         self.media = MediaHub(self.broker, self.robots)
         self.sound = SoundHub(self.broker, self.robots, self._note_talk)
         self.open_components = OpenComponents(self.broker, self.robots, self.spawn)
         self.drive_changed: set[str] = set()
         self._tasks: set[asyncio.Task[None]] = set()
+        self._saving = False
         self._announced_at = float("-inf")
         self._announcing: set[str] = set()  # systems of the robots in the last announcement
 
@@ -96,13 +105,14 @@ class Server:
     # -- from the broker
 
     def _receive(self, message: Message, now: float) -> None:
-        self.robots.receive(message, now)
         address = parse_topic(message.topic)
         if address is None:
             return
+        self.robots.receive(message, now)
         ref = address.identity.base
-        self.stops.receive(message, clock(), known=ref in self.robots.components)
-        self._send(self.stops.tick(clock()))
+        self._send(self.stops.receive(message, clock()))
+        if ref not in self.robots.components:
+            return
         if address.metric != ONLINE.metric or self.robots.value(ref, _ESTOP_METRIC) is None:
             self.stops.changed.add(ref)
             self._note_latch(ref)
@@ -148,16 +158,17 @@ class Server:
         return accepted
 
     def _send(self, messages: list[Message]) -> None:
-        for message in messages:
-            self.broker.publish(message.topic, message.payload, qos=message.qos)
+        send(self.broker.publish, messages)
 
     def stop(self, ref: str, name: str, session: Session, device: str, why: str, address: str = "") -> None:
         """An emergency stop of one component, or of all (""): sent at once, and repeated until it is confirmed."""
         by = f"{session.user} on {device}" if device else session.user
         if ref and not _is_base(ref):
             return
-        known = self.robots.components.values()
-        self._send(self.stops.press(ref, name, by=by, why=why, now=clock(), known=known, user=session.user))
+        known, before = self.robots.components.values(), tuple(self.known)
+        self._send(
+            self.stops.press(ref, name, by=by, why=why, now=clock(), known=known, before=before, user=session.user)
+        )
         self._show_stops()
         self.audit.write("stop", ref=ref or "all", user=session.user, device=device, address=address, detail=why)
 
@@ -264,7 +275,29 @@ class Server:
                     refresh_at = now + _REFRESH_S
                     self.robots.refresh(time.monotonic())
                     self._show_broker()
+                    self._remember_robots()
                 self._announce(now)
+
+    def operated(self, ref: str) -> None:
+        """A person drives this robot from here."""
+        self.known.operated(ref, int(time.time() // _DAY_S))
+
+    def _remember_robots(self) -> None:
+        for component in self.robots.components.values():
+            self.known.seen(component, int(time.time() // _DAY_S))
+        if not self._saving and (changes := self.known.changes()):
+            self._saving = True
+            self.spawn(self._save(changes))
+
+    async def _save(self, changes: dict[str, str | None]) -> None:
+        """On a thread: another process may be writing to the file."""
+        try:
+            for ref, value in changes.items():
+                await asyncio.to_thread(self.people.set, _KNOWN + ref, value)
+        except sqlite3.Error as error:
+            log.warning("which robots are known is not saved: %s", error)
+        finally:
+            self._saving = False
 
     def _announce(self, now: float) -> None:
         """Tell other servers once a second, and when a lease changes, which robots are driven from here."""

@@ -5,14 +5,14 @@ The robot remembers the stop; see docs/emergency-stop.md.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 
 from pebble.client.estop import COLLECT_S, Progress, RobotStop, StopSender
-from pebble.contract.identity import Direction, parse_topic
+from pebble.contract.identity import parse_topic
 from pebble.runtime.robot_estop import RobotEstop
 from pebble.transports import Message
 from pebble.web import messages as m
-from pebble.web.robots import Component, own_topic
+from pebble.web.robots import Component
 
 MAX_STOPS = 64  # that are being sent at once; beyond, the oldest is no longer sent
 MAX_EACH = 16  # of them by one user: the stops of another one are not ended by too many
@@ -37,13 +37,26 @@ class Stops:
         self._shown: dict[str, tuple[str, str]] = {}  # by robot: progress and words, as pages see them
 
     def press(
-        self, ref: str, name: str, *, by: str, why: str, now: float, known: Iterable[Component], user: str = ""
+        self,
+        ref: str,
+        name: str,
+        *,
+        by: str,
+        why: str,
+        now: float,
+        known: Iterable[Component],
+        before: Collection[str] = (),
+        user: str = "",
     ) -> list[Message]:
-        """Stop one robot, or all if ``ref`` is "". ``known`` are the components from which messages were received."""
+        """Stop one robot, or all if ``ref`` is "".
+
+        ``known`` are the components from which messages were received; those known from ``before`` are stopped with
+        all, too.
+        """
         if name in self._senders:
             return []
         self._make_room(user)
-        sender = StopSender(name, by=by, why=why, now=now, robots=[ref] if ref else None)
+        sender = StopSender(name, by=by, why=why, now=now, robots=[ref] if ref else None, known=before, own_only=True)
         self._senders[name], self._users[name] = (sender, now), user
         for component in known:
             if not ref or component.ref == ref:
@@ -62,23 +75,26 @@ class Stops:
         """Who has pressed this stop; None if it is not known here."""
         return self._users.get(name)
 
-    def receive(self, message: Message, now: float, *, known: bool = True) -> None:
-        """Take a message of a robot. One that is not ``known`` is not stopped with all: there may be any number."""
+    def receive(self, message: Message, now: float) -> list[Message]:
+        """Take a message of a robot; returns what to publish to this robot now."""
         address = parse_topic(message.topic)
         if address is None:
-            return
+            return []
+        ref, messages = address.identity.base, []
         for sender, began in self._senders.values():
-            if not known and address.identity.base not in sender.robots:
-                continue
             if not sender.finished or now - began < COLLECT_S:
                 sender.receive(message, now)
+                messages += sender.tick_robot(ref, now)
+                self._note_progress(sender, ref)
+        return messages
 
     def tick(self, now: float) -> list[Message]:
-        """What to publish now; to be called every 50 ms, and after a message."""
+        """What to publish now; to be called every 50 ms."""
         messages = []
         for name, (sender, began) in list(self._senders.items()):
-            messages += [one for one in sender.tick(now) if _own(one.topic, sender)]
-            self.changed |= {ref for ref, stop in sender.robots.items() if self._shown.get(ref) != _progress(stop)}
+            messages += sender.tick(now)
+            for ref in sender.robots:
+                self._note_progress(sender, ref)
             if sender.finished and now - began > _SHOWN_S:
                 self._remove(name)
         return messages
@@ -100,6 +116,10 @@ class Stops:
             sending_text=text,
             stop=name,
         )
+
+    def _note_progress(self, sender: StopSender, ref: str) -> None:
+        if ref in sender.robots and self._shown.get(ref) != _progress(sender.robots[ref]):
+            self.changed.add(ref)
 
     def _make_room(self, user: str) -> None:
         own = [name for name in self._senders if self._users[name] == user]
@@ -142,13 +162,3 @@ def _owner(owner: str, estop: RobotEstop) -> m.OwnerState:
         persisted=state.persisted,
         reset_refused=state.reset_refused,
     )
-
-
-def _own(topic: str, sender: StopSender) -> bool:
-    """Whether it is an incoming topic of a robot that is being stopped: capabilities may name another robot's.
-
-    Also one that the contract calls otherwise: a stop does no harm there, and it may be what drives this robot.
-    """
-    address = parse_topic(topic)
-    base = "" if address is None else address.identity.base
-    return base in sender.robots and own_topic(base, topic, Direction.INCOMING)

@@ -7,8 +7,8 @@ from itertools import pairwise
 
 import pytest
 
-from pebble.client.estop import MAX_ROBOTS, Progress, StopSender, new_name
-from pebble.transports import Message
+from pebble.client.estop import MAX_PASSED, MAX_ROBOTS, Progress, StopSender, new_name, send
+from pebble.transports import Message, QoS
 from tests.client.estop_robot import Robot, capabilities, outgoing
 
 GOOB, FRED = "pebble/robots/goob", "pebble/robots/fred"
@@ -256,22 +256,110 @@ def test_what_no_robot_publishes_finds_none(message: Message) -> None:
     assert stop.robots == {}
 
 
-def test_the_number_of_robots_is_limited_and_the_rest_is_reported() -> None:
+HEARTBEAT, PICTURE = ("online", {"t": 1}), ("front-camera", "a picture")
+RETAINED = ("status", {})
+CAPABILITIES = (
+    "capabilities",
+    {"t": 1, "value": {"drive": {"available": True}, "estop": {"available": True, "owners": ["serial"]}}},
+)
+LATCH = Robot(GOOB, "serial").owners[0].latch
+STATE = ("estop/serial", LATCH.state(True))
+BAD_STATE = ("estop/serial", {"latched": "no"})
+
+#: What strangers publish for each of their components, then the real robot, and whether it gets a place of theirs.
+CROWDS = [
+    ([HEARTBEAT], [HEARTBEAT], False),
+    ([HEARTBEAT], [PICTURE], False),
+    ([HEARTBEAT], [BAD_STATE], False),
+    ([HEARTBEAT], [CAPABILITIES], True),
+    ([HEARTBEAT], [HEARTBEAT, CAPABILITIES], True),
+    ([HEARTBEAT], [STATE], True),
+    ([HEARTBEAT, BAD_STATE], [CAPABILITIES], True),
+    ([RETAINED], [HEARTBEAT], True),
+    ([RETAINED], [PICTURE], True),
+    ([RETAINED], [RETAINED], False),
+    ([CAPABILITIES], [HEARTBEAT], False),
+    ([CAPABILITIES, HEARTBEAT], [STATE], True),
+    ([STATE], [CAPABILITIES], False),
+    ([STATE, CAPABILITIES, HEARTBEAT], [STATE, CAPABILITIES, HEARTBEAT], False),
+]
+
+
+def publish(stop: StopSender, base: str, bodies: list[tuple[str, object]], now: float) -> list[Message]:
+    for metric, body in bodies:
+        receive(stop, outgoing(base, metric, body, retain=metric == "status"), now=now)
+    return stop.tick(now)
+
+
+@pytest.mark.parametrize("hold", [False, True])
+@pytest.mark.parametrize(("theirs", "own", "has_place"), CROWDS)
+def test_a_crowd_of_strangers_keeps_the_stop_from_no_robot(
+    theirs: list[tuple[str, object]], own: list[tuple[str, object]], *, has_place: bool, hold: bool
+) -> None:
+    stop, sent = sender(hold=hold), []
+    for step in range(20):
+        now = 0.25 * step
+        for number in range(MAX_ROBOTS + 200):
+            publish_quietly(stop, f"pebble/robots/r{number}", theirs, now)
+        messages = stop.tick(now) + publish(stop, GOOB, own, now)
+        sent += [now] * (ESTOP in topics(messages))
+    assert sent[0] == 0.0
+    assert max(later - earlier for earlier, later in pairwise([*sent, 5.0])) <= 0.5
+    assert len(sent) <= 10, "at most twice a second"
+    assert (GOOB in stop.robots, len(stop.robots)) == (has_place, MAX_ROBOTS)
+    assert stop.omitted
+    assert not stop.confirmed
+
+
+def publish_quietly(stop: StopSender, base: str, bodies: list[tuple[str, object]], now: float) -> None:
+    for metric, body in bodies:
+        stop.receive(outgoing(base, metric, body, retain=metric == "status"), now)
+
+
+def test_a_robot_without_a_place_gets_the_stop_for_a_minute_and_more_often_rather_than_less() -> None:
     stop = sender()
+    for number in range(MAX_ROBOTS + MAX_PASSED + 1):
+        publish_quietly(stop, f"pebble/robots/r{number}", [HEARTBEAT], 0.0)
+    first, last = f"pebble/robots/r{MAX_ROBOTS}", f"pebble/robots/r{MAX_ROBOTS + MAX_PASSED}"
+    assert len({topic for topic in topics(stop.tick(0.0)) if topic.endswith("/estop")}) == MAX_ROBOTS + MAX_PASSED + 1
+    assert topics(publish(stop, last, [HEARTBEAT], 0.1)) == []
+    assert f"{first}/incoming/estop" in topics(publish(stop, first, [HEARTBEAT], 0.1))
+    assert f"{first}/incoming/estop" in topics(publish(stop, first, [HEARTBEAT], 59.0))
+    assert publish(stop, first, [HEARTBEAT], 60.0) == []
+    assert stop.finished
+
+
+def test_robots_known_from_before_are_stopped_unheard_and_keep_their_places() -> None:
+    stop = StopSender(new_name(), by="", why="", now=0.0, robots=None, known=[GOOB])
+    assert topics(stop.tick(0.0)) == [ESTOP, DRIVE]
     for number in range(MAX_ROBOTS + 5):
-        receive(stop, outgoing(f"pebble/robots/r{number}", "online", {}), now=0.1)
-    assert (len(stop.robots), stop.omitted, stop.confirmed) == (MAX_ROBOTS, 5, False)
+        publish_quietly(stop, f"pebble/robots/r{number}", [CAPABILITIES, HEARTBEAT], 0.1)
+    assert topics(stop.tick(0.5))[:2] == [ESTOP, DRIVE], "before those of strangers"
 
 
-def test_remains_of_other_robots_take_no_place_of_one_that_is_there() -> None:
+def test_a_confirmation_counts_although_strangers_fill_every_place() -> None:
     stop, robot = sender(), Robot(GOOB, "serial")
     for number in range(MAX_ROBOTS):
-        receive(stop, outgoing(f"pebble/robots/r{number}", "status", {}, retain=True), now=0.1)
-    receive(stop, outgoing(FRED, "status", {}, retain=True), outgoing(GOOB, "online", {}), now=0.2)
-    assert (FRED in stop.robots, GOOB in stop.robots, len(stop.robots)) == (False, True, MAX_ROBOTS)
-    receive(stop, robot.capabilities(), *robot.take(stop.tick(0.2)), now=0.3)
-    assert robot.owners[0].latch.latched
-    assert (stop.omitted, stop.confirmed) == (2, False)
+        publish_quietly(stop, f"pebble/robots/r{number}", [CAPABILITIES, HEARTBEAT], 0.1)
+    receive(stop, *robot.take(publish(stop, GOOB, [HEARTBEAT], 0.2)), robot.capabilities(), now=0.3)
+    assert (robot.owners[0].latch.latched, stop.robots[GOOB].progress) == (True, Progress.CONFIRMED)
+    assert not stop.confirmed, "others are omitted"
+
+
+def test_named_robots_are_all_stopped_however_many() -> None:
+    bases = [f"pebble/robots/r{number}" for number in range(MAX_ROBOTS + 5)]
+    assert len(sender(*bases).tick(0.0)) == 2 * len(bases)
+
+
+def test_a_stop_that_is_refused_for_want_of_acknowledgements_is_sent_without_one() -> None:
+    sent: list[tuple[str, QoS]] = []
+
+    def refusing(topic: str, _payload: bytes, *, qos: QoS) -> bool:
+        sent.append((topic, qos))
+        return qos is QoS.LATEST
+
+    send(refusing, sender(GOOB).tick(0.0))
+    assert sent == [(topic, qos) for topic in (ESTOP, DRIVE) for qos in (QoS.DELIVERED, QoS.LATEST)]
 
 
 # -- hold

@@ -7,8 +7,6 @@ import threading
 import time
 from pathlib import Path
 
-import pytest
-
 from pebble.fleet.audit import Audit
 from tests.support import until
 

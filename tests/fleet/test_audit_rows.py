@@ -20,13 +20,20 @@ def robot(number: int) -> str:
     return f"pebble/robots/fake{number}"
 
 
+def in_one_network(number: int) -> str:
+    return f"2001:db8::{number >> 8:x}:{number & 255:x}"
+
+
 #: Members of the kind: what a stranger, or one person, can cause MANY times within a minute; and the rows that it
 #: may have then.
 FLOODS: dict[str, tuple[Callable[[int], dict[str, str]], int]] = {
     "logins of one name": (lambda n: {"what": "login-refused", "user": "admin", "address": "192.0.2.1"}, 1),
     "logins of changing names": (lambda n: {"what": "login-refused", "user": f"u{n}\x1b[2J", "address": "::1"}, 1),
     "one name with commas": (lambda n: {"what": "login-refused", "user": ", " * n, "address": "::1"}, 1),
-    "addresses of one /64": (lambda n: {"what": "login-limited", "user": "a", "address": f"2001:db8::{n >> 8:x}:{n & 255:x}"}, 1),
+    "addresses of one /64": (
+        lambda n: {"what": "login-limited", "user": "a", "address": in_one_network(n)},
+        1,
+    ),
     "a /64 for each": (
         lambda n: {"what": "login-limited", "user": "a", "address": f"2001:db8:{n >> 8:x}:{n & 255:x}::1"},
         GROUPS + 1,
@@ -37,7 +44,10 @@ FLOODS: dict[str, tuple[Callable[[int], dict[str, str]], int]] = {
     ),
     "lost rows": (lambda n: {"what": "audit-dropped"}, 1),
     "logins that succeed": (lambda n: {"what": "login", **VIEWER}, 1),
-    "and from changing addresses": (lambda n: {"what": "login", **VIEWER, "address": f"2001:db8::{n >> 8:x}:{n & 255:x}"}, EACH + 1),
+    "and from changing addresses": (
+        lambda n: {"what": "login", **VIEWER, "address": in_one_network(n)},
+        EACH + 1,
+    ),
     "stops of one robot": (lambda n: {"what": "stop", "ref": robot(0), **VIEWER}, 1),
     "stops of invented robots": (lambda n: {"what": "stop", "ref": robot(n), **VIEWER}, EACH + 1),
     "stops with changing reasons": (lambda n: {"what": "stop", "detail": f"{n}", **VIEWER}, EACH + 1),
@@ -103,7 +113,7 @@ def test_refused_rows_name_who_was_tried_and_the_network() -> None:
     assert [(row.user, row.address, row.count) for row in merging.take()] == [("ann, bob", "2001:db8::/64", 3)]
 
 
-def test_beyond_the_quota_a_row_says_so() -> None:
+def test_beyond_the_quota_a_row_counts_the_others() -> None:
     merging = Merging()
     for number in range(EACH + 5):
         merging.add(entry(what="stop", ref=robot(number), user="ann", detail="x"), 0.0)
@@ -111,9 +121,9 @@ def test_beyond_the_quota_a_row_says_so() -> None:
     assert (last.ref, last.user, last.detail, last.count) == (OTHERS, "ann", "", 5)
 
 
-@pytest.mark.parametrize(("what", "table", "kept"), [("login-refused", "refused", 30), ("stop", "audit", 50)])
-def test_a_table_loses_the_oldest_of_whoever_has_most(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, what: str, table: str, kept: int
+@pytest.mark.parametrize(("what", "table", "left"), [("login-refused", "refused", 30), ("stop", "audit", 50)])
+def test_a_table_loses_the_oldest_of_who_has_most(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, what: str, table: str, left: int
 ) -> None:
     for name, value in {"MAX_ACTS": 52, "MAX_REFUSED": 30, "_TRIM_PERIOD": 1}.items():
         monkeypatch.setattr(audit_module, name, value)
@@ -131,7 +141,7 @@ def test_a_table_loses_the_oldest_of_whoever_has_most(
     rows = log.read(2000)
     log.close()
     assert [row.what for row in rows if row.user == "ann"] == ["drive", "reset"]
-    assert [row.at for row in rows if row.user == "viewer"] == [1002.0 - number for number in range(kept, 0, -1)]
+    assert [row.at for row in rows if row.user == "viewer"] == [1002.0 - number for number in range(left, 0, -1)]
 
 
 def test_a_database_of_an_older_version_keeps_its_rows(tmp_path: Path) -> None:

@@ -6,10 +6,11 @@ import json
 import re
 import signal
 import socket
+import threading
 import time
 import urllib.request
-from collections.abc import Iterable, Iterator
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -309,3 +310,68 @@ def test_a_page_that_opens_thousands_of_components(server: ServerProcess, broker
         assert drives(page, robot)
         assert server.memory() - before < 40 * MB
         assert len(subscriptions(log)) < 3000
+
+
+LARGE = b'{"t":1,"value":{"drive":{"available":true},"estop":{"available":true,"owners":["s"]},"a":"%s"}}'
+
+#: What strangers publish of each of their 600 components, all the time. Those who publish all that a robot does cannot
+#: be told from one: access lists at the broker are for that.
+STRANGERS = {
+    "heartbeats": ("online", online),
+    "capabilities": ("capabilities", lambda: LARGE % b""),
+    "large capabilities": ("capabilities", lambda: LARGE % (b"x" * 60_000)),
+    "what is no state": ("estop/s", lambda: b'{"latched":false}'),
+    "pictures": ("front-camera", lambda: b"x"),
+}
+
+
+class Crowd:
+    """600 components of a stranger, each of which publishes the same all the time."""
+
+    def __init__(self, port: int, metric: str, payload: bytes) -> None:
+        self._port, self._metric, self._payload = port, metric, payload
+        self._ending = threading.Event()
+        self._publish()
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def close(self) -> None:
+        self._ending.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while not self._ending.wait(0.5):
+            self._publish()
+
+    def _publish(self) -> None:
+        flood(self._port, ((f"pebble/robots/e{one}/outgoing/{self._metric}", self._payload) for one in range(600)))
+
+
+@pytest.mark.parametrize(("metric", "payload"), STRANGERS.values(), ids=STRANGERS)
+def test_a_crowd_of_strangers_hides_no_robot_and_keeps_no_stop_from_it(
+    broker: Broker, server: ServerProcess, metric: str, payload: Callable[[], bytes]
+) -> None:
+    with closing(Crowd(broker.port, metric, payload())), server.page() as page:
+        with RecordingRobot(broker.port, GOOB) as robot:
+            assert page.knows(GOOB, 15)
+            page.send("estop", ref="", stop="00000000000000aa", why="x")
+            assert until(lambda: robot.latched, 10), "by a stop of all"
+        with RecordingRobot(broker.port, VICTIM, capabilities={}) as robot:
+            page.send("estop", ref=VICTIM, stop="00000000000000ab", why="x")
+            assert until(lambda: robot.latched, 10), "by its own stop, known or not"
+
+
+def test_a_robot_known_from_before_is_shown_and_stopped_at_once(broker: Broker, tmp_path: Path) -> None:
+    server = ServerProcess(broker.port, tmp_path)
+    with RecordingRobot(broker.port, GOOB) as robot:
+        with server.page() as page:
+            assert drives(page, robot)
+        time.sleep(0.5)  # until it is saved
+        server.close()
+        with closing(Crowd(broker.port, "capabilities", LARGE % b"")):
+            server = ServerProcess(broker.port, tmp_path)
+            with server.page() as page:
+                assert page.knows(GOOB, 15)
+                page.send("estop", ref="", stop="00000000000000aa", why="x")
+                assert until(lambda: robot.latched, 10)
+    server.close()

@@ -41,6 +41,7 @@ export function Fleet() {
   useModel(settings);
   useTick(1000); // robots come and go
   const refs = useRefs();
+  const omitted = useValue("", "web/broker")?.robots_omitted ?? 0;
   const [filter, setFilter] = useState("");
   const cards = useNodes(
     (ref) => html`<li key=${ref}><${Boundary} what=${nameOf(ref)}><${FleetCard} at=${ref} /><//></li>`,
@@ -67,6 +68,11 @@ export function Fleet() {
       </h1>
       ${total > 0 ? html`<${FleetTools} filter=${filter} onFilter=${setFilter} />` : html`<${RecordingsLink} />`}
     </div>
+    ${omitted > 0 &&
+    html`<p class="dim" data-test="omitted">
+      Too much is sent at this broker: ${omitted} messages of further components, or values, are not shown. STOP ALL
+      reaches all.
+    </p>`}
     ${total === 0 && html`<${Empty} />`}
     ${total > 0 && !shown.length && !shownAway.length && html`<p class="empty">Nothing matches “${filter}”.</p>`}
     <ul class="fleet-cards">

@@ -1,0 +1,76 @@
+"""The robots that were here before, so that those who invent others cannot push them out. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+from pebble.web.robots import Component
+
+MAX_KNOWN = 256
+_REMEMBERED_DAYS = 30  # without a sign of it, after which one that only was there gives way to another
+_OPERATED, _SEEN = "operated", "seen"
+
+
+class _Entry(NamedTuple):
+    operated: bool  # people have moved it from here, which no message of a stranger does
+    day: int  # since 1970, the newest on which it was there
+
+    def __str__(self) -> str:
+        return f"{_OPERATED if self.operated else _SEEN} {self.day}"
+
+
+class KnownRobots:
+    """Robots by base topic. A new one takes no place of those that people have operated, nor of those seen lately."""
+
+    def __init__(self, saved: dict[str, str]) -> None:
+        self._entries = {ref: entry for ref, text in saved.items() if (entry := _parsed(text)) is not None}
+        self._unsaved: dict[str, str | None] = {ref: None for ref in saved if ref not in self._entries}
+        while len(self._entries) > MAX_KNOWN:
+            self._remove(min(self._entries, key=self._entries.__getitem__))
+
+    def __contains__(self, ref: object) -> bool:
+        return ref in self._entries
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._entries)
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def operated(self, ref: str, day: int) -> None:
+        """A person drives it."""
+        self._note(ref, _Entry(operated=True, day=day))
+
+    def seen(self, component: Component, day: int) -> None:
+        """It is there; what neither drives nor can be stopped is not remembered."""
+        estop = component.estop
+        if component.rank.live and component.rank.has_capabilities and (estop.available or component.drives()):
+            operated = component.ref in self._entries and self._entries[component.ref].operated
+            self._note(component.ref, _Entry(operated=operated, day=day))
+
+    def changes(self) -> dict[str, str | None]:
+        """What has to be saved since the last call; None: it is no longer remembered."""
+        changes, self._unsaved = self._unsaved, {}
+        return changes
+
+    def _note(self, ref: str, new: _Entry) -> None:
+        if self._entries.get(ref) == new:
+            return
+        if ref not in self._entries and len(self._entries) >= MAX_KNOWN:
+            first = min(self._entries, key=self._entries.__getitem__)
+            operated, day = self._entries[first]
+            if not new.operated and (operated or day >= new.day - _REMEMBERED_DAYS):
+                return
+            self._remove(first)
+        self._entries[ref] = new
+        self._unsaved[ref] = str(new)
+
+    def _remove(self, ref: str) -> None:
+        del self._entries[ref]
+        self._unsaved[ref] = None
+
+
+def _parsed(text: str) -> _Entry | None:
+    how, _, day = text.partition(" ")
+    return _Entry(how == _OPERATED, int(day)) if how in (_OPERATED, _SEEN) and day.isdecimal() else None
