@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
+from types import TracebackType
 
 from pebble.errors import PebbleError
 
@@ -15,11 +16,12 @@ from pebble.errors import PebbleError
 def main() -> int:
     """The entry point; returns the exit code."""
     _open_missing_streams()
+    sys.excepthook = _print_error
     try:
         code = _run(sys.argv[1:])
         sys.stdout.flush()
     except PebbleError as error:
-        for line in str(error).splitlines():
+        for line in _without_secrets(str(error)).splitlines():
             sys.stderr.write(f"pebble: {line}\n")
         return 1
     except KeyboardInterrupt:
@@ -40,6 +42,19 @@ def _open_missing_streams() -> None:
             os.set_inheritable(descriptor, True)
             # As Python's own: it stays open when a child replaces the stream, and its descriptor by a pipe.
             setattr(sys, name, os.fdopen(descriptor, mode, encoding="utf-8", closefd=False))
+
+
+def _without_secrets(text: str) -> str:
+    from pebble.config.secret_text import without_secrets  # of use to errors only
+
+    return without_secrets(text)
+
+
+def _print_error(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+    """As Python prints an error that is none of ours: what is in a traceback may come from a command line."""
+    from traceback import format_exception
+
+    sys.stderr.write(_without_secrets("".join(format_exception(kind, error, trace))))
 
 
 def _run(arguments: list[str]) -> int:

@@ -12,6 +12,8 @@ from pathlib import Path
 
 import msgspec
 
+from pebble.config.hosts import HostError, split
+from pebble.config.text_files import read_password
 from pebble.contract.identity import Identity
 from pebble.errors import ConfigError, PebbleError
 from pebble.simulation.fleet import ConnectionReporter, Fleet
@@ -78,12 +80,15 @@ def run(
 def broker_address(options: argparse.Namespace) -> BrokerAddress:
     """Make the broker's address from the options. Raises ConfigError."""
     tls = options.tls or options.ca is not None
-    host, _, port = options.broker.rpartition(":") if ":" in options.broker else (options.broker, "", "")
-    if not host or not (port.isdigit() or port == ""):
-        raise ConfigError(f"--broker must be HOST or HOST:PORT, not {options.broker}")
+    try:
+        named = split(options.broker)
+    except HostError as error:
+        raise ConfigError(f"--broker must be HOST or HOST:PORT: it {error}") from None
+    if named.scheme or named.user is not None or named.rest:
+        raise ConfigError("--broker must be HOST or HOST:PORT, and nothing else")
     return BrokerAddress(
-        host=host,
-        port=int(port or (_TLS_PORT if tls else _PORT)),
+        host=named.host,
+        port=named.port or (_TLS_PORT if tls else _PORT),
         username=options.username,
         password=_password(options.password_file) if options.username else None,
         tls=tls,
@@ -94,10 +99,7 @@ def broker_address(options: argparse.Namespace) -> BrokerAddress:
 def _password(file: Path | None) -> str | None:
     if file is None:
         return os.environ.get(PASSWORD)
-    try:
-        return file.read_text().rstrip("\r\n")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"--password-file {file}: {getattr(error, 'strerror', 'is not text')}") from None
+    return read_password(file, "--password-file")
 
 
 def _recorder(trace: Trace) -> Callable[[float, Motors], None]:

@@ -19,7 +19,7 @@ def sweep(folder: Path = SHM) -> int:
 def mappings() -> list[tuple[int, int, str]]:
     """The mapped segments of this process: first address, the one after the last, and the file."""
     found = []
-    for line in Path("/proc/self/maps").read_text().splitlines():
+    for line in Path("/proc/self/maps").read_text(encoding="utf-8").splitlines():
         place, *_, path = line.split(maxsplit=5)
         if ".zenoh" in path and path.startswith(str(SHM)):
             start, end = (int(address, 16) for address in place.split("-"))

@@ -20,7 +20,7 @@ from common.connection import Connection
 from common.deadman import DeadMan
 from common.estop import EmergencyStop
 from common.payload import parse
-from common.settings import base, get
+from common.settings import base, get, host
 from common.sockets import Stream, query_name
 from common.ticks import add, diff
 from common.wifi import Wifi
@@ -61,7 +61,7 @@ class NetworkRobot:
         self._wrap = wrap
         self._wifi = Wifi(get(settings, "wifi", "ssid"), get(settings, "wifi", "password", ""))
         self._clock = Clock(settings.get("ntp", "pool.ntp.org"), now)
-        self._host = get(settings, "mqtt", "host")
+        self._host = host(settings)
         incoming = self._root + b"/incoming/"
         topics = incoming + b"estop", incoming + b"estop-reset", incoming + b"drive-values"
         longest = _LONGEST_PAYLOAD + len(topics[_DRIVE]) + 7

@@ -13,6 +13,7 @@ from typing import Any
 from pebble.client.names import ANY_ROBOT, Names, base_of
 from pebble.client.url import settings_of
 from pebble.config import Config, load
+from pebble.config.text_files import read_password
 from pebble.errors import ConfigError, PebbleError, TransportError
 from pebble.runtime.addresses import Addresses
 from pebble.runtime.connections import REMOTE_RECONNECT_S, local_settings, mqtt_settings, zenoh_settings
@@ -101,10 +102,7 @@ def password(file: Path | None) -> str | None:
     """The password in the file, else in the environment. Raises PebbleError."""
     if file is None:
         return os.environ.get(PASSWORD)
-    try:
-        return file.read_text().rstrip("\r\n")
-    except (OSError, UnicodeDecodeError) as error:
-        raise PebbleError(f"--password-file {file}: {getattr(error, 'strerror', 'is not text')}") from None
+    return read_password(file, "--password-file")
 
 
 class Listener:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from pathlib import Path
-from urllib.parse import unquote, urlsplit
 
+from pebble.config.hosts import HostError, split
 from pebble.errors import PebbleError
 from pebble.transports import MqttSettings, TlsSettings, ZenohSettings
 
@@ -21,6 +21,7 @@ def settings_of(
 ) -> tuple[str, MqttSettings | ZenohSettings]:
     """The kind of transport and its settings. Raises UrlError, whose text never contains the password."""
     scheme, _, rest = url.partition(":")
+    scheme = scheme.lower()
     if scheme == "zenoh":
         return "zenoh", _zenoh(rest)
     if scheme in _PORTS and rest.startswith("//"):
@@ -43,26 +44,23 @@ def _zenoh(path: str) -> ZenohSettings:
 
 def _mqtt(url: str, password: str | None, ca_cert: Path | None) -> MqttSettings:
     try:
-        parts = urlsplit(url)
-        port = parts.port
-    except ValueError as error:
-        raise UrlError(f"--url: {error}, use {FORMS}") from None
+        parts = split(url)
+    except HostError as error:
+        raise UrlError(f"--url {error}; use {FORMS}") from None
     if parts.password is not None:
         raise UrlError(
             "--url holds a password, which every user of this machine can read: put it into a file "
             "(--password-file FILE) or into the environment (PEBBLE_PASSWORD)"
         )
-    if not parts.hostname:
-        raise UrlError(f"--url names no host, use {FORMS}")
-    if parts.path.strip("/") or parts.query or parts.fragment:
+    if parts.rest.strip("/"):
         raise UrlError(f"--url must end after the port; topics are named separately: {FORMS}")
     encrypted = parts.scheme == "mqtts"
     if ca_cert is not None and not encrypted:
         raise UrlError("--ca-cert has no use with mqtt://: use mqtts://")
     return MqttSettings(
-        host=parts.hostname,
-        port=_PORTS[parts.scheme] if port is None else port,
-        username=None if parts.username is None else unquote(parts.username),
+        host=parts.host,
+        port=_PORTS[parts.scheme] if parts.port is None else parts.port,
+        username=parts.user,
         password=password,
         tls=TlsSettings(ca_cert=ca_cert) if encrypted else None,
     )

@@ -11,6 +11,8 @@ from typing import Annotated
 
 import typer
 
+from pebble.config.secret_text import without_secrets
+from pebble.runtime.parent import MaskingFormatter
 from pebble.version import __version__
 
 #: Each command, and the module of this package that registers it.
@@ -89,7 +91,7 @@ def _run(arguments: list[str]) -> int:
         code = typer.main.get_command(app).main(line, prog_name="pebble", standalone_mode=False)
     except typer.TyperException as error:
         help_ = " ".join(["pebble", *wanted, "--help"])
-        sys.stderr.write(f"pebble: {error.format_message().rstrip('.')}; see {help_}\n")
+        sys.stderr.write(f"pebble: {without_secrets(error.format_message().rstrip('.'))}; see {help_}\n")
         return 2
     except typer.Abort as error:  # Ctrl-C
         raise KeyboardInterrupt from error
@@ -101,7 +103,7 @@ def _thread_errors_on_stderr() -> Iterator[None]:
     """Log errors to stderr: a command raises its own errors, but not those of threads."""
     handler = logging.StreamHandler()
     handler.setLevel(logging.ERROR)
-    handler.setFormatter(logging.Formatter("pebble: %(message)s"))
+    handler.setFormatter(MaskingFormatter("pebble: %(message)s"))
     logging.getLogger("pebble").addHandler(handler)
     try:
         yield

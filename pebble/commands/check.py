@@ -10,6 +10,7 @@ from typing import Annotated, NamedTuple
 import typer
 
 from pebble.config import Config, Mqtt, RemoteConnection, load, resolved
+from pebble.config.secret_text import shown_user, without_secrets
 from pebble.config.web import is_loopback
 from pebble.contract import CHANNELS, MEDIA_STATUS, STATUS, TOUCH_SENSORS, Channel
 from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
@@ -59,7 +60,7 @@ def _check(path: Path, *, as_json: bool, first: bool) -> bool:
         _check_certificates(config)
     except ConfigError as error:
         for problem in error.problems:
-            typer.echo(f"pebble: {path.name}: {problem}", err=True)
+            typer.echo(f"pebble: {without_secrets(f'{path.name}: {problem}')}", err=True)
         return False
     if as_json:
         typer.echo(json.dumps(resolved(config), indent=2))
@@ -232,7 +233,7 @@ def _remote_connection(remote: RemoteConnection) -> str:
 
 
 def _mqtt(mqtt: Mqtt) -> str:
-    user = "anonymous" if mqtt.username is None else f"user {mqtt.username}"
+    user = "anonymous" if mqtt.username is None else f"user {shown_user(mqtt.username)}"
     password = "" if mqtt.username is None or mqtt.password is None else ", password ***"
     name = " without a check of the name" if mqtt.tls.insecure else ""
     tls = f"TLS{name}" if mqtt.tls.enabled else "not encrypted"

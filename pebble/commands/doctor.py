@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from pebble.config import load
+from pebble.config.secret_text import without_secrets
 from pebble.doctor import Finding, Level
 from pebble.runtime.environment import withhold
 
@@ -49,7 +50,8 @@ def register(app: typer.Typer) -> None:
 def _print(finding: Finding) -> None:
     width = shutil.get_terminal_size().columns
     typer.secho(f"{finding.level.value:<4}  ", fg=_COLOURS[finding.level], nl=False)
-    text = textwrap.fill(f"{finding.what}: {finding.text}", width, initial_indent=_INDENT, subsequent_indent=_INDENT)
+    text = without_secrets(f"{finding.what}: {finding.text}")
+    text = textwrap.fill(text, width, initial_indent=_INDENT, subsequent_indent=_INDENT)
     typer.echo(text.removeprefix(_INDENT))
     if finding.fix:  # always on one line: it is to be copied
-        typer.secho(f"{_INDENT}fix: {finding.fix}", bold=True)
+        typer.secho(f"{_INDENT}fix: {without_secrets(finding.fix)}", bold=True)

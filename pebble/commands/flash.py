@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 
 from pebble.config import Config, load
+from pebble.config.text_files import read_password
 from pebble.errors import PebbleError
 from pebble.flash import ports
 from pebble.flash.boards import FIRMWARE, Firmware, firmware_named
@@ -115,11 +116,7 @@ def _private(
 def _wifi_password(ssid: str, file: Path | None) -> str:
     """Never from the command line, where every user of this machine could read it."""
     if file is not None:
-        try:
-            return file.read_text().rstrip("\r\n")
-        except (OSError, UnicodeDecodeError) as error:
-            why = getattr(error, "strerror", None) or "is not text"
-            raise PebbleError(f"--wifi-password-file {file}: {why}") from None
+        return read_password(file, "--wifi-password-file")
     if WIFI_PASSWORD in os.environ:
         return os.environ[WIFI_PASSWORD]
     if not sys.stdin.isatty():

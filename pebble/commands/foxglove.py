@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pebble.client.connection import Target, resolve
-from pebble.commands.options import CaCert, PasswordFile
+from pebble.commands.options import CaCert, PasswordFile, host_of
 from pebble.config.web import is_loopback
 from pebble.errors import PebbleError
 from pebble.runtime.connections import REMOTE_RECONNECT_S
@@ -46,6 +46,7 @@ def serve(
     """
     if (config is None) == (url is None):
         raise PebbleError("which robots is missing: name either a robot's config file or --url mqtt://BROKER")
+    host = host_of("--host", host)
     if not is_loopback(host) and not no_login:
         raise PebbleError(
             f"--host {host}: other machines could watch and listen without a login, because Foxglove's protocol has "

@@ -1,10 +1,12 @@
 """Arguments and options that several commands share."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from pebble.config import hosts
 from pebble.errors import PebbleError
 
 ConfigArgument = Annotated[Path, typer.Argument(help="A robot's config file.", show_default=False)]
@@ -23,6 +25,14 @@ PasswordFile = Annotated[
 CaCert = Annotated[Path | None, typer.Option(help="Certificate authority to trust with mqtts://.", metavar="FILE")]
 Output = Annotated[Path, typer.Option("--output", help="Folder for results and plots.", metavar="FOLDER")]
 Quick = Annotated[bool, typer.Option("--quick", help="Few cases and short rounds; results are marked as quick.")]
+
+
+def host_of(option: str, text: str, parse: Callable[[str], str] = hosts.host) -> str:
+    """The host that an option names. Raises PebbleError."""
+    try:
+        return parse(text)
+    except hosts.HostError as error:
+        raise PebbleError(f"{option} {error}") from None
 
 
 def split_names(text: str) -> list[str]:

@@ -33,7 +33,7 @@ def write(name: str, folder: Path) -> Iterator[Path]:
         "pytest.ini": _text("pytest.ini"),
     }
     for file, text in texts.items():
-        (target / file).write_text(text)
+        (target / file).write_text(text, encoding="utf-8")
         yield target / file
 
 
@@ -45,11 +45,11 @@ def _alike(target: Path) -> Path | None:
 
 
 def _text(file: str) -> str:
-    return files("pebble.commands").joinpath("starter", file).read_text()
+    return files("pebble.commands").joinpath("starter", file).read_text(encoding="utf-8")
 
 
 def _room() -> str:
-    return files("pebble.simulation.world").joinpath("room.json").read_text()
+    return files("pebble.simulation.world").joinpath("room.json").read_text(encoding="utf-8")
 
 
 def _robot(target: Path) -> str:

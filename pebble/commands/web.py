@@ -17,9 +17,10 @@ from typer.core import TyperCommand, TyperGroup
 from pebble.client.connection import password as broker_password
 from pebble.client.url import settings_of as settings_of_url
 from pebble.commands import web_people
-from pebble.commands.options import CaCert, PasswordFile
+from pebble.commands.options import CaCert, PasswordFile, host_of
 from pebble.commands.web_people import PEOPLE, TLS, PeopleOption, default_folder, opened
 from pebble.config import load
+from pebble.config.hosts import name_of_page
 from pebble.config.web import WebTls, is_loopback
 from pebble.errors import PebbleError
 from pebble.fleet.certificates import CA_CERT, SERVER_CERT, SERVER_KEY
@@ -79,7 +80,13 @@ def serve(
     empty = folder is not None and not _has_certificate(folder)
     if recordings is not None and not recordings.is_dir():
         raise PebbleError(f"--recordings {recordings}: there is no such folder")
-    options = {"host": host, "port": port, "names": tuple(name or ()), "people": people, "recordings": recordings}
+    options = {
+        "host": None if host is None else host_of("--host", host),
+        "port": port,
+        "names": tuple(host_of("--name", one, name_of_page) for one in name or ()),
+        "people": people,
+        "recordings": recordings,
+    }
     if url is not None:
         settings, plain = _of_url(_broker(url, password_file, ca_cert), options, None if empty else folder), False
     else:

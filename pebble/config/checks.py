@@ -9,11 +9,13 @@ from typing import Any
 from msgspec.structs import replace
 
 from pebble.config.exposure import warn_if_readable, warn_of_logins_in_clear
-from pebble.config.masking import without_login
+from pebble.config.hosts import HostError, check_web_url
 from pebble.config.media import VideoStream
 from pebble.config.problems import Path
 from pebble.config.reader import Check, Reader
+from pebble.config.secret_text import without_login
 from pebble.config.shared_topics import shared_topics
+from pebble.config.text_files import NotTextError, read_text
 from pebble.config.transport import Mqtt, Tls, TransportSection
 from pebble.config.tree import MqttBridge, Root, SerialBridge, SerialBridges, SerialSafety, Services
 from pebble.config.types import Secret
@@ -23,6 +25,7 @@ from pebble.contract.identity import SERVERS
 _LATER = ("ros1_bridge",)
 _TLS = ("tls/", "quic/")  # endpoints of Zenoh that are encrypted
 _LONGEST_TEXT = 65535  # bytes of a user name or password (MQTT 3.1.1, section 1.5.3)
+_VARIABLE = re.compile("[A-Z_][A-Z0-9_]*").fullmatch  # as they are usually written; else it may be a password
 _INSTANCE_NAME = re.compile(r"[A-Za-z0-9_.-]{1,32}").fullmatch  # it becomes part of a process's name and client id
 
 
@@ -76,9 +79,15 @@ def _services(reader: Reader, services: Services, path: Path) -> Services:
 
 def _video_stream(reader: Reader, stream: VideoStream, path: Path) -> VideoStream:
     """Every operator receives the address: a login in it would be no secret."""
-    if stream.webrtc_url is None or (public := without_login(stream.webrtc_url)) == stream.webrtc_url:
+    if stream.webrtc_url is None:
         return stream
-    reader.notes.warning((*path, "webrtc_url"), "its login is left out, because the address is published")
+    public = without_login(stream.webrtc_url)
+    if public != stream.webrtc_url:
+        reader.notes.warning((*path, "webrtc_url"), "its login is left out, because the address is published")
+    try:
+        check_web_url(public)
+    except HostError as error:
+        reader.notes.warning((*path, "webrtc_url"), f"no page can show it: {error}")
     return replace(stream, webrtc_url=public)
 
 
@@ -188,8 +197,6 @@ def _mqtt(reader: Reader, mqtt: Mqtt, path: Path) -> Mqtt:
     if len(given) > 1:
         reader.notes.problem((*path, given[1]), f"is a second password beside {given[0]}, leave one of them")
         return mqtt
-    if mqtt.host and not _is_host(mqtt.host):
-        reader.notes.problem((*path, "host"), "must be a name or address: 1 to 63 characters between dots, 253 in all")
     if mqtt.username is not None and len(mqtt.username.encode()) > _LONGEST_TEXT:
         reader.notes.problem((*path, "username"), f"is longer than MQTT carries, {_LONGEST_TEXT} bytes")
     if given and mqtt.username is None:
@@ -207,14 +214,10 @@ def _mqtt(reader: Reader, mqtt: Mqtt, path: Path) -> Mqtt:
     return replace(mqtt, password=Secret(password))
 
 
-def _is_host(text: str) -> bool:
-    """By its length, on which the system's resolver fails."""
-    return len(text) <= 253 and all(1 <= len(label) <= 63 for label in text.removesuffix(".").split("."))
-
-
 def _variable(reader: Reader, name: str, path: Path) -> str | None:
     if name not in reader.env:
-        reader.notes.problem(path, f"the environment variable {name} is not set, set it before the start")
+        shown = f"the environment variable {name}" if _VARIABLE(name) else "it names an environment variable that"
+        reader.notes.problem(path, f"{shown} is not set, set it before the start")
         return None
     reader.password_variables[name] = None
     return reader.env[name]
@@ -223,11 +226,13 @@ def _variable(reader: Reader, name: str, path: Path) -> str | None:
 def _contents(reader: Reader, file: FilePath, path: Path) -> str | None:
     """The file's text without its final newline; noted and None when it cannot be read."""
     try:
-        return file.read_text().rstrip("\r\n")
+        return read_text(file).rstrip("\n")
     except FileNotFoundError:
-        reader.notes.problem(path, f"there is no file {file}")
-    except ValueError:  # UnicodeDecodeError, or a zero byte in the path
-        reader.notes.problem(path, f"{str(file)!r} does not hold text")
+        # a password that was written instead of a file's name is not repeated
+        shown = f"there is no file {file}" if path[-1] != "password_file" else f"there is no such file in {file.parent}"
+        reader.notes.problem(path, shown)
+    except NotTextError as error:
+        reader.notes.problem(path, f"{file} {error}")
     except OSError as error:
         reader.notes.problem(path, f"{file} cannot be read: {os.strerror(error.errno or 0)}")
     return None

@@ -169,7 +169,7 @@ def default_run_folder(base: str, env: Mapping[str, str]) -> Path:
 def _is_run_from(folder: Path, base: str) -> bool:
     """Whether the newest launcher in this run directory, if we may read it, was that of this robot."""
     try:
-        return (folder / LAUNCHER_LOCK).read_text(errors="replace").splitlines()[1:2] == [base]
+        return (folder / LAUNCHER_LOCK).read_text(errors="replace", encoding="utf-8").splitlines()[1:2] == [base]
     except OSError:
         return False
 

@@ -1,36 +1,16 @@
-"""Finds and hides what is secret in a config: passwords, tokens, logins in addresses, values of variables."""
+"""Finds and hides what is secret in a config: by its keys, and in its texts as secret_text does."""
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Any
 
 from msgspec.structs import fields
 
+from pebble.config.secret_text import HIDDEN, is_secret, is_secret_option, shown_user, without_secrets
 from pebble.config.types import Secret, Section
 
-HIDDEN = "***"
-_NAMES = "pass|secret|token|credential|(?:api|access|private|auth).?key"
-_KEY = re.compile(_NAMES, re.IGNORECASE).search
 _HARMLESS = ("password_file", "password_env")
-_LOGIN = re.compile(r"(?<=://)[^/?#\s]*(?=@)")  # user:password of a URL
-_WORD = re.compile(rf"(\b[\w-]{{0,40}}(?:{_NAMES}|pwd)[\w-]{{0,40}}=)[^&\s]+", re.IGNORECASE)  # of a query or an option
-
-
-def is_secret(key: str) -> bool:
-    """Whether the key's name says that its value, or the file or variable that it names, is secret."""
-    return bool(_KEY(key))
-
-
-def without_secrets(text: str) -> str:
-    """``text`` with stars in place of logins in URLs, and of passwords and tokens in queries and options."""
-    return _WORD.sub(rf"\1{HIDDEN}", _LOGIN.sub(HIDDEN, text))
-
-
-def without_login(url: str) -> str:
-    """``url`` without its user and password."""
-    return re.sub(f"{_LOGIN.pattern}@", "", url)
 
 
 def holds_secret(value: Any, key: str = "") -> bool:
@@ -55,11 +35,18 @@ def masked(value: Any, key: str = "") -> Any:
         variables = key == "env" or key.endswith("_env")  # whatever they are called
         return dict.fromkeys(value, HIDDEN) if variables else _object(value)
     if isinstance(value, tuple | list):
-        return [masked(item, key) for item in value]
+        return [
+            HIDDEN
+            if place and isinstance(value[place - 1], str) and is_secret_option(value[place - 1])
+            else masked(item, key)
+            for place, item in enumerate(value)
+        ]
     if isinstance(value, Path):
         return str(value)
-    return without_secrets(value) if isinstance(value, str) else value
+    if isinstance(value, str):
+        return shown_user(value) if key == "username" else without_secrets(value)
+    return value
 
 
 def _object(items: dict[str, Any]) -> dict[str, Any]:
-    return {key: masked(value, key) for key, value in items.items() if value is not None}
+    return {without_secrets(key): masked(value, key) for key, value in items.items() if value is not None}

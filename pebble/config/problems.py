@@ -3,6 +3,8 @@
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
+from pebble.config.secret_text import without_secrets
+
 Path = tuple[str | int, ...]
 
 
@@ -13,7 +15,7 @@ class Note(NamedTuple):
     text: str
 
     def __str__(self) -> str:
-        return f"{show_path(self.path)}: {self.text}"
+        return without_secrets(f"{show_path(self.path)}: {self.text}")
 
 
 class Notes:
@@ -56,7 +58,7 @@ def _grouped(retired: list[Note]) -> Iterator[str]:
             show_path((*parent, keys[0] if len(keys) == 1 else f"{{{', '.join(keys)}}}"))
             for parent, keys in groups.items()
         )
-        yield f"{', '.join(places)}: no longer used, {text}"
+        yield without_secrets(f"{', '.join(places)}: no longer used, {text}")
 
 
 def show_path(path: Path) -> str:

@@ -5,13 +5,15 @@ import math
 from pathlib import Path
 from typing import Any
 
-from pebble.config import problems
+from pebble.config import problems, text_files
 from pebble.config.tree import Services
 from pebble.config.types import ServiceSection
+from pebble.config.visible import hidden, without_hidden
 from pebble.errors import ConfigError
 
 _SERVICES = tuple(name for name in Services.__struct_fields__ if isinstance(getattr(Services(), name), ServiceSection))
 _INTERVAL = "retained_publish_interval_seconds"
+_WORDS = ("command", "player_command", "env", "publisher_env", "receiver_env", "robots", "robot_discovery")
 _DEEPEST = 50  # levels: far more than any section has, and few enough for whatever reads it later
 
 
@@ -24,13 +26,13 @@ def read_text(path: Path) -> str:
     try:
         if path.is_dir():
             raise ConfigError(f"{path}: is a folder, name the JSON file in it")
-        return path.read_text(encoding="utf-8-sig")
+        return text_files.read_text(path)
     except FileNotFoundError:
         raise ConfigError(f"{path}: there is no such file") from None
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{path}: is not UTF-8 text, see its byte {error.start}") from None
+    except text_files.NotTextError as error:
+        raise ConfigError(f"{path}: {error}") from None
 
 
 def decode(text: str, name: str) -> Any:
@@ -69,8 +71,8 @@ def plain(raw: Any, notes: problems.Notes, path: problems.Path = ()) -> Any:
     if isinstance(raw, float) and not math.isfinite(raw):
         notes.problem(path, f"must be a number, not {raw}")
         return None
-    if isinstance(raw, str) and (flaw := _flaw(raw)):
-        notes.problem(path, f"holds {flaw}")
+    if isinstance(raw, str) and (flaw := hidden(raw, words=_is_words(path), inside=path[-1:] != ("password",))):
+        notes.problem(path, flaw)
         return ""
     return raw
 
@@ -80,8 +82,8 @@ def _object(pairs: Pairs, notes: problems.Notes, path: problems.Path) -> dict[st
     for key, value in pairs:
         if key.startswith("//"):
             continue
-        if flaw := _flaw(key):
-            notes.problem(path, f"holds a key with {flaw}")
+        if flaw := hidden(key):
+            notes.problem(path, f'has a key "{without_hidden(key)}" that {flaw}')
             continue
         if key in data:
             notes.problem((*path, key), "occurs twice in one object, leave one of them")
@@ -89,15 +91,9 @@ def _object(pairs: Pairs, notes: problems.Notes, path: problems.Path) -> dict[st
     return data
 
 
-def _flaw(text: str) -> str:
-    """What no path, command, variable or message can hold; "" if there is nothing of it."""
-    if "\0" in text:
-        return "a NUL character (\\u0000), leave it out"
-    try:
-        text.encode()
-    except UnicodeEncodeError:
-        return "half a character (a lone surrogate)"
-    return ""
+def _is_words(path: problems.Path) -> bool:
+    """Whether a text is a command, a variable's value or made for people: blanks at its ends may be meant."""
+    return "topics" not in path and any(key in _WORDS for key in path)
 
 
 def inherit(raw: Any) -> Any:

@@ -1,5 +1,6 @@
 """Turns plain data into config sections; continues after a mistake, so that all are reported at once."""
 
+import re
 import types
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -11,11 +12,13 @@ from msgspec.structs import FieldInfo, fields
 
 from pebble.config import problems
 from pebble.config.types import Secret, Section
+from pebble.errors import PebbleError
 
 S = TypeVar("S", bound=Section)
 #: Checks a finished section of its class; returns it, completed if necessary.
 Check = Callable[["Reader", Any, problems.Path], Any]
 
+_NUMBER = re.compile(r"[+-]?[0-9.]{1,10}|true|false", re.ASCII).fullmatch
 _WRONG = object()  # in place of a refused value: the key gets its default
 
 
@@ -76,20 +79,30 @@ class Reader:
             name, item = get_args(kind)
             return self._map(name, item, raw, path)
         if kind is Path:
-            return self._path(raw, path) if isinstance(raw, str) else self._refuse(kind, metas, raw, path)
+            return self._path(raw, metas, path) if isinstance(raw, str) else self._refuse(kind, metas, raw, path)
         if get_origin(kind) is Literal and isinstance(raw, str):
             raw = next((choice for choice in get_args(kind) if str(choice).lower() == raw.lower()), raw)
         try:
             value = msgspec.convert(raw, annotation)
         except msgspec.ValidationError:
             return self._refuse(kind, metas, raw, path)
-        return Secret(value) if _extra(metas, "secret") else value
+        return Secret(value) if _extra(metas, "secret") else self._parsed(metas, value, path)
 
-    def _path(self, text: str, path: problems.Path) -> Any:
+    def _parsed(self, metas: list[Meta], value: Any, path: problems.Path) -> Any:
+        parse = _extra(metas, "parse")
+        try:
+            return value if parse is None else parse(value)
+        except PebbleError as error:
+            self.notes.problem(path, str(error))
+            return _WRONG
+
+    def _path(self, text: str, metas: list[Meta], path: problems.Path) -> Any:
+        if self._parsed(metas, text, path) is _WRONG:
+            return _WRONG
         try:
             return self.folder / Path(text).expanduser()
         except RuntimeError:  # ~somebody, or ~ without a home
-            self.notes.problem(path, f"{_shown(text)} names a home folder that is not known, write the whole path")
+            self.notes.problem(path, "names a home folder that is not known, write the whole path")
             return _WRONG
 
     def _list(self, item: Any, raw: Any, path: problems.Path) -> Any:
@@ -120,9 +133,8 @@ class Reader:
 
     def _refuse(self, kind: Any, metas: list[Meta], raw: Any, path: problems.Path) -> Any:
         shown = "a value of another kind" if _extra(metas, "secret") else _shown(raw)
-        if kind in (bool, int, float) and isinstance(raw, str):
-            shown = f"the text {shown}"  # 1883 and "1883" look alike
-        self.notes.problem(path, f"must be {expected(kind, metas)}, not {shown}")
+        instead = "" if shown == "text" and (get_origin(kind) is Literal or kind in (str, Path)) else f", not {shown}"
+        self.notes.problem(path, f"must be {expected(kind, metas)}{instead}")
         return _WRONG
 
 
@@ -145,7 +157,7 @@ def expected(kind: Any, metas: list[Meta]) -> str:
     if text := _extra(metas, "expected"):
         return str(text)
     if get_origin(kind) is Literal:
-        *most, last = map(_shown, get_args(kind))
+        *most, last = (msgspec.json.encode(choice).decode() for choice in get_args(kind))
         return f"{', '.join(most)} or {last}" if most else last
     if get_origin(kind) in (Union, types.UnionType):
         return " or ".join(expected(member, []) for member in get_args(kind))
@@ -176,6 +188,9 @@ def _is_section(kind: Any) -> bool:
 
 
 def _shown(raw: Any) -> str:
+    """What was written, in words; of a text only a number, because a secret may have been written in a wrong place."""
+    if isinstance(raw, str):
+        return f'the text "{raw}"' if _NUMBER(raw) else "text"  # 1883 and "1883" look alike
     if isinstance(raw, dict):
         return "an object"
     if isinstance(raw, list):

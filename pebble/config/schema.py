@@ -116,7 +116,7 @@ def _allowed(field: FieldInfo) -> str:
         return " A list."
     if get_origin(kind) is dict:
         return " An object."
-    if kind in (bool, str) and not any(meta.extra for meta in metas):
+    if kind in (bool, str) and not any(set(meta.extra or ()) - {"parse"} for meta in metas):
         return ""
     text = expected(kind, metas).partition(":")[0]  # the rules of topics are in the text above
     return f" {text[:1].upper()}{text[1:]}."
@@ -134,9 +134,9 @@ def _default(field: FieldInfo) -> str:
 
 def write(root: Path) -> None:
     """Write both files below ``root``, the project's folder."""
-    (root / SCHEMA_FILE).write_text(schema_text())
+    (root / SCHEMA_FILE).write_text(schema_text(), encoding="utf-8")
     docs = root / DOCS_FILE
-    docs.write_text(docs_text(docs.read_text()))
+    docs.write_text(docs_text(docs.read_text(encoding="utf-8")), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -4,7 +4,18 @@ from typing import Annotated, Any, Literal
 
 from msgspec import Meta, field
 
-from pebble.config.types import ClientId, CommonName, Endpoint, File, Password, Port, Section, Silence, doc
+from pebble.config.types import (
+    BrokerHost,
+    ClientId,
+    CommonName,
+    Endpoint,
+    File,
+    Password,
+    Port,
+    Section,
+    Silence,
+    doc,
+)
 
 
 class Tls(Section, frozen=True, kw_only=True):
@@ -21,7 +32,7 @@ class Tls(Section, frozen=True, kw_only=True):
 class Mqtt(Section, frozen=True, kw_only=True):
     """One MQTT broker."""
 
-    host: Annotated[str, doc("Name or address of the broker.")] = "127.0.0.1"
+    host: Annotated[BrokerHost, doc("Name or address of the broker.")] = "127.0.0.1"
     port: Annotated[Port, doc("TCP port of the broker.")] = 1883
     keepalive: Annotated[
         int,
@@ -45,7 +56,7 @@ class Mqtt(Section, frozen=True, kw_only=True):
 class RemoteMqtt(Mqtt, frozen=True, kw_only=True):
     """The remote broker, which operators connect to."""
 
-    host: Annotated[str, doc("Name or address of the broker; required when the bridge is enabled.")] = ""
+    host: Annotated[BrokerHost, doc("Name or address of the broker; required when the bridge is enabled.")] = ""
     client_id: Annotated[
         ClientId | None,
         doc(

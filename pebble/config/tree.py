@@ -13,6 +13,7 @@ from pebble.config.transport import Mqtt, RemoteConnection, RemoteMqtt, Transpor
 from pebble.config.types import (
     EMPTY,
     Command,
+    Device,
     File,
     Interval,
     Level,
@@ -180,7 +181,9 @@ class MqttBridge(ServiceSection, frozen=True, kw_only=True):
 class SerialPort(Section, frozen=True, kw_only=True):
     """The line to the MCU."""
 
-    port: Annotated[str | None, doc("Device, for example `/dev/ttyACM0`; required where the bridge is enabled.")] = None
+    port: Annotated[Device | None, doc("Device, for example `/dev/ttyACM0`; required where the bridge is enabled.")] = (
+        None
+    )
     baud: Annotated[int, Meta(ge=50, le=12_000_000, description="Bits per second; must be the firmware's.")] = 115200
     timeout_seconds: Annotated[Interval, doc("How long one read waits.")] = 0.1
 

@@ -6,6 +6,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from msgspec import Meta, Struct, field
 
+from pebble.config import hosts
 from pebble.contract.identity import LEVEL, LEVEL_RULE
 
 # As pebble.transports.topics checks it: brokers close the connection on what is refused here.
@@ -14,23 +15,40 @@ _ESTOP = "(?:[^/]+/){3}(?:incoming|outgoing)/estop"  # of any robot: nothing els
 _TOPIC = rf"^(?!\$)(?!{_ESTOP})(?!(?:[^/]*/){{200}})[^{_BAD}]{{1,250}}$(?!\n)"
 
 # ``expected`` completes a problem's text "must be …, not …".
-Level = Annotated[str, Meta(pattern=LEVEL, extra={"expected": LEVEL_RULE})]
+Level = Annotated[str, Meta(pattern=LEVEL, extra={"expected": LEVEL_RULE, "parse": hosts.no_login})]
 Topic = Annotated[
     str,
     Meta(
         pattern=_TOPIC,
-        extra={"expected": "a topic: 1 to 250 characters, no + or #, no $ at the start, not one of an emergency stop"},
+        extra={
+            "expected": "a topic: 1 to 250 characters, no + or #, no $ at the start, not one of an emergency stop",
+            "parse": hosts.no_login,
+        },
     ),
 ]
+# ``parse`` reads what was written, or raises a PebbleError that says what to write.
 Endpoint = Annotated[
-    str, Meta(pattern=r"^[a-z0-9-]+/.+", extra={"expected": 'a Zenoh endpoint such as "tls/192.168.1.7:7447"'})
+    str,
+    Meta(
+        pattern=r"^[a-z0-9-]+/.+",
+        extra={"expected": 'a Zenoh endpoint such as "tls/192.168.1.7:7447"', "parse": hosts.endpoint},
+    ),
 ]
-CommonName = Annotated[str, Meta(min_length=1, max_length=64, extra={"expected": "the name in a certificate"})]
+Host = Annotated[str, Meta(extra={"parse": hosts.host})]
+BrokerHost = Annotated[str, Meta(extra={"parse": hosts.broker_host})]
+Device = Annotated[str, Meta(extra={"parse": hosts.no_login})]
+NameOfPage = Annotated[str, Meta(extra={"parse": hosts.name_of_page})]
+CommonName = Annotated[
+    str, Meta(min_length=1, max_length=64, extra={"expected": "the name in a certificate", "parse": hosts.no_login})
+]
 ClientId = Annotated[
     str,
     Meta(
         pattern=r"^[!-~]{1,128}$(?!\n)",
-        extra={"expected": "the id that the broker knows: 1 to 128 letters, digits and signs, without blanks"},
+        extra={
+            "expected": "the id that the broker knows: 1 to 128 letters, digits and signs, without blanks",
+            "parse": hosts.no_login,
+        },
     ),
 ]
 LogLevel = Literal["DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL"]
@@ -51,7 +69,7 @@ AudioChannels = Annotated[int, Meta(ge=1, le=8)]
 #: A list of words, or one line that is split as a shell would; it is never run by a shell.
 Command = tuple[str, ...]
 #: Relative to the config file; ``~`` is the user's home.
-File = Annotated[Path, Meta(extra={"expected": "a path"})]
+File = Annotated[Path, Meta(extra={"expected": "a path", "parse": hosts.no_url})]
 #: Environment variables by name.
 Variables = dict[Annotated[str, Meta(pattern="^[^=]+$", extra={"expected": "the name of a variable, without ="})], str]
 Password = Annotated[str, Meta(extra={"secret": True})]

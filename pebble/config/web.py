@@ -6,12 +6,21 @@ from typing import Annotated, Any
 from msgspec import Meta, field
 
 from pebble.config.transport import Mqtt
-from pebble.config.types import EMPTY, Count, File, Level, LogLevel, Port, Section, ServiceSection, Variables, doc
-
-HostName = Annotated[
-    str,
-    Meta(pattern=r"^[A-Za-z0-9.:_-]{1,253}$(?!\n)", extra={"expected": 'a host name or address, such as "fair.local"'}),
-]
+from pebble.config.types import (
+    EMPTY,
+    BrokerHost,
+    Count,
+    File,
+    Host,
+    Level,
+    LogLevel,
+    NameOfPage,
+    Port,
+    Section,
+    ServiceSection,
+    Variables,
+    doc,
+)
 
 
 class WebHandler(ServiceSection, frozen=True, kw_only=True):
@@ -24,7 +33,7 @@ class WebMqtt(Mqtt, frozen=True, kw_only=True):
     """The broker that robots connect to."""
 
     host: Annotated[
-        str, doc("Name or address of the broker; unset: the robot's own, services.mqtt_bridge.remote_mqtt.")
+        BrokerHost, doc("Name or address of the broker; unset: the robot's own, services.mqtt_bridge.remote_mqtt.")
     ] = ""
 
 
@@ -57,11 +66,11 @@ class WebInterface(Section, frozen=True, kw_only=True):
 
     log_level: Annotated[LogLevel, doc("Log level of `pebble web`; the root's log_level unless set.")] = "INFO"
     host: Annotated[
-        HostName,
+        Host,
         doc("Address to listen on; one that other machines reach needs tls and a user (`pebble web user add`)."),
     ] = "127.0.0.1"
     port: Annotated[Port, doc("TCP port to listen on.")] = 8080
-    names: Annotated[tuple[HostName, ...], doc("Further host names and addresses that browsers may use for it.")] = ()
+    names: Annotated[tuple[NameOfPage, ...], doc("Further host names and addresses that browsers may use for it.")] = ()
     server: Annotated[Level | None, doc("What it is called on pages and for other servers; unset: this machine.")] = (
         None
     )

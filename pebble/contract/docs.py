@@ -215,7 +215,7 @@ def main(arguments: list[str]) -> None:
     """Write both files into the given folder, or into docs/ of this checkout."""
     folder = Path(arguments[0]) if arguments else Path(__file__).resolve().parents[2] / "docs"
     for name, text in documents().items():
-        (folder / name).write_text(text)
+        (folder / name).write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":

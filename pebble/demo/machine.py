@@ -40,7 +40,7 @@ class Machine:
         if self._samples and now - self._samples[-1].at < _SLICE_S:
             return
         try:
-            ticks = [int(word) for word in _STAT.read_text().split("\n", 1)[0].split()[1 : _FIELDS + 1]]
+            ticks = [int(word) for word in _STAT.read_text(encoding="utf-8").split("\n", 1)[0].split()[1 : _FIELDS + 1]]
             self._samples.append(Sample(now, ticks[_IDLE] + ticks[_IOWAIT], ticks[_STEAL], sum(ticks)))
         except (OSError, ValueError, IndexError):  # another system
             return

@@ -18,6 +18,7 @@ from importlib import metadata
 from pathlib import Path
 
 from pebble.config import Config, Mqtt
+from pebble.config.secret_text import shown_user
 from pebble.doctor import Finding, Level
 from pebble.doctor.broker_probe import REFUSED_ID, REFUSED_LOGINS, ProbeResult, probe
 from pebble.doctor.loudspeaker import loudspeaker
@@ -175,7 +176,7 @@ def _mapped(proc: Path, paths: set[Path]) -> set[Path]:
     found: set[Path] = set()
     for maps in proc.glob("[0-9]*/maps"):
         try:
-            text = maps.read_text(errors="replace")
+            text = maps.read_text(errors="replace", encoding="utf-8")
         except OSError:  # ended meanwhile, or of another user
             continue
         found |= {path for path in paths if str(path) in text}
@@ -323,8 +324,8 @@ def _login(what: str, settings: MqttSettings, answer: ProbeResult) -> Finding:
     return Finding(
         Level.FAIL,
         what,
-        f"refuses user {settings.username}: {why}",
-        f"on the broker: sudo mosquitto_passwd /etc/mosquitto/passwd {settings.username}",
+        f"refuses user {(user := shown_user(settings.username))}: {why}",
+        f"on the broker: sudo mosquitto_passwd /etc/mosquitto/passwd {user}",
     )
 
 

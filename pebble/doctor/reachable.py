@@ -56,6 +56,6 @@ def _ipv6(words: list[str]) -> str:
 
 def _text(path: Path) -> str:
     try:
-        return path.read_text()
+        return path.read_text(encoding="utf-8")
     except OSError:  # no IPv6, or a kernel without this file
         return ""

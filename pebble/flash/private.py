@@ -75,9 +75,10 @@ def check_broker(config: Config) -> None:
 
 def _is_loopback(host: str) -> bool:
     try:
-        return ipaddress.ip_address(host).is_loopback
+        address = ipaddress.ip_address(host)
     except ValueError:
         return False
+    return address.is_loopback or address.is_unspecified
 
 
 def _tls(broker: Mqtt, firmware: Firmware) -> tuple[Any, bytes | None]:

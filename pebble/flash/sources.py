@@ -41,7 +41,7 @@ def modules(firmware: Firmware, root: Path | None = None) -> list[Path]:
 
 
 def _imported(file: Path, root: Path) -> Iterator[Path]:
-    for node in ast.walk(ast.parse(file.read_text(), file.name)):
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"), file.name)):
         names = []
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]

@@ -145,7 +145,7 @@ class Steps:
         ask = self._remote("run", str(script))
 
         def identify() -> str:
-            script.write_text(on_board.IDENTIFY)
+            script.write_text(on_board.IDENTIFY, encoding="utf-8")
             self._info = on_board.check_answer(self._tools.run(ask), self._board)
             return self._info.text
 
@@ -204,7 +204,7 @@ class Steps:
         command = self._remote("run", str(script))
 
         def act() -> None:
-            script.write_text(on_board.REMOVE_OLD.format(folders=folders))
+            script.write_text(on_board.REMOVE_OLD.format(folders=folders), encoding="utf-8")
             self._tools.run(command)
 
         lines = (f"{script.name}: removes main.py, {', '.join(f'{folder}/' for folder in folders)}", f"$ {command}")

@@ -52,7 +52,7 @@ def copy(image: Path, drive: Path) -> None:
 
 
 def _mounted(mounts: Path) -> Iterator[Path]:
-    for line in mounts.read_text().splitlines() if mounts.exists() else ():
+    for line in mounts.read_text(encoding="utf-8").splitlines() if mounts.exists() else ():
         device, folder, kind, *_ = line.split()
         if kind in ("vfat", "msdos") or device.startswith("/dev/sd"):
             yield Path(folder.encode().decode("unicode_escape"))  # spaces are \040
@@ -61,7 +61,7 @@ def _mounted(mounts: Path) -> Iterator[Path]:
 
 def _is_boot_loader(folder: Path) -> bool:
     with suppress(OSError):
-        return "SAMD21" in (folder / _INFO).read_text(errors="replace")
+        return "SAMD21" in (folder / _INFO).read_text(errors="replace", encoding="utf-8")
     return False
 
 

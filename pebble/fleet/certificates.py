@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pebble.config.hosts import HostError
+from pebble.config.hosts import host as host_of
 from pebble.errors import PebbleError
 
 if TYPE_CHECKING:
@@ -111,13 +113,12 @@ def _hosts(names: Iterable[str]) -> list[str]:
 def _host(name: str) -> str:
     """A host name or IP address in its one spelling. Raises CertificateError."""
     try:
-        return str(ipaddress.ip_address(name.strip("[]")))
-    except ValueError:
-        pass
-    host = name.lower().rstrip(".")
-    if not _HOST.fullmatch(host) or host.rpartition(".")[2].isdigit():
-        raise CertificateError(f"{name!r} is neither a host name nor an IP address; leave out https:// and the port")
-    return host
+        host = host_of(name).lower()
+    except HostError as error:
+        raise CertificateError(f"a certificate's name {error}") from None
+    if "%" in host or not (":" in host or _HOST.fullmatch(host)):
+        raise CertificateError(f"{host}: a certificate names no network card and no _, leave out what has one")
+    return str(ipaddress.ip_address(host)) if ":" in host else host
 
 
 def _authority(hosts: Sequence[str]) -> tuple[EllipticCurvePrivateKey, x509.Certificate]:

@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable
 from typing import Self
 
+from pebble.config.secret_text import without_secrets
 from pebble.config.tree import LogsSection
 from pebble.contract.payloads import LogRecord
 from pebble.runtime.parent import TAG
@@ -135,8 +136,8 @@ class LevelReader:
 
 
 def text_of(line: bytes) -> str:
-    """A line as text, whatever bytes are in it."""
-    return line.decode(errors="replace").rstrip()
+    """A line as text, whatever bytes are in it; without logins, which programs of others may print."""
+    return without_secrets(line.decode(errors="replace").rstrip())
 
 
 def _known(level: str) -> str | None:

@@ -36,7 +36,9 @@ class RunLock:
         make_private(self._run_dir, close=True)
         self._lock = FileLock.take(self.path)
         if self._lock is None:
-            holder = self.path.read_text(errors="replace").strip("\0\n").partition("\n")[0] or "(unknown)"
+            holder = (
+                self.path.read_text(errors="replace", encoding="utf-8").strip("\0\n").partition("\n")[0] or "(unknown)"
+            )
             raise PebbleError(
                 f"{self._robot} already runs: process {holder} holds {self.path}; end it there with Ctrl-C"
             )

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from pebble.config import LAUNCHER_LOCK
+from pebble.config.secret_text import without_secrets
 
 NOTIFY_FD = (
     "PEBBLE_NOTIFY_FD"  # a pipe to the launcher: "READY" once, "ALIVE" every second, "WANT …", "LACKS …", "DROPPED …"
@@ -34,7 +35,16 @@ log = logging.getLogger(__name__)
 def set_up_logging(level: str) -> None:
     """Write log lines to stderr in the format that the launcher forwards."""
     new = None if _logs_from(level) else level
-    logging.basicConfig(level=new, format=LOG_FORMAT, datefmt="%H:%M:%S", stream=sys.stderr)
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(MaskingFormatter(LOG_FORMAT, "%H:%M:%S"))
+    logging.basicConfig(level=new, handlers=[handler])
+
+
+class MaskingFormatter(logging.Formatter):
+    """Hides logins in lines and tracebacks, whatever program or library they come from."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return without_secrets(super().format(record))
 
 
 def set_log_level(level: str) -> None:
@@ -86,7 +96,7 @@ def tied_to_parent(command: Sequence[str], number: signal.Signals | None = None)
 def launcher_runs(run_dir: Path) -> bool:
     """Whether the newest launcher of the robot with this run directory is still a running process."""
     try:
-        pid = int((run_dir / LAUNCHER_LOCK).read_text().partition("\n")[0])
+        pid = int((run_dir / LAUNCHER_LOCK).read_text(encoding="utf-8").partition("\n")[0])
         os.kill(pid, 0)
     except (OSError, ValueError, OverflowError):
         return False

@@ -186,8 +186,8 @@ def _script(kind: Any) -> str:
 
 def main() -> None:
     """Write both files."""
-    DOCS.write_text(re.sub(r"\n{3,}", "\n\n", markdown()))
-    DECLARATIONS.write_text(declarations())
+    DOCS.write_text(re.sub(r"\n{3,}", "\n\n", markdown()), encoding="utf-8")
+    DECLARATIONS.write_text(declarations(), encoding="utf-8")
 
 
 if __name__ == "__main__":

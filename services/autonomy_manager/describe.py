@@ -17,6 +17,7 @@ from typing import IO, Any
 import msgspec
 from msgspec import Struct
 
+from pebble.config.text_files import NotTextError, text_of
 from pebble.runtime.parent import tied_to_parent
 from pebble.services.autonomy_manager.forms import MAX_SETTINGS, Setting
 
@@ -158,10 +159,10 @@ def _parse(raw: bytes, source: str) -> Description:
     """Of a script's output the last line counts: modules may print while they are imported."""
     if len(raw) > _LONGEST:
         raise DescribeError(f"{source} is longer than {_LONGEST} bytes")
-    text = raw if source == MANIFEST else raw.strip().rpartition(b"\n")[2]
     try:
+        text = text_of(raw) if source == MANIFEST else raw.strip().rpartition(b"\n")[2]
         return msgspec.json.decode(text, type=Description)
-    except (msgspec.DecodeError, ValueError, RecursionError) as error:
+    except (msgspec.DecodeError, ValueError, RecursionError, NotTextError) as error:
         raise DescribeError(f"{source}: {error}") from None
 
 

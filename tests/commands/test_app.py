@@ -82,7 +82,10 @@ def test_a_wrong_command_line_is_one_line_and_exit_code_2(
         (("topic", "list", "--url", "http://x"), "mqtt://HOST"),
         (("topic", "list", "--url", "mqtt://127.0.0.1", "--remote"), "--remote"),
         (("topic", "echo", "online", "--url", "mqtt://127.0.0.1", "--robot", "a/b"), "--robot a/b"),
-        (("topic", "list", "--url", "mqtt://127.0.0.1", "--password-file", "/nowhere/p"), "/nowhere/p"),
+        (
+            ("topic", "list", "--url", "mqtt://127.0.0.1", "--password-file", "/nowhere/p"),
+            "--password-file: No such file",
+        ),
         (("topic", "list", "--url", "mqtt://127.0.0.1:1"), "127.0.0.1:1"),
         (("topics", "--base", "a/b"), "a/b"),
     ],

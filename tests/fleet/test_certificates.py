@@ -135,10 +135,10 @@ def test_clients_refuse_what_a_stolen_authority_signs_for_foreign_names(
 
 
 @pytest.mark.parametrize(
-    "name", ["", "https://lab.local", "lab.local:8080", "a b", "-x.local", "*.local", "1.2.3", "ä"]
+    "name", ["", "https://lab.local", "lab.local:8080", "a b", "-x.local", "*.local", "1.2.3", "a_b", "fe80::1%eth0"]
 )
 def test_odd_names_are_refused(tmp_path: Path, name: str) -> None:
-    with pytest.raises(CertificateError, match="is neither a host name nor an IP address"):
+    with pytest.raises(CertificateError, match="a certificate"):
         init(tmp_path, [name])
     assert list(tmp_path.iterdir()) == []
 

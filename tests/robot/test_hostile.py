@@ -41,7 +41,7 @@ def valid(channel: Channel, raw: bytes) -> bool:
     if channel.payload is bool and not raw:
         return True  # removes a retained flag
     try:
-        body = json.loads(raw.decode())
+        body = json.loads(raw.strip(bytes({*range(256)} - {*range(0x21, 0x7F)})).decode())
     except (ValueError, RecursionError):
         return False
     if channel.payload is bool:
@@ -54,16 +54,18 @@ def valid(channel: Channel, raw: bytes) -> bool:
         return False
     inner = body["value"] if isinstance(body.get("value"), dict) else body
     names = {Drive: "xzy", LightsSolid: "bgr", LightsFlash: ["b", "g", "r", "period"]}.get(channel.payload)
-    return names is None or all(_number(inner[name], channel.payload is Drive) for name in names if name in inner)
+    return names is None or all(_may_be_read(inner[name]) for name in names if name in inner)
 
 
-def _number(value: Any, strings: bool) -> bool:
-    if isinstance(value, bool) or not isinstance(value, (int, float, str) if strings else (int, float)):
-        return False
+def _may_be_read(value: Any) -> bool:
+    """As a number, or as something else that counts as the default; NaN and infinity refuse a command."""
+    text = str(value).lower()
+    if not isinstance(value, (int, float, str)) or isinstance(value, bool):
+        return True
     try:
         return math.isfinite(float(value))
     except (ValueError, OverflowError):
-        return False
+        return isinstance(value, str) and "nan" not in text and "inf" not in text
 
 
 # -- garbage of many kinds

@@ -60,7 +60,7 @@ def _prometheus(values: dict[str, Any]) -> str:
 
 def _replace(path: Path, text: str) -> None:
     part = path.with_name(f".{path.name}.part")
-    part.write_text(text)
+    part.write_text(text, encoding="utf-8")
     part.replace(path)
 
 

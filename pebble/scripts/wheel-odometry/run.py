@@ -104,7 +104,9 @@ def geometry(robot: Robot, options: Options) -> WheelGeometry:
 
 def tune_state(robot: Robot) -> dict[str, float]:
     try:
-        values = convert(json.loads((robot.config.folder / TUNE_STATE).read_text())["current_values"], dict[str, Any])
+        values = convert(
+            json.loads((robot.config.folder / TUNE_STATE).read_text(encoding="utf-8"))["current_values"], dict[str, Any]
+        )
     except (OSError, ValueError, KeyError, TypeError) as error:
         robot.log.warning("%s: %s; the geometry counts", TUNE_STATE, error)
         return {}

@@ -9,7 +9,7 @@ from itertools import islice
 from typing import Any
 
 from pebble.config import Config, Mqtt
-from pebble.config.masking import is_secret, without_secrets
+from pebble.config.secret_text import is_secret, without_secrets
 from pebble.errors import PebbleError
 
 _MOST_LINKS = 1000
@@ -34,7 +34,7 @@ class ConfigCopy:
             self._folder.mkdir(mode=0o700)
             self._link()
             self.path.touch(mode=0o600, exist_ok=False)
-            self.path.write_text(json.dumps(self._data(broker), indent=2))
+            self.path.write_text(json.dumps(self._data(broker), indent=2), encoding="utf-8")
         except (OSError, ValueError) as error:
             raise PebbleError(f"the config of scripts, {self.path}, cannot be written: {error}") from None
 

@@ -1,0 +1,64 @@
+"""Hides in texts what is secret: logins in addresses, passwords and tokens."""
+
+from __future__ import annotations
+
+import re
+
+HIDDEN = "***"
+_NAMES = "pass|secret|token|credential|(?:api|access|private|auth).?key"
+_KEY = re.compile(_NAMES, re.IGNORECASE).search
+_WORD = re.compile(rf"(\b[\w-]{{0,40}}(?:{_NAMES}|pwd)[\w-]{{0,40}}=)[^&\s]+", re.IGNORECASE)  # of a query or an option
+is_secret_option = re.compile(rf"--?[\w-]{{0,40}}(?:{_NAMES}|pwd)[\w-]{{0,40}}", re.IGNORECASE).fullmatch
+# URLs in a URL are percent-encoded: %3A is a colon, %2F a slash, %40 an @.
+_AT = re.compile("@|%40")
+_SLASHES = re.compile("://|%3A%2F%2F", re.IGNORECASE)
+_COLON = re.compile("(?<=[^\"'/]):(?![\"'])|^:|%3A", re.IGNORECASE)
+_BEFORE_USER = re.compile("[/\"'=,;(\\[{<]|%2F", re.IGNORECASE)
+_WITH_BLANKS = re.compile(r"(://)[^\s/@:]{0,100}:(?!\d{1,5}(?:[\s/?#\"',;]|$))[^@\n]{0,200}@")
+
+
+def is_secret(key: str) -> bool:
+    """Whether the key's name says that its value, or the file or variable that it names, is secret."""
+    return bool(_KEY(key))
+
+
+def without_secrets(text: str) -> str:
+    """``text`` with stars in place of logins in URLs, and of passwords and tokens in queries and options.
+
+    It rather hides too much: all before the last @ of a word that holds ``://``, or a colon before the @.
+    """
+    if _AT.search(text):
+        text = re.sub(r"\S+", _without_login, _WITH_BLANKS.sub(rf"\1{HIDDEN}@", text))
+    return _WORD.sub(rf"\1{HIDDEN}", text) if "=" in text else text
+
+
+def _without_login(found: re.Match[str]) -> str:
+    word = found[0]
+    ends = [end.start() for end in _AT.finditer(word)]
+    if not ends:
+        return word
+    if (slashes := _SLASHES.search(word)) and slashes.end() <= ends[-1]:
+        start = slashes.end()
+    elif colon := next((one for one in _COLON.finditer(word, 0, ends[-1]) if one.end() < ends[-1]), None):
+        start = max((one.end() for one in _BEFORE_USER.finditer(word, 0, colon.start())), default=0)
+    else:
+        return word
+    return f"{word[:start]}{HIDDEN}{word[ends[-1] :]}"
+
+
+def shown_user(name: str) -> str:
+    """A user name for messages; a password that was written behind it is hidden."""
+    user, colon, _ = without_secrets(name).partition(":")
+    return f"{user}:{HIDDEN}" if colon else user
+
+
+def without_login(url: str) -> str:
+    """``url`` without its user and password, where they can be told from its path."""
+    before, slashes, after = url.partition("://")
+    authority = re.match(r"[^/?#\s]*", after)
+    place = authority[0] if authority else ""
+    if "@" in place:
+        return f"{before}{slashes}{place.rpartition('@')[2]}{after[len(place) :]}"
+    if "@" not in after or not re.search(r":(?!\d*$)", place):
+        return url  # an @ behind the port is part of a path
+    return f"{before}{slashes}{after.rpartition('@')[2]}"  # the password has a slash

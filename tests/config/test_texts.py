@@ -1,0 +1,225 @@
+"""Texts of a config: characters that are not seen, secrets in wrong places, and files in other encodings."""
+
+from __future__ import annotations
+
+import ast
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pebble.config import load, resolved
+from pebble.config.secret_text import without_secrets
+from pebble.config.text_files import NotTextError, text_of
+from pebble.errors import ConfigError
+from tests.support import ROOT
+
+SECRET = "s3cr3t"
+
+
+def config(place: str = "", value: Any = None) -> dict[str, Any]:
+    """A config that is right but for ``value`` at ``place``, whose levels stand between slashes."""
+    raw: dict[str, Any] = {
+        "robot": {"id": "rover"},
+        "transport": {"kind": "zenoh", "run_dir": "run", "state_dir": "state"},
+        "services": {"mqtt_bridge": {"enabled": True, "remote_mqtt": {"host": "127.0.0.1", "port": 1}}},
+    }
+    section = raw
+    *levels, last = place.split("/") if place else [""]
+    for level in levels:
+        section = section.setdefault(level, {})
+    if last:
+        section[last] = value
+    return raw
+
+
+def problems(folder: Path, raw: Any) -> str:
+    """What is wrong with it; "" if nothing is."""
+    file = folder / "c.json"
+    file.write_text(raw if isinstance(raw, str) else json.dumps(raw), encoding="utf-8")
+    try:
+        load(file)
+    except ConfigError as error:
+        return str(error)
+    return ""
+
+
+REMOTE = "services/mqtt_bridge/remote_mqtt"
+
+#: Characters that are not seen, at an end of a text: of these places, with what names the place.
+UNSEEN = [*"\u200b\u00a0\ufeff\u00ad\u200e\u202e\u2066\u2060\u3000\u2003\t\n\r\x00\x1b\x7f\u180e\u3164"]
+PLACES = ["robot/id", "robot/type", f"{REMOTE}/host", f"{REMOTE}/username", f"{REMOTE}/client_id", "local_mqtt/host"]
+
+
+@pytest.mark.parametrize("char", [*UNSEEN, " "], ids=lambda char: f"U+{ord(char):04X}")
+def test_a_character_that_is_not_seen_is_named_by_its_code(tmp_path: Path, char: str) -> None:
+    for place in PLACES:
+        for text in (f"a{char}", f"{char}a"):
+            found = problems(tmp_path, config(place, text))
+            assert place.replace("/", ".") in found, found
+            assert f"U+{ord(char):04X}" in found, found
+            assert ("ends" if text[0] == "a" else "starts") in found, found
+
+
+def test_what_is_meant_stays(tmp_path: Path) -> None:
+    meant = {
+        f"{REMOTE}/username": "Rover One",
+        f"{REMOTE}/password": "with blanks",
+        "services/soundboard_handler/playback": {"directory": "My Sounds"},
+        "robot/id": "göob-日本",
+    }
+    for place, value in meant.items():
+        raw = config(place, value)
+        raw["services"]["mqtt_bridge"]["remote_mqtt"].setdefault("username", "rover")
+        assert problems(tmp_path, raw) == ""
+
+
+def test_a_key_that_looks_like_another(tmp_path: Path) -> None:
+    found = problems(tmp_path, config(f"{REMOTE}/ho\u200bst", "x"))
+    assert 'has a key "host" that holds U+200B' in found
+
+
+#: Where people put a login or a password that does not belong there.
+LOGINS = {
+    "a URL as host": (f"{REMOTE}/host", f"mqtt://rover:{SECRET}@192.0.2.7:1883"),
+    "a login before the host": (f"{REMOTE}/host", f"rover:{SECRET}@192.0.2.7"),
+    "an @ in the password": (f"{REMOTE}/host", f"mqtt://rover:p@{SECRET}@192.0.2.7"),
+    "a slash in the password": (f"{REMOTE}/host", f"mqtt://rover:p/{SECRET}@192.0.2.7"),
+    "percent-encoded": (f"{REMOTE}/host", f"mqtt%3A%2F%2Frover%3A{SECRET}%40192.0.2.7"),
+    "an id": ("robot/id", f"http://a:{SECRET}@b"),
+    "a port": (f"{REMOTE}/port", f"1883:{SECRET}"),
+    "a misspelt key": (f"{REMOTE}/passwrod", SECRET),
+    "a list": (f"{REMOTE}/password", [SECRET]),
+    "a file's name": (f"{REMOTE}/password_file", SECRET),
+    "a variable's name": (f"{REMOTE}/password_env", SECRET),
+    "a user": (f"{REMOTE}/username", f"rover:{SECRET}"),
+    "a Zenoh endpoint": ("transport/connect", [f"tls/u:{SECRET}@h:7447"]),
+    "an unknown key": (f"{REMOTE}/mqtt://u:{SECRET}@h", 1),
+    "a choice": (f"{REMOTE}/protocol", SECRET),
+    "a topic": ("services/serial_mcu_bridge", {"topics": {"drive": f"mqtt://u:{SECRET}@h/x"}}),
+    "a video address": ("services/video_stream", {"webrtc_url": f"http://u:{SECRET}@h/x"}),
+}
+
+
+@pytest.mark.parametrize("case", LOGINS)
+def test_a_secret_is_one_wherever_it_was_put(tmp_path: Path, case: str) -> None:
+    """No command prints it, whether the config is refused or not."""
+    file = tmp_path / "c.json"
+    file.write_text(json.dumps(config(*LOGINS[case])), encoding="utf-8")
+    for words in (["check"], ["check", "--json"], ["doctor"]):
+        command = [sys.executable, "-m", "pebble.cli", *words, str(file)]
+        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60)
+        assert done.stdout + done.stderr
+        assert SECRET not in done.stdout + done.stderr
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["topic", "list", "--url", f"mqtt://ann:{SECRET}@127.0.0.1"],
+        ["topic", "list", "--url", f"mqtt://ann:{SECRET}@127.0.0.1:99999"],
+        ["topic", "list", "--url", f"ftp://ann:{SECRET}@127.0.0.1"],
+        ["estop", f"mqtt://ann:{SECRET}@127.0.0.1", "--url", "mqtt://127.0.0.1:1"],
+        ["check", f"mqtt://ann:{SECRET}@127.0.0.1"],
+        ["nonsense", f"--password={SECRET}"],
+        ["web", "--url", f"mqtt://ann:{SECRET}@127.0.0.1:1"],
+        ["foxglove", "--host", f"http://ann:{SECRET}@127.0.0.1", "--url", "mqtt://127.0.0.1:1"],
+    ],
+)
+def test_a_secret_on_a_command_line_is_not_printed_again(words: list[str]) -> None:
+    command = [sys.executable, "-m", "pebble.cli", *words]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert done.returncode
+    assert SECRET not in done.stdout + done.stderr
+
+
+def test_the_resolved_config_hides_them(tmp_path: Path) -> None:
+    raw = config(f"{REMOTE}/password", SECRET)
+    raw["services"]["mqtt_bridge"]["remote_mqtt"]["username"] = "rover"
+    raw["services"]["mqtt_bridge"]["reboot_control"] = {"command": ["curl", "--token", SECRET, f"http://a:{SECRET}@b"]}
+    assert problems(tmp_path, raw) == ""
+    assert SECRET not in json.dumps(resolved(load(tmp_path / "c.json")))
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("broker.example:1883", "broker.example:1883"),
+        ("at 12:30 ann@desk stopped goob", "at 12:30 ann@desk stopped goob"),
+        ("zenoh: tls/[::1]:7447", "zenoh: tls/[::1]:7447"),
+        (f"mqtt://a:{SECRET}@b:1", "mqtt://***@b:1"),
+        (f'"a:{SECRET}@b"', '"***@b"'),
+        (f"x?token={SECRET}&y=1", "x?token=***&y=1"),
+    ],
+)
+def test_only_what_is_secret_is_hidden(text: str, shown: str) -> None:
+    assert without_secrets(text) == shown
+
+
+TEXT = json.dumps(config(), indent=1).replace("rover", "röver")
+
+
+@pytest.mark.parametrize(
+    ("encode", "expected"),
+    [
+        (lambda text: text.encode(), ""),
+        (lambda text: text.encode("utf-8-sig"), ""),
+        (lambda text: text.replace("\n", "\r\n").encode("utf-8-sig"), ""),
+        (lambda text: text.replace("\n", "\r").encode(), ""),
+        (lambda text: text.encode("utf-16"), 'is UTF-16 ("Unicode" in Notepad)'),
+        (lambda text: text.encode("utf-16-le"), "is UTF-16"),
+        (lambda text: text.encode("utf-16-be"), "is UTF-16"),
+        (lambda text: text.encode("utf-32"), "is UTF-32"),
+        (lambda text: text.encode("latin-1"), "is not UTF-8 at its byte 24, in line 3, but Latin-1"),
+        (lambda text: text.encode() + b"\0", "its byte"),
+    ],
+)
+def test_a_file_in_another_encoding_is_understood_or_named(
+    tmp_path: Path, encode: Callable[[str], bytes], expected: str
+) -> None:
+    """In any locale; the same function reads password files and what else people write."""
+    file = tmp_path / "c.json"
+    file.write_bytes(encode(TEXT))
+    env = os.environ | {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0", "PYTHONIOENCODING": "utf-8"}
+    command = [sys.executable, "-m", "pebble.cli", "check", str(file)]
+    done = subprocess.run(command, cwd=ROOT, env=env, capture_output=True, timeout=60)
+    printed = (done.stdout + done.stderr).decode()
+    assert expected in printed
+    assert ("röver" in printed) is not bool(expected)
+    assert "Traceback" not in printed
+
+
+def test_a_sentence_repeats_no_byte_of_the_file() -> None:
+    with pytest.raises(NotTextError) as caught:
+        text_of(SECRET.encode() + b"\xff")
+    assert SECRET not in str(caught.value)
+
+
+def test_every_text_file_of_the_product_is_read_as_utf_8() -> None:
+    """In no other encoding, whatever the locale is."""
+    wrong = [
+        f"{path.relative_to(ROOT)}:{call.lineno}"
+        for folder in ("pebble", "transports", "services", "simulation")
+        for path in sorted((ROOT / folder).rglob("*.py"))
+        if "firmware" not in path.parts
+        for call in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(call, ast.Call) and _is_text(call) and "encoding" not in [one.arg for one in call.keywords]
+    ]
+    assert wrong == []
+
+
+def _is_text(call: ast.Call) -> bool:
+    """Whether the call opens a text file."""
+    if isinstance(call.func, ast.Attribute) and call.func.attr in ("read_text", "write_text"):
+        return not (isinstance(call.func.value, ast.Name) and call.func.value.id == "text_files")
+    name = getattr(call.func, "id", None) or getattr(call.func, "attr", None)
+    modes = [
+        one.value for one in (*call.args[:2], *(key.value for key in call.keywords)) if isinstance(one, ast.Constant)
+    ]
+    is_file = isinstance(call.func, ast.Name) or (isinstance(call.func, ast.Attribute) and len(call.args) == 0)
+    return name == "open" and is_file and any(mode in ("r", "w", "a", "x", "r+", "w+") for mode in modes)
