@@ -18,15 +18,18 @@ _NUMBERS = int, float
 def load(raw: memoryview | bytes):
     """Parse JSON of limited size and depth. Raises ValueError, OverflowError or MemoryError.
 
-    Around it may be what programs add: a byte order mark, a C string's NUL, white space. All but printable ASCII is
-    left out there, by which every JSON text begins and ends.
+    Around it may be what programs add: a byte order mark, white space, a C string's NUL and the rest of its buffer. All
+    but printable ASCII is left out there, by which every JSON text begins and ends.
     """
-    last = len(raw)
-    if last > _MAX_BYTES:
+    size = len(raw)
+    if size > _MAX_BYTES:
         raise ValueError
     first = 0
-    while first < last and not 0x20 < raw[first] < 0x7F:
+    while first < size and not 0x20 < raw[first] < 0x7F:
         first += 1
+    last = first
+    while last < size and raw[last]:
+        last += 1
     while first < last and not 0x20 < raw[last - 1] < 0x7F:
         last -= 1
     raw = raw[first:last]

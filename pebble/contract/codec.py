@@ -83,26 +83,27 @@ def plain(channel: Channel, raw: bytes) -> Any:
     """The JSON value in ``raw``, of any shape. Raises PayloadError if it is invalid or beyond the limits."""
     if channel.direction == INCOMING and len(raw) > MAX_COMMAND_BYTES:
         raise PayloadError(f"{channel.metric}: {len(raw)} bytes, more than {MAX_COMMAND_BYTES}")
-    raw = trim(raw)
-    if too_deep(raw):
+    text = trim(raw)
+    if too_deep(text):
         raise PayloadError(f"{channel.metric}: nested deeper than {MAX_DEPTH}")
     try:
-        raw.decode()  # msgspec checks only the strings it keeps
-        return _decoder.decode(raw)
+        text.decode()  # msgspec checks only the strings it keeps
+        return _decoder.decode(text)
     except UnicodeDecodeError:
         raise PayloadError(f"{channel.metric}: not UTF-8") from None
     except msgspec.DecodeError as error:
-        if b"\0" in raw:
-            raise PayloadError(f"{channel.metric}: NULs between its characters, as in UTF-16: send UTF-8") from None
+        if b"\0" in raw.strip(_AROUND):
+            raise PayloadError(f"{channel.metric}: not JSON before its NUL: if it is UTF-16, send UTF-8") from None
         raise PayloadError(f"{channel.metric}: not JSON: {error}") from None
 
 
 def trim(raw: bytes) -> bytes:
     """``raw`` without the bytes around its JSON that programs of other languages add; the same object if it has none.
 
-    Firmware does the same (firmware/common/payload.py).
+    No JSON has a NUL in it: after one is what was in a C program's buffer before. Firmware does the same
+    (firmware/common/payload.py).
     """
-    return raw.strip(_AROUND)
+    return raw.lstrip(_AROUND).partition(b"\0")[0].rstrip(_AROUND)
 
 
 def _stop(channel: Channel, raw: bytes) -> EstopCommand:
