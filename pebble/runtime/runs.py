@@ -41,31 +41,31 @@ def following(run: int) -> int:
     return run + 1 if run < LAST_RUN else 1
 
 
-def next_run(config: Config, barred: int = 0, seen: int = 0) -> int:
+def next_run(config: Config, barred: int = 0, received: int = 0) -> int:
     """The number of a run that starts now: newer than ``barred``, which motor owners report.
 
-    It is also above ``seen`` and above every earlier run of this robot, unless these are not ahead of ``barred``:
+    It is also above ``received`` and above every earlier run of this robot, unless these are not ahead of ``barred``:
     then a stranger has sent a number far ahead. Several processes may call this at once. Without the file, or with a
     damaged one, it counts from the clock. Raises PebbleError if another process does not give the file free.
     """
-    return _next(config.state_file("autonomy-run"), barred, time.time, seen)
+    return _next(config.state_file("autonomy-run"), barred, time.time, received)
 
 
-def _next(path: Path, barred: int, wall_clock: Callable[[], float], seen: int = 0) -> int:
+def _next(path: Path, barred: int, wall_clock: Callable[[], float], received: int = 0) -> int:
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK, 0o600)
     except OSError as error:
         log.warning("%s cannot be opened (%s): the run's number is made from the clock", path, error.strerror)
-        return _above(barred, seen, _from_clock(wall_clock))
+        return _above(barred, received, _from_clock(wall_clock))
     try:
         _lock(file, path)
-        number = _above(barred, seen, _read(file, path, wall_clock))
+        number = _above(barred, received, _read(file, path, wall_clock))
         os.pwrite(file, f"{number:0{_DIGITS}d}\n".encode(), 0)
         os.fsync(file)
     except OSError as error:
         log.warning("%s cannot be written (%s): the run's number is made from the clock", path, error.strerror)
-        number = _above(barred, seen, _from_clock(wall_clock))
+        number = _above(barred, received, _from_clock(wall_clock))
     finally:
         os.close(file)
     return number

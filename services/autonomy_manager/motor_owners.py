@@ -20,7 +20,7 @@ class MotorOwners:
     """The newest state of each motor owner; of those in ``names`` only, where there are any."""
 
     def __init__(self, names: Collection[str]) -> None:
-        self.newest_run = 0  # of all that were heard or used; an owner bars the run before it
+        self.newest_run = 0  # of all that were received or used; an owner bars the run before it
         self._names = names
         self._states: dict[str, EstopState] = {}
 

@@ -88,7 +88,7 @@ def test_check_shows_links_processes_and_effective_topics_but_no_secret(run: Run
         ({"transport": {"kind": "zenoh"}}, False),
     ],
 )
-def test_check_warns_where_others_may_pose_as_a_script(
+def test_check_names_the_broker_where_others_may_pose_as_a_script(
     run: Run, tmp_path: Path, keys: dict[str, object], shared: bool
 ) -> None:
     assert run("check", config_file(tmp_path, **{"local_mqtt": {"host": "127.0.0.1"}, **keys}), columns=160) == 0

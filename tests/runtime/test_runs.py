@@ -129,10 +129,10 @@ def test_whatever_a_stranger_has_sent_the_next_run_moves_and_no_earlier_one(
         assert owner.moves(own)
     for number in numbers:
         owner.arbiter.judge(not zero, (own + number) & LAST_RUN or LAST_RUN, -1, 5000)
-    seen = numbers[-1] if restarted != "manager" else 0
+    received = numbers[-1] if restarted != "manager" else 0
     if restarted == "owner":
         owner = Owner(owner.arbiter.barred)
-    following = _next(path, owner.arbiter.barred, clock, seen)
+    following = _next(path, owner.arbiter.barred, clock, received)
     assert owner.moves(following)
     if during and len(numbers) < 3:  # with three a stranger may have gone round all numbers
         assert owner.arbiter.judge(True, own, -1, 5000) == REFUSED
