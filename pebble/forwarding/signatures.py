@@ -13,7 +13,7 @@ from pebble.contract import DRIVE, codec
 from pebble.contract.payloads import SCRIPT, Drive
 from pebble.errors import PayloadError
 
-_SCRIPT = SCRIPT.encode()
+_SCRIPT, _BACKSLASH = SCRIPT.encode(), 0x5C
 
 
 def unsigned(payload: bytes) -> bytes | None:
@@ -22,7 +22,7 @@ def unsigned(payload: bytes) -> bytes | None:
     JSON has no other way to write the letters than as they are or with backslashes. What has either of them and cannot
     be read does not pass: the parser of a board may be more lenient.
     """
-    if _SCRIPT not in payload and b"\\" not in payload:
+    if _BACKSLASH not in payload and _SCRIPT not in payload:
         return payload
     try:
         drive: Drive = codec.decode(DRIVE, payload)
