@@ -213,14 +213,15 @@ def _uplink(config: Config) -> str:
 
 
 def _scripts(config: Config) -> list[tuple[str, str]]:
-    """What a script's signature is worth where operators and the robot share a broker: no bridge stands between."""
-    local, bridge = config.local_mqtt, config.services.mqtt_bridge
-    remote = bridge.remote_mqtt if bridge.enabled and bridge.remote is None else None
-    if config.transport.kind != "mqtt" or (bridge.enabled and bridge.remote is not None):
+    """What a script's signature is worth at a broker that others share: no bridge stands between it and the motors."""
+    bridge, shared = config.services.mqtt_bridge, config.transport.mqtt_mirror
+    if config.transport.kind == "mqtt":
+        elsewhere = bridge.remote is not None and bridge.remote.kind != "mqtt"
+        apart = elsewhere or _place(bridge.remote_mqtt) != _place(config.local_mqtt)
+        shared = None if bridge.enabled and apart else config.local_mqtt
+    if shared is None:
         return []
-    if remote is not None and _place(remote) != _place(local):
-        return []
-    return [("scripts", f"anybody at broker {local.host}:{local.port} may pose as one, or end one")]
+    return [("scripts", f"anybody at broker {shared.host}:{shared.port} may pose as one, or end one")]
 
 
 def _place(mqtt: Mqtt) -> tuple[str, int]:

@@ -85,7 +85,24 @@ def test_check_shows_links_processes_and_effective_topics_but_no_secret(run: Run
         ({"services": {"mqtt_bridge": {"enabled": True, "remote_mqtt": {"host": "broker.example"}}}}, False),
         ({"services": {"mqtt_bridge": {"enabled": True, "remote_mqtt": {"host": "127.0.0.1", "port": 1884}}}}, False),
         ({"services": {"mqtt_bridge": {"enabled": True, "remote_mqtt": {"host": "localhost"}}}}, True),
+        (
+            {
+                "services": {
+                    "mqtt_bridge": {"enabled": True, "remote": {"kind": "mqtt"}, "remote_mqtt": {"host": "::1"}}
+                }
+            },
+            True,
+        ),
+        (
+            {
+                "services": {
+                    "mqtt_bridge": {"enabled": True, "remote": {"kind": "zenoh", "connect": ["tcp/10.0.0.2:7447"]}}
+                }
+            },
+            False,
+        ),
         ({"transport": {"kind": "zenoh"}}, False),
+        ({"transport": {"kind": "zenoh", "mqtt_mirror": {"host": "127.0.0.1"}}}, True),
     ],
 )
 def test_check_names_the_broker_where_others_may_pose_as_a_script(

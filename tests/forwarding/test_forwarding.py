@@ -530,7 +530,8 @@ class TestSignatures:
         b'{"value":{"z":0.5,"source":"\\u0061utonomy","run":1},"z":0,"source":"page"}',
         b'{"value":{"z":0},"value":{"z":0.5,"source":"autonomy","run":1}}',
         b'{"v\\u0061lue":{"z":0.5,"source":"autonomy","run":1}}',
-        b'{"z":0.5,"sour\\ce":"autonom\\y","run":1}',  # boards read it
+        *(b'{"z":0.5,"sour\\ce":"autonom\\y","run":1}', b'{"z":0.5,"source":"autonomy","run":1}\0'),  # boards read it
+        *(b'\xef\xbb\xbf{"z":0.5,"source":"autonomy","run":1}', b' \r\n{"z":0.5,"source":"autonomy","run":1}\t'),
     )
     ZEROS = (
         *(b"1", b"536870912", b"1073741823", b"1073741824", b"-1", b"true", b"1.5", b'"7"', b"null"),
