@@ -199,7 +199,7 @@ def test_tls(start: Any, tmp_path: Path) -> None:
     [
         (("minilamp", "127.0.0.1:port"), "--broker"),
         (("minilamp", "127.0.0.1", "--id", "a/b"), "robot.id"),
-        (("minilamp", "127.0.0.1", "--username", "ann", "--password-file", "/nowhere"), "/nowhere"),
+        (("minilamp", "127.0.0.1", "--username", "ann", "--password-file", "/nowhere"), "--password-file"),
         (("minilamp", "127.0.0.1", "--ca", "/nowhere"), "/nowhere"),
         (("benjr", "127.0.0.1", "--tls"), "memory"),
     ],
