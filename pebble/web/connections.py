@@ -10,7 +10,7 @@ import contextlib
 import logging
 import re
 import socket
-from collections import Counter
+import threading
 from ipaddress import ip_address
 from typing import Any, cast
 
@@ -23,7 +23,12 @@ from pebble.fleet.tries import network_of
 log = logging.getLogger(__name__)
 
 MAX_CONNECTIONS = 200
-MAX_EACH = 32  # from one address that is not of this machine
+MAX_PEOPLE = 192  # of these by people who have logged in; the rest is for those who come to do so, or to stop a robot
+MAX_STRANGERS = 152  # by others, however few people there are
+MAX_EACH = 32  # of others from one address that is not of this machine
+MAX_PERSON = 64  # of one person; more count as others
+ACCEPT = 16  # at once; what the last ones have sent is read before the next ones come
+_WAITING = 2048  # to be accepted
 HANDSHAKE_S = 10.0  # for TLS
 HEAD_S = 10.0  # for the head of a request, from its first byte on
 RESPONSE_S = 60.0  # for the rest of the request, and until the response is read
@@ -34,51 +39,100 @@ _MAX_UNREAD = 256 * 1024  # bytes of answers to a client's own pings
 
 
 class _Accepted(socket.socket):
-    """A connection that is counted until it is closed."""
+    """A connection that is counted until it is closed, or has given way."""
 
-    def __init__(self, listener: Listener, network: str, *arguments: Any, **options: Any) -> None:
+    def __init__(self, listener: Listener, address: Any, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
         self._listener: Listener | None = listener
-        self._network = network
+        self.client, self.network = tuple(address[:2]), network_of(address[0])
+        self.spoke = False
+        self.person: str | None = None  # None: it has not logged in
+
+    def recv(self, *arguments: Any) -> bytes:
+        self.spoke = True
+        return super().recv(*arguments)
+
+    def recv_into(self, *arguments: Any) -> int:
+        self.spoke = True
+        return super().recv_into(*arguments)
+
+    def give_way(self) -> None:
+        """End it; its protocol notices that, and closes it."""
+        self._leave()
+        with contextlib.suppress(OSError):  # the other side was faster
+            self.shutdown(socket.SHUT_RDWR)
 
     def close(self) -> None:
+        self._leave()
+        super().close()
+
+    def _leave(self) -> None:
         listener, self._listener = self._listener, None
         if listener is not None:
-            listener.closed(self._network)
-        super().close()
+            listener.left(self)
 
 
 class Listener(socket.socket):
-    """A listening socket that refuses connections beyond the limits: before TLS, which costs time."""
+    """A listening socket with places for people and for others.
 
-    def __init__(self, family: int, limit: int = MAX_CONNECTIONS, each: int = MAX_EACH) -> None:
+    A connection is one of the others until a request on it belongs to a person (:meth:`recognise`). Where there is no
+    place for a new one, the oldest of the others gives way, one that has sent nothing first: who opens connections and
+    holds them keeps out neither a person nor a stop.
+    """
+
+    def __init__(
+        self, family: int, limit: int = MAX_CONNECTIONS, each: int = MAX_EACH, strangers: int = MAX_STRANGERS
+    ) -> None:
         super().__init__(family, socket.SOCK_STREAM)
-        self._limit, self._each = limit, each
-        self._open: Counter[str] = Counter()
-        self.refused = 0
+        self._limit, self._each, self._strangers = limit, each, strangers
+        self._lock = threading.RLock()  # sessions are read on other threads, too
+        self._others: dict[Any, _Accepted] = {}  # by address and port, the oldest first
+        self._people: dict[Any, _Accepted] = {}
+        self.ended = 0
 
     @property
     def connections(self) -> int:
-        return self._open.total()
+        return len(self._others) + len(self._people)
+
+    def listen(self, _backlog: int = 0, /) -> None:
+        """asyncio accepts as many at once as it asks to let wait; these are two things here."""
+        super().listen(_WAITING)
 
     def accept(self) -> tuple[socket.socket, Any]:
-        """Raises ConnectionAbortedError for a connection beyond the limits, which asyncio ignores."""
         descriptor, address = self._accept()  # type: ignore[attr-defined]
-        network = network_of(address[0])
-        if self.connections >= self._limit or (self._open[network] >= self._each and not _is_loopback(address[0])):
-            socket.close(descriptor)
-            self.refused += 1
-            if self.refused & (self.refused - 1) == 0:  # the 1st, 2nd, 4th, 8th …
-                log.warning("%d connections refused, the last from %s: too many at once", self.refused, address[0])
-            raise ConnectionAbortedError
-        self._open[network] += 1
-        accepted = _Accepted(self, network, self.family, self.type, self.proto, fileno=descriptor)
+        accepted = _Accepted(self, address, self.family, self.type, self.proto, fileno=descriptor)
+        with self._lock:
+            self._make_room(accepted.network, is_local=_is_loopback(address[0]))
+            self._others[accepted.client] = accepted
         return accepted, address
 
-    def closed(self, network: str) -> None:
-        self._open[network] -= 1
-        if not self._open[network]:
-            del self._open[network]
+    def recognise(self, client: tuple[str, int], person: str) -> None:
+        """A request on the connection from this address and port belongs to a person."""
+        with self._lock:
+            one = self._others.get(tuple(client))
+            own = sum(other.person == person for other in self._people.values())
+            if one is not None and own < MAX_PERSON and len(self._people) < min(MAX_PEOPLE, self._limit - 1):
+                one.person = person
+                self._people[one.client] = self._others.pop(one.client)
+
+    def left(self, one: _Accepted) -> None:
+        with self._lock:
+            for places in (self._others, self._people):
+                if places.get(one.client) is one:
+                    del places[one.client]
+
+    def _make_room(self, network: str, *, is_local: bool) -> None:
+        others = list(self._others.values())
+        own = [one for one in others if one.network == network]
+        if not is_local and len(own) >= self._each:
+            others = own
+        elif len(others) < min(self._strangers, self._limit - len(self._people)):
+            return
+        oldest = next((one for one in others if not one.spoke), others[0])
+        oldest.give_way()
+        self.ended += 1
+        if self.ended & (self.ended - 1) == 0:  # the 1st, 2nd, 4th, 8th …
+            log.warning("%d connections ended, the last from %s: too many at once", self.ended, oldest.client[0])
 
 
 class Loop(asyncio.SelectorEventLoop):

@@ -31,6 +31,7 @@ log = logging.getLogger(__name__)
 FLUSH_S = 0.05  # between two states
 HELLO_S = 5.0  # to begin with
 CHECK_S = 5.0  # between two looks at whether the session still exists
+_STOP_WAITS_S = 0.05  # at most, however much the page has sent
 _WATCH_COST = 20  # it subscribes to so many topics
 _WAITING = 64  # messages that wait to be sent, besides the state
 _RELOAD = "This page is older than the server: reload it"
@@ -78,7 +79,7 @@ class Control:
                 op = await self._receive()
                 wait_s = self._pace.take(_WATCH_COST if isinstance(op, m.Watch) else 1, time.monotonic())
                 if wait_s:
-                    await asyncio.sleep(wait_s)
+                    await asyncio.sleep(min(wait_s, _STOP_WAITS_S) if isinstance(op, m.EstopOp | m.StopOp) else wait_s)
                 self._handle(op)
         except Leave as reason:
             await self._leave(reason)

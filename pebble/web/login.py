@@ -68,10 +68,13 @@ def routes() -> list[Route]:
 def session_of(connection: HTTPConnection) -> Session | None:
     """The session of a request, read from the database each time; where there is no login, LOCAL with its ``name``."""
     settings: WebSettings = connection.app.state.settings
+    session: Session | None = None
     if not settings.login:
-        return named(LOCAL, connection.query_params.get("name", ""))
-    token = connection.cookies.get(_cookie(settings))
-    session: Session | None = connection.app.state.people.session(token) if token else None
+        session = named(LOCAL, connection.query_params.get("name", ""))
+    elif token := connection.cookies.get(_cookie(settings)):
+        session = connection.app.state.people.session(token)
+    if session is not None and connection.client is not None:
+        connection.app.state.recognise(connection.client, session.user if settings.login else "")
     return session
 
 

@@ -11,7 +11,7 @@ import uvicorn
 from pebble.errors import PebbleError
 from pebble.fleet import certificates
 from pebble.web.app import create_app
-from pebble.web.connections import MAX_CONNECTIONS, HttpProtocol, Listener, Loop, WebSocketProtocol
+from pebble.web.connections import ACCEPT, HttpProtocol, Listener, Loop, WebSocketProtocol
 from pebble.web.settings import WebSettings
 
 _LARGEST_MESSAGE = 64 * 1024
@@ -30,8 +30,8 @@ def run(settings: WebSettings, *, on_ready: Callable[[str], None] | None = None)
     return 0
 
 
-async def _serve(settings: WebSettings, listener: socket.socket, on_ready: Callable[[str], None] | None) -> None:
-    server = uvicorn.Server(_config(settings))
+async def _serve(settings: WebSettings, listener: Listener, on_ready: Callable[[str], None] | None) -> None:
+    server = uvicorn.Server(_config(settings, listener))
     watching = asyncio.ensure_future(_report(server, url_of(settings, listener), on_ready))
     try:
         await server.serve(sockets=[listener])
@@ -48,9 +48,11 @@ async def _report(server: uvicorn.Server, url: str, on_ready: Callable[[str], No
         on_ready(url)
 
 
-def _config(settings: WebSettings) -> uvicorn.Config:
+def _config(settings: WebSettings, listener: Listener) -> uvicorn.Config:
+    app = create_app(settings)
+    app.state.recognise = listener.recognise
     return uvicorn.Config(
-        create_app(settings),
+        app,
         ssl_certfile=settings.certificate,
         ssl_keyfile=settings.key,
         log_config=None,
@@ -66,11 +68,11 @@ def _config(settings: WebSettings) -> uvicorn.Config:
         ws_ping_interval=2.0,
         ws_ping_timeout=4.0,
         timeout_graceful_shutdown=_END_S,
-        limit_concurrency=MAX_CONNECTIONS + 1,  # the listener refuses them before
+        backlog=ACCEPT,  # no limit_concurrency: the listener limits connections
     )
 
 
-def _listen(settings: WebSettings) -> socket.socket:
+def _listen(settings: WebSettings) -> Listener:
     family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
     listener = Listener(family)
     try:

@@ -33,7 +33,7 @@ class Served:
         self.settings = WebSettings(**{"broker": broker, "port": 0, "server": "hall", **settings})
         self._listener = _listen(self.settings)
         self.port = int(self._listener.getsockname()[1])
-        self._uvicorn = uvicorn.Server(_config(self.settings))
+        self._uvicorn = uvicorn.Server(_config(self.settings, self._listener))
         self._thread = threading.Thread(target=self._run, name="served", daemon=True)
 
     @property

@@ -55,10 +55,9 @@ class Serving:
                 ws=WebSocketProtocol,
                 log_config=None,
                 lifespan="off",
-                timeout_keep_alive=1,
                 ws_ping_interval=0.3,
                 ws_ping_timeout=0.3,
-                **options,
+                **{"timeout_keep_alive": 1, **options},
             )
         )
         self._server.capture_signals = NoSignals  # type: ignore[method-assign]
@@ -99,7 +98,7 @@ def serve(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Serving]]:
     running: list[Serving] = []
 
     def start(**options: Any) -> Serving:
-        limits = {name: options.pop(name) for name in ("limit", "each") if name in options}
+        limits = {name: options.pop(name) for name in ("limit", "each", "strangers") if name in options}
         running.append(Serving(Listener(socket.AF_INET, **limits), **options))
         return running[-1]
 
@@ -236,18 +235,50 @@ def test_a_websocket_that_pings_and_does_not_read_costs_no_memory(serve: Callabl
     assert until(lambda: serving.listener.connections == 0, 4)
 
 
-def test_connections_are_limited_and_the_next_one_is_served_when_one_ends(serve: Callable[..., Serving]) -> None:
-    serving = serve(limit=3)
-    clients = [serving.connect() for _ in range(3)]
-    for client in clients:
-        get(client)
-    for _ in range(20):
-        assert is_closed(serving.connect())
-    assert until(lambda: serving.listener.refused == 20)  # it is counted once the socket is closed
-    assert serving.listener.connections == 3
-    clients[0].close()
-    assert until(lambda: serving.listener.connections == 2)
-    assert get(serving.connect()).startswith(b"HTTP/1.1 200")
+#: The users of the first connections ("": of nobody; "-": it also sends nothing), and how many of them, and of a flood
+#: of 40 silent ones after them, remain in 20 places.
+HELD = {
+    "nobody's": ([""], 12, [""]),
+    "nobody's, some silent": (["", "-", ""], 12, ["", ""]),
+    "more of nobody than there are places": ([""] * 14, 12, [""] * 11),
+    "a person's and nobody's": (["ann", "ann", ""], 14, ["ann", "ann", ""]),
+    "more of one person than one may have": (["ann"] * 8, 16, ["ann"] * 8),
+    "of many people, but for the last place": ([f"p{n}" for n in range(20)], 20, [f"p{n}" for n in range(19)]),
+}
+
+
+@pytest.mark.parametrize(("users", "all_in_all", "remaining"), HELD.values(), ids=HELD)
+def test_who_has_logged_in_keeps_a_place_and_the_oldest_silent_one_of_the_others_gives_way(
+    serve: Callable[..., Serving],
+    monkeypatch: pytest.MonkeyPatch,
+    users: list[str],
+    all_in_all: int,
+    remaining: list[str],
+) -> None:
+    for name, value in {"MAX_PERSON": 4, "HEAD_S": 60.0}.items():
+        monkeypatch.setattr(connections, name, value)
+    serving = serve(limit=20, strangers=12, timeout_keep_alive=60)
+    held: list[tuple[str, socket.socket]] = []
+    for user in users:
+        client = serving.connect()
+        if user != "-":
+            get(client)
+        if user not in ("", "-"):
+            serving.listener.recognise(client.getsockname(), user)
+        held.append((user, client))
+    flood = [serving.connect() for _ in range(40)]
+    expected = len(users) + len(flood) - all_in_all
+    assert until(lambda: serving.listener.ended == expected), serving.listener.ended
+    assert [user for user, client in held if not _has_ended(client)] == remaining
+    assert sum(not _has_ended(client) for client in flood) == all_in_all - len(remaining)
+    assert get(serving.connect()).startswith(b"HTTP/1.1 200"), "whoever comes now is served"
+    for client in flood:
+        client.close()
+
+
+def _has_ended(client: socket.socket) -> bool:
+    client.settimeout(0.05)
+    return is_closed(client)
 
 
 def test_each_other_address_has_its_own_limit(serve: Callable[..., Serving], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -264,8 +295,11 @@ def test_each_other_address_has_its_own_limit(serve: Callable[..., Serving], mon
     held = [connect("127.0.0.2") for _ in range(2)]
     for client in held:
         get(client)
-    assert is_closed(connect("127.0.0.2"))
+    newest = connect("127.0.0.2")
+    assert is_closed(held[0]), "the oldest of its own"
     assert get(connect("127.0.0.3"))
+    assert get(newest)
+    assert get(held[1])
     local = [connect("127.0.0.1") for _ in range(5)]
     assert all(get(client) for client in local)
 

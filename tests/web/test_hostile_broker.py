@@ -340,7 +340,7 @@ class Crowd:
         self._thread.join()
 
     def _run(self) -> None:
-        while not self._ending.wait(0.5):
+        while not self._ending.wait(2):
             self._publish()
 
     def _publish(self) -> None:
