@@ -1,6 +1,7 @@
 """One robot's config. docs/configuration.md lists every key; configs/schema.json tells editors."""
 
 from pebble.config.config import LAUNCHER_LOCK as LAUNCHER_LOCK
+from pebble.config.config import RUN_DIR_OF_UNIT as RUN_DIR_OF_UNIT
 from pebble.config.config import Config as Config
 from pebble.config.config import config_of_process as config_of_process
 from pebble.config.config import default_run_folder as default_run_folder

@@ -23,7 +23,7 @@ from pebble.errors import ConfigError
 
 #: In the run directory: the process id of the robot's newest launcher, and on a second line the robot's base topic.
 LAUNCHER_LOCK = "launcher.lock"
-_BY_SYSTEMD = Path("/run/pebble")  # of our unit; a tool that is started from a shell does not see its environment
+RUN_DIR_OF_UNIT = Path("/run/pebble")  # of our unit; a tool that is started from a shell does not see its environment
 _LONGEST_NAME = 150  # bytes; file systems allow 255
 
 
@@ -158,8 +158,8 @@ def default_run_folder(base: str, env: Mapping[str, str]) -> Path:
     """
     if by_systemd := env.get("RUNTIME_DIRECTORY"):
         return Path(by_systemd.split(":")[0])  # one per RuntimeDirectory= of the unit
-    if _is_run_from(_BY_SYSTEMD, base):
-        return _BY_SYSTEMD
+    if _is_run_from(RUN_DIR_OF_UNIT, base):
+        return RUN_DIR_OF_UNIT
     robot = f"{zlib.crc32(base.encode()):08x}"
     if by_login := env.get("XDG_RUNTIME_DIR"):
         return Path(by_login, "pebble", robot)

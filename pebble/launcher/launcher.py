@@ -58,8 +58,9 @@ class Launcher:
         Raises PebbleError if the robot runs already or its run directory cannot be used. Main thread only.
         """
         own_records = OwnRecords(self._logs, self._config.log_level_of("launcher"))
-        with _run_lock(self._config), self._signals, own_records:
+        with own_records, _run_lock(self._config) as lock, self._signals:
             try:
+                self._reactor.every(_CONFIG_POLL_S, lock.answer)
                 self._start()
                 self._reactor.run_until(self._stop_requested)
                 self._stop()

@@ -2,26 +2,21 @@
 
 from __future__ import annotations
 
-import errno
-import hashlib
 import os
-import socket
-import struct
 from pathlib import Path
 from typing import Self
 
 from pebble.config import LAUNCHER_LOCK
 from pebble.errors import PebbleError
+from pebble.launcher.machine_name import MachineName
 from pebble.transports.peers import FileLock, make_private
-
-_PEER = struct.Struct("3i")  # SO_PEERCRED: process, user, group
 
 
 class RunLock:
     """Makes the run directory for this user alone and holds its lock; the kernel releases it however the process ends.
 
-    A second lock is independent of the environment, which determines the run directory: an abstract socket, of which
-    there is one on a machine for a robot and the config file it is started from.
+    A second lock is independent of the environment, which determines the run directory: a name, of which there is one
+    on a machine for a robot and the config file it is started from.
 
     Raises PebbleError when another process holds a lock, or when the directory cannot be trusted.
     """
@@ -30,7 +25,7 @@ class RunLock:
         self._run_dir, self._robot, self._config = run_dir, robot, config
         self.path = run_dir / LAUNCHER_LOCK
         self._lock: FileLock | None = None
-        self._name: socket.socket | None = None
+        self._name: MachineName | None = None
 
     def take(self) -> Self:
         make_private(self._run_dir, close=True)
@@ -43,12 +38,17 @@ class RunLock:
                 f"{self._robot} already runs: process {holder} holds {self.path}; end it there with Ctrl-C"
             )
         try:
-            self._name = _take_name(self._robot, self._config)
+            self._name = MachineName.take(self._robot, self._config)
         except PebbleError:
             self.release()
             raise
         self._lock.write(f"{os.getpid()}\n{self._robot}\n".encode())
         return self
+
+    def answer(self) -> None:
+        """Answer the launchers that ask who holds the robot's name; to be called every second or two."""
+        if self._name is not None:
+            self._name.answer()
 
     def release(self) -> None:
         """Release the locks. The file stays, with the process id of the last launcher and its robot."""
@@ -64,32 +64,3 @@ class RunLock:
 
     def __exit__(self, *_: object) -> None:
         self.release()
-
-
-def _take_name(robot: str, config: Path) -> socket.socket:
-    digest = hashlib.sha256(os.fsencode(config.resolve()) + b"\0" + robot.encode()).hexdigest()
-    name = f"\0pebble up {digest[:32]}"
-    taken = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-    try:
-        taken.bind(name)
-        taken.listen()
-    except OSError as error:
-        taken.close()
-        if error.errno != errno.EADDRINUSE:
-            raise PebbleError(f"{robot} cannot be locked: {error.strerror}") from None
-        raise PebbleError(
-            f"{robot} already runs from {config}, with another run directory: {_holder(name)}; end that one first"
-        ) from None
-    return taken
-
-
-def _holder(name: str) -> str:
-    """Which process listens there, for people; it does not answer."""
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as asking:
-        asking.setblocking(False)
-        try:
-            asking.connect(name)
-        except OSError:  # it has ended meanwhile, or many have asked
-            return "another process"
-        process, user, _ = _PEER.unpack(asking.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size))
-    return f"process {process} of user {user}"

@@ -806,7 +806,7 @@ class TestRunDirectory:
         assert read({"robot": {"id": "goob"}}, env).run_dir() == Path("/run/pebble")
 
     def test_a_tool_in_a_shell_finds_that_of_our_unit(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr("pebble.config.config._BY_SYSTEMD", tmp_path)
+        monkeypatch.setattr("pebble.config.config.RUN_DIR_OF_UNIT", tmp_path)
         goob, fred = {"robot": {"id": "goob"}}, {"robot": {"id": "fred"}}
         assert read(goob, {}).run_dir() != tmp_path
         for text in ("", "1\n", "1\npebble/robots/fred\n", "\xff\n\xff"):
