@@ -9,7 +9,7 @@ import os
 import socket
 import struct
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
@@ -46,22 +46,23 @@ class MachineName:
         """Raises PebbleError if another launcher runs this robot from ``config``."""
         digest = hashlib.sha256(os.fsencode(config.resolve()) + b"\0" + robot.encode()).hexdigest()
         name, own = f"pebble up {digest[:32]}", f"pebble up {digest[:32]} {os.urandom(8).hex()}"
-        end = time.monotonic() + _ANSWER_S
+        looked_at, end = {own}, time.monotonic() + _ANSWER_S
+        strangers: list[_Holder] = []
         try:
             if (bound := _bind(name)) is not None:
-                own = name
-            elif (launcher := _find_launcher(_holders(name, own, end), config)) is None:
-                bound = _bind(own)
+                looked_at = {name}
             else:
-                raise _running(robot, config, launcher)
+                strangers += _strangers(robot, config, _holders(name, looked_at, end))
+                bound = _bind(own)
         except OSError as error:
             raise PebbleError(f"{robot} cannot be locked: {error.strerror}") from None
         if bound is None:
             raise PebbleError(f"{robot} cannot be locked: all names are taken")
-        strangers = list(_holders(name, own, end))
-        if (launcher := _find_launcher(strangers, config)) is not None:
+        try:
+            strangers += _strangers(robot, config, _holders(name, looked_at, end))
+        except PebbleError:
             bound.close()
-            raise _running(robot, config, launcher)
+            raise
         if strangers:
             log.warning("%s starts although %s", robot, _described(strangers, name))
         return cls(bound)
@@ -86,15 +87,15 @@ class _Holder(NamedTuple):
 _UNKNOWN = _Holder(0, -1, (), is_launcher=False)
 
 
-def _find_launcher(holders: Iterable[_Holder], config: Path) -> _Holder | None:
-    return next((holder for holder in holders if holder.is_launcher and _may_run(holder, config)), None)
-
-
-def _running(robot: str, config: Path, launcher: _Holder) -> PebbleError:
-    return PebbleError(
-        f"{robot} already runs from {config}, with another run directory: process {launcher.process}"
-        f" of user {launcher.user}; end that one first"
-    )
+def _strangers(robot: str, config: Path, holders: Iterator[_Holder]) -> Iterator[_Holder]:
+    """All holders, if none is a launcher. Raises PebbleError if one is."""
+    for holder in holders:
+        if holder.is_launcher and _may_run(holder, config):
+            raise PebbleError(
+                f"{robot} already runs from {config}, with another run directory: process {holder.process}"
+                f" of user {holder.user}; end that one first"
+            )
+        yield holder
 
 
 def _bind(name: str) -> socket.socket | None:
@@ -110,9 +111,9 @@ def _bind(name: str) -> socket.socket | None:
     return bound
 
 
-def _holders(name: str, own: str, end: float) -> Iterator[_Holder]:
-    """Those of ``name`` and of all names below it, but for our ``own``; at ``end`` those that do not answer, too."""
-    done, last = {own}, False
+def _holders(name: str, done: set[str], end: float) -> Iterator[_Holder]:
+    """Those of ``name`` and of all names below it that are not ``done`` yet; at ``end`` also those that do not answer."""
+    last = False
     while not last and (names := {held: inodes for held, inodes in _listed(name).items() if held not in done}):
         last = time.monotonic() > end
         seen = _seen_holders({inode for inodes in names.values() for inode in inodes})
