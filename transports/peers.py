@@ -40,8 +40,12 @@ def make_private(run_dir: Path, *, close: bool = False) -> None:
     """
     try:
         run_dir.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        if run_dir.parent.stat().st_uid not in (os.getuid(), 0):
-            raise TransportError(f"transport.run_dir {run_dir}: the folder it is in belongs to another user")
+        for owner in (run_dir.parent.lstat().st_uid, run_dir.parent.stat().st_uid):  # of a link, and of what it names
+            if owner not in (os.getuid(), 0):
+                raise TransportError(
+                    f"transport.run_dir {run_dir}: the folder it is in belongs to another user ({owner}):"
+                    " remove it as that user or root, or set transport.run_dir to another folder"
+                )
         run_dir.mkdir(mode=0o700, exist_ok=True)
         found = run_dir.lstat()
         if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid():

@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 from pebble.config import LAUNCHER_LOCK, RUN_DIR_OF_UNIT
 from pebble.errors import PebbleError
+from pebble.transports.socket_holders import command_of, processes_with
 
 log = logging.getLogger(__name__)
 
@@ -27,7 +28,6 @@ _LISTED_FIELDS = 8  # of /proc/net/unix; the last is the name
 _UNMAPPED = 65534  # how a user namespace shows users that it does not have
 _STREAM = "0001"
 _QUEUE = 128  # connections that wait to be taken
-_SHOWN = 60  # characters of a command
 
 
 class MachineName:
@@ -112,7 +112,7 @@ def _bind(name: str) -> socket.socket | None:
 
 
 def _holders(name: str, done: set[str], end: float) -> Iterator[_Holder]:
-    """Those of ``name`` and of all names below it that are not ``done`` yet; at ``end`` also those that do not answer."""
+    """Those of ``name`` and of all names below it, not ``done`` yet; at ``end`` also those that do not answer."""
     last = False
     while not last and (names := {held: inodes for held, inodes in _listed(name).items() if held not in done}):
         last = time.monotonic() > end
@@ -140,15 +140,12 @@ def _listed(name: str) -> dict[str, set[str]]:
 
 
 def _seen_holders(inodes: set[str]) -> dict[str, list[_Holder]]:
-    """The processes of each socket, as far as we may look: into our user's, as root into all."""
     seen: dict[str, list[_Holder]] = {}
-    for process in Path("/proc").glob("[0-9]*"):
-        with suppress(OSError):
-            links = {entry: str(entry.readlink()) for entry in (process / "fd").iterdir()}
-            if held := inodes & {link[8:-1] for link in links.values() if link.startswith("socket:[")}:
-                holder = _process(process, links)
-                for inode in held:
-                    seen.setdefault(inode, []).append(holder)
+    for process, links, held in processes_with(inodes):
+        with suppress(OSError):  # it has ended
+            holder = _process(process, links)
+            for inode in held:
+                seen.setdefault(inode, []).append(holder)
     return seen
 
 
@@ -212,17 +209,9 @@ def _described(strangers: list[_Holder], name: str) -> str:
     if known is None:
         who, end = "a process that this user may not see", f"find it with: sudo ss -xap | grep '{name}'"
     else:
-        who = f"process {known.process} of user {known.user} ({_command(known.process)})"
+        who = f"process {known.process} of user {known.user} ({command_of(known.process)})"
         end = f"end it with: sudo kill {known.process}"
     return (
         f"{who}{more} has bound the name by which launchers of a robot find each other, and is not known as one of them"
         f" (if it is, two run now); {end}"
     )
-
-
-def _command(process: int) -> str:
-    try:
-        words = Path(f"/proc/{process}/cmdline").read_text(encoding="utf-8", errors="replace")
-    except OSError:
-        return "its command is hidden from this user"
-    return ascii(words.replace("\0", " ").strip()[:_SHOWN])

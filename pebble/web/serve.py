@@ -10,6 +10,7 @@ import uvicorn
 
 from pebble.errors import PebbleError
 from pebble.fleet import certificates
+from pebble.transports.socket_holders import why_not
 from pebble.web.app import create_app
 from pebble.web.connections import ACCEPT, HttpProtocol, Listener, Loop, WebSocketProtocol
 from pebble.web.settings import WebSettings
@@ -81,7 +82,8 @@ def _listen(settings: WebSettings) -> Listener:
     except OSError as error:
         listener.close()
         raise PebbleError(
-            f"cannot listen on {settings.host} port {settings.port}: {error.strerror}; choose another with --port"
+            f"cannot listen on {settings.host} port {settings.port}: {why_not(error, settings.port)};"
+            " choose another with --port"
         ) from None
     return listener
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import signal
 import ssl
 import stat
@@ -313,7 +314,8 @@ def test_other_signals_end_it_too(tmp_path: Path, number: signal.Signals) -> Non
 def test_a_port_in_use_is_named(run: Run, tmp_path: Path) -> None:
     broker = Broker(tmp_path)
     assert run("web", "--url", f"mqtt://127.0.0.1:{broker.port}", "--port", broker.port) == 1
-    assert run.err.startswith(f"pebble: cannot listen on 127.0.0.1 port {broker.port}: Address already in use")
+    fact = f"Address already in use (by process {broker.pid} of user {os.getuid()}: '"
+    assert run.err.startswith(f"pebble: cannot listen on 127.0.0.1 port {broker.port}: {fact}")
     broker.stop()
 
 

@@ -200,8 +200,8 @@ def test_a_second_launcher_is_refused_if_the_first_may_run_the_robot(
     if squatted:
         assert first_line(start(5555, SQUAT, "listens", name_of(config))) == "bound"
     holder = start(first, LAUNCH, run_dir_of(folder, first), BASE, config, groups=(4321,))
-    assert "starts although" not in (said := first_line(holder)) or squatted
-    assert "bound" in (said, squatted and first_line(holder))
+    assert "starts although" not in (printed := first_line(holder)) or squatted
+    assert "bound" in (printed, squatted and first_line(holder))
     asked = start(second, LAUNCH, run_dir_of(folder, second), BASE, config, groups=(4321,))
     fact = "already runs from" if refused else "starts although"
     assert f"{BASE} {fact}" in (line := first_line(asked))

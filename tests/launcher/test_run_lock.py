@@ -82,6 +82,17 @@ def test_a_link_laid_out_for_us_is_refused(tmp_path: Path) -> None:
         RunLock(tmp_path / "run", "x/y/z", tmp_path / "robot.json").take()
 
 
+@pytest.mark.skipif(os.getuid() != 0, reason="only root makes the folder of another user")
+@pytest.mark.parametrize("is_link", [False, True])
+def test_a_folder_that_another_user_made_first_is_named(tmp_path: Path, is_link: bool) -> None:
+    above, own = tmp_path / "pebble-0", tmp_path / "own"
+    own.mkdir()
+    above.symlink_to(own) if is_link else above.mkdir()
+    os.chown(above, 65534, 65534, follow_symlinks=False)
+    with pytest.raises(PebbleError, match=r"belongs to another user \(65534\): remove it as that user or root, or set"):
+        RunLock(above / "run", "x/y/z", tmp_path / "robot.json").take()
+
+
 def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(PebbleError, match=f"transport.run_dir {tmp_path}/file/run cannot be used: File exists"):

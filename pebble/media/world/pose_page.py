@@ -90,8 +90,9 @@ class PoseReader:
     def __init__(self, path: Path) -> None:
         file = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
         try:
-            if os.fstat(file).st_size != _SIZE:
-                raise ValueError(f"{path} is not complete")
+            found = os.fstat(file)
+            if found.st_size != _SIZE or found.st_uid != os.getuid():
+                raise ValueError(f"{path} is not complete, or another user's")
             self._words = _map(file, writable=False)
         finally:
             os.close(file)

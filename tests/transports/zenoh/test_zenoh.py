@@ -7,6 +7,7 @@ import json
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -821,3 +822,19 @@ def test_a_hub_that_talks_nonsense_does_not_deafen_a_client(robot: Robot, monkey
     robot.hub.start()
     assert until(lambda: client.state is State.CONNECTED)
     assert next(left, None) is None
+
+
+@pytest.mark.parametrize("endpoint", ["tcp/127.0.0.1:{}", "tcp/localhost:{}", "tcp/127.0.0.1:{}#iface=lo"])
+def test_a_taken_port_keeps_no_robot_from_its_hub(
+    endpoint: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as stranger:
+        endpoint = endpoint.format(stranger.getsockname()[1])
+        settings = ZenohSettings(tmp_path / "run", listen=(endpoint,))
+        fact = f"transport.listen: {endpoint}: Address already in use (by process {os.getpid()} of user {os.getuid()}: "
+        with pytest.raises(TransportError, match=re.escape(fact)):  # its endpoints are all that it is for
+            ZenohHub(settings).open()
+        hub = ZenohHub(replace(settings, reserved=("x/y/z/outgoing",))).open()
+        hub.close()
+        assert fact in caplog.text
+        assert "the robot runs without it: end that process and start the robot again" in caplog.text

@@ -6,11 +6,14 @@ robot's processes do not pass through it. ``python -m pebble.runtime.hub`` runs 
 
 from __future__ import annotations
 
+import errno
 import logging
 import queue
+import socket
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,6 +26,7 @@ from pebble.transports.base import QoS
 from pebble.transports.counters import Counters
 from pebble.transports.peers import FileLock, PeerRegistry, new_name, prepare_run_dir
 from pebble.transports.settings import ZenohSettings
+from pebble.transports.socket_holders import why_not
 from pebble.transports.zenoh import wire
 from pebble.transports.zenoh.callbacks import direct
 from pebble.transports.zenoh.hub.admission import WillAdmission
@@ -97,13 +101,33 @@ class ZenohHub:
         self._store = store = HubStore(tuple(topic_to_key(topic) + "/" for topic in self._settings.reserved))
         self._worker = HubWorker(self.name, store, self._admission, journal, self.counters)
         try:
-            config = session_config(self._settings, "router", listen=[run_dir / HUB_SOCKET], connect=siblings)
+            settings = replace(self._settings, listen=tuple(filter(self._is_free, self._settings.listen)))
+            config = session_config(settings, "router", listen=[run_dir / HUB_SOCKET], connect=siblings)
             self._session = open_session(config)
         except zenoh.ZError as error:
             raise TransportError(f"the hub cannot open {run_dir / HUB_SOCKET}: {error}") from None
         Barrier(self._session, self.name, lambda: 0)
         self._worker.serve(self._session)
         self._token = self._session.liveliness().declare_token(wire.UP + self.name)
+
+    def _is_free(self, endpoint: str) -> bool:
+        """Say who has taken an endpoint. A robot's hub runs without it, as any user can take a port; others end."""
+        kind = socket.SOCK_DGRAM if endpoint.startswith("quic/") else socket.SOCK_STREAM
+        host, _, port = endpoint.partition("/")[2].partition("#")[0].partition("?")[0].rpartition(":")
+        try:
+            family, *_, address = socket.getaddrinfo(host.strip("[]"), int(port), type=kind)[0]
+            with socket.socket(family, kind) as tried:
+                tried.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, kind == socket.SOCK_STREAM)
+                tried.bind(address)
+        except (ValueError, OSError) as error:
+            if not isinstance(error, OSError) or error.errno != errno.EADDRINUSE:
+                return True  # Zenoh says what is wrong with it
+            fact = f"transport.listen: {endpoint}: {why_not(error, int(port))}"
+            if not self._settings.reserved:
+                raise TransportError(f"{fact}; end it, or name another port") from None
+            log.error("%s; the robot runs without it: end that process and start the robot again", fact)
+            return False
+        return True
 
 
 class HubWorker:

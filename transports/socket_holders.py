@@ -1,0 +1,50 @@
+"""Which processes hold a socket, as far as this user may look: into those of the same user, as root into all."""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Collection, Iterator
+from contextlib import suppress
+from pathlib import Path
+
+_SHOWN = 60  # characters of a command
+_LISTENS = "0A"  # in /proc/net/tcp
+
+
+def processes_with(inodes: Collection[str]) -> Iterator[tuple[Path, dict[Path, str], set[str]]]:
+    """The processes that hold some of these sockets: folder in /proc, all its descriptors, and which it holds."""
+    for process in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):
+            links = {entry: str(entry.readlink()) for entry in (process / "fd").iterdir()}
+            if held := {link[8:-1] for link in links.values() if link.startswith("socket:[")}.intersection(inodes):
+                yield process, links, held
+
+
+def command_of(process: int) -> str:
+    """Its command, safe to print: a process may choose any bytes."""
+    try:
+        words = Path(f"/proc/{process}/cmdline").read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return "its command is hidden from this user"
+    return ascii(words.replace("\0", " ").strip()[:_SHOWN])
+
+
+def why_not(error: OSError, port: int) -> str:
+    """Why this TCP port could not be listened at, and for one that is taken, by which process, if it can be found."""
+    return f"{error.strerror}{port_holder(port)}" if error.errno == errno.EADDRINUSE else str(error.strerror)
+
+
+def port_holder(port: int) -> str:
+    """Example: `` (by process 12 of user 1000: 'nc -l 8080')``; "" if no process listens there that can be found."""
+    users = {}
+    for name in ("tcp", "tcp6"):
+        with suppress(OSError):
+            for line in Path("/proc/net", name).read_text(encoding="ascii").splitlines()[1:]:
+                fields = line.split()
+                if fields[3] == _LISTENS and fields[1].endswith(f":{port:04X}"):
+                    users[fields[9]] = fields[7]
+    for process, _, held in processes_with(users):
+        return f" (by process {process.name} of user {users[held.pop()]}: {command_of(int(process.name))})"
+    if users:
+        return f" (by a process of user {users.popitem()[1]}: sudo ss -ltnp 'sport = :{port}')"
+    return ""
