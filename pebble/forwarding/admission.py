@@ -34,7 +34,8 @@ class Admission:
 
     def refuse(self, side: Side, subject: Subject, message: Message) -> Drop | None:
         """Why this message may not pass; None if it may."""
-        if side is Side.REMOTE and subject.kind.direction == INCOMING and len(message.payload) > MAX_COMMAND_BYTES:
+        is_bounded = subject.kind.direction == INCOMING and not subject.is_stop  # any payload is a stop
+        if side is Side.REMOTE and is_bounded and len(message.payload) > MAX_COMMAND_BYTES:
             return Drop.TOO_LARGE
         if subject.channel is not None and subject.kind is not Kind.ACTION:
             return None

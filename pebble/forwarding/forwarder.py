@@ -117,6 +117,8 @@ class Forwarder:
         self._both_ways = frozenset(kind for kind in Kind if rules.both_ways(kind))
         #: What :func:`route` has returned. There are not many subjects, so it needs no bound.
         self._routes: dict[tuple[Side, Subject, QoS, bool, bool | None, bool], Forward | Drop] = {}
+        for transport in transports.values():
+            transport.is_vital = self._is_stop
         self._lock = self.retained_lock = threading.RLock()  # while it is held no retained message passes
         self._reconciliation = Reconciliation(winner)
         self._admission = Admission(clock)
@@ -400,6 +402,10 @@ class Forwarder:
         return self._clock() < self._retained_until[side] and not self._reconciliation.has_received(side, message.topic)
 
     # -- stops, without the lock
+
+    def _is_stop(self, topic: str) -> bool:
+        subject = self._subjects[topic]
+        return subject is not None and subject.is_stop
 
     def _is_old_stop(self, side: Side, message: Message) -> bool:
         if not message.retain:

@@ -167,6 +167,9 @@ class TestAdmission:
         assert self.refuse(admission, f"incoming/{topic}", bytes(MAX_COMMAND_BYTES)) is None
         assert self.refuse(admission, f"incoming/{topic}", bytes(MAX_COMMAND_BYTES + 1)) is Drop.TOO_LARGE
 
+    def test_but_a_stop_is_not_since_any_payload_is_one(self) -> None:
+        assert self.refuse(Admission(), "incoming/estop", bytes(MAX_COMMAND_BYTES + 1)) is None
+
     @pytest.mark.parametrize(
         ("topics", "most"),
         [(["flags/reboot"], MAX_ACTIONS), ([f"mine/{number}" for number in range(9)], MAX_UNKNOWN_COMMANDS)],

@@ -20,7 +20,7 @@ from pebble.errors import TransportError
 from pebble.transports import Message, MqttSettings, QoS, State, TlsSettings, Transport, clock, create
 from pebble.transports.mqtt import transport as transport_module
 from pebble.transports.mqtt.client import Client
-from pebble.transports.mqtt.connection import UNACKED_LIMIT, Connection
+from pebble.transports.mqtt.connection import UNACKED_LIMIT, UNACKED_RESERVE, Connection
 from pebble.transports.mqtt.packets import MAX_PACKET
 from pebble.transports.topics import MAX_BYTES
 from tests.services.autonomy_manager.gate.mqtt_bytes import connect, publish
@@ -925,10 +925,14 @@ def test_unacknowledged_messages_are_bounded(broker: Broker, clients: Clients, p
     proxy.blackhole()
     accepted = [client.publish(topic, b"%d" % number, qos=DELIVERED) for number in range(UNACKED_LIMIT + 100)]
     assert accepted == [True] * UNACKED_LIMIT + [False] * 100
+    client.is_vital = lambda one: one.endswith("/stop")  # type: ignore[method-assign]
+    stops = [client.publish(f"{topic}/stop", b"stop", qos=DELIVERED) for _ in range(UNACKED_RESERVE + 1)]
+    assert stops == [True] * UNACKED_RESERVE + [False]
     assert client.publish(f"{topic}/kept", b"parked", qos=DELIVERED, retain=True)
     proxy.resume()
-    assert until(lambda: len(received.messages) == UNACKED_LIMIT + 1, 30)
-    assert received.payloads == [*(b"%d" % number for number in range(UNACKED_LIMIT)), b"parked"]
+    assert until(lambda: len(received.messages) == UNACKED_LIMIT + UNACKED_RESERVE + 1, 30)
+    numbers = [b"%d" % number for number in range(UNACKED_LIMIT)]
+    assert received.payloads == [*numbers, *[b"stop"] * UNACKED_RESERVE, b"parked"]
 
 
 # -- brokers that lack things

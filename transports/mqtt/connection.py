@@ -44,7 +44,8 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 _HESITATION_S = 0.5  # a CONNACK that takes longer comes over a very slow connection, or from a suspended broker
-UNACKED_LIMIT = 1000  # DELIVERED messages the broker has not acknowledged; beyond it they are refused
+UNACKED_LIMIT = 1000  # DELIVERED messages the broker has not acknowledged; beyond it they are refused,
+UNACKED_RESERVE = 100  # except so many stops: the messages before them may be those of strangers
 _OVERHEAD = 1 + 4 + 2 + 2 + 1 + 5  # bytes of a PUBLISH besides topic and payload, at most: with an expiry
 _CLEAR = 8 * 1024  # bytes ahead of a ping that do not delay it much
 _LEAST_PING_S = 0.05  # between two pings, however short the allowed silence
@@ -134,6 +135,7 @@ class Connection:
         as_published: bool,
         on_answers: Callable[[Mapping[str, bool]], None],
         skips_retained: Callable[[bytes], bool],
+        is_vital: Callable[[str], bool] = lambda _topic: False,
     ) -> None:
         settings = opening.settings
         self.as_published = as_published
@@ -147,7 +149,7 @@ class Connection:
         self._modern = settings.protocol == "5"
         self._lock = threading.RLock()
         self._inbox: list[Message] = []
-        self._on_answers, self._skips_retained = on_answers, skips_retained
+        self._on_answers, self._skips_retained, self._is_vital = on_answers, skips_retained, is_vital
         self._asked: dict[int, list[str]] = {}  # the filters of each SUBSCRIBE without an answer, by message id
         self._answers: dict[str, bool] = {}  # filters answered since the last `on_answers`: refused?
         self._backlog = Backlog()
@@ -423,7 +425,7 @@ class Connection:
         with self._lock:
             if self._client.socket is None:
                 return False
-            if message.qos is QoS.DELIVERED and self._in_flight.unacked >= UNACKED_LIMIT:
+            if message.qos is QoS.DELIVERED and self._in_flight.unacked >= UNACKED_LIMIT and self._is_full(message):
                 return False
             if message.retain:
                 self._in_flight.accept(message)
@@ -443,6 +445,10 @@ class Connection:
         if self.max_packet is None:
             return True
         return _OVERHEAD + len(message.topic.encode()) + len(message.payload) <= self.max_packet
+
+    def _is_full(self, message: Message) -> bool:
+        beyond = self._in_flight.unacked - UNACKED_LIMIT
+        return beyond >= UNACKED_RESERVE or not self._is_vital(message.topic)
 
     def _write_publish(self, message: Message, expires_s: int | None) -> None:
         mid = self._client.publish(

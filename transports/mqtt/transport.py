@@ -239,6 +239,7 @@ class MqttTransport(Transport):
             as_published=as_published,
             on_answers=self._note_answers,
             skips_retained=lambda topic: self.skips_retained(topic),
+            is_vital=lambda topic: self.is_vital(topic),
         )
 
     def _connect(self, connection: Connection, stopping: threading.Event) -> None:

@@ -12,7 +12,7 @@ import pytest
 from pebble.forwarding.forwarder import Gate
 from pebble.transports import QoS, State
 from pebble.transports.memory import MemoryTransport
-from tests.services.mqtt_bridge.bridge_rig import Client, MemoryRig, MqttRig, Quiet, gate_of
+from tests.services.mqtt_bridge.bridge_rig import BASE, Client, MemoryRig, MqttRig, Quiet, gate_of
 from tests.support import AmqttBroker, Broker, until
 from tests.tcp_proxy import TcpProxy
 
@@ -125,6 +125,12 @@ class TestUrgency:
         assert until(lambda: memory.remote.on(STOP))
         Quiet(memory.local, memory.remote).wait(0.7)
         assert memory.remote.payloads(STOP) == [b"now"]
+
+    @pytest.mark.parametrize("side", ["transport", "_remote"])
+    def test_it_is_taken_where_too_many_messages_wait(self, memory: MemoryRig, side: str) -> None:
+        is_vital = getattr(memory.bridge(), side).is_vital
+        found = {suffix: is_vital(f"{BASE}/{suffix}") for suffix in (STOP, RESET, STATE, DRIVE, "incoming/estop/x")}
+        assert found == {suffix: suffix == STOP for suffix in found}
 
     def test_an_mcus_private_alias_does_not_hold_it_back(self, memory: MemoryRig) -> None:
         memory.bridge()
