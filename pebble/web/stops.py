@@ -8,14 +8,16 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable
 
 from pebble.client.estop import COLLECT_S, Progress, RobotStop, StopSender
+from pebble.client.rank import Rank
 from pebble.contract.identity import parse_topic
 from pebble.runtime.robot_estop import RobotEstop
 from pebble.transports import Message
 from pebble.web import messages as m
 from pebble.web.robots import Component
 
-MAX_STOPS = 64  # that are being sent at once; beyond, the oldest is no longer sent
-MAX_EACH = 16  # of them by one user: the stops of another one are not ended by too many
+MAX_STOPS = 512  # that are being sent at once: more than one of each robot that is known from before
+MAX_SAME = 64  # of them for the same robot, or for all: the newest are sent,
+MAX_EACH = 4  # and of those by one user
 _SHOWN_S = 60.0  # so long pages see how a finished stop ended
 
 _SENDING = {
@@ -34,6 +36,7 @@ class Stops:
         self.changed: set[str] = set()  # robots whose view may be another one now
         self._senders: dict[str, tuple[StopSender, float]] = {}  # by name, the newest last
         self._users: dict[str, str] = {}  # who has pressed each of them
+        self._refs: dict[str, str] = {}  # for which robot; "": all
         self._shown: dict[str, tuple[str, str]] = {}  # by robot: progress and words, as pages see them
 
     def press(
@@ -55,9 +58,9 @@ class Stops:
         """
         if name in self._senders:
             return []
-        self._make_room(user)
+        self._make_room(ref, user)
         sender = StopSender(name, by=by, why=why, now=now, robots=[ref] if ref else None, known=before, own_only=True)
-        self._senders[name], self._users[name] = (sender, now), user
+        self._senders[name], self._users[name], self._refs[name] = (sender, now), user, ref
         for component in known:
             if not ref or component.ref == ref:
                 for message in component.known.values():
@@ -81,8 +84,8 @@ class Stops:
         if address is None:
             return []
         ref, messages = address.identity.base, []
-        for sender, began in self._senders.values():
-            if not sender.finished or now - began < COLLECT_S:
+        for name, (sender, began) in self._senders.items():
+            if self._refs[name] in ("", ref) and (not sender.finished or now - began < COLLECT_S):
                 sender.receive(message, now)
                 messages += sender.tick_robot(ref, now)
                 self._note_progress(sender, ref)
@@ -121,19 +124,27 @@ class Stops:
         if ref in sender.robots and self._shown.get(ref) != _progress(sender.robots[ref]):
             self.changed.add(ref)
 
-    def _make_room(self, user: str) -> None:
-        own = [name for name in self._senders if self._users[name] == user]
-        own.sort(key=lambda name: not self._senders[name][0].finished)  # stable: else the oldest first
-        for name in own[: max(0, len(own) - MAX_EACH + 1)]:
+    def _make_room(self, ref: str, user: str) -> None:
+        same = [name for name, one in self._refs.items() if one == ref]
+        same.sort(key=lambda name: not self._senders[name][0].finished)  # stable: else the oldest first
+        own = [name for name in same if self._users[name] == user]
+        for name in {*same[: max(0, len(same) - MAX_SAME + 1)], *own[: max(0, len(own) - MAX_EACH + 1)]}:
             self._remove(name)
-        while len(self._senders) >= MAX_STOPS:
-            self._remove(next(iter(self._senders)))
+        if len(self._senders) >= MAX_STOPS:
+            newest = {one: name for name, one in self._refs.items() if not self._senders[name][0].finished}
+            self._remove(min(self._senders, key=lambda name: self._worth(name, newest.get(self._refs[name]))))
+
+    def _worth(self, name: str, newest: str | None) -> tuple[bool, bool, bool, Rank]:
+        """What is stopped already goes first, then what a newer stop stops as well, then robots that may be invented."""
+        sender, ref = self._senders[name][0], self._refs[name]
+        rank = sender.robots[ref].rank if ref else Rank()
+        return not sender.finished, name == newest, not ref, rank
 
     def _remove(self, name: str) -> None:
         sender, _ = self._senders.pop(name)
         sender.end()
         self.changed |= set(sender.robots)
-        del self._users[name]
+        del self._users[name], self._refs[name]
 
     def _newest(self, ref: str) -> tuple[str, RobotStop | None]:
         for name, (sender, _) in reversed(self._senders.items()):

@@ -6,6 +6,7 @@ import time
 
 import pytest
 
+from pebble.client.estop import new_name
 from pebble.contract import CAPABILITIES, ESTOP, ONLINE, codec
 from pebble.contract.payloads import Capabilities, Heartbeat
 from pebble.fleet.audit import Audit
@@ -14,10 +15,44 @@ from pebble.runtime.robot_estop import RobotEstop
 from pebble.transports import Message, MqttSettings
 from pebble.web.server import Server
 from pebble.web.settings import WebSettings
-from pebble.web.stops import MAX_EACH, Stops
+from pebble.web.stops import MAX_EACH, MAX_STOPS, Stops
 
 A, B = "pebble/robots/a", "pebble/robots/b"
 FIRST = "f" * 16
+
+
+def press(stops: Stops, ref: str, user: str = "ann") -> str:
+    name = new_name()
+    stops.press(ref, name, by=user, why="", now=1.0, known=[], user=user)
+    return name
+
+
+def capabilities_of(ref: str) -> Message:
+    value = {"estop": {"available": True, "owners": ["motion"]}, "drive": {"available": True}}
+    return Message(CAPABILITIES.topic(ref), codec.encode(CAPABILITIES, Capabilities(t=1, value=value)))
+
+
+@pytest.mark.parametrize(
+    ("ref", "others"),
+    [
+        (A, [(f"pebble/robots/fake{number}", "ann") for number in range(3 * MAX_STOPS)]),
+        (A, [(f"pebble/robots/fake{number}", f"viewer{number}") for number in range(3 * MAX_STOPS)]),
+        (A, [(B, f"viewer{number}") for number in range(3 * MAX_STOPS)]),
+        (A, [("", f"viewer{number}") for number in range(3 * MAX_STOPS)]),
+        ("", [(f"pebble/robots/fake{number}", "ann") for number in range(3 * MAX_STOPS)]),
+        (A, [(f"pebble/robots/real{number}", "ann") for number in range(MAX_STOPS - 1)]),
+    ],
+    ids=["of invented robots", "by many", "of one robot", "of all", "one of all", "of a fleet, by one person"],
+)
+def test_other_stops_end_none_that_is_repeated(ref: str, others: list[tuple[str, str]]) -> None:
+    stops = Stops()
+    press(stops, ref)
+    if ref:
+        stops.receive(capabilities_of(ref), 1.0)
+    for other, user in others:
+        press(stops, other, user)
+    repeated = [message.topic for message in [*stops.tick(1.6), *stops.receive(capabilities_of(A), 1.7)]]
+    assert ESTOP.topic(A) in repeated
 
 
 def test_a_stop_that_makes_room_for_others_is_shown_no_longer() -> None:
@@ -26,10 +61,10 @@ def test_a_stop_that_makes_room_for_others_is_shown_no_longer() -> None:
     assert stops.view(RobotEstop(A)).sending == "sent"
     stops.changed.clear()
     for number in range(MAX_EACH):
-        stops.press(B, f"{number:016x}", by="ann", why="", now=1.0, known=[], user="ann")
+        stops.press(A, f"{number:016x}", by="ann", why="", now=1.0, known=[], user="ann")
     assert stops.user(FIRST) is None
     assert A in stops.changed
-    assert stops.view(RobotEstop(A)).sending == ""
+    assert stops.view(RobotEstop(A)).stop == f"{MAX_EACH - 1:016x}"
 
 
 @pytest.mark.parametrize("topic", [f"{B}/incoming/drive-values", f"{A}/outgoing/status"])
