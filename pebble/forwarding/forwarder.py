@@ -37,7 +37,6 @@ from pebble.contract import (
     Kind,
     codec,
 )
-from pebble.contract.payloads import STOP_WORDS, Drive
 from pebble.errors import PayloadError
 from pebble.forwarding.admission import Admission
 from pebble.forwarding.cycles import Cycles, Finding
@@ -513,19 +512,13 @@ def _is_late(subject: Subject, message: Message, waited_s: float) -> bool:
 
 
 def _ends_something(subject: Subject, message: Message) -> bool:
-    """Whether it can only bring something to rest: a zero, and the end of a script, a sound or a picture."""
     channel = subject.channel
     if channel not in _SWITCHES and channel is not DRIVE:
         return False
     try:
-        command = codec.decode(channel, message.payload)
+        return codec.ends(codec.decode(channel, message.payload))
     except PayloadError:
         return False
-    if isinstance(command, Drive):
-        return not command.moves
-    if word := getattr(command, "action", None):  # it wins over ``enabled``
-        return word.strip().lower() in STOP_WORDS
-    return getattr(command, "enabled", getattr(command, "on", None)) is False
 
 
 def _echo_matters(subject: Subject) -> bool:

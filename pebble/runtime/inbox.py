@@ -16,6 +16,8 @@ Job = Callable[[], None]
 class Inbox:
     """Jobs posted by any thread, taken by one. Beyond ``limit`` waiting jobs the oldest is dropped and counted.
 
+    One that has a name is not dropped as long as there are others: no number of these keeps out the end of something.
+
     A signal handler may post while its own thread is inside any of these methods: the lock is reentrant, and so is the
     wakeup.
     """
@@ -30,13 +32,19 @@ class Inbox:
         self._woken = False
         self.dropped = 0
 
-    def post(self, job: Job, *, newest_of: Hashable = None) -> None:
-        """Queue ``job``; with ``newest_of`` it takes the place of a waiting job of the same name."""
+    def post(self, job: Job, *, newest_of: Hashable = None, last_of: Hashable = None) -> None:
+        """Queue ``job``; with ``newest_of`` it takes the place of a waiting job of the same name.
+
+        With ``last_of`` it replaces that, too, but comes after all that wait.
+        """
         with self._lock:
-            if len(self._jobs) >= self._limit and newest_of not in self._jobs:
-                self._jobs.popitem(last=False)
+            if last_of is not None:
+                self._jobs.pop(last_of, None)
+            name = newest_of if last_of is None else last_of
+            if len(self._jobs) >= self._limit and name not in self._jobs:
+                del self._jobs[next((one for one in self._jobs if type(one) is int), next(iter(self._jobs)))]
                 self.dropped += 1
-            self._jobs[next(self._numbers) if newest_of is None else newest_of] = job
+            self._jobs[next(self._numbers) if name is None else name] = job
         self._wakeup.set()
 
     def post_internal(self, job: Job) -> None:

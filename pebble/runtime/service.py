@@ -346,7 +346,10 @@ class Service:
             # The service's clock may stand still while the machine is suspended; the message's does not.
             self._handle(channel, lambda: method(value, **names), min(arrived, self.clock() - message.waited_s))
 
-        self._inbox.post(handle, newest_of=message.topic if channel.newest else None)
+        if channel.newest:
+            self._inbox.post(handle, newest_of=message.topic)
+        else:
+            self._inbox.post(handle, last_of=message.topic if codec.ends(value) else None)
 
     def _remark(self, channel: Channel, sender: str, text: str) -> None:
         """Log what a command does that its sender may not mean, once a minute and sender."""

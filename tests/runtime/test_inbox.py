@@ -3,6 +3,9 @@ from __future__ import annotations
 import signal
 import threading
 import time
+from typing import Any
+
+import pytest
 
 from pebble.runtime.inbox import Inbox
 from tests.support import until
@@ -41,6 +44,27 @@ def test_beyond_the_limit_the_oldest_is_dropped_and_counted() -> None:
     drain(inbox)
     assert ran == [8, 9, 101]
     assert inbox.dropped == 8
+
+
+@pytest.mark.parametrize(
+    ("posts", "expected"),
+    [
+        (["STOP", 0, 1, 2, 3, 4], ["STOP", 3, 4]),
+        ([0, "STOP", 1, "STOP", 2], [1, "STOP", 2]),
+        (["drive", "STOP", 0, 1, 2], ["drive", "STOP", 2]),
+        (["STOP", 0, 1, "STOP"], [0, 1, "STOP"]),
+        (["A", "B", "C", "D"], ["B", "C", "D"]),
+    ],
+)
+def test_what_ends_something_is_not_dropped_for_others_and_comes_after_what_it_ends(
+    posts: list[str | int], expected: list[str | int]
+) -> None:
+    inbox, ran = Inbox(limit=3), list[str | int]()
+    for one in posts:
+        names: dict[str, Any] = {} if isinstance(one, int) else {"last_of": one} if one.isupper() else {"newest_of": one}
+        inbox.post(lambda one=one: ran.append(one), **names)  # type: ignore[misc]
+    drain(inbox)
+    assert ran == expected
 
 
 def test_internal_jobs_are_first_in_line_and_never_dropped() -> None:

@@ -449,6 +449,21 @@ def test_a_command_that_waited_while_the_machine_was_suspended_is_dropped(
     assert robot.saw("a", 0.25)
 
 
+def test_a_flood_of_commands_that_wait_does_not_push_out_the_one_that_ends_something(robot: Robot) -> None:
+    robot.start()
+    robot.service.go_on.clear()
+    sound = f"{BASE}/incoming/soundboard-command"
+    robot.publish(sound, '{"action": "play", "file": "a"}')
+    assert robot.saw("a")
+    robot.publish(sound, '{"action": "Stop", "file": "the end"}')
+    for number in range(1500):
+        robot.publish(sound, f'{{"action": "nonsense", "file": "{number}"}}')
+    assert until(lambda: robot.service.transport.counters["delivered"] == 1502)
+    robot.service.go_on.set()
+    assert until(lambda: robot.service.seen[-1] == "1499")
+    assert robot.service.seen[1:3] == ["the end", "501"]
+
+
 def test_a_command_that_waited_in_the_transport_is_dropped(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
     robot.start()
     monkeypatch.setattr(robot.hub, "now", lambda: clock.since_boot() - 0.6)
