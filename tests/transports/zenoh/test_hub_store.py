@@ -7,7 +7,7 @@ from msgspec.structs import replace
 
 from pebble.transports import QoS
 from pebble.transports.zenoh.hub import store as hub_store
-from pebble.transports.zenoh.hub.store import HubStore, Record, Retained, StoredWill
+from pebble.transports.zenoh.hub.store import MAX_WILLS, RESERVED_WILLS, HubStore, Record, Retained, StoredWill
 from pebble.transports.zenoh.wire import Hello, Stamp, Will, digest
 
 WILL = Will("status", b"gone", QoS.DELIVERED, True)
@@ -106,6 +106,17 @@ def test_what_others_store_leaves_the_reserved_room() -> None:
     assert not made.apply(retained("robot/outgoing/state", bytes(90)))
     made = store(*made.records())
     assert len(made.retained()) == 3
+
+
+def test_wills_of_others_leave_places_for_those_of_the_reserved_keys() -> None:
+    made, will = HubStore(("robot/outgoing/",)), Will("elsewhere", b"", QoS.DELIVERED, True)
+    for number in range(MAX_WILLS):
+        made.apply(StoredWill(f"stranger{number}", will))
+    own = Will("robot/outgoing/online", b"", QoS.DELIVERED, True)
+    assert [made.apply(StoredWill(f"own{number}", own)) for number in range(RESERVED_WILLS + 1)] == [
+        *[True] * RESERVED_WILLS,
+        False,
+    ]
 
 
 @pytest.mark.usefixtures("small")

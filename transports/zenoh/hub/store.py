@@ -15,6 +15,7 @@ log = logging.getLogger(__name__)
 MAX_BYTES = 64 << 20  # of retained messages and wills together
 RESERVED_BYTES = 16 << 20  # of them, for keys that are reserved: other clients cannot fill these
 MAX_WILLS = 1000
+RESERVED_WILLS = 100  # of them, for the same keys
 _OVERHEAD = 400  # bytes of Python's objects for one record, about
 
 
@@ -105,8 +106,11 @@ class HubStore:
     def _store_will(self, record: StoredWill) -> bool:
         name, before, after = record.name, self._wills.get(record.name), record.will
         if after is not None:
-            full = before is None and len(self._wills) >= MAX_WILLS
-            if full or not self._resize(topic_to_key(after.topic), _size(after)):
+            key = topic_to_key(after.topic)
+            outside = self._reserved and not key.startswith(self._reserved)
+            most = MAX_WILLS - RESERVED_WILLS if outside else MAX_WILLS
+            full = before is None and len(self._wills) >= most
+            if full or not self._resize(key, _size(after)):
                 self._refuse(f"will of {name}")
                 return False
             self._wills[name] = after
