@@ -73,7 +73,8 @@ class TerminalDriver:
             self._take_over = False  # a newer driver is asked for, not fought
             self._drive(self.gesture.interrupt(now, repeat=False))
         self._discovery.receive(message, now, wall)
-        if message.topic.startswith(f"{self.base}/") and (message.topic in self._known or len(self._known) < _TOPICS):
+        room = len(self._known) < _TOPICS or message.topic in (*self._known, CAPABILITIES.topic(self.base))
+        if room and message.topic.startswith(f"{self.base}/"):
             self._known[message.topic] = message
         if self.stopping is not None:
             self.stopping.receive(message, now)

@@ -12,6 +12,8 @@ from pebble.transports.wakeup import Wakeup
 
 Job = Callable[[], None]
 
+LIMIT = 1000  # jobs that wait
+
 
 class Inbox:
     """Jobs posted by any thread, taken by one. Beyond ``limit`` waiting jobs the oldest is dropped and counted.
@@ -22,7 +24,7 @@ class Inbox:
     wakeup.
     """
 
-    def __init__(self, limit: int = 1000) -> None:
+    def __init__(self, limit: int = LIMIT) -> None:
         self._limit = limit
         self._lock = threading.RLock()
         self._wakeup = Wakeup()

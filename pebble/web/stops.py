@@ -135,7 +135,7 @@ class Stops:
             self._remove(min(self._senders, key=lambda name: self._worth(name, newest.get(self._refs[name]))))
 
     def _worth(self, name: str, newest: str | None) -> tuple[bool, bool, bool, Rank]:
-        """What is stopped already goes first, then what a newer stop stops as well, then robots that may be invented."""
+        """What is confirmed goes first, then what a newer stop stops as well, then robots that may be invented."""
         sender, ref = self._senders[name][0], self._refs[name]
         rank = sender.robots[ref].rank if ref else Rank()
         return not sender.finished, name == newest, not ref, rank

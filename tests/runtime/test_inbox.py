@@ -3,7 +3,6 @@ from __future__ import annotations
 import signal
 import threading
 import time
-from typing import Any
 
 import pytest
 
@@ -61,8 +60,8 @@ def test_what_ends_something_is_not_dropped_for_others_and_comes_after_what_it_e
 ) -> None:
     inbox, ran = Inbox(limit=3), list[str | int]()
     for one in posts:
-        names: dict[str, Any] = {} if isinstance(one, int) else {"last_of": one} if one.isupper() else {"newest_of": one}
-        inbox.post(lambda one=one: ran.append(one), **names)  # type: ignore[misc]
+        name = {} if isinstance(one, int) else {"last_of" if one.isupper() else "newest_of": one}
+        inbox.post(lambda one=one: ran.append(one), **name)  # type: ignore[misc]
     drain(inbox)
     assert ran == expected
 
