@@ -231,6 +231,15 @@ def test_an_emergency_stop_is_sent_until_it_is_confirmed(keys: list[str]) -> Non
     assert (cab.driver.unconfirmed, "stopped by ann@desk" in cab.status) == (False, True)
 
 
+def test_invented_owners_keep_no_capabilities_from_a_later_stop() -> None:
+    cab = Cab()
+    cab.receive(*(outgoing(GOOB, f"estop/fake{number}", {}) for number in range(100)))
+    cab.ready()
+    cab.driver.press(["escape", "escape"], cab.now)
+    assert cab.driver.stopping is not None
+    assert cab.driver.stopping.robots[GOOB].estop.has_capabilities
+
+
 def test_escape_once_is_no_emergency_stop() -> None:
     cab = Cab().ready()
     cab.driver.press(["escape"], cab.now)
