@@ -191,9 +191,10 @@ class Broker(Program):
         host: str = HOST,
         wrap: Wrap = unchanged,
         program: str | None = None,
+        port: int | None = None,
     ) -> None:
         """``extra``: more lines of mosquitto's configuration. ``program``: a module to run at the port in its place."""
-        self.port = free_port()
+        self.port = port or free_port()
         stem = folder / name
         command = python(program, self.port) if program else mosquitto_command(self.port, stem, extra, host)
         super().__init__(name, wrap(command), folder / f"{name}.log")

@@ -26,6 +26,7 @@ _TYPES = {
 _VERSION = b"{version}"  # in the pages, replaced by that of the files
 _MODULES = b"{modules}"  # replaced by links to all that is imported: browsers need not discover them one by one
 _SCREENS = {"fleet.html": "ui/fleet.js", "robot.html": "ui/robot.js"}  # index.html, with what that screen needs
+_SHEETS = {"fleet.html": "fleet.css"}  # that the screen needs beside app.css
 _IMPORT = re.compile(rb'^(?:import|export|\}).*?"(\.\.?/[^"]+)";?$', re.MULTILINE)
 _COMMENTS = re.compile(r"^[ \t]*(?:/\*.*?\*/|//[^\n]*)[ \t]*$", re.MULTILINE | re.DOTALL)
 _LINE_ENDS = re.compile(r"(?<=\S)[ \t]+//[ ][^\"'`\n]*$", re.MULTILINE)  # one with quotes may be the end of a string
@@ -43,7 +44,9 @@ class StaticFiles:
         self.version = digest.hexdigest()[:12]
         index = self.files.pop("index.html")
         for name, screen in _SCREENS.items():
-            links = map(_link, (screen, *self._imported("main.js", screen)))
+            links = [_link(one) for one in (screen, *self._imported("main.js", screen))]
+            if name in _SHEETS:
+                links.insert(0, b'<link rel="preload" as="style" href="/static/{version}/%s">' % _SHEETS[name].encode())
             self.files[name] = index.replace(_MODULES, b"\n    ".join(links))
         for name in self.files:
             if name.endswith(".html"):

@@ -57,7 +57,7 @@ class MediaPages:
 
     def _answer(self, request: BaseHTTPRequestHandler) -> None:
         path = request.path
-        file = (STATIC if path.startswith("/media/") else PAGES) / path.lstrip("/")
+        file = (STATIC if path.startswith(("/media/", "/core/")) else PAGES) / path.lstrip("/")
         data = self._data.get(path)
         if data is None and file.is_file():
             data = file.read_bytes()

@@ -142,10 +142,10 @@ def test_talking_ends_as_a_gesture_does_and_not_before(at_benjr: Console, interr
 
 
 def test_keys_in_text_and_shortcuts_do_nothing(at_benjr: Console) -> None:
-    at_benjr.page.evaluate("document.querySelector('main').append(document.createElement('input'))")
-    at_benjr.page.locator("main > input").click()
+    at_benjr.page.evaluate("document.body.prepend(document.createElement('input'))")
+    at_benjr.page.locator("body > input").click()
     at_benjr.page.keyboard.type("fpmt?+-")
-    at_benjr.page.evaluate("document.querySelector('main > input').remove()")
+    at_benjr.page.evaluate("document.querySelector('body > input').remove()")
     for shortcut in ("Control+KeyM", "Alt+KeyT"):
         at_benjr.page.keyboard.press(shortcut)
     at_benjr.page.wait_for_timeout(100)

@@ -316,6 +316,7 @@ def test_what_is_granted_too_late_is_given_back() -> None:
 def test_a_browser_that_refuses_is_asked_again_and_one_that_cannot_is_left_alone() -> None:
     assert awake("granted = false; await awake.want(true); granted = true; await awake.want(true);") == [2, 0]
     assert awake("await new Awake(undefined).want(true);") == [0, 0]
+    assert awake("locks.request = () => { throw new Error('denied'); }; await awake.want(true);") == [0, 0]
 
 
 # -- what is joined to the page later; ``later`` runs what it does each second
@@ -338,9 +339,10 @@ performance.now = () => now;
 let healthy = true;
 const { install } = await import(given.more);
 const driver = { ref: "pebble/robots/goob" };
-const page = { driver, connection: {}, store: { get: () => undefined }, panels: { toggle: (name) => seen.push(name) } };
-page.sound = { toggleMute: () => seen.push("mute") };
+const panels = { toggle: (name) => seen.push(name) };
+const page = { driver, connection: { show() {} }, store: { get: () => undefined }, panels, commands: {} };
 install(page);
+page.sound = { toggleMute: () => seen.push("mute") };
 const key = (code, key = code) => driver.actions.keyDown({ code, key, repeat: false });
 const turn = () => new Promise((resolve) => setImmediate(resolve));
 """

@@ -54,7 +54,30 @@ def test_no_other_host_is_named(path: Path):
 def test_what_is_safety_or_media_needs_no_framework(folder: str):
     for path in (STATIC / folder).glob("*.js"):
         imports = re.findall(r"from \"([^\"]+)\"", path.read_text())
-        assert all(name.startswith("./") for name in imports), path.name
+        assert all(name.startswith(("./", "../core/browser")) for name in imports), path.name
+
+
+#: What browsers may lack, deny or take away.
+DENIABLE = r"""\b(?:sessionStorage|localStorage|indexedDB|getGamepads|navigator\.\w|matchMedia|setPointerCapture
+  |requestFullscreen|exitFullscreen|fullscreenE\w+|orientation\.|getRandomValues|randomUUID|createImageBitmap\(
+  |new\ (?:WebSocket|Worker|\w+Observer|AudioContext|AudioWorkletNode|\w+Decoder|Encoded\w+Chunk|OffscreenCanvas
+    |\w+Stream)\b)"""
+OWN = r"new (?:MutationObserver|\w*(?:Picture|H264|Opus|Text)Decoder)\b"  # ours, and what every browser has
+
+
+@pytest.mark.parametrize(
+    "path", [one for one in OURS if one.suffix == ".js"], ids=lambda path: str(path.relative_to(STATIC))
+)
+def test_what_a_browser_may_deny_is_tried_in_one_place(path: Path):
+    code = re.sub(OWN, "", stripped(path.read_bytes(), "js").decode())
+    found = re.findall(DENIABLE, code, re.VERBOSE)
+    assert path.match("core/browser*.js") or found == []
+
+
+def test_pages_ask_not_to_be_translated():
+    """Else a browser would say in other words, and late, what is so now."""
+    for path in STATIC.glob("*.html"):
+        assert '<html lang="en" translate="no" class="notranslate">' in path.read_text(), path.name
 
 
 def _imported(module: Path) -> set[Path]:
@@ -76,6 +99,7 @@ def test_a_load_of_the_page_is_small(screen: str):
     modules = [STATIC / name for name in ("main.js", f"ui/{screen}.js", "media/video-worker.js")]
     names = {str(path.relative_to(STATIC.resolve())) for one in modules for path in _imported(one.resolve())}
     names |= {f"{screen}.html", "app.css", "icons.svg", "manifest.webmanifest"}
+    names |= {f"{screen}.css"} & set(served)
     size = sum(len(gzip.compress(served[name], 9)) for name in names)
     assert size <= 1000 * MOST_KB, f"{size} bytes in {len(names)} files"
 

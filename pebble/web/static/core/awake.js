@@ -16,7 +16,11 @@ export class Awake {
     if (!wanted) return this.release();
     if (this.lock?.released === false || this.asking || document.hidden) return;
     this.asking = true;
-    this.lock = await Promise.resolve(this.locks?.request("screen")).catch(() => null) ?? null; // the battery is low
+    try {
+      this.lock = (await this.locks?.request("screen")) ?? null;
+    } catch {
+      this.lock = null; // the battery is low, or the site of a frame does not allow it
+    }
     this.asking = false;
     if (!this.wanted) this.release();
   }

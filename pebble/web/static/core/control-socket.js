@@ -1,11 +1,13 @@
 /** The control socket: commands to the server, state from it; made anew whenever it is lost. */
 
+import * as browser from "./browser.js";
 import { PING_TIMEOUT_MS } from "./reasons.js";
 
 const FIRST_DELAY_MS = 250;
 const LONGEST_DELAY_MS = 4000;
 const CHECK_MS = 250;
 const CONNECT_MS = 8000; // a phone far from its access point needs seconds for TCP, TLS and the handshake
+const STATES = ["welcome", "state", "ping"];
 const TOKEN = "pebble-token"; // restores the driver lease after a reload
 
 /** @typedef {{store: any, version: string, name?: () => string, onOpen?: () => void, onLost?: () => void,
@@ -35,12 +37,12 @@ export class ControlSocket {
   }
 
   connect() {
-    const scheme = location.protocol === "https:" ? "wss" : "ws";
-    const socket = new WebSocket(`${scheme}://${location.host}/ws/control`);
+    const socket = browser.webSocket("/ws/control");
+    if (!socket) return this.lost(0);
     this.socket = socket;
     this.heardAt = performance.now();
     socket.onopen = () => this.hello(socket);
-    socket.onmessage = (event) => socket === this.socket && this.receive(JSON.parse(event.data));
+    socket.onmessage = (event) => socket === this.socket && this.read(event.data);
     socket.onclose = (event) => socket === this.socket && this.lost(event.code);
   }
 
@@ -65,9 +67,20 @@ export class ControlSocket {
   }
 
   hello(socket) {
-    const token = (this.maySend("lease") && sessionStorage.getItem(TOKEN)) || "";
+    const token = (this.maySend("lease") && browser.session.get(TOKEN)) || "";
     const { version, name } = this.options;
     socket.send(JSON.stringify({ op: "hello", version, device: device(), name: name?.() ?? "", token }));
+  }
+
+  /** A state that was not taken whole would look like the newest one: a new connection brings all of it. */
+  read(text) {
+    const message = JSON.parse(text);
+    try {
+      this.receive(message);
+    } catch (error) {
+      if (STATES.includes(message.op)) this.restart();
+      throw error;
+    }
   }
 
   receive(message) {
@@ -76,6 +89,7 @@ export class ControlSocket {
       case "ping":
         this.socket?.send(JSON.stringify({ op: "echo", n: message.n, t: performance.now() }));
         this.roundTripMs = message.round_trip_ms;
+        this.attempts = 0;
         this.options.store.sync(message.now, message.round_trip_ms);
         return this.options.onChange?.();
       case "state":
@@ -97,9 +111,8 @@ export class ControlSocket {
   }
 
   welcome(message) {
-    sessionStorage.setItem(TOKEN, message.token);
+    browser.session.set(TOKEN, message.token);
     this.you = message;
-    this.attempts = 0;
     this.state = "open";
     this.outdated = true;
     this.options.store.sync(message.now);
@@ -149,7 +162,7 @@ async function askForLogin() {
 }
 
 export function device() {
-  const phone = matchMedia("(pointer: coarse)").matches;
-  const system = /Android|iPhone|iPad|Windows|Mac|Linux/.exec(navigator.userAgent)?.[0] ?? "";
+  const phone = browser.media("(pointer: coarse)").matches;
+  const system = /Android|iPhone|iPad|Windows|Mac|Linux/.exec(browser.userAgent())?.[0] ?? "";
   return phone ? `phone ${system}`.trim() : system || "browser";
 }

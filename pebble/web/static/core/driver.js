@@ -1,8 +1,10 @@
 /** Ties inputs, gesture and control socket together: from events of the browser to drive commands. */
 
+import * as browser from "./browser.js";
 import { Gesture, PERIOD_MS, STALL_MS } from "./gesture.js";
 import { DRIVE_KEYS, Inputs, PAD_ESTOP, USUAL } from "./inputs.js";
 import { SLOW_MS, SLOW_SPEED, driveReason } from "./reasons.js";
+import { callAll } from "./store.js";
 
 const SUSPENDED_MS = 500; // between the wall clock and the page's own
 const TWICE_MS = 600; // Escape, pressed twice
@@ -35,16 +37,17 @@ export class Driver {
     this.onSpace = null;
     /** @type {import("./actions.js").Actions | null} which keys and buttons these are; fetched later */
     this.actions = null;
-    /** @type {(id: string) => import("./inputs.js").Mapping | null} of a gamepad; null: unknown yet, it only stops */
-    this.mappingOf = () => USUAL;
+    /** @type {import("./pad-input.js").PadInput | null} fetched later; until then gamepads only stop */
+    this.pads = null;
+    this.padLatches = this.padStops = 0; // gamepads that press it
     this.mine = false;
     this.idleFrom = Infinity; // since when the lease is not used
-    this.padName = this.padKey = "";
     this.output = { x: 0, z: 0, y: 0 };
     this.escapeAt = -Infinity;
-    this.padStopped = this.padLatched = false;
     this.updatedAt = -Infinity;
     this.latchedAt = -Infinity; // when the component was last seen stopped
+    /** @type {Set<string>} parts of the page that do not work */
+    this.failed = new Set();
     this.refusal = ""; // why the server has ended the last gesture
     this.clockBase = Date.now() - performance.now();
     /** @type {Set<() => void>} */
@@ -60,9 +63,9 @@ export class Driver {
     document.addEventListener("freeze", () => this.leave());
     document.addEventListener("visibilitychange", () => document.hidden && this.leave());
     document.addEventListener("contextmenu", () => this.interrupt());
-    screen.orientation?.addEventListener?.("change", () => this.interrupt());
+    browser.onTurn(() => this.interrupt());
     for (const name of ["focusin", "focusout"]) document.addEventListener(name, () => this.changed());
-    addEventListener("gamepaddisconnected", () => this.inputs.padGone());
+    addEventListener("gamepaddisconnected", () => this.tick());
     setInterval(() => this.tick(), PERIOD_MS);
   }
 
@@ -133,6 +136,7 @@ export class Driver {
       pictureAgeMs: this.pictureAge(),
       inSight: this.inSight,
       roundTripMs: this.socket.roundTripMs,
+      failed: [...this.failed][0] ?? "",
       padFrozen: this.inputs.padFrozen,
       mustRelease: this.gesture.mustRelease,
       refusal: this.refusal,
@@ -159,8 +163,7 @@ export class Driver {
 
   /** The space bar: stops the robot, with or without the lease. */
   space() {
-    this.interrupt();
-    this.socket.send({ op: "stop", ref: this.ref });
+    this.stopped(() => this.socket.send({ op: "stop", ref: this.ref }));
   }
 
   /** End the gesture; what is held counts again after it was released. */
@@ -256,14 +259,43 @@ export class Driver {
   }
 
   latch(why) {
-    this.interrupt();
-    this.estop.press(this.ref, why); // without an open component: all
+    this.stopped(() => this.estop.press(this.ref, why)); // without an open component: all
+  }
+
+  /** A stop is sent, whatever else fails. @param {() => void} send */
+  stopped(send) {
+    try {
+      this.interrupt();
+    } finally {
+      send();
+    }
   }
 
   tick() {
-    this.readPad();
-    this.update();
-    this.watchLease();
+    for (const part of /** @type {const} */ (["readPads", "update", "watchLease"])) this.attempt(part);
+  }
+
+  /** What fails ends the gesture and is said; the others go on. @param {"readPads" | "update" | "watchLease"} part */
+  attempt(part) {
+    try {
+      this[part]();
+      this.failed.delete(part);
+    } catch (error) {
+      if (!this.failed.has(part)) console.error(error);
+      this.fail(part, true);
+    }
+  }
+
+  /** A part of the page does not work: what it shows may be old, and nothing is driven. @param {string} part @param {boolean} fails */
+  fail(part, fails) {
+    if (!fails) this.failed.delete(part);
+    else if (!this.failed.has(part)) {
+      this.failed.add(part);
+      this.inputs.clear();
+      this.gesture.interrupt(performance.now());
+      this.output = { x: 0, z: 0, y: 0 };
+    }
+    queueMicrotask(() => this.changed());
   }
 
   watchLease() {
@@ -286,29 +318,15 @@ export class Driver {
     this.socket.restart();
   }
 
-  /** @returns {Gamepad | null} the one that drives */
-  get pad() {
-    const pads = [...(navigator.getGamepads?.() ?? [])].filter((pad) => pad !== null && pad.connected !== false);
-    return pads.find((one) => /attack 3/i.test(one.id)) ?? pads[0] ?? null;
-  }
-
-  readPad() {
-    const { pad } = this;
-    const focused = document.hasFocus() ? pad : null;
-    const pressed = (index) => pad?.buttons[index]?.pressed === true;
-    const latched = focused !== null && PAD_ESTOP.every(pressed);
-    if (latched && !this.padLatched) this.latch("gamepad"); // before all that may fail
-    this.padLatched = latched;
-    this.padName = pad?.id ?? "";
-    const key = `${pad?.index} ${this.padName}`;
-    if (key !== this.padKey) this.inputs.padGone(); // another one has to be seen in neutral, too
-    this.padKey = key;
-    const mapping = this.mappingOf(this.padName);
-    const stop = latched || pressed((mapping ?? USUAL).buttons.stop);
-    if (stop && !this.padStopped && !latched) this.space();
-    this.padStopped = stop;
-    this.inputs.padSample(mapping && focused, performance.now(), mapping);
-    this.actions?.padSample(focused, mapping);
+  readPads() {
+    const shown = browser.gamepads() ?? [];
+    if (this.pads) return this.pads.read(shown, performance.now());
+    const isPressed = (pad, index) => browser.attempt(() => pad.buttons[index].pressed, false);
+    const pressing = (buttons) => shown.filter((pad) => buttons.every((index) => isPressed(pad, index))).length;
+    const [latches, stops] = [pressing(PAD_ESTOP), pressing([USUAL.buttons.stop])];
+    if (latches > this.padLatches) this.latch("gamepad");
+    if (stops > this.padStops) this.space();
+    Object.assign(this, { padLatches: latches, padStops: stops });
   }
 
   update() {
@@ -334,11 +352,12 @@ export class Driver {
   /** Notify watchers, if what they show is another than before. */
   changed() {
     const { x, z, y } = this.output;
-    const { ref, padName, sliders, inSight, typing } = this;
-    const shown = JSON.stringify([ref, this.reason(), x, z, y, padName, sliders, inSight, typing]);
+    const { ref, pads, sliders, inSight, typing } = this;
+    const pad = pads && [pads.choice.key, pads.reasons()];
+    const shown = JSON.stringify([ref, this.reason(), x, z, y, pad, sliders, inSight, typing]);
     if (shown === this.shown) return;
     this.shown = shown;
-    for (const watcher of this.watchers) watcher();
+    callAll(this.watchers);
   }
 }
 

@@ -1,9 +1,6 @@
 /** The emergency stop: sent on the control socket, and also by a request if that is not open. */
 
-/** @param {number} bytes @returns {string} random hex digits; also where there is no secure context */
-function randomHex(bytes) {
-  return Array.from(crypto.getRandomValues(new Uint8Array(bytes)), (byte) => byte.toString(16).padStart(2, "0")).join("");
-}
+import * as browser from "./browser.js";
 
 export class Estop {
   /** @param {{send: (op: Record<string, any>) => boolean, you?: any}} socket */
@@ -17,7 +14,7 @@ export class Estop {
 
   /** Stop one component, or all if ``ref`` is "". @param {string} ref @param {string} why */
   press(ref, why = "button") {
-    const op = { op: "estop", ref, stop: randomHex(8), why };
+    const op = { op: "estop", ref, stop: browser.randomHex(8), why };
     this.pressed = { ref, stop: op.stop, at: Date.now(), reached: true };
     if (!this.socket.send(op)) this.post(op, this.pressed);
     this.onChange();

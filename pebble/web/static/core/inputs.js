@@ -13,7 +13,10 @@ const FROZEN_MS = 3000; // a deflected gamepad that drives, and whose time stand
 export const PAD_ESTOP = [8, 9]; // buttons that no mapping has
 
 /** @typedef {{speed: number, turn: number, balance: number}} Sliders speed and turn 0..1, balance -1..1 */
-/** @typedef {{id: string, axes: readonly number[], buttons: readonly {pressed: boolean}[], timestamp: number}} Pad */
+/**
+ * @typedef {{id: string, index: number, mapping: string, axes: readonly number[],
+ *   buttons: readonly {pressed: boolean}[], timestamp: number}} Pad
+ */
 /** @typedef {{axis: number, invert: boolean}} Axis */
 /**
  * What of a gamepad does what. ``auxiliary``, while held: the horizontal axis is the auxiliary one. Buttons of other
@@ -33,7 +36,7 @@ export class Inputs {
   constructor() {
     /** @type {Set<string>} */
     this.keys = new Set();
-    /** @type {Set<string>} keys that are held, but count only after they were released */
+    /** @type {Set<string>} keys, and "stick", that are held, but count only after they were released */
     this.waiting = new Set();
     /** @type {Map<string, number>} value of each button that is held on the page, by name */
     this.held = new Map();
@@ -43,7 +46,7 @@ export class Inputs {
     this.pad = { x: 0, z: 0, y: 0 };
     this.padArmed = false; // it was seen in neutral since it appeared
     this.padFrozen = false;
-    this.padStamp = -1;
+    this.padStamp = "";
     this.padMovedAt = 0;
   }
 
@@ -80,6 +83,7 @@ export class Inputs {
   }
 
   stickEnd() {
+    this.waiting.delete("stick");
     this.pointer = null;
     this.stick = { x: 0, z: 0 };
   }
@@ -96,13 +100,12 @@ export class Inputs {
    */
   padSample(pad, now, mapping = USUAL) {
     if (pad === null) return this.padGone();
-    const read = ({ axis, invert }) => zone(pad.axes[axis] ?? 0, mapping.deadZone) * (invert ? -1 : 1);
-    const across = read(mapping.x);
-    const auxiliary = pad.buttons[mapping.buttons.auxiliary]?.pressed === true;
-    const sample = { x: auxiliary ? 0 : across, z: read(mapping.z), y: auxiliary ? across : 0 };
+    const sample = padVector(pad, mapping);
+    if (sample === null) return this.padGone();
     const neutral = sample.x === 0 && sample.z === 0 && sample.y === 0;
-    if (pad.timestamp !== this.padStamp || neutral) {
-      this.padStamp = pad.timestamp;
+    const stamp = [pad.timestamp, sample.x, sample.z, sample.y].join();
+    if (stamp !== this.padStamp || neutral) {
+      this.padStamp = stamp;
       this.padMovedAt = now;
       this.padFrozen = false;
     } else if (this.padArmed && now - this.padMovedAt > FROZEN_MS) {
@@ -110,7 +113,7 @@ export class Inputs {
       this.padArmed = false;
     }
     if (neutral) this.padArmed = true;
-    this.pad = this.padArmed ? { x: sample.x + 0, z: sample.z + 0, y: sample.y + 0 } : { x: 0, z: 0, y: 0 };
+    this.pad = this.padArmed ? sample : { x: 0, z: 0, y: 0 };
   }
 
   padGone() {
@@ -122,7 +125,9 @@ export class Inputs {
   clear() {
     this.clearKeys();
     this.held.clear();
+    const dragged = this.pointer !== null || this.waiting.has("stick");
     this.stickEnd();
+    if (dragged) this.waiting.add("stick");
     this.pad = { x: 0, z: 0, y: 0 };
     this.padArmed = false;
   }
@@ -165,6 +170,17 @@ export class Inputs {
   axis(plus, minus) {
     return Number(plus.some((code) => this.keys.has(code))) - Number(minus.some((code) => this.keys.has(code)));
   }
+}
+
+/**
+ * What the stick of a gamepad asks for.
+ * @param {Pad} pad @param {Mapping} mapping @returns {{x: number, z: number, y: number} | null} null: it has no such axes
+ */
+export function padVector({ axes, buttons }, { x, z, deadZone, buttons: { auxiliary } }) {
+  const read = ({ axis, invert }) => (axis < 0 ? 0 : zone(axes[axis], deadZone) * (invert ? -1 : 1));
+  if (![x, z].every(({ axis }) => axis < 0 || Number.isFinite(axes[axis]))) return null;
+  const [across, ahead] = [read(x) + 0, read(z) + 0]; // without -0
+  return buttons[auxiliary]?.pressed === true ? { x: 0, z: ahead, y: across } : { x: across, z: ahead, y: 0 };
 }
 
 /** Scale left and right wheels apart, for robots that pull to one side. */

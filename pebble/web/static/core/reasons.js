@@ -34,6 +34,7 @@ const RESET_MS = 600; // after a reset robots refuse whoever has not paused for 
  * @property {number|null} pictureAgeMs null: no picture is wanted here; NaN: its age is not known
  * @property {boolean} inSight the driver sees the robot itself
  * @property {number} roundTripMs
+ * @property {string} failed a part of this page that does not work; ""
  * @property {boolean} padFrozen
  * @property {boolean} mustRelease
  * @property {string} refusal why the server has ended the last gesture; "" it has not
@@ -52,6 +53,7 @@ export function driveReason(s) {
 }
 
 function pageReason(s) {
+  if (s.failed) return reason("failed", `This page does not work (${s.failed}): load it again`, { label: "Reload", kind: "reload" });
   if (s.reload) return reason("reload", "This page is older than the server", { label: "Reload", kind: "reload" });
   if (!s.drives) return reason("plain", "Driving needs https: this connection is not encrypted");
   if (!s.rights.includes("drive")) return reason("role", "Log in as driver to drive", { label: "Log in", kind: "login" });
@@ -118,6 +120,6 @@ function oldPicture(s) {
   return `The picture is ${(s.pictureAgeMs / 1000).toFixed(1)} s old`;
 }
 
-function reason(code, text, action) {
+export function reason(code, text, action) {
   return action ? { code, text, action } : { code, text };
 }

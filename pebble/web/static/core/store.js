@@ -169,12 +169,17 @@ export class Store {
     this.changed = new Set();
     const due = new Set();
     for (const key of changed) for (const fn of this.subscribers.get(key) ?? []) due.add(fn);
-    for (const fn of due) {
-      try {
-        fn();
-      } catch (error) {
-        queueMicrotask(() => { throw error; }); // is reported, and the others are called
-      }
+    callAll(due);
+  }
+}
+
+/** What fails is reported, and keeps none of the others from being called. @param {Iterable<() => void>} fns */
+export function callAll(fns) {
+  for (const fn of [...fns]) {
+    try {
+      fn();
+    } catch (error) {
+      queueMicrotask(() => { throw error; });
     }
   }
 }

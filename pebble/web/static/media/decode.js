@@ -1,5 +1,6 @@
 // Reads payloads, and decides which pictures may be shown: the rules of pebble/media/decode.py. Pure: it needs no page.
 
+import * as browser from "../core/browser.js";
 import { PayloadError } from "./errors.js";
 import { MAX_BYTES, joined } from "./jpeg.js";
 
@@ -111,7 +112,7 @@ function fromBase64(text) {
  * @returns {Promise<Uint8Array>}
  */
 export async function inflate(packed, limit = MAX_BYTES) {
-  const stream = new DecompressionStream("deflate");
+  const stream = new (browser.find("DecompressionStream"))("deflate");
   const reader = stream.readable.getReader();
   const writer = stream.writable.getWriter();
   const written = writer.write(packed).then(() => writer.close());

@@ -1,5 +1,6 @@
 // Decodes access units of H.264 with WebCodecs, one picture for each.
 
+import * as browser from "../core/browser.js";
 import { checkUnit, unseal } from "./access-unit.js";
 import { PayloadError, UnsupportedError } from "./errors.js";
 
@@ -66,18 +67,18 @@ export class H264Decoder {
     if (this.decoder === null) throw new PayloadError("no key frame yet");
     const timestamp = this.units++;
     this.labels.set(timestamp, label);
-    this.decoder.decode(new EncodedVideoChunk({ type: codec === null ? "delta" : "key", timestamp, data: unit }));
+    this.decoder.decode(new (browser.find("EncodedVideoChunk"))({ type: codec === null ? "delta" : "key", timestamp, data: unit }));
   }
 
   /** @param {string} codec */
   async open(codec) {
     this.close();
-    if (typeof VideoDecoder === "undefined") throw new UnsupportedError("this browser has no decoder for h264");
+    if (!browser.find("VideoDecoder")) throw new UnsupportedError("this browser has no decoder for h264");
     const config = { codec, optimizeForLatency: true }; // without a description: Annex B
-    if (!(await VideoDecoder.isConfigSupported(config)).supported) {
+    if (!(await browser.find("VideoDecoder").isConfigSupported(config)).supported) {
       throw new UnsupportedError(`this browser cannot decode ${codec}`);
     }
-    const decoder = new VideoDecoder({
+    const decoder = new (browser.find("VideoDecoder"))({
       output: (frame) => this.take(decoder, frame),
       error: (error) => {
         if (this.decoder === decoder) this.error = error;

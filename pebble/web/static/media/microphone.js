@@ -1,5 +1,8 @@
 // The microphone, opened while a person talks and for a moment after it.
 
+import * as browser from "../core/browser.js";
+import * as more from "../core/browser-more.js";
+
 const KEEP_MS = 5000; // it stays open between two sentences
 const WORKLET = new URL("./capture-worklet.js", import.meta.url).href;
 const WANTED = { audio: { echoCancellation: true, channelCount: 1 } };
@@ -9,9 +12,6 @@ const PROBLEMS = {
   NotFoundError: "There is no microphone",
   NotReadableError: "The microphone is in use by another program",
 };
-
-/** @returns {boolean} false over plain http from another machine */
-export const hasMicrophone = () => Boolean(navigator.mediaDevices?.getUserMedia) && "AudioWorkletNode" in window;
 
 export class Microphone {
   /** @param {AudioContext} context */
@@ -38,12 +38,12 @@ export class Microphone {
     try {
       if (!this.node) {
         await this.context.audioWorklet.addModule(WORKLET);
-        this.node = new AudioWorkletNode(this.context, "pebble-capture", { numberOfInputs: 1, numberOfOutputs: 1 });
+        this.node = new (browser.find("AudioWorkletNode"))(this.context, "pebble-capture", { numberOfInputs: 1, numberOfOutputs: 1 });
         this.node.connect(this.context.destination); // what leads nowhere is not called; it plays nothing
       }
       if (!this.stream?.active) {
         this.close();
-        this.stream = await navigator.mediaDevices.getUserMedia(WANTED);
+        this.stream = await more.microphone.open(WANTED);
         this.source = this.context.createMediaStreamSource(this.stream);
         this.source.connect(this.node);
       }

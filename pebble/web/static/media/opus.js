@@ -1,15 +1,16 @@
 // Packets of Opus to samples, by the browser's decoder.
 
+import * as browser from "../core/browser.js";
 import { milliseconds, split } from "./sound-packet.js";
 
 const MOST_PENDING = 32;
 
 /** @returns {Promise<boolean>} false over plain http from another machine, for example */
 export async function decodesOpus() {
-  if (typeof AudioDecoder === "undefined") return false;
+  if (!browser.find("AudioDecoder")) return false;
   try {
     const config = { codec: "opus", sampleRate: 48000, numberOfChannels: 1 };
-    return (await AudioDecoder.isConfigSupported(config)).supported === true;
+    return (await browser.find("AudioDecoder").isConfigSupported(config)).supported === true;
   } catch {
     return false;
   }
@@ -37,7 +38,7 @@ export class OpusDecoder {
     this.pending.push({ sound, left: packets.length, parts: [], rate: 0 });
     try {
       for (const data of packets) {
-        decoder.decode(new EncodedAudioChunk({ type: "key", timestamp: this.at, data }));
+        decoder.decode(new (browser.find("EncodedAudioChunk"))({ type: "key", timestamp: this.at, data }));
         this.at += 1000 * milliseconds(data);
       }
     } catch (error) {
@@ -57,7 +58,7 @@ export class OpusDecoder {
   open(channels) {
     this.channels = channels;
     /** @type {AudioDecoder} */
-    const decoder = new AudioDecoder({
+    const decoder = new (browser.find("AudioDecoder"))({
       output: (data) => {
         try {
           if (decoder === this.decoder) this.take(data);

@@ -1,5 +1,6 @@
 // Decodes the payloads of one robot into bitmaps: pebble/media/decode.py for browsers, pixel by pixel the same.
 
+import * as browser from "../core/browser.js";
 import { Sequence, inflate, readPayload } from "./decode.js";
 import { addDifference } from "./delta.js";
 import { PayloadError, UnsupportedError } from "./errors.js";
@@ -70,7 +71,7 @@ export class PictureDecoder {
     const made = await this.h264.decode(payload.body, payload.keyframe, quiet ? null : labelOf(payload));
     if (made === null) return null;
     try {
-      return { bitmap: await createImageBitmap(made.frame), ...made.label };
+      return { bitmap: await browser.find("createImageBitmap")(made.frame), ...made.label };
     } finally {
       made.frame.close();
     }
@@ -88,14 +89,14 @@ export class PictureDecoder {
       return null;
     }
     const whole = this.add(picture);
-    return quiet ? null : { bitmap: await createImageBitmap(whole), ...labelOf(payload) };
+    return quiet ? null : { bitmap: await browser.find("createImageBitmap")(whole), ...labelOf(payload) };
   }
 
   /** Let differences build on this picture. */
   begin(/** @type {ImageBitmap} */ picture) {
     const { width, height } = picture;
     if (!this.context || this.context.canvas.width !== width || this.context.canvas.height !== height) {
-      const context = new OffscreenCanvas(width, height).getContext("2d", { willReadFrequently: true });
+      const context = new (browser.find("OffscreenCanvas"))(width, height).getContext("2d", { willReadFrequently: true });
       if (!context) throw new UnsupportedError("this browser has no canvas for pictures");
       this.context = context;
     }
@@ -128,7 +129,7 @@ export async function decodeJpeg(bytes) {
   const { width, height, plain } = checkJpeg(bytes);
   let bitmap;
   try {
-    bitmap = await createImageBitmap(new Blob([/** @type {any} */ (plain)], { type: "image/jpeg" }), AS_IT_IS);
+    bitmap = await browser.find("createImageBitmap")(new Blob([/** @type {any} */ (plain)], { type: "image/jpeg" }), AS_IT_IS);
   } catch (error) {
     throw new PayloadError(`JPEG: ${error}`);
   }

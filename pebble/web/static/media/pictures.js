@@ -1,5 +1,7 @@
 // The pictures of one robot on a page: a socket to the server, and a worker that decodes.
 
+import * as browser from "../core/browser.js";
+
 const DRAWN = 0;
 const FIRST_WAIT_MS = 250;
 const LONGEST_WAIT_MS = 4000;
@@ -51,7 +53,7 @@ export class Pictures {
   static async canDecode() {
     const can = [];
     if (await decodesH264()) can.push("h264");
-    if (typeof createImageBitmap === "function" && typeof DecompressionStream === "function") {
+    if (browser.find("createImageBitmap") && browser.find("DecompressionStream")) {
       if (readsBack()) can.push("pbvz", "pbvd", "json");
       can.push("jpeg");
     }
@@ -79,9 +81,9 @@ export class Pictures {
     const can = await Pictures.canDecode();
     if (connection !== this.connection) return; // stopped meanwhile
     this.worker ??= this.startWorker();
-    const scheme = location.protocol === "https:" ? "wss:" : "ws:";
     const query = new URLSearchParams({ ref: this.state.ref, can: can.join(",") });
-    const socket = new WebSocket(`${scheme}//${location.host}/ws/media?${query}`);
+    const socket = browser.webSocket(`/ws/media?${query}`);
+    if (!socket) return this.lost();
     socket.binaryType = "arraybuffer";
     socket.onopen = () => this.change({ connection: "open" });
     socket.onmessage = ({ data }) => {
@@ -109,10 +111,16 @@ export class Pictures {
   }
 
   startWorker() {
-    const worker = new Worker(new URL("./video-worker.js", import.meta.url), { type: "module" });
-    worker.onmessage = ({ data }) => this.take(data);
-    worker.onerror = (event) => this.change({ problem: `pictures cannot be decoded here: ${event.message}` });
-    return worker;
+    const fail = ({ message }) => this.change({ problem: `pictures cannot be decoded here: ${message}` });
+    try {
+      const worker = browser.worker(new URL("./video-worker.js", import.meta.url));
+      worker.onmessage = ({ data }) => this.take(data);
+      worker.onerror = fail;
+      return worker;
+    } catch (error) {
+      fail(error);
+      return null;
+    }
   }
 
   /** Draw what the worker has made, and only then acknowledge it. @param {any} made */
@@ -154,9 +162,9 @@ export class Pictures {
 }
 
 async function decodesH264() {
-  if (typeof VideoDecoder === "undefined") return false; // plain http from another machine, for example
+  if (!browser.find("VideoDecoder")) return false; // plain http from another machine, for example
   try {
-    const answers = await Promise.all(CODECS.map((codec) => VideoDecoder.isConfigSupported({ codec })));
+    const answers = await Promise.all(CODECS.map((codec) => browser.find("VideoDecoder").isConfigSupported({ codec })));
     return answers.every(({ supported }) => supported);
   } catch {
     return false;
@@ -165,8 +173,8 @@ async function decodesH264() {
 
 /** Whether pixels that were drawn are read back as they were: some browsers add noise against tracking. */
 function readsBack() {
-  if (typeof OffscreenCanvas === "undefined") return false;
-  const context = new OffscreenCanvas(16, 16).getContext("2d", { willReadFrequently: true });
+  if (!browser.find("OffscreenCanvas")) return false;
+  const context = new (browser.find("OffscreenCanvas"))(16, 16).getContext("2d", { willReadFrequently: true });
   if (!context) return false;
   const pixels = context.createImageData(16, 16);
   for (let i = 0; i < pixels.data.length; i++) pixels.data[i] = i % 4 === 3 ? 255 : (i * 37) % 256;

@@ -1,5 +1,7 @@
 // The pictures of a recording: recorded payloads in, bitmaps out, by the same worker as live ones.
 
+import * as browser from "../core/browser.js";
+
 const HEAD_BYTES = 5; // u32 number, u8 kind: as the messages of the server
 const MOST_PENDING = 24; // pictures at the worker; the replay waits for it
 
@@ -61,7 +63,7 @@ export class ReplayPictures {
   }
 
   start() {
-    const worker = new Worker(new URL("./replay-video-worker.js", import.meta.url), { type: "module" });
+    const worker = browser.worker(new URL("./replay-video-worker.js", import.meta.url));
     worker.onmessage = ({ data }) => this.made(data);
     worker.onerror = (event) => this.change(`Pictures cannot be decoded here: ${event.message}`);
     return worker;

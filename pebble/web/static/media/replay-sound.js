@@ -1,5 +1,6 @@
 // The sound of a recording, at the speed at which it was recorded, together with its pictures.
 
+import * as browser from "../core/browser.js";
 import { makeSpeaker } from "./speaker.js";
 
 const BUFFERED_MS = 65; // in the jitter buffer, and at the loudspeaker: see playout.js
@@ -34,7 +35,7 @@ export class ReplaySound {
     this.problem = "";
     this.onChange();
     try {
-      const context = (this.context ??= new AudioContext({ latencyHint: "interactive" }));
+      const context = (this.context ??= new (browser.find("AudioContext"))({ latencyHint: "interactive" }));
       context.resume();
       const speaker = (this.speaker ??= await makeSpeaker(context));
       if (!this.on) return; // stopped meanwhile
@@ -111,7 +112,7 @@ export class ReplaySound {
   }
 
   open() {
-    const worker = new Worker(new URL("./replay-sound-worker.js", import.meta.url), { type: "module" });
+    const worker = browser.worker(new URL("./replay-sound-worker.js", import.meta.url));
     worker.onmessage = ({ data }) => {
       this.stats = data.stats;
       const { received, refused } = data.stats;

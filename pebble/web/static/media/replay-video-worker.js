@@ -2,10 +2,11 @@
 // Else it is the graphics processor's, and of pictures that come one at a time Chromium 150 takes 4 MB for every three,
 // up to half a gigabyte. Where pictures follow one another that memory is used again.
 
+import * as browser from "../core/browser.js";
 import "./video-worker.js";
 
 const OPTIONS = /** @type {any} */ ({ format: "RGBA" });
-const bitmapOf = self.createImageBitmap.bind(self);
+const bitmapOf = browser.find("createImageBitmap").bind(self);
 
 self.createImageBitmap = /** @type {any} */ (
   (/** @type {any} */ source, /** @type {any[]} */ ...rest) =>

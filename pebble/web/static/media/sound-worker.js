@@ -1,5 +1,6 @@
 // The sound of one component: its socket, what is played of it, and what a person says to it.
 
+import * as browser from "../core/browser.js";
 import { decodesOpus } from "./opus.js";
 import { Playout } from "./playout.js";
 import { Uplink } from "./uplink.js";
@@ -48,8 +49,8 @@ async function open(message) {
 }
 
 function connect() {
-  const scheme = location.protocol === "https:" ? "wss:" : "ws:";
-  const mine = new WebSocket(`${scheme}//${location.host}/ws/sound?${new URLSearchParams({ ref, can, name, device })}`);
+  const mine = browser.webSocket(`/ws/sound?${new URLSearchParams({ ref, can, name, device })}`);
+  if (!mine) return lost();
   mine.binaryType = "arraybuffer";
   received = 0;
   mine.onopen = () => self.postMessage({ connection: "open" });
@@ -58,14 +59,16 @@ function connect() {
     if (typeof data === "string") self.postMessage({ answer: JSON.parse(data) });
     else take(data);
   };
-  mine.onclose = () => {
-    uplink?.close();
-    uplink = null; // it cannot go on by another connection
-    self.postMessage({ connection: "lost" });
-    setTimeout(connect, wait * (0.75 + 0.5 * Math.random()));
-    wait = Math.min(LONGEST_WAIT_MS, 2 * wait);
-  };
+  mine.onclose = lost;
   socket = mine;
+}
+
+function lost() {
+  uplink?.close();
+  uplink = null; // it cannot go on by another connection
+  self.postMessage({ connection: "lost" });
+  setTimeout(connect, wait * (0.75 + 0.5 * Math.random()));
+  wait = Math.min(LONGEST_WAIT_MS, 2 * wait);
 }
 
 /** @param {ArrayBuffer} payload */

@@ -1,5 +1,6 @@
 // What the worker of sound pushes, to the loudspeaker: by an AudioWorklet, or without one, by what browsers had before.
 
+import * as browser from "../core/browser.js";
 import { Ring } from "./ring.js";
 
 const BLOCK = 1024;
@@ -14,7 +15,7 @@ export async function makeSpeaker(context) {
   if (!context.audioWorklet) return oldSpeaker(context);
   await context.audioWorklet.addModule(WORKLET);
   const options = { numberOfInputs: 0, outputChannelCount: [2] };
-  const node = new AudioWorkletNode(context, "pebble-playout", options);
+  const node = new (browser.find("AudioWorkletNode"))(context, "pebble-playout", options);
   return { node, attach: (port) => node.port.postMessage({ port }, [port]) };
 }
 

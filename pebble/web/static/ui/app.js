@@ -1,16 +1,17 @@
 // The frame of every screen: header, banners, the fleet or one component, and the settings.
 
+import * as browser from "../core/browser.js";
 import { Banners } from "./banner.js";
 import { Header } from "./header.js";
-import { Boundary, html, styled, useEffect, useMedia, useModel, usePage, useState } from "./hooks.js";
+import { Boundary, fetchRest, html, styled, useEffect, useMedia, useModel, usePage, useState } from "./hooks.js";
 import { Part } from "./parts.js";
 import { nameOf } from "./words.js";
 
 /** What is fetched when it is first shown, so that the first screen is there soon; main.js fetches the rest later. */
 export const PARTS = {
-  fleet: async () => (await import("./fleet.js")).Fleet,
+  fleet: styled(async () => (await import("./fleet.js")).Fleet, "fleet.css"),
   robot: async () => (await import("./robot.js")).Robot,
-  panels: styled(async () => (await import("./panels.js")).Panels, "panels.css", "notices.css"),
+  panels: styled(async () => (await fetchRest(), await import("./panels.js")).Panels, "panels.css", "notices.css"),
 };
 
 /** Not among them: few people look at recordings. */
@@ -19,9 +20,9 @@ const REPLAY = styled(async () => (await import("./replay/replay.js")).Replay, "
 /** @returns {"desktop" | "portrait" | "immersive"} how the page is laid out */
 export function useLayout() {
   const { route } = usePage();
-  const [full, setFull] = useState(Boolean(document.fullscreenElement));
+  const [full, setFull] = useState(browser.fullScreen.on);
   useEffect(() => {
-    const change = () => setFull(Boolean(document.fullscreenElement));
+    const change = () => setFull(browser.fullScreen.on);
     document.addEventListener("fullscreenchange", change);
     return () => document.removeEventListener("fullscreenchange", change);
   }, []);
@@ -45,7 +46,7 @@ export function App() {
   const toggle = () => panels.toggle("settings");
   return html`<div class=${`app ${layout} ${ref ? "at-robot" : "at-fleet"}`}>
     <a class="skip" href="#main">Skip to content</a>
-    <${Boundary} what="The header">
+    <${Boundary} vital what="The header">
       <${Header}
         at=${ref}
         layout=${layout}
@@ -55,13 +56,13 @@ export function App() {
         onDrawer=${() => setDrawer(!drawer)}
       />
     <//>
-    <${Boundary} what="The banner"><${Banners} at=${ref} layout=${layout} /><//>
+    <${Boundary} vital what="The banner"><${Banners} at=${ref} layout=${layout} /><//>
     ${shown &&
     html`<${Boundary} key=${shown} what="This panel"
       ><${Part} part=${PARTS.panels} now shown=${shown} onClose=${() => panels.show("")}
     /><//>`}
     <main id="main" tabindex="-1">
-      <${Boundary} key=${ref || `replay ${replay}`} what="This screen">
+      <${Boundary} key=${ref || `replay ${replay}`} vital what="This screen">
         ${ref
           ? html`<${Part}
               part=${PARTS.robot}

@@ -7,7 +7,8 @@ import { Form } from "./form.js";
 import { html, useMetric, useOnline, useState, useTick, useValue } from "./hooks.js";
 import { Icon, Why } from "./parts.js";
 import { useReasons, whyNotEnd } from "./why-not.js";
-import { clockTime, nameOf, plain } from "./words.js";
+import { plain } from "./more-words.js";
+import { clockTime, nameOf } from "./words.js";
 import { useMemo } from "../vendor/hooks.mjs";
 
 const ASKED_MS = 10_000; // so long the page says that it has asked

@@ -1,5 +1,6 @@
 // How the inputs are scaled, and the extra axis.
 
+import * as browser from "../core/browser.js";
 import { Slider, set } from "./drive.js";
 import { html, useEffect, useModel, usePage } from "./hooks.js";
 import { Icon } from "./parts.js";
@@ -17,7 +18,7 @@ export function DriveSettings() {
       <${AuxButton} driver=${driver} value=${1} label="Extra axis up">+<//>
       <${AuxButton} driver=${driver} value=${-1} label="Extra axis down">−<//>
     </div>
-    <p class="pad-name"><${Icon} name="pad" />${driver.padName || "no gamepad: press one of its buttons"}</p>
+    <p class="pad-name"><${Icon} name="pad" />${driver.pads?.pad?.id || "no gamepad: press one of its buttons"}</p>
   </div>`;
 }
 
@@ -32,7 +33,7 @@ function AuxButton({ driver, value, label, children }) {
     disabled=${Boolean(reason) && !driver.gestureActive}
     aria-describedby=${reason ? "why-drive" : undefined}
     onPointerDown=${(event) => {
-      event.currentTarget.setPointerCapture(event.pointerId);
+      browser.capture(event);
       driver.hold(`aux ${value}`, value, event.timeStamp);
     }}
     onPointerUp=${end}

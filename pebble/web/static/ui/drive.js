@@ -17,7 +17,7 @@ export function DriveCard({ at }) {
 
 const MORE = {
   keyHints: styled(async () => (await import("./key-hints.js")).KeyHints, "panels.css"),
-  settings: async () => (await import("./drive-settings.js")).DriveSettings,
+  settings: styled(async () => (await import("./drive-settings.js")).DriveSettings, "panels.css"),
 };
 
 function Hints() {
@@ -42,6 +42,7 @@ export function WhyLine({ at }) {
   return html`<div class=${`why-line ${reason ? "off" : "on"}`}>
     <p id="why-drive" data-test="why"><i aria-hidden="true">${reason ? "○" : "●"}</i><span>${text}</span></p>
     <span class="sr" role="status">${useCalm(text)}</span>
+    ${driver.pads?.reasons().slice(0, 2).map(({ code, text: said }) => html`<p key=${said} class="why" data-test=${code}>${said}.</p>`)}
     <div class="why-actions">
       <${ReasonAction} action=${reason?.action} />
       ${mine && html`<button type="button" data-test="release" onClick=${() => driver.release()}>Release</button>`}

@@ -7,30 +7,18 @@ import {
   useEffect,
   useMetric,
   useModel,
-  useNodes,
   usePage,
+  useRef,
   useRefs,
   useState,
   useTick,
   useValue,
 } from "./hooks.js";
 import { Offers, Route, WATCHES } from "./models.js";
+import { charging, plain, shortTime } from "./more-words.js";
 import { Icon, Live, StopButton } from "./parts.js";
 import { RecordingsLink } from "./recordings-link.js";
-import {
-  battery,
-  charging,
-  clockTime,
-  driverName,
-  inner,
-  isObject,
-  kindOf,
-  nameOf,
-  plain,
-  roughly,
-  shortTime,
-  typeOf,
-} from "./words.js";
+import { battery, clockTime, driverName, inner, isObject, kindOf, nameOf, roughly, typeOf } from "./words.js";
 
 const THUMBNAIL_MS = 1000;
 const SORTS = { name: "name", type: "type", battery: "battery" };
@@ -307,4 +295,18 @@ function AwayRow({ at }) {
       Forget
     </button>
   </li>`;
+}
+
+/**
+ * Draw each item again only when it changes by itself: Preact passes over a node that it has drawn before. ``draw`` may
+ * use nothing but its argument.
+ * @param {(ref: string) => any} draw @returns {(refs: string[]) => any[]}
+ */
+function useNodes(draw) {
+  const nodes = useRef(new Map());
+  return (refs) => {
+    const old = nodes.current;
+    nodes.current = new Map(refs.map((ref) => [ref, old.get(ref) ?? draw(ref)]));
+    return [...nodes.current.values()];
+  };
 }

@@ -1,7 +1,8 @@
 // The settings of a script: what a robot lists of them, what was typed, and what is sent. Robots may list anything.
 
 import { read, write } from "./models.js";
-import { inner, isObject, plain } from "./words.js";
+import { plain } from "./more-words.js";
+import { inner, isObject } from "./words.js";
 
 const MOST_SCRIPTS = 256; // of one robot; robots list no more
 const MOST_FIELDS = 64; // of one script; robots list no more

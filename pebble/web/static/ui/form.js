@@ -2,7 +2,7 @@
 
 import { html } from "./hooks.js";
 import { UNREADABLE, hint, option } from "./form-model.js";
-import { plain } from "./words.js";
+import { plain } from "./more-words.js";
 
 /**
  * @param {{id: string, fields: import("./form-model.js").Field[], texts: import("./form-model.js").Texts,

@@ -1,7 +1,9 @@
 // What the gamepad shows, and the wizard that learns what its axes and buttons do. It moves no robot: a panel is open.
 
+import * as browser from "../core/browser.js";
 import { PAD_ACTIONS, buttonName, buttonOf } from "../core/actions.js";
 import { Learning, STEPS } from "../core/pad-learning.js";
+import { PAD_ESTOP } from "../core/inputs.js";
 import { MOST } from "../core/pad-mapping.js";
 import { html, useEffect, useModel, usePage, useState, useTick } from "./hooks.js";
 import { pads } from "./pads.js";
@@ -15,14 +17,37 @@ export function GamepadPanel({ onClose }) {
   useTick(SAMPLE_MS);
   useEffect(() => tryButtons(driver, true));
   useEffect(() => () => tryButtons(driver, false), []);
-  const { pad } = driver;
+  const pad = driver.pads?.pad;
   return html`<${Panel} id="gamepad" onClose=${onClose} title="Gamepad">
+    ${driver.pads?.reasons().map(({ code, text }) => html`<p key=${text} class="panel-text why" data-test=${`panel-${code}`}>${text}.</p>`)}
+    ${driver.pads?.choice.here.length > 1 && html`<${Which} />`}
     ${pad
-      ? html`<${Wizard} key=${pad.id} pad=${pad} />`
+      ? html`<${Wizard} key=${driver.pads.choice.key} pad=${pad} />`
       : html`<p class="panel-text">
-          There is no gamepad: connect one, click this page, and press one of its buttons. Browsers show it only then.
+          ${browser.gamepads() === null
+            ? "This browser shows no gamepads to this page."
+            : "There is no gamepad: connect one, click this page, and press one of its buttons. Browsers show it only then."}
         </p>`}
   <//>`;
+}
+
+function Which() {
+  const { driver } = usePage();
+  return html`<div class="panel-text choices" role="group" aria-label="Gamepads">
+    ${driver.pads.choice.here.map(
+      ([key, { pad }]) => html`<button
+        key=${key}
+        type="button"
+        class=${key === driver.pads.choice.key ? "primary" : ""}
+        aria-pressed=${key === driver.pads.choice.key}
+        data-test=${`pad-${pad.index}`}
+        onClick=${() => driver.pads.pick(key)}
+      >
+        ${pad.index + 1}: ${pad.id}
+      </button>`,
+    )}
+    <p class="dim">The one that was touched last drives. One whose stick is never in the middle has to be chosen, and set up.</p>
+  </div>`;
 }
 
 /** While buttons are tried here, they do nothing else. */
@@ -44,7 +69,7 @@ function Wizard({ pad }) {
   });
   const own = pads.mappings.has(pad.id);
   return html`<div class="panel-text">
-    <p><b>${pad.id}</b> <span class="dim">${own ? "set up in this browser" : "with the usual layout"}</span></p>
+    <p><b>${pad.id}</b> <span class="dim">${layoutWords(pad, own)}</span></p>
     <${Live} pad=${pad} />
     ${learning
       ? html`<${Question} learning=${learning} onCancel=${() => learn(null)} />`
@@ -141,10 +166,15 @@ function Summary({ pad, own, onLearn }) {
       )}
       <div>
         <dt>STOP</dt>
-        <dd>buttons 9 and 10 together, always</dd>
+        <dd>${PAD_ESTOP.every((index) => index < pad.buttons.length) ? "buttons 9 and 10 together, always" : "none: it has too few buttons"}</dd>
       </div>
     </dl>`;
 }
+
+const layoutWords = ({ mapping, id }, own) => {
+  if (own) return "set up in this browser";
+  return mapping === "standard" || /attack 3/i.test(id) ? "with the usual layout" : "of an unknown layout, taken for the usual one: set it up";
+};
 
 const axisWords = ({ axis, invert }) => `axis ${axis + 1}${invert ? ", reversed" : ""}`;
 

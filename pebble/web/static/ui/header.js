@@ -1,5 +1,6 @@
 // The header of every screen: which robot, whether it is there, and STOP.
 
+import * as browser from "../core/browser.js";
 import { Boundary, html, styled, useMetric, useModel, useOnline, usePage, usePart, useRefs, useTick, useValue } from "./hooks.js";
 import { Route } from "./models.js";
 import { Icon, Live, StopButton } from "./parts.js";
@@ -28,12 +29,12 @@ export function Header({ at, layout, panel, onPanel, drawer, onDrawer }) {
       >
         <${Icon} name="menu" />
       </button>
-      ${document.fullscreenElement &&
+      ${browser.fullScreen.on &&
       html`<button
         type="button"
         class="round"
         aria-label="Leave full screen"
-        onClick=${() => document.exitFullscreen()}
+        onClick=${() => browser.fullScreen.toggle()}
       >
         <${Icon} name="small" />
       </button>`}`}
@@ -124,7 +125,8 @@ export function Liveness({ at }) {
 }
 
 function Vital({ at }) {
-  const { connection } = usePage();
+  const { connection, driver } = usePage();
+  const fails = useModel(driver).failed.size > 0;
   const level = useMetric(at, "charging-level");
   const charging = useValue(at, "charging-status");
   const view = useValue(at, "web/driver");
@@ -138,7 +140,7 @@ function Vital({ at }) {
     >`}
     ${connection.isOpen &&
     view?.by &&
-    html`<span class=${`chip ${view.you ? "mine" : ""}`}><${Icon} name="wheel" />${whoDrives(view)}</span>`}
+    html`<span class=${`chip ${view.you ? "mine" : ""}`}><${Icon} name="wheel" />${fails && view.you ? "Not driving" : whoDrives(view)}</span>`}
   </div>`;
 }
 

@@ -34,8 +34,8 @@ function Bindings() {
   useModel(driver);
   useModel(pads);
   const name = useKeyNames();
-  const mapping = pads.mappingOf(driver.padName);
-  const standard = driver.pad?.mapping === "standard";
+  const mapping = pads.mappingOf(driver.pads?.pad?.id ?? "");
+  const standard = driver.pads?.pad?.mapping === "standard";
   return html`<section class="panel-text" aria-label="Keys, gamepad and touch">
     <ul class="bindings">
       ${ACTIONS.map(
@@ -51,7 +51,7 @@ function Bindings() {
     </ul>
     <p class="dim">
       Keys count where they lie: other keyboards have other letters there. They do nothing while you type in a field.
-      Buttons are those of ${driver.padName || "a usual gamepad"}.
+      Buttons are those of ${driver.pads?.pad?.id || "a usual gamepad"}.
     </p>
   </section>`;
 }

@@ -1,5 +1,6 @@
 // What every widget is made of: templates, the page's services, and values that follow the store.
 
+import * as browser from "../core/browser.js";
 import { Component, createContext, h } from "../vendor/preact.mjs";
 import { useContext, useEffect, useReducer, useRef, useState } from "../vendor/hooks.mjs";
 import htm from "../vendor/htm.mjs";
@@ -106,29 +107,15 @@ export function useLater(ms) {
   });
 }
 
-/**
- * Draw each item again only when it changes by itself: Preact passes over a node that it has drawn before. ``draw`` may
- * use nothing but its argument.
- * @param {(ref: string) => any} draw @returns {(refs: string[]) => any[]}
- */
-export function useNodes(draw) {
-  const nodes = useRef(new Map());
-  return (refs) => {
-    const old = nodes.current;
-    nodes.current = new Map(refs.map((ref) => [ref, old.get(ref) ?? draw(ref)]));
-    return [...nodes.current.values()];
-  };
-}
-
 /** @param {string} query @returns {boolean} whether the media query matches */
 export function useMedia(query) {
   const redraw = useRedraw();
   useEffect(() => {
-    const list = matchMedia(query);
+    const list = browser.media(query);
     list.addEventListener("change", redraw);
     return () => list.removeEventListener("change", redraw);
   }, [query]);
-  return matchMedia(query).matches;
+  return browser.media(query).matches;
 }
 
 const RETRY_MS = 1000;
@@ -139,13 +126,13 @@ const fetched = new Map(); // parts of the page that are here, by what fetches t
 export const isHere = (part) => fetched.has(part);
 
 let begin;
-const picture = new Promise((resolve) => (begin = resolve));
+let rest = new Promise((resolve) => (begin = resolve));
 
 /** What is not needed to see and to drive waits for this, so that it takes nothing from the first picture. */
-export const fetchRest = () => begin();
+export const fetchRest = () => (begin(), rest);
 
-/** @param {() => void} fn called once all the rest is fetched */
-export const withRest = (fn) => picture.then(fn);
+/** @param {() => Promise<any>} first fetches what all the rest needs */
+export const withRest = (first) => (rest = rest.then(first));
 
 /** @param {() => Promise<any>} part fetched now, so that it is here when it is shown */
 export async function fetchPart(part) {
@@ -166,7 +153,7 @@ export function usePart(part, now = false) {
     let over = Boolean(body);
     async function attempt() {
       try {
-        if (!now) await picture;
+        if (!now) await rest;
         await fetchPart(part);
       } catch (error) {
         console.error(error);
@@ -200,18 +187,30 @@ export function useCalm(text) {
   return shown;
 }
 
-/** A part of the page that may fail without the rest. */
+/** A part of the page that may fail without the rest. While one fails that is vital, nothing is driven. */
 export class Boundary extends Component {
+  static contextType = Page;
+
   componentDidCatch(error) {
     console.error(error);
-    this.setState({ error });
+    this.fails(error);
   }
 
-  render({ children, what }, { error }) {
+  componentWillUnmount() {
+    this.fails(null);
+  }
+
+  fails(error) {
+    this.setState({ error });
+    if (this.props.vital) this.context.driver.fail(this.props.what, error !== null);
+  }
+
+  render({ children, what, vital }, { error }) {
     if (!error) return children;
     return html`<p class="failed" role="alert">
       ${what} failed: ${String(error.message ?? error)}
-      <button type="button" onClick=${() => this.setState({ error: null })}>Try again</button>
+      <button type="button" onClick=${() => this.fails(null)}>Try again</button>
+      ${vital && html`<button type="button" class="stop" onPointerDown=${() => this.context.commands.stop("")}>STOP ALL</button>`}
     </p>`;
   }
 }

@@ -1,5 +1,6 @@
 // What is printed on the keys of this keyboard, where browsers tell.
 
+import * as more from "../core/browser-more.js";
 import { keyName } from "../core/actions.js";
 import { useEffect, useState } from "./hooks.js";
 
@@ -7,8 +8,7 @@ import { useEffect, useState } from "./hooks.js";
 export function useKeyNames() {
   const [layout, setLayout] = useState(null);
   useEffect(() => {
-    const { keyboard } = /** @type {any} */ (navigator);
-    keyboard?.getLayoutMap?.().then(setLayout, () => {}); // not in a frame of another site
+    more.keyboardLayout().then(setLayout, () => {});
   }, []);
   return (code) => keyName(code, layout ?? undefined);
 }

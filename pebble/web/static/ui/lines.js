@@ -1,6 +1,7 @@
 // Any JSON value as lines of text, nested ones below and farther in. Pure.
 
-import { isObject, plain } from "./words.js";
+import { plain } from "./more-words.js";
+import { isObject } from "./words.js";
 
 export const MAX_LINES = 100;
 export const MAX_DEPTH = 4; // deeper ones are put into one line

@@ -1,5 +1,6 @@
 // The log lines of a robot's services as they come, filtered.
 
+import * as more from "../core/browser-more.js";
 import { LEVELS } from "../core/logs.js";
 import { html, useEffect, useModel, usePage, useRef, useState, useValue } from "./hooks.js";
 import { logViewOf } from "./log-view.js";
@@ -80,11 +81,11 @@ function CopyButton({ lines }) {
     return () => clearTimeout(timer);
   }, [done]);
   const copy = () =>
-    navigator.clipboard.writeText(lines.map(textOf).join("\n")).then(
+    more.clipboard.copy(lines.map(textOf).join("\n")).then(
       () => show(`${lines.length} lines copied`),
       () => show("The browser refused it"),
     );
-  const can = Boolean(navigator.clipboard);
+  const can = more.clipboard.possible;
   return html`<button
       type="button"
       data-test="log-copy"

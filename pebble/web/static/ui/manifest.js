@@ -1,6 +1,7 @@
 // What a self-describing microcontroller says of itself, read with suspicion, and values for its commands. Pure.
 
-import { inner, isObject, plain } from "./words.js";
+import { plain } from "./more-words.js";
+import { inner, isObject } from "./words.js";
 
 export const MAX_INTERFACES = 64;
 export const MAX_FIELDS = 32; // of one interface

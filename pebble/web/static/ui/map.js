@@ -1,5 +1,7 @@
 // Where a component was and is, by its odometry: a trail over a grid.
 
+import * as browser from "../core/browser.js";
+import * as more from "../core/browser-more.js";
 import { differs, pieces, poseOf, poseWords } from "../core/trail.js";
 import { html, useEffect, useMetrics, useOnline, usePage, useRef, useState, useTick } from "./hooks.js";
 import { Gone, isGone } from "./parts.js";
@@ -71,9 +73,9 @@ class View {
     this.gone = false; // whether the newest pose is an old one
     this.seen = true;
     this.timer = setInterval(() => this.seen && !document.hidden && this.draw(), STEP_MS);
-    this.sizes = new ResizeObserver(() => this.draw());
+    this.sizes = more.sizes(() => this.draw());
     this.sizes.observe(canvas);
-    this.sight = new IntersectionObserver((entries) => (this.seen = entries[entries.length - 1].isIntersecting));
+    this.sight = more.sight((seen) => (this.seen = seen));
     this.sight.observe(canvas);
     this.listen();
   }
@@ -125,7 +127,7 @@ class View {
     let mouse = { x: 0, y: 0 };
     on("pointerdown", (event) => {
       mouse = { x: event.clientX, y: event.clientY };
-      if (event.pointerType === "mouse") this.canvas.setPointerCapture(event.pointerId);
+      if (event.pointerType === "mouse") browser.capture(event);
     });
     on("pointermove", (event) => {
       if (event.pointerType !== "mouse" || !(event.buttons & 1)) return;

@@ -6,7 +6,8 @@ import { command, fieldOf, range, readManifest, step, text, unsendable } from ".
 import { Icon, Why, isGone } from "./parts.js";
 import { Spark, remember } from "./spark.js";
 import { useReasons, whyNotMoved } from "./why-not.js";
-import { clockTime, plain, roughly } from "./words.js";
+import { plain } from "./more-words.js";
+import { clockTime, roughly } from "./words.js";
 
 const MOST = 16;
 

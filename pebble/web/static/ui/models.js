@@ -1,5 +1,7 @@
 // What the page knows besides the store: its connection, its address, its settings, and the picture.
 
+import * as browser from "../core/browser.js";
+import { callAll } from "../core/store.js";
 import { inner, isObject } from "./words.js";
 
 /** Whether this screen only watches: nothing but stops is sent. It is in the address, so it outlives everything. */
@@ -19,7 +21,7 @@ export class Model {
   }
 
   changed() {
-    for (const fn of [...this.followers]) fn();
+    callAll(this.followers);
   }
 }
 
@@ -233,7 +235,7 @@ export class CardView extends Model {
 /** What this browser remembers. @param {string} name @param {any} otherwise @returns {any} */
 export function read(name, otherwise) {
   try {
-    return JSON.parse(localStorage.getItem(`pebble ${name}`) ?? "null") ?? otherwise;
+    return JSON.parse(browser.local.get(`pebble ${name}`) ?? "null") ?? otherwise;
   } catch {
     return otherwise;
   }
@@ -241,11 +243,7 @@ export function read(name, otherwise) {
 
 /** @param {string} name @param {any} value */
 export function write(name, value) {
-  try {
-    localStorage.setItem(`pebble ${name}`, JSON.stringify(value));
-  } catch {
-    // there is no room, or this window remembers nothing
-  }
+  browser.local.set(`pebble ${name}`, JSON.stringify(value));
 }
 
 const list = (value) => (Array.isArray(value) ? value.filter((one) => typeof one === "string") : []);

@@ -1,14 +1,21 @@
 // What is not needed at once: actions of keys and gamepad besides driving, the screen that stays on, and wall screens.
 
+import * as more from "../core/browser-more.js";
 import { Actions } from "../core/actions.js";
 import { Awake } from "../core/awake.js";
+import { PadInput } from "../core/pad-input.js";
+import { install as installCommands } from "./commands.js";
+import { lacks } from "./lacks.js";
 import { WATCHES } from "./models.js";
 import { pads } from "./pads.js";
+
+export { keepWhole } from "./mend.js";
 
 const WATCHING = ["help", "mute"]; // what can be asked of a screen that only watches
 const STEP = 0.1; // of the speed, for each press
 const SLOWEST = 0.05; // as the slider's
 const CHECK_MS = 1000;
+const IDLE_MS = 55_000; // the server ends what is not used for a minute
 const RELOAD_MS = 5000; // where nobody is there to press a button
 
 /** To be called once. @param {any} page */
@@ -20,9 +27,19 @@ export function install(page) {
     (id, phase) => driver.onAction(id, phase),
     () => driver.ref !== "" && document.querySelector("dialog[open]") === null,
   );
+  installCommands(page);
+  driver.onControlLost = (by, idleMs) => page.connection.show(controlEnd(by, idleMs));
   page.pads = pads;
-  driver.mappingOf = (id) => pads.mappingOf(id);
+  driver.pads = new PadInput(driver, (id) => pads.mappingOf(id));
   new Wall(page).start();
+  const missing = lacks().join(" ");
+  if (missing) page.connection.show(missing);
+}
+
+/** @param {string} by who has it now @param {number} idleMs since this page drove */
+function controlEnd(by, idleMs) {
+  const why = idleMs > IDLE_MS ? "after a minute without driving" : "with the connection";
+  return by ? `${by} took over` : `Your control has ended ${why}: take it again`;
 }
 
 /** Does what an action means. What other modules do is fetched with the first press. */
@@ -72,7 +89,7 @@ class Doer {
 class Wall {
   constructor(page) {
     this.page = page;
-    this.awake = new Awake(navigator.wakeLock);
+    this.awake = new Awake(more.wakeLock());
     this.uselessSince = Infinity;
   }
 

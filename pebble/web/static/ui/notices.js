@@ -7,7 +7,8 @@ import { Model, read, write } from "./models.js";
 import { Panel } from "./panel.js";
 import { Icon } from "./parts.js";
 import { RecordingsLink } from "./recordings-link.js";
-import { battery, inner, isObject, nameOf, shortTime } from "./words.js";
+import { shortTime } from "./more-words.js";
+import { battery, inner, isObject, nameOf } from "./words.js";
 
 const LIMITS = "battery limits"; // by component, in the unit that it reports
 const METRICS = ["web/liveness", "web/estop", "autonomy-status", "status", "charging-level", "charging-status"];

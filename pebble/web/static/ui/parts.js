@@ -1,5 +1,6 @@
 // Small parts of many widgets.
 
+import * as browser from "../core/browser.js";
 import { html, useEffect, useLater, usePart, useRef, useState, useTick } from "./hooks.js";
 import { roughly } from "./words.js";
 
@@ -68,7 +69,7 @@ export function HoldButton({ onHeld, disabled = false, children, className = "",
     aria-describedby=${describedBy}
     onPointerDown=${(event) => {
       if (event.button) return;
-      event.currentTarget.setPointerCapture(event.pointerId);
+      browser.capture(event);
       setTapped(false);
       hold(true);
     }}

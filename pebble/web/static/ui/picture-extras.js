@@ -1,5 +1,6 @@
 // What belongs to a picture besides it: what robots draw over it, snapshots, and the robot's own stream.
 
+import * as more from "../core/browser-more.js";
 import { MIXED, refusal } from "../core/stream.js";
 import { html, useEffect, useMetrics, useModel, usePage, useRef, useState, useValue } from "./hooks.js";
 import { Model, read, write } from "./models.js";
@@ -70,7 +71,7 @@ function Overlays({ source }) {
       if (entry) newest.receive(entry.value, entry.receivedAt);
       draw();
     };
-    const sizes = new ResizeObserver(draw);
+    const sizes = more.sizes(draw);
     sizes.observe(video.canvas);
     const unsubscribe = store.subscribe(source, OVERLAYS, take);
     return () => {

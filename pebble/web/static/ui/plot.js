@@ -1,5 +1,7 @@
 // Draws the lines of one plot with uPlot, a few times a second and only while they are seen.
 
+import * as browser from "../core/browser.js";
+import * as more from "../core/browser-more.js";
 import made from "../vendor/uPlot.mjs";
 import { spread } from "../core/plot-choices.js";
 import { html, useEffect, usePage, useRef } from "./hooks.js";
@@ -42,7 +44,7 @@ export function Lines({ series, fields, shownMs, least, paused }) {
     const element = /** @type {HTMLElement | null} */ (place.current);
     if (!element) return undefined; // it was closed before it was shown
     const view = new View(element, fields, least);
-    const calm = matchMedia("(prefers-reduced-motion: reduce)");
+    const calm = browser.media("(prefers-reduced-motion: reduce)");
     let seen = true;
     let drawnAt = -Infinity;
     const draw = () => {
@@ -53,8 +55,8 @@ export function Lines({ series, fields, shownMs, least, paused }) {
       drawnAt = now;
       view.draw(series.columns(fields, now - shownMs, now), now - shownMs, now, store.offset);
     };
-    const sizes = new ResizeObserver(() => view.resize(element.clientWidth));
-    const sight = new IntersectionObserver((entries) => (seen = entries[entries.length - 1].isIntersecting));
+    const sizes = more.sizes(() => view.resize(element.clientWidth));
+    const sight = more.sight((is) => (seen = is));
     sizes.observe(element);
     sight.observe(element);
     join(draw);

@@ -7,7 +7,8 @@ import { read, write } from "./models.js";
 import { Gone, Icon, Why, isGone } from "./parts.js";
 import { Lines } from "./plot.js";
 import { recorderOf } from "./recorder.js";
-import { isObject, number, plain } from "./words.js";
+import { plain } from "./more-words.js";
+import { isObject, number } from "./words.js";
 
 const WORDS_MS = 500; // between two changes of the numbers
 const MOST_METRICS = 60; // in the list

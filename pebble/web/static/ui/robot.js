@@ -1,5 +1,6 @@
 // One component: its picture, how to drive it, and its cards; on a desktop, a phone, and a phone that lies.
 
+import * as browser from "../core/browser.js";
 import { CARDS, TABS, VOICE } from "./cards.js";
 import { DriveCard, DrivePad, DriveSettings, Speed, WhyLine } from "./drive.js";
 import { Boundary, fetchRest, html, useEffect, useMetric, useMetrics, useModel, usePage, useState, useValue } from "./hooks.js";
@@ -62,7 +63,7 @@ function Desktop({ at, offers, view, video, source }) {
         ${cards.filter(({ wide }) => wide).map(shown)}
         <${Missing} at=${at} offers=${offers} view=${view} hasVideo=${Boolean(video)} />
       </div>
-      ${offers.drives && html`<${Boundary} what="Driving"><${DriveCard} at=${at} offers=${offers} /><//>`}
+      ${offers.drives && html`<${Boundary} vital what="Driving"><${DriveCard} at=${at} offers=${offers} /><//>`}
       ${side && html`<${CardOf} card=${side} at=${at} offers=${offers} view=${view} />`}
     </div>
   </div>`;
@@ -91,7 +92,7 @@ function Portrait({ at, offers, view, video, source, onPanel }) {
       html`<${Boundary} what="The picture"><${Stage} at=${at} video=${video} source=${source} offers=${offers} /><//>`}
       ${!video && offers.drives && html`<${NoCamera} at=${at} offers=${offers} />`}
       ${offers.drives &&
-      html`<${Boundary} what="Driving">
+      html`<${Boundary} vital what="Driving">
         <section class="phone-pad" aria-label="Drive">
           <${WhyLine} at=${at} />
           <${DrivePad} />
@@ -143,7 +144,7 @@ function Immersive({ at, offers, view, video, source, drawer, onPanel }) {
         /><//>`
       : html`<div class="stage"><p class="cover">no camera</p></div>`}
     ${offers.drives &&
-    html`<${Boundary} what="Driving">
+    html`<${Boundary} vital what="Driving">
       <div class="float-pad"><${DrivePad} /></div>
       <div class="float-why"><${WhyLine} at=${at} /></div>
     <//>`}
@@ -164,8 +165,8 @@ function Immersive({ at, offers, view, video, source, drawer, onPanel }) {
 const MoreSettings = ({ onPanel }) => html`<button type="button" class="wide" data-test="settings" onClick=${onPanel}>
     <${Icon} name="settings" /><${SettingsWords} />
   </button>
-  ${document.fullscreenElement &&
-  html`<button type="button" class="wide" onClick=${() => document.exitFullscreen()}>
+  ${browser.fullScreen.on &&
+  html`<button type="button" class="wide" onClick=${() => browser.fullScreen.toggle()}>
     <${Icon} name="small" />Leave full screen
   </button>`}`;
 

@@ -2,7 +2,8 @@
 
 import { html, useOnline, usePage, useTick, useValue } from "./hooks.js";
 import { logViewOf } from "./log-view.js";
-import { inner, isObject, plain, roughly } from "./words.js";
+import { plain } from "./more-words.js";
+import { inner, isObject, roughly } from "./words.js";
 
 const MOST = 64;
 const RECENT_MS = 600_000;

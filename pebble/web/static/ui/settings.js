@@ -1,6 +1,7 @@
 // Who I am, and how the page looks and is used in this browser.
 
 import { html, useModel, usePage } from "./hooks.js";
+import { lacks } from "./lacks.js";
 import { NoticeList } from "./notices.js";
 import { Panel } from "./panel.js";
 import { Icon } from "./parts.js";
@@ -23,6 +24,7 @@ export function SettingsPanel({ onClose }) {
   const narrow = !document.querySelector(".bell"); // else the list is behind a button of its own
   return html`<${Panel} id="settings" title="Settings" onClose=${onClose}>
     <${WhoAmI} />
+    ${lacks().map((one) => html`<p key=${one} class="panel-text why" data-test="lacks">${one}</p>`)}
     ${narrow &&
     html`<section class="panel-part" aria-labelledby="notices-heading">
       <h3 id="notices-heading">Notices</h3>

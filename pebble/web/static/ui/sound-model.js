@@ -1,7 +1,9 @@
 // Listening to the component that is open, and talking to it: what is under way, and why not more.
 
+import * as browser from "../core/browser.js";
+import * as more from "../core/browser-more.js";
 import { device } from "../core/control-socket.js";
-import { Microphone, hasMicrophone } from "../media/microphone.js";
+import { Microphone } from "../media/microphone.js";
 import { makeSpeaker } from "../media/speaker.js";
 import { Model, Offers } from "./models.js";
 import { nameOf } from "./words.js";
@@ -185,7 +187,7 @@ export class Sound extends Model {
   /** @returns {AudioContext} running as soon as the browser lets it */
   start() {
     if (!this.context) {
-      this.context = new AudioContext({ latencyHint: "interactive" });
+      this.context = new (browser.find("AudioContext"))({ latencyHint: "interactive" });
       this.gain = this.context.createGain();
       this.gain.connect(this.context.destination);
     }
@@ -203,7 +205,7 @@ export class Sound extends Model {
     this.disconnect();
     this.ref = ref;
     this.name = this.connection.you?.user ?? "";
-    const worker = new Worker(WORKER, { type: "module" });
+    const worker = browser.worker(WORKER);
     worker.onmessage = ({ data }) => worker === this.worker && this.take(data);
     const message = { op: "open", ref, name: this.name, device: device(), port, rate: this.context?.sampleRate };
     worker.postMessage(message, port ? [port] : []);
@@ -237,7 +239,7 @@ export class Sound extends Model {
     if (!this.connection.isOpen) return "No connection to the server";
     if (this.store.get("", "web/broker")?.value.connected === false) return "The server cannot reach the broker";
     if (!this.offers.has("audio")) return `${nameOf(this.route.ref)} has no sound`;
-    return "AudioContext" in window ? "" : "This browser plays no sound";
+    return browser.find("AudioContext") ? "" : "This browser plays no sound";
   }
 
   /** @returns {string} why this page cannot talk now; "" it can */
@@ -245,7 +247,7 @@ export class Sound extends Model {
     const why = this.listenReason();
     if (why) return why;
     if (!this.connection.may("drive")) return "Log in as driver to talk";
-    if (!hasMicrophone()) return "Needs https";
+    if (!more.microphone.possible) return "Needs https";
     const { ref } = this.route;
     if (this.store.get(ref, "web/liveness")?.value.online === false) return `${nameOf(ref)} is silent`;
     const view = this.store.get(ref, "web/sound")?.value;

@@ -1,5 +1,6 @@
 // Listen to a component, and talk to it: in the bar below its picture, or in a card.
 
+import * as browser from "../core/browser.js";
 import { html, useCalm, useEffect, useModel, usePage, useValue } from "./hooks.js";
 import { Icon, Why } from "./parts.js";
 import { Sound } from "./sound-model.js";
@@ -69,7 +70,7 @@ function TalkButton({ sound, noListening }) {
     aria-describedby=${why ? (why === noListening ? "why-listen" : "why-talk") : undefined}
     onPointerDown=${(event) => {
       if (event.button) return;
-      event.currentTarget.setPointerCapture(event.pointerId);
+      browser.capture(event);
       sound.talk(true);
     }}
     onPointerUp=${end}

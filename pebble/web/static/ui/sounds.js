@@ -4,7 +4,8 @@ import { html, useModel, useOnline, useValue } from "./hooks.js";
 import { Icon, Why } from "./parts.js";
 import { clips, grouped, play, playing, repeatLast, soundsOf } from "./sounds-model.js";
 import { useReasons, whyNot, whyNotEnd } from "./why-not.js";
-import { nameOf, plain } from "./words.js";
+import { plain } from "./more-words.js";
+import { nameOf } from "./words.js";
 import { useMemo } from "../vendor/hooks.mjs";
 
 const MOST = 60; // clips that are listed at a time

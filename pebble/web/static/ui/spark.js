@@ -2,7 +2,7 @@
 
 import { html, useEffect, useMedia, useRef, useTick } from "./hooks.js";
 import { fieldOf } from "./manifest.js";
-import { plain } from "./words.js";
+import { plain } from "./more-words.js";
 
 const SPAN_MS = 60_000;
 const APART_MS = 240; // at most so many points are kept as the span has of these

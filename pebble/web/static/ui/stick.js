@@ -1,5 +1,6 @@
 // The round stick: one finger, captured; whatever takes the finger away lets the stick go.
 
+import * as browser from "../core/browser.js";
 import { html, useEffect, useRef, useState } from "./hooks.js";
 
 const REACH = 0.36; // of the width: how far the knob travels
@@ -26,14 +27,15 @@ export function Stick({ driver }) {
     event.preventDefault();
     element.current.focus({ preventScroll: true });
     if (dragged) return driver.interrupt(); // a second finger
+    if (event.pointerId === pointer) driver.stickEnd(); // its release was not reported
     if (driver.reason()) return pointAt("why-drive");
     if (event.button || !driver.stickStart(event.pointerId, event.timeStamp)) return undefined;
-    element.current.setPointerCapture(event.pointerId);
+    browser.capture(event);
     place.current = element.current.getBoundingClientRect();
     setPointer(event.pointerId);
     return move(event);
   };
-  const mine = (event) => dragged && event.pointerId === pointer;
+  const mine = (event) => event.pointerId === pointer;
   const release = (event) => {
     if (!mine(event)) return;
     setPointer(null);
@@ -43,6 +45,7 @@ export function Stick({ driver }) {
     if (!mine(event)) return;
     setPointer(null);
     driver.interrupt();
+    driver.stickEnd();
   };
   const { x, z } = dragged ? knob : shown(driver);
   return html`<div
@@ -68,7 +71,7 @@ export function Stick({ driver }) {
 
 /** Move an element a little, to show where the answer is. @param {string} id */
 function pointAt(id) {
-  if (matchMedia("(prefers-reduced-motion: reduce)").matches) return;
+  if (browser.media("(prefers-reduced-motion: reduce)").matches) return;
   const there = [0, 6, -6, 0].map((x) => ({ transform: `translateX(${x}px)` }));
   document.getElementById(id)?.animate(there, 300);
 }

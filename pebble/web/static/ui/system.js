@@ -8,7 +8,8 @@ import { Model } from "./models.js";
 import { Panel } from "./panel.js";
 import { HoldButton, Icon, Why } from "./parts.js";
 import { useReasons, whyNot, whyNotEnd } from "./why-not.js";
-import { clockTime, driverName, nameOf, plain } from "./words.js";
+import { plain } from "./more-words.js";
+import { clockTime, driverName, nameOf } from "./words.js";
 
 /** @typedef {import("../core/outcome.js").Action} Action */
 

@@ -3,7 +3,8 @@
 import { html, styled, useMetric, useOnline, useTick, useValue } from "./hooks.js";
 import { Live, Part } from "./parts.js";
 import { poseOf, poseWords } from "../core/trail.js";
-import { battery, charging, inner, isObject, number, plain, roughly, span } from "./words.js";
+import { charging, plain } from "./more-words.js";
+import { battery, inner, isObject, number, roughly, span } from "./words.js";
 
 const STREAM_MS = 1000;
 const SERVICES = styled(async () => (await import("./services.js")).Services, "system.css");

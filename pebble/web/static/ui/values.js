@@ -3,7 +3,8 @@
 import { html, useMetric, useMetrics, useOnline, useState, useTick } from "./hooks.js";
 import { Lines } from "./lines.js";
 import { isGone } from "./parts.js";
-import { plain, roughly } from "./words.js";
+import { plain } from "./more-words.js";
+import { roughly } from "./words.js";
 
 const MOST = 120;
 const SHORT = 6; // lines that are always shown

@@ -1,5 +1,6 @@
 // The live picture: how old it is, how it comes, and where from.
 
+import * as browser from "../core/browser.js";
 import { VOICE } from "./cards.js";
 import {
   Boundary,
@@ -85,10 +86,10 @@ export function Stage({ at, video: control, source, offers, wide = false, immers
       <button
         type="button"
         data-test="full-screen"
-        hidden=${!document.documentElement.requestFullscreen}
-        onClick=${toggleFull}
+        hidden=${!browser.fullScreen.possible}
+        onClick=${() => browser.fullScreen.toggle()}
       >
-        <${Icon} name=${document.fullscreenElement ? "small" : "full"} />${document.fullscreenElement
+        <${Icon} name=${browser.fullScreen.on ? "small" : "full"} />${browser.fullScreen.on
           ? "Leave full screen"
           : "Full screen"}
       </button>
@@ -99,8 +100,6 @@ export function Stage({ at, video: control, source, offers, wide = false, immers
   </section>`;
 }
 
-const toggleFull = () =>
-  (document.fullscreenElement ? document.exitFullscreen() : document.documentElement.requestFullscreen()).catch(() => {});
 
 /** Why there is no live picture; "" there is. */
 function useCover(control, source) {

@@ -5,7 +5,6 @@ import { isObject } from "../core/json.js";
 export { isObject };
 
 const time = new Intl.DateTimeFormat("en-GB", { hour: "2-digit", minute: "2-digit", second: "2-digit" });
-const short = new Intl.DateTimeFormat("en-GB", { hour: "2-digit", minute: "2-digit" });
 
 /** @param {string} ref @returns {string} the last level: what people call it */
 export const nameOf = (ref) => ref.slice(ref.lastIndexOf("/") + 1);
@@ -18,9 +17,6 @@ export const kindOf = (ref) => (typeOf(ref) === "people" ? "person" : typeOf(ref
 
 /** @param {number} ms epoch @returns {string} 12:03:41 */
 export const clockTime = (ms) => time.format(ms);
-
-/** @param {number} ms epoch @returns {string} 12:03 */
-export const shortTime = (ms) => short.format(ms);
 
 /** @param {number} ms @returns {string} 68 ms, 5.2 s, 18 min, 3 h, 2 days */
 export function span(ms) {
@@ -58,29 +54,8 @@ export function battery(payload) {
   return `${number(value, 1)}${unit ? ` ${unit}` : ""}`;
 }
 
-/** @param {unknown} payload of charging-status @returns {string} */
-export function charging(payload) {
-  const value = inner(payload);
-  return value === true ? "charging" : value === false ? "not charging" : "charging: unknown";
-}
-
 /** @param {any} view DriverView @returns {string} "bob (phone)", "bob at fair-1" */
 export function driverName(view) {
   const device = view.device ? ` (${view.device})` : "";
   return `${view.by}${device}${view.server ? ` at ${view.server}` : ""}`;
 }
-
-const MAX_TEXT = 400;
-
-/** One line for any JSON value. @param {unknown} value @returns {string} */
-export function plain(value) {
-  if (typeof value === "number") return String(Math.abs(value) < 1e5 ? Number(value.toPrecision(5)) : Math.round(value));
-  if (value === null || value === undefined) return "–";
-  if (typeof value !== "object") return cut(String(value));
-  if (Array.isArray(value)) return cut(`[${value.slice(0, 40).map(plain).join(", ")}]`);
-  return cut(Object.entries(value).slice(0, 40).map(([key, one]) => `${key} ${nested(one)}`).join(" · "));
-}
-
-const nested = (value) => (isObject(value) ? `{${plain(value)}}` : plain(value));
-
-const cut = (text) => (text.length > MAX_TEXT ? `${text.slice(0, MAX_TEXT)}…` : text);

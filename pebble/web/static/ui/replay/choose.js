@@ -6,7 +6,8 @@ import { RouteLink } from "../header.js";
 import { Icon, Why } from "../parts.js";
 import { recordingsOf } from "../recordings-link.js";
 import { iconOf } from "../fleet.js";
-import { clockTime, nameOf, shortTime } from "../words.js";
+import { shortTime } from "../more-words.js";
+import { clockTime, nameOf } from "../words.js";
 
 const date = new Intl.DateTimeFormat("en-GB", { weekday: "short", day: "numeric", month: "short", year: "numeric" });
 const short = new Intl.DateTimeFormat("en-GB", { day: "numeric", month: "short" });

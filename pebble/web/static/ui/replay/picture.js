@@ -1,5 +1,6 @@
 // The recorded picture, and what plays it.
 
+import * as browser from "../../core/browser.js";
 import { SPEEDS } from "../../core/replay/player.js";
 import { whyOf } from "../../core/replay/timeline.js";
 import { html, useEffect, useModel, useRef, useTick } from "../hooks.js";
@@ -101,7 +102,7 @@ function Bar({ at, replay, player }) {
 function Listen({ sound, player }) {
   const silent = player.seeks && !sound.packets ? "No sound was recorded here" : "";
   const why = player.speed !== 1 ? "Sound is played at speed ×1 only" : sound.problem || (sound.on ? silent : "");
-  const off = !sound.on && !("AudioContext" in window) ? "This browser plays no sound" : "";
+  const off = !sound.on && !browser.find("AudioContext") ? "This browser plays no sound" : "";
   return html`<span class="replay-sound"
     ><button
       type="button"

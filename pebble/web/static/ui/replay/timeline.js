@@ -1,9 +1,11 @@
 // The day on a canvas: what was going on, what is missing, and where the replay is.
 
+import * as browser from "../../core/browser.js";
 import { Archive } from "../../core/replay/archive.js";
 import { ROWS, columns, holding, mostKbits } from "../../core/replay/timeline.js";
 import { html, useEffect, useModel, useRef, useState, useTick } from "../hooks.js";
-import { clockTime, shortTime } from "../words.js";
+import { shortTime } from "../more-words.js";
+import { clockTime } from "../words.js";
 import { dayWords } from "./choose.js";
 import { long } from "./picture.js";
 
@@ -196,7 +198,7 @@ class Drawing {
     });
     on("pointerdown", (event) => {
       if (event.button) return;
-      this.canvas.setPointerCapture(event.pointerId);
+      browser.capture(event);
       if (!this.pointers.size) this.moved = 0;
       this.pointers.set(event.pointerId, { x: this.x(event), y: event.clientY });
     });

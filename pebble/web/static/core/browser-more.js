@@ -1,0 +1,34 @@
+/** What is not needed at once of what browsers may lack, deny or take away; see browser.js. */
+
+import { attempt } from "./browser.js";
+
+/** @returns {WakeLock | undefined} */
+export const wakeLock = () => attempt(() => navigator.wakeLock, undefined);
+
+export const clipboard = {
+  get possible() {
+    return attempt(() => Boolean(navigator.clipboard), false);
+  },
+  /** @param {string} text @returns {Promise<void>} */
+  copy: async (text) => navigator.clipboard.writeText(text),
+};
+
+export const microphone = {
+  get possible() {
+    return attempt(() => Boolean(navigator.mediaDevices.getUserMedia) && "AudioWorkletNode" in globalThis, false);
+  },
+  /** @param {MediaStreamConstraints} wanted */
+  open: async (wanted) => navigator.mediaDevices.getUserMedia(wanted),
+};
+
+/** @returns {Promise<any>} what is printed on the keys; null: not in this browser, or in a frame of another site */
+export const keyboardLayout = async () => attempt(() => /** @type {any} */ (navigator).keyboard.getLayoutMap(), null);
+
+const nothing = () => {};
+const blind = /** @type {any} */ ({ observe: nothing, disconnect: nothing });
+
+/** @param {ResizeObserverCallback} fn @returns {ResizeObserver} */
+export const sizes = (fn) => attempt(() => new ResizeObserver(fn), blind);
+
+/** @param {(seen: boolean) => void} fn @returns {IntersectionObserver} */
+export const sight = (fn) => attempt(() => new IntersectionObserver((all) => fn(all[all.length - 1].isIntersecting)), blind);
