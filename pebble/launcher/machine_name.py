@@ -40,6 +40,7 @@ class MachineName:
 
     def __init__(self, bound: socket.socket) -> None:
         self._bound = bound
+        self.name = bound.getsockname()[1:].decode()
 
     @classmethod
     def take(cls, robot: str, config: Path) -> MachineName:

@@ -107,12 +107,10 @@ def config_of(folder: Path, user: int, mode: int = 0o644, group: int = 0) -> Pat
 
 
 def name_of(config: Path) -> str:
-    """The name that a launcher of ``config`` binds, as the system lists it."""
+    """The name that a launcher of ``config`` binds."""
     bound = MachineName.take(BASE, config)
-    listed = {line.split("@")[-1].strip() for line in Path("/proc/net/unix").read_text().splitlines()}
     bound.close()
-    (name,) = listed - {line.split("@")[-1].strip() for line in Path("/proc/net/unix").read_text().splitlines()}
-    return name
+    return bound.name
 
 
 def run_dir_of(folder: Path, user: int) -> Path:

@@ -830,7 +830,7 @@ def test_a_taken_port_keeps_no_robot_from_its_hub(
 ) -> None:
     with socket.create_server(("127.0.0.1", 0)) as stranger:
         endpoint = endpoint.format(stranger.getsockname()[1])
-        settings = ZenohSettings(tmp_path / "run", listen=(endpoint,))
+        settings = ZenohSettings(run_dir=tmp_path / "run", listen=(endpoint,))
         fact = f"transport.listen: {endpoint}: Address already in use (by process {os.getpid()} of user {os.getuid()}: "
         with pytest.raises(TransportError, match=re.escape(fact)):  # its endpoints are all that it is for
             ZenohHub(settings).open()
