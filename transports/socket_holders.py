@@ -15,7 +15,10 @@ def processes_with(inodes: Collection[str]) -> Iterator[tuple[Path, dict[Path, s
     """The processes that hold some of these sockets: folder in /proc, all its descriptors, and which it holds."""
     for process in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):
-            links = {entry: str(entry.readlink()) for entry in (process / "fd").iterdir()}
+            links = {}
+            for entry in (process / "fd").iterdir():
+                with suppress(OSError):  # closed meanwhile
+                    links[entry] = str(entry.readlink())
             if held := {link[8:-1] for link in links.values() if link.startswith("socket:[")}.intersection(inodes):
                 yield process, links, held
 
