@@ -134,7 +134,7 @@ def test_a_page_whose_whole_document_was_replaced_is_loaded_again(browser: Brows
 @pytest.mark.parametrize(
     "how", [_THROWS, _GONE, "value: function () { throw new DOMException('denied', 'SecurityError'); }"]
 )
-def test_without_sockets_the_page_says_that_there_is_no_connection_and_stops_by_a_request(
+def test_without_sockets_the_page_shows_that_there_is_no_connection_and_stops_by_a_request(
     browser: Browser, how: str
 ) -> None:
     script = _DENY % ("[window, 'WebSocket']", how)
