@@ -134,9 +134,7 @@ def test_a_page_whose_whole_document_was_replaced_is_loaded_again(browser: Brows
 @pytest.mark.parametrize(
     "how", [_THROWS, _GONE, "value: function () { throw new DOMException('denied', 'SecurityError'); }"]
 )
-def test_without_sockets_the_page_shows_that_there_is_no_connection_and_stops_by_a_request(
-    browser: Browser, how: str
-) -> None:
+def test_without_sockets_the_page_reports_no_connection_and_stops_by_a_request(browser: Browser, how: str) -> None:
     script = _DENY % ("[window, 'WebSocket']", how)
     with serving(STATES["driving"]) as canned, tab(browser, canned.url + canned.state.path, script=script) as opened:
         assert opened.until(f"{_WORDS}.includes('No connection to the server')")
