@@ -5,33 +5,66 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
+from typing import TextIO
 
 from pebble.errors import PebbleError
+
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)  # the output's disk, or its terminal has gone
 
 
 def main() -> int:
     """The entry point; returns the exit code."""
+    _use_utf8()
     _open_missing_streams()
     sys.excepthook = _print_error
+    for stream in (sys.stdout, sys.stderr):
+        stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]  # what a terminal cannot show
     try:
         code = _run(sys.argv[1:])
         sys.stdout.flush()
     except PebbleError as error:
-        for line in _without_secrets(str(error)).splitlines():
-            sys.stderr.write(f"pebble: {line}\n")
-        return 1
+        code = _fail(*_without_secrets(str(error)).splitlines())
     except KeyboardInterrupt:
-        return 130
+        code = 130
     except BrokenPipeError:  # the reader has ended (`pebble topics | head`)
+        code = 1
+    except OSError as error:
+        if error.filename is not None or error.errno not in _FULL:
+            raise
+        code = _fail(f"the output cannot be written: {error.strerror}")
+    return code if all([_flushes(sys.stdout), _flushes(sys.stderr)]) else code or 1
+
+
+def _use_utf8() -> None:
+    """Begin anew in UTF-8 mode where the locale is of another encoding: robots' names stand in names of files."""
+    if sys.getfilesystemencoding() != "utf-8" and not sys.flags.utf8_mode:
+        os.environ["PYTHONUTF8"] = "1"  # for the programs that this one starts
+        os.execv(sys.executable, [sys.executable, "-X", "utf8", *sys.orig_argv[1:]])  # noqa: S606
+
+
+def _fail(*lines: str) -> int:
+    with suppress(OSError):  # nowhere to write it to
+        for line in lines:
+            sys.stderr.write(f"pebble: {line}\n")
+    return 1
+
+
+def _flushes(stream: TextIO) -> bool:
+    """Write out what waits, and discard it if that fails: the interpreter would try again at its end."""
+    try:
+        stream.flush()
+    except OSError:
         from pebble.commands.show import discard_output
 
-        discard_output(sys.stdout)
-        return 1
-    return code
+        discard_output(stream)
+        return False
+    return True
 
 
 def _open_missing_streams() -> None:

@@ -13,6 +13,7 @@ from msgspec.structs import asdict
 
 from pebble.config.checks import CHECKS
 from pebble.config.exposure import warn_if_readable
+from pebble.config.home import in_home
 from pebble.config.masking import holds_secret, masked
 from pebble.config.raw import Pairs, decode, inherit, plain, read_text
 from pebble.config.reader import Reader
@@ -183,7 +184,7 @@ def default_state_folder(base: str, env: Mapping[str, str]) -> Path:
     robot = _file_name(base)
     if by_systemd := env.get("STATE_DIRECTORY"):
         return Path(by_systemd.split(":")[0], robot)
-    return Path(env.get("XDG_STATE_HOME") or Path.home() / ".local/state", "pebble", robot)
+    return Path(env.get("XDG_STATE_HOME") or in_home("~/.local/state"), "pebble", robot)
 
 
 def _file_name(base: str) -> str:

@@ -5,6 +5,7 @@ from typing import Annotated
 
 from msgspec import Meta
 
+from pebble.config.home import in_home
 from pebble.config.types import File, Interval, Seconds, ServiceSection, doc
 
 Bytes = Annotated[int, Meta(ge=0, le=1 << 50)]
@@ -28,4 +29,4 @@ class Recorder(ServiceSection, frozen=True, kw_only=True):
     @property
     def place(self) -> Path:
         """The folder, also where none is named."""
-        return self.folder or Path("~/recordings").expanduser()
+        return self.folder or in_home("~/recordings")

@@ -14,6 +14,7 @@ from pebble.launcher.dropped import Dropped
 from pebble.launcher.features import Features
 from pebble.launcher.log_forwarding import LogForwarder, OwnRecords
 from pebble.launcher.on_demand import OnDemand
+from pebble.launcher.orphans import reap
 from pebble.launcher.process_supervisor import ProcessSupervisor
 from pebble.launcher.programs import Program, Stage, preload, programs, shared_modules
 from pebble.launcher.reactor import Reactor, StopSignals
@@ -26,6 +27,7 @@ from pebble.runtime.parent import LAUNCHER_PID
 from pebble.transports import segments
 
 _CONFIG_POLL_S = 2.0
+_ORPHANS_S = 1.0
 _REAP_S = 2.0  # the kernel needs this long at most to end what was killed
 
 log = logging.getLogger(__name__)
@@ -85,6 +87,8 @@ class Launcher:
         for warning in self._config.warnings:
             log.warning("%s", warning)
         self._reactor.every(_CONFIG_POLL_S, self._config_watch.poll)
+        if os.getpid() == 1:
+            self._reactor.every(_ORPHANS_S, self._reap_orphans)
         self._status.start()
 
     def _supervise(self, program: Program) -> ProcessSupervisor:
@@ -128,6 +132,9 @@ class Launcher:
         """The config's variables replace inherited ones, and never those that the launcher itself sets."""
         own = {LAUNCHER_PID: str(os.getpid()), **self._on_demand.environment(program)}
         return {**self._environment, **program.environment, **own}
+
+    def _reap_orphans(self) -> None:
+        reap({supervisor.pid for supervisor in self._supervisors if supervisor.pid is not None})
 
     def _stood_still(self, seconds: float) -> None:
         self._status.stood_still()

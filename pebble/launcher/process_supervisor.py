@@ -71,6 +71,11 @@ class ProcessSupervisor:
         return self._child is not None
 
     @property
+    def pid(self) -> int | None:
+        """The present child's; None while there is none."""
+        return None if self._child is None else self._child.pid
+
+    @property
     def requested(self) -> bool:
         """True if an on-demand program is to run."""
         return self.state in _ACTIVE

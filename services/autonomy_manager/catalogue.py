@@ -14,6 +14,7 @@ from msgspec.structs import asdict, replace
 import pebble
 from pebble.config import Config
 from pebble.config.autonomy import Script as ScriptSection
+from pebble.config.home import in_home
 from pebble.services.autonomy_manager import builtin_forms
 from pebble.services.autonomy_manager.describe import (
     MANIFEST,
@@ -45,7 +46,7 @@ def roots(config: Config, own: Path = _OWN_SCRIPTS) -> tuple[Path, ...]:
     An absolute path is the only folder; a relative one is searched beside the config, and then Pebble's own.
     The original starts relative paths at its repository, two folders above its configs.
     """
-    given = Path(config.services.autonomy_manager.autonomy_root).expanduser()
+    given = in_home(config.services.autonomy_manager.autonomy_root)
     if given.is_absolute():
         return (given,)
     beside = [config.folder / given]
@@ -154,7 +155,7 @@ class Catalogue:
             return (str(folder / program) if "/" in program else program, *more)
         if section.python is not None:
             python = section.python
-            return (str(self._config.folder / Path(python).expanduser()) if "/" in python else python, str(entry))
+            return (str(self._config.folder / in_home(python)) if "/" in python else python, str(entry))
         if entry.suffix != ".py" and os.access(entry, os.X_OK):
             return (str(entry),)
         return (sys.executable, str(entry))

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 import time
-from pathlib import Path
 from typing import Any
 
 from msgspec import Struct
 
+from pebble.config.home import in_home
 from pebble.contract import MEDIA_REPORT, SOUNDBOARD_COMMAND, SOUNDBOARD_FILES, SOUNDBOARD_STATUS
 from pebble.contract.payloads import STOP_WORDS, MediaReport, SoundboardCommand, SoundboardFiles, SoundboardStatus
 from pebble.runtime.service import Service, on
@@ -40,7 +40,7 @@ class SoundboardHandler(Service):
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
         self._section = self.config.services.soundboard_handler
-        self._clips = Clips(self._section.playback.directory or Path("~/sounds").expanduser())
+        self._clips = Clips(self._section.playback.directory or in_home("~/sounds"))
         self._players = Players.of(self.config)
         self._listed: list[str] | None = None
         self._scan_problem = ""

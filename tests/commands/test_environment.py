@@ -1,0 +1,98 @@
+"""What a command's environment may lack: a home, a name for the user, an encoding, an output that takes anything."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.support import ROOT
+
+_PATH = {"PATH": os.defpath}
+_NO_USER = ("setpriv", "--reuid=12345", "--regid=12345", "--clear-groups")
+needs_root = pytest.mark.skipif(
+    os.getuid() != 0 or subprocess.run([*_NO_USER, sys.executable, "-c", ""], capture_output=True).returncode != 0,
+    reason="needs root, and a Python that other users may run",
+)
+
+#: Words before the command, the environment, and what the command says instead of ending with a traceback.
+ENVIRONMENTS = [
+    pytest.param(_NO_USER, {}, "~/.local/state: the home folder is not known; set HOME", marks=needs_root),
+    pytest.param(_NO_USER, {"HOME": ""}, "", marks=needs_root),
+    pytest.param(_NO_USER, {"HOME": "/nonexistent"}, "", marks=needs_root),
+    ((), {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0"}, "pebble/robots/gö🤖b"),
+    ((), {"PYTHONIOENCODING": "ascii"}, "pebble/robots/g\\xf6\\U0001f916b"),
+    ((), {"PYTHONIOENCODING": "latin-1"}, "\\U0001f916b"),
+    ((), {"LC_ALL": "xx_YY.UTF-8"}, "pebble/robots/gö🤖b"),
+    ((), {"HOME": "/", "TMPDIR": "/nonexistent", "PATH": ""}, "pebble/robots/gö🤖b"),
+]
+COMMANDS = [["check"], ["check", "--json"]]
+
+
+@pytest.fixture
+def config() -> Iterator[Path]:
+    """In a folder that every user may read."""
+    folder = Path(tempfile.mkdtemp())
+    folder.chmod(0o755)
+    path = folder / "robot.json"
+    services = {"mqtt_bridge": {"enabled": True, "remote_mqtt": {"host": "127.0.0.1", "port": 1}}}
+    path.write_text(json.dumps({"robot": {"id": "gö🤖b"}, "transport": {"kind": "zenoh"}, "services": services}))
+    yield path
+    shutil.rmtree(folder)
+
+
+@pytest.mark.parametrize(("before", "environment", "printed"), ENVIRONMENTS)
+def test_a_command_runs_or_names_what_is_missing(
+    config: Path, before: tuple[str, ...], environment: dict[str, str], printed: str
+) -> None:
+    for words in COMMANDS[:1] if printed.startswith("~") else COMMANDS:
+        command = [*before, sys.executable, "-m", "pebble.cli", *words, str(config)]
+        env = {**_PATH, "HOME": str(config.parent), **environment, "PYTHONPATH": str(ROOT)}
+        if printed.startswith("~"):
+            del env["HOME"]
+        done = subprocess.run(command, env=env, cwd="/", capture_output=True, timeout=60)
+        text = (done.stdout + done.stderr).decode(errors="replace")
+        assert "Traceback" not in text
+        assert "Error" not in text
+        assert done.returncode == int(printed.startswith("~")), text
+        assert printed in text or words != ["check"], text
+
+
+@pytest.mark.parametrize("outputs", [">/dev/full", "2>/dev/full", ">/dev/full 2>&1", "| true"])
+@pytest.mark.parametrize("words", [*COMMANDS, ["--help"], ["topics"], ["nonsense"]])
+def test_an_output_that_is_full_or_gone_ends_a_command_in_order(config: Path, outputs: str, words: list[str]) -> None:
+    command = [sys.executable, "-m", "pebble.cli", *words, *([str(config)] if words in COMMANDS else [])]
+    done = subprocess.run(["sh", "-c", f'"$@" {outputs}', "sh", *command], cwd=ROOT, capture_output=True, timeout=60)
+    assert done.returncode in (0, 1, 2)
+    assert b"Traceback" not in done.stderr
+    assert b"Exception ignored" not in done.stderr
+
+
+def test_process_1_collects_what_others_leave_to_it(config: Path) -> None:
+    """Each round of this script leaves a process that ends later, whose parent is then process 1."""
+    space = ["unshare", "--pid", "--fork", "--mount-proc", "--kill-child"]
+    if subprocess.run([*space, "true"], capture_output=True).returncode:
+        pytest.skip("no pid namespace can be made here")
+    script = config.parent / "leave.py"
+    script.write_text(
+        "import os, subprocess, time\n"
+        "from pebble.launcher.orphans import reap\n"
+        "subprocess.run(['sh', '-c', 'for i in 1 2 3; do (sleep 0.2 &); done'])\n"
+        "own = subprocess.Popen(['true'])\n"
+        "end, collected = time.monotonic() + 10, 0\n"
+        "while collected < 3 and time.monotonic() < end:\n"
+        "    collected += reap({own.pid})\n"
+        "    time.sleep(0.05)\n"
+        "print(os.getpid(), collected, own.wait())\n"
+    )
+    done = subprocess.run(
+        [*space, sys.executable, script], env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True
+    )
+    assert done.stdout.split() == ["1", "3", "0"], done.stderr
