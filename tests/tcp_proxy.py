@@ -113,6 +113,10 @@ class TcpProxy:
             self._pairs = [pair for pair in self._pairs if not pair.gone]
             self._pairs.append(_Pair(self, near, far))
 
+    def passes(self, _data: bytes) -> bool:
+        """Whether what a client sends goes on; otherwise its connection is reset."""
+        return True
+
     def wait_until_passing(self) -> bool:
         """True at once while data passes; False after a moment in a black hole."""
         return self._passing.wait(_STEP_S)
@@ -132,6 +136,34 @@ class BridgelessProxy(TcpProxy):
             near.close()
         else:
             super()._join_to_target(near)
+
+
+class ForbiddingProxy(TcpProxy):
+    """Makes any broker one that hangs up on each PUBLISH to a `forbidden` topic, as aedes and hosted ones do."""
+
+    def __init__(self, target: int) -> None:
+        self.forbidden: set[str] = set()
+        self.hung_up = 0
+        super().__init__(target)
+
+    def passes(self, data: bytes) -> bool:
+        """Whether ``data``, which a client sent together, has none of them."""
+        if not any(b"\0" + bytes((len(topic),)) + topic.encode() in data for topic in self.forbidden):
+            return True
+        if 0x30 not in {data[at] & 0xF0 for at in _packets(data)}:
+            return True  # a SUBSCRIBE
+        self.hung_up += 1
+        return False
+
+
+def _packets(data: bytes) -> list[int]:
+    """Where each packet in ``data`` begins, whole ones that are shorter than 16 KB."""
+    found, at = [], 0
+    while at + 2 < len(data):
+        found.append(at)
+        size, head = (data[at + 1], 2) if data[at + 1] < 128 else (data[at + 1] & 127 | data[at + 2] << 7, 3)
+        at += head + size
+    return found
 
 
 class _Pair:
@@ -172,7 +204,7 @@ class _Pair:
                 if not self._proxy.wait_until_passing() or not select.select([source], [], [], _STEP_S)[0]:
                     continue
                 data = source.recv(self._proxy.piece)
-                if not data:
+                if not data or (source is self._ends[0] and not self._proxy.passes(data)):
                     break
                 time.sleep(self._proxy.delay_s)
                 self._send(sink, data)

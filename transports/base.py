@@ -200,7 +200,7 @@ class Transport(ABC):
     #: Whether a topic is one of any number that strangers invent: a backend then stores nothing for it.
     is_invented: Callable[[str], bool] = staticmethod(lambda _topic: False)
     #: Whether a topic is one of stops: where a backend refuses messages because too many wait, it still takes these.
-    is_vital: Callable[[str], bool] = staticmethod(lambda _topic: False)
+    is_stop: Callable[[str], bool] = staticmethod(lambda _topic: False)
 
     def __init__(self, client_id: str, *, will: Message | None = None) -> None:
         if will is not None:

@@ -7,8 +7,8 @@ import threading
 from collections import Counter
 from collections.abc import Callable
 
-#: Messages that were dropped because there was no room, or they were too large.
-BOUNDS = ("dropped", "too_large", "too_long", "forgotten")
+#: Messages that were dropped: there was no room, they were too large, or the broker hangs up on their topic.
+BOUNDS = ("dropped", "too_large", "too_long", "forgotten", "withheld")
 
 
 class Counters:

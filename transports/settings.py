@@ -39,6 +39,8 @@ class MqttSettings:
     #: at 0, and at 1 no more than it queues (mosquitto: 1,000). And whether it is to send them at all (MQTT 5).
     max_qos: int = 1
     sends_retained: bool = True
+    #: Filters of topics that are sent even to a broker that hangs up on them.
+    vital: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

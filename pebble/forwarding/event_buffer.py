@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import threading
 import time
 from collections import deque
@@ -12,22 +11,15 @@ from dataclasses import dataclass
 from pebble.transports import Message, State, Transport
 from pebble.transports.counters import Counters
 
-log = logging.getLogger(__name__)
-
 LIMIT = 256
 #: A dead connection accepts messages until its silence is detected (2 s by default). Events published so shortly before
 #: the loss are sent again: QoS 1 allows duplicates, and no loss.
 RESEND_S = 3.0
 
 
-#: After so many losses in a row while it was on its way, an event is given up: the broker may hang up because of it.
-_LOSSES = 3
-
-
 @dataclass(eq=False, slots=True)
 class _Event:
     message: Message
-    losses: int = 0  # of the connection while it was on its way
     sent_at: float = 0.0
 
 
@@ -73,7 +65,7 @@ class EventBuffer:
         with self._lock:
             if self._lost_at is not None:
                 recent = [event for event in self._recent if 0 <= self._lost_at - event.sent_at <= RESEND_S]
-                waiting = self._without_refused(recent) + list(self._waiting)
+                waiting = recent + list(self._waiting)
                 self._counters.add("events_dropped", max(0, len(waiting) - self._limit))
                 self._waiting = deque(waiting[-self._limit :])
                 self._lost_at = None
@@ -84,21 +76,6 @@ class EventBuffer:
         with self._lock:
             self._waiting.clear()
             self._recent.clear()
-
-    def _without_refused(self, lost: list[_Event]) -> list[_Event]:
-        """``lost`` without the largest of those that were lost too often in a row: nothing else says which it was."""
-        for event in lost:
-            event.losses += 1
-        suspects = [event for event in lost if event.losses >= _LOSSES]
-        if not suspects:
-            return lost
-        refused = max(suspects, key=lambda event: len(event.message.payload))
-        for event in lost:
-            event.losses = 0
-        size, topic = len(refused.message.payload), refused.message.topic
-        log.error("dropped an event of %d bytes on %s: three connections in a row were lost with it", size, topic)
-        self._counters.add("events_dropped")
-        return [event for event in lost if event is not refused]
 
     def _append(self, event: _Event) -> None:
         self._waiting.append(event)

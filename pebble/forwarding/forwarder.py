@@ -117,7 +117,7 @@ class Forwarder:
         #: What :func:`route` has returned. There are not many subjects, so it needs no bound.
         self._routes: dict[tuple[Side, Subject, QoS, bool, bool | None, bool], Forward | Drop] = {}
         for transport in transports.values():
-            transport.is_vital = self._is_stop
+            transport.is_stop = self._is_stop
         self._lock = self.retained_lock = threading.RLock()  # while it is held no retained message passes
         self._reconciliation = Reconciliation(winner)
         self._admission = Admission(clock)

@@ -3,16 +3,35 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace as replace_settings
 from typing import Any
 
 from msgspec.structs import replace
 
 from pebble.config import Config, Mqtt, RemoteConnection, RemoteMqtt, Tls
-from pebble.contract import CHANNELS, INCOMING, OUTGOING, Kind
+from pebble.contract import (
+    CAPABILITIES,
+    CHANNELS,
+    DRIVE,
+    ESTOP,
+    ESTOP_RESET,
+    ESTOP_STATE,
+    HEARTBEAT,
+    INCOMING,
+    ONLINE,
+    OUTGOING,
+    Channel,
+    Kind,
+)
 from pebble.errors import ConfigError, TransportError
 from pebble.runtime.addresses import Addresses
 from pebble.transports import Message, MqttSettings, TlsSettings, Transport, ZenohSettings, check_kind, create
 from pebble.transports.socket_paths import FRAMES_SOCKET, PEER_SOCKET, fits_socket
+
+_ANY = "+/+/+"  # the levels of any robot
+#: Topics of the robot's states, and of all commands, that are published even to a broker that hangs up on them.
+_VITAL_STATES = (*(one.filter(_ANY) for one in (ONLINE, HEARTBEAT, CAPABILITIES, ESTOP_STATE)), f"{_ANY}/+/control/#")
+_ALL_VITAL = (*_VITAL_STATES, f"{_ANY}/{INCOMING}/#")
 
 LOCAL_RECONNECT_S, REMOTE_RECONNECT_S = 0.5, 2.0
 _BRIDGE = "remote-bridge"
@@ -56,7 +75,8 @@ def local_settings(config: Config, as_published: bool = False) -> Any:
     """The settings of the local transport, by its kind; a third party's gets ``transport.settings`` as it is."""
     kind = config.transport.kind
     if kind == "mqtt":
-        return mqtt_settings(config.local_mqtt, as_published=as_published, reconnect_max_s=LOCAL_RECONNECT_S)
+        settings = mqtt_settings(config.local_mqtt, as_published=as_published, reconnect_max_s=LOCAL_RECONNECT_S)
+        return replace_settings(settings, vital=(*_ALL_VITAL, *_renamed_vital(config)))
     if kind == "zenoh":
         return zenoh_settings(config)
     return config.transport.settings
@@ -68,6 +88,7 @@ def remote_transport(config: Config, name: str, *, will: Message | None = None) 
     if bridge.remote is None:
         remote, program = bridge.remote_mqtt, "" if name == _BRIDGE else name
         settings = mqtt_settings(remote, as_published=True, reconnect_max_s=REMOTE_RECONNECT_S, program=program)
+        settings = replace_settings(settings, vital=(*_VITAL_STATES, *_renamed_vital(config)))
         return create("mqtt", _name(config, "mqtt", name), settings, will=will)
     kind = bridge.remote.kind
     return create(kind, _name(config, kind, name), _remote_settings(config, bridge.remote), will=will)
@@ -119,14 +140,26 @@ def hub_settings(config: Config) -> ZenohSettings:
 
 
 def _renamed_wills(config: Config) -> Iterator[tuple[str, bool]]:
-    """Whether the hub takes wills on the topics that this config renames, those of every serial line included."""
+    """Whether the hub takes wills on the topics that this config renames."""
+    for channel, topic in _renamed(config):
+        if channel.direction == INCOMING:
+            yield topic, channel.kind is Kind.FLAG
+
+
+def _renamed_vital(config: Config) -> tuple[str, ...]:
+    vital = (ONLINE, CAPABILITIES, DRIVE, ESTOP, ESTOP_RESET)
+    return tuple(dict.fromkeys(topic for channel, topic in _renamed(config) if channel in vital))
+
+
+def _renamed(config: Config) -> Iterator[tuple[Channel, str]]:
+    """The channels that this config renames, and their topics, those of every serial line included."""
     lines = [config.services.serial_mcu_bridge, *config.serial_instances().values()]
     for line in lines:
         addresses = Addresses(replace(config, services=replace(config.services, serial_mcu_bridge=line)))
         for channel in CHANNELS:
             topic = addresses[channel].topic
-            if channel.direction == INCOMING and topic != channel.filter(config.base):
-                yield topic, channel.kind is Kind.FLAG
+            if topic != channel.filter(config.base):
+                yield channel, topic
 
 
 def mqtt_settings(
@@ -149,6 +182,7 @@ def mqtt_settings(
         as_published=as_published,
         reconnect_max_s=reconnect_max_s,
         silence_s=mqtt.silence_seconds,
+        vital=_ALL_VITAL,
     )
 
 

@@ -388,33 +388,6 @@ class TestEventBuffer:
         events.flush()
         assert wire.sent == [b"1", b"2", b"2", b"3", b"4"]
 
-    def test_one_with_which_the_connection_is_lost_three_times_in_a_row_is_dropped(
-        self, events: EventBuffer, wire: Wire, caplog: pytest.LogCaptureFixture
-    ) -> None:
-        """The broker may refuse it by hanging up: the largest of those that were on their way."""
-        large, small = Message("map", bytes(50_000), QoS.DELIVERED), Message("t", b"small", QoS.DELIVERED)
-        events.send(large)
-        events.send(small)
-        for _ in range(4):
-            events.watch(State.CONNECTING)
-            events.flush()
-        assert wire.sent == [large.payload, small.payload] * 3 + [small.payload] * 2
-        assert [record.getMessage() for record in caplog.records] == [
-            "dropped an event of 50000 bytes on map: three connections in a row were lost with it"
-        ]
-        assert events._counters["events_dropped"] == 1
-
-    def test_one_that_was_not_on_its_way_each_time_is_not_dropped(
-        self, events: EventBuffer, wire: Wire, clock: Clock
-    ) -> None:
-        for number in range(5):
-            self.publish(events, number)
-            events.watch(State.CONNECTING)
-            clock.now += RESEND_S + 1
-            events.flush()
-            clock.now += RESEND_S + 1
-        assert wire.sent == [b"%d" % number for number in range(5) for _ in range(2)]
-
     def test_one_refused_in_between_is_sent_with_the_next(self, events: EventBuffer, wire: Wire) -> None:
         wire.up = False
         self.publish(events, 1)

@@ -18,6 +18,7 @@ from paho.mqtt.enums import CallbackAPIVersion
 
 from pebble.errors import TransportError
 from pebble.transports import Message, MqttSettings, QoS, State, TlsSettings, Transport, clock, create
+from pebble.transports.mqtt import retention, suspects
 from pebble.transports.mqtt import transport as transport_module
 from pebble.transports.mqtt.client import Client
 from pebble.transports.mqtt.connection import UNACKED_LIMIT, UNACKED_RESERVE, Connection
@@ -25,7 +26,7 @@ from pebble.transports.mqtt.packets import MAX_PACKET
 from pebble.transports.topics import MAX_BYTES
 from tests.services.autonomy_manager.gate.mqtt_bytes import connect, publish
 from tests.support import ROOT, AmqttBroker, Broker, RefusingBroker, free_port, until
-from tests.tcp_proxy import BridgelessProxy, TcpProxy
+from tests.tcp_proxy import BridgelessProxy, ForbiddingProxy, TcpProxy
 from tests.transports.received import Received
 
 DELIVERED = QoS.DELIVERED
@@ -789,12 +790,111 @@ def test_a_retained_message_that_the_broker_refuses_is_set_aside(
         assert until(lambda: received.payloads[-1:] == [b"%d" % number])  # noqa: B023
     assert until(lambda: robot.state is State.CONNECTED)
     assert robot.counters["connected"] == {"3.1.1": 4, "5": 1}[protocol]
-    errors = [record.getMessage() for record in caplog.records if record.levelno == logging.ERROR]
-    assert len(errors) == 1
-    assert f"{topic}/map" in errors[0]
-    assert "50001 bytes" in errors[0]
+    (line,) = [line for line in caplog.messages if f"{topic}/map" in line]
+    assert "50001 bytes" in line
     robot.publish(f"{topic}/map", b"smaller", qos=qos, retain=True)
     assert until(lambda: b"smaller" in received.payloads)
+
+
+# -- what a broker refuses
+
+
+@pytest.fixture
+def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(suspects, "HOLD_S", 1.0)
+    monkeypatch.setattr(suspects, "RETRY_S", 1.5)
+    monkeypatch.setattr(suspects, "QUIET_S", 0.3)
+
+
+@both_protocols
+@pytest.mark.parametrize("retain", [False, True], ids=["stream", "state"])
+@pytest.mark.usefixtures("hasty")
+def test_a_topic_on_which_the_broker_hangs_up_costs_that_topic_until_it_is_allowed(
+    broker: Broker, clients: Clients, topic: str, protocol: str, retain: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    with ForbiddingProxy(broker.port) as proxy:
+        proxy.forbidden = {f"{topic}/forbidden"}
+        robot = clients(proxy.port, "robot", protocol=protocol, vital=(f"{topic}/online",))
+        other, commands, received = clients(broker.port), Received(), Received()
+        robot.subscribe(f"{topic}/command", commands)
+        other.subscribe(f"{topic}/forbidden", received)
+        stopping = threading.Event()
+
+        def stream() -> None:
+            while not stopping.wait(0.02):
+                robot.publish(f"{topic}/forbidden", b"x", retain=retain)
+                robot.publish(f"{topic}/online", b"1", retain=True)
+
+        thread = threading.Thread(target=stream)
+        thread.start()
+        try:
+            assert until(lambda: any("is not sent" in line for line in caplog.messages), 20)
+            assert robot.counters["withheld"] > 0
+            assert reconnected(robot)
+            for number in range(20):
+                other.publish(f"{topic}/command", b"%d" % number, qos=DELIVERED)
+            assert until(lambda: len(commands.payloads) == 20)
+            (error,) = [record for record in caplog.records if "is not sent" in record.getMessage()]
+            assert error.levelno == logging.ERROR
+            assert f"{topic}/forbidden" in error.getMessage()
+            assert not received.payloads
+            proxy.forbidden = set()
+            assert until(lambda: len(received.payloads) > (0 if retain else 20), 20)
+            again = f"accepts messages on {topic}/forbidden again"
+            assert until(lambda: any(again in line for line in caplog.messages), 20)
+        finally:
+            stopping.set()
+            thread.join()
+
+
+@pytest.mark.usefixtures("hasty")
+def test_a_vital_topic_on_which_the_broker_hangs_up_is_named_and_never_withheld(
+    broker: Broker, clients: Clients, topic: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    with ForbiddingProxy(broker.port) as proxy:
+        proxy.forbidden = {f"{topic}/online"}
+        robot = clients(proxy.port, "robot", vital=(f"{topic}/online",), reconnect_max_s=0.1)
+        robot.publish(f"{topic}/online", b"1", qos=DELIVERED, retain=True)
+        assert until(lambda: any("this account cannot run a robot" in line for line in caplog.messages))
+        assert any(f"{topic}/online" in line for line in caplog.messages)
+        assert robot.counters["withheld"] == 0
+        proxy.forbidden = set()
+        received = Received()
+        clients(broker.port).subscribe(f"{topic}/online", received)
+        assert until(lambda: b"1" in received.payloads)
+
+
+@pytest.fixture(scope="module")
+def reading_broker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Broker]:
+    """Takes what is published below ``allowed``, and says nothing about the rest; everything may be read."""
+    folder = tmp_path_factory.mktemp("reading")
+    (folder / "acl").write_text("topic read #\ntopic readwrite allowed/#\n")
+    broker = Broker(folder, f"acl_file {folder / 'acl'}")
+    yield broker
+    broker.stop()
+
+
+@both_protocols
+@pytest.mark.parametrize("qos", [QoS.LATEST, DELIVERED])
+def test_what_a_broker_refuses_in_silence_is_reported(
+    reading_broker: Broker,
+    clients: Clients,
+    protocol: str,
+    qos: QoS,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(retention, "AFTER_S", 0.3)
+    monkeypatch.setattr(retention, "LATE_S", 0.2)
+    client = clients(reading_broker.port, protocol=protocol)
+    for topic in ("allowed/state", "denied/state"):
+        client.publish(topic, b"1", qos=qos, retain=True)
+    assert until(lambda: len(caplog.messages) == 1)
+    assert "denied/state" in caplog.text
+    assert "allowed/state" not in caplog.text
+    words = "not authorized" if (protocol, qos) == ("5", DELIVERED) else "has not kept"
+    assert words in caplog.text
 
 
 @pytest.mark.parametrize("qos", [QoS.LATEST, DELIVERED])
@@ -925,7 +1025,7 @@ def test_unacknowledged_messages_are_bounded(broker: Broker, clients: Clients, p
     proxy.blackhole()
     accepted = [client.publish(topic, b"%d" % number, qos=DELIVERED) for number in range(UNACKED_LIMIT + 100)]
     assert accepted == [True] * UNACKED_LIMIT + [False] * 100
-    client.is_vital = lambda one: one.endswith("/stop")  # type: ignore[method-assign]
+    client.is_stop = lambda one: one.endswith("/stop")  # type: ignore[method-assign]
     stops = [client.publish(f"{topic}/stop", b"stop", qos=DELIVERED) for _ in range(UNACKED_RESERVE + 1)]
     assert stops == [True] * UNACKED_RESERVE + [False]
     assert client.publish(f"{topic}/kept", b"parked", qos=DELIVERED, retain=True)

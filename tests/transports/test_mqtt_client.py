@@ -189,6 +189,7 @@ def test_a_message_is_acknowledged_when_it_was_handled_even_if_that_failed(fails
             as_published=False,
             on_answers=lambda _answers: None,
             skips_retained=lambda _topic: False,
+            on_refusal=lambda _topic, _why: None,
         )
         stack.callback(connection.discard)
         connecting = threading.Thread(target=connection.connect, args=(threading.Event(),))

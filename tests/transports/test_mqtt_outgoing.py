@@ -9,8 +9,8 @@ from pebble.transports.mqtt.outgoing import (
     Backlog,
     InFlightTable,
     PendingAck,
-    RefusedMessages,
 )
+from pebble.transports.mqtt.suspects import Written
 
 
 def drain(backlog: Backlog) -> list[bytes]:
@@ -157,7 +157,23 @@ def test_answers_complete_their_request_only() -> None:
     in_flight.pong(1.0)  # one more than there were pings
 
 
-def test_a_small_message_is_never_refused_however_often_the_broker_hangs_up() -> None:
-    refused, heartbeat = RefusedMessages(), Message("online", b'{"t":1795465907428}', retain=True)
-    assert [refused.note_loss([heartbeat], now) for now in range(10)] == [None] * 10
-    assert not refused.has(heartbeat, 10.0)
+def test_a_topic_counts_as_accepted_once_the_ping_after_its_first_message_is_answered() -> None:
+    """Also if others of its messages follow all the time; until then the loss of the connection may be its fault."""
+    in_flight = InFlightTable()
+    for number in range(4):
+        send(in_flight, Message("stream", b""), 0, now := 5.0 + number / 10)
+        in_flight.ping(now, None)
+    send(in_flight, Message("rare", bytes(9)), 0, 5.4)
+    assert in_flight.first_written(5.5) == {"stream": Written(0), "rare": Written(9)}
+    in_flight.pong(5.5)
+    assert in_flight.has_accepted("stream", 200)
+    assert not in_flight.has_accepted("rare", 9)
+    send(in_flight, Message("stream", bytes(200)), 0, 5.6)
+    send(in_flight, Message("stream", bytes(9000)), 0, 5.7)
+    assert in_flight.first_written(5.8)["stream"] == Written(9000), "the broker may accept no more than it has"
+    for _ in range(3):
+        in_flight.pong(5.8)
+    in_flight.ping(5.8, None)
+    in_flight.pong(5.9)
+    assert in_flight.first_written(5.9)["stream"] == Written(9000, answered=True)
+    assert in_flight.first_written(7.9) == {}

@@ -225,6 +225,7 @@ class TestRead:
                 packet(0x90, b"\1\2" + none + b"\1\x80"),
                 packet(0xB0, b"\1\3" + none),
                 packet(0x40, b"\1\4"),
+                packet(0x40, b"\1\5\x87" + none),
                 packet(0xD0, b""),
                 packet(0x62, b"\1\5"),
                 packet(0xE0, b"\x8e"),
@@ -235,7 +236,8 @@ class TestRead:
             ("accepted", Accepted()),
             ("answer", 0x102, b"\1\x80"),
             ("answer", 0x103, b""),
-            ("puback", 0x104),
+            ("puback", 0x104, 0),
+            ("puback", 0x105, 0x87),
             ("pong",),
             ("disconnect", 0x8E),
         ]

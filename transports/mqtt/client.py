@@ -36,6 +36,11 @@ class Opening(NamedTuple):
     address: Address  # one of the host's; TLS checks the name of the host
 
 
+def is_hang_up(error: OSError | None) -> bool:
+    """Whether the other side has closed the connection, by FIN (None) or RST, rather than the network between."""
+    return error is None or isinstance(error, ConnectionError | ssl.SSLEOFError)
+
+
 class Client:
     """`open` waits for TCP and TLS, everything else returns at once. ``listener`` is called by `read`."""
 
@@ -44,6 +49,7 @@ class Client:
         self.socket: socket.socket | None = None  # None: not open yet, or lost
         self.unwritten = 0  # bytes that the kernel has not accepted yet
         self.drained = True  # `receive` has taken out everything that had come
+        self.hung_up = False  # the other side has ended the connection, in whatever way
         self._modern = settings.protocol == "5"
         self._address, self._settings, self._context = opening.address, settings, opening.context
         self._hello = packets.connect(
@@ -107,12 +113,13 @@ class Client:
         if sock is None:
             return 0
         try:
-            data = sock.recv(_PIECE)
+            data, error = sock.recv(_PIECE), None
         except _NOT_NOW:
             return 0
-        except OSError:
-            data = b""
+        except OSError as failure:
+            data, error = b"", failure
         if not data:
+            self.hung_up = is_hang_up(error)
             self.close()
         # What TLS has unpacked is no measure of what the socket has.
         self.drained = not data or (len(data) < _PIECE and self._context is None)
@@ -141,12 +148,12 @@ class Client:
             self._quota = self._receive_maximum = accepted.receive_maximum
         self._listener.on_accepted(accepted)
 
-    def on_puback(self, mid: int) -> None:
+    def on_puback(self, mid: int, code: int) -> None:
         if self._held:
             self._send(self._held.popleft())
         else:
             self._quota = min(self._quota + 1, self._receive_maximum)
-        self._listener.on_puback(mid)
+        self._listener.on_puback(mid, code)
 
     # -- writing
 
@@ -202,7 +209,8 @@ class Client:
                 written = self.socket.send(data)
             except _NOT_NOW:
                 written = 0
-            except OSError:
+            except OSError as error:
+                self.hung_up = is_hang_up(error)
                 self.close()
                 return
             if written == len(data):

@@ -36,6 +36,7 @@ from pebble.transports.mqtt.outgoing import (
     unconfirmed_bytes,
 )
 from pebble.transports.mqtt.packets import ANY_QOS, RETAIN, Accepted, Filter, MalformedError
+from pebble.transports.mqtt.suspects import Written
 from pebble.transports.topics import MAX_BYTES
 
 if TYPE_CHECKING:
@@ -123,7 +124,8 @@ class Connection:
     """One connection: a client, the backlog of its socket, and the acknowledgements that the broker owes.
 
     `as_published` uses bridge mode on 3.1.1, and noLocal and retain-as-published on 5 (T7, T16). `on_answers` is called
-    on the network thread with the filters that the broker has answered, and whether it refused each (T21).
+    on the network thread with the filters that the broker has answered, and whether it refused each (T21), and
+    `on_refusal` with the topic of a message that it does not take, and the reason (MQTT 5).
     """
 
     def __init__(
@@ -135,7 +137,8 @@ class Connection:
         as_published: bool,
         on_answers: Callable[[Mapping[str, bool]], None],
         skips_retained: Callable[[bytes], bool],
-        is_vital: Callable[[str], bool] = lambda _topic: False,
+        on_refusal: Callable[[str, str], None],
+        is_stop: Callable[[str], bool] = lambda _topic: False,
     ) -> None:
         settings = opening.settings
         self.as_published = as_published
@@ -149,7 +152,8 @@ class Connection:
         self._modern = settings.protocol == "5"
         self._lock = threading.RLock()
         self._inbox: list[Message] = []
-        self._on_answers, self._skips_retained, self._is_vital = on_answers, skips_retained, is_vital
+        self._on_answers, self._skips_retained = on_answers, skips_retained
+        self._on_refusal, self._is_stop = on_refusal, is_stop
         self._asked: dict[int, list[str]] = {}  # the filters of each SUBSCRIBE without an answer, by message id
         self._answers: dict[str, bool] = {}  # filters answered since the last `on_answers`: refused?
         self._backlog = Backlog()
@@ -164,11 +168,14 @@ class Connection:
         self._packets = 0  # received so far
         self._received_at = self._answered_at  # before the socket was emptied, or a piece of what is in it taken out
         self._stalled_since = self._answered_at  # when the last time without reading began, for which a ping was sent
+        #: Topics whose next message is followed by a ping at once: its answer shows that the broker accepts it.
+        self.doubtful: set[str] = set()
         self._more = False  # a batch ended before the socket was empty
         self._copies = False  # there are retained messages in the batch
         self._accepted = False
         self._refusal: Refused | None = None
         self._disconnect_reason = ""
+        self._hung_up = False  # the broker has sent DISCONNECT, for a reason that may be a message
         self._taken_over = True  # may be: MQTT 3.1.1 has no words for it
         self._wake_read, self._wake_write = socket.socketpair()
         self._wake_read.setblocking(False)
@@ -448,13 +455,16 @@ class Connection:
 
     def _is_full(self, message: Message) -> bool:
         beyond = self._in_flight.unacked - UNACKED_LIMIT
-        return beyond >= UNACKED_RESERVE or not self._is_vital(message.topic)
+        return beyond >= UNACKED_RESERVE or not self._is_stop(message.topic)
 
     def _write_publish(self, message: Message, expires_s: int | None) -> None:
         mid = self._client.publish(
             message.topic, message.payload, int(message.qos), retain=message.retain, expires_s=expires_s
         )
         self._in_flight.sent(message, mid, clock.since_boot())
+        if self.doubtful and message.topic in self.doubtful:
+            self.doubtful.discard(message.topic)
+            self._ping()
 
     def subscribe(self, filters: Iterable[tuple[str, bool]], qos: QoS = QoS.DELIVERED) -> PendingAck:
         """Subscribe to filters, each with its noLocal option (MQTT 5 only)."""
@@ -514,6 +524,18 @@ class Connection:
         with self._lock:
             return self._in_flight.unconfirmed_retained()
 
+    def has_accepted(self, topic: str, size: int) -> bool:
+        """Whether the broker has answered a ping after a message of ``topic`` that was as large."""
+        with self._lock:
+            return self._in_flight.has_accepted(topic, size)
+
+    def written_before_loss(self) -> dict[str, Written] | None:
+        """What the other side may have closed the connection for; None: it has not, or for another reason."""
+        with self._lock:
+            if not (self._hung_up or (self._client.hung_up and not self._disconnect_reason)):
+                return None
+            return self._in_flight.first_written(clock.since_boot())
+
     # -- called by the client: on the network thread, with the lock held
 
     def _note_answer(self) -> None:
@@ -544,6 +566,7 @@ class Connection:
     def on_disconnect(self, code: int) -> None:
         self._disconnect_reason = f"{self.where} closed the connection: {reasons.words(code)}"
         self._taken_over = code == reasons.TAKEN_OVER
+        self._hung_up = reasons.may_concern_message(code)
         self._client.close()
 
     def on_answer(self, mid: int, codes: bytes) -> None:
@@ -556,8 +579,11 @@ class Connection:
             log.warning("%s refused to subscribe us to %s", self.where, ", ".join(refused))
         self._in_flight.answer(mid)
 
-    def on_puback(self, mid: int) -> None:
+    def on_puback(self, mid: int, code: int) -> None:
         now = clock.since_boot()
+        if code >= reasons.FAILURE and (topic := self._in_flight.topic_of(mid)) is not None:
+            self._counters.add("publications_refused")
+            self._on_refusal(topic, reasons.words(code))
         sent_at = self._in_flight.acknowledge(mid, now)
         if sent_at is not None:
             self._packets += 1

@@ -11,12 +11,11 @@ import struct
 import sys
 import threading
 from collections import deque
-from collections.abc import Collection
 from contextlib import suppress
 from dataclasses import dataclass
-from math import inf
 
 from pebble.transports.base import Message, QoS
+from pebble.transports.mqtt.suspects import SMALL, TOPICS, WINDOW_S, Written
 
 try:
     import fcntl
@@ -28,10 +27,6 @@ else:
 
 BACKLOG_MESSAGES = 64  # that are not retained
 BACKLOG_BYTES = 256 * 1024  # of their payloads; one message may always wait, whatever its size
-LOSSES = 3  # in a row with a message in flight, after which it counts as refused
-REFUSED_S = 3600.0
-_SMALL = 256  # bytes that every broker takes: what hangs up with nothing larger in flight has another reason
-_REFUSED = 1000  # topics
 ROUND_TRIPS = 8  # answer times that are remembered
 
 _TCP_INFO = getattr(socket, "TCP_INFO", None)  # Linux only
@@ -119,42 +114,6 @@ class PendingAck:
         self._answered.set()
 
 
-class RefusedMessages:
-    """Retained messages that the broker refuses: by its limit, or by hanging up each time they are sent.
-
-    Nothing else says so on MQTT 3.1.1, and the one in question is unknown: of those in flight at several losses in a
-    row it is the largest. A smaller one on the same topic is not refused, and after a while none is: other causes end.
-    """
-
-    def __init__(self) -> None:
-        self._losses: dict[str, int] = {}  # in a row, by topic
-        self._refused: dict[str, tuple[int, float]] = {}  # by topic: bytes, and when
-
-    def note_loss(self, in_flight: Collection[Message], now: float) -> Message | None:
-        """The broker has hung up with ``in_flight`` unconfirmed; returns the message that is refused from now on."""
-        self._losses = {message.topic: self._losses.get(message.topic, 0) + 1 for message in in_flight}
-        often = [message for message in in_flight if self._losses[message.topic] >= LOSSES]
-        suspects = [message for message in often if len(message.payload) > _SMALL]
-        if not suspects:
-            return None
-        largest = max(suspects, key=lambda message: len(message.payload))
-        self._losses.clear()
-        self.add(largest, now)
-        return largest
-
-    def add(self, message: Message, now: float) -> bool:
-        """Refuse ``message`` from now on; returns whether that is new."""
-        if len(self._refused) >= _REFUSED:
-            del self._refused[next(iter(self._refused))]
-        is_new = message.topic not in self._refused
-        self._refused[message.topic] = len(message.payload), now
-        return is_new
-
-    def has(self, message: Message, now: float) -> bool:
-        size, since = self._refused.get(message.topic, (inf, -inf))
-        return len(message.payload) >= size and now - since < REFUSED_S
-
-
 @dataclass(slots=True)
 class _Unconfirmed:
     """A retained message the broker may not have. A PUBACK, or the answer to a later ping, confirms that it has."""
@@ -169,12 +128,16 @@ class InFlightTable:
 
     def __init__(self) -> None:
         self._round_trips: deque[float] = deque(maxlen=ROUND_TRIPS)  # the latest, seconds
-        self._unacked: dict[int, tuple[str | None, float]] = {}  # by message id: the topic, if retained; when sent
+        self._unacked: dict[int, tuple[str, float]] = {}  # by message id: the topic, and when sent
         self._acked_at = float("-inf")  # the newest acknowledgement
         self._unconfirmed: dict[str, _Unconfirmed] = {}  # newest retained message of each topic, oldest first
         self._requests: dict[int, PendingAck] = {}
         self.answered: list[PendingAck] = []  # and not completed yet
-        self._pings: deque[tuple[float, PendingAck | None]] = deque()  # unanswered: when sent, and what waits for it
+        #: Unanswered: when sent, what waits for it, and what was written before it and after the ping before.
+        self._pings: deque[tuple[float, PendingAck | None, dict[str, tuple[float, int]]]] = deque()
+        # By topic, since when and of how many bytes: messages written after the newest ping, larger than those
+        self._written: dict[str, tuple[float, int]] = {}
+        self._accepted: dict[str, tuple[float, int]] = {}  # that an answered ping followed.
         self._ping_number = self._pong_number = 0
 
     # -- messages
@@ -200,9 +163,12 @@ class InFlightTable:
             self._unconfirmed[message.topic] = _Unconfirmed(message)
 
     def sent(self, message: Message, mid: int, now: float) -> None:
-        """Note that ``message`` went out under the id ``mid``."""
+        """Note that ``message`` went out under the id ``mid``. Hot."""
+        size, known = len(message.payload), self._accepted.get(message.topic)
+        if known is None or size > known[1]:
+            _note(self._written, message.topic, now, size)
         if message.qos is QoS.DELIVERED:
-            self._unacked[mid] = (message.topic if message.retain else None, now)
+            self._unacked[mid] = (message.topic, now)
         if message.retain:
             entry = self._unconfirmed[message.topic]
             if message.qos is QoS.DELIVERED:
@@ -216,9 +182,27 @@ class InFlightTable:
             return None
         self._acked_at = now
         topic, sent_at = self._unacked.pop(mid)
-        if topic is not None and topic in self._unconfirmed and self._unconfirmed[topic].mid == mid:
+        if topic in self._unconfirmed and self._unconfirmed[topic].mid == mid:
             del self._unconfirmed[topic]
         return sent_at
+
+    def topic_of(self, mid: int) -> str | None:
+        """The topic of a DELIVERED message that is not acknowledged; None: there is no such message."""
+        return self._unacked[mid][0] if mid in self._unacked else None
+
+    def has_accepted(self, topic: str, size: int) -> bool:
+        """Whether the answer to a ping has followed a message of ``topic`` that was as large."""
+        return topic in self._accepted and size <= self._accepted[topic][1]
+
+    def first_written(self, now: float) -> dict[str, Written]:
+        """Topics with a message within the last `WINDOW_S` that was the first one on them, or the largest."""
+        since = now - WINDOW_S - self.round_trip_s
+        found = {topic: Written(size, True) for topic, (at, size) in self._accepted.items() if at >= since}
+        for written in (*(written for _, _, written in self._pings), self._written):
+            for topic, (at, size) in written.items():
+                if at >= since and not self.has_accepted(topic, size):
+                    found[topic] = Written(max(size, found[topic].size if topic in found else 0))
+        return found
 
     # -- requests and pings
 
@@ -239,16 +223,19 @@ class InFlightTable:
 
     def ping(self, now: float, ack: PendingAck | None) -> None:
         """Track a PINGREQ."""
-        self._pings.append((now, ack))
+        self._pings.append((now, ack, self._written))
+        self._written = {}
         self._ping_number += 1
 
     def pong(self, now: float) -> None:
         """Process a PINGRESP."""
         if not self._pings:
             return
-        sent_at, ack = self._pings.popleft()
+        sent_at, ack, written = self._pings.popleft()
         self._pong_number += 1
         self.measured(now - sent_at)
+        for topic, (at, size) in written.items():
+            _note(self._accepted, topic, at, max(size, SMALL))
         for topic in [t for t, entry in self._unconfirmed.items() if entry.ping and entry.ping <= self._pong_number]:
             del self._unconfirmed[topic]
         if ack is not None:
@@ -265,10 +252,17 @@ class InFlightTable:
     def end(self) -> None:
         """Complete everything: no answer can come any more."""
         self.complete()
-        for ack in [*self._requests.values(), *(ack for _, ack in self._pings if ack)]:
+        for ack in [*self._requests.values(), *(ack for _, ack, _ in self._pings if ack)]:
             ack.complete()
         self._requests.clear()
         self._pings.clear()
+
+
+def _note(table: dict[str, tuple[float, int]], topic: str, at: float, size: int) -> None:
+    """Note a message, unless one that was as large is in ``table`` already, or there is no room."""
+    known = table.get(topic)
+    if (known is None and len(table) < TOPICS) or (known is not None and size > known[1]):
+        table[topic] = at, size
 
 
 def unconfirmed_bytes(sock: socket.socket) -> int:

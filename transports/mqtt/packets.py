@@ -158,7 +158,8 @@ class Listener(Protocol):
     def on_publication(self, topic: bytes, payload: bytes, first: int) -> None:
         """``first`` is the first byte of the packet, with QoS and retain."""
 
-    def on_puback(self, mid: int) -> None: ...
+    def on_puback(self, mid: int, code: int) -> None:
+        """``code`` is MQTT 5's; from 128 on it is a refusal."""
 
     def on_answer(self, mid: int, codes: bytes) -> None:
         """A SUBACK, with a code for each filter, or an UNSUBACK; from 128 on a code is a refusal."""
@@ -241,7 +242,7 @@ class Reader:
             if data[at] & 0xF0 == _PUBLISH:
                 self._publish(data, data[at], start, stop)
             elif data[at] == _PUBACK and size >= _SHORTEST[_PUBACK]:
-                self._listener.on_puback(data[start] << 8 | data[start + 1])
+                self._listener.on_puback(data[start] << 8 | data[start + 1], data[start + 2] if size > 2 else 0)
             else:
                 self._other(data[at], data[start:stop])
         return count

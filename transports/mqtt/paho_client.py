@@ -19,7 +19,7 @@ from paho.mqtt.subscribeoptions import SubscribeOptions
 
 from pebble.transports import hosts
 from pebble.transports.hosts import Address, dial
-from pebble.transports.mqtt.client import SEND_BUFFER, Opening
+from pebble.transports.mqtt.client import SEND_BUFFER, Opening, is_hang_up
 from pebble.transports.mqtt.packets import ANY_QOS, HEAD, MAX_PACKET, RETAIN, Accepted, Filter, Listener
 
 _PIECE = 64 * 1024  # bytes that are read at once
@@ -93,7 +93,7 @@ class PahoClient:
 
     def __init__(self, opening: Opening, listener: Listener, *, bridge: bool) -> None:
         client_id, settings, context, will, address = opening
-        self.drained = True
+        self.drained, self.hung_up = True, True  # paho does not say how a connection ended on which it wrote
         self._settings, self._context, self._listener = settings, context, listener
         self._modern = settings.protocol == "5"
         protocol = MQTTProtocolVersion.MQTTv5 if self._modern else MQTTProtocolVersion.MQTTv311
@@ -118,7 +118,7 @@ class PahoClient:
         client.on_disconnect = self._on_disconnect
         client.on_subscribe = self._on_subscribe
         client.on_unsubscribe = lambda _client, _data, mid, _reasons, _properties: listener.on_answer(mid, b"")
-        client.on_publish = lambda _client, _data, mid, _reason, _properties: listener.on_puback(mid)
+        client.on_publish = lambda _client, _data, mid, reason, _properties: listener.on_puback(mid, reason.value)
 
     def open(self) -> None:
         self._paho.connect(self._settings.host, self._settings.port, self._settings.keepalive_s)
@@ -144,12 +144,13 @@ class PahoClient:
         if sock is None:
             return 0
         try:
-            data = sock.recv(_PIECE)
+            data, error = sock.recv(_PIECE), None
         except (BlockingIOError, ssl.SSLWantReadError, ssl.SSLWantWriteError):
             return 0
-        except OSError:
-            data = b""
+        except OSError as failure:
+            data, error = b"", failure
         if not data:
+            self.hung_up = is_hang_up(error)
             self.close()
         self.drained = not data or (len(data) < _PIECE and self._context is None)
         self._paho.ahead, self._paho.begin = data, 0

@@ -8,6 +8,9 @@ FAILURE: Final = 0x80  # MQTT 5: this code and those above are errors
 TAKEN_OVER: Final = 0x8E
 PROTOCOL_REFUSED: Final = 1  # of 3.1.1: what some brokers answer to bridge mode
 
+#: MQTT 5: why a broker closes a connection whatever was published on it.
+_OF_NO_MESSAGE = frozenset({0x00, 0x88, 0x89, 0x8A, 0x8B, 0x8D, TAKEN_OVER, 0x96, 0x98, 0x9C, 0x9D, 0x9F, 0xA0})
+
 _OF_3_1_1 = {1: 0x84, 2: 0x85, 3: 0x88, 4: 0x86, 5: 0x87}  # CONNACK's codes as those of MQTT 5
 
 _WORDS = {
@@ -52,6 +55,11 @@ _WORDS = {
 def words(code: int) -> str:
     """The name of a reason code of MQTT 5, or of a SUBACK of 3.1.1."""
     return _WORDS.get(code, "normal disconnection" if code == 0 else f"code {code}")
+
+
+def may_concern_message(code: int) -> bool:
+    """Whether a DISCONNECT with this code may be the answer to a message."""
+    return code not in _OF_NO_MESSAGE
 
 
 def connection_refused(code: int) -> str:

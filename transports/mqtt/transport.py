@@ -8,20 +8,24 @@ import ssl
 import threading
 import time
 from collections.abc import Callable, Mapping
-from math import ceil
+from math import ceil, inf
 
 from pebble.errors import TransportError
 from pebble.transports import clock
 from pebble.transports.base import Message, Outgoing, QoS, State, Subscription, Transport
+from pebble.transports.bounds import BoundedTable
 from pebble.transports.hosts import Address, Turns
 from pebble.transports.mqtt import client_ids
 from pebble.transports.mqtt.bridge_mode import Attempt, BridgeMode, Result
 from pebble.transports.mqtt.client import Opening
 from pebble.transports.mqtt.connection import Connection, Lost, Refused, Silent, ignore
 from pebble.transports.mqtt.filters import BrokerFilters, OwnMessageFilter, overlap
-from pebble.transports.mqtt.outgoing import LOSSES, PendingAck, RefusedMessages
+from pebble.transports.mqtt.outgoing import PendingAck
+from pebble.transports.mqtt.retention import RetentionCheck
+from pebble.transports.mqtt.suspects import TOPICS, Kind, SuspectTopics, Written, named
 from pebble.transports.settings import MqttSettings
 from pebble.transports.tls import make_context
+from pebble.transports.topics import MAX_BYTES
 
 log = logging.getLogger(__name__)
 
@@ -32,6 +36,8 @@ _RETRY_S = 0.05  # second attempt to connect; doubles up to settings.reconnect_m
 _CATCH_UP_S = 0.5  # time for a broker that was suspended to deliver its backlog before we subscribe
 _STEADY_S = 2.0  # after a connection this long the first retry is immediate
 _REPEAT_LOG_S = 30.0  # between two equal log lines
+_TRY_S = 0.25  # between two looks whether a topic that is withheld may be tried
+_NOT_TAKEN_S = 600.0  # between two log lines about one topic that the broker does not take
 _IDLE_S = 60.0  # the connection wakes up earlier, for its pings
 
 
@@ -62,7 +68,14 @@ class MqttTransport(Transport):
         self._broker_stalled = False  # the broker may have been suspended, and have old messages to forward first
         self._logged = ("", 0.0)  # the newest problem in the log, and when it went there
         self._own_message_filter = OwnMessageFilter()
-        self._refused_messages = RefusedMessages()
+        self._suspects = SuspectTopics(settings.vital)  # guarded by _publishing
+        self._tried_at = 0.0  # when it was last looked whether one of them may be tried
+        self._arrived_at = float("-inf")  # the newest message
+        self._checked: set[str] = set()  # addresses of brokers that were asked what they retain
+        self._retention: RetentionCheck | None = None
+        self._retention_answer = PendingAck()
+        #: Topics on which the broker takes no messages: why, and when that was last in the log.
+        self.not_taken = BoundedTable[tuple[str, float]](TOPICS, TOPICS * MAX_BYTES, lambda _: 0)
 
     @property
     def untried(self) -> bool:
@@ -102,17 +115,24 @@ class MqttTransport(Transport):
         if connection is None or not (self._state is State.CONNECTED or self._syncing):
             return False
         if not connection.takes(message):
-            if self._refused_messages.add(message, time.monotonic()):
-                self._report_refused(message, f"{connection.where} takes packets of at most {connection.max_packet}")
+            why = f"{len(message.payload)} bytes, but it takes packets of {connection.max_packet} at most"
+            self._report_not_taken(connection, message.topic, why, logging.ERROR)
             self.counters.add("too_large")
             return True
-        if message.retain and self._refused_messages.has(message, time.monotonic()):
-            self.counters.add("too_large")
-            return True  # as if it were sent: it must not be tried again with every connection
+        tried = False
+        if self._suspects.withheld and not self._suspects.accepts(message):
+            tried = self._suspects.tries(message, time.monotonic(), self._arrived_at)
+            if not tried:
+                self.counters.add("withheld")
+                return True  # as if it were sent: nothing may wait behind it
+            connection.doubtful.add(message.topic)
         expires_s = ceil(self.settings.silence_s) if urgent and not message.retain else None
         if message.retain:
             self._own_message_filter.note_own(message)
-        return connection.publish(message, expires_s=expires_s)
+        accepted = connection.publish(message, expires_s=expires_s)
+        if tried and not accepted:
+            self._suspects.give_up()
+        return accepted
 
     def _declare(self, subscription: Subscription) -> None:
         with self._routing:
@@ -219,28 +239,99 @@ class MqttTransport(Transport):
             if failed := self._turns.succeeded():
                 self._log(logging.INFO, f"connected to {connection.where}; before it {failed}")
             while not stopping.is_set():
-                connection.pump(_IDLE_S, self._deliver_all)
+                connection.pump(_IDLE_S, self._deliver_all if self._retention is None else self._deliver_and_note)
                 if self._pending and connection.has_room:
                     self._sync_retained(self._own.keys())
-        except Silent:
+                if self._suspects.withheld:
+                    self._try_withheld(connection)
+                if self._retention is not None:
+                    self._check_retention(connection)
+        except Lost as lost:
+            self._note_loss(connection, None if isinstance(lost, Silent) else connection.written_before_loss())
             raise
-        except Lost:
-            refused = self._refused_messages.note_loss(connection.unconfirmed_retained(), time.monotonic())
-            if refused is not None:
-                self._report_refused(refused, f"{connection.where} hung up {LOSSES} times in a row while it was sent")
-            raise
+
+    def _note_loss(self, connection: Connection, written: Mapping[str, Written] | None) -> None:
+        with self._publishing:
+            assessment = self._suspects.lost(written, time.monotonic())
+        if assessment is not None:
+            level = logging.WARNING if assessment.kind is Kind.SUSPECTED else logging.ERROR
+            log.log(level, "%s: %s", self.client_id, assessment.text(connection.where))
+
+    def _try_withheld(self, connection: Connection) -> None:
+        """See whether the broker accepts the message that is tried, and send the next one that is retained."""
+        now = time.monotonic()
+        with self._publishing:
+            confirmed = self._suspects.confirm(now, connection.has_accepted)
+            if confirmed is not None:
+                tried, reported = confirmed
+                if reported:
+                    log.info("%s: %s accepts messages on %s again", self.client_id, connection.where, tried.topic)
+                if (newest := self._own.get(tried.topic)) is not None and newest is not tried:
+                    self._remember(newest, sent=self._send(newest, False))
+            elif now - self._tried_at < _TRY_S:
+                return
+            self._tried_at = now
+            for topic in self._suspects.due(now, self._arrived_at):
+                message = self._own.get(topic)
+                if message is not None and not self._suspects.accepts(message):
+                    self._remember(message, sent=self._send(message, False))
+                    return
+
+    def _check_retention(self, connection: Connection) -> None:
+        """Ask once for each of our retained messages by name, and report which ones the broker does not have."""
+        check, now = self._retention, time.monotonic()
+        assert check is not None  # noqa: S101 - the caller looked
+        if check.is_due(now):
+            if topics := check.begin(self._own_topics_apart(connection)):
+                connection.subscribe([(topic, False) for topic in topics], QoS.LATEST)
+                self._retention_answer = connection.ping()
+            else:
+                self._retention = None
+        elif check.topics:
+            missing = check.missing(now, answered=self._retention_answer.done)
+            if missing is not None:
+                self._end_retention_check(connection, check, missing)
+
+    def _own_topics_apart(self, connection: Connection) -> list[str]:
+        """Topics of our retained messages that the broker should have, and that no subscription of ours receives."""
+        with self._routing:
+            filters = list(self._filters)
+        with self._publishing:
+            return [
+                topic
+                for topic, message in self._own.items()
+                if message.payload and topic not in self._shared and self._accepts(connection, message)
+                if topic not in self.not_taken and not any(overlap(topic, filter_) for filter_ in filters)
+            ]
+
+    def _end_retention_check(self, connection: Connection, check: RetentionCheck, missing: list[str]) -> None:
+        connection.unsubscribe(check.topics)
+        self._retention = None
+        if self._address is not None:
+            self._checked.add(self._address.text)
+        missing = [topic for topic in missing if topic in self._own and topic not in self.not_taken]
+        if missing:
+            log.warning(
+                "%s: %s has not kept what was published on %s: may this account publish there and read it, "
+                "and does the broker keep retained messages?",
+                self.client_id,
+                connection.where,
+                named(missing),
+            )
 
     def _make_connection(self, will: Message | None, *, as_published: bool) -> Connection:
         assert self._address is not None  # noqa: S101 - both callers run at an address
-        return Connection(
+        connection = Connection(
             Opening(self._mqtt_client_id, self.settings, self._context, will, self._address),
             self.counters,
             where=self._where,
             as_published=as_published,
             on_answers=self._note_answers,
             skips_retained=lambda topic: self.skips_retained(topic),
-            is_vital=lambda topic: self.is_vital(topic),
+            is_stop=lambda topic: self.is_stop(topic),
+            on_refusal=lambda topic, why: self._report_not_taken(connection, topic, why),
         )
+        return connection
 
     def _connect(self, connection: Connection, stopping: threading.Event) -> None:
         try:
@@ -285,7 +376,14 @@ class MqttTransport(Transport):
             copied = connection.ping()
         self._await(connection, subscribed, stopping, self._deliver_all)
         self._await(connection, copied, stopping, self._deliver_all)
+        now = time.monotonic()
+        with self._publishing:
+            self._suspects.connected(now)
+            connection.doubtful |= self._suspects.doubtful
         self._initial_sync(known)
+        self._retention = None
+        if self._address is not None and self._address.text not in self._checked:
+            self._retention = RetentionCheck(now)
 
     def _let_catch_up(self, connection: Connection, stopping: threading.Event) -> None:
         """Wait before subscribing: a broker that was suspended first forwards old messages of others."""
@@ -322,7 +420,7 @@ class MqttTransport(Transport):
 
     def _accepts(self, connection: Connection, message: Message) -> bool:
         """Whether the broker has, as far as is known, accepted this retained message."""
-        return connection.takes(message) and not self._refused_messages.has(message, time.monotonic())
+        return connection.takes(message) and self._suspects.accepts(message)
 
     def _await(
         self,
@@ -340,7 +438,14 @@ class MqttTransport(Transport):
                 raise Silent(f"{connection.where} does not answer")
             connection.pump(left, receive)
 
+    def _deliver_and_note(self, messages: list[Message]) -> None:
+        if self._retention is not None:
+            self._retention.note(messages, time.monotonic())
+        self._deliver_all(messages)
+
     def _deliver_all(self, messages: list[Message]) -> None:
+        if self._suspects.withheld:
+            self._arrived_at = time.monotonic()
         for message in messages:
             self.count_received()
             repeat = False
@@ -355,6 +460,9 @@ class MqttTransport(Transport):
     def _note_answers(self, refused: Mapping[str, bool]) -> None:
         if self._connection is None:
             return  # to the query of our own retained messages
+        if self._retention is not None:
+            for filter_ in [filter_ for filter_, is_refused in refused.items() if is_refused]:
+                self._retention.refused(filter_)
         with self._lock:
             for filter_, is_refused in refused.items():
                 for subscription in self._subscriptions:
@@ -379,9 +487,12 @@ class MqttTransport(Transport):
                 if message.topic not in self._pending:
                     self._remember(message, sent=False)
 
-    def _report_refused(self, message: Message, why: str) -> None:
-        size = len(message.payload)
-        log.error("%s: a message of %d bytes on %s is not sent: %s", self.client_id, size, message.topic, why)
+    def _report_not_taken(self, connection: Connection, topic: str, why: str, level: int = logging.WARNING) -> None:
+        """Once for each topic, and again after a while: any number of messages may follow."""
+        now = time.monotonic()
+        if now - self.not_taken.get(topic, ("", -inf))[1] >= _NOT_TAKEN_S:
+            self.not_taken[topic] = why, now
+            log.log(level, "%s: %s does not take a message on %s: %s", self.client_id, connection.where, topic, why)
 
     def _report_problem(self, problem: str, *, logged: bool) -> None:
         self.problem = problem

@@ -128,8 +128,8 @@ class TestUrgency:
 
     @pytest.mark.parametrize("side", ["transport", "_remote"])
     def test_it_is_taken_where_too_many_messages_wait(self, memory: MemoryRig, side: str) -> None:
-        is_vital = getattr(memory.bridge(), side).is_vital
-        found = {suffix: is_vital(f"{BASE}/{suffix}") for suffix in (STOP, RESET, STATE, DRIVE, "incoming/estop/x")}
+        is_stop = getattr(memory.bridge(), side).is_stop
+        found = {suffix: is_stop(f"{BASE}/{suffix}") for suffix in (STOP, RESET, STATE, DRIVE, "incoming/estop/x")}
         assert found == {suffix: suffix == STOP for suffix in found}
 
     def test_an_mcus_private_alias_does_not_hold_it_back(self, memory: MemoryRig) -> None:

@@ -1,0 +1,49 @@
+"""Asks a broker once which of our own retained messages it has: nothing else shows what it silently drops. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from math import inf
+
+from pebble.transports.base import Message
+
+AFTER_S = 2.0  # from the first connection to the question
+LATE_S = 1.0  # without another message, after which none comes any more
+TOPICS = 200  # at most are asked for
+
+
+class RetentionCheck:
+    """One question to one broker: subscribe to `topics`, hand over what comes, and see what is `missing`."""
+
+    def __init__(self, now: float) -> None:
+        self.topics: list[str] = []
+        self._due_at, self._newest_at = now + AFTER_S, inf
+        self._found: set[str] = set()
+
+    def is_due(self, now: float) -> bool:
+        return not self.topics and now >= self._due_at
+
+    def begin(self, topics: Collection[str]) -> list[str]:
+        """Returns those of ``topics`` to subscribe to."""
+        self.topics = list(topics)[:TOPICS]
+        return self.topics
+
+    def note(self, messages: list[Message], now: float) -> None:
+        found = {one.topic for one in messages if one.retain}.intersection(self.topics)
+        if found:
+            self._found |= found
+            self._newest_at = now
+
+    def refused(self, topic: str) -> None:
+        """We may not subscribe to ``topic``: so nothing shows whether the broker has it."""
+        self._found.add(topic)
+
+    def missing(self, now: float, *, answered: bool) -> list[str] | None:
+        """What the broker has not sent, once the question is over; None before that.
+
+        ``answered`` is whether it has answered a later request: what it has should have come, but may still be late.
+        """
+        if answered:
+            self._newest_at = min(self._newest_at, now)
+        left = [topic for topic in self.topics if topic not in self._found]
+        return None if left and now - self._newest_at < LATE_S else left
