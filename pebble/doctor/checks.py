@@ -23,6 +23,7 @@ from pebble.doctor import Finding, Level
 from pebble.doctor.broker_probe import REFUSED_ID, REFUSED_LOGINS, ProbeResult, probe
 from pebble.doctor.loudspeaker import loudspeaker
 from pebble.doctor.media import media
+from pebble.doctor.publishing import publishing
 from pebble.doctor.reachable import beyond_loopback, own_addresses
 from pebble.doctor.recordings import recorder
 from pebble.errors import PebbleError
@@ -66,7 +67,10 @@ def _robot(config: Config) -> Iterator[Finding]:
     yield from recorder(config)
     for name, mqtt in _brokers(config):
         settings = mqtt_settings(mqtt, reconnect_max_s=REMOTE_RECONNECT_S, program="doctor")
-        yield from broker(name, settings)
+        found = list(broker(name, settings))
+        yield from found
+        if mqtt is config.services.mqtt_bridge.remote_mqtt and found[0].level is Level.OK:
+            yield publishing(found[0].what, settings, config.base)
         if is_loopback(mqtt.host):
             yield from beyond_loopback(name, settings, own_addresses())
 

@@ -18,8 +18,10 @@ from pebble.config import load, parse
 from pebble.doctor import Finding, Level
 from pebble.doctor import checks as doctor
 from pebble.doctor.broker_probe import ProbeResult, connect_packet, probe
+from pebble.doctor.publishing import publishing
 from pebble.transports.settings import MqttSettings, TlsSettings
 from tests.support import Broker, free_port
+from tests.tcp_proxy import ForbiddingProxy
 
 MEGABYTE = 1024 * 1024
 
@@ -182,6 +184,36 @@ def test_an_unreachable_broker_fails() -> None:
         "cannot be reached: Connection refused",
         "sudo systemctl start mosquitto",
     )
+
+
+@pytest.mark.parametrize("protocol", ["3.1.1", "5"])
+@pytest.mark.parametrize(
+    ("allowed", "level", "why"),
+    [
+        ("readwrite #", Level.OK, "accepts what this account publishes"),
+        ("read #", Level.FAIL, "may not publish to pebble/robots/goob/outgoing/bridge-probe"),
+        ("readwrite pebble/robots/other/#", Level.FAIL, "may not publish to pebble/robots/goob/outgoing/bridge-probe"),
+    ],
+)
+def test_an_account_that_may_not_publish_is_found(
+    tmp_path: Path, protocol: str, allowed: str, level: Level, why: str
+) -> None:
+    (tmp_path / "acl").write_text(f"topic {allowed}\n")
+    broker = Broker(tmp_path, f"acl_file {tmp_path / 'acl'}")
+    try:
+        settings = MqttSettings(host="127.0.0.1", port=broker.port, protocol=protocol)
+        finding = publishing("b", settings, "pebble/robots/goob")
+    finally:
+        broker.stop()
+    assert (finding.level, why in finding.text) == (level, True)
+    assert level is Level.OK or finding.fix == "allow it to write and read pebble/robots/goob/outgoing/# on the broker"
+
+
+def test_a_broker_that_hangs_up_on_what_is_published_is_found(open_broker: Broker) -> None:
+    with ForbiddingProxy(open_broker.port) as proxy:
+        proxy.forbidden = {"pebble/robots/goob/outgoing/bridge-probe"}
+        finding = publishing("b", MqttSettings(host="127.0.0.1", port=proxy.port), "pebble/robots/goob")
+    assert (finding.level, "hangs up" in finding.text) == (Level.FAIL, True)
 
 
 def probe_returning(own: ProbeResult, without_login: ProbeResult) -> Callable[..., ProbeResult]:
