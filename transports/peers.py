@@ -99,6 +99,11 @@ class FileLock:
                 return cls(path, descriptor)
             os.close(descriptor)  # removed between open and flock
 
+    @property
+    def in_place(self) -> bool:
+        """Whether others that open its path find this lock: the file, or its folder, may have been removed."""
+        return _is_at(self.path, self._descriptor)
+
     def write(self, text: bytes) -> None:
         """Replace what is in the file. A full disk leaves zeros, as many: the lock counts, the text is for people."""
         try:
@@ -108,10 +113,23 @@ class FileLock:
             log.warning("%s cannot be written: %s", self.path, error.strerror)
 
     def release(self, *, remove: bool = True) -> None:
-        """Release the lock; ``remove`` deletes the file."""
-        if remove:
+        """Release the lock; ``remove`` deletes the file, unless another has taken its place."""
+        if remove and self.in_place:
             self.path.unlink(missing_ok=True)
         os.close(self._descriptor)
+
+
+class OwnFile:
+    """A file that is this process's now: of a socket where it listens, or of memory that it shares."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._made = _identity(path)
+
+    @property
+    def in_place(self) -> bool:
+        """Whether others that open its path still reach this process."""
+        return self._made is not None and _identity(self._path) == self._made
 
 
 class PresenceLock:
@@ -121,10 +139,28 @@ class PresenceLock:
         self.name, self._owner = name, owner
         self.socket = run_dir / f"{name}.sock"
         self._lock = lock
+        self._listening = OwnFile(self.socket)
 
     def ready(self) -> None:
         """Mark the process as reachable: from now on newcomers wait for its answer."""
+        self._listening = OwnFile(self.socket)
         self._lock.write(self._owner.encode() or b"?")
+
+    @property
+    def in_place(self) -> bool:
+        """Whether newcomers find this process; a folder that cannot be read is no answer."""
+        try:
+            return self._lock.in_place and self._listening.in_place
+        except OSError:
+            return True
+
+    def renew(self) -> None:
+        """Lock a file that was removed again; not `ready` any more. Raises TransportError if there can be none."""
+        if not self._lock.in_place:
+            lock = FileLock.wait(self._lock.path)
+            self._lock.release()
+            self._lock = lock
+        self._lock.write(b"")
 
     def release(self) -> None:
         _clear_socket(self.socket)
@@ -166,10 +202,16 @@ def new_name() -> str:
 
 
 def _is_at(path: Path, descriptor: int) -> bool:
+    return _identity(path) == _identity(descriptor)
+
+
+def _identity(file: Path | int) -> tuple[int, int] | None:
+    """What tells a file from one that has taken its place; None if there is none."""
     try:
-        return os.path.samestat(path.stat(), os.fstat(descriptor))
-    except FileNotFoundError:
-        return False
+        found = os.stat(file)  # noqa: PTH116 - of a descriptor as well
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    return found.st_dev, found.st_ino
 
 
 def _open_lock(path: Path) -> int:

@@ -27,6 +27,7 @@ from pebble.runtime.parent import LAUNCHER_PID
 from pebble.transports import segments
 
 _CONFIG_POLL_S = 2.0
+_RUN_DIR_S = 1.0
 _ORPHANS_S = 1.0
 _REAP_S = 2.0  # the kernel needs this long at most to end what was killed
 
@@ -62,7 +63,7 @@ class Launcher:
         own_records = OwnRecords(self._logs, self._config.log_level_of("launcher"))
         with own_records, _run_lock(self._config) as lock, self._signals:
             try:
-                self._reactor.every(_CONFIG_POLL_S, lock.answer)
+                self._reactor.every(_RUN_DIR_S, lock.keep)
                 self._start()
                 self._reactor.run_until(self._stop_requested)
                 self._stop()

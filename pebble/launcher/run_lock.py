@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from pathlib import Path
 from typing import Self
@@ -10,6 +11,8 @@ from pebble.config import LAUNCHER_LOCK
 from pebble.errors import PebbleError
 from pebble.launcher.machine_name import MachineName
 from pebble.transports.peers import FileLock, make_private
+
+log = logging.getLogger(__name__)
 
 
 class RunLock:
@@ -26,6 +29,7 @@ class RunLock:
         self.path = run_dir / LAUNCHER_LOCK
         self._lock: FileLock | None = None
         self._name: MachineName | None = None
+        self._problem = ""
 
     def take(self) -> Self:
         make_private(self._run_dir, close=True)
@@ -42,13 +46,44 @@ class RunLock:
         except PebbleError:
             self.release()
             raise
-        self._lock.write(f"{os.getpid()}\n{self._robot}\n".encode())
+        self._write()
         return self
 
-    def answer(self) -> None:
-        """Answer the launchers that ask who holds the robot's name; to be called every second or two."""
+    def _write(self) -> None:
+        if self._lock is not None:
+            self._lock.write(f"{os.getpid()}\n{self._robot}\n".encode())
+
+    def keep(self) -> None:
+        """Make the directory and the lock again if they were removed, by a cleaner or a logout; call it every second.
+
+        It also answers the launchers that ask who holds the robot's name. Raises PebbleError if another launcher has
+        taken the lock.
+        """
         if self._name is not None:
             self._name.answer()
+        lock, problem = self._lock, ""
+        try:
+            if lock is None or lock.in_place:
+                return
+            make_private(self._run_dir, close=True)
+            fresh = FileLock.take(self.path)
+        except (OSError, PebbleError) as error:
+            problem = str(error)
+        else:
+            if fresh is None:
+                raise PebbleError(f"{self.path} was removed, and another launcher holds it now: this robot stops")
+            lock.release()
+            self._lock = fresh
+            self._write()
+            log.warning("%s was removed: it is made again", self.path)
+        if problem and problem != self._problem:
+            log.error(
+                "%s was removed: what starts again reaches none of the robot's other processes until it can be made "
+                "again: %s",
+                self._run_dir,
+                problem,
+            )
+        self._problem = problem
 
     def release(self) -> None:
         """Release the locks. The file stays, with the process id of the last launcher and its robot."""

@@ -60,6 +60,7 @@ def run_hub(settings: ZenohSettings, stop: threading.Event) -> None:
         notify.ready()
         while not stop.wait(ALIVE_PERIOD_S):
             notify.alive()
+            hub.look()
             if time.monotonic() >= due:
                 due += DROPPED_PERIOD_S
                 dropped.report({"no_room": hub.refused, "wills": hub.refused_wills})

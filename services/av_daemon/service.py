@@ -10,6 +10,7 @@ from msgspec.structs import replace
 
 from pebble.contract import MEDIA_REPORT, MEDIA_STATUS
 from pebble.contract.payloads import MediaReport, MediaStatus
+from pebble.errors import DeviceError
 from pebble.runtime.service import Service, every, on
 from pebble.services.av_daemon import sources
 from pebble.services.av_daemon.reports import Reports
@@ -33,6 +34,7 @@ class AvDaemon(Service):
         self._published: dict[str, MediaReport] | None = None
         self._published_at = float("-inf")
         self._streams: list[Stream] = []
+        self._writers: list[FrameWriter] = []
 
     def start(self) -> None:
         options, now = self.config.services.av_daemon, self.clock()
@@ -64,6 +66,12 @@ class AvDaemon(Service):
             stream.poll(now)
 
     @every(1.0)
+    def look(self) -> None:
+        """End, to be started again, when what readers need was removed from the run directory or from /dev/shm."""
+        if not all(writer.in_place for writer in self._writers):
+            raise DeviceError("the socket or the shared memory of the frames was removed: starting again with new ones")
+
+    @every(1.0)
     def publish_status(self) -> None:
         """Publish changes at most once a second, and changes of mere numbers every few seconds."""
         now = self.clock()
@@ -83,6 +91,7 @@ class AvDaemon(Service):
         writer = FrameWriter(self.config.run_dir(), name, capacity=size)
         writer.open()
         self.on_stop(writer.close)
+        self._writers.append(writer)
         delay = self.config.services.av_daemon.restart_delay_seconds
         self._streams.append(Stream(name, writer, open_source, restart_delay_s=delay))
 

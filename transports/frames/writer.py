@@ -21,7 +21,7 @@ from pebble.transports.frames import shared_memory, views
 from pebble.transports.frames.frame import FrameInfo, encode
 from pebble.transports.frames.session import METADATA, SharingError, StreamNames, open_writing
 from pebble.transports.frames.shared_memory import MARGIN, Chunk, SharedPool
-from pebble.transports.peers import FileLock, prepare_run_dir
+from pebble.transports.peers import FileLock, OwnFile, prepare_run_dir
 from pebble.transports.zenoh.session import check_process, close_at_exit, close_session
 
 log = logging.getLogger(__name__)
@@ -67,6 +67,7 @@ class FrameWriter:
         self._bulk: zenoh.Publisher | None = None  # of pictures sent as bytes
         self._pool: SharedPool | None = None
         self._lock: FileLock | None = None
+        self._files: list[OwnFile] = []  # without which readers that start now get nothing
         self._tokens: list[Any] = []
         self._readers: set[str] = set()
 
@@ -95,7 +96,24 @@ class FrameWriter:
             liveliness.declare_subscriber(self._names.readers, follow, history=True),
             liveliness.declare_token(self._names.writer(self._writer_id, size, segment)),
         ]
+        needed = [self._names.socket, self._lock.path, *([segments.SHM / segment] if segment else [])]
+        self._files = [OwnFile(path) for path in needed]
         return self
+
+    @property
+    def in_place(self) -> bool:
+        """False: readers that start now get nothing from this writer, and would from one that is opened now.
+
+        Its files may be removed: by a cleaner of old ones, or with a user's shared memory when the user logs out.
+        """
+        try:
+            if all(file.in_place for file in self._files):
+                return True
+            prepare_run_dir(self._folder)
+        except (OSError, TransportError) as error:
+            log.debug("the frames of %s: %s", self._stream, error)
+            return True
+        return False
 
     def _declare_publisher(self, session: zenoh.Session, when_full: zenoh.CongestionControl) -> zenoh.Publisher:
         return session.declare_publisher(

@@ -46,6 +46,7 @@ GOODBYE_S = 0.3  # and when closing
 HUB_ANSWER_S = 1.0
 RETAINED_ANSWER_S = 3.0
 _RETRY_S = 0.2
+_LOOK_S = 1.0  # between two looks at the files of this process in the run directory
 _PUBLISHERS = 1000  # topics for which one is declared
 _TOPIC_LIMIT = 10_000  # topics whose priority, or removal, is remembered
 
@@ -86,6 +87,7 @@ class ZenohTransport(Transport):
         self._loopback = LoopbackQueue(self.counters)
         self._opened = threading.Event()
         self._client_config = ""
+        self._lost = ""  # why this process cannot listen where others look for it
         self._thread: threading.Thread | None = None
 
     # -- opening and closing
@@ -107,15 +109,21 @@ class ZenohTransport(Transport):
     def _start_peer(self) -> None:
         self._presence = self._registry.register(self.client_id)
         try:
+            self._listen(self._presence)
+        except TransportError:
+            self._presence.release()
+            raise
+
+    def _listen(self, presence: PresenceLock) -> None:
+        try:
             hub = self._settings.run_dir / HUB_SOCKET
-            siblings = self._registry.sockets(but=self._presence.name)
-            config = session_config(self._settings, "peer", listen=[self._presence.socket], connect=[hub, *siblings])
+            siblings = self._registry.sockets(but=presence.name)
+            config = session_config(self._settings, "peer", listen=[presence.socket], connect=[hub, *siblings])
             session = open_session(config)
         except (zenoh.ZError, TransportError) as error:
-            self._presence.release()
             raise TransportError(f"zenoh session of {self.client_id}: {error}") from None
-        self._begin(session, self._presence.name)
-        self._presence.ready()
+        if self._begin(session, presence.name):
+            presence.ready()
 
     def _start_client(self) -> bool:
         """Try until a hub answers: a session in client mode cannot open without one."""
@@ -177,9 +185,13 @@ class ZenohTransport(Transport):
         if self._settings.client and not self._start_client():
             return
         seen = linked = 0
+        look_s = None if self._presence is None else _LOOK_S
         self._initial_synchronization()
-        while (view := self._watch.wait(seen, _RETRY_S if self._watch.hubs and not linked else None)) is not None:
+        while (view := self._watch.wait(seen, _RETRY_S if self._watch.hubs and not linked else look_s)) is not None:
             try:
+                if self._presence is not None and not (self._session and self._presence.in_place):
+                    linked = 0 if self._listen_again(self._presence) else linked
+                    continue
                 linked = self._follow(view, seen, linked)
             except Exception:  # any error must lead to a reconnect, never end the thread
                 if self._watch.closed:
@@ -188,6 +200,49 @@ class ZenohTransport(Transport):
                 linked = 0
                 self._watch.wait_closed(HUB_ANSWER_S)
             seen = view.version
+
+    def _listen_again(self, presence: PresenceLock) -> bool:
+        """Open a new session where processes that start now find this one; False if that cannot be: then keep the old.
+
+        Its files, or the whole run directory, were removed: by a cleaner of old files, or when a user logged out.
+        """
+        try:
+            prepare_run_dir(self._settings.run_dir)
+            presence.renew()
+        except (OSError, TransportError) as error:
+            self._report_lost(f"{error}. Until then processes that start again do not reach this one")
+            self._watch.wait_closed(_LOOK_S)
+            return False
+        self._end_session()
+        try:
+            self._listen(presence)
+        except TransportError as error:  # it was removed again
+            self._report_lost(str(error))
+            self._watch.wait_closed(_LOOK_S)
+            return True
+        self._lost = ""
+        log.warning("%s: its socket was removed from %s, it has made a new one", self.client_id, self._settings.run_dir)
+        self._initial_synchronization()
+        return True
+
+    def _end_session(self) -> None:
+        """Close the session without its will: another one of this process follows."""
+        self._set_state(State.CONNECTING)
+        with self._publishing, self._connection_lock:
+            session, self._session, self._publishers = self._session, None, {}
+        if session is None:
+            return
+        with contextlib.suppress(zenoh.ZError):
+            self._ask_hub(session, wire.BYE, wire.encode(self._name), GOODBYE_S)
+        with self._connecting:
+            close_session(session)
+            self._subscribers.clear()
+        self._watch.reset()
+
+    def _report_lost(self, problem: str) -> None:
+        if problem != self._lost:
+            self._lost = problem
+            log.error("%s: its socket was removed, and it cannot make a new one: %s", self.client_id, problem)
 
     def _initial_synchronization(self) -> None:
         try:

@@ -24,7 +24,7 @@ import zenoh
 from pebble.errors import TransportError
 from pebble.transports.base import QoS
 from pebble.transports.counters import Counters
-from pebble.transports.peers import FileLock, PeerRegistry, new_name, prepare_run_dir
+from pebble.transports.peers import FileLock, OwnFile, PeerRegistry, new_name, prepare_run_dir
 from pebble.transports.settings import ZenohSettings
 from pebble.transports.socket_holders import why_not
 from pebble.transports.zenoh import wire
@@ -59,6 +59,12 @@ class ZenohHub:
         self._token: zenoh.LivelinessToken | None = None
         self._store: HubStore | None = None
         self._admission = WillAdmission(settings.wills)
+        self._listening = OwnFile(self._socket)
+        self._problem = ""  # why clients that start now do not reach this hub
+
+    @property
+    def _socket(self) -> Path:
+        return self._settings.run_dir / HUB_SOCKET
 
     @property
     def refused_wills(self) -> int:
@@ -71,18 +77,41 @@ class ZenohHub:
 
     def open(self) -> ZenohHub:
         """Start. Raises TransportError if the run directory has a hub already, or cannot be used."""
-        run_dir = self._settings.run_dir
-        prepare_run_dir(run_dir)
-        self._lock = FileLock.take(run_dir / "hub.lock")
-        if self._lock is None:
-            raise TransportError(f"there is a hub for {run_dir} already (it holds {run_dir / 'hub.lock'})")
+        self._lock = self._take_lock()
         try:
-            self._start(run_dir)
+            self._start()
         except BaseException:
             self.close()
             raise
         close_at_exit(self)
         return self
+
+    def look(self) -> None:
+        """Listen again if the socket was removed, by a cleaner or a logout, with all that is stored; call it regularly.
+
+        Raises TransportError if another hub has taken its place, or if it cannot listen there again.
+        """
+        lock, worker = self._lock, self._worker
+        if lock is None or worker is None:
+            return
+        try:
+            if lock.in_place and self._listening.in_place:
+                return
+            self._lock = lock if lock.in_place else self._take_lock()
+        except (OSError, TransportError) as error:
+            if str(error) != self._problem:
+                self._problem = str(error)
+                log.error("the hub cannot be reached by what starts now: its files were removed, and %s", error)
+            return
+        if lock is not self._lock:
+            lock.release()
+        if self._listening.in_place:
+            return
+        if self._session is not None:
+            close_session(self._session)
+        self._problem = ""
+        self._listen(worker)
+        log.warning("the socket of the hub was removed from %s, it has made a new one", self._settings.run_dir)
 
     def close(self) -> None:
         if self._session is not None:
@@ -90,24 +119,38 @@ class ZenohHub:
         if self._worker is not None:
             self._worker.close()
         if self._lock is not None:
-            for left in (HUB_SOCKET, HUB_SOCKET + ".lock"):
-                (self._settings.run_dir / left).unlink(missing_ok=True)
+            if self._lock.in_place:  # else they may be another hub's
+                for left in (HUB_SOCKET, HUB_SOCKET + ".lock"):
+                    (self._settings.run_dir / left).unlink(missing_ok=True)
             self._lock.release()
         self._session = self._worker = self._lock = None
 
-    def _start(self, run_dir: Path) -> None:
+    def _take_lock(self) -> FileLock:
+        run_dir = self._settings.run_dir
+        prepare_run_dir(run_dir)
+        lock = FileLock.take(run_dir / "hub.lock")
+        if lock is None:
+            raise TransportError(f"there is a hub for {run_dir} already (it holds {run_dir / 'hub.lock'})")
+        return lock
+
+    def _start(self) -> None:
         journal = None if self._settings.journal is None else Journal(self._settings.journal)
-        siblings = PeerRegistry(run_dir).sockets()  # they would connect within 0.5 s; we connect at once
         self._store = store = HubStore(tuple(topic_to_key(topic) + "/" for topic in self._settings.reserved))
         self._worker = HubWorker(self.name, store, self._admission, journal, self.counters)
+        self._listen(self._worker)
+
+    def _listen(self, worker: HubWorker) -> None:
+        self._session = None
+        siblings = PeerRegistry(self._settings.run_dir).sockets()  # they would connect within 0.5 s; we connect at once
         try:
             settings = replace(self._settings, listen=tuple(filter(self._is_free, self._settings.listen)))
-            config = session_config(settings, "router", listen=[run_dir / HUB_SOCKET], connect=siblings)
+            config = session_config(settings, "router", listen=[self._socket], connect=siblings)
             self._session = open_session(config)
         except zenoh.ZError as error:
-            raise TransportError(f"the hub cannot open {run_dir / HUB_SOCKET}: {error}") from None
+            raise TransportError(f"the hub cannot open {self._socket}: {error}") from None
+        self._listening = OwnFile(self._socket)
         Barrier(self._session, self.name, lambda: 0)
-        self._worker.serve(self._session)
+        worker.serve(self._session)
         self._token = self._session.liveliness().declare_token(wire.UP + self.name)
 
     def _is_free(self, endpoint: str) -> bool:
@@ -150,13 +193,17 @@ class HubWorker:
             self._write_journal(journal)
 
     def serve(self, session: zenoh.Session) -> None:
+        """Serve the clients of ``session`` instead of those of the one before, which is closed."""
+        if self._session is not None:
+            self._tasks.put(self._await_return)
         self._session = session
         session.declare_subscriber(wire.RETAINED + "**", self._queued(self._store_retained))
         session.declare_queryable(wire.RETAINED + "**", self._queued(self._query), complete=True)
         session.declare_queryable(wire.HELLO, self._queued(self._on_hello))
         session.declare_queryable(wire.BYE, self._queued(self._on_bye))
         session.liveliness().declare_subscriber(wire.LIVE + "*", self._queued(self._on_client), history=True)
-        self._thread.start()
+        if not self._thread.is_alive():
+            self._thread.start()
 
     def close(self) -> None:
         if self._thread.is_alive():
@@ -341,9 +388,18 @@ class HubWorker:
         for record in self._store.records():
             earlier.apply(record)  # newer
         self._store = earlier
+        self._await_wills()
+        return True
+
+    def _await_return(self) -> None:
+        """Clients of a session that was closed have as long to come back as after a restart."""
+        self._alive_clients.clear()
+        self._received.clear()
+        self._await_wills()
+
+    def _await_wills(self) -> None:
         due = time.monotonic() + RETURN_S
         self._will_due |= dict.fromkeys(self._store.wills() - self._alive_clients - self._will_due.keys(), due)
-        return True
 
 
 def _payload(query: zenoh.Query) -> bytes:
