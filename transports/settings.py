@@ -26,6 +26,7 @@ class MqttSettings:
     keepalive_s: int = 15
     username: str | None = None
     password: str | None = field(default=None, repr=False)
+    password_file: Path | None = None  # where the password was read, and is read again when it has changed
     tls: TlsSettings | None = None
     #: For brokers that admit only ids they know. None: one that cannot be guessed, which no other client can take over.
     client_id: str | None = None

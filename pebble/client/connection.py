@@ -71,7 +71,8 @@ def resolve(target: Target) -> tuple[str, Any, Names, str]:
     url = str(target.url)
     if target.remote:
         raise PebbleError("--remote needs --config; with --url name the remote broker itself")
-    kind, settings = settings_of(url, password=password(target.password_file), ca_cert=target.ca_cert)
+    file = target.password_file
+    kind, settings = settings_of(url, password=password(file), password_file=file, ca_cert=target.ca_cert)
     return kind, settings, Names(ANY_ROBOT if target.robot is None else base_of(target.robot)), url
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from pebble.config.hosts import HostError, split
@@ -17,15 +18,18 @@ class UrlError(PebbleError):
 
 
 def settings_of(
-    url: str, *, password: str | None = None, ca_cert: Path | None = None
+    url: str, *, password: str | None = None, password_file: Path | None = None, ca_cert: Path | None = None
 ) -> tuple[str, MqttSettings | ZenohSettings]:
-    """The kind of transport and its settings. Raises UrlError, whose text never contains the password."""
+    """The kind of transport and its settings. Raises UrlError, whose text never contains the password.
+
+    ``password_file``: the file in which the password was found, if it was in one.
+    """
     scheme, _, rest = url.partition(":")
     scheme = scheme.lower()
     if scheme == "zenoh":
         return "zenoh", _zenoh(rest)
     if scheme in _PORTS and rest.startswith("//"):
-        return "mqtt", _mqtt(url, password, ca_cert)
+        return "mqtt", replace(_mqtt(url, password, ca_cert), password_file=password_file)
     raise UrlError(f"--url must be {FORMS}")
 
 

@@ -112,9 +112,9 @@ def _of_file(path: Path) -> tuple[Path, Options, list[_Connection]]:
 
 def _transport_of(connection: Connection, folder: Path) -> tuple[str, Any]:
     """The kind of transport and its settings. Raises PebbleError."""
-    file, ca_cert = connection.password_file, connection.ca_cert
-    secret = None if file is None else password(folder / file)
-    return settings_of(connection.url, password=secret, ca_cert=None if ca_cert is None else folder / ca_cert)
+    file, ca_cert = (path and folder / path for path in (connection.password_file, connection.ca_cert))
+    secret = None if file is None else password(file)
+    return settings_of(connection.url, password=secret, password_file=file, ca_cert=ca_cert)
 
 
 def _modern(transport: Any, protocol: str) -> Any:

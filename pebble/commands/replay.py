@@ -114,7 +114,7 @@ def replay(
     _check(options, base, url, paused=paused, terminal=terminal)
     if incoming and speed < _WITH_COMMANDS:
         raise PebbleError(f"--speed {speed:g} would drive a robot for longer than it was: leave out --incoming")
-    connection = settings_of(url, password=password(password_file), ca_cert=ca_cert)
+    connection = settings_of(url, password=password(password_file), password_file=password_file, ca_cert=ca_cert)
     since_ns, until_ns = parse_period(since, until, now=datetime.now().astimezone())
     paths = files(recordings)
     source = ReplaySource(paths)

@@ -122,7 +122,8 @@ def register(app: typer.Typer) -> None:
 
 
 def _broker(url: str, password_file: Path | None, ca_cert: Path | None) -> MqttSettings:
-    _, settings = settings_of_url(url, password=broker_password(password_file), ca_cert=ca_cert)
+    password = broker_password(password_file)
+    _, settings = settings_of_url(url, password=password, password_file=password_file, ca_cert=ca_cert)
     if not isinstance(settings, MqttSettings):
         raise PebbleError("the operator page needs MQTT: use --url mqtt://HOST[:PORT] or mqtts://…")
     return replace(settings, reconnect_max_s=REMOTE_RECONNECT_S)

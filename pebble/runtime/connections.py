@@ -176,6 +176,7 @@ def mqtt_settings(
         keepalive_s=mqtt.keepalive,
         username=mqtt.username,
         password=mqtt.password,
+        password_file=mqtt.password_file,
         tls=tls_settings(mqtt.tls),
         client_id=f"{client_id}-{program}" if client_id and program else client_id,
         protocol=mqtt.protocol,

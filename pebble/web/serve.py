@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import socket
+import ssl
 from collections.abc import Callable
 
 import uvicorn
 
 from pebble.errors import PebbleError
 from pebble.fleet import certificates
+from pebble.transports.renewed import Renewed
 from pebble.transports.socket_holders import why_not
+from pebble.transports.tls import make_server_context
 from pebble.web.app import create_app
 from pebble.web.connections import ACCEPT, HttpProtocol, Listener, Loop, WebSocketProtocol
 from pebble.web.settings import WebSettings
@@ -32,7 +35,11 @@ def run(settings: WebSettings, *, on_ready: Callable[[str], None] | None = None)
 
 
 async def _serve(settings: WebSettings, listener: Listener, on_ready: Callable[[str], None] | None) -> None:
-    server = uvicorn.Server(_config(settings, listener))
+    config = _config(settings, listener)
+    config.load()
+    if config.ssl is not None:
+        _renew_certificate(config.ssl, settings)
+    server = uvicorn.Server(config)
     watching = asyncio.ensure_future(_report(server, url_of(settings, listener), on_ready))
     try:
         await server.serve(sockets=[listener])
@@ -47,6 +54,20 @@ async def _report(server: uvicorn.Server, url: str, on_ready: Callable[[str], No
         await asyncio.sleep(0.02)
     if on_ready is not None:
         on_ready(url)
+
+
+def _renew_certificate(listening: ssl.SSLContext, settings: WebSettings) -> None:
+    """Have each new connection use the certificate that the files hold then."""
+
+    certificate, key = settings.certificate, settings.key
+    if certificate is None:
+        return
+    newest = Renewed((certificate, key), lambda: make_server_context(certificate, key), listening)
+
+    def choose(connection: ssl.SSLObject, _name: str | None, _context: ssl.SSLContext) -> None:
+        connection.context = newest.get()
+
+    listening.sni_callback = choose
 
 
 def _config(settings: WebSettings, listener: Listener) -> uvicorn.Config:

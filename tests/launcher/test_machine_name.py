@@ -52,7 +52,7 @@ try:
     with RunLock(Path(sys.argv[1]), sys.argv[2], Path(sys.argv[3])) as lock:
         print("bound", flush=True)
         for line in sys.stdin:
-            lock.answer()
+            lock.keep()
             print("answered", flush=True)
 except Exception as error:
     print(error, flush=True)

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import logging
 import random
-import ssl
 import threading
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from math import ceil, inf
 
 from pebble.errors import TransportError
 from pebble.transports import clock
 from pebble.transports.base import Message, Outgoing, QoS, State, Subscription, Transport
 from pebble.transports.bounds import BoundedTable
+from pebble.transports.credentials import Credentials
 from pebble.transports.hosts import Address, Turns
 from pebble.transports.mqtt import client_ids
 from pebble.transports.mqtt.bridge_mode import Attempt, BridgeMode, Result
@@ -24,7 +25,6 @@ from pebble.transports.mqtt.outgoing import PendingAck
 from pebble.transports.mqtt.retention import RetentionCheck
 from pebble.transports.mqtt.suspects import TOPICS, Kind, SuspectTopics, Written, named
 from pebble.transports.settings import MqttSettings
-from pebble.transports.tls import make_context
 from pebble.transports.topics import MAX_BYTES
 
 log = logging.getLogger(__name__)
@@ -55,7 +55,7 @@ class MqttTransport(Transport):
         self._turns = Turns(settings.host, settings.port)
         self.as_published = settings.as_published
         self.exact_echo = settings.as_published or settings.protocol == "5"
-        self._context: ssl.SSLContext | None = None
+        self._credentials: Credentials | None = None  # read when it opens
         self._attempt: Connection | None = None  # the newest connection, in any state
         self._connection: Connection | None = None  # the same, once it can be used
         self._routing = threading.RLock()  # guards the broker's filters, and the connection they belong to
@@ -89,8 +89,7 @@ class MqttTransport(Transport):
     # -- the interface to base
 
     def _open(self, timeout: float) -> None:  # noqa: ARG002  (base waits)
-        if self.settings.tls is not None:
-            self._context = make_context(self.settings.tls)
+        self._credentials = Credentials(self.settings)
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join(_ANSWER_S)  # closed while it was dialling
         self._will_on_close = None
@@ -321,8 +320,10 @@ class MqttTransport(Transport):
 
     def _make_connection(self, will: Message | None, *, as_published: bool) -> Connection:
         assert self._address is not None  # noqa: S101 - both callers run at an address
+        assert self._credentials is not None  # noqa: S101 - and while it is open
+        settings = replace(self.settings, password=self._credentials.password())
         connection = Connection(
-            Opening(self._mqtt_client_id, self.settings, self._context, will, self._address),
+            Opening(self._mqtt_client_id, settings, self._credentials.context(), will, self._address),
             self.counters,
             where=self._where,
             as_published=as_published,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import secrets
 import socket
-import ssl
 import threading
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -12,14 +11,14 @@ from pathlib import Path
 
 from pebble.config import Config
 from pebble.errors import PebbleError
-from pebble.runtime.connections import tls_settings
+from pebble.runtime.connections import LOCAL_RECONNECT_S, mqtt_settings
 from pebble.services.autonomy_manager.gate.client_filter import ClientFilter, Login
 from pebble.services.autonomy_manager.gate.config_copy import ConfigCopy, broker_of
 from pebble.services.autonomy_manager.gate.drive_outlet import DriveOutlet
 from pebble.services.autonomy_manager.gate.server import MAX_CONNECTIONS, GateServer
 from pebble.services.autonomy_manager.gate.topics import TopicRules
 from pebble.transports.counters import Counters
-from pebble.transports.tls import make_context
+from pebble.transports.credentials import Credentials
 
 _USER = "script"
 _JOIN_S = 2.0
@@ -54,7 +53,7 @@ class Gate:
         """Listen, and write the config. Raises PebbleError."""
         password = secrets.token_urlsafe(24)
         with ExitStack() as opened:
-            context = self._context()
+            credentials = Credentials(mqtt_settings(self._broker, reconnect_max_s=LOCAL_RECONNECT_S))
             try:
                 listener = opened.enter_context(socket.create_server(("127.0.0.1", 0), backlog=MAX_CONNECTIONS))
             except OSError as error:
@@ -62,7 +61,7 @@ class Gate:
             opened.callback(self._copy.remove)
             self._copy.write(listener.getsockname()[1], _USER, password)
             own = Login(_USER.encode(), password.encode())
-            self._serve(listener, context, own, opened)
+            self._serve(listener, credentials, own, opened)
             self._opened = opened.pop_all()
 
     def halt(self) -> None:
@@ -81,22 +80,18 @@ class Gate:
             if not (moves and self._halted):
                 self._publish(topic, payload)
 
-    def _serve(self, listener: socket.socket, context: ssl.SSLContext | None, own: Login, opened: ExitStack) -> None:
-        broker = Login(*map(_encoded, (self._broker.username, self._broker.password)))
+    def _serve(self, listener: socket.socket, credentials: Credentials, own: Login, opened: ExitStack) -> None:
+        user = _encoded(self._broker.username)
         self._server = server = GateServer(
             listener,
-            (self._broker.host, self._broker.port, context),
+            lambda: (self._broker.host, self._broker.port, credentials.context()),
             self._outlet,
-            lambda: ClientFilter(self._rules, own, broker),
+            lambda: ClientFilter(self._rules, own, Login(user, _encoded(credentials.password()))),
         )
         thread = threading.Thread(target=server.serve, name="gate", daemon=True)
         thread.start()
         opened.callback(thread.join, _JOIN_S)
         opened.callback(server.stop)
-
-    def _context(self) -> ssl.SSLContext | None:
-        tls = tls_settings(self._broker.tls)
-        return None if tls is None else make_context(tls)
 
 
 def _encoded(text: str | None) -> bytes | None:

@@ -20,7 +20,11 @@ class GateServer:
     """Call :meth:`serve` on a thread of its own; :meth:`post` and :meth:`stop` from any thread."""
 
     def __init__(
-        self, listener: socket.socket, broker: Broker, outlet: DriveOutlet, make_filter: Callable[[], ClientFilter]
+        self,
+        listener: socket.socket,
+        broker: Callable[[], Broker],
+        outlet: DriveOutlet,
+        make_filter: Callable[[], ClientFilter],
     ) -> None:
         self._listener, self._broker, self._outlet, self._make_filter = listener, broker, outlet, make_filter
         self._loop = asyncio.new_event_loop()
@@ -63,7 +67,7 @@ class GateServer:
             writer.transport.abort()
             return
         relay = Relay((reader, writer), self._make_filter(), self._handle, self._ended)
-        client = self._loop.create_task(relay.run(self._broker))
+        client = self._loop.create_task(relay.run(self._broker()))
         self._clients.add(client)
         client.add_done_callback(self._clients.discard)
 
