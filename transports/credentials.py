@@ -6,7 +6,7 @@ import ssl
 from pathlib import Path
 
 from pebble.transports.renewed import Renewed
-from pebble.transports.settings import MqttSettings
+from pebble.transports.settings import MqttSettings, TlsSettings
 from pebble.transports.tls import make_context
 
 
@@ -16,14 +16,9 @@ class Credentials:
     def __init__(self, settings: MqttSettings) -> None:
         self._password = settings.password
         self._password_file: Renewed[str] | None = None
-        self._tls: Renewed[ssl.SSLContext] | None = None
+        self._tls = renewed_context(settings.tls)
         if (file := settings.password_file) is not None:
             self._password_file = Renewed([file], lambda: _password(file), self._password)
-        if (tls := settings.tls) is not None:
-            system = ssl.get_default_verify_paths()
-            trusted = (tls.ca_cert,) if tls.ca_cert else (Path(system.cafile or system.openssl_cafile), system.capath)
-            files = *(None if file is None else Path(file) for file in trusted), tls.client_cert, tls.client_key
-            self._tls = Renewed(files, lambda: make_context(tls))
 
     def context(self) -> ssl.SSLContext | None:
         """None: without TLS."""
@@ -31,6 +26,16 @@ class Credentials:
 
     def password(self) -> str | None:
         return self._password if self._password_file is None else self._password_file.get()
+
+
+def renewed_context(tls: TlsSettings | None) -> Renewed[ssl.SSLContext] | None:
+    """The context of these certificates, or of the system's authorities. Raises TransportError if there is none now."""
+    if tls is None:
+        return None
+    system = ssl.get_default_verify_paths()
+    trusted = (system.cafile, system.capath) if tls.ca_cert is None else (tls.ca_cert,)
+    files = [Path(file) for file in (*trusted, tls.client_cert, tls.client_key) if file is not None]
+    return Renewed(files, lambda: make_context(tls))
 
 
 def _password(file: Path) -> str:

@@ -21,8 +21,8 @@ class Renewed(Generic[_T]):
     value stays. ``first`` is the value if the files were read already; else the first one is made now, with its errors.
     """
 
-    def __init__(self, files: Iterable[Path | None], make: Callable[[], _T], first: _T | None = None) -> None:
-        self._files = [file for file in files if file is not None]
+    def __init__(self, files: Iterable[Path], make: Callable[[], _T], first: _T | None = None) -> None:
+        self._files = list(files)
         self._make = make
         self._made_from = self._versions()  # before they are read: what is written meanwhile differs again
         self._value = make() if first is None else first

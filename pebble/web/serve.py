@@ -62,7 +62,8 @@ def _renew_certificate(listening: ssl.SSLContext, settings: WebSettings) -> None
     certificate, key = settings.certificate, settings.key
     if certificate is None:
         return
-    newest = Renewed((certificate, key), lambda: make_server_context(certificate, key), listening)
+    files = [certificate] if key is None else [certificate, key]
+    newest = Renewed(files, lambda: make_server_context(certificate, key), listening)
 
     def choose(connection: ssl.SSLObject, _name: str | None, _context: ssl.SSLContext) -> None:
         connection.context = newest.get()

@@ -24,6 +24,7 @@ import zenoh
 from pebble.errors import TransportError
 from pebble.transports.base import QoS
 from pebble.transports.counters import Counters
+from pebble.transports.credentials import renewed_context
 from pebble.transports.peers import FileLock, OwnFile, PeerRegistry, new_name, prepare_run_dir
 from pebble.transports.settings import ZenohSettings
 from pebble.transports.socket_holders import why_not
@@ -60,6 +61,8 @@ class ZenohHub:
         self._store: HubStore | None = None
         self._admission = WillAdmission(settings.wills)
         self._listening = OwnFile(self._socket)
+        self._certificates = renewed_context(settings.tls)
+        self._used = None if self._certificates is None else self._certificates.get()
         self._problem = ""  # why clients that start now do not reach this hub
 
     @property
@@ -87,15 +90,15 @@ class ZenohHub:
         return self
 
     def look(self) -> None:
-        """Listen again if the socket was removed, by a cleaner or a logout, with all that is stored; call it regularly.
+        """Listen again, with all that is stored, if the socket was removed or a certificate renewed; call it regularly.
 
-        Raises TransportError if another hub has taken its place, or if it cannot listen there again.
+        A cleaner of old files may remove it, or a logout. Zenoh reads certificates when a session opens. Raises TransportError if another hub has taken its place, or if it cannot listen there again.
         """
         lock, worker = self._lock, self._worker
         if lock is None or worker is None:
             return
         try:
-            if lock.in_place and self._listening.in_place:
+            if lock.in_place and self._listening.in_place and not self._is_renewed():
                 return
             self._lock = lock if lock.in_place else self._take_lock()
         except (OSError, TransportError) as error:
@@ -105,13 +108,22 @@ class ZenohHub:
             return
         if lock is not self._lock:
             lock.release()
-        if self._listening.in_place:
+        found = self._listening.in_place
+        if found and not self._is_renewed():
             return
+        if self._certificates is not None:
+            self._used = self._certificates.get()
         if self._session is not None:
             close_session(self._session)
         self._problem = ""
         self._listen(worker)
-        log.warning("the socket of the hub was removed from %s, it has made a new one", self._settings.run_dir)
+        if found:
+            log.info("the hub uses renewed certificates")
+        else:
+            log.warning("the socket of the hub was removed from %s, it has made a new one", self._settings.run_dir)
+
+    def _is_renewed(self) -> bool:
+        return self._certificates is not None and self._certificates.get() is not self._used
 
     def close(self) -> None:
         if self._session is not None:
