@@ -16,7 +16,7 @@ class Credentials:
     def __init__(self, settings: MqttSettings) -> None:
         self._password = settings.password
         self._password_file: Renewed[str] | None = None
-        self._tls = renewed_context(settings.tls)
+        self._tls = None if settings.tls is None else renewed_context(settings.tls)
         if (file := settings.password_file) is not None:
             self._password_file = Renewed([file], lambda: _password(file), self._password)
 
@@ -28,10 +28,8 @@ class Credentials:
         return self._password if self._password_file is None else self._password_file.get()
 
 
-def renewed_context(tls: TlsSettings | None) -> Renewed[ssl.SSLContext] | None:
+def renewed_context(tls: TlsSettings) -> Renewed[ssl.SSLContext]:
     """The context of these certificates, or of the system's authorities. Raises TransportError if there is none now."""
-    if tls is None:
-        return None
     system = ssl.get_default_verify_paths()
     trusted = (system.cafile, system.capath) if tls.ca_cert is None else (tls.ca_cert,)
     files = [Path(file) for file in (*trusted, tls.client_cert, tls.client_key) if file is not None]

@@ -6,6 +6,7 @@ import asyncio
 import socket
 import ssl
 from collections.abc import Callable
+from pathlib import Path
 
 import uvicorn
 
@@ -37,8 +38,8 @@ def run(settings: WebSettings, *, on_ready: Callable[[str], None] | None = None)
 async def _serve(settings: WebSettings, listener: Listener, on_ready: Callable[[str], None] | None) -> None:
     config = _config(settings, listener)
     config.load()
-    if config.ssl is not None:
-        _renew_certificate(config.ssl, settings)
+    if config.ssl is not None and settings.certificate is not None:
+        renew_certificate(config.ssl, settings.certificate, settings.key)
     server = uvicorn.Server(config)
     watching = asyncio.ensure_future(_report(server, url_of(settings, listener), on_ready))
     try:
@@ -56,12 +57,8 @@ async def _report(server: uvicorn.Server, url: str, on_ready: Callable[[str], No
         on_ready(url)
 
 
-def _renew_certificate(listening: ssl.SSLContext, settings: WebSettings) -> None:
-    """Have each new connection use the certificate that the files hold then."""
-
-    certificate, key = settings.certificate, settings.key
-    if certificate is None:
-        return
+def renew_certificate(listening: ssl.SSLContext, certificate: Path, key: Path | None) -> None:
+    """Have each new connection to ``listening`` use the certificate that the files hold then."""
     files = [certificate] if key is None else [certificate, key]
     newest = Renewed(files, lambda: make_server_context(certificate, key), listening)
 

@@ -2,6 +2,8 @@ from __future__ import annotations
 
 import errno
 import os
+import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -97,3 +99,37 @@ def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(PebbleError, match=f"transport.run_dir {tmp_path}/file/run cannot be used: File exists"):
         RunLock(tmp_path / "file" / "run", "x/y/z", tmp_path / "robot.json").take()
+
+
+@pytest.mark.parametrize("remove", [lambda run: shutil.rmtree(run), lambda run: (run / LAUNCHER_LOCK).unlink()])
+def test_what_was_removed_is_locked_again(tmp_path: Path, remove: Callable[[Path], object]) -> None:
+    run, config = tmp_path / "run", tmp_path / "robot.json"
+    with RunLock(run, "x/y/z", config) as lock:
+        remove(run)
+        lock.keep()
+        assert lock.path.read_text() == f"{os.getpid()}\nx/y/z\n"
+        with pytest.raises(PebbleError, match=f"holds {lock.path}"):
+            RunLock(run, "x/y/other", tmp_path / "other.json").take()
+
+
+def test_what_cannot_be_locked_again_is_reported_once_and_tried_again(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    run = tmp_path / "run"
+    with RunLock(run, "x/y/z", tmp_path / "robot.json") as lock:
+        shutil.rmtree(run)
+        run.write_text("in the way")
+        lock.keep()
+        lock.keep()
+        assert [record.levelname for record in caplog.records] == ["ERROR"]
+        run.unlink()
+        lock.keep()
+        assert lock.path.exists()
+
+
+def test_a_robot_whose_lock_another_has_taken_stops(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    with RunLock(run, "x/y/z", tmp_path / "robot.json") as lock:
+        shutil.rmtree(run)
+        with RunLock(run, "x/y/other", tmp_path / "other.json"), pytest.raises(PebbleError, match="this robot stops"):
+            lock.keep()

@@ -217,6 +217,38 @@ def test_both_can_be_opened_again(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+@needs_shared_memory
+@pytest.mark.parametrize("what", ["socket", "lock", "folder", "memory"])
+def test_a_writer_knows_when_readers_that_start_now_get_nothing(tmp_path: Path, what: str) -> None:
+    run = tmp_path / "run"
+    with FrameWriter(run, "camera", capacity=50_000) as writer:
+        assert writer.in_place
+        memory = {Path(path) for _, _, path in segments.mappings()}
+        files = {"socket": run.glob("*.sock"), "lock": run.glob("*.life"), "folder": run.iterdir(), "memory": memory}
+        for path in list(files[what]):
+            path.unlink(missing_ok=True)
+        assert not writer.in_place
+    with writer:
+        assert writer.in_place
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root has file systems of its own")
+@pytest.mark.parametrize("size", ["ro,size=64k", "size=64k", "size=1400k", "size=2m"])
+def test_without_room_in_shared_memory_frames_are_sent_as_bytes(tmp_path: Path, size: str) -> None:
+    program = (
+        "import sys, time; from pathlib import Path; from pebble.transports.frames import *\n"
+        "with FrameWriter(Path(sys.argv[1]), 'camera', capacity=900_000) as w, "
+        "FrameReader(Path(sys.argv[1]), 'camera') as r:\n"
+        "    while not w.wanted: time.sleep(0.01)\n"
+        "    frame = None\n"
+        "    while frame is None: w.write(b'x' * 900_000, FrameInfo()); frame = r.read(0.2)\n"
+        "    print(frame.data.size, frame.shared, 'as bytes' in w.problem)"
+    )
+    mount = f'mount -t tmpfs -o {size} none /dev/shm && exec "$@"'
+    command = ["unshare", "-m", "sh", "-c", mount, "sh", sys.executable, "-c", program, str(tmp_path)]
+    assert subprocess.check_output(command, timeout=30, text=True) == "900000 False True\n"
+
+
 def test_a_closed_reader_stops_reading(tmp_path: Path) -> None:
     reader = FrameReader(tmp_path, "camera").open()
     frames: list[object] = []

@@ -24,9 +24,9 @@ import zenoh
 from pebble.errors import TransportError
 from pebble.transports.base import QoS
 from pebble.transports.counters import Counters
-from pebble.transports.credentials import renewed_context
 from pebble.transports.peers import FileLock, OwnFile, PeerRegistry, new_name, prepare_run_dir
-from pebble.transports.settings import ZenohSettings
+from pebble.transports.renewed import Renewed
+from pebble.transports.settings import TlsSettings, ZenohSettings
 from pebble.transports.socket_holders import why_not
 from pebble.transports.zenoh import wire
 from pebble.transports.zenoh.callbacks import direct
@@ -61,7 +61,7 @@ class ZenohHub:
         self._store: HubStore | None = None
         self._admission = WillAdmission(settings.wills)
         self._listening = OwnFile(self._socket)
-        self._certificates = renewed_context(settings.tls)
+        self._certificates = None if settings.tls is None else _renewed(settings.tls)
         self._used = None if self._certificates is None else self._certificates.get()
         self._problem = ""  # why clients that start now do not reach this hub
 
@@ -92,7 +92,8 @@ class ZenohHub:
     def look(self) -> None:
         """Listen again, with all that is stored, if the socket was removed or a certificate renewed; call it regularly.
 
-        A cleaner of old files may remove it, or a logout. Zenoh reads certificates when a session opens. Raises TransportError if another hub has taken its place, or if it cannot listen there again.
+        A cleaner of old files removes sockets, or a logout. Zenoh reads certificates when a session begins to listen.
+        Raises TransportError if it cannot listen there again.
         """
         lock, worker = self._lock, self._worker
         if lock is None or worker is None:
@@ -412,6 +413,12 @@ class HubWorker:
     def _await_wills(self) -> None:
         due = time.monotonic() + RETURN_S
         self._will_due |= dict.fromkeys(self._store.wills() - self._alive_clients - self._will_due.keys(), due)
+
+
+def _renewed(tls: TlsSettings) -> Renewed[Any]:
+    from pebble.transports.credentials import renewed_context  # ssl, which few hubs need
+
+    return renewed_context(tls)
 
 
 def _payload(query: zenoh.Query) -> bytes:
