@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import ssl
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
@@ -90,7 +90,7 @@ def test_a_robot_is_back_after_its_authority_its_certificate_and_its_password_we
         certificates.init(made, ["localhost"])
         shutil.copytree(made, used, dirs_exist_ok=True)
         password.write_text(f"secret {number}\n")
-        os.system(f"mosquitto_passwd -c -b {accounts} rover 'secret {number}'")
+        subprocess.run(["mosquitto_passwd", "-c", "-b", accounts, "rover", f"secret {number}"], check=True)
         accounts.chmod(0o644)
 
     install(1)

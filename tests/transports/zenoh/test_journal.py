@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import errno
 import os
+import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -159,6 +161,42 @@ def test_a_rewrite_that_fails_leaves_the_file_as_it_was_and_takes_no_room(
     assert not journal.rewrite_due
     journal.close()
     assert read(path) == [b"one", b"three"]
+
+
+@pytest.mark.parametrize("back", [True, False])
+@pytest.mark.parametrize(
+    "remove",
+    [
+        lambda folder: shutil.rmtree(folder),
+        lambda folder: folder.rename(folder.with_name("unmounted")),
+        lambda folder: (folder / "journal").unlink(),
+        lambda folder: (folder / "journal").rename(folder / "kept"),
+    ],
+)
+def test_a_file_that_was_removed_is_written_anew(
+    tmp_path: Path, remove: Callable[[Path], object], back: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    clock, path = Clock(), tmp_path / "state" / "journal"
+    journal = Journal(path, clock=clock)
+    journal.rewrite([b"one"])
+    remove(path.parent)
+    if not back:
+        shutil.rmtree(path.parent, ignore_errors=True)
+        path.parent.write_text("in the way")
+    journal.append(b"two")
+    assert journal.rewrite_due
+    journal.rewrite([b"one", b"two"])
+    if not back:
+        assert not journal.rewrite_due
+        path.parent.unlink()
+        clock.now += 30
+        assert journal.rewrite_due
+        journal.rewrite([b"one", b"two"])
+    journal.append(b"three")
+    assert not journal.rewrite_due
+    assert [record.levelname for record in caplog.records].count("WARNING" if back else "ERROR") == 1
+    journal.close()
+    assert read(path) == [b"one", b"two", b"three"]
 
 
 @pytest.mark.parametrize("path", ["/proc/nowhere/journal", "/dev/null/journal"])

@@ -17,6 +17,8 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
 
+from pebble.transports.peers import OwnFile
+
 log = logging.getLogger(__name__)
 
 SYNC_S = 1.0
@@ -42,6 +44,7 @@ class Journal:
         self._size = self._base = 0
         self._due = _NEVER  # when to rewrite
         self._failing = False
+        self._own = OwnFile(path)
         self._dirty = threading.Event()
         self._closing = threading.Event()
         self._lock = threading.Lock()  # the file may be replaced while the syncer uses it
@@ -49,13 +52,23 @@ class Journal:
 
     @property
     def rewrite_due(self) -> bool:
-        """Whether it is time to ``rewrite``: the file has grown, or its disk failed a while ago."""
-        return self._clock() >= self._due
+        """Whether it is time to ``rewrite``: the file has grown or was removed, or its disk failed a while ago."""
+        return self._clock() >= self._due or not self._in_place
 
     @property
     def wait_s(self) -> float:
         """How long ``rewrite_due`` need not be checked."""
         return min(RETRY_S, max(0.0, self._due - self._clock()))
+
+    @property
+    def _in_place(self) -> bool:
+        """False: the file or its folder was removed or replaced, and what is appended is lost with this process."""
+        if self._file is None:
+            return True  # it is tried again when it is due
+        try:
+            return self._own.in_place
+        except OSError:  # what is there cannot be seen
+            return True
 
     def load(self) -> list[bytes] | None:
         """The records of the last run, oldest first, up to the first damaged one; None while they cannot be read.
@@ -80,11 +93,16 @@ class Journal:
     def rewrite(self, records: Iterable[bytes]) -> None:
         """Replace the file by ``records``, all or nothing."""
         framed = b"".join(map(_framed, records))
+        in_place = self._in_place
         try:
             descriptor = self._replaced_by(framed)
         except OSError as error:
+            if not in_place:
+                self._release()  # what is appended there is lost
             self._fail(error)
             return
+        if not in_place:
+            log.warning("journal %s was removed: it is written anew", self.path)
         self._release()
         with self._lock:
             self._file = descriptor
@@ -102,6 +120,7 @@ class Journal:
         try:
             os.fdatasync(descriptor)
             fresh.replace(self.path)
+            self._own = OwnFile(self.path)
         except OSError:
             os.close(descriptor)
             fresh.unlink(missing_ok=True)
