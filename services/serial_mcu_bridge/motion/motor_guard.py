@@ -152,9 +152,14 @@ class MotorGuard:
             self._changed(now)
 
     def save_again(self) -> None:
-        """Repeat a write that failed; nothing to do otherwise. One that takes long is not repeated."""
-        if self.persisted is False and not self._file.busy:
+        """Repeat a write that failed, or whose file was removed since; one that takes long is not repeated."""
+        if not self._can_save and self._file.can_save():
+            self._can_save = True
             self._save()
+        elif not self._file.busy and (self.persisted is False or not self._file.in_place):
+            self._save()
+        if self._barred and not self._barred_file.busy and not self._barred_file.in_place:
+            self._barred_file.save(self._barred)
 
     def repeat_state(self, now: float) -> None:
         """Publish the state again: a broker that was restored from an older save retains an older one."""

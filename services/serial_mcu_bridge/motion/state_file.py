@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from pebble.runtime.rate_limit import RateLimitedLog
+from pebble.transports.peers import OwnFile
 
 log = logging.getLogger(__name__)
 
@@ -38,6 +39,15 @@ class StateFile:
         self._closing = False
         self._thread: threading.Thread | None = None
         self._log = RateLimitedLog(log)
+        self._own: OwnFile | None = None  # as this process wrote it last
+
+    @property
+    def in_place(self) -> bool:
+        """False: what this process wrote is not there any more."""
+        try:
+            return self._own is None or self._own.in_place
+        except OSError:  # what is there cannot be seen
+            return True
 
     def can_save(self) -> bool:
         """Whether the folder can be written, or made."""
@@ -108,6 +118,7 @@ class StateFile:
                 file.flush()
                 os.fsync(file.fileno())
             new.replace(self.path)
+            self._own = OwnFile(self.path)
             _sync(self.path.parent)  # else a power cut may undo the renaming
         except OSError as error:
             self._log.log("failed", logging.ERROR, "%s cannot be written: %s", self.path, error.strerror)

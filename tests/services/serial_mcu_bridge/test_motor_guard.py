@@ -2,8 +2,9 @@
 
 import json
 import os
+import shutil
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import msgspec
@@ -280,3 +281,34 @@ def test_a_state_can_be_repeated_for_brokers_that_have_an_older_one(rig: Rig) ->
     before = len(rig.states)
     rig.guard.repeat_state(rig.now)
     assert rig.states[before:] == [rig.state]
+
+
+@pytest.mark.parametrize(
+    "remove", [lambda folder: shutil.rmtree(folder), lambda folder: folder.rename(folder.with_name("moved"))]
+)
+def test_a_stop_whose_file_was_removed_is_written_again(tmp_path: Path, remove: Callable[[Path], object]) -> None:
+    rig = Rig(tmp_path / "state" / "estop.json")
+    rig.stop()
+    assert rig.written()
+    rig.guard.save_again()
+    assert not rig.file.busy
+    remove(tmp_path / "state")
+    rig.guard.save_again()
+    assert rig.written()
+    rig.close()
+    again = Rig(tmp_path / "state" / "estop.json")
+    assert again.state.latched
+    again.close()
+
+
+def test_a_folder_that_can_be_written_later_gets_the_stop(tmp_path: Path) -> None:
+    (tmp_path / "state").write_text("in the way")
+    rig = Rig(tmp_path / "state" / "estop.json")
+    rig.stop()
+    rig.guard.save_again()
+    assert rig.states[-1].persisted is None
+    (tmp_path / "state").unlink()
+    rig.guard.save_again()
+    assert rig.written()
+    assert rig.state.persisted is True
+    rig.close()
