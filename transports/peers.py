@@ -131,6 +131,11 @@ class OwnFile:
         """Whether others that open its path still reach this process."""
         return self._made is not None and _identity(self._path) == self._made
 
+    @property
+    def replaced(self) -> bool:
+        """Whether another file is at its path."""
+        return _identity(self._path) not in (None, self._made)
+
 
 class PresenceLock:
     """The lock that marks one running process in the run directory, and the path of its socket."""

@@ -18,6 +18,7 @@ from pebble.errors import PebbleError
 from pebble.fleet.database import open_database
 from pebble.fleet.roles import Role, Session
 from pebble.fleet.tries import Tries, network_of
+from pebble.transports.peers import OwnFile
 
 NAME = re.compile(r"[a-z0-9_-]{1,32}")
 SESSION_S = 7 * 24 * 3600.0  # a session ends after this long, whether it is used or not
@@ -68,7 +69,8 @@ class People:
         monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
         self._lock = threading.Lock()
-        self._database = open_database(path, _TABLES)
+        self._path = path
+        self._database = self._open()
         self._clock = clock
         self._addresses, self._names = Tries(monotonic), Tries(monotonic)
         self._no_hash = _hash("", b"no such person..")  # compared where the name is unknown: the same time
@@ -76,6 +78,18 @@ class People:
     def close(self) -> None:
         with self._lock:
             self._database.close()
+
+    def _open(self) -> sqlite3.Connection:
+        database = open_database(self._path, _TABLES)
+        self._own = None if self._path is None else OwnFile(self._path)
+        return database
+
+    def _current(self) -> sqlite3.Connection:
+        """The database. While its file is gone it goes on; one that has taken its place, as a backup, is opened."""
+        if self._own is not None and self._own.replaced:
+            self._database.close()  # first: it removes what SQLite wrote beside the old file
+            self._database = self._open()
+        return self._database
 
     # -- people
 
@@ -199,11 +213,11 @@ class People:
 
     def _rows(self, statement: str, *values: Any) -> Sequence[Any]:
         with self._lock:
-            return self._database.execute(statement, values).fetchall()
+            return self._current().execute(statement, values).fetchall()
 
     def _change(self, statement: str, *values: Any) -> int:
         with self._lock:
-            return self._database.execute(statement, values).rowcount
+            return self._current().execute(statement, values).rowcount
 
     def _change_one(self, name: str, statement: str, *values: Any) -> None:
         if self._change(statement, *values) == 0:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import stat
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -259,3 +260,17 @@ def test_a_file_that_is_no_database(tmp_path: Path) -> None:
         People(file)
     with pytest.raises(PebbleError, match="below: cannot be used"):
         People(file / "below")
+
+
+def test_a_file_that_is_gone_costs_nothing_and_one_in_its_place_counts_at_once(tmp_path: Path) -> None:
+    file, backup = tmp_path / "state" / "people", tmp_path / "people"
+    with closing(People(backup)) as others:
+        others.add("bob", PASSWORD, Role.VIEWER)
+    with closing(People(file)) as people:
+        people.add("alice", PASSWORD, Role.DRIVER)
+        file.parent.rename(tmp_path / "away")
+        assert people.check("alice", PASSWORD, HERE) == User("alice", Role.DRIVER)
+        file.parent.mkdir()
+        backup.rename(file)
+        assert people.check("alice", PASSWORD, HERE) is None
+        assert people.check("bob", PASSWORD, HERE) == User("bob", Role.VIEWER)
