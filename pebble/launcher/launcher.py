@@ -7,7 +7,7 @@ import os
 from collections.abc import Sequence
 
 from pebble.config import Config
-from pebble.errors import ConfigError
+from pebble.errors import ConfigError, PebbleError
 from pebble.launcher.child import Child
 from pebble.launcher.config_watch import ConfigWatch
 from pebble.launcher.dropped import Dropped
@@ -54,16 +54,17 @@ class Launcher:
         self._logs = LogForwarder(self._status.publish_log, config.services.launcher.logs)
         self._config_watch = ConfigWatch(config)
         self._signals = StopSignals(self._kill_all)
+        self._lost = False  # another launcher has taken the run directory
 
     def run(self) -> int:
-        """Run until a stop signal; 0 after an orderly stop, 1 after one that a second signal enforced.
+        """Run until a stop signal; 0 after an orderly stop, 1 after one that a second signal or a lost lock enforced.
 
         Raises PebbleError if the robot runs already or its run directory cannot be used. Main thread only.
         """
         own_records = OwnRecords(self._logs, self._config.log_level_of("launcher"))
         with own_records, _run_lock(self._config) as lock, self._signals:
             try:
-                self._reactor.every(_RUN_DIR_S, lock.keep)
+                self._reactor.every(_RUN_DIR_S, lambda: self._keep(lock))
                 self._start()
                 self._reactor.run_until(self._stop_requested)
                 self._stop()
@@ -72,7 +73,7 @@ class Launcher:
                 self._status.close()
                 self._reactor.close()
                 segments.sweep()  # Zenoh leaves its files in /dev/shm even when its processes end in order
-        return 0 if self._signals.received <= 1 else 1
+        return 0 if self._signals.received <= 1 and not self._lost else 1
 
     # -- starting
 
@@ -144,7 +145,16 @@ class Launcher:
     # -- stopping
 
     def _stop_requested(self) -> bool:
-        return self._signals.received > 0
+        return self._signals.received > 0 or self._lost
+
+    def _keep(self, lock: RunLock) -> None:
+        if self._lost:
+            return
+        try:
+            lock.keep()
+        except PebbleError as error:
+            self._lost = True
+            log.error("%s", error)
 
     def _stop(self) -> None:
         """Stop stage by stage. Each has its own share of the timeout, so a hung process cannot starve later stages."""

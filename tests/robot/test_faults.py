@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import itertools
 import json
+import shutil
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import pytest
 
+from pebble.config import LAUNCHER_LOCK
 from tests.robot.operator import Driver, Operator, number_of, retained_messages
 from tests.robot.rig import BASE, STOP, Rig
 from tests.support import until
@@ -120,6 +122,20 @@ def test_another_process_killed(driven: Rig, program: str) -> None:
         killed = driven.kill(program)
     drive.end(killed)
     drive.check_stops()
+
+
+@pytest.mark.parametrize("program", ["mqtt_bridge", "serial_mcu_bridge"])
+def test_run_directory_removed(driven: Rig, program: str) -> None:
+    """What starts again afterwards reaches the processes that went on, and the lock is held again."""
+    drive, run = Drive(driven), driven.folder / "run"
+    sockets = len(list(run.glob("*.seat")))
+    with fault(driven):
+        shutil.rmtree(run)
+        assert until(lambda: (run / LAUNCHER_LOCK).exists() and len(list(run.glob("*.seat"))) >= sockets)
+    made_again = time.monotonic()
+    drive.end(made_again)
+    drive = Drive(driven)
+    drive.end(driven.kill(program))
 
 
 def test_local_transport_killed(driven: Rig) -> None:

@@ -97,7 +97,7 @@ class FrameWriter:
             liveliness.declare_token(self._names.writer(self._writer_id, size, segment)),
         ]
         needed = [self._names.socket, self._lock.path, *([segments.SHM / segment] if segment else [])]
-        self._files = [OwnFile(path) for path in needed]
+        self._files = [file for file in map(OwnFile, needed) if file.in_place]
         return self
 
     @property
@@ -159,6 +159,7 @@ class FrameWriter:
             self._publisher = self._bulk = self._pool = None
             close_session(session)
             self._tokens.clear()
+            self._files.clear()
             self._readers.clear()
             lock, self._lock = self._lock, None
             if lock is not None:

@@ -24,6 +24,7 @@ class ConfigCopy:
         self._config, self._source = config, config.path
         self._folder = config.run_dir() / "autonomy"
         self.path = self._folder / config.path.name
+        self._written: tuple[int, str, str] | None = None
 
     def write(self, port: int, username: str, password: str) -> None:
         """Write the copy for a gate on loopback ``port``. Raises PebbleError."""
@@ -37,9 +38,19 @@ class ConfigCopy:
             self.path.write_text(json.dumps(self._data(broker), indent=2), encoding="utf-8")
         except (OSError, ValueError) as error:
             raise PebbleError(f"the config of scripts, {self.path}, cannot be written: {error}") from None
+        self._written = port, username, password
+
+    def keep(self) -> None:
+        """Write the copy again if it was removed with the run directory. Raises PebbleError."""
+        if (written := self._written) is not None and not self.path.exists():
+            try:
+                self.write(*written)
+            finally:
+                self._written = written
 
     def remove(self) -> None:
         """Delete the folder, not what its links lead to."""
+        self._written = None
         shutil.rmtree(self._folder, ignore_errors=True)
 
     def _data(self, broker: dict[str, Any]) -> dict[str, Any]:

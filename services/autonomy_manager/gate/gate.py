@@ -46,7 +46,8 @@ class Gate:
 
     @property
     def config_path(self) -> Path:
-        """The config for the scripts; exists while the gate is open."""
+        """The config for the scripts; exists while the gate is open. Raises PebbleError if it cannot."""
+        self._copy.keep()
         return self._copy.path
 
     def open(self) -> None:

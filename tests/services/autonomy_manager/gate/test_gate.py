@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import socket
 import stat
@@ -361,6 +362,7 @@ def test_the_scripts_config_has_no_secret_and_its_files_beside_it(broker: Broker
     remote = {"host": "far", "username": "goob", "password": "hunter2", "tls": {"enabled": True}}
     services = {"mqtt_bridge": {"remote_mqtt": remote, "media": {}}}
     rig = Rig(broker, tmp_path, services=services, local_mqtt={"username": "robot", "password": "hunter3"})
+    shutil.rmtree(rig.gate.config_path.parent)  # as with a run directory that a logout removes
     text, path = rig.gate.config_path.read_text(), rig.gate.config_path
     assert "hunter" not in text
     assert json.loads(text)["services"]["mqtt_bridge"]["remote_mqtt"]["host"] == "far"
