@@ -85,8 +85,8 @@ def _open(folder: Path, listen: list[Path], connect: list[Path], *, shared: bool
     }
     try:
         return open_session(json.dumps(config))
-    except zenoh.ZError as error:  # whatever the reason: it will be the same without sharing, or that helps
-        kind = SharingError if shared else TransportError
+    except zenoh.ZError as error:
+        kind = SharingError if shared and "shm" in str(error) else TransportError
         raise kind(f"frames at {(listen or connect)[0]}: {error}") from None
     except BaseException as error:
         if not shared or type(error).__name__ != "PanicException":  # pyo3's, which is no Exception and not importable
