@@ -8,7 +8,7 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from pebble.config import Config, Mqtt, RemoteConnection, RemoteMqtt, Tls
+from pebble.config import Config, Mqtt, RemoteConnection, RemoteMqtt, SerialBridges, Tls
 from pebble.contract import (
     CAPABILITIES,
     CHANNELS,
@@ -153,8 +153,9 @@ def _renamed_vital(config: Config) -> tuple[str, ...]:
 
 def _renamed(config: Config) -> Iterator[tuple[Channel, str]]:
     """The channels that this config renames, and their topics, those of every serial line included."""
-    lines = [config.services.serial_mcu_bridge, *config.serial_instances().values()]
-    for line in lines:
+    own = config.services.serial_mcu_bridge  # in the process of one line: that one
+    lines = config.serial_instances().values() if isinstance(own, SerialBridges) else ()
+    for line in (own, *lines):
         addresses = Addresses(replace(config, services=replace(config.services, serial_mcu_bridge=line)))
         for channel in CHANNELS:
             topic = addresses[channel].topic
