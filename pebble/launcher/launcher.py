@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 from pebble.config import Config
 from pebble.errors import ConfigError, PebbleError
 from pebble.launcher.child import Child
 from pebble.launcher.config_watch import ConfigWatch
+from pebble.launcher.driveable import Driveable
 from pebble.launcher.dropped import Dropped
 from pebble.launcher.features import Features
 from pebble.launcher.log_forwarding import LogForwarder, OwnRecords
 from pebble.launcher.on_demand import OnDemand
 from pebble.launcher.orphans import reap
 from pebble.launcher.process_supervisor import ProcessSupervisor
-from pebble.launcher.programs import Program, Stage, preload, programs, shared_modules
+from pebble.launcher.programs import Program, Stage, preload, program_of, programs, shared_modules
 from pebble.launcher.reactor import Reactor, StopSignals
 from pebble.launcher.restart_policy import RestartPolicy
 from pebble.launcher.run_lock import RunLock
@@ -50,7 +51,10 @@ class Launcher:
         self._on_demand = OnDemand(self._reactor, self._supervisors)
         self._features = Features(lambda: self._status.capabilities_changed())
         self._dropped = Dropped()
-        self._status = StatusPublisher(config, self._reactor, self._supervisors, self._features, self._dropped)
+        self._driveable = self._driveable_by({supervisor.program.name for supervisor in self._supervisors})
+        self._status = StatusPublisher(
+            config, self._reactor, self._supervisors, self._features, self._dropped, self._driveable
+        )
         self._logs = LogForwarder(self._status.publish_log, config.services.launcher.logs)
         self._config_watch = ConfigWatch(config)
         self._signals = StopSignals(self._kill_all)
@@ -105,6 +109,15 @@ class Launcher:
             on_end=lambda: self._ended(program),
         )
 
+    def _driveable_by(self, running: Collection[str]) -> Driveable:
+        lines = {program_of(name): self._config.motor_owner(name) for name in self._config.serial_instances()}
+        return Driveable(
+            {program: name for program, name in lines.items() if program in running},
+            [program for name in self._config.motor_lines() if (program := program_of(name)) in running],
+            [name for name in ("mqtt_bridge",) if name in running],
+            lambda: self._status.changed(),
+        )
+
     def _log_line(self, program: Program, pid: int, line: str) -> None:
         if program.runs_scripts:
             self._logs.tagged_line(program.name, pid, line)
@@ -114,12 +127,13 @@ class Launcher:
     def _receive_note(self, program: Program, line: str) -> None:
         if self._dropped.receive(program.name, line):
             self._status.changed()
-        elif not self._features.receive(program.name, line):
+        elif not self._driveable.receive(program.name, line) and not self._features.receive(program.name, line):
             self._on_demand.receive(program, line)
 
     def _ended(self, program: Program) -> None:
         self._features.ended(program.name)
         self._dropped.ended(program.name)
+        self._driveable.ended(program.name)
         self._on_demand.ended(program)
 
     def _spawn(self, program: Program) -> Child:

@@ -114,9 +114,14 @@ def _transport_modules(config: Config) -> tuple[str, ...]:
     return tuple(module for kind in sorted(kinds) if (module := module_of(kind)) is not None)
 
 
+def program_of(instance: str, name: str = "serial_mcu_bridge") -> str:
+    """The name of the program of a serial line, or of another service's instance."""
+    return f"{name}:{instance}" if instance else name
+
+
 def _service(config: Config, name: str, stage: Stage, instance: str = "", **more: Any) -> Program:
     arguments = (str(config.path), instance) if instance else (str(config.path),)
-    return Program(f"{name}:{instance}" if instance else name, f"pebble.services.{name}", arguments, stage, **more)
+    return Program(program_of(instance, name), f"pebble.services.{name}", arguments, stage, **more)
 
 
 def _av_daemon(config: Config) -> Program:

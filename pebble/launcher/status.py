@@ -14,6 +14,7 @@ from pebble.contract import CAPABILITIES, LOGS, STATUS, Channel, codec
 from pebble.contract.payloads import Capabilities, LogRecord, ServiceState, Status
 from pebble.launcher.announcer_pipe import AnnouncerPipe
 from pebble.launcher.capabilities import capabilities
+from pebble.launcher.driveable import Driveable
 from pebble.launcher.dropped import Dropped
 from pebble.launcher.features import Features
 from pebble.launcher.process_supervisor import ProcessSupervisor
@@ -37,9 +38,11 @@ class StatusPublisher:
         supervisors: Sequence[ProcessSupervisor],
         features: Features,
         dropped: Dropped,
+        driveable: Driveable,
     ) -> None:
         self._config, self._addresses = config, Addresses(config)
-        self._reactor, self._supervisors, self._features, self._dropped = reactor, supervisors, features, dropped
+        self._reactor, self._supervisors, self._features = reactor, supervisors, features
+        self._dropped, self._driveable = dropped, driveable
         self._pipe = AnnouncerPipe(reactor)
         self._systemd = SystemdNotifier()
         self._status_due = self._capabilities_due = False
@@ -107,7 +110,16 @@ class StatusPublisher:
         relevant = {s.program.name: self._state(s) for s in shown if not _rests(s)}
         self._systemd.status(_summary(relevant))
         states = {supervisor.program.name: self._state(supervisor) for supervisor in shown}
-        self._publish_state(STATUS, _status(states, self._webrtc_url()))
+        self._publish_state(STATUS, self._status(states, self._driveable.mcus, self._webrtc_url()))
+
+    def _status(
+        self, states: dict[str, ServiceState], mcus: dict[str, Any] | None = None, webrtc_url: str | None = None
+    ) -> Status:
+        """Operator pages show what is at ``webrtc_url``."""
+        driveable = self._driveable.verdict({name: one.state for name, one in states.items()})
+        more = {"mcu": mcus or None, "driveable": driveable, "webrtc_url": webrtc_url}
+        value = {"services": states, **{name: one for name, one in more.items() if one is not None}}
+        return Status(t=_now_ms(), value=value)
 
     def _state(self, supervisor: ProcessSupervisor) -> ServiceState:
         policy, dropped = supervisor.policy, self._dropped[supervisor.program.name]
@@ -130,7 +142,7 @@ class StatusPublisher:
     def _will(self) -> Message:
         """Every service is stopped: children die with the launcher, whose end is what triggers the will."""
         shown = (supervisor.program.name for supervisor in self._supervisors if supervisor.shown)
-        return self._message(STATUS, _status({name: ServiceState(state="stopped") for name in shown}))
+        return self._message(STATUS, self._status({name: ServiceState(state="stopped") for name in shown}))
 
     def _message(self, channel: Channel, value: Any) -> Message:
         address = self._addresses[channel]
@@ -140,14 +152,6 @@ class StatusPublisher:
 def _rests(supervisor: ProcessSupervisor) -> bool:
     """An on-demand program that is not requested: systemd's summary leaves it out."""
     return supervisor.program.on_demand and not supervisor.requested and not supervisor.running
-
-
-def _status(states: dict[str, ServiceState], webrtc_url: str | None = None) -> Status:
-    """Operator pages show what is at ``webrtc_url``."""
-    value: dict[str, Any] = {"services": states}
-    if webrtc_url is not None:
-        value["webrtc_url"] = webrtc_url
-    return Status(t=_now_ms(), value=value)
 
 
 def _summary(states: dict[str, ServiceState]) -> str:

@@ -17,14 +17,14 @@ from typing import NamedTuple
 from pebble.config import LAUNCHER_LOCK
 from pebble.config.secret_text import without_secrets
 
-NOTIFY_FD = (
-    "PEBBLE_NOTIFY_FD"  # a pipe to the launcher: "READY" once, "ALIVE" every second, "WANT …", "LACKS …", "DROPPED …"
-)
+#: A pipe to the launcher: "READY" once, "ALIVE" every second, and the other notes of :class:`Notifier`.
+NOTIFY_FD = "PEBBLE_NOTIFY_FD"
 WANTED = "PEBBLE_WANTED"  # "name=encoding …": running programs that a predecessor of this process requested
 ENCODING = "PEBBLE_ENCODING"  # the encoding in the request that started this media program
 LAUNCHER_PID = "PEBBLE_LAUNCHER_PID"
 ALIVE_PERIOD_S = 1.0
 DROPPED_PERIOD_S = 10.0
+_WHY = 200  # characters of a reason
 LOG_FORMAT = "%(asctime)s [%(levelname)s] %(message)s"  # what the launcher's log forwarding reads (paper A.8.7)
 TAG = re.compile(r"\[([^\]]+) (\d+)\] (.*)", re.DOTALL)  # of a line by ``tagged``
 _PR_SET_PDEATHSIG = 1
@@ -159,6 +159,19 @@ class Notifier:
         words = " ".join(f"{reason}={number}" for reason, number in counts.items())
         return self._write(f"DROPPED {words}\n".encode())
 
+    def local(self, *, connected: bool, why: str = "") -> bool:
+        """Report whether this process is connected to its siblings. False: the launcher was too busy, repeat it."""
+        return self._write(f"LOCAL {int(connected)} {_one_line(why)}".rstrip().encode() + b"\n")
+
+    def mcu(self, state: str, heard_ms: int | None, why: str = "") -> bool:
+        """Report on this process's serial line, as :mod:`pebble.launcher.driveable` reads it. False: repeat it."""
+        heard = "-" if heard_ms is None else heard_ms
+        return self._write(f"MCU {state} {heard} {_one_line(why)}".rstrip().encode() + b"\n")
+
+    def reaches(self, owner: str, reached: bool) -> bool:
+        """Report whether what a motor owner publishes arrives here. False: the launcher was too busy, repeat it."""
+        return self._write(f"{'REACHES' if reached else 'MISSES'} {owner}\n".encode())
+
     def _write(self, line: bytes) -> bool:
         if self._fd is None:
             return True
@@ -168,6 +181,25 @@ class Notifier:
             log.debug("the launcher did not take %s", line)
             return False
         return True
+
+
+def _one_line(text: str) -> str:
+    """For an operator: on one line, without passwords, not too long."""
+    return "".join(one if one.isprintable() else " " for one in without_secrets(text))[:_WHY].strip()
+
+
+class LocalConnection:
+    """Reports to the launcher whether this process is connected to its siblings: call :meth:`report` regularly."""
+
+    def __init__(self, notifier: Notifier) -> None:
+        self._notifier = notifier
+        self._reported: tuple[bool, str] | None = None
+
+    def report(self, connected: bool, problem: str) -> None:
+        """``problem`` is why it is not connected. Reported if it has changed."""
+        found = (connected, "" if connected else problem)
+        if found != self._reported and self._notifier.local(connected=connected, why=found[1]):
+            self._reported = found
 
 
 class DroppedMessages:

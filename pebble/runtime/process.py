@@ -17,11 +17,13 @@ from pebble.runtime.parent import (
     ALIVE_PERIOD_S,
     DROPPED_PERIOD_S,
     DroppedMessages,
+    LocalConnection,
     Notifier,
     set_log_level,
     set_up_logging,
 )
 from pebble.runtime.service import Service
+from pebble.transports import State
 
 _STOP_DEADLINE_S = 3.0
 
@@ -65,15 +67,19 @@ def _serve(service_class: type[Service], config: Config, instance: str) -> int:
     transport = local_transport(config, service_class.client_name or name, as_published=service_class.as_published)
     service = service_class(config, transport, instance=instance)
     notify = Notifier()
-    dropped = DroppedMessages(notify)
+    dropped, local = DroppedMessages(notify), LocalConnection(notify)
 
     def quit_(_signal: int, _frame: object) -> None:
         exit_at_the_latest()
         service.quit()
 
+    def alive() -> None:
+        notify.alive()
+        local.report(transport.state is State.CONNECTED, transport.problem)
+
     signal.signal(signal.SIGTERM, quit_)
     signal.signal(signal.SIGINT, quit_)
-    service.timers.add(service.clock(), notify.alive, period=ALIVE_PERIOD_S)
+    service.timers.add(service.clock(), alive, period=ALIVE_PERIOD_S)
     service.timers.add(service.clock(), lambda: dropped.report(service.dropped()), period=DROPPED_PERIOD_S)
     service.run(ready=notify.ready)
     return 0

@@ -21,6 +21,7 @@ from pebble.services.mqtt_bridge.actions import ACTIONS, SystemActions
 from pebble.services.mqtt_bridge.heartbeat import Heartbeat
 from pebble.services.mqtt_bridge.leftovers import Leftovers
 from pebble.services.mqtt_bridge.media import MEDIA, Media, MediaRequests
+from pebble.services.mqtt_bridge.motor_owners import CHECK_S, MotorOwners
 from pebble.services.mqtt_bridge.private_topics import PrivateTopics
 from pebble.services.mqtt_bridge.same_broker import SameBrokerProbe, now_ms
 from pebble.transports import Message, State, Subscription
@@ -63,7 +64,10 @@ class MqttBridge(Service):
         self._remote_subscriptions: list[Subscription] = []
         self._same_broker = SameBrokerProbe(self.config, self.transport, self._remote, self.clock)
         self._actions = SystemActions(section, folder=self.config.state_dir(), clock=self.clock)
-        self._media = MediaRequests(Media(self.config.on_demand_programs(), earlier_requests()), Notifier().request)
+        notifier = Notifier()
+        self._media = MediaRequests(Media(self.config.on_demand_programs(), earlier_requests()), notifier.request)
+        owners = map(self.config.motor_owner, self.config.motor_lines())
+        self._owners = MotorOwners(self.config.base, owners, notifier)
         self._private = PrivateTopics(self.config.base)
         self._subjects = Subjects(self.config)
         self._leftovers = Leftovers(self.config.base, self._subjects, self._remote)
@@ -245,6 +249,10 @@ class MqttBridge(Service):
     def _send_media_requests(self) -> None:
         self._media.send()
 
+    @every(CHECK_S)
+    def _check_owners(self) -> None:
+        self._owners.check(self.clock())
+
     @every(PROBE_PERIOD_S)
     def _probe_again(self) -> None:
         self._forwarder.probe_again(Side.REMOTE)
@@ -253,6 +261,8 @@ class MqttBridge(Service):
 
     def _on_side_state(self, side: Side, state: State) -> None:
         self._forwarder.watch(side, state)
+        if side is Side.LOCAL:
+            self._owners.connected()
         if state is State.CONNECTED:
             self.post(partial(self._connected, side, self._remote_epoch))
             return
@@ -269,6 +279,8 @@ class MqttBridge(Service):
                 # one broker after all, or another program's heartbeat of the same millisecond
                 self.post_message(BRIDGE_PROBE, self._same_broker.send_again, newest_of="suspect")
             return
+        if message.topic in self._owners.topics:
+            self._owners.receive(message.topic)
         self._leftovers.note_local(message)
         for admitted in self._private.admit(message):
             self._react(Side.LOCAL, admitted, self._forwarder.receive(Side.LOCAL, admitted))

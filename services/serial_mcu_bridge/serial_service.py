@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from abc import ABC, abstractmethod
 from importlib import import_module
 from typing import Any, ClassVar
@@ -10,8 +11,10 @@ from typing import Any, ClassVar
 from pebble.config import Config, SerialBridge
 from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
 from pebble.errors import ConfigError, DeviceError
+from pebble.runtime.parent import Notifier
 from pebble.runtime.rate_limit import RateLimitedLog
-from pebble.runtime.service import Service
+from pebble.runtime.service import Service, every
+from pebble.services.serial_mcu_bridge.line.hearing import CHECK_S, Hearing
 from pebble.services.serial_mcu_bridge.line.serial_line import LineState, SerialLine
 
 _INPUT_LIMIT = 65_536  # bytes waiting for the service's thread; 1.4 s of a full 460,800 baud line
@@ -35,6 +38,9 @@ class SerialService(Service, ABC):
         self.device_log = RateLimitedLog(self.log, burst=20)
         self._input = bytearray()
         self._input_lock = threading.Lock()
+        self._hearing = Hearing()
+        self.notifier = Notifier()
+        self._reported: tuple[str, int | None, str] | None = None  # of the MCU, to the launcher
         self.line = SerialLine(
             section.serial.port,
             section.serial.baud,
@@ -86,7 +92,20 @@ class SerialService(Service, ABC):
     def _on_line_state(self, state: LineState) -> None:
         if state is LineState.CLOSED:
             raise DeviceError("the serial line's thread has ended")  # so the process ends and the launcher restarts it
+        self.report_mcu()
         self.on_line_state(state)
+
+    @every(CHECK_S)
+    def report_mcu(self) -> None:
+        """Report to the launcher what has changed of the MCU."""
+        line, now = self.line, time.monotonic()  # the line's clock
+        if line.state is LineState.CLOSED:
+            return
+        idle = now - line.sent_until >= CHECK_S
+        state, heard_ms = self._hearing.check(line.state, line.opened, line.received, now, idle=idle)
+        found = state, heard_ms, line.problem
+        if found != self._reported and self.notifier.mcu(*found):
+            self._reported = found
 
     def _queue_input(self, chunk: bytes) -> None:
         """On the reading thread, which also parses it if the service is idle.

@@ -63,6 +63,7 @@ class SerialLine:
         self.path, self.baud = path, baud
         self.opened = 0  # how often the device was opened
         self.refused = 0  # lines refused because there was no device
+        self.received = 0  # chunks of bytes from the device since it was opened and has booted
         self.outbox = Outbox(stop, drive_timeout_s)
         self._stop, self._boot_s, self._read_timeout = stop, boot_s, read_timeout_s
         self._retry, self._end = retry_s, end
@@ -90,6 +91,11 @@ class SerialLine:
     def problem(self) -> str:
         """The reason why there is no device; empty while there is one."""
         return self._problem
+
+    @property
+    def sent_until(self) -> float:
+        """When all that was written to the device has had time to be sent, in monotonic seconds."""
+        return self._busy_until
 
     def open(self) -> None:
         """Start the thread that opens the device. Returns at once."""
@@ -208,6 +214,7 @@ class SerialLine:
     def _attach(self, port: Port) -> None:
         with self._lock:
             self.opened += 1
+            self.received = 0
             port.discard_output()  # an earlier process may have left old commands in the kernel
             self._port, self._failure, self._blocked_since = port, None, None
             self.outbox.clear()
@@ -247,6 +254,7 @@ class SerialLine:
 
     def _receive(self, chunk: bytes) -> None:
         if chunk and self._state is LineState.READY:
+            self.received += 1
             self._on_bytes(chunk)
 
     def _become_ready(self) -> None:

@@ -30,7 +30,6 @@ from pebble.contract.payloads import (
 )
 from pebble.errors import TransportError
 from pebble.runtime.lines import LineSplitter
-from pebble.runtime.parent import Notifier
 from pebble.runtime.service import WAIT_LIMIT_S, every, on
 from pebble.runtime.timers import Timer
 from pebble.services.serial_mcu_bridge.line.serial_line import LineState
@@ -88,7 +87,6 @@ class MotorBridge(SerialService):
         )
         self._deadline: Timer | None = None  # stops the motors unless a command arrives; None: they are stopped
         self._guard_timer: Timer | None = None
-        self._notifier = Notifier()
         self._announced = self._notified = True  # that it latches: to operators, and to the launcher
         self._charging: ChargingStatus | None = None
         self._splitter = LineSplitter()
@@ -193,7 +191,7 @@ class MotorBridge(SerialService):
         if self._latches is not self._announced:
             self._announced = self._latches
             self._announce()
-        if self._notified is not self._announced and self._notifier.lacks("estop", not self._announced):
+        if self._notified is not self._announced and self.notifier.lacks("estop", not self._announced):
             self._notified = self._announced
 
     def _announce(self) -> None:

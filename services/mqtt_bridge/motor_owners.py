@@ -1,0 +1,48 @@
+"""Whether the robot's motor owners and this process reach each other: what it would send them passes the same way."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from pebble.contract import ESTOP_STATE
+from pebble.runtime.parent import Notifier
+
+CHECK_S = 1.0
+_MISSED_S = 15.0  # owners publish their state every 5 s
+
+
+class MotorOwners:
+    """Reports to the launcher which motor owners it receives; times are seconds of the caller's clock.
+
+    The first message of a connection counts for nothing, because it may be a retained one.
+    """
+
+    def __init__(self, base: str, owners: Iterable[str], notifier: Notifier) -> None:
+        self.topics = {ESTOP_STATE.topic(base, owner=owner): owner for owner in owners}
+        self._notifier = notifier
+        self._messages = dict.fromkeys(self.topics, 0)  # of this connection
+        self._checked = dict(self._messages)
+        self._heard_at: dict[str, float | None] = dict.fromkeys(self.topics)  # None: since the first check
+        self._reported: dict[str, bool | None] = dict.fromkeys(self.topics)
+
+    def connected(self) -> None:
+        """A new connection begins; on the transport's thread, like :meth:`receive`."""
+        self._messages = dict.fromkeys(self.topics, 0)
+
+    def receive(self, topic: str) -> None:
+        """Note a message on one of ``topics``."""
+        self._messages[topic] += 1
+
+    def check(self, now: float) -> None:
+        """Report what has changed; call it every ``CHECK_S``, on one thread."""
+        for topic, owner in self.topics.items():
+            count, before = self._messages[topic], self._checked[topic]
+            self._checked[topic] = count
+            heard_at = self._heard_at[topic]
+            if heard_at is None or (count > 1 and count != before):
+                heard_at = self._heard_at[topic] = now
+            reached = True if count > 1 else self._reported[topic]
+            if now - heard_at >= _MISSED_S:
+                reached = False
+            if reached is not None and reached != self._reported[topic] and self._notifier.reaches(owner, reached):
+                self._reported[topic] = reached

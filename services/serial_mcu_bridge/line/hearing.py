@@ -1,0 +1,45 @@
+"""Whether the board on a serial line is heard, and whether its silence means anything. Pure."""
+
+from __future__ import annotations
+
+from pebble.services.serial_mcu_bridge.line.serial_line import LineState
+
+CHECK_S = 1.0
+_RECENT_S, _SILENT_S = 1.0, 10.0
+_REGULAR = 5  # checks in a row; our motor boards report at least twice a second, also at rest
+
+
+class Hearing:
+    """Call :meth:`check` about once a second, and when the state of the line changes.
+
+    A board that has sent something of its own accord in five checks in a row, while nothing was sent to it, is one that
+    reports at rest: if it stops, it hangs, or its wires do. Others may be silent by design.
+    """
+
+    def __init__(self) -> None:
+        self._opened = 0
+        self._received = 0
+        self._heard_at: float | None = None
+        self._counted_at = 0.0
+        self._in_row = 0
+
+    def check(self, state: LineState, opened: int, received: int, now: float, *, idle: bool) -> tuple[str, int | None]:
+        """The state of the line, and how long ago its board was heard: 0, 1000 or 10000 ms, at least.
+
+        ``opened`` counts openings, ``received`` what was received since the last one; ``idle``: nothing was sent to the
+        board for a second.
+        """
+        if opened != self._opened:
+            self._opened, self._received, self._heard_at, self._in_row = opened, 0, None, 0
+        heard = received != self._received
+        self._received = received
+        if heard:
+            self._heard_at = now
+        if self._in_row < _REGULAR and now - self._counted_at >= 0.9 * CHECK_S:
+            self._counted_at, self._in_row = now, self._in_row + 1 if heard and idle else 0
+        if self._heard_at is None or state is not LineState.READY:
+            return state.value, None
+        age_s = now - self._heard_at
+        if age_s >= _SILENT_S:
+            return "silent" if self._in_row >= _REGULAR else state.value, 10_000
+        return state.value, 0 if age_s < _RECENT_S else 1_000
