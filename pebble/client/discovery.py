@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from typing import Any
 
+from pebble.client.driveable import Driveable, driveable_of
 from pebble.client.estop_states import RobotEstop
 from pebble.contract import (
     AUTONOMY_STATUS,
@@ -14,6 +15,7 @@ from pebble.contract import (
     IMU,
     ONLINE,
     OUTGOING,
+    STATUS,
     Channel,
     channel_of,
     codec,
@@ -85,6 +87,7 @@ class DiscoveredRobot:
         self.messages = RateMeter()
         self.capabilities: dict[str, Any] = {}
         self.estop = RobotEstop(base)
+        self.driveable: Driveable | None = None  # as its status says
         self.volts: float | None = None
         self.charging: bool | None = None
         self.attitude: Orientation | None = None  # of the newest sample of its inertial sensor
@@ -165,8 +168,10 @@ class Discovery:
             robot.attitude = payload.value.orientation_deg
         elif channel is AUTONOMY_STATUS:
             robot.autonomy = payload
+        elif channel is STATUS:
+            robot.driveable = driveable_of(message.payload)
         else:
             robot.charging = payload.value
 
 
-_KNOWN = (ONLINE, CAPABILITIES, CHARGING_LEVEL, CHARGING_STATUS, IMU, AUTONOMY_STATUS)
+_KNOWN = (ONLINE, CAPABILITIES, CHARGING_LEVEL, CHARGING_STATUS, IMU, AUTONOMY_STATUS, STATUS)

@@ -9,9 +9,10 @@ import secrets
 from collections.abc import Callable, Collection, Iterable
 from enum import Enum
 
+from pebble.client.driveable import Driveable, driveable_of
 from pebble.client.estop_states import RobotEstop
 from pebble.client.rank import Rank, RankedTable
-from pebble.contract import AUTONOMY_COMMAND, DRIVE, ESTOP, Channel, codec
+from pebble.contract import AUTONOMY_COMMAND, DRIVE, ESTOP, STATUS, Channel, codec
 from pebble.contract.identity import Direction, parse_topic
 from pebble.contract.payloads import AutonomyCommand, Drive, EstopCommand
 from pebble.motion.latch import is_name, stop_of
@@ -50,6 +51,7 @@ class RobotStop:
     ) -> None:
         self.estop = RobotEstop(base)
         self.live = False  # anything but retained messages has arrived from it
+        self.driveable: Driveable | None = None  # as its status says
         self.confirmed_s: float | None = None  # how long it took; None: it is not confirmed
         self.own_only = False  # topics that its capabilities name are used only if they are incoming ones of its own
         self.next: float = now  # when to send again, unless it is confirmed or spared
@@ -60,6 +62,7 @@ class RobotStop:
         self._sent_at = float("-inf")
         self._script_ended = False
         self._given_up = False
+        self._status_topic = STATUS.topic(base)
         self._boots: dict[str, str] = {}  # by owner, the newest one in which it has listed this stop
 
     @property
@@ -111,6 +114,9 @@ class RobotStop:
         """Update from a message of this robot."""
         if not (self.live or message.retain):
             self.live, self.rank = True, self.rank._replace(live=True)
+        if message.topic == self._status_topic:
+            self.driveable = driveable_of(message.payload)
+            return
         known = self.estop.has_capabilities
         if not self.estop.receive(message):
             return

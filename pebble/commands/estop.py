@@ -17,12 +17,13 @@ import typer
 
 from pebble.client.connection import Listener, Target, connected, target_of
 from pebble.client.discovery import ALL_OUTGOING, Discovery
+from pebble.client.driveable import Driveable
 from pebble.client.estop import Progress, RobotStop, StopSender, new_name, send
 from pebble.client.estop_states import Reset, RobotEstop
 from pebble.client.names import id_of
 from pebble.commands import show
 from pebble.commands.options import CaCert, ConfigOption, PasswordFile, RemoteOption, UrlOption
-from pebble.contract import CAPABILITIES, ESTOP_STATE, ONLINE
+from pebble.contract import CAPABILITIES, ESTOP_STATE, ONLINE, STATUS
 from pebble.errors import PebbleError, TransportError
 from pebble.runtime.signals import interrupted_by_signals
 from pebble.transports import State, Transport
@@ -152,7 +153,7 @@ def _listen(transport: Transport, filters: list[str]) -> Listener:
 
 
 def _filters(base: str) -> list[str]:
-    return [channel.filter(base) for channel in (ESTOP_STATE, CAPABILITIES, ONLINE)]
+    return [channel.filter(base) for channel in (ESTOP_STATE, STATUS, CAPABILITIES, ONLINE)]
 
 
 def _receive(listener: Listener, sender: StopSender) -> None:
@@ -204,6 +205,8 @@ class _Report:
     def _print(self, *, patient: bool) -> None:
         for base, robot in list(self._sender.robots.items()):
             line = _line(robot, patient=patient)
+            if robot.driveable is not None and robot.driveable.doubt:
+                line += f"; its status says: {robot.driveable.doubt}"
             if self._lines.get(base) != line:
                 self._lines[base] = line
                 _echo(show.printable(f"{id_of(base)}: {line}"))
@@ -265,7 +268,7 @@ def _status(target: Target, *, every: bool) -> int:
     with connected(target) as (transport, names):
         discovery = Discovery()
         is_remote = target.remote or str(target.url).startswith("mqtt")  # within a robot there is no heartbeat
-        for channel in (ESTOP_STATE, CAPABILITIES, *((ONLINE,) if is_remote else ())):
+        for channel in (ESTOP_STATE, STATUS, CAPABILITIES, *((ONLINE,) if is_remote else ())):
             transport.subscribe(
                 channel.filter(names.base),
                 lambda message: discovery.receive(message, time.monotonic(), time.time()),
@@ -277,13 +280,13 @@ def _status(target: Target, *, every: bool) -> int:
             _wait(lambda: all(robot.liveness.received_at for robot in discovery.all_robots()), _HEARTBEAT_S)
         robots = sorted(discovery.all_robots(), key=lambda robot: robot.base)
     for robot in robots:
-        _print_states(robot.estop, silent=is_remote and robot.liveness.received_at is None)
+        _print_states(robot.estop, robot.driveable, silent=is_remote and robot.liveness.received_at is None)
     if not robots:
         typer.echo("no robot has published an emergency stop or capabilities")
     return 0 if robots else 1
 
 
-def _print_states(robot: RobotEstop, *, silent: bool = False) -> None:
+def _print_states(robot: RobotEstop, driveable: Driveable | None = None, *, silent: bool = False) -> None:
     """One line for a robot that is free or has no emergency stop, else one for each stopped owner.
 
     ``silent``: it sends no heartbeat now.
@@ -298,7 +301,10 @@ def _print_states(robot: RobotEstop, *, silent: bool = False) -> None:
         lines.append(f"{name}: {_absent(robot)}")
     elif missing or not robot.states:
         lines.append(f"{name}: unknown, no state of {', '.join(missing) or 'any motor owner'}")
-    for line in lines or [f"{name}: free"]:
+    lines = lines or [f"{name}: free"]
+    if driveable is not None and driveable.doubt:
+        lines.append(f"{name}: {driveable.doubt}")
+    for line in lines:
         typer.echo(show.printable(line))
 
 

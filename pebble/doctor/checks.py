@@ -21,6 +21,7 @@ from pebble.config import Config, Mqtt
 from pebble.config.secret_text import shown_user
 from pebble.doctor import Finding, Level
 from pebble.doctor.broker_probe import REFUSED_ID, REFUSED_LOGINS, ProbeResult, probe
+from pebble.doctor.driving import driving
 from pebble.doctor.loudspeaker import loudspeaker
 from pebble.doctor.media import media
 from pebble.doctor.publishing import publishing
@@ -61,6 +62,8 @@ def _robot(config: Config) -> Iterator[Finding]:
     yield state_directory(config.state_dir())
     for line in config.serial_instances().values():
         yield serial_port(Path(str(line.serial.port)))
+    if (found := driving(config)) is not None:
+        yield found
     yield from media(config, Path("/dev"))
     yield from loudspeaker(config)
     yield from operator_page(config)

@@ -1,0 +1,41 @@
+"""Whether a robot that runs on this machine can be driven, as its own status says."""
+
+from __future__ import annotations
+
+import time
+
+from pebble.client.connection import Target, connected
+from pebble.client.driveable import Driveable, driveable_of
+from pebble.config import Config
+from pebble.contract import STATUS
+from pebble.doctor import Finding, Level
+from pebble.errors import PebbleError
+from pebble.runtime.parent import launcher_runs
+from pebble.transports import Message
+
+_ANSWER_S = 2.0
+_LEVELS = {"yes": Level.OK, "unknown": Level.WARN, "no": Level.FAIL}
+
+
+def driving(config: Config) -> Finding | None:
+    """Read it on the robot's own side; None: it has no motors, or does not run."""
+    if not config.motor_lines() or not launcher_runs(config.run_dir()):
+        return None
+    found: list[Driveable | None] = []
+
+    def receive(message: Message) -> None:
+        found.append(driveable_of(message.payload))
+
+    try:
+        with connected(Target(config=config.path, program="doctor")) as (transport, names):
+            transport.subscribe(STATUS.filter(names.base), receive)
+            end = time.monotonic() + _ANSWER_S
+            while not found and time.monotonic() < end:
+                time.sleep(0.01)
+    except PebbleError as error:
+        return Finding(Level.FAIL, "driving", f"nothing reaches the running robot: {error}")
+    if not found or found[-1] is None:
+        return Finding(Level.WARN, "driving", "the running robot does not say whether it can be driven")
+    state, why = found[-1]
+    text = "commands reach the motors" if state == "yes" else f"{'not possible' if state == 'no' else state}: {why}"
+    return Finding(_LEVELS[state], "driving", text)
