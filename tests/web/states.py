@@ -116,14 +116,14 @@ def imu(now: int) -> dict[str, Any]:
     return {"t": now, "seq": 12, "mcu_ms": 1200, "value": value}
 
 
-def services() -> dict[str, Any]:
+def services(**more: Any) -> dict[str, Any]:
     value = {
         "mqtt_bridge": {"state": "ready", "restarts": 0, "last_exit": None},
         "serial_mcu_bridge": {"state": "ready", "restarts": 1, "last_exit": "exit code 1"},
         "av_daemon": {"state": "ready", "restarts": 0, "last_exit": None},
         "autonomy_manager": {"state": "restarting", "restarts": 2, "last_exit": "signal 9"},
     }
-    return {"t": 0, "value": {"services": value}}
+    return {"t": 0, "value": {"services": value, **more}}
 
 
 def logs(now: int) -> list[Any]:
@@ -357,6 +357,24 @@ def with_stream(address: str) -> Callable[[int], Value]:
     return lambda now: (GOOB, "status", {"t": now, "value": {"webrtc_url": address}}, 100)
 
 
+NO_BOARD = "cannot open /dev/ttyACM0: No such file or directory"
+#: Of goob the motor board is unplugged; of fred it is silent, perhaps by design.
+UNDRIVEABLE = (
+    at(
+        GOOB,
+        "status",
+        services(
+            mcu={
+                "serial": {"state": "absent", "why": NO_BOARD},
+                "imu": {"state": "ready", "heard_ms": 0},
+                "relays": {"state": "silent", "heard_ms": 10_000},
+            },
+            driveable={"state": "no", "why": f"serial: {NO_BOARD}"},
+        ),
+    ),
+    at(FRED, "status", services(driveable={"state": "unknown", "why": "serial: its board has sent nothing yet"})),
+)
+
 #: The server has recordings.
 REPLAYING = State("/replay", fleet, LIVE, {"recordings": True}, recordings=True)
 
@@ -365,6 +383,8 @@ STATES: dict[str, State] = {
     "fleet-stopped": State(
         "/", changed(fleet, stopped(GOOB, "eve on phone"), stopped(FRED, "eve on phone", why="button, all")), LIVE
     ),
+    "fleet-undriveable": State("/", changed(fleet, *UNDRIVEABLE), LIVE),
+    "undriveable": State(GOOB_PATH, changed(fleet, MINE, *UNDRIVEABLE), LIVE),
     "fleet-empty": State("/", lambda _now: []),
     "fleet-lost": State("/", fleet, silent=True),
     "fleet-watching": State("/?watch", fleet, LIVE),

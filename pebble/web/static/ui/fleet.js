@@ -18,7 +18,7 @@ import { Offers, Route, WATCHES } from "./models.js";
 import { charging, plain, shortTime } from "./more-words.js";
 import { Icon, Live, StopButton } from "./parts.js";
 import { RecordingsLink } from "./recordings-link.js";
-import { battery, clockTime, driverName, inner, isObject, kindOf, nameOf, roughly, typeOf } from "./words.js";
+import { battery, clockTime, doubtOf, driverName, inner, isObject, kindOf, nameOf, roughly, typeOf } from "./words.js";
 
 const THUMBNAIL_MS = 1000;
 const SORTS = { name: "name", type: "type", battery: "battery" };
@@ -182,7 +182,7 @@ function FleetCard({ at }) {
         <h2>${name}</h2>
         <span class="dim">${[kindOf(at), kind].filter(Boolean).join(" · ")}</span>
       </div>
-      <${Liveness} at=${at} />
+      <${Liveness} at=${at} short />
     </div>
     ${(settings.thumbnails || WATCHES) &&
     (offers.hasVideo
@@ -228,8 +228,14 @@ function BatteryFact({ at, online }) {
 
 function DriverFact({ at, offers, online, stopped }) {
   const view = useValue(at, "web/driver");
+  const doubt = doubtOf(useValue(at, "status"));
   if (!online) return null;
   if (!offers.known && !offers.drives) return null;
+  if (doubt.text) {
+    return html`<li class=${`fact ${doubt.no ? "bad" : "dim"}`}>
+      <span><span aria-hidden="true">${doubt.no ? "▲" : "○"} </span>${doubt.text}</span>
+    </li>`;
+  }
   if (!offers.drives) return html`<li class="fact dim"><${Icon} name="wheel" />does not drive</li>`;
   if (!view?.by) return stopped ? null : html`<li class="fact dim"><${Icon} name="wheel" />free to drive</li>`;
   return html`<li class="fact">

@@ -12,7 +12,7 @@ const NOTED = 16; // the server's newest
 const SIGNS = { ready: "●", init: "○", restarting: "▲", failed: "✖", stopped: "■" };
 
 export function Services({ at, view }) {
-  const services = inner(useValue(at, "status"))?.services;
+  const { services, mcu } = inner(useValue(at, "status")) ?? {};
   const times = useValue(at, "web/restarts")?.times ?? {};
   const online = useOnline(at);
   useTick(5000);
@@ -33,6 +33,9 @@ export function Services({ at, view }) {
         />`,
       )}
     ${names.length > MOST && html`<li class="dim">… ${names.length - MOST} more</li>`}
+    ${Object.entries(isObject(mcu) ? mcu : {})
+      .slice(0, MOST)
+      .map(([name, line]) => html`<${SerialLine} key=${`mcu ${name}`} name=${name} online=${online} line=${line} />`)}
   </ul>`;
 }
 
@@ -54,6 +57,22 @@ function Service({ at, view, name, online, one, times }) {
     <button type="button" class="quiet" aria-label=${`Logs of ${name}`} data-test=${`logs-of-${name}`} onClick=${logs}>
       Logs
     </button>
+    ${words && html`<span class="services-more">${words}</span>`}
+  </li>`;
+}
+
+const BOARD_SIGNS = { ready: "●", booting: "○", silent: "▲", absent: "✖" };
+
+/** A serial line, and whether its board is heard. */
+function SerialLine({ name, online, line }) {
+  const { state, why, heard_ms: heard } = isObject(line) ? line : {};
+  const bad = state === "absent" || state === "silent";
+  const silence = heard === undefined ? "nothing received yet" : heard >= 10_000 ? "nothing received for 10 s" : "";
+  const words = plain(why ?? (state === "ready" || state === "silent" ? silence : ""));
+  return html`<li class=${online ? (bad ? "bad" : "") : "dim"} data-test=${`mcu-line-${name}`}>
+    <i aria-hidden="true">${Object.hasOwn(BOARD_SIGNS, state) ? BOARD_SIGNS[state] : "○"}</i>
+    <span class="services-name">board on ${name}</span>
+    <span class="services-state">${online ? "" : "was "}${plain(state)}</span>
     ${words && html`<span class="services-more">${words}</span>`}
   </li>`;
 }

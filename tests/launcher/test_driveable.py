@@ -1,0 +1,109 @@
+"""Whether a robot can be driven follows from what its processes report."""
+
+from __future__ import annotations
+
+import pytest
+
+from pebble.launcher.driveable import Driveable
+
+OWNER, BRIDGE = "serial_mcu_bridge", "mqtt_bridge"
+READY = {OWNER: "ready", BRIDGE: "ready"}
+WELL = {
+    "link of the owner": (OWNER, "LOCAL 1"),
+    "link of the bridge": (BRIDGE, "LOCAL 1"),
+    "reach": (BRIDGE, "REACHES serial"),
+    "board": (OWNER, "MCU ready 0"),
+}
+#: What is different, and what follows.
+CASES = {
+    "all is well": ({}, "yes"),
+    "heard some seconds ago": ({"board": (OWNER, "MCU ready 1000")}, "yes"),
+    "port": ({"board": (OWNER, "MCU absent - no /dev/ttyACM0")}, "no serial: no /dev/ttyACM0"),
+    "port, without a reason": ({"board": (OWNER, "MCU absent -")}, "no serial: there is no such device"),
+    "stopped sending": (
+        {"board": (OWNER, "MCU silent 10000")},
+        "no serial: its board has stopped sending: it hangs, or has lost its power",
+    ),
+    "booting": ({"board": (OWNER, "MCU booting -")}, "unknown serial: its board is starting"),
+    "never heard": ({"board": (OWNER, "MCU ready -")}, "unknown serial: its board has sent nothing yet"),
+    "silent by design": ({"board": (OWNER, "MCU ready 10000")}, "unknown serial: its board has sent nothing for 10 s"),
+    "line not reported": ({"board": None}, "unknown serial: it has just started"),
+    "owner cut off": ({"link of the owner": (OWNER, "LOCAL 0 no hub")}, "no serial_mcu_bridge: no hub"),
+    "bridge cut off": (
+        {"link of the bridge": (BRIDGE, "LOCAL 0")},
+        "no mqtt_bridge: it does not reach the other programs",
+    ),
+    "link not reported": ({"link of the bridge": None}, "unknown mqtt_bridge has just started"),
+    "siblings apart": ({"reach": (BRIDGE, "MISSES serial")}, "no mqtt_bridge receives nothing from serial"),
+    "reach not reported": ({"reach": None}, "unknown mqtt_bridge has received nothing from serial yet"),
+    "the worst counts": (
+        {"board": (OWNER, "MCU booting -"), "reach": (BRIDGE, "MISSES serial")},
+        "no mqtt_bridge receives nothing from serial",
+    ),
+}
+
+
+class Told(Driveable):
+    """A motor line behind the bridge, and an inertial sensor; counts how often the status had to follow."""
+
+    def __init__(self) -> None:
+        lines = {OWNER: "serial", f"{OWNER}:imu": "imu"}
+        super().__init__(lines, [OWNER], [BRIDGE], self._count)
+        self.changes = 0
+
+    def _count(self) -> None:
+        self.changes += 1
+
+    def says(self, states: dict[str, str] | None = None) -> str:
+        return " ".join((self.verdict(READY if states is None else states) or {}).values())
+
+
+@pytest.mark.parametrize(("different", "expected"), CASES.values(), ids=CASES)
+def test_the_worst_that_is_known_decides(different: dict[str, tuple[str, str] | None], expected: str) -> None:
+    robot = Told()
+    for note in {**WELL, **different}.values():
+        assert note is None or robot.receive(*note)
+    assert robot.says() == expected
+
+
+@pytest.mark.parametrize("state", ["init", "restarting", "failed", "stopped"])
+@pytest.mark.parametrize("program", [OWNER, BRIDGE])
+def test_a_process_that_is_not_ready_drives_nothing(program: str, state: str) -> None:
+    robot = Told()
+    for note in WELL.values():
+        robot.receive(*note)
+    assert robot.says({**READY, program: state}).startswith(f"no {program} is ")
+
+
+def test_what_a_process_reported_ends_with_it() -> None:
+    robot = Told()
+    for note in WELL.values():
+        robot.receive(*note)
+    assert robot.mcus == {"serial": {"state": "ready", "heard_ms": 0}}
+    robot.ended(OWNER)
+    assert robot.mcus == {}
+    assert robot.says() == "unknown serial_mcu_bridge has just started"
+
+
+def test_the_age_of_what_was_heard_is_not_published_by_itself() -> None:
+    robot, counts = Told(), []
+    for heard in ("-", "0", "1000", "0", "1000", "10000", "0"):
+        robot.receive(OWNER, f"MCU ready {heard}")
+        counts.append(robot.changes)
+    assert counts == [1, 2, 2, 2, 2, 3, 4]
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["", "MCU", "MCU ready", "MCU ready 40", "MCU well 0", "LOCAL", "LOCAL 2", "REACHES", "REACHES a b", "HAS estop"],
+)
+def test_other_lines_are_no_reports(line: str) -> None:
+    assert not Told().receive(OWNER, line)
+
+
+def test_unknown_names_are_not_kept_and_robots_without_motors_say_nothing() -> None:
+    robot = Told()
+    assert robot.receive("other", "MCU ready 0")
+    assert robot.receive(BRIDGE, "REACHES other")
+    assert (robot.mcus, robot.changes) == ({}, 0)
+    assert Driveable({"a:imu": "imu"}, [], [BRIDGE], lambda: None).verdict({}) is None

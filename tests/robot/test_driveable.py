@@ -1,0 +1,102 @@
+"""A robot that cannot be driven does not look as if it could: in its status, by ``pebble estop`` and by doctor."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.robot.rig import Motors, Rig
+from tests.support import ROOT, until
+
+
+class Terminal(Motors):
+    """A serial port whose board is this test: it sends only what :meth:`send` sends."""
+
+    def __init__(self, folder: Path) -> None:
+        self._ours, self._theirs = os.openpty()
+        os.set_blocking(self._ours, False)
+        trace = folder / "trace.jsonl"
+        trace.touch()
+        super().__init__(Path(os.ttyname(self._theirs)), trace)
+
+    def send(self, line: bytes) -> None:
+        os.write(self._ours, line)
+
+    def close(self) -> None:
+        os.close(self._ours)
+        os.close(self._theirs)
+
+
+@pytest.fixture(params=["mqtt", "zenoh"])
+def rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
+    with Rig(request.param) as one:
+        yield one
+
+
+def driveable(rig: Rig) -> dict[str, str]:
+    status = rig.operator.last("outgoing/status")
+    found: dict[str, str] = {} if status is None else status.json["value"].get("driveable", {})
+    return found
+
+
+def says(rig: Rig, state: str, why: str = "", seconds: float = 20.0) -> bool:
+    return until(lambda: driveable(rig).get("state") == state and why in driveable(rig).get("why", ""), seconds)
+
+
+def pebble(*words: object) -> str:
+    command = [sys.executable, "-m", "pebble.cli", *map(str, words)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
+    return done.stdout + done.stderr
+
+
+def test_an_unplugged_board_is_named_everywhere_until_it_is_back(rig: Rig) -> None:
+    assert says(rig, "yes")
+    rig.mcu.command("unplug")  # type: ignore[attr-defined]
+    assert says(rig, "no", f"serial: cannot open {rig.mcu.port}")
+    assert _mcu(rig)["state"] == "absent"
+    assert f"CANNOT BE DRIVEN OR STOPPED: serial: cannot open {rig.mcu.port}" in pebble("estop", rig.config, "--remote")
+    doubts = [pebble("estop", "status", rig.config, "--remote"), pebble("doctor", rig.config)]
+    assert all(f"serial: cannot open {rig.mcu.port}" in " ".join(text.split()) for text in doubts), doubts
+    rig.mcu.command("replug")  # type: ignore[attr-defined]
+    assert says(rig, "yes")
+    assert _mcu(rig) == {"state": "ready", "heard_ms": 0}
+    assert "commands reach the motors" in pebble("doctor", rig.config)
+
+
+def test_a_motor_owner_that_ends_drives_nothing_until_it_is_back(rig: Rig) -> None:
+    assert says(rig, "yes")
+    rig.kill("serial_mcu_bridge")
+    assert until(lambda: any("serial_mcu_bridge" in why for why in _reasons(rig)), 10), _reasons(rig)
+    assert says(rig, "yes")
+
+
+def test_what_silence_means_depends_on_what_the_board_did_before(tmp_path: Path) -> None:
+    board = Terminal(tmp_path)
+    with Rig("mqtt", motors=board) as rig:
+        assert says(rig, "unknown", "its board has sent nothing yet")
+        board.send(b"Done!\n")
+        assert says(rig, "yes")
+        assert says(rig, "unknown", "its board has sent nothing for 10 s")
+        end = time.monotonic() + 8
+        until(lambda: board.send(b"C chg=0 v=7.5\n") or time.monotonic() > end, 10)  # type: ignore[func-returns-value]
+        assert says(rig, "yes")
+        assert says(rig, "no", "its board has stopped sending")
+        assert _mcu(rig) == {"state": "silent", "heard_ms": 10_000}
+
+
+def _mcu(rig: Rig) -> dict[str, Any]:
+    status = rig.operator.last("outgoing/status")
+    assert status is not None
+    found: dict[str, Any] = status.json["value"]["mcu"]["serial"]
+    return found
+
+
+def _reasons(rig: Rig) -> list[str]:
+    return [one.json["value"].get("driveable", {}).get("why", "") for one in rig.operator.on("outgoing/status")]
