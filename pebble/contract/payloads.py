@@ -235,7 +235,10 @@ class ServiceState(Payload, frozen=True, kw_only=True):
 
 
 class Status(Payload, frozen=True, kw_only=True):
-    """A robot's general state; robots carry ``services``, other components may put anything into ``value``."""
+    """A robot's general state; robots carry ``services``, other components may put anything into ``value``.
+
+    Also ``mcu`` and ``driveable`` where there are serial lines and motors: docs/life-of-a-restart.md, 8.
+    """
 
     t: int | UnsetType = UNSET  # epoch milliseconds
     value: dict[str, Any] = field(default_factory=dict)

@@ -67,7 +67,7 @@ class LiveRobot:
         """Leave without a trace."""
         for owner in self.robot.owners:
             self.publish(Message(owner.state().topic, b""))
-        self.publish(Message(self.robot.capabilities().topic, b""))
+        self.publish(*(Message(f"{self.base}/outgoing/{metric}", b"") for metric in ("capabilities", "status")))
         self._transport.close()
 
     def _take(self, message: Message) -> None:
@@ -177,6 +177,34 @@ def test_an_owner_that_saves_nothing_is_stopped_with_a_remark(run: Run, robot_on
     robot = robot_on("mcu", persisted=None)
     assert run("estop", robot.id, url) == 0
     assert "NOT SAVED: a restart frees it" in run.out
+
+
+UNPLUGGED = "serial: no /dev/ttyACM0"
+DOUBTS = {
+    "no": ({"state": "no", "why": UNPLUGGED}, f"CANNOT BE DRIVEN OR STOPPED: {UNPLUGGED}"),
+    "unknown": ({"state": "unknown", "why": UNPLUGGED}, f"not known whether its motors obey: {UNPLUGGED}"),
+    "no reason": ({"state": "no"}, "CANNOT BE DRIVEN OR STOPPED: it does not say why"),
+    "escapes": ({"state": "no", "why": "\x1b[2J"}, "CANNOT BE DRIVEN OR STOPPED: \\u001b[2J"),
+    "long": ({"state": "no", "why": "x" * 9000}, f"CANNOT BE DRIVEN OR STOPPED: {'x' * 300}\n"),
+    "it can": ({"state": "yes"}, ""),
+    "an older robot": (None, ""),
+    "no object": ("no", ""),
+    "another state": ({"state": ["no"]}, ""),
+}
+
+
+@pytest.mark.parametrize(("driveable", "doubt"), DOUBTS.values(), ids=DOUBTS)
+def test_a_stop_of_a_robot_that_cannot_be_driven_says_so(
+    run: Run, robot_on: Make, url: str, driveable: object, doubt: str
+) -> None:
+    robot = robot_on("base")
+    robot.publish(outgoing(robot.base, "status", {"value": {"services": {}, "driveable": driveable}}))
+    assert run("estop", robot.id, url) == 0
+    output = run.out
+    assert "stopped and confirmed" in output
+    assert run("estop", "status", robot.id, url) == 0
+    for text in (output, run.out):
+        assert (doubt in text) if doubt else ("status says" not in text and "DRIVEN" not in text)
 
 
 def test_a_robot_that_does_not_answer_is_reported_and_ctrl_c_ends_it(robot_on: Make, url: str) -> None:

@@ -77,6 +77,21 @@ def test_a_motor_owner_that_ends_drives_nothing_until_it_is_back(rig: Rig) -> No
     assert says(rig, "yes")
 
 
+def test_siblings_that_do_not_reach_each_other_are_noticed_although_all_are_ready() -> None:
+    with Rig("zenoh") as rig:
+        assert says(rig, "yes")
+        _socket_of(rig.processes()["serial_mcu_bridge"], rig.folder / "run").unlink()
+        rig.kill("mqtt_bridge")  # its successor finds no way to the motor owner
+
+        def drives() -> bool:
+            rig.operator.send("incoming/drive-values", {"x": 0, "z": 0.2})
+            return rig.mcu.moving(began)
+
+        began = time.monotonic()
+        assert until(lambda: "receives nothing from serial" in driveable(rig).get("why", "") or drives(), 40)
+        assert drives() is (driveable(rig)["state"] == "yes")
+
+
 def test_what_silence_means_depends_on_what_the_board_did_before(tmp_path: Path) -> None:
     board = Terminal(tmp_path)
     with Rig("mqtt", motors=board) as rig:
@@ -89,6 +104,15 @@ def test_what_silence_means_depends_on_what_the_board_did_before(tmp_path: Path)
         assert says(rig, "yes")
         assert says(rig, "no", "its board has stopped sending")
         assert _mcu(rig) == {"state": "silent", "heard_ms": 10_000}
+
+
+def _socket_of(pid: int, folder: Path) -> Path:
+    """That on which its siblings connect to it."""
+    links = {str(link.readlink()) for link in Path(f"/proc/{pid}/fd").iterdir() if link.is_symlink()}
+    sockets = (line.split() for line in Path("/proc/net/unix").read_text().splitlines() if str(folder) in line)
+    own = {Path(columns[7]) for columns in sockets if f"socket:[{columns[6]}]" in links}
+    (found,) = {path for path in own if not path.name.startswith("hub")}
+    return found
 
 
 def _mcu(rig: Rig) -> dict[str, Any]:
