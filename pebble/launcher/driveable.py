@@ -19,14 +19,14 @@ class Mcu(NamedTuple):
     """A serial line. ``silent``: its board used to send all the time, and has stopped."""
 
     state: str
-    heard_ms: int | None  # how long ago its board sent anything: 0, 1000 or 10000, at least; None: never since opening
+    silent_ms: int | None  # how long ago its board sent anything: 0, 1000 or 10000, at least; None: never since opening
     why: str = ""  # it is absent
 
     @property
     def shown(self) -> dict[str, Any]:
         """As in the status."""
-        heard = {} if self.heard_ms is None else {"heard_ms": self.heard_ms}
-        return {"state": self.state, **heard, **({"why": self.why} if self.why else {})}
+        age = {} if self.silent_ms is None else {"heard_ms": self.silent_ms}
+        return {"state": self.state, **age, **({"why": self.why} if self.why else {})}
 
     @property
     def drives(self) -> tuple[str, str]:
@@ -38,9 +38,9 @@ class Mcu(NamedTuple):
                 return _NO, "its board has stopped sending: it hangs, or has lost its power"
             case "booting":
                 return _UNKNOWN, "its board is starting"
-        if self.heard_ms is None:
+        if self.silent_ms is None:
             return _UNKNOWN, "its board has sent nothing yet"
-        return (_YES, "") if self.heard_ms < 10_000 else (_UNKNOWN, "its board has sent nothing for 10 s")
+        return (_YES, "") if self.silent_ms < 10_000 else (_UNKNOWN, "its board has sent nothing for 10 s")
 
 
 class Driveable:
@@ -85,7 +85,7 @@ class Driveable:
         for table in (self._mcus, self._connected, self._reached):
             table.pop(program, None)
 
-    def verdict(self, states: Mapping[str, str]) -> dict[str, str] | None:
+    def assessment(self, states: Mapping[str, str]) -> dict[str, str] | None:
         """``{"state": "no", "why": "serial: …"}`` by the worst that is known; None: the robot has no motors.
 
         ``states`` are those of all programs.
@@ -123,7 +123,7 @@ class Driveable:
         before, self._mcus[program] = self._mcus.get(program), mcu
         if (
             before is None
-            or before._replace(heard_ms=None) != mcu._replace(heard_ms=None)
+            or before._replace(silent_ms=None) != mcu._replace(silent_ms=None)
             or before.drives != mcu.drives
         ):
             self._on_change()

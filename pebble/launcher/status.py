@@ -116,7 +116,7 @@ class StatusPublisher:
         self, states: dict[str, ServiceState], mcus: dict[str, Any] | None = None, webrtc_url: str | None = None
     ) -> Status:
         """Operator pages show what is at ``webrtc_url``."""
-        driveable = self._driveable.verdict({name: one.state for name, one in states.items()})
+        driveable = self._driveable.assessment({name: one.state for name, one in states.items()})
         more = {"mcu": mcus or None, "driveable": driveable, "webrtc_url": webrtc_url}
         value = {"services": states, **{name: one for name, one in more.items() if one is not None}}
         return Status(t=_now_ms(), value=value)

@@ -163,10 +163,10 @@ class Notifier:
         """Report whether this process is connected to its siblings. False: the launcher was too busy, repeat it."""
         return self._write(f"LOCAL {int(connected)} {_one_line(why)}".rstrip().encode() + b"\n")
 
-    def mcu(self, state: str, heard_ms: int | None, why: str = "") -> bool:
+    def mcu(self, state: str, silent_ms: int | None, why: str = "") -> bool:
         """Report on this process's serial line, as :mod:`pebble.launcher.driveable` reads it. False: repeat it."""
-        heard = "-" if heard_ms is None else heard_ms
-        return self._write(f"MCU {state} {heard} {_one_line(why)}".rstrip().encode() + b"\n")
+        age = "-" if silent_ms is None else silent_ms
+        return self._write(f"MCU {state} {age} {_one_line(why)}".rstrip().encode() + b"\n")
 
     def reaches(self, owner: str, reached: bool) -> bool:
         """Report whether what a motor owner publishes arrives here. False: the launcher was too busy, repeat it."""

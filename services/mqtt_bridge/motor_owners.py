@@ -22,7 +22,7 @@ class MotorOwners:
         self._notifier = notifier
         self._messages = dict.fromkeys(self.topics, 0)  # of this connection
         self._checked = dict(self._messages)
-        self._heard_at: dict[str, float | None] = dict.fromkeys(self.topics)  # None: since the first check
+        self._received_at: dict[str, float | None] = dict.fromkeys(self.topics)  # None: since the first check
         self._reported: dict[str, bool | None] = dict.fromkeys(self.topics)
 
     def connected(self) -> None:
@@ -38,11 +38,11 @@ class MotorOwners:
         for topic, owner in self.topics.items():
             count, before = self._messages[topic], self._checked[topic]
             self._checked[topic] = count
-            heard_at = self._heard_at[topic]
-            if heard_at is None or (count > 1 and count != before):
-                heard_at = self._heard_at[topic] = now
+            received_at = self._received_at[topic]
+            if received_at is None or (count > 1 and count != before):
+                received_at = self._received_at[topic] = now
             reached = True if count > 1 else self._reported[topic]
-            if now - heard_at >= _MISSED_S:
+            if now - received_at >= _MISSED_S:
                 reached = False
             if reached is not None and reached != self._reported[topic] and self._notifier.reaches(owner, reached):
                 self._reported[topic] = reached

@@ -14,7 +14,7 @@ from pebble.errors import ConfigError, DeviceError
 from pebble.runtime.parent import Notifier
 from pebble.runtime.rate_limit import RateLimitedLog
 from pebble.runtime.service import Service, every
-from pebble.services.serial_mcu_bridge.line.hearing import CHECK_S, Hearing
+from pebble.services.serial_mcu_bridge.line.silence import CHECK_S, Silence
 from pebble.services.serial_mcu_bridge.line.serial_line import LineState, SerialLine
 
 _INPUT_LIMIT = 65_536  # bytes waiting for the service's thread; 1.4 s of a full 460,800 baud line
@@ -38,7 +38,7 @@ class SerialService(Service, ABC):
         self.device_log = RateLimitedLog(self.log, burst=20)
         self._input = bytearray()
         self._input_lock = threading.Lock()
-        self._hearing = Hearing()
+        self._silence = Silence()
         self.notifier = Notifier()
         self._reported: tuple[str, int | None, str] | None = None  # of the MCU, to the launcher
         self.line = SerialLine(
@@ -102,8 +102,8 @@ class SerialService(Service, ABC):
         if line.state is LineState.CLOSED:
             return
         idle = now - line.sent_until >= CHECK_S
-        state, heard_ms = self._hearing.check(line.state, line.opened, line.received, now, idle=idle)
-        found = state, heard_ms, line.problem
+        state, silent_ms = self._silence.check(line.state, line.opened, line.received, now, idle=idle)
+        found = state, silent_ms, line.problem
         if found != self._reported and self.notifier.mcu(*found):
             self._reported = found
 

@@ -194,7 +194,7 @@ DOUBTS = {
 
 
 @pytest.mark.parametrize(("driveable", "doubt"), DOUBTS.values(), ids=DOUBTS)
-def test_a_stop_of_a_robot_that_cannot_be_driven_says_so(
+def test_a_stop_of_a_robot_that_cannot_be_driven_is_reported_with_that(
     run: Run, robot_on: Make, url: str, driveable: object, doubt: str
 ) -> None:
     robot = robot_on("base")

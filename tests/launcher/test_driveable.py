@@ -43,7 +43,7 @@ CASES = {
 }
 
 
-class Told(Driveable):
+class Assessed(Driveable):
     """A motor line behind the bridge, and an inertial sensor; counts how often the status had to follow."""
 
     def __init__(self) -> None:
@@ -54,41 +54,41 @@ class Told(Driveable):
     def _count(self) -> None:
         self.changes += 1
 
-    def says(self, states: dict[str, str] | None = None) -> str:
-        return " ".join((self.verdict(READY if states is None else states) or {}).values())
+    def shows(self, states: dict[str, str] | None = None) -> str:
+        return " ".join((self.assessment(READY if states is None else states) or {}).values())
 
 
 @pytest.mark.parametrize(("different", "expected"), CASES.values(), ids=CASES)
 def test_the_worst_that_is_known_decides(different: dict[str, tuple[str, str] | None], expected: str) -> None:
-    robot = Told()
+    robot = Assessed()
     for note in {**WELL, **different}.values():
         assert note is None or robot.receive(*note)
-    assert robot.says() == expected
+    assert robot.shows() == expected
 
 
 @pytest.mark.parametrize("state", ["init", "restarting", "failed", "stopped"])
 @pytest.mark.parametrize("program", [OWNER, BRIDGE])
 def test_a_process_that_is_not_ready_drives_nothing(program: str, state: str) -> None:
-    robot = Told()
+    robot = Assessed()
     for note in WELL.values():
         robot.receive(*note)
-    assert robot.says({**READY, program: state}).startswith(f"no {program} is ")
+    assert robot.shows({**READY, program: state}).startswith(f"no {program} is ")
 
 
 def test_what_a_process_reported_ends_with_it() -> None:
-    robot = Told()
+    robot = Assessed()
     for note in WELL.values():
         robot.receive(*note)
     assert robot.mcus == {"serial": {"state": "ready", "heard_ms": 0}}
     robot.ended(OWNER)
     assert robot.mcus == {}
-    assert robot.says() == "unknown serial_mcu_bridge has just started"
+    assert robot.shows() == "unknown serial_mcu_bridge has just started"
 
 
-def test_the_age_of_what_was_heard_is_not_published_by_itself() -> None:
-    robot, counts = Told(), []
-    for heard in ("-", "0", "1000", "0", "1000", "10000", "0"):
-        robot.receive(OWNER, f"MCU ready {heard}")
+def test_the_age_of_what_was_received_is_not_published_by_itself() -> None:
+    robot, counts = Assessed(), []
+    for age in ("-", "0", "1000", "0", "1000", "10000", "0"):
+        robot.receive(OWNER, f"MCU ready {age}")
         counts.append(robot.changes)
     assert counts == [1, 2, 2, 2, 2, 3, 4]
 
@@ -98,12 +98,12 @@ def test_the_age_of_what_was_heard_is_not_published_by_itself() -> None:
     ["", "MCU", "MCU ready", "MCU ready 40", "MCU well 0", "LOCAL", "LOCAL 2", "REACHES", "REACHES a b", "HAS estop"],
 )
 def test_other_lines_are_no_reports(line: str) -> None:
-    assert not Told().receive(OWNER, line)
+    assert not Assessed().receive(OWNER, line)
 
 
-def test_unknown_names_are_not_kept_and_robots_without_motors_say_nothing() -> None:
-    robot = Told()
+def test_unknown_names_are_ignored_and_robots_without_motors_are_not_assessed() -> None:
+    robot = Assessed()
     assert robot.receive("other", "MCU ready 0")
     assert robot.receive(BRIDGE, "REACHES other")
     assert (robot.mcus, robot.changes) == ({}, 0)
-    assert Driveable({"a:imu": "imu"}, [], [BRIDGE], lambda: None).verdict({}) is None
+    assert Driveable({"a:imu": "imu"}, [], [BRIDGE], lambda: None).assessment({}) is None

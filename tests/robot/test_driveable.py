@@ -46,7 +46,7 @@ def driveable(rig: Rig) -> dict[str, str]:
     return found
 
 
-def says(rig: Rig, state: str, why: str = "", seconds: float = 20.0) -> bool:
+def shows(rig: Rig, state: str, why: str = "", seconds: float = 20.0) -> bool:
     return until(lambda: driveable(rig).get("state") == state and why in driveable(rig).get("why", ""), seconds)
 
 
@@ -57,29 +57,29 @@ def pebble(*words: object) -> str:
 
 
 def test_an_unplugged_board_is_named_everywhere_until_it_is_back(rig: Rig) -> None:
-    assert says(rig, "yes")
+    assert shows(rig, "yes")
     rig.mcu.command("unplug")  # type: ignore[attr-defined]
-    assert says(rig, "no", f"serial: cannot open {rig.mcu.port}")
+    assert shows(rig, "no", f"serial: cannot open {rig.mcu.port}")
     assert _mcu(rig)["state"] == "absent"
     assert f"CANNOT BE DRIVEN OR STOPPED: serial: cannot open {rig.mcu.port}" in pebble("estop", rig.config, "--remote")
     doubts = [pebble("estop", "status", rig.config, "--remote"), pebble("doctor", rig.config)]
     assert all(f"serial: cannot open {rig.mcu.port}" in " ".join(text.split()) for text in doubts), doubts
     rig.mcu.command("replug")  # type: ignore[attr-defined]
-    assert says(rig, "yes")
+    assert shows(rig, "yes")
     assert _mcu(rig) == {"state": "ready", "heard_ms": 0}
     assert "commands reach the motors" in pebble("doctor", rig.config)
 
 
 def test_a_motor_owner_that_ends_drives_nothing_until_it_is_back(rig: Rig) -> None:
-    assert says(rig, "yes")
+    assert shows(rig, "yes")
     rig.kill("serial_mcu_bridge")
     assert until(lambda: any("serial_mcu_bridge" in why for why in _reasons(rig)), 10), _reasons(rig)
-    assert says(rig, "yes")
+    assert shows(rig, "yes")
 
 
 def test_siblings_that_do_not_reach_each_other_are_noticed_although_all_are_ready() -> None:
     with Rig("zenoh") as rig:
-        assert says(rig, "yes")
+        assert shows(rig, "yes")
         _socket_of(rig.processes()["serial_mcu_bridge"], rig.folder / "run").unlink()
         rig.kill("mqtt_bridge")  # its successor finds no way to the motor owner
 
@@ -95,14 +95,14 @@ def test_siblings_that_do_not_reach_each_other_are_noticed_although_all_are_read
 def test_what_silence_means_depends_on_what_the_board_did_before(tmp_path: Path) -> None:
     board = Terminal(tmp_path)
     with Rig("mqtt", motors=board) as rig:
-        assert says(rig, "unknown", "its board has sent nothing yet")
+        assert shows(rig, "unknown", "its board has sent nothing yet")
         board.send(b"Done!\n")
-        assert says(rig, "yes")
-        assert says(rig, "unknown", "its board has sent nothing for 10 s")
+        assert shows(rig, "yes")
+        assert shows(rig, "unknown", "its board has sent nothing for 10 s")
         end = time.monotonic() + 8
         until(lambda: board.send(b"C chg=0 v=7.5\n") or time.monotonic() > end, 10)  # type: ignore[func-returns-value]
-        assert says(rig, "yes")
-        assert says(rig, "no", "its board has stopped sending")
+        assert shows(rig, "yes")
+        assert shows(rig, "no", "its board has stopped sending")
         assert _mcu(rig) == {"state": "silent", "heard_ms": 10_000}
 
 

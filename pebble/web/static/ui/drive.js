@@ -3,7 +3,7 @@
 import { html, styled, useCalm, useModel, usePage, useValue } from "./hooks.js";
 import { Card, HoldButton, Icon, Part } from "./parts.js";
 import { Stick } from "./stick.js";
-import { doubtOf, driverName, nameOf } from "./words.js";
+import { driverName, nameOf } from "./words.js";
 
 export function DriveCard({ at }) {
   return html`<${Card} id="drive" title="Drive" icon="wheel" className="drive">
@@ -38,16 +38,11 @@ export function WhyLine({ at }) {
   const connected = useValue("", "web/broker")?.connected !== false; // else the banner says why
   const why = reason?.code === "broker" && !connected ? "The server cannot reach the broker" : reason?.text;
   const keys = driver.typing ? " Keys go to the field you have chosen: click beside it." : "";
-  const doubt = doubtOf(useValue(at, "status"));
-  const driving = doubt.no ? `${doubt.text}.` : `You are driving ${nameOf(at)}.`;
-  const text = why ?? (mine ? driving + keys : "");
-  const off = reason || doubt.no;
-  const more = doubt.no && mine && !why ? "" : doubt.text;
-  return html`<div class=${`why-line ${off ? "off" : "on"}`}>
-    <p id="why-drive" data-test="why"><i aria-hidden="true">${off ? "○" : "●"}</i><span>${text}</span></p>
-    ${more && html`<p class="why" data-test="doubt">${more}</p>`}
-    <span class="sr" role="status">${useCalm(`${text} ${more}`)}</span>
-    ${driver.pads?.reasons().slice(0, 2).map(({ code, text: said }) => html`<p key=${said} class="why" data-test=${code}>${said}.</p>`)}
+  const text = why ?? (mine ? `You are driving ${nameOf(at)}.${keys}` : "");
+  return html`<div class=${`why-line ${reason ? "off" : "on"}`}>
+    <p id="why-drive" data-test="why"><i aria-hidden="true">${reason ? "○" : "●"}</i><span>${text}</span></p>
+    <span class="sr" role="status">${useCalm(text)}</span>
+    ${[...driver.doubts, ...(driver.pads?.reasons() ?? [])].slice(0, 2).map(({ code, text: said }) => html`<p key=${said} class="why" data-test=${code}>${said}.</p>`)}
     <div class="why-actions">
       <${ReasonAction} action=${reason?.action} />
       ${mine && html`<button type="button" data-test="release" onClick=${() => driver.release()}>Release</button>`}

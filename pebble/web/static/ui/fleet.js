@@ -1,5 +1,6 @@
 // All components at a glance: who is there, who drives, what is stopped.
 
+import { doubtOf } from "./doubt.js";
 import { RouteLink, Liveness } from "./header.js";
 import {
   Boundary,
@@ -18,7 +19,7 @@ import { Offers, Route, WATCHES } from "./models.js";
 import { charging, plain, shortTime } from "./more-words.js";
 import { Icon, Live, StopButton } from "./parts.js";
 import { RecordingsLink } from "./recordings-link.js";
-import { battery, clockTime, doubtOf, driverName, inner, isObject, kindOf, nameOf, roughly, typeOf } from "./words.js";
+import { battery, clockTime, driverName, inner, isObject, kindOf, nameOf, roughly, typeOf } from "./words.js";
 
 const THUMBNAIL_MS = 1000;
 const SORTS = { name: "name", type: "type", battery: "battery" };
@@ -182,7 +183,7 @@ function FleetCard({ at }) {
         <h2>${name}</h2>
         <span class="dim">${[kindOf(at), kind].filter(Boolean).join(" · ")}</span>
       </div>
-      <${Liveness} at=${at} short />
+      <${Liveness} at=${at} />
     </div>
     ${(settings.thumbnails || WATCHES) &&
     (offers.hasVideo

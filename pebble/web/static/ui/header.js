@@ -4,7 +4,7 @@ import * as browser from "../core/browser.js";
 import { Boundary, html, styled, useMetric, useModel, useOnline, usePage, usePart, useRefs, useTick, useValue } from "./hooks.js";
 import { Route } from "./models.js";
 import { Icon, Live, StopButton } from "./parts.js";
-import { battery, doubtOf, driverName, kindOf, nameOf, roughly, span, typeOf } from "./words.js";
+import { battery, driverName, kindOf, nameOf, roughly, span, typeOf } from "./words.js";
 
 export function Header({ at, layout, panel, onPanel, drawer, onDrawer }) {
   const { commands, driver, route } = usePage();
@@ -104,13 +104,12 @@ function Volts({ at }) {
   return level ? html`<span class="volts"><${Live} entry=${level} online=${online}>${battery(level.value)}<//></span>` : null;
 }
 
-/** Whether a component is there, and how late its heartbeats are. @param {{at: string, short?: boolean}} props */
-export function Liveness({ at, short }) {
+/** Whether a component is there, and how late its heartbeats are. @param {{at: string}} props */
+export function Liveness({ at }) {
   const { connection } = usePage();
   useModel(connection, (one) => one.isOpen);
   const entry = useMetric(at, "web/liveness");
   const view = entry?.value;
-  const doubt = doubtOf(useValue(at, "status"));
   useTick(view?.online === false ? 1000 : 0);
   if (!connection.isOpen) return html`<span class="state unknown"><i>○</i> unknown</span>`;
   if (!view || view.online === null) return html`<span class="state unknown"><i>○</i> waiting</span>`;
@@ -119,7 +118,6 @@ export function Liveness({ at, short }) {
     return html`<span class="state bad"><i>✖</i> ${view.silent_s === null ? "offline" : `silent${silent}`}</span>`;
   }
   const latency = view.whole_seconds || view.latency_ms === null ? "? ms" : span(view.latency_ms);
-  if (doubt.no) return html`<span class="state bad" title=${doubt.text}><i>▲</i> ${short ? latency : "cannot be driven"}</span>`;
   const why = view.whole_seconds ? "Its clock counts whole seconds: how late its heartbeats are is unknown" : undefined;
   return html`<span class="state ok" title=${why}
     ><i>●</i> <span class="sr">online, heartbeats late by </span>${latency}</span
@@ -128,7 +126,7 @@ export function Liveness({ at, short }) {
 
 function Vital({ at }) {
   const { connection, driver } = usePage();
-  const fails = useModel(driver).failed.size > 0 || doubtOf(useValue(at, "status")).no;
+  const fails = useModel(driver).failed.size > 0;
   const level = useMetric(at, "charging-level");
   const charging = useValue(at, "charging-status");
   const view = useValue(at, "web/driver");

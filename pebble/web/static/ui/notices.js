@@ -1,6 +1,7 @@
 // What an operator of many robots should learn without looking at each: a bell in the header, and its list.
 
 import { Notices, Watcher } from "../core/notices.js";
+import { DoubtMark } from "./doubt.js";
 import { RouteLink } from "./header.js";
 import { html, useCalm, useEffect, useModel, usePage, useRefs, useState, useValue } from "./hooks.js";
 import { Model, read, write } from "./models.js";
@@ -136,6 +137,7 @@ export function Bell({ at, wide }) {
     show(!open);
   };
   return html`<${Announcement} newest=${notices.list[0]} />
+    ${at && html`<${DoubtMark} at=${at} wide=${wide} />`}
     ${wide && at && html`<${RecordingsLink} at=${at} className="button quiet" />`}
     ${wide &&
     html`<button

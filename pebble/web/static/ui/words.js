@@ -46,17 +46,6 @@ export function reported(status) {
   return key && typeof value[key] === "string" ? value[key] : "";
 }
 
-/**
- * Why drive commands and stops may have no effect, as a robot's status says; "" no such reason is known.
- * @param {unknown} status payload @returns {{no: boolean, text: string}} ``no``: they have none
- */
-export function doubtOf(status) {
-  const { state, why } = inner(status)?.driveable ?? {};
-  const no = state === "no";
-  const words = no ? "Cannot be driven" : state === "unknown" ? "Not known whether it can be driven" : "";
-  return { no, text: words && typeof why === "string" ? `${words}: ${why.slice(0, 200)}` : words };
-}
-
 /** @param {unknown} payload of charging-level @returns {string} 7.92 V, 81 % */
 export function battery(payload) {
   const value = inner(payload);

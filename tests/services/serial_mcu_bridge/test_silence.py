@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from pebble.services.serial_mcu_bridge.line.hearing import Hearing
+from pebble.services.serial_mcu_bridge.line.silence import Silence
 from pebble.services.serial_mcu_bridge.line.serial_line import LineState
 
 #: Per second: r received at rest, d received while it was driven, . nothing, o opened again, x the device has gone.
@@ -26,11 +26,11 @@ CASES = {
 
 
 @pytest.mark.parametrize(("seconds", "state", "heard_ms"), CASES.values(), ids=CASES)
-def test_hearing(seconds: str, state: str, heard_ms: int | None) -> None:
-    hearing, opened, received, found = Hearing(), 1, 0, ("", None)
+def test_silence(seconds: str, state: str, silent_ms: int | None) -> None:
+    silence, opened, received, found = Silence(), 1, 0, ("", None)
     for now, second in enumerate(seconds, start=100):
         opened += second == "o"
         received = 0 if second == "o" else received + 20 * (second in "rd")
         line = LineState.ABSENT if second == "x" else LineState.READY
-        found = hearing.check(line, opened, received, float(now), idle=second != "d")
-    assert found == (state, heard_ms)
+        found = silence.check(line, opened, received, float(now), idle=second != "d")
+    assert found == (state, silent_ms)

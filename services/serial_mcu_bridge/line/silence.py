@@ -9,7 +9,7 @@ _RECENT_S, _SILENT_S = 1.0, 10.0
 _REGULAR = 5  # checks in a row; our motor boards report at least twice a second, also at rest
 
 
-class Hearing:
+class Silence:
     """Call :meth:`check` about once a second, and when the state of the line changes.
 
     A board that has sent something of its own accord in five checks in a row, while nothing was sent to it, is one that
@@ -19,7 +19,7 @@ class Hearing:
     def __init__(self) -> None:
         self._opened = 0
         self._received = 0
-        self._heard_at: float | None = None
+        self._received_at: float | None = None
         self._counted_at = 0.0
         self._in_row = 0
 
@@ -30,16 +30,16 @@ class Hearing:
         board for a second.
         """
         if opened != self._opened:
-            self._opened, self._received, self._heard_at, self._in_row = opened, 0, None, 0
-        heard = received != self._received
+            self._opened, self._received, self._received_at, self._in_row = opened, 0, None, 0
+        sent = received != self._received
         self._received = received
-        if heard:
-            self._heard_at = now
+        if sent:
+            self._received_at = now
         if self._in_row < _REGULAR and now - self._counted_at >= 0.9 * CHECK_S:
-            self._counted_at, self._in_row = now, self._in_row + 1 if heard and idle else 0
-        if self._heard_at is None or state is not LineState.READY:
+            self._counted_at, self._in_row = now, self._in_row + 1 if sent and idle else 0
+        if self._received_at is None or state is not LineState.READY:
             return state.value, None
-        age_s = now - self._heard_at
+        age_s = now - self._received_at
         if age_s >= _SILENT_S:
             return "silent" if self._in_row >= _REGULAR else state.value, 10_000
         return state.value, 0 if age_s < _RECENT_S else 1_000

@@ -1,0 +1,33 @@
+// Whether drive commands and stops reach the motors of a robot, as its own status says. Fetched after the first picture.
+
+import { callAll } from "../core/store.js";
+import { html, useEffect, usePage, useValue } from "./hooks.js";
+import { inner } from "./words.js";
+
+const LONGEST = 200; // characters of a reason
+
+/**
+ * Why drive commands and stops may have no effect; "" no such reason is known.
+ * @param {unknown} status payload @returns {{no: boolean, text: string}} ``no``: they have none
+ */
+export function doubtOf(status) {
+  const { state, why } = inner(status)?.driveable ?? {};
+  const no = state === "no";
+  const words = no ? "Cannot be driven" : state === "unknown" ? "Not known whether it can be driven" : "";
+  return { no, text: words && typeof why === "string" ? `${words}: ${why.slice(0, LONGEST)}` : words };
+}
+
+/** A mark in the header; the line beside the stick says why. @param {{at: string, wide: boolean}} props */
+export function DoubtMark({ at, wide }) {
+  const { driver } = usePage();
+  const { no, text } = doubtOf(useValue(at, "status"));
+  useEffect(() => {
+    driver.doubts = text ? [{ code: "doubt", text }] : [];
+    callAll(driver.watchers);
+    return () => void (driver.doubts = []);
+  }, [at, text]);
+  if (!no) return null;
+  return html`<span class="chip plain bad" title=${text} data-test="undriveable"
+    ><span aria-hidden="true">▲</span> <span class=${wide ? "" : "sr"}>cannot be driven</span></span
+  >`;
+}
