@@ -247,9 +247,9 @@ class TestRead:
         properties = Properties(PacketTypes.CONNACK)
         properties.ReceiveMaximum, properties.MaximumPacketSize, properties.AssignedClientIdentifier = 20, 4096, "me"
         properties.UserProperty = [("a", "b"), ("c", "d")]
-        properties.ServerKeepAlive, properties.RetainAvailable = 30, 1
+        properties.ServerKeepAlive, properties.RetainAvailable, properties.MaximumQoS = 30, 0, 0
         noted, _ = read(packet(0x20, b"\0\0" + properties.pack()), modern=True)
-        assert noted.seen == [("accepted", Accepted(max_packet=4096, receive_maximum=20))]
+        assert noted.seen == [("accepted", Accepted(max_packet=4096, receive_maximum=20, max_qos=0, retain=0))]
 
     @both_versions
     def test_a_refusal_has_its_code(self, modern: bool) -> None:

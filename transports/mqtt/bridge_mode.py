@@ -19,6 +19,8 @@ class Result(Enum):
     ACCEPTED = "accepted"
     PROTOCOL_REFUSED = "unacceptable protocol version"
     HUNG_UP = "closed without an answer"
+    RETAIN_REFUSED = "retain not supported"
+    QOS_REFUSED = "QoS not supported"
     FAILED = "anything else: a wrong password, no answer, no connection"
 
 

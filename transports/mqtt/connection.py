@@ -25,6 +25,7 @@ from pebble.transports.base import Message, Outgoing, QoS
 from pebble.transports.counters import Counters
 from pebble.transports.mqtt import reasons
 from pebble.transports.mqtt.bridge_mode import Result
+from pebble.transports.mqtt.broker_limits import EVERYTHING, Limits
 from pebble.transports.mqtt.client import Client, Opening
 from pebble.transports.mqtt.incoming import BrokerDelay, WaitingTime, readable_bytes
 from pebble.transports.mqtt.outgoing import (
@@ -54,6 +55,8 @@ _LEAST_SHARE = 0.75  # of the interval between pings: answers to regular ones co
 _FRESH_S = 0.05  # what is in a socket that was empty so recently counts as having come just now
 _OVERSLEPT_S = 0.1  # poll took so much longer than asked for: the process was stopped, or the machine suspended
 _LOGGED = 200  # bytes of a topic
+_UNWRITTEN = 1 << 20  # bytes of DELIVERED messages that wait where the broker has no QoS 1; beyond it they are refused
+_LACKS = {reasons.NO_RETAIN: Result.RETAIN_REFUSED, reasons.NO_QOS: Result.QOS_REFUSED}
 _BATCH = 64  # messages read in a row before they are delivered
 _QUICKACK = getattr(socket, "TCP_QUICKACK", None)  # Linux only
 _ABORT = struct.pack("ii", 1, 0)  # SO_LINGER that makes close() drop what was not sent
@@ -135,6 +138,7 @@ class Connection:
         *,
         where: str,
         as_published: bool,
+        limits: Limits = EVERYTHING,
         on_answers: Callable[[Mapping[str, bool]], None],
         skips_retained: Callable[[bytes], bool],
         on_refusal: Callable[[str, str], None],
@@ -146,6 +150,8 @@ class Connection:
         self.hesitated = False  # the broker took so long to accept us that it may have been suspended
         self.where = where  # the broker, in words
         self.max_packet: int | None = None  # bytes, as the broker says on MQTT 5
+        self.limits = limits  # what the broker has, with what it says on MQTT 5
+        self.lacks: Result | None = None  # why it has closed the connection, if it lacks something
         #: When there was the last sign that the answers are behind retained messages, or behind a long one.
         self.arriving_at = float("-inf")
         self._settings, self._counters = settings, counters
@@ -434,7 +440,9 @@ class Connection:
                 return False
             if message.qos is QoS.DELIVERED and self._in_flight.unacked >= UNACKED_LIMIT and self._is_full(message):
                 return False
-            if message.retain:
+            if not self.limits.qos and self._client.unwritten > _UNWRITTEN and not self._is_stop(message.topic):
+                return False
+            if message.retain and self.limits.retain:
                 self._in_flight.accept(message)
             if message.qos is QoS.LATEST and self._client.waiting:
                 self._counters.add("dropped", self._backlog.put(message))
@@ -458,6 +466,8 @@ class Connection:
         return beyond >= UNACKED_RESERVE or not self._is_stop(message.topic)
 
     def _write_publish(self, message: Message, expires_s: int | None) -> None:
+        if self.limits is not EVERYTHING:
+            message = self.limits.fit(message)
         mid = self._client.publish(
             message.topic, message.payload, int(message.qos), retain=message.retain, expires_s=expires_s
         )
@@ -519,6 +529,11 @@ class Connection:
             stalled_s = 0.0 if since is None else max(0.0, clock.since_boot() - since - usual_s)
             return Outgoing(waiting, round_trip_s, stalled_s)
 
+    @property
+    def confirmed(self) -> Limits:
+        """What this connection has shown the broker to have."""
+        return Limits(self._in_flight.has_retained, int(self._in_flight.has_acknowledged))
+
     def unconfirmed_retained(self) -> list[Message]:
         """Retained messages that the broker may not have received, oldest first."""
         with self._lock:
@@ -544,6 +559,9 @@ class Connection:
 
     def on_accepted(self, accepted: Accepted) -> None:
         self.max_packet = accepted.max_packet
+        stated = Limits(accepted.retain != 0, 1 if accepted.max_qos is None else min(accepted.max_qos, 1))
+        if stated != EVERYTHING:
+            self.limits = self.limits.both(stated)
         self._note_connack()
         self._ping_due_at = self._answered_at + self._ping_interval_s
         self._accepted = True
@@ -554,7 +572,7 @@ class Connection:
         if code == reasons.PROTOCOL_REFUSED and not self._modern:
             self._refusal = Refused(refused + Result.PROTOCOL_REFUSED.value, Result.PROTOCOL_REFUSED)
         else:
-            self._refusal = Refused(refused + reasons.connection_refused(code))
+            self._refusal = Refused(refused + reasons.connection_refused(code), _LACKS.get(code, Result.FAILED))
 
     def _note_connack(self) -> None:
         started = self._answered_at
@@ -567,6 +585,7 @@ class Connection:
         self._disconnect_reason = f"{self.where} closed the connection: {reasons.words(code)}"
         self._taken_over = code == reasons.TAKEN_OVER
         self._hung_up = reasons.may_concern_message(code)
+        self.lacks = _LACKS.get(code)
         self._client.close()
 
     def on_answer(self, mid: int, codes: bytes) -> None:

@@ -131,6 +131,7 @@ class InFlightTable:
         self._unacked: dict[int, tuple[str, float]] = {}  # by message id: the topic, and when sent
         self._acked_at = float("-inf")  # the newest acknowledgement
         self._unconfirmed: dict[str, _Unconfirmed] = {}  # newest retained message of each topic, oldest first
+        self.has_acknowledged = self.has_retained = False  # the broker, a DELIVERED or a retained message
         self._requests: dict[int, PendingAck] = {}
         self.answered: list[PendingAck] = []  # and not completed yet
         #: Unanswered: when sent, what waits for it, and what was written before it and after the ping before.
@@ -180,10 +181,11 @@ class InFlightTable:
         """Process a PUBACK: when its message was sent; None if it belongs to no known message."""
         if mid not in self._unacked:
             return None
-        self._acked_at = now
+        self._acked_at, self.has_acknowledged = now, True
         topic, sent_at = self._unacked.pop(mid)
         if topic in self._unconfirmed and self._unconfirmed[topic].mid == mid:
             del self._unconfirmed[topic]
+            self.has_retained = True
         return sent_at
 
     def topic_of(self, mid: int) -> str | None:
@@ -238,6 +240,7 @@ class InFlightTable:
             _note(self._accepted, topic, at, max(size, SMALL))
         for topic in [t for t, entry in self._unconfirmed.items() if entry.ping and entry.ping <= self._pong_number]:
             del self._unconfirmed[topic]
+            self.has_retained = True
         if ack is not None:
             self.answered.append(ack)
 

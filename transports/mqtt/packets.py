@@ -25,7 +25,7 @@ _QOS_1, _QOS_2 = 0b010, 0b100
 _BRIDGE = 0x80  # added to the protocol level of 3.1.1: what mosquitto calls bridge mode
 _CLEAN, _WILL, _WILL_RETAIN, _PASSWORD, _USERNAME = 0x02, 0x04, 0x20, 0x40, 0x80  # flags of CONNECT
 _EXPIRY = 0x02  # property: seconds after which the broker discards a message
-_RECEIVE_MAXIMUM, _MAXIMUM_PACKET = 0x21, 0x27
+_RECEIVE_MAXIMUM, _MAXIMUM_QOS, _RETAIN_AVAILABLE, _MAXIMUM_PACKET = 0x21, 0x24, 0x25, 0x27
 _NO_LOCAL, _AS_PUBLISHED, _NO_RETAINED = 0x04, 0x08, 0x20  # options of a subscription
 
 #: Bytes of each property's value by its number; text and bytes begin with their length (MQTT 5.0, 2.2.2.2).
@@ -145,6 +145,8 @@ class Accepted:
 
     max_packet: int | None = None  # bytes that the broker takes
     receive_maximum: int | None = None  # messages of QoS 1 that may be unacknowledged
+    max_qos: int | None = None
+    retain: int | None = None  # 0: retains nothing
 
 
 class Listener(Protocol):
@@ -303,7 +305,8 @@ class Reader:
             self._listener.on_refused(body[1])
             return
         found = properties(body[2 : 2 + self._properties_size(body, 2)])
-        self._listener.on_accepted(Accepted(found.get(_MAXIMUM_PACKET), found.get(_RECEIVE_MAXIMUM)))
+        wanted = (_MAXIMUM_PACKET, _RECEIVE_MAXIMUM, _MAXIMUM_QOS, _RETAIN_AVAILABLE)
+        self._listener.on_accepted(Accepted(*map(found.get, wanted)))
 
     # -- packets that are too long
 

@@ -227,7 +227,8 @@ class PahoClient:
         if reason.is_failure:
             self._listener.on_refused(reason.value)
         else:
-            self._listener.on_accepted(Accepted(getattr(properties, "MaximumPacketSize", None)))
+            names = ("MaximumPacketSize", "", "MaximumQoS", "RetainAvailable")
+            self._listener.on_accepted(Accepted(*(getattr(properties, name, None) for name in names)))
 
     def _on_disconnect(self, _client: Any, _data: Any, flags: Any, reason: ReasonCode, _properties: Any) -> None:
         if flags.is_disconnect_packet_from_server:

@@ -6,6 +6,8 @@ from typing import Final
 
 FAILURE: Final = 0x80  # MQTT 5: this code and those above are errors
 TAKEN_OVER: Final = 0x8E
+NO_RETAIN: Final = 0x9A
+NO_QOS: Final = 0x9B
 PROTOCOL_REFUSED: Final = 1  # of 3.1.1: what some brokers answer to bridge mode
 
 #: MQTT 5: why a broker closes a connection whatever was published on it.
@@ -40,8 +42,8 @@ _WORDS = {
     0x97: "quota exceeded",
     0x98: "administrative action",
     0x99: "payload format invalid",
-    0x9A: "retain not supported",
-    0x9B: "QoS not supported",
+    NO_RETAIN: "retain not supported",
+    NO_QOS: "QoS not supported",
     0x9C: "use another server",
     0x9D: "server moved",
     0x9E: "shared subscription not supported",

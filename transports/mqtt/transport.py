@@ -18,6 +18,7 @@ from pebble.transports.credentials import Credentials
 from pebble.transports.hosts import Address, Turns
 from pebble.transports.mqtt import client_ids
 from pebble.transports.mqtt.bridge_mode import Attempt, BridgeMode, Result
+from pebble.transports.mqtt.broker_limits import EVERYTHING, BrokerLimits, Limits
 from pebble.transports.mqtt.client import Opening
 from pebble.transports.mqtt.connection import Connection, Lost, Refused, Silent, ignore
 from pebble.transports.mqtt.filters import BrokerFilters, OwnMessageFilter, overlap
@@ -38,6 +39,7 @@ _STEADY_S = 2.0  # after a connection this long the first retry is immediate
 _REPEAT_LOG_S = 30.0  # between two equal log lines
 _TRY_S = 0.25  # between two looks whether a topic that is withheld may be tried
 _NOT_TAKEN_S = 600.0  # between two log lines about one topic that the broker does not take
+_TRIED_S = 1.0  # after which a connection shows what the broker has
 _IDLE_S = 60.0  # the connection wakes up earlier, for its pings
 
 
@@ -63,7 +65,7 @@ class MqttTransport(Transport):
         self._stopping = threading.Event()
         self._will_on_close: Message | None = None
         self._thread: threading.Thread | None = None
-        self._bridge_mode = BridgeMode()  # of the broker at this address:
+        self._bridge_mode, self._limits = BridgeMode(), BrokerLimits()  # of the broker at this address:
         self._address: Address | None = None
         self._broker_stalled = False  # the broker may have been suspended, and have old messages to forward first
         self._logged = ("", 0.0)  # the newest problem in the log, and when it went there
@@ -76,6 +78,7 @@ class MqttTransport(Transport):
         self._retention_answer = PendingAck()
         #: Topics on which the broker takes no messages: why, and when that was last in the log.
         self.not_taken = BoundedTable[tuple[str, float]](TOPICS, TOPICS * MAX_BYTES, lambda _: 0)
+        self._reported = EVERYTHING  # what the log says the broker has
 
     @property
     def untried(self) -> bool:
@@ -188,17 +191,20 @@ class MqttTransport(Transport):
             if self._turns.several and not self._turns.is_over:
                 continue  # the next address
             pause = min(self.settings.reconnect_max_s, _RETRY_S * 2 ** (failures - 1)) if failures else 0.0
-            failures = min(failures + 1, 20)
+            if not self._limits.asks_again:
+                failures = min(failures + 1, 20)
             stopping.wait(pause * random.uniform(0.5, 1.0))  # noqa: S311  (jitter, no secret)
 
     def _run_connection(self, stopping: threading.Event) -> None:
         """Run one connection from its start to its end; raises Lost unless it ends by `close`."""
         self._address = self._next_address()
-        if self._asks_for_bridge_mode and self._bridge_mode.next_attempt is Attempt.PROBE:
+        self._limits.begin(time.monotonic())
+        if self._limits.wants_probe or (self._asks_for_bridge_mode and self._bridge_mode.next_attempt is Attempt.PROBE):
             self._probe(stopping)
         plain = self._asks_for_bridge_mode and self._bridge_mode.next_attempt is Attempt.PLAIN
         as_published = self.settings.as_published and not plain
-        connection = self._attempt = self._make_connection(self.will, as_published=as_published)
+        will = self._limits.limits.fit_will(self.will)
+        connection = self._attempt = self._make_connection(will, as_published=as_published)
         try:
             self._connect(connection, stopping)
             self._serve(connection, stopping)
@@ -216,7 +222,7 @@ class MqttTransport(Transport):
         except (OSError, ValueError) as error:
             raise Lost(f"{self._broker} cannot be reached: {error}") from None
         if address != self._address:
-            self._bridge_mode = BridgeMode()
+            self._bridge_mode, self._limits = BridgeMode(), BrokerLimits()
         return address
 
     @property
@@ -226,27 +232,37 @@ class MqttTransport(Transport):
     def _note_failure(self, problem: str, held_s: float) -> None:
         """The turn of the address is over, unless its broker is to be asked once more in another way."""
         turns = self._turns
-        if not self._asks_for_bridge_mode or self._bridge_mode.next_attempt is Attempt.BRIDGE:
+        if self._is_last_attempt and not self._limits.asks_again:
             failed = turns.failed(problem.removeprefix(f"{self._where} "), held_s)
             if turns.several:
                 problem = f"{self._broker}: {failed}"
-        self._report_problem(problem, logged=held_s > 0 or turns.is_over or not turns.several)
+        if not self._limits.asks_again or held_s > 0:
+            self._report_problem(problem, logged=held_s > 0 or turns.is_over or not turns.several)
 
     def _serve(self, connection: Connection, stopping: threading.Event) -> None:
+        tried_at = time.monotonic() + _TRIED_S
         try:
             self._synchronize(connection, stopping)
             if failed := self._turns.succeeded():
                 self._log(logging.INFO, f"connected to {connection.where}; before it {failed}")
             while not stopping.is_set():
                 connection.pump(_IDLE_S, self._deliver_all if self._retention is None else self._deliver_and_note)
+                if connection.limits is not self._reported and time.monotonic() > tried_at:
+                    self._report_limits(connection)
                 if self._pending and connection.has_room:
                     self._sync_retained(self._own.keys())
                 if self._suspects.withheld:
                     self._try_withheld(connection)
                 if self._retention is not None:
                     self._check_retention(connection)
-        except Lost as lost:
-            self._note_loss(connection, None if isinstance(lost, Silent) else connection.written_before_loss())
+        except Silent:
+            self._note_loss(connection, None)
+            raise
+        except Lost:
+            # First whether it lacks what all such messages need: else the first topics would seem to be at fault.
+            less = self._tries_less(connection, held=time.monotonic() > tried_at)
+            if not (less or self._limits.undecided):
+                self._note_loss(connection, connection.written_before_loss())
             raise
 
     def _note_loss(self, connection: Connection, written: Mapping[str, Written] | None) -> None:
@@ -300,6 +316,7 @@ class MqttTransport(Transport):
                 topic
                 for topic, message in self._own.items()
                 if message.payload and topic not in self._shared and self._accepts(connection, message)
+                if connection.limits.retain
                 if topic not in self.not_taken and not any(overlap(topic, filter_) for filter_ in filters)
             ]
 
@@ -327,6 +344,7 @@ class MqttTransport(Transport):
             self.counters,
             where=self._where,
             as_published=as_published,
+            limits=self._limits.limits,
             on_answers=self._note_answers,
             skips_retained=lambda topic: self.skips_retained(topic),
             is_stop=lambda topic: self.is_stop(topic),
@@ -338,9 +356,9 @@ class MqttTransport(Transport):
         try:
             connection.connect(stopping)
         except Lost as lost:
-            self._bridge_mode.note(lost.result if isinstance(lost, Refused) else Result.FAILED)
+            self._note_result(lost.result if isinstance(lost, Refused) else Result.FAILED)
             raise
-        self._bridge_mode.note(Result.ACCEPTED)
+        self._note_result(Result.ACCEPTED)
         if self.settings.as_published:
             if self.as_published and not connection.as_published:
                 log.warning("%s has no bridge mode: own messages come back on this connection", connection.where)
@@ -358,11 +376,41 @@ class MqttTransport(Transport):
             probe.connect(stopping)
             probe.disconnect()
         except Lost:
-            self._bridge_mode.note(Result.FAILED)
+            self._note_probe(Result.FAILED)
             raise
         finally:
             probe.discard()
-        self._bridge_mode.note(Result.ACCEPTED)
+        self._note_probe(Result.ACCEPTED)
+
+    @property
+    def _is_last_attempt(self) -> bool:
+        return not self._asks_for_bridge_mode or self._bridge_mode.next_attempt is Attempt.BRIDGE
+
+    def _note_result(self, result: Result) -> None:
+        self._bridge_mode.note(result)
+        if self.will is not None or result is Result.ACCEPTED:  # without a will nothing is left to refuse
+            self._limits.note_connect(result, time.monotonic(), last=self._is_last_attempt)
+
+    def _note_probe(self, result: Result) -> None:
+        if self._bridge_mode.next_attempt is Attempt.PROBE:
+            self._bridge_mode.note(result)
+        self._limits.note_probe(result)
+
+    def _tries_less(self, connection: Connection, *, held: bool) -> bool:
+        """Whether the connection may be lost because of what the broker lacks: the next one uses less."""
+        now = time.monotonic()
+        if connection.lacks is not None:
+            self._limits.note_connect(connection.lacks, now, last=True)
+            return True
+        in_flight = Limits(bool(connection.unconfirmed_retained()), int(connection.unacked > 0))
+        return self._limits.note_loss(in_flight, connection.confirmed, now, held=held)
+
+    def _report_limits(self, connection: Connection) -> None:
+        limits = connection.limits
+        if limits.losses and limits != self._reported:
+            level = logging.WARNING if self.will is not None or self._own else logging.INFO  # it loses nothing
+            log.log(level, "%s: %s %s", self.client_id, connection.where, limits.losses)
+        self._reported = limits
 
     def _synchronize(self, connection: Connection, stopping: threading.Event) -> None:
         """Query which of our retained messages the broker has, subscribe, and send what it lacks."""

@@ -1,0 +1,143 @@
+"""What an MQTT client makes of a broker without retained messages, QoS 1 or wills."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from pebble.transports import Message, MqttSettings, QoS, State
+from pebble.transports.mqtt.bridge_mode import Result
+from pebble.transports.mqtt.broker_limits import EVERYTHING, BrokerLimits, Limits
+from pebble.transports.mqtt.transport import MqttTransport
+from tests.support import Broker, until
+from tests.transports.received import Received
+
+NONE = Limits(retain=False, qos=0)
+NO_RETAIN, NO_QOS, NO_WILL = Limits(retain=False), Limits(qos=0), Limits(will=False)
+RESULTS = {"accepts": Result.ACCEPTED, "hangs up": Result.HUNG_UP, "no retain": Result.RETAIN_REFUSED}
+RESULTS |= {"no QoS": Result.QOS_REFUSED, "refuses": Result.FAILED}
+LOSSES = {"loses": (EVERYTHING, NONE, False), "loses confirmed": (EVERYTHING, EVERYTHING, False)}
+LOSSES |= {"loses held": (EVERYTHING, NONE, True), "loses idle": (NONE, NONE, False)}
+
+
+@pytest.mark.parametrize(
+    ("events", "limits"),
+    [
+        (["hangs up"] * 20, EVERYTHING),  # a proxy whose broker is away: no probe is accepted
+        (["hangs up", "probed", "hangs up"], EVERYTHING),
+        (["hangs up", "probed", "hangs up", "accepts"] * 5, EVERYTHING),
+        (["hangs up", "probed", *["hangs up"] * 2], NO_RETAIN),
+        (["hangs up", "probed", *["hangs up"] * 3], NO_QOS),
+        (["hangs up", "probed", *["hangs up"] * 4], NONE),
+        (["hangs up", "probed", *["hangs up"] * 5], NO_WILL),
+        (["hangs up", "probed", *["hangs up"] * 6], EVERYTHING),  # the will was not the reason
+        (["hangs up", "probed", *["hangs up"] * 2, "refuses"], EVERYTHING),  # the broker has gone
+        (["hangs up", "probed", *["hangs up"] * 3, "accepts", *["hangs up"] * 9], NO_QOS),  # it is away
+        (["no retain"], NO_RETAIN),
+        (["no QoS", "no retain", "accepts"], NONE),
+        (["no retain", "accepts", "later"], EVERYTHING),  # it may have another config
+        (["refuses"] * 20, EVERYTHING),
+        (["accepts", "loses idle"] * 20, EVERYTHING),
+        (["accepts", "loses held"] * 20, EVERYTHING),
+        (["accepts", "loses confirmed"] * 20, EVERYTHING),
+        (["accepts", "loses"] * 5, EVERYTHING),
+        (["accepts", *["loses"] * 5, "loses confirmed", *["loses"] * 5], EVERYTHING),
+        (["accepts", *["loses"] * 6, "accepts"], NO_RETAIN),
+        (["accepts", *["loses"] * 6, "accepts", "loses held", "accepts", *["loses"] * 3], NO_RETAIN),
+        (["accepts", *["loses"] * 7], NO_QOS),
+        (["accepts", *["loses"] * 8], NONE),
+        (["accepts", *["loses"] * 9], EVERYTHING),  # less did not help
+        (["accepts", *["loses"] * 9, *["loses"] * 20], EVERYTHING),
+        (["accepts", "loses confirmed", *["loses"] * 11], EVERYTHING),
+        (["accepts", "loses confirmed", *["loses"] * 12], NO_RETAIN),  # a new config
+    ],
+)
+def test_what_is_tried_next(events: list[str], limits: Limits) -> None:
+    learning, now = BrokerLimits(), 0.0
+    for event in events:
+        learning.begin(now)
+        if event in LOSSES:
+            in_flight, confirmed, held = LOSSES[event]
+            learning.note_loss(in_flight, confirmed if confirmed is EVERYTHING else NONE, now, held=held)
+        elif event in RESULTS:
+            if learning.wants_probe:
+                learning.note_probe(Result.FAILED)
+            learning.note_connect(RESULTS[event], now, last=True)
+        elif event == "probed":
+            assert learning.wants_probe
+            learning.note_probe(Result.ACCEPTED)
+        else:
+            now += 1000.0
+    learning.begin(now)
+    assert learning.limits == limits
+
+
+@pytest.mark.parametrize("protocol", ["3.1.1", "5"])
+@pytest.mark.parametrize("has_will", [True, False])
+@pytest.mark.parametrize("as_published", [True, False])
+@pytest.mark.parametrize(
+    ("options", "lost"),
+    [
+        (["retain_available false"], "keeps no retained messages"),
+        (["max_qos 0"], "has no QoS 1"),
+        (["retain_available false", "max_qos 0"], "keeps no retained messages"),
+        ([], ""),
+    ],
+)
+def test_messages_pass_both_ways_and_one_warning_says_what_is_lost(
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    options: list[str],
+    lost: str,
+    protocol: str,
+    has_will: bool,
+    as_published: bool,
+) -> None:
+    broker = Broker(tmp_path, *options)
+    settings = MqttSettings(host="127.0.0.1", port=broker.port, protocol=protocol, as_published=as_published)
+    will = Message("robot/online", b"gone", QoS.DELIVERED, retain=True)
+    robot = MqttTransport("robot", settings, will=will if has_will else None)
+    operator = MqttTransport("operator", MqttSettings(host="127.0.0.1", port=broker.port)).open()
+    try:
+        seen, commands = Received(), Received()
+        operator.subscribe("robot/#", seen)
+        robot.subscribe("commands/#", commands, echo=False)
+        robot.publish("robot/state", b"state", qos=QoS.DELIVERED, retain=True)
+        robot.open()
+        assert until(lambda: b"state" in seen.payloads)
+        assert until(lambda: robot.publish("robot/event", b"event", qos=QoS.DELIVERED) and b"event" in seen.payloads)
+        assert until(lambda: operator.publish("commands/stop", b"", urgent=True) and commands.payloads)
+        assert until(lambda: not lost or any(lost in record.getMessage() for record in caplog.records))
+        warned = [record.levelno for record in caplog.records if "that is changed" in record.getMessage()]
+        assert len(warned) == ("retain" in lost)
+        broker.stop()
+        assert until(lambda: robot.state is not State.CONNECTED)
+        broker.start()
+        assert until(lambda: robot.state is State.CONNECTED)
+        robot.close()
+        assert until(lambda: not has_will or b"gone" in seen.payloads)
+    finally:
+        robot.close()
+        operator.close()
+        broker.stop()
+
+
+def test_losses_of_the_link_take_nothing_away(tmp_path: Path) -> None:
+    broker = Broker(tmp_path)
+    will = Message("robot/online", b"gone", QoS.DELIVERED, retain=True)
+    robot = MqttTransport("robot", MqttSettings(host="127.0.0.1", port=broker.port), will=will).open()
+    late = MqttTransport("late", MqttSettings(host="127.0.0.1", port=broker.port))
+    try:
+        for number in range(14):
+            robot.publish("robot/state", b"%d" % number, qos=QoS.DELIVERED, retain=True)
+            broker.kill()
+            broker.start()
+        assert until(lambda: robot.state is State.CONNECTED)
+        seen = Received()
+        late.open()
+        assert until(lambda: late.subscribe("robot/state", seen) and seen.payloads[-1:] == [b"13"])
+    finally:
+        robot.close()
+        late.close()
+        broker.stop()
