@@ -102,9 +102,8 @@ def test_messages_pass_both_ways_and_one_warning_says_what_is_lost(
     try:
         seen, commands = Received(), Received()
         operator.subscribe("robot/#", seen)
-        robot.subscribe("commands/#", commands, echo=False)
+        robot.open().subscribe("commands/#", commands, echo=False)
         robot.publish("robot/state", b"state", qos=QoS.DELIVERED, retain=True)
-        robot.open()
         assert until(lambda: b"state" in seen.payloads)
         assert until(lambda: robot.publish("robot/event", b"event", qos=QoS.DELIVERED) and b"event" in seen.payloads)
         assert until(lambda: operator.publish("commands/stop", b"", urgent=True) and commands.payloads)
