@@ -129,7 +129,7 @@ class Subscription:
                 return
             if not self._delivered_topics.has(message.topic):
                 self._delivered_topics[message.topic] = None
-            elif repeat if self._transport.as_published else message.retain:
+            elif repeat if self._transport.as_published else message.retain and not self._transport.delivers_late:
                 self._transport.counters.add("stale")
                 return
             if self.direct:
@@ -194,6 +194,8 @@ class Transport(ABC):
     #: Whether the other end had older values of what only we publish when the newest connection began: it was restored
     #: from an earlier save, or is another one. A backend that cannot notice it leaves it False.
     went_back: bool = False
+    #: Deliver retained messages also after a live one of their topic (T8): it may have been our own. The owner decides.
+    delivers_late: bool = False
     #: Whether retained messages of a topic (UTF-8) may be discarded before anything else is done with them: strangers
     #: plant 100,000. Called with locks held: it must neither wait nor publish. A backend may ignore it.
     skips_retained: Callable[[bytes], bool] = staticmethod(lambda _topic: False)
@@ -349,6 +351,13 @@ class Transport(ABC):
             self._matched.clear()
         self._declare(subscription)
         return subscription
+
+    def ask(self, topics: Collection[str]) -> None:
+        """Have the retained messages of ``topics`` delivered to the subscriptions that match; waits, bounded.
+
+        Some brokers send them only to subscriptions of exact names; a backend whose network has none does nothing.
+        """
+        del topics
 
     def __enter__(self) -> Self:
         return self.open()

@@ -54,6 +54,8 @@ log = logging.getLogger(__name__)
 
 #: Retained messages closely follow the acknowledgement of a subscription: by then they are here even over a slow link.
 INITIAL_SYNC_S = 0.5
+#: Some brokers send them later: they are all here after a silence this long.
+QUIET_S = 0.25
 #: On connections where live messages may have the retain flag, too, the first message of a topic within this time
 #: after :func:`barrier` counts as an old one.
 _RETAINED_S = 0.05
@@ -134,6 +136,7 @@ class Forwarder:
         self._restarted: set[Side] = set()
         self._lost_at = {side: float("-inf") for side in Side}  # -inf: before the first connection, too
         self._went_back = dict.fromkeys(Side, False)
+        self._seen: dict[Side, set[str]] = {side: set() for side in Side}  # two-way topics, since we subscribed
         self._mirroring = self._mirror_refused = False
 
     @property
@@ -157,6 +160,7 @@ class Forwarder:
     def subscribing(self, side: Side) -> None:
         """The owner is about to subscribe to ``side``: its retained messages arrive from now on."""
         self._retained_at[side] = float("-inf")
+        self._seen[side].clear()
         self._retained_until[side] = self._stops_retained_until[side] = float("inf")
 
     def watch(self, side: Side, state: State) -> None:
@@ -177,6 +181,10 @@ class Forwarder:
         self._stops_retained_until[side] = max(now + _RETAINED_S, self._retained_at[side] + INITIAL_SYNC_S)
         if self.gate is Gate.OPEN:
             self._events[side].flush()
+
+    def is_arriving(self, side: Side) -> bool:
+        """Whether retained messages of ``side`` have come until just now."""
+        return self._clock() - self._retained_at[side] < QUIET_S
 
     def synchronize(self, side: Side) -> None:
         """Publish what retained messages have left open; to be called INITIAL_SYNC_S after :meth:`subscribed`."""
@@ -378,15 +386,30 @@ class Forwarder:
 
     def _reconcile(self, side: Side, subject: Subject, message: Message) -> Drop | None:
         """Why a two-way retained message must not pass; None if it may."""
-        topic, payload = message.topic, message.payload
+        topic, payload, seen = message.topic, message.payload, self._seen[side]
+        transport = self._transports[side]
+        if message.retain and topic in seen and transport.delivers_late and not transport.as_published:
+            return Drop.KNOWN  # older than what was seen
+        if len(seen) < _MAX_WAITING:
+            seen.add(topic)
         retained = self.gate is not Gate.SHUT and self._is_retained(side, message)
         if not retained and not self._echo_is_exact(any) and self._reconciliation.value(topic) == payload:
             return Drop.KNOWN
         away = self._transports[side.other].state is not State.CONNECTED
         resolution = self._reconciliation.receive(
-            side, topic, payload, retained=retained, other_away=away, went_back=self._went_back[side]
+            side,
+            topic,
+            payload,
+            retained=retained,
+            late=message.retain and self._may_be_old(side),
+            other_away=away,
+            went_back=self._went_back[side],
         )
         if resolution is Resolution.PASS:
+            self._on_value(subject, payload)
+            return None
+        if resolution is Resolution.RESTORE:
+            self._publish_value(side, topic, payload)
             self._on_value(subject, payload)
             return None
         if resolution is Resolution.CORRECT:
@@ -409,6 +432,10 @@ class Forwarder:
     def _is_old_stop(self, side: Side, message: Message) -> bool:
         if not message.retain:
             return False
+        return self._may_be_old(side)
+
+    def _may_be_old(self, side: Side) -> bool:
+        """Whether a message with the retain flag may be a retained one."""
         return not self._transports[side].as_published or self._clock() < self._stops_retained_until[side]
 
     def _note_retained(self, side: Side) -> None:

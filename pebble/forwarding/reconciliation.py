@@ -8,6 +8,8 @@ The rules:
    winner's have arrived.
 3. A side that lost a value receives it again. So does the winner if it has gone back, restored from an earlier save: a
    retained message of it that is an earlier value counts as old.
+4. Silence does not mean that a side has no value: a retained message of the winner that arrives after it was sent the
+   other side's value counts, and the winner receives it again.
 """
 
 from __future__ import annotations
@@ -27,6 +29,7 @@ class Resolution(Enum):
     PASS = "publish it to the other side"  # noqa: S105  (no password)
     KNOWN = "nothing new"
     HOLD = "wait for the winner"
+    RESTORE = "publish it to both sides: what the sender had was overwritten before it came"
     CORRECT = "publish the right value to the sender"
     OVERTAKEN = "changed on the other side while this one was away"
 
@@ -55,6 +58,7 @@ class Reconciliation:
         self._held = BoundedTable[bytes](TOPICS, BYTES, len)  # of the other side, until the winner's have arrived
         self._published = {side: BoundedTable[bytes](TOPICS, BYTES, len) for side in Side}
         self._received: dict[Side, set[str]] = {side: set() for side in Side}  # since the connection began
+        self._offered: dict[Side, set[str]] = {side: set() for side in Side}  # sent because a side seemed to lack them
         self._synchronized = dict.fromkeys(Side, False)
         self._overtaken: set[str] = set()  # changed by the loser while the winner was away
 
@@ -71,6 +75,7 @@ class Reconciliation:
     def begin(self, side: Side) -> None:
         """The connection of ``side`` was lost, or is new: its retained messages will arrive again."""
         self._received[side].clear()
+        self._offered[side].clear()
         self._synchronized[side] = False
 
     def has_received(self, side: Side, topic: str) -> bool:
@@ -84,21 +89,27 @@ class Reconciliation:
         payload: bytes,
         *,
         retained: bool,
+        late: bool = False,
         other_away: bool = False,
         went_back: bool = False,
     ) -> Resolution:
         """``side`` published ``payload``; ``retained``: a subscription brought it, it may be old.
 
-        ``went_back``: ``side`` has older values than it had a moment ago.
+        ``late``: it may be old although its side counts as synchronized. ``went_back``: ``side`` has older values than
+        it had a moment ago.
         """
         if len(self._received[side]) < TOPICS:
             self._received[side].add(topic)
         resolution = Resolution.PASS
         if retained:
             resolution = self._resolve_retained(side, topic, payload, went_back=went_back)
+        if resolution is Resolution.PASS and topic in self._offered[side]:
+            self._offered[side].discard(topic)
+            if late and side is self._winner:
+                resolution = Resolution.RESTORE
         if resolution is Resolution.HOLD:
             self._held[topic] = payload
-        elif resolution is Resolution.PASS:
+        elif resolution in (Resolution.PASS, Resolution.RESTORE):
             self._held.pop(topic, None)
             if side is self._winner:
                 self._overtaken.discard(topic)
@@ -127,6 +138,7 @@ class Reconciliation:
             for topic, last in self._last.items()
             if topic not in fresh and self._is_missing(side, topic, last)
         ]
+        self._offered[side].update(topic for _, topic, _ in due)
         return due
 
     def _set(self, topic: str, payload: bytes, side: Side) -> None:

@@ -96,6 +96,11 @@ class Subjects(dict[str, Subject | None]):
         """The topics of ``channels``, those of every serial instance included."""
         return list(dict.fromkeys(addresses[channel].topic for addresses in self._addresses for channel in channels))
 
+    @cached_property
+    def flags(self) -> list[str]:
+        """The topics of the contract's flags."""
+        return self.topics(*(one for one in CHANNELS if one.kind is Kind.FLAG and not one.is_pattern))
+
     def _find(self, topic: str) -> Subject | None:
         try:
             check_topic(topic)

@@ -10,7 +10,7 @@ from pebble.contract import BRIDGE_PROBE, DRIVE, INCOMING, ONLINE, OUTGOING, REM
 from pebble.contract.payloads import MediaRequest
 from pebble.errors import PayloadError
 from pebble.forwarding.cycles import PROBE_PERIOD_S
-from pebble.forwarding.forwarder import INITIAL_SYNC_S, Forwarder, Gate, Routed, barrier
+from pebble.forwarding.forwarder import INITIAL_SYNC_S, QUIET_S, Forwarder, Gate, Routed, barrier
 from pebble.forwarding.routing import TABLE_A1, Drop, Forward, Side
 from pebble.forwarding.subjects import Subject, Subjects
 from pebble.runtime.connections import remote_transport
@@ -29,6 +29,7 @@ from pebble.transports import Message, State, Subscription
 #: After the barrier, for brokers that pass messages between connections with a delay.
 _PROBE_WAIT_S = 0.1
 _RETRY_S = 1.0
+_ARRIVING_S = 2.0  # longest wait for retained messages that still come after the subscription
 _IGNORED = (Drop.ECHO, Drop.LATE, Drop.PROBE)  # nothing that a person or a program requests of the bridge now
 _CHECK_AGAIN_S = 30.0  # while nothing is mirrored
 _LEFTOVERS_AFTER_S = 30.0  # by then all services have published what they retain; so long after the start, or later
@@ -81,6 +82,7 @@ class MqttBridge(Service):
             clock=self.clock,
         )
         self.transport.is_invented = lambda topic: self._subjects.invented(topic.encode()) is not None
+        self._remote.delivers_late = True
         self._remote.skips_retained = partial(self._forwarder.skips_retained, Side.REMOTE)
         #: What the bridge itself does about a message, and about a flag's value, by channel.
         self._message_reactions: dict[str, Callable[[bytes], None]] = {
@@ -170,8 +172,12 @@ class MqttBridge(Service):
     def _synchronize_later(self, side: Side) -> None:
         epoch = self._remote_epoch
 
+        end = self.clock() + _ARRIVING_S
+
         def synchronize() -> None:
-            if side is Side.LOCAL or epoch == self._remote_epoch:
+            if side is Side.REMOTE and self._forwarder.is_arriving(side) and self.clock() < end:
+                self.call_at(self.clock() + QUIET_S, synchronize)
+            elif side is Side.LOCAL or epoch == self._remote_epoch:
                 self._forwarder.synchronize(side)
                 self._forwarder.probe_commands(Side.REMOTE)  # by now a mirror of the wrong broker has stopped
 
@@ -189,6 +195,7 @@ class MqttBridge(Service):
             self._remote.subscribe(filter_, receive, echo=False, direct=True)
             for filter_ in self._subjects.filters(INCOMING)
         ]
+        self._remote.ask(self._subjects.flags)
         self._forwarder.subscribed(Side.REMOTE)
         self._synchronize_later(Side.REMOTE)
 

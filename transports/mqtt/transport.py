@@ -6,7 +6,7 @@ import logging
 import random
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from math import ceil, inf
 
@@ -150,6 +150,19 @@ class MqttTransport(Transport):
             deadline = time.monotonic() + _ANSWER_S
             for ack in acks:
                 ack.wait(deadline - time.monotonic())
+
+    def ask(self, topics: Collection[str]) -> None:
+        with self._routing:
+            connection, names = self._connection, [topic for topic in topics if topic not in self._filters]
+            if connection is None or not names:
+                return
+            for name in names:
+                self._own_message_filter.subscribe_again(name)
+            asked = connection.subscribe([(name, self._no_local(name)) for name in names], QoS.LATEST)
+            acks = [asked, connection.ping(), connection.unsubscribe(names)]
+        deadline = time.monotonic() + _ANSWER_S
+        for ack in acks:
+            ack.wait(deadline - time.monotonic())
 
     def _undeclare(self, subscription: Subscription) -> None:  # noqa: ARG002  (the ones that stay decide)
         with self._routing:

@@ -10,6 +10,7 @@ import pytest
 from pebble.services.mqtt_bridge import service as bridge_module
 from pebble.transports import State
 from tests.services.mqtt_bridge.bridge_rig import BASE, MemoryRig, MqttRig, Quiet
+from tests.sparing_broker import SparingBroker
 from tests.support import Broker, until
 from tests.tcp_proxy import TcpProxy
 
@@ -92,6 +93,29 @@ def test_a_value_that_an_operator_chose_again_during_an_outage_is_no_older_one(r
     way.mend()
     assert until(lambda: connections(rig) > before)
     assert until(lambda: rig.local.payloads(AUDIO_FLAG) == [FALSE, TRUE, FALSE])
+
+
+@pytest.mark.parametrize(("late_s", "by_name"), [(0.0, False), (0.0, True), (0.7, False), (1.5, False), (1.5, True)])
+def test_an_operators_flag_counts_however_late_the_broker_sends_it(
+    brokers: tuple[Broker, Broker], late_s: float, by_name: bool
+) -> None:
+    """Silence does not mean that the broker has no value."""
+    local, remote = ({"host": "127.0.0.1", "port": broker.port} for broker in brokers)
+    front = SparingBroker(brokers[1].port, late_s=late_s, by_name=by_name)
+    rig = MqttRig(local, remote, uplink=front.port)
+    try:
+        rig.local.publish(AUDIO_FLAG, TRUE, retain=True)
+        rig.remote.publish(AUDIO_FLAG, FALSE, retain=True)
+        for client in (rig.local, rig.remote):
+            client.transport.close()
+        rig.start()
+        Quiet(rig.client("local")).wait(2.0)
+        assert {side: rig.retained(side).get(AUDIO_FLAG) for side in ("local", "remote")} == dict.fromkeys(
+            ("local", "remote"), FALSE
+        )
+    finally:
+        rig.close()
+        front.close()
 
 
 class TestLeftovers:

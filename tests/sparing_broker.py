@@ -1,0 +1,65 @@
+"""Stands before a real broker, and hands out its retained messages as others do: late, or for exact names only."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from contextlib import suppress
+
+from tests.support import free_port
+
+_CONNECT, _PUBLISH, _SUBSCRIBE = 0x10, 0x30, 0x82
+_NO_BRIDGE_MODE = b"\x20\x02\x00\x01"
+
+
+class SparingBroker:
+    """``late_s``: how long after it was asked for a retained message comes; ``by_name``: not for wildcards."""
+
+    def __init__(self, to: int, *, late_s: float = 0.0, by_name: bool = False) -> None:
+        self.port, self._to, self._late_s, self._by_name = free_port(), to, late_s, by_name
+        self._loop = asyncio.new_event_loop()
+        self._loop.run_until_complete(asyncio.start_server(self._serve, "127.0.0.1", self.port))
+        self._thread = threading.Thread(target=self._loop.run_forever, daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        asked: list[bytes] = []
+        with suppress(OSError, asyncio.IncompleteReadError):
+            to_reader, to_writer = await asyncio.open_connection("127.0.0.1", self._to)
+            back = asyncio.ensure_future(self._back(to_reader, writer, asked))
+            with suppress(OSError, asyncio.IncompleteReadError):
+                while True:
+                    first, packet, body = await _packet(reader)
+                    if first == _CONNECT and body[6] & 0x80:
+                        writer.write(_NO_BRIDGE_MODE)
+                        break
+                    if first == _SUBSCRIBE:
+                        asked.append(body)
+                    to_writer.write(packet)
+            to_writer.close()
+            await back
+        writer.close()
+
+    async def _back(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, asked: list[bytes]) -> None:
+        with suppress(OSError, asyncio.IncompleteReadError):
+            while True:
+                first, packet, body = await _packet(reader)
+                named = any(body[: 2 + int.from_bytes(body[:2], "big")] in one for one in asked)
+                if first & 0xF1 != _PUBLISH | 1:
+                    writer.write(packet)
+                elif named or not self._by_name:
+                    self._loop.call_later(self._late_s, writer.write, packet)
+
+
+async def _packet(reader: asyncio.StreamReader) -> tuple[int, bytes, bytes]:
+    """Its first byte, all of it, and what follows its length."""
+    head, size, shift = await reader.readexactly(2), 0, 0
+    while head[-1] > 127:
+        size, shift = size | (head[-1] & 127) << shift, shift + 7
+        head += await reader.readexactly(1)
+    body = await reader.readexactly(size | head[-1] << shift)
+    return head[0], head + body, body
