@@ -170,9 +170,13 @@ class Forwarder:
             self.subscribing(side)  # the transport does so at the next connection
             self._restarted.add(side)
             self._lost_at[side] = self._clock()
-        else:
-            brief = self._clock() - self._lost_at[side] < _RESTORED_S
-            self._went_back[side] = brief and self._transports[side].went_back
+            # Known before its retained messages come, which may be before it counts as connected.
+            self._went_back[side] = side is not self._winner and self._transports[side].was_ended
+        elif side is self._winner:
+            self._went_back[side] = self._was_brief(side) and self._transports[side].went_back
+
+    def _was_brief(self, side: Side) -> bool:
+        return self._clock() - self._lost_at[side] < _RESTORED_S
 
     def subscribed(self, side: Side) -> None:
         """``side`` is connected and subscribed to, and its retained messages have arrived."""
@@ -403,7 +407,7 @@ class Forwarder:
             retained=retained,
             late=message.retain and self._may_be_old(side),
             other_away=away,
-            went_back=self._went_back[side],
+            went_back=self._went_back[side] and (side is self._winner or self._was_brief(side)),
         )
         if resolution is Resolution.PASS:
             self._on_value(subject, payload)

@@ -6,7 +6,7 @@ The rules:
 2. A retained message that a subscription brings counts only where nothing else is known. At a reconnect the *winner*
    side is right. Retained messages of the other side fill what the winner does not have; they are held back until the
    winner's have arrived.
-3. A side that lost a value receives it again. So does the winner if it has gone back, restored from an earlier save: a
+3. A side that lost a value receives it again. So does a side that has gone back, restored from an earlier save: a
    retained message of it that is an earlier value counts as old.
 4. Silence does not mean that a side has no value: a retained message of the winner that arrives after it was sent the
    other side's value counts, and the winner receives it again.
@@ -157,7 +157,8 @@ class Reconciliation:
             return Resolution.PASS if self._synchronized[self._winner] else Resolution.HOLD
         if last.payload == payload:
             return Resolution.KNOWN
-        return Resolution.CORRECT if last.side is self._winner else Resolution.PASS
+        older = last.side is self._winner or (went_back and hash(payload) in last.earlier)
+        return Resolution.CORRECT if older else Resolution.PASS
 
     def _is_missing(self, side: Side, topic: str, last: LastValue) -> bool:
         """Whether ``side`` lacks the newest value; it lacks no removal of what it never received."""

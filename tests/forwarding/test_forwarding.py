@@ -216,6 +216,14 @@ class TestReconciliation:
             ("R:a x:b r:c R:d", ["pass", "pass", "pass", "pass"]),
             ("r:a r:b R:a", ["pass", "pass", "pass"]),
             ("r:a r:b B:a", ["pass", "pass", "correct"]),
+            ("l:a l:b A:a", ["pass", "pass", "correct"]),
+            ("r:a l:b A:a", ["pass", "pass", "correct"]),
+            ("l:a l:b A:c", ["pass", "pass", "pass"]),
+            ("l:a l:b A:b", ["pass", "pass", "known"]),
+            ("l:a l:b L:a", ["pass", "pass", "pass"]),
+            ("L:a sync R:b", ["hold", "restore"]),
+            ("L:a sync l:c R:b", ["hold", "pass", "restore"]),
+            ("L:a sync r:b R:c", ["hold", "pass", "pass"]),
             ("r:a l:b B:a", ["pass", "pass", "correct"]),
             ("r:a r:b B:c", ["pass", "pass", "pass"]),
             ("r:a r:b B:b", ["pass", "pass", "known"]),
@@ -226,7 +234,7 @@ class TestReconciliation:
     def test_resolutions(self, history: str, resolutions: list[str]) -> None:
         """L, R: retained messages. l, r: live ones. x: a live local one while the remote side is away.
 
-        B: a retained message of the remote side, which has gone back.
+        A, B: a retained message of the local side, and of the remote one, which has gone back.
         """
         reconciliation = Reconciliation(REMOTE)
         given = []
@@ -237,7 +245,13 @@ class TestReconciliation:
             who, _, payload = word.partition(":")
             side = REMOTE if who in "RrB" else LOCAL
             resolution = reconciliation.receive(
-                side, "t", payload.encode(), retained=who.isupper(), other_away=who == "x", went_back=who == "B"
+                side,
+                "t",
+                payload.encode(),
+                retained=who.isupper(),
+                late=who == "R",
+                other_away=who == "x",
+                went_back=who in "AB",
             )
             given.append(resolution)
         assert given == [Resolution[name.upper()] for name in resolutions]

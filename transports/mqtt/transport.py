@@ -190,7 +190,8 @@ class MqttTransport(Transport):
             try:
                 self._run_connection(stopping)
             except Lost as lost:
-                self._broker_stalled |= isinstance(lost, Silent)
+                self.was_ended = not isinstance(lost, Silent)  # else it may be we who stood still
+                self._broker_stalled |= not self.was_ended
                 problem = str(lost)
             except Exception:  # any error must lead to a reconnect, never end the thread
                 log.exception("%s: unexpected failure of the connection", self.client_id)

@@ -82,6 +82,38 @@ def test_a_broker_that_was_restored_from_an_older_save_gets_the_newest_values(
     assert rig.local.payloads(AUDIO_FLAG) == [FALSE, TRUE]
 
 
+@pytest.mark.parametrize("by", ["remote", "local"])
+def test_the_robots_own_broker_that_was_restored_from_an_older_save_gets_the_newest_flag(
+    tmp_path: Path, by: str
+) -> None:
+    own, remote = Broker(tmp_path, persistence=True), Broker(tmp_path)
+    rig = MqttRig(*({"host": "127.0.0.1", "port": broker.port} for broker in (own, remote)))
+    rig.start()
+    try:
+        setter, other = (rig.remote, rig.local) if by == "remote" else (rig.local, rig.remote)
+        saved: dict[Path, bytes] = {}
+        for value in (TRUE, FALSE):
+            setter.publish(AUDIO_FLAG, value, retain=True)
+            setter.transport._own.clear()
+            assert until(lambda: other.payloads(AUDIO_FLAG)[-1:] == [value])  # noqa: B023
+            if not saved:
+                own.save()
+                saved = {file: file.read_bytes() for file in own.store.iterdir()}
+        own.kill()
+        for file, data in saved.items():
+            file.write_bytes(data)
+        before = rig.bridge.transport.counters["connected"]
+        own.start()
+        assert until(lambda: rig.bridge.transport.counters["connected"] > before)
+        assert until(lambda: rig.retained("local").get(AUDIO_FLAG) == FALSE)
+        assert rig.retained("remote")[AUDIO_FLAG] == FALSE
+        assert TRUE not in rig.remote.payloads(AUDIO_FLAG)[2:]
+    finally:
+        rig.close()
+        own.kill()
+        remote.stop()
+
+
 def test_a_value_that_an_operator_chose_again_during_an_outage_is_no_older_one(rig: MqttRig, way: TcpProxy) -> None:
     set_status(rig, b"status")
     set_flag(rig, FALSE)
