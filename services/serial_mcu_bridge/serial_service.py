@@ -14,8 +14,8 @@ from pebble.errors import ConfigError, DeviceError
 from pebble.runtime.parent import Notifier
 from pebble.runtime.rate_limit import RateLimitedLog
 from pebble.runtime.service import Service, every
-from pebble.services.serial_mcu_bridge.line.silence import CHECK_S, Silence
 from pebble.services.serial_mcu_bridge.line.serial_line import LineState, SerialLine
+from pebble.services.serial_mcu_bridge.line.silence import CHECK_S, Silence
 
 _INPUT_LIMIT = 65_536  # bytes waiting for the service's thread; 1.4 s of a full 460,800 baud line
 

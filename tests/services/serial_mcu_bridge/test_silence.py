@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from pebble.services.serial_mcu_bridge.line.silence import Silence
 from pebble.services.serial_mcu_bridge.line.serial_line import LineState
+from pebble.services.serial_mcu_bridge.line.silence import Silence
 
 #: Per second: r received at rest, d received while it was driven, . nothing, o opened again, x the device has gone.
 CASES = {
