@@ -62,8 +62,8 @@ def _robot(config: Config) -> Iterator[Finding]:
     yield state_directory(config.state_dir())
     for line in config.serial_instances().values():
         yield serial_port(Path(str(line.serial.port)))
-    if (found := driving(config)) is not None:
-        yield found
+    if (driveable := driving(config)) is not None:
+        yield driveable
     yield from media(config, Path("/dev"))
     yield from loudspeaker(config)
     yield from operator_page(config)
