@@ -25,7 +25,7 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize(("seconds", "state", "heard_ms"), CASES.values(), ids=CASES)
+@pytest.mark.parametrize(("seconds", "state", "silent_ms"), CASES.values(), ids=CASES)
 def test_silence(seconds: str, state: str, silent_ms: int | None) -> None:
     silence, opened, received, found = Silence(), 1, 0, ("", None)
     for now, second in enumerate(seconds, start=100):
