@@ -405,7 +405,6 @@ class Forwarder:
             topic,
             payload,
             retained=retained,
-            late=message.retain and self._may_be_old(side),
             other_away=away,
             went_back=self._went_back[side] and (side is self._winner or self._was_brief(side)),
         )
@@ -436,10 +435,6 @@ class Forwarder:
     def _is_old_stop(self, side: Side, message: Message) -> bool:
         if not message.retain:
             return False
-        return self._may_be_old(side)
-
-    def _may_be_old(self, side: Side) -> bool:
-        """Whether a message with the retain flag may be a retained one."""
         return not self._transports[side].as_published or self._clock() < self._stops_retained_until[side]
 
     def _note_retained(self, side: Side) -> None:

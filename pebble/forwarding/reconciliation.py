@@ -58,7 +58,9 @@ class Reconciliation:
         self._held = BoundedTable[bytes](TOPICS, BYTES, len)  # of the other side, until the winner's have arrived
         self._published = {side: BoundedTable[bytes](TOPICS, BYTES, len) for side in Side}
         self._received: dict[Side, set[str]] = {side: set() for side in Side}  # since the connection began
-        self._offered: dict[Side, set[str]] = {side: set() for side in Side}  # sent because a side seemed to lack them
+        # Of topics on which the winner has published nothing since its connection began, as far as has arrived:
+        self._offered: set[str] = set()  # what it seemed to lack, and was sent,
+        self._newer: set[str] = set()  # and what the loser changed since
         self._synchronized = dict.fromkeys(Side, False)
         self._overtaken: set[str] = set()  # changed by the loser while the winner was away
 
@@ -75,7 +77,9 @@ class Reconciliation:
     def begin(self, side: Side) -> None:
         """The connection of ``side`` was lost, or is new: its retained messages will arrive again."""
         self._received[side].clear()
-        self._offered[side].clear()
+        if side is self._winner:
+            self._offered.clear()
+            self._newer.clear()
         self._synchronized[side] = False
 
     def has_received(self, side: Side, topic: str) -> bool:
@@ -89,32 +93,30 @@ class Reconciliation:
         payload: bytes,
         *,
         retained: bool,
-        late: bool = False,
         other_away: bool = False,
         went_back: bool = False,
     ) -> Resolution:
         """``side`` published ``payload``; ``retained``: a subscription brought it, it may be old.
 
-        ``late``: it may be old although its side counts as synchronized. ``went_back``: ``side`` has older values than
-        it had a moment ago.
+        ``went_back``: ``side`` has older values than it had a moment ago.
         """
         if len(self._received[side]) < TOPICS:
             self._received[side].add(topic)
         resolution = Resolution.PASS
         if retained:
             resolution = self._resolve_retained(side, topic, payload, went_back=went_back)
-        if resolution is Resolution.PASS and topic in self._offered[side]:
-            self._offered[side].discard(topic)
-            if late and side is self._winner:
-                resolution = Resolution.RESTORE
         if resolution is Resolution.HOLD:
             self._held[topic] = payload
         elif resolution in (Resolution.PASS, Resolution.RESTORE):
             self._held.pop(topic, None)
             if side is self._winner:
                 self._overtaken.discard(topic)
+                self._newer.discard(topic)
+                self._offered.discard(topic)
             elif other_away and len(self._overtaken) < TOPICS:
                 self._overtaken.add(topic)
+            elif not retained and self._may_come_late(topic) and len(self._newer) < TOPICS:
+                self._newer.add(topic)
             self._set(topic, payload, side)
         return resolution
 
@@ -138,7 +140,8 @@ class Reconciliation:
             for topic, last in self._last.items()
             if topic not in fresh and self._is_missing(side, topic, last)
         ]
-        self._offered[side].update(topic for _, topic, _ in due)
+        if side is self._winner:
+            self._offered.update(topic for _, topic, _ in due)
         return due
 
     def _set(self, topic: str, payload: bytes, side: Side) -> None:
@@ -148,17 +151,23 @@ class Reconciliation:
     def _resolve_retained(self, side: Side, topic: str, payload: bytes, *, went_back: bool) -> Resolution:
         last = self._last.get(topic)
         if side is self._winner:
-            if topic in self._overtaken:
+            if topic in self._overtaken or topic in self._newer:
                 return Resolution.OVERTAKEN
             if went_back and last is not None and last.payload != payload and hash(payload) in last.earlier:
                 return Resolution.CORRECT
-            return Resolution.KNOWN if last is not None and last.payload == payload else Resolution.PASS
+            if last is not None and last.payload == payload:
+                return Resolution.KNOWN
+            return Resolution.RESTORE if topic in self._offered else Resolution.PASS
         if last is None:
             return Resolution.PASS if self._synchronized[self._winner] else Resolution.HOLD
         if last.payload == payload:
             return Resolution.KNOWN
         older = last.side is self._winner or (went_back and hash(payload) in last.earlier)
         return Resolution.CORRECT if older else Resolution.PASS
+
+    def _may_come_late(self, topic: str) -> bool:
+        """Whether the winner may still have an old value: silence does not mean that it has none."""
+        return self._synchronized[self._winner] and topic not in self._received[self._winner]
 
     def _is_missing(self, side: Side, topic: str, last: LastValue) -> bool:
         """Whether ``side`` lacks the newest value; it lacks no removal of what it never received."""

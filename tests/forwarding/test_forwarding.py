@@ -222,7 +222,10 @@ class TestReconciliation:
             ("l:a l:b A:b", ["pass", "pass", "known"]),
             ("l:a l:b L:a", ["pass", "pass", "pass"]),
             ("L:a sync R:b", ["hold", "restore"]),
-            ("L:a sync l:c R:b", ["hold", "pass", "restore"]),
+            ("L:a sync l:c R:b", ["hold", "pass", "overtaken"]),
+            ("L:a sync l:c r:d R:b", ["hold", "pass", "pass", "pass"]),
+            ("sync l:a R:b again R:c", ["pass", "overtaken", "pass"]),
+            ("L:a sync again R:b", ["hold", "pass"]),
             ("L:a sync r:b R:c", ["hold", "pass", "pass"]),
             ("r:a l:b B:a", ["pass", "pass", "correct"]),
             ("r:a r:b B:c", ["pass", "pass", "pass"]),
@@ -234,13 +237,14 @@ class TestReconciliation:
     def test_resolutions(self, history: str, resolutions: list[str]) -> None:
         """L, R: retained messages. l, r: live ones. x: a live local one while the remote side is away.
 
-        A, B: a retained message of the local side, and of the remote one, which has gone back.
+        again: the remote connection begins anew. A, B: a retained message of the local side, and of the remote one,
+        which has gone back.
         """
         reconciliation = Reconciliation(REMOTE)
         given = []
         for word in history.split():
-            if word == "sync":
-                reconciliation.synchronize(REMOTE)
+            if word in ("sync", "again"):
+                (reconciliation.synchronize if word == "sync" else reconciliation.begin)(REMOTE)
                 continue
             who, _, payload = word.partition(":")
             side = REMOTE if who in "RrB" else LOCAL
@@ -249,7 +253,6 @@ class TestReconciliation:
                 "t",
                 payload.encode(),
                 retained=who.isupper(),
-                late=who == "R",
                 other_away=who == "x",
                 went_back=who in "AB",
             )
