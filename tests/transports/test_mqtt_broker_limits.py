@@ -85,7 +85,7 @@ def test_what_is_tried_next(events: list[str], limits: Limits) -> None:
         ([], ""),
     ],
 )
-def test_messages_pass_both_ways_and_one_warning_says_what_is_lost(
+def test_messages_pass_both_ways_and_one_warning_names_what_is_lost(
     tmp_path: Path,
     caplog: pytest.LogCaptureFixture,
     options: list[str],

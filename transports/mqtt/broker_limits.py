@@ -17,7 +17,7 @@ from pebble.transports.mqtt.bridge_mode import Result
 _HANG_UPS: Final = 3  # on CONNECT, one of them after a CONNECT without a will was accepted
 _LOSSES: Final = 6  # in a row, with nothing confirmed: twice as many as prove that one topic is refused,
 _PROVEN_LOSSES: Final = 12  # and so many if this broker has confirmed such messages before: it may have a new config
-_KEPT_S: Final = 600.0  # after which the next connection is made with everything again
+_VALID_S: Final = 600.0  # after which the next connection is made with everything again
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +95,7 @@ class BrokerLimits:
 
     def begin(self, now: float) -> None:
         """A connection is about to be made."""
-        if not self._searching and now - self._since > _KEPT_S:
+        if not self._searching and now - self._since > _VALID_S:
             self.limits, self._cleared = EVERYTHING, False
 
     def note_probe(self, result: Result) -> None:
