@@ -273,9 +273,7 @@ class MqttTransport(Transport):
             self._note_loss(connection, None)
             raise
         except Lost:
-            # First whether it lacks what all such messages need: else the first topics would seem to be at fault.
-            less = self._tries_less(connection, held=time.monotonic() > tried_at)
-            if not (less or self._limits.undecided):
+            if not self._tries_less(connection, held=time.monotonic() > tried_at):
                 self._note_loss(connection, connection.written_before_loss())
             raise
 
