@@ -49,8 +49,8 @@ export class Driver {
     /** @type {Set<string>} parts of the page that do not work */
     this.failed = new Set();
     this.refusal = ""; // why the server has ended the last gesture
-    /** @type {{code: string, text: string}[]} why it may not move, whatever is sent: found by what is fetched later */
-    this.doubts = [];
+    /** @type {import("./reasons.js").Reason|null} why nothing moves it, whatever is sent; found by what is fetched later */
+    this.doubt = null;
     this.clockBase = Date.now() - performance.now();
     /** @type {Set<() => void>} */
     this.watchers = new Set();

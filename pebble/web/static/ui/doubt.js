@@ -17,17 +17,17 @@ export function doubtOf(status) {
   return { no, text: words && typeof why === "string" ? `${words}: ${why.slice(0, LONGEST)}` : words };
 }
 
-/** A mark in the header; the line beside the stick says why. @param {{at: string, wide: boolean}} props */
-export function DoubtMark({ at, wide }) {
+/** A mark in the header; the line beside the stick says why. @param {{at: string}} props */
+export function DoubtMark({ at }) {
   const { driver } = usePage();
   const { no, text } = doubtOf(useValue(at, "status"));
   useEffect(() => {
-    driver.doubts = text ? [{ code: "doubt", text }] : [];
+    driver.doubt = no ? { code: "doubt", text } : null;
     callAll(driver.watchers);
-    return () => void (driver.doubts = []);
-  }, [at, text]);
-  if (!no) return null;
-  return html`<span class="chip plain bad" title=${text} data-test="undriveable"
-    ><span aria-hidden="true">▲</span> <span class=${wide ? "" : "sr"}>cannot be driven</span></span
+    return () => void (driver.doubt = null);
+  }, [at, no, text]);
+  if (!text) return null;
+  return html`<span class=${`chip plain ${no ? "bad" : "late"}`} title=${text} data-test="doubt-mark"
+    ><span aria-hidden="true">${no ? "▲" : "?"}</span> <span class="sr">${text}</span></span
   >`;
 }

@@ -33,8 +33,8 @@ export function WhyLine({ at }) {
   const { connection, driver } = usePage();
   useModel(driver);
   const view = useValue(at, "web/driver");
-  const mine = useModel(connection).isOpen && view?.you === true;
-  const reason = driver.reason();
+  const mine = useModel(connection).isOpen && view?.you;
+  const reason = driver.reason() ?? driver.doubt;
   const connected = useValue("", "web/broker")?.connected !== false; // else the banner says why
   const why = reason?.code === "broker" && !connected ? "The server cannot reach the broker" : reason?.text;
   const keys = driver.typing ? " Keys go to the field you have chosen: click beside it." : "";
@@ -42,7 +42,7 @@ export function WhyLine({ at }) {
   return html`<div class=${`why-line ${reason ? "off" : "on"}`}>
     <p id="why-drive" data-test="why"><i aria-hidden="true">${reason ? "○" : "●"}</i><span>${text}</span></p>
     <span class="sr" role="status">${useCalm(text)}</span>
-    ${[...driver.doubts, ...(driver.pads?.reasons() ?? [])].slice(0, 2).map(({ code, text: said }) => html`<p key=${said} class="why" data-test=${code}>${said}.</p>`)}
+    ${[driver.doubt, ...(driver.pads?.reasons() ?? [])].filter((one) => one && one !== reason).slice(0, 2).map(({ code, text: said }) => html`<p key=${said} class="why" data-test=${code}>${said}.</p>`)}
     <div class="why-actions">
       <${ReasonAction} action=${reason?.action} />
       ${mine && html`<button type="button" data-test="release" onClick=${() => driver.release()}>Release</button>`}

@@ -137,7 +137,7 @@ export function Bell({ at, wide }) {
     show(!open);
   };
   return html`<${Announcement} newest=${notices.list[0]} />
-    ${at && html`<${DoubtMark} at=${at} wide=${wide} />`}
+    ${at && html`<${DoubtMark} at=${at} />`}
     ${wide && at && html`<${RecordingsLink} at=${at} className="button quiet" />`}
     ${wide &&
     html`<button
