@@ -42,7 +42,7 @@ export function WhyLine({ at }) {
   return html`<div class=${`why-line ${reason ? "off" : "on"}`}>
     <p id="why-drive" data-test="why"><i aria-hidden="true">${reason ? "○" : "●"}</i><span>${text}</span></p>
     <span class="sr" role="status">${useCalm(text)}</span>
-    ${[driver.doubt, ...(driver.pads?.reasons() ?? [])].filter((one) => one && one !== reason).slice(0, 2).map(({ code, text: said }) => html`<p key=${said} class="why" data-test=${code}>${said}.</p>`)}
+    ${[driver.doubt, ...(driver.pads?.reasons() ?? "")].filter((one) => one && one !== reason).slice(0, 2).map(({ code, text }) => html`<p key=${text} class="why" data-test=${code}>${text}.</p>`)}
     <div class="why-actions">
       <${ReasonAction} action=${reason?.action} />
       ${mine && html`<button type="button" data-test="release" onClick=${() => driver.release()}>Release</button>`}
