@@ -88,6 +88,11 @@ class BrokerLimits:
         """Whether the same broker is to be asked once more, in another way."""
         return self.wants_probe or self._probed or self._searching
 
+    @property
+    def undecided(self) -> bool:
+        """Whether connections are being lost because the broker may lack something, which only more of them show."""
+        return self._losses > 0 and not (self._proven or self._cleared)
+
     def begin(self, now: float) -> None:
         """A connection is about to be made."""
         if not self._searching and now - self._since > _VALID_S:

@@ -232,6 +232,11 @@ class SuspectTopics:
         return Assessment(Kind.VITAL, topics)
 
 
+def is_large(written: Mapping[str, Written] | None) -> bool:
+    """Whether the size of a message is the most likely reason for the loss of the connection."""
+    return any(one.size >= LARGE for one in (written or {}).values())
+
+
 def named(topics: list[str]) -> str:
     """Some of ``topics``, in words."""
     if len(topics) <= 3:

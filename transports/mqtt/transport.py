@@ -24,7 +24,7 @@ from pebble.transports.mqtt.connection import Connection, Lost, Refused, Silent,
 from pebble.transports.mqtt.filters import BrokerFilters, OwnMessageFilter, overlap
 from pebble.transports.mqtt.outgoing import PendingAck
 from pebble.transports.mqtt.retention import RetentionCheck
-from pebble.transports.mqtt.suspects import TOPICS, Kind, SuspectTopics, Written, named
+from pebble.transports.mqtt.suspects import TOPICS, Kind, SuspectTopics, Written, is_large, named
 from pebble.transports.settings import MqttSettings
 from pebble.transports.topics import MAX_BYTES
 
@@ -273,8 +273,13 @@ class MqttTransport(Transport):
             self._note_loss(connection, None)
             raise
         except Lost:
-            if not self._tries_less(connection, held=time.monotonic() > tried_at):
-                self._note_loss(connection, connection.written_before_loss())
+            # First whether it lacks what all such messages need: else each of their topics would seem to be at fault.
+            less, written = (
+                self._tries_less(connection, held=time.monotonic() > tried_at),
+                connection.written_before_loss(),
+            )
+            if not (less or self._limits.undecided) or is_large(written):
+                self._note_loss(connection, written)
             raise
 
     def _note_loss(self, connection: Connection, written: Mapping[str, Written] | None) -> None:
