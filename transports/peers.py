@@ -16,6 +16,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from pebble.errors import TransportError
+from pebble.transports.own_file import OwnFile, identity
 from pebble.transports.socket_paths import check_socket_path
 
 log = logging.getLogger(__name__)
@@ -119,24 +120,6 @@ class FileLock:
         os.close(self._descriptor)
 
 
-class OwnFile:
-    """A file that is this process's now: of a socket where it listens, or of memory that it shares."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._made = _identity(path)
-
-    @property
-    def in_place(self) -> bool:
-        """Whether others that open its path still reach this process."""
-        return self._made is not None and _identity(self._path) == self._made
-
-    @property
-    def replaced(self) -> bool:
-        """Whether another file is at its path."""
-        return _identity(self._path) not in (None, self._made)
-
-
 class PresenceLock:
     """The lock that marks one running process in the run directory, and the path of its socket."""
 
@@ -207,16 +190,7 @@ def new_name() -> str:
 
 
 def _is_at(path: Path, descriptor: int) -> bool:
-    return _identity(path) == _identity(descriptor)
-
-
-def _identity(file: Path | int) -> tuple[int, int] | None:
-    """What tells a file from one that has taken its place; None if there is none."""
-    try:
-        found = os.stat(file)  # noqa: PTH116 - of a descriptor as well
-    except (FileNotFoundError, NotADirectoryError):
-        return None
-    return found.st_dev, found.st_ino
+    return identity(path) == identity(descriptor)
 
 
 def _open_lock(path: Path) -> int:

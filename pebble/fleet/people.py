@@ -18,7 +18,7 @@ from pebble.errors import PebbleError
 from pebble.fleet.database import open_database
 from pebble.fleet.roles import Role, Session
 from pebble.fleet.tries import Tries, network_of
-from pebble.transports.peers import OwnFile
+from pebble.transports.own_file import OwnFile
 
 NAME = re.compile(r"[a-z0-9_-]{1,32}")
 SESSION_S = 7 * 24 * 3600.0  # a session ends after this long, whether it is used or not

@@ -21,7 +21,8 @@ from pebble.transports.frames import shared_memory, views
 from pebble.transports.frames.frame import FrameInfo, encode
 from pebble.transports.frames.session import METADATA, SharingError, StreamNames, open_writing
 from pebble.transports.frames.shared_memory import MARGIN, Chunk, SharedPool
-from pebble.transports.peers import FileLock, OwnFile, prepare_run_dir
+from pebble.transports.own_file import OwnFile
+from pebble.transports.peers import FileLock, prepare_run_dir
 from pebble.transports.zenoh.session import check_process, close_at_exit, close_session
 
 log = logging.getLogger(__name__)

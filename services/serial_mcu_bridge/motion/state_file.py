@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from pebble.runtime.rate_limit import RateLimitedLog
-from pebble.transports.peers import OwnFile
+from pebble.transports.own_file import OwnFile
 
 log = logging.getLogger(__name__)
 

@@ -12,6 +12,7 @@ import msgspec
 
 from pebble.config import Config
 from pebble.services.serial_mcu_bridge.line.outbox import Outbox
+from pebble.services.serial_mcu_bridge.line.serial_line import LineState
 from pebble.services.serial_mcu_bridge.motion import motor_guard
 from pebble.services.serial_mcu_bridge.text import motor_bridge
 from pebble.services.serial_mcu_bridge.text.motor_bridge import MotorBridge
@@ -59,6 +60,7 @@ class RecordedLine:
 
     opened = 1
     problem = ""
+    state = LineState.CLOSED  # so that it is not reported: that goes by the real clock
 
     def __init__(self, wheels: Wheels, process: Process, scheduler: Scheduler) -> None:
         self._wheels, self._process, self._scheduler = wheels, process, scheduler
@@ -103,7 +105,7 @@ class MemoryFile:
         self, disk: Disk, process: Process, path: Path, on_saved: Callable[[int, bool], None] = lambda _n, _ok: None
     ) -> None:
         self.path = path
-        self.busy = False
+        self.busy, self.in_place = False, True
         self._disk, self._process, self._on_saved = disk, process, on_saved
         self._number = 0
 

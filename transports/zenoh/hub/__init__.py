@@ -24,7 +24,8 @@ import zenoh
 from pebble.errors import TransportError
 from pebble.transports.base import QoS
 from pebble.transports.counters import Counters
-from pebble.transports.peers import FileLock, OwnFile, PeerRegistry, new_name, prepare_run_dir
+from pebble.transports.own_file import OwnFile
+from pebble.transports.peers import FileLock, PeerRegistry, new_name, prepare_run_dir
 from pebble.transports.renewed import Renewed
 from pebble.transports.settings import TlsSettings, ZenohSettings
 from pebble.transports.socket_holders import why_not

@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
 
-from pebble.transports.peers import OwnFile
+from pebble.transports.own_file import OwnFile
 
 log = logging.getLogger(__name__)
 
