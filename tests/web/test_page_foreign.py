@@ -71,7 +71,7 @@ _LATER = """(ref) => {
   pebble.store.set(ref, "web/driver", { you: false, by: "zoe", device: "" });
   pebble.store.set(ref, "web/estop", { latched: true, by: "zoe", why: "button", since: 0, sending: "", owners: [] });
 }"""
-_WORDS = "document.body.innerText"
+_WORDS = "(document.body?.innerText ?? '')"
 _RARE = pytest.mark.page
 
 
