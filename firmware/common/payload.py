@@ -19,18 +19,18 @@ def load(raw: memoryview | bytes):
     """Parse JSON of limited size and depth. Raises ValueError, OverflowError or MemoryError.
 
     Around it may be what programs add: a byte order mark, white space, a C string's NUL and the rest of its buffer. All
-    but printable ASCII is left out there, by which every JSON text begins and ends.
+    of UTF-8 but printable ASCII is left out there, by which every JSON text begins and ends.
     """
     size = len(raw)
     if size > _MAX_BYTES:
         raise ValueError
     first = 0
-    while first < size and not 0x20 < raw[first] < 0x7F:
+    while first < size and (raw[first] < 0x21 or 0x7E < raw[first] < 0xF5):
         first += 1
     last = first
     while last < size and raw[last]:
         last += 1
-    while first < last and not 0x20 < raw[last - 1] < 0x7F:
+    while first < last and (raw[last - 1] < 0x21 or 0x7E < raw[last - 1] < 0xF5):
         last -= 1
     raw = raw[first:last]
     brackets = highest = 0

@@ -36,8 +36,9 @@ _LATEST_STAMP = 253_402_300_800_000  # the year 10000 in ms: later times are inv
 
 # Narrower than float(): that also takes "1_0", digits of other scripts and the names of NaN and infinity.
 _numeric = re.compile(r"\s*[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?\s*", re.ASCII).fullmatch
-#: All but printable ASCII, by which every JSON text begins and ends: a byte order mark, a C string's NUL, white space.
-_AROUND = bytes(byte for byte in range(256) if not 0x21 <= byte <= 0x7E)
+#: All of UTF-8 but printable ASCII, by which every JSON text begins and ends: a byte order mark, a C string's NUL,
+#: white space. The bytes above are in no UTF-8: what they are around is no text.
+_AROUND = bytes(byte for byte in range(0xF5) if not 0x21 <= byte <= 0x7E)
 _KEYS_SHOWN, _SHOWN = 8, 20  # of a payload that is not understood, and characters of each
 _encoder = msgspec.json.Encoder()
 _decoder = msgspec.json.Decoder()
@@ -92,7 +93,7 @@ def plain(channel: Channel, raw: bytes) -> Any:
         text.decode()  # msgspec checks only the strings it keeps
         return _decoder.decode(text)
     except UnicodeDecodeError:
-        raise PayloadError(f"{channel.metric}: not UTF-8") from None
+        raise PayloadError(f"{channel.metric}: not UTF-8: send UTF-8") from None
     except msgspec.DecodeError as error:
         if b"\0" in raw.strip(_AROUND):
             raise PayloadError(f"{channel.metric}: not JSON before its NUL: if it is UTF-16, send UTF-8") from None

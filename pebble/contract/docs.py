@@ -41,9 +41,9 @@ _ACCEPTED = """\
   refuses the whole command: the wheels do what they did until their deadline.
 * A drive command without `x`, `z` and `y` is a stop. The motor owner's log names its keys, once a minute for each
   `source`; boards have no log.
-* Bytes around a payload that are not printable ASCII change nothing: a byte order mark, white space, a C string's
-  NUL and what is after it. An empty payload still removes what was retained; white space alone is a bridge's probe,
-  and ignored.
+* Bytes of UTF-8 around a payload that are not printable ASCII change nothing: a byte order mark, white space, a C
+  string's NUL and what is after it. An empty payload still removes what was retained; white space alone is a bridge's
+  probe, and ignored.
 * Refused, counted and logged: NaN and infinities in any spelling, wrong types, bytes that are not UTF-8 (so also
   UTF-16), JSON nested deeper than 32 levels, commands larger than 64 KB. But on `estop` what cannot be read stops.
 * Unknown fields are ignored. A retained command or action is stale: it is neither executed nor forwarded.

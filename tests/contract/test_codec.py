@@ -507,7 +507,7 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 def oracle_json(raw: bytes) -> Any:
     """The standard library's reading, made strict; ValueError or RecursionError for what is no JSON."""
-    text = re.sub(rb"^[^!-~]+|[^!-~]*(\0(?s:.*))?$", b"", raw).decode()
+    text = re.sub(rb"^[^!-~\xf5-\xff]+|[^!-~\xf5-\xff]*(\0(?s:.*))?$", b"", raw).decode()
     plain = json.loads(text, parse_float=_strict_float, parse_constant=_no_constant, object_pairs_hook=_object)
     json.dumps(plain, ensure_ascii=False).encode()
     if len(raw) > 65536 or _depth(plain) > 32:
