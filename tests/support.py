@@ -9,10 +9,14 @@ import socket
 import statistics
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
+
+import pytest
 
 from pebble.rig.processes import free_port as free_port
 from pebble.rig.processes import mosquitto_command
@@ -36,6 +40,21 @@ def cases(some: int, all_: int) -> int:
 def some(all_: Iterable[T], step: int) -> list[T]:
     """Each ``step``-th of many parameters of a test; all of them if asked to be thorough."""
     return list(all_)[:: 1 if THOROUGH else step]
+
+
+needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root makes other users' files and mounts file systems")
+
+
+@contextmanager
+def beside(work: Callable[[], object], ending: threading.Event) -> Iterator[None]:
+    """Let ``work`` run on a thread of its own; it returns once ``ending`` is set."""
+    thread = threading.Thread(target=work)
+    thread.start()
+    try:
+        yield
+    finally:
+        ending.set()
+        thread.join()
 
 
 def until(condition: Callable[[], object], timeout: float = 10.0, *, step: float = 0.005) -> bool:

@@ -1,4 +1,4 @@
-"""Finds characters that nobody sees in a text: they make two texts differ that look the same."""
+"""Finds characters in a text that are not shown: they make two texts differ that look the same."""
 
 import re
 

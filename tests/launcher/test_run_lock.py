@@ -11,6 +11,7 @@ import pytest
 from pebble.config import LAUNCHER_LOCK
 from pebble.errors import PebbleError
 from pebble.launcher.run_lock import RunLock
+from tests.support import needs_root
 
 
 def test_the_folder_is_made_for_this_user_alone(tmp_path: Path) -> None:
@@ -84,7 +85,7 @@ def test_a_link_laid_out_for_us_is_refused(tmp_path: Path) -> None:
         RunLock(tmp_path / "run", "x/y/z", tmp_path / "robot.json").take()
 
 
-@pytest.mark.skipif(os.getuid() != 0, reason="only root makes the folder of another user")
+@needs_root
 @pytest.mark.parametrize("is_link", [False, True])
 def test_a_folder_that_another_user_made_first_is_named(tmp_path: Path, is_link: bool) -> None:
     above, own = tmp_path / "pebble-0", tmp_path / "own"

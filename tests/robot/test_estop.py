@@ -11,7 +11,7 @@ import pytest
 
 from tests.commands.command_line import program
 from tests.robot.rig import BASE, STOP, Rig
-from tests.support import until
+from tests.support import beside, until
 
 pytestmark = pytest.mark.alone  # deadlines are checked
 
@@ -25,13 +25,8 @@ def driven_by_operator(rig: Rig) -> Iterator[None]:
         while not ending.wait(0.05):
             rig.operator.send("incoming/drive-values", {"x": 0, "z": 0.5})
 
-    thread = threading.Thread(target=drive)
-    thread.start()
-    try:
+    with beside(drive, ending):
         yield
-    finally:
-        ending.set()
-        thread.join()
 
 
 def pebble(*arguments: object) -> tuple[int, str]:

@@ -22,7 +22,7 @@ from websockets.exceptions import ConnectionClosed
 from pebble.fleet.roles import Role
 from pebble.web import connections, control
 from pebble.web import messages as m
-from tests.support import Broker, until
+from tests.support import Broker, beside, until
 from tests.web.attacker import PASSWORDS, Everything, Hall
 from tests.web.served import Page, RecordingRobot, Served, now_ms
 
@@ -700,13 +700,8 @@ def held_connections(port: int, number: int = 1200) -> Iterator[None]:
             if client is not None:
                 client.close()
 
-    thread = threading.Thread(target=refill, args=([None] * number,))
-    thread.start()
-    try:
+    with beside(lambda: refill([None] * number), ending):
         yield
-    finally:
-        ending.set()
-        thread.join()
 
 
 def test_held_connections_keep_out_neither_a_person_nor_a_stop(

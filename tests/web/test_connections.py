@@ -235,13 +235,13 @@ def test_a_websocket_that_pings_and_does_not_read_costs_no_memory(serve: Callabl
     assert until(lambda: serving.listener.connections == 0, 4)
 
 
-#: The users of the first connections ("": of nobody; "-": it also sends nothing), and how many of them, and of a flood
-#: of 40 silent ones after them, remain in 20 places.
+#: The users of the first connections ("": without a login; "-": it also sends nothing), and how many of them, and of a
+#: flood of 40 silent ones after them, remain in 20 places.
 HELD = {
-    "nobody's": ([""], 12, [""]),
-    "nobody's, some silent": (["", "-", ""], 12, ["", ""]),
-    "more of nobody than there are places": ([""] * 14, 12, [""] * 11),
-    "a person's and nobody's": (["ann", "ann", ""], 14, ["ann", "ann", ""]),
+    "without a login": ([""], 12, [""]),
+    "without a login, some silent": (["", "-", ""], 12, ["", ""]),
+    "more without a login than there are places": ([""] * 14, 12, [""] * 11),
+    "a person's and one without a login": (["ann", "ann", ""], 14, ["ann", "ann", ""]),
     "more of one person than one may have": (["ann"] * 8, 16, ["ann"] * 8),
     "of many people, but for the last place": ([f"p{n}" for n in range(20)], 20, [f"p{n}" for n in range(19)]),
 }

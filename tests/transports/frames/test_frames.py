@@ -21,7 +21,7 @@ from pebble.transports.frames import FrameInfo, FrameReader, FrameWriter
 from pebble.transports.frames.frame import encode
 from pebble.transports.frames.session import METADATA
 from tests.locking import needs_shared_memory
-from tests.support import some, until
+from tests.support import needs_root, some, until
 from tests.transports.frames.frames_net import FramesNet
 
 VGA = 640 * 480 * 3
@@ -234,7 +234,7 @@ def test_a_writer_knows_when_readers_that_start_now_get_nothing(tmp_path: Path, 
         assert writer.in_place
 
 
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root has file systems of its own")
+@needs_root
 @pytest.mark.parametrize("size", ["ro,size=64k", "size=64k", "size=1400k", "size=2m"])
 def test_without_room_in_shared_memory_frames_are_sent_as_bytes(tmp_path: Path, size: str) -> None:
     program = (
