@@ -13,6 +13,8 @@ from pebble.perception.camera_model import CameraModel, Floats
 
 FAMILY = "APRILTAG_25H9"  # the original's default, in its spelling
 _HIDDEN_S = 0.7  # a tag that is out of sight for longer is lost, as followers have it: another one may be chosen
+_PICTURE = "a picture is a numpy array of (height, width, 3) bytes, blue first, or (height, width)"
+_HINTS = {(4,): ": leave out the last with picture[:, :, :3]", (1,): ": use picture[:, :, 0]"}
 _AS_LARGE = 0.9  # of two areas: the difference is noise
 
 
@@ -96,8 +98,9 @@ class TagFinder:
 
         Of several with one id the largest is the first; see :class:`TagChoice`.
 
-        Pictures are used as they come: av_daemon has rotated them.
+        Pictures are used as they come: av_daemon has rotated them. Raises PebbleError for anything else.
         """
+        picture = _checked(picture)
         height, width = picture.shape[:2]
         grey = picture if picture.ndim == 2 else self._cv2.cvtColor(picture, self._cv2.COLOR_BGR2GRAY)
         corners, ids, _ = self._detector.detectMarkers(grey)
@@ -107,6 +110,16 @@ class TagFinder:
             if (place := self._geometry.place(four, width, height)) is not None:
                 tags.append(Tag(int(number), four, place))
         return sorted(tags, key=lambda tag: (tag.id, -tag.area))
+
+
+def _checked(picture: Any) -> Any:
+    if not isinstance(picture, np.ndarray):
+        raise PebbleError(f"{_PICTURE}, not {type(picture).__name__}")
+    if picture.dtype != np.uint8:
+        raise PebbleError(f"{_PICTURE}, not of {picture.dtype}")
+    if not (picture.ndim == 2 or (picture.ndim == 3 and picture.shape[2] == 3)) or not picture.size:
+        raise PebbleError(f"{_PICTURE}, not of {picture.shape}{_HINTS.get(picture.shape[2:], '')}")
+    return np.ascontiguousarray(picture)
 
 
 class TagChoice:

@@ -214,3 +214,43 @@ def test_the_finder_lists_all_tags_of_an_id_the_largest_first() -> None:
     tags = TagFinder(EDGE_M).find(small)
     assert [tag.id for tag in tags] == [13, 13]
     assert [tag.distance_m for tag in tags] == [pytest.approx(1.04, rel=0.05), pytest.approx(1.71, rel=0.05)]
+
+
+COLOURS = np.full((48, 64, 3), 150, np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "why"),
+    [
+        (None, "not NoneType"),
+        (b"\xff\xd8", "not bytes"),
+        (COLOURS.tolist(), "not list"),
+        (COLOURS / 255.0, "not of float64"),
+        (COLOURS.astype(np.float32), "not of float32"),
+        (COLOURS.astype(np.uint16), "not of uint16"),
+        (COLOURS > 100, "not of bool"),
+        (np.dstack([COLOURS, COLOURS[:, :, 0]]), r"picture\[:, :, :3\]"),
+        (COLOURS[:, :, :1], r"picture\[:, :, 0\]"),
+        (COLOURS[:, :, :2], r"not of \(48, 64, 2\)"),
+        (COLOURS[None], "not of"),
+        (COLOURS.ravel(), "not of"),
+        (COLOURS[0, 0, 0], "not uint8"),
+        (COLOURS[:0], r"not of \(0, 64, 3\)"),
+        (COLOURS[:, :0, 0], "not of"),
+    ],
+)
+def test_what_is_no_picture_is_refused_with_a_sentence(wrong: Any, why: str) -> None:
+    with pytest.raises(PebbleError, match=r"a picture is a numpy array of \(height, width, 3\) bytes.*" + why):
+        TagFinder().find(wrong)
+
+
+@pytest.mark.parametrize("edge", [1, 2, 3, 5, 9])
+def test_a_small_picture_has_no_tags(edge: int) -> None:
+    assert TagFinder().find(COLOURS[:edge, :edge]) == []
+
+
+def test_a_part_of_a_picture_is_one() -> None:
+    image, _ = picture(13, ahead_m=1.0)
+    image.setflags(write=False)
+    for part in (image[:, ::-1][:, ::-1], image[20:, 10:], np.asfortranarray(image)):
+        assert [tag.id for tag in TagFinder().find(part)] == [13]
