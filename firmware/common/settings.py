@@ -2,25 +2,29 @@
 
 import json
 
-_PATH = "/private_config.json"
 
-
-def load() -> dict:
-    """Read the file; {} if that fails: the robot must stop its motors before it reports missing settings."""
+def load(path: str = "/private_config.json") -> dict:
+    """Read the file. It raises nothing: the robot must stop its motors before :func:`get` reports what is wrong."""
     try:
-        with open(_PATH) as file:
+        with open(path) as file:
             if file.read(1) != "\ufeff":  # which some editors write first
                 file.seek(0)
-            return json.load(file)
-    except (OSError, ValueError):
+            return dict(json.load(file))
+    except OSError:
         return {}
+    except (ValueError, TypeError):  # of UTF-16, too
+        return {"": 0}  # no file has this key
 
 
 def get(settings: dict, section: str, name: str, default=None):
-    """Return one setting. Raises ValueError if it is missing and has no default."""
-    value = settings.get(section, {}).get(name, default)
-    if value is None:
-        raise ValueError("private_config.json lacks " + section + "." + name)
+    """Return one setting. Raises ValueError if it is missing and has no default, or if the file cannot be read."""
+    try:
+        value = settings.get(section, {}).get(name, default)
+    except AttributeError:
+        value = None
+    if value is None or "" in settings:
+        what = "is no JSON" if "" in settings else "lacks " + section + "." + name
+        raise ValueError("private_config.json " + what)
     return value
 
 
