@@ -30,9 +30,9 @@ _LONGEST = 16 * 1024  # bytes that a probe repeats
 
 #: A payload that is received more often within this time may circulate; or an operator holds a key. If something else
 #: circulates, each topic is suspicious. Sensors repeat themselves for hours: their reports are suspicious in a storm.
-_SUSPICIOUS, _WINDOW_S = 5, 2.0
+SUSPICIOUS, _WINDOW_S = 5, 2.0
 #: No operator and no script repeats a payload so often in this time.
-_STORM = 150
+STORM = 150
 PROBE_PERIOD_S, _PERIOD_IN_STORM_S = 1.0, 0.1  # between two probes of a topic
 _UNANSWERED = 3  # probes, after which the other way is gone
 #: A stop is published again after 0.5 s at the earliest; what comes back is faster.
@@ -89,10 +89,13 @@ class Cycles:
         self.closed_ways: Final[set[tuple[Side, str]]] = set()
         self._unlogged: tuple[Side, str, float] | None = None  # circulates, and since when this is known
 
-    def receive(self, side: Side, topic: str, payload: bytes, *, once: bool, report: bool = False) -> Finding:
+    def receive(
+        self, side: Side, topic: str, payload: bytes, *, once: bool, runs: bool = False, after: int = SUSPICIOUS
+    ) -> Finding:
         """``side`` has sent a message that may be forwarded.
 
-        ``once``: it means something that happens once; ``report``: it is what a robot reports again and again.
+        ``once``: it means something that happens once; ``runs``: of that, what may pass while it circulates, because
+        the caller recognises what comes back; ``after``: so many equal ones within 2 s are not suspicious.
         """
         number = _number_of(payload) if payload[-1:] in _DIGITS else None
         with self._lock:
@@ -100,20 +103,23 @@ class Cycles:
                 return self._receive_probe(side, topic, number)
             way, now = self._ways.get((side, topic)) or self._way(side, topic), self._clock()
             count = way.count(payload, now)
-            if way.closed and (once or count > _SUSPICIOUS):  # more than one copy may come back
+            # Of what the caller knows more than one copy may come back.
+            if way.closed and ((once and not runs) or count > SUSPICIOUS):
                 return Finding.CIRCULATES
-            period = _PERIOD_IN_STORM_S if count > _STORM and not way.closed else PROBE_PERIOD_S
+            period = _PERIOD_IN_STORM_S if count > STORM and not way.closed else PROBE_PERIOD_S
             never_probed = way.probed_at == float("-inf")
-            often = count > (_STORM if report else _SUSPICIOUS)
-            suspicious = way.closed or often or (never_probed and bool(self.closed_ways))
+            suspicious = way.closed or count > after or (never_probed and bool(self.closed_ways))
             suspicious = suspicious and (once or len(payload) <= _LONGEST)
-            return Finding.SUSPECT if suspicious and now - way.probed_at >= period else Finding.PASS
+            due = (
+                now - way.probed_at >= period or count == after + 1
+            )  # the other way may be younger than the last probe
+            return Finding.SUSPECT if suspicious and due else Finding.PASS
 
     def repeats_stop(self, side: Side, topic: str, payload: bytes) -> bool:
         """Whether an emergency stop returns too fast for its sender. Stops are not probed: any payload is one."""
         with self._lock:
             now, key = self._clock(), (side, payload)
-            often = self._way(side, topic).count(payload, now) > _SUSPICIOUS
+            often = self._way(side, topic).count(payload, now) > SUSPICIOUS
             if often and now - self._stops.get(key, float("-inf")) < _STOP_PERIOD_S:
                 return True
             _remember(self._stops, key, now)
@@ -181,8 +187,8 @@ class Cycles:
             log.info("%s circulates from the %s side; another bridge on the same way probes it", topic, side.value)
         else:
             log.error(
-                "%s circulates: something else forwards it from the %s to the %s side. Commands that circulate are not "
-                "forwarded. Remove it from the other bridge (a broker's `connection`), or the other robot with this id",
+                "%s circulates: something else forwards it from the %s to the %s side. Drive commands that circulate "
+                "are not forwarded. Remove it from the other bridge (a broker's `connection`), or the other robot of this id",
                 topic,
                 side.other.value,
                 side.value,

@@ -39,7 +39,7 @@ from pebble.contract import (
 )
 from pebble.errors import PayloadError
 from pebble.forwarding.admission import Admission
-from pebble.forwarding.cycles import Cycles, Finding
+from pebble.forwarding.cycles import STORM, SUSPICIOUS, Cycles, Finding
 from pebble.forwarding.event_buffer import EventBuffer
 from pebble.forwarding.loopback_filter import LoopbackFilter
 from pebble.forwarding.reconciliation import Reconciliation, Resolution
@@ -264,12 +264,18 @@ class Forwarder:
         if subject.is_stop:
             repeated = self._cycles.repeats_stop(side, message.topic, message.payload)
             return Finding.CIRCULATES if repeated else Finding.PASS
-        once, report = subject.kind in ONE_SHOT, subject.kind.direction == OUTGOING
-        return self._cycles.receive(side, message.topic, message.payload, once=once, report=report)
+        once = subject.kind in ONE_SHOT
+        return self._cycles.receive(
+            side, message.topic, message.payload, once=once, runs=subject.runs, after=_after(subject)
+        )
 
     def _note_return(self, side: Side, subject: Subject, message: Message) -> None:
-        """``message`` goes to ``side``; if its topic circulates, it comes back from the other one."""
-        if subject.kind not in ONE_SHOT and (side.other, message.topic) in self._cycles.closed_ways:
+        """``message`` goes to ``side``; if its topic circulates, it comes back from the other one.
+
+        What runs something is noted before it is known whether its topic circulates: its probe is still under way.
+        """
+        circulates = subject.kind not in ONE_SHOT and (side.other, message.topic) in self._cycles.closed_ways
+        if circulates or subject.runs:
             self._returns[side.other].expect(message.topic, message.payload)
 
     # -- the receiving threads
@@ -464,7 +470,7 @@ class Forwarder:
 
     def _publish(self, side: Side, subject: Subject, message: Message, forward: Forward) -> None:
         topic, payload, transport = message.topic, message.payload, self._transports[side]
-        if self._cycles.closed_ways:
+        if subject.runs or self._cycles.closed_ways:
             self._note_return(side, subject, message)
         echoing = not transport.exact_echo and _echo_matters(subject)
         if echoing:
@@ -528,6 +534,19 @@ def _is_json(value: bytes) -> bool:
 
 def _ignore(_message: Message) -> None:
     """A barrier has to subscribe to something."""
+
+
+def _after(subject: Subject) -> int:
+    """How many equal messages within 2 s are not suspicious: of what runs something, none that could run it twice.
+
+    Actions are probed at once. Programs of others need to know of probes on those topics already; on those of other
+    commands they see one only after a repetition.
+    """
+    if subject.kind.direction == OUTGOING:
+        return STORM
+    if subject.kind is Kind.ACTION:
+        return 0
+    return 1 if subject.runs else SUSPICIOUS
 
 
 def _is_late(subject: Subject, message: Message, waited_s: float) -> bool:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cache, cached_property
 
 from pebble.config import Config
-from pebble.contract import CHANNELS, ESTOP, INCOMING, OUTGOING, Channel, Kind
+from pebble.contract import CHANNELS, DRIVE, ESTOP, INCOMING, OUTGOING, Channel, Kind
 from pebble.errors import TransportError
 from pebble.runtime.addresses import Addresses
 from pebble.runtime.process import view_of
@@ -47,6 +47,11 @@ class Subject:
     @cached_property
     def is_stop(self) -> bool:
         return self.channel is ESTOP
+
+    @cached_property
+    def runs(self) -> bool:
+        """Whether the robot does something because of one message: once, although it may circulate."""
+        return self.kind in (Kind.COMMAND, Kind.ACTION) and self.channel is not DRIVE and not self.is_stop
 
 
 class Subjects(dict[str, Subject | None]):

@@ -129,6 +129,32 @@ class TestOthers:
         assert world.robot.payloads("incoming/dance") == [b"1"]
         assert world.operator.payloads("incoming/dance") == [b"1"]
 
+    @pytest.mark.parametrize("carried", ["", "incoming/#"], ids=["one topic", "all topics"])
+    @pytest.mark.parametrize("begins", ["before", "at rest", "after one"])
+    @pytest.mark.parametrize(
+        ("suffix", "at_most"),
+        [
+            *((f"incoming/flags/{name}", 1) for name in ("reboot", "service-restart", "git-pull")),
+            *((f"incoming/{name}", 2) for name in ("dance", "lights-flash", "soundboard-command", "autonomy-command")),
+        ],
+    )
+    def test_what_runs_something_runs_it_once(
+        self, world: World, suffix: str, at_most: int, begins: str, carried: str
+    ) -> None:
+        world.bridge(probe=begins != "before")
+        runs = []
+        for number, payload in enumerate((b"true", b"true", b'{"a": 1}', b"true")):
+            if number == (begins == "after one"):
+                Way(world.local, world.remote, "out", carried or suffix)
+            before = len(world.robot.payloads(suffix))
+            world.send(world.operator, suffix, payload)
+            assert world.rests(100)
+            assert set(world.robot.payloads(suffix)[before:]) == {payload}
+            runs.append(len(world.robot.payloads(suffix)) - before)
+            world.network.now += 3
+        assert max(runs) <= at_most, runs
+        assert runs[2:] == [1, 1]
+
     @pytest.mark.parametrize("direction", ["in", "out", "both"])
     @pytest.mark.parametrize("probe", [True, False])
     def test_flags(self, world: World, direction: str, probe: bool) -> None:
