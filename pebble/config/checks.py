@@ -124,7 +124,7 @@ def _serial(reader: Reader, serial: SerialBridges, path: Path) -> SerialBridges:
 def _serial_line(reader: Reader, line: SerialBridge, path: Path, ports: dict[str, str]) -> None:
     name, port = str(path[-1]), line.serial.port
     if port is None:
-        reader.notes.doubt((*path, "serial", "port"), "is missing, write the device, for example /dev/ttyACM0")
+        reader.notes.doubt((*path, "serial", "port"), "is missing, write the device: ls /dev/serial/by-id/*")
     elif port in ports:
         reader.notes.problem(path, f"shares {port} with {ports[port]}, write another serial.port")
     else:

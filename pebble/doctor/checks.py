@@ -19,7 +19,7 @@ from pathlib import Path
 
 from pebble.config import Config, Mqtt
 from pebble.config.secret_text import shown_user
-from pebble.doctor import Finding, Level
+from pebble.doctor import Finding, Level, device_names
 from pebble.doctor.broker_probe import REFUSED_ID, REFUSED_LOGINS, ProbeResult, probe
 from pebble.doctor.driving import driving
 from pebble.doctor.loudspeaker import loudspeaker
@@ -60,8 +60,8 @@ def _robot(config: Config) -> Iterator[Finding]:
     yield run_directory(run_dir, os.geteuid())
     yield leftover_sockets(run_dir, _is_listening)
     yield state_directory(config.state_dir())
-    for line in config.serial_instances().values():
-        yield serial_port(Path(str(line.serial.port)))
+    for name, line in config.serial_instances().items():
+        yield serial_port(Path(str(line.serial.port)), name)
     if (driveable := driving(config)) is not None:
         yield driveable
     yield from media(config, Path("/dev"))
@@ -270,14 +270,15 @@ def _is_listening(path: Path) -> bool:
     return True
 
 
-def serial_port(path: Path) -> Finding:
-    what = f"serial port {path}"
+def serial_port(path: Path, name: str = "", names: Path = Path("/dev/serial")) -> Finding:
+    """``name``: of the instance in the config; ``names``: the folder with by-id/."""
+    what, key = f"serial port {path}", _port_key(name)
     try:
         found = path.stat()
     except OSError:
-        return Finding(Level.FAIL, what, "does not exist: is the MCU plugged in?", "ls -l /dev/serial/by-id/")
+        return device_names.missing(what, "does not exist: is the MCU plugged in?", key, names)
     if not stat.S_ISCHR(found.st_mode):
-        return Finding(Level.FAIL, what, "is not a device", "correct services.serial_mcu_bridge.serial.port")
+        return Finding(Level.FAIL, what, "is not a device", f"correct {key}")
     if not os.access(path, os.R_OK | os.W_OK):
         group = _group(found.st_gid)
         return Finding(
@@ -286,7 +287,12 @@ def serial_port(path: Path) -> Finding:
             f"may only be used by {group}",
             f"sudo usermod -aG {group} {_user(os.geteuid())}, then log in again",
         )
-    return Finding(Level.OK, what, "readable and writable")
+    return device_names.usable(what, path, "readable and writable", key, names)
+
+
+def _port_key(instance: str) -> str:
+    within = f"instances.{instance}." if instance else ""
+    return f"services.serial_mcu_bridge.{within}serial.port"
 
 
 # -- brokers

@@ -9,9 +9,10 @@ from pathlib import Path
 
 from pebble.config import Config
 from pebble.contract.encodings import NEED_PYAV
-from pebble.doctor import Finding, Level
+from pebble.doctor import Finding, Level, device_names
 from pebble.media import pyav
 
+_DEVICE = "services.av_daemon.video.device"
 _LIBCAMERA = ("rpicam-vid", "libcamera-vid")
 
 Which = Callable[[str], str | None]
@@ -34,16 +35,17 @@ def camera(backend: str, device: str, devices: Path, which: Which) -> Finding:
         return Finding(Level.OK, "camera", "synthetic: needs no device")
     if backend != "v4l2":
         return program("camera", _LIBCAMERA, "sudo apt install rpicam-apps", which)
+    names = devices / "v4l"
     path = devices / f"video{device}" if device.isdecimal() else Path(device)
     if "://" in device:
         return Finding(Level.OK, "camera", "on the network: not checked")
     if not path.exists():
-        return Finding(Level.FAIL, "camera", f"{path} does not exist: is it plugged in?", "ls -l /dev/v4l/by-id/")
+        return device_names.missing("camera", f"{path} does not exist: is it plugged in?", _DEVICE, names)
     if not os.access(path, os.R_OK | os.W_OK):
         return Finding(
             Level.FAIL, "camera", f"{path} is not accessible to this user", "sudo usermod -aG video $USER, log in again"
         )
-    return Finding(Level.OK, "camera", f"{path} readable and writable")
+    return device_names.usable("camera", path, f"{path} readable and writable", _DEVICE, names)
 
 
 def program(what: str, names: tuple[str, ...], fix: str, which: Which) -> Finding:

@@ -34,7 +34,7 @@ class SerialService(Service, ABC):
         super().__init__(*arguments, **options)
         section = self.options
         if section.serial.port is None:
-            raise ConfigError("services.serial_mcu_bridge.serial.port: required, for example /dev/ttyACM0")
+            raise ConfigError("services.serial_mcu_bridge.serial.port: required: ls /dev/serial/by-id/*")
         self.device_log = RateLimitedLog(self.log, burst=20)
         self._input = bytearray()
         self._input_lock = threading.Lock()
