@@ -49,9 +49,11 @@ def _use_utf8() -> None:
 
 
 def _fail(*lines: str) -> int:
+    from pebble.config.visible import shown
+
     with suppress(OSError):  # nowhere to write it to
         for line in lines:
-            sys.stderr.write(f"pebble: {line}\n")
+            sys.stderr.write(f"pebble: {shown(line)}\n")
     return 1
 
 

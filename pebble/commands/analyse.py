@@ -113,7 +113,7 @@ def _print(traffic: Traffic, written: list[Path]) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    from pebble.commands.show import printable
+    from pebble.config.visible import shown
     from pebble.recordings.traffic.report import remarks
 
     table = Table(box=box.SIMPLE_HEAD)
@@ -123,12 +123,12 @@ def _print(traffic: Traffic, written: list[Path]) -> None:
             heading, justify="left" if is_name else "right", no_wrap=True, min_width=8 if is_name else None
         )
     for robot in traffic.robots:
-        table.add_row(Text(printable(robot.robot.rpartition("/")[2])), *_cells(robot))
+        table.add_row(Text(shown(robot.robot.rpartition("/")[2])), *_cells(robot))
     console = Console()
     console.print(table)
     console.print("Medians: latency of heartbeats in ms, video and audio in kbit/s.", style="dim", soft_wrap=True)
     for remark in remarks(traffic):
-        console.print(printable(remark), markup=False, highlight=False, soft_wrap=True)
+        console.print(shown(remark), markup=False, highlight=False, soft_wrap=True)
     for path in written:
         console.print(f"Written: {path}", style="dim", markup=False, highlight=False, soft_wrap=True)
 

@@ -16,9 +16,9 @@ from pebble.client.driver_lease import ANSWER_S, DriverLease
 from pebble.client.key_decoder import END, KeyDecoder
 from pebble.client.key_gesture import PERIOD_S, KeyGesture
 from pebble.client.terminal_driver import TerminalDriver
-from pebble.commands import show
 from pebble.commands.estop import me
 from pebble.commands.options import CaCert, ConfigOption, PasswordFile, RemoteOption, UrlOption
+from pebble.config.visible import shown
 from pebble.media.in_flight import InFlight
 from pebble.transports import Message, QoS, State, Transport
 from pebble.transports.clock import since_boot as clock
@@ -139,7 +139,7 @@ class _Loop:
             self._show(terminal, now)
 
     def _show(self, terminal: Terminal, now: float) -> None:
-        line = show.printable(self._driver.status())
+        line = shown(self._driver.status())
         self._shown_at = now
         if line != self._shown:
             self._shown = line

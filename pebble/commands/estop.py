@@ -23,6 +23,7 @@ from pebble.client.estop_states import Reset, RobotEstop
 from pebble.client.names import id_of
 from pebble.commands import show
 from pebble.commands.options import CaCert, ConfigOption, PasswordFile, RemoteOption, UrlOption
+from pebble.config.visible import shown
 from pebble.contract import CAPABILITIES, ESTOP_STATE, ONLINE, STATUS
 from pebble.errors import PebbleError, TransportError
 from pebble.runtime.signals import interrupted_by_signals
@@ -209,7 +210,7 @@ class _Report:
                 line += f"; its status says: {robot.driveable.doubt}"
             if self._lines.get(base) != line:
                 self._lines[base] = line
-                _echo(show.printable(f"{id_of(base)}: {line}"))
+                _echo(shown(f"{id_of(base)}: {line}"))
 
 
 def _echo(line: str, *, err: bool = False) -> None:
@@ -243,7 +244,7 @@ def _line(robot: RobotStop, *, patient: bool) -> str:
 
 def _reset(target: Target) -> int:
     with connected(target) as (transport, names):
-        robot, name = RobotEstop(names.base), show.printable(id_of(names.base))
+        robot, name = RobotEstop(names.base), shown(id_of(names.base))
         robot.subscribe(transport)
         _wait(lambda: robot.has_capabilities and len(robot.states) >= len(robot.owners))
         if not robot.states:
@@ -259,7 +260,7 @@ def _reset(target: Target) -> int:
                 raise TransportError(f"the reset was not sent: {transport.problem or 'the connection was lost'}")
         _wait(lambda: not reset.waiting)
         for owner, why in reset.refusals().items():
-            raise PebbleError(show.printable(f"{name} is still stopped: {owner}: {why}; look again, then repeat"))
+            raise PebbleError(shown(f"{name} is still stopped: {owner}: {why}; look again, then repeat"))
     typer.echo(f"{name}: free; it moves again once drive commands have paused for half a second")
     return 0
 
@@ -305,7 +306,7 @@ def _print_states(robot: RobotEstop, driveable: Driveable | None = None, *, sile
     if driveable is not None and driveable.doubt:
         lines.append(f"{name}: {driveable.doubt}")
     for line in lines:
-        typer.echo(show.printable(line))
+        typer.echo(shown(line))
 
 
 def _absent(robot: RobotEstop) -> str:

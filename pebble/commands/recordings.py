@@ -20,6 +20,7 @@ from rich.table import Table
 
 from pebble.client.names import base_of
 from pebble.commands import show
+from pebble.config.visible import shown
 from pebble.errors import PebbleError
 from pebble.recordings import catalogue
 from pebble.recordings.catalogue import FileInfo, Query
@@ -127,10 +128,10 @@ def info(places: Places, since: Since = None, until: Until = None) -> None:
         typer.echo(f"{missing:,} messages are missing: files were damaged")
     for robot in sorted(set().union(*(one.robots for one in looked))):
         count = sum(number for topic, number in topics.items() if topic.startswith(f"{robot}/"))
-        typer.echo(f"\n{_one_line(show.printable(robot))}: {count:,} messages")
+        typer.echo(f"\n{_one_line(shown(robot))}: {count:,} messages")
         own = Counter({topic[len(robot) + 1 :]: n for topic, n in topics.items() if topic.startswith(f"{robot}/")})
         for topic, number in own.most_common(_SHOWN_TOPICS):
-            typer.echo(f"  {number:>10,}  {_one_line(show.printable(topic))}")
+            typer.echo(f"  {number:>10,}  {_one_line(shown(topic))}")
         if len(own) > _SHOWN_TOPICS:
             typer.echo(f"  … and {len(own) - _SHOWN_TOPICS} topics more")
     _print_events(one.path for one in looked)
@@ -154,7 +155,7 @@ def search(
             continue
         flag = " (retained)" if message.channel.metadata.get("retained") else ""
         line = _one_line(show.body(message.payload, _ONE_LINE))
-        topic_ = _one_line(show.printable(message.channel.topic))
+        topic_ = _one_line(shown(message.channel.topic))
         typer.echo(f"{_local(message.log_ns, fraction=True)}  {topic_}{flag}  {line}")
         found += 1
         if found == count:
@@ -286,7 +287,7 @@ def rm(
         for entry in entries
         if (one := span(entry.path)) and one.last_ns >= since_ns and one.first_ns < until_ns
     ]
-    what = f"{show.printable(base)} " if base else "everything "
+    what = f"{shown(base)} " if base else "everything "
     if not yes and not typer.confirm(f"Delete {what}from {len(due)} files in {folder}?"):
         return 1
     deleted = 0
@@ -311,7 +312,7 @@ def _finish_all(folder: Folder) -> int:
             path.rename(finished_path(path))
             sync_folder(path.parent)
         except (PebbleError, OSError) as error:
-            typer.echo(f"pebble: {path.name}: {show.printable(str(error))}", err=True)
+            typer.echo(f"pebble: {path.name}: {shown(str(error))}", err=True)
             failed += 1
             continue
         lost = f", {made.missing:,} missing" if made.missing else ""
@@ -354,8 +355,8 @@ def _lane(path: Path) -> str:
     """``state`` or ``media of goob``, from the name of a recorder's file; else that name."""
     parts = path.name.removesuffix(".active").removesuffix(".mcap").split(".", 1)
     if len(parts) == 1:
-        return show.printable(path.name)
-    return show.printable(f"media of {parts[1].rpartition('.')[2]}" if parts[1].startswith("media.") else parts[1])
+        return shown(path.name)
+    return shown(f"media of {parts[1].rpartition('.')[2]}" if parts[1].startswith("media.") else parts[1])
 
 
 def _state(one: FileInfo) -> str:
@@ -376,7 +377,7 @@ def _print_events(paths: Iterable[Path]) -> None:
         if isinstance(since, int) and isinstance(until, int):
             event["lasted"] = show.duration(max(0.0, (until - since) / 1e3))
         details = _one_line(", ".join(f"{key} {value}" for key, value in event.items()))
-        typer.echo(f"  {_local(at * 10**6)}  {show.printable(f'{name}: {details}')}")
+        typer.echo(f"  {_local(at * 10**6)}  {shown(f'{name}: {details}')}")
 
 
 def _export(form: Form, messages: Iterable[Recorded], target: Path, robot: str, on_time: Callable[[int], None]) -> str:
@@ -406,7 +407,7 @@ def _import(found: Iterable[Imported | BadLine], writer: McapWriter) -> Counter[
         if isinstance(one, BadLine):
             counted["bad"] += 1
             if counted["bad"] <= 3:
-                typer.echo(f"pebble: line {one.number}: {show.printable(one.problem)}", err=True)
+                typer.echo(f"pebble: line {one.number}: {shown(one.problem)}", err=True)
             continue
         encoding = "json" if one.payload[:1] in (b"{", b"[") else "application/octet-stream"
         key = (one.topic, encoding, tuple(one.metadata.items()))
@@ -421,7 +422,7 @@ def _import(found: Iterable[Imported | BadLine], writer: McapWriter) -> Counter[
 def _only_robot(paths: list[Path]) -> str:
     robots = set[str]().union(*(catalogue.look_at(path).robots for path in paths))
     if len(robots) != 1:
-        names = ", ".join(sorted(show.printable(robot) for robot in robots)) or "none"
+        names = ", ".join(sorted(shown(robot) for robot in robots)) or "none"
         raise PebbleError(f"whose pictures and sound is not clear: add --robot ({names})")
     return robots.pop()
 

@@ -18,8 +18,8 @@ from pebble.client.connection import password
 from pebble.client.key_decoder import END, LEFT, RIGHT, SPACE, KeyDecoder
 from pebble.client.names import id_of
 from pebble.client.url import settings_of
-from pebble.commands import show
 from pebble.commands.options import CaCert, PasswordFile
+from pebble.config.visible import shown
 from pebble.errors import PebbleError
 from pebble.recordings.catalogue import look_at
 from pebble.recordings.library import files
@@ -145,7 +145,7 @@ def replay(
             loop=loop,
             paused=paused,
         )
-        typer.echo(f"{', '.join(show.printable(one) for one in rules.robots)}{': ' + _KEYS if terminal else ''}")
+        typer.echo(f"{', '.join(shown(one) for one in rules.robots)}{': ' + _KEYS if terminal else ''}")
         sys.stdout.flush()
         if terminal:
             stack.enter_context(console.keys())
@@ -179,9 +179,9 @@ def _confirm(rules: Rules) -> None:
     """Ask for each robot's id. Raises PebbleError for any other answer."""
     for base in rules.robots:
         name = id_of(base).rpartition("/")[2]
-        answer = typer.prompt(f"Type {show.printable(name)} to send the recorded actions to {show.printable(base)}")
+        answer = typer.prompt(f"Type {shown(name)} to send the recorded actions to {shown(base)}")
         if answer.strip() != name:
-            raise PebbleError(f"{show.printable(base)}: not confirmed")
+            raise PebbleError(f"{shown(base)}: not confirmed")
 
 
 def _maker(kind: str, settings: object) -> Callable[[str, Message | None], Transport]:
@@ -270,7 +270,7 @@ class _Console:
         """Where there is no status line, a line for each change."""
         if problem != self._problem:
             self._problem = problem
-            typer.echo(f"pebble: {show.printable(problem) or 'it goes on'}", err=True)
+            typer.echo(f"pebble: {shown(problem) or 'it goes on'}", err=True)
 
     def _on_signal(self, number: int, _frame: object) -> None:
         self.ended = self.ended or signal.Signals(number).name
@@ -300,7 +300,7 @@ class _Console:
     def _show(self, terminal: Terminal, player: Player, robots: ReplayedRobots) -> None:
         if (now := time.monotonic()) - self._shown_at >= _SHOW_PERIOD_S:
             self._shown_at = now
-            terminal.show(show.printable(status(player, robots.problem)))
+            terminal.show(shown(status(player, robots.problem)))
 
 
 def status(player: Player, problem: str) -> str:

@@ -13,8 +13,8 @@ import typer
 from pebble.client.connection import Target, connected, target_of
 from pebble.client.names import id_of
 from pebble.client.scripts import RobotScripts, options_of
-from pebble.commands import show
 from pebble.commands.options import CaCert, ConfigOption, PasswordFile, RemoteOption, UrlOption
+from pebble.config.visible import shown
 from pebble.contract.payloads import AutonomyStatus
 from pebble.errors import PebbleError, TransportError
 from pebble.transports import Transport
@@ -93,11 +93,11 @@ def start(
         if scripts.answers == answers or status is None:
             raise PebbleError(f"no answer within {_ANSWER_S:g} s: is the robot up?")
         if not _runs(before, status, file):
-            raise PebbleError(show.printable(status.error or f"{file} does not run"))
+            raise PebbleError(shown(status.error or f"{file} does not run"))
         _print_status(status)
         _wait(lambda: _ended(scripts.status), _FIRST_SECOND_S)
         if scripts.status is not None and _ended(scripts.status) and scripts.status.error:
-            raise PebbleError(show.printable(scripts.status.error))
+            raise PebbleError(shown(scripts.status.error))
     return 0
 
 
@@ -146,7 +146,7 @@ def _scripts(robot: str, options: Target) -> Iterator[tuple[Transport, RobotScri
         scripts = RobotScripts(names)
         scripts.subscribe(transport)
         _wait(lambda: scripts.files is not None and scripts.status is not None, 1.0)
-        yield transport, scripts, show.printable(id_of(names.base))
+        yield transport, scripts, shown(id_of(names.base))
 
 
 def _answered(before: AutonomyStatus | None, now: AutonomyStatus | None, file: str, elapsed: float) -> bool:
@@ -197,7 +197,7 @@ def _option(one: dict[str, Any]) -> str:
 
 
 def _print(line: str) -> None:
-    typer.echo(show.printable(line))
+    typer.echo(shown(line))
 
 
 def _wait(condition: Callable[[], bool], seconds: float = _ANSWER_S) -> None:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 import math
 import os
-import re
 import statistics
 from itertools import pairwise
 from typing import Any, TextIO
 
 from pebble.client.estop_states import RobotEstop
 from pebble.client.names import Names, id_of
+from pebble.config.visible import shown
 from pebble.contract import codec
 from pebble.contract.identity import parse_topic
 from pebble.contract.payloads import EstopState
@@ -23,12 +23,6 @@ _WINDOW = 1000
 _DUMPED = 32  # bytes of a binary payload that are shown
 #: Binary payloads by their first bytes.
 RECOGNISERS = {b"PBAT": "PBAT sound", b"PBVD": "PBVD picture", b"\xff\xd8": "JPEG picture"}
-_control = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]").sub
-
-
-def printable(text: str) -> str:
-    """``text`` with control characters escaped: a payload must not control the terminal."""
-    return _control(lambda found: f"\\u{ord(found[0]):04x}", text)
 
 
 def discard_output(stream: TextIO) -> None:
@@ -43,10 +37,10 @@ def body(payload: bytes, width: int) -> str:
     plain = parsed(payload)
     if plain is not None:
         line = json.dumps(plain, ensure_ascii=False)
-        return printable(line if len(line) <= width else json.dumps(plain, ensure_ascii=False, indent=2))
+        return shown(line if len(line) <= width else json.dumps(plain, ensure_ascii=False, indent=2))
     known = recognised(payload)
     if known is None and _is_text(payload):
-        return printable(payload.decode())
+        return shown(payload.decode())
     return f"{known or 'binary'}, {len(payload)} bytes\n{hex_dump(payload[:_DUMPED], width)}"
 
 
@@ -78,7 +72,7 @@ def hex_dump(raw: bytes, width: int) -> str:
 
 def headline(message: Message, now: float) -> str:
     """Topic, size, QoS, whether it is retained, and its age by the payload's stamp. ``now``: epoch seconds."""
-    parts = [printable(message.topic), f"{len(message.payload)} B", f"qos {int(message.qos)}"]
+    parts = [shown(message.topic), f"{len(message.payload)} B", f"qos {int(message.qos)}"]
     if message.retain:
         parts.append("retained")
     elif message.retain_requested:
@@ -194,10 +188,10 @@ def print_listing(listing: Listing, now: float, wall: float) -> None:
         address = parse_topic(topic)
         if address is not None and address.identity.base != base:
             base = address.identity.base
-            table.add_row(Text(printable(base), style="bold"))
-        shown = topic if address is None else f"  {address.direction}/{address.metric}"
+            table.add_row(Text(shown(base), style="bold"))
+        name = topic if address is None else f"  {address.direction}/{address.metric}"
         kind, style = _kind(listing.names, topic)
-        table.add_row(Text(printable(shown)), *_cells(listing.records[topic], now, wall), Text(kind, style=style))
+        table.add_row(Text(shown(name)), *_cells(listing.records[topic], now, wall), Text(kind, style=style))
     console.print(table)
     if listing.omitted:
         console.print(f"omitted: {listing.omitted} messages of further topics")
@@ -217,7 +211,7 @@ def stopped_robots(listing: Listing, wall: float) -> list[str]:
 def stopped_line(robot: RobotEstop, wall: float) -> str:
     """``goob is stopped by ann@desk, 3 min ago: a dog``; empty if it is not stopped."""
     state = robot.stopped_by
-    return "" if state is None else f"{printable(id_of(robot.base))} is {stopped(state, wall)}"
+    return "" if state is None else f"{shown(id_of(robot.base))} is {stopped(state, wall)}"
 
 
 def stopped(state: EstopState, wall: float) -> str:

@@ -17,6 +17,7 @@ from pebble.client.names import Names, id_of
 from pebble.commands import show
 from pebble.commands.draft import Draft, draft
 from pebble.commands.options import CaCert, ConfigOption, PasswordFile, RemoteOption, UrlOption
+from pebble.config.visible import shown
 from pebble.contract import DRIVE, codec
 from pebble.contract.identity import parse_topic
 from pebble.errors import PayloadError, PebbleError, TransportError
@@ -259,7 +260,7 @@ def _refuse_stopped(robot: RobotEstop | None) -> None:
     if robot is not None and robot.stopped_by is not None:
         raise PebbleError(
             f"{show.stopped_line(robot, time.time())}; it is not driven (--force publishes anyway). "
-            f"To end the stop: pebble estop reset {show.printable(id_of(robot.base))}, with the same --url or --config"
+            f"To end the stop: pebble estop reset {shown(id_of(robot.base))}, with the same --url or --config"
         )
 
 

@@ -14,6 +14,7 @@ import typer
 
 from pebble.config import load
 from pebble.config.config import default_state_folder
+from pebble.config.visible import shown
 from pebble.errors import PebbleError
 from pebble.fleet.audit import Audit
 from pebble.fleet.people import People
@@ -73,14 +74,9 @@ def audit(
         until = time.strftime("%H:%M:%S", time.localtime(entry.last))
         what = entry.what if entry.count == 1 else f"{entry.what} × {entry.count:,} until {until}"
         texts = (what, entry.ref, entry.user, entry.device, entry.address, entry.detail)
-        table.add_row(at, *(Text(_visible(text)) for text in texts))
+        table.add_row(at, *(Text(shown(text).replace("\n", "\\u000a")) for text in texts))
     Console(highlight=False).print(table)
     return 0
-
-
-def _visible(text: str) -> str:
-    """On one line, and each character that controls a terminal or hides text by its code: strangers chose it."""
-    return "".join(char if char.isprintable() else f"\\u{ord(char):04x}" for char in text)
 
 
 # -- people

@@ -181,7 +181,7 @@ class MqttBridge(ServiceSection, frozen=True, kw_only=True):
 class SerialPort(Section, frozen=True, kw_only=True):
     """The line to the MCU."""
 
-    port: Annotated[Device | None, doc("Device, from `ls /dev/serial/by-id/*`; required where the bridge is enabled.")] = (
+    port: Annotated[Device | None, doc("Device: `ls /dev/serial/by-id/*`; required where the bridge is enabled.")] = (
         None
     )
     baud: Annotated[int, Meta(ge=50, le=12_000_000, description="Bits per second; must be the firmware's.")] = 115200

@@ -188,7 +188,7 @@ class Cycles:
         else:
             log.error(
                 "%s circulates: something else forwards it from the %s to the %s side. Drive commands that circulate "
-                "are not forwarded. Remove it from the other bridge (a broker's `connection`), or the other robot of this id",
+                "are not forwarded. Remove it from the other bridge (a broker's `connection`), or the other robot",
                 topic,
                 side.other.value,
                 side.value,

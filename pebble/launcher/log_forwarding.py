@@ -13,6 +13,7 @@ from typing import Self
 
 from pebble.config.secret_text import without_secrets
 from pebble.config.tree import LogsSection
+from pebble.config.visible import shown
 from pebble.contract.payloads import LogRecord
 from pebble.runtime.parent import TAG
 
@@ -137,7 +138,7 @@ class LevelReader:
 
 def text_of(line: bytes) -> str:
     """A line as text, whatever bytes are in it; without logins, which programs of others may print."""
-    return without_secrets(line.decode(errors="replace").rstrip())
+    return shown(without_secrets(line.decode(errors="replace").rstrip()))
 
 
 def _known(level: str) -> str | None:

@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 from pebble.config import LAUNCHER_LOCK
 from pebble.config.secret_text import without_secrets
+from pebble.config.visible import shown
 
 #: A pipe to the launcher: "READY" once, "ALIVE" every second, and the other notes of :class:`Notifier`.
 NOTIFY_FD = "PEBBLE_NOTIFY_FD"
@@ -41,10 +42,10 @@ def set_up_logging(level: str) -> None:
 
 
 class MaskingFormatter(logging.Formatter):
-    """Hides logins in lines and tracebacks, whatever program or library they come from."""
+    """Hides logins in lines and tracebacks, whatever program or library they come from, and what steers a terminal."""
 
     def format(self, record: logging.LogRecord) -> str:
-        return without_secrets(super().format(record))
+        return shown(without_secrets(super().format(record)))
 
 
 def set_log_level(level: str) -> None:

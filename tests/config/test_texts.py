@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import json
+import logging
 import os
 import subprocess
 import sys
@@ -16,7 +17,9 @@ import pytest
 from pebble.config import load, resolved
 from pebble.config.secret_text import without_secrets
 from pebble.config.text_files import NotTextError, text_of
+from pebble.config.visible import shown
 from pebble.errors import ConfigError
+from pebble.runtime.parent import MaskingFormatter
 from tests.support import ROOT
 
 SECRET = "s3cr3t"
@@ -223,3 +226,28 @@ def _is_text(call: ast.Call) -> bool:
     ]
     is_file = isinstance(call.func, ast.Name) or (isinstance(call.func, ast.Attribute) and len(call.args) == 0)
     return name == "open" and is_file and any(mode in ("r", "w", "a", "x", "r+", "w+") for mode in modes)
+
+
+@pytest.mark.parametrize(
+    ("text", "seen"),
+    [
+        ("goob\u202ebmal", "goob\\u202ebmal"),  # all after it would be drawn backwards
+        ("a\u2066b\u2069", "a\\u2066b\\u2069"),
+        ("a\u200fb\u061c", "a\\u200fb\\u061c"),
+        ("go\u200bob\u00ad", "go\\u200bob\\u00ad"),
+        ("\ufeffgoob", "\\ufeffgoob"),
+        ("a\U000e0041", "a\\U000e0041"),
+        ("a\u3164b\u2028", "a\\u3164b\\u2028"),
+        ("\x1b[2J\x1b]0;title\x07", "\\u001b[2J\\u001b]0;title\\u0007"),
+        ("\x9b2J\r\x00\x7f", "\\u009b2J\\u000d\\u0000\\u007f"),
+        ("\ud83d", "\\ud83d"),  # half a character
+        ("robot Käfer 机器人 روبات", "robot Käfer 机器人 روبات"),
+        *((word, word) for word in ("👩\u200d🚀 ❤\ufe0f", "می\u200cخو")),  # parts of what is seen
+        ("no\u00a0break\tand\nlines", "no\u00a0break\tand\nlines"),
+    ],
+)
+def test_what_is_not_seen_or_steers_a_terminal_is_shown_by_its_code(text: str, seen: str) -> None:
+    assert shown(text) == seen
+    assert shown(f"x {text}") == f"x {seen}"
+    record = logging.LogRecord("a", logging.INFO, "", 0, "%s", (text,), None)
+    assert MaskingFormatter("%(message)s").format(record) == seen

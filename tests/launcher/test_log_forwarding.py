@@ -144,6 +144,10 @@ def test_a_line_becomes_text_without_its_end() -> None:
     assert [text_of(line) for line in (b"two\r", b"", b"  three  ")] == ["two", "", "  three"]
 
 
+def test_what_a_program_writes_does_not_steer_the_terminal() -> None:
+    assert text_of(b"\x1b[2Jgone\x07 \xe2\x80\xae.\r\n") == "\\u001b[2Jgone\\u0007 \\u202e."
+
+
 def test_bytes_that_are_no_text_are_replaced() -> None:
     assert text_of(b"a\xff\xfeb") == "a\ufffd\ufffdb"
 
