@@ -157,7 +157,12 @@ def _of_config(file: Path, options: dict[str, Any], folder: Path | None) -> tupl
         tls = WebTls(certificate=folder / SERVER_CERT, key=folder / SERVER_KEY, ca=folder / CA_CERT)
         web = msgspec.structs.replace(web, tls=tls)
     allowed = msgspec.structs.replace(web, plain_http=True)  # what is missing is reported with the commands for it
-    return settings_or_all_problems(msgspec.structs.replace(config, web_interface=allowed)), web.plain_http
+    settings = settings_or_all_problems(msgspec.structs.replace(config, web_interface=allowed))
+    # `pebble web user add ann` does not know the config: its people count until the robot's own page has some.
+    shared = default_folder() / PEOPLE
+    if settings.login and web.people is None and not _has_user(settings.people) and _has_user(shared):
+        settings = replace(settings, people=shared)
+    return settings, web.plain_http
 
 
 def _has_certificate(folder: Path) -> bool:
@@ -174,8 +179,14 @@ def _missing(settings: WebSettings, *, plain: bool, empty: bool) -> list[str]:
     if not settings.login and not empty:
         return []
     missing = [] if (settings.certificate is not None or plain) and not empty else ["certificate"]
-    with opened(settings.people) as database:
-        return missing if database.list() else [*missing, "user"]
+    return missing if _has_user(settings.people) else [*missing, "user"]
+
+
+def _has_user(people: Path | None) -> bool:
+    if people is None or not people.exists():
+        return False
+    with opened(people) as database:
+        return bool(database.list())
 
 
 def _print_missing(settings: WebSettings, missing: list[str], folder: Path) -> None:
@@ -222,6 +233,8 @@ def _run(settings: WebSettings) -> int:
 
 def _print_ready(settings: WebSettings, url: str) -> None:
     typer.echo(f"The operator page is at {url} (Ctrl-C ends it)")
+    if settings.login:
+        typer.echo(f"Who may log in is in {settings.people}")
     if settings.authority is not None and settings.authority.is_file():
         show = f"pebble cert show --folder {settings.authority.parent}"
         typer.echo(f"Browsers must trust {url}ca.pem once; `{show}` explains how")

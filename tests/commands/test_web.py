@@ -123,6 +123,40 @@ def test_the_same_from_a_config(run: Run, served: list[WebSettings], tmp_path: P
     assert served[0].login
 
 
+@pytest.mark.parametrize("order", ["user first", "certificate first"])
+@pytest.mark.parametrize(
+    ("added", "counts"),
+    [
+        ([()], "state/pebble/web"),  # as docs/operator-page.md has it
+        ([("--config", "r.json")], "robot"),
+        ([(), ("--config", "r.json")], "robot"),
+        ([("--people", "other.sqlite")], ""),
+    ],
+    ids=["of this user", "of the robot", "of both", "of neither"],
+)
+def test_whose_people_may_use_the_page_of_a_config(
+    run: Run,
+    served: list[WebSettings],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    added: list[tuple[str, ...]],
+    counts: str,
+    order: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    made = config_file(tmp_path, transport={"kind": "mqtt", "state_dir": str(tmp_path / "robot")}, **BROKER)
+    Path(made).rename("r.json")
+    if order == "certificate first":
+        assert run("cert", "init", "lab.local") == 0
+    for number, options in enumerate(added):
+        give(monkeypatch, f"{SECRET}\n")
+        assert run("web", "user", "add", f"ann{number}", *options) == 0, run.err
+    if order == "user first":
+        assert run("cert", "init", "lab.local") == 0
+    assert run("web", "r.json", "--host", "0.0.0.0") == (0 if counts else 2), run.err
+    assert [settings.people for settings in served] == ([tmp_path / counts / "people.sqlite"] if counts else [])
+
+
 def test_plain_http_for_others_is_a_matter_of_the_config(run: Run, served: list[WebSettings], tmp_path: Path) -> None:
     people = People(tmp_path / "people.sqlite")
     people.add("alice", SECRET, Role.VIEWER)
