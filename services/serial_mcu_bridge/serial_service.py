@@ -113,6 +113,7 @@ class SerialService(Service, ABC):
         idle, (opened, heard) = now - line.sent_until >= CHECK_S, self._heard
         heard = heard if opened == line.opened else 0
         state, silent_ms = self._silence.check(line.state, line.opened, heard, now, idle=idle)
+        line.reports_at_rest = self._silence.reports_at_rest
         misread = silent_ms is None and line.state is LineState.READY and line.received > 0
         found = state, silent_ms, _MISREAD if misread and self._misread else line.problem
         self._misread = misread  # a line may be under way

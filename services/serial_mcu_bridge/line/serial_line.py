@@ -19,6 +19,7 @@ log = logging.getLogger(__name__)
 
 _FIRST_RETRY_S, _LAST_RETRY_S = 0.1, 1.0
 _RETRY_WRITE_S = 0.002  # while bytes are being sent; a drive line takes 1.4 ms at 115200 baud
+_UNREAD_S = 1.0  # without a report, from a board that reports at rest
 _STALL_S = 1.0  # a device that accepts nothing for so long is closed and opened again
 _DRAIN_S = 0.3  # for the last stop line to be sent
 _PATH_CHECK_S = 1.0
@@ -44,6 +45,10 @@ class SerialLine:
     ``stop`` is the line that stops the motors, empty where there are none; ``drive_timeout_s`` the age at which a drive
     line expires. ``end`` is what ends a text line, or a frame; empty where nothing is ever sent.
     ``retry_s`` is the longest wait between two attempts to open the device.
+
+    A pseudo-terminal hides how much its reader has left unread. There a device that ``reports_at_rest`` gets a stop
+    instead of drive lines once it has been silent for 1 s, and nothing more until it is heard: else it might obey
+    commands that are minutes old.
     """
 
     def __init__(
@@ -63,6 +68,8 @@ class SerialLine:
         self.path, self.baud = path, baud
         self.opened = 0  # how often the device was opened
         self.refused = 0  # lines refused because there was no device
+        self.unread = 0  # drive lines that were not sent, because earlier ones were probably not read
+        self.reports_at_rest = False  # set by the owner, who knows the protocol
         self.received = 0  # chunks of bytes from the device since it was opened and has booted
         self.outbox = Outbox(stop, drive_timeout_s)
         self._stop, self._boot_s, self._read_timeout = stop, boot_s, read_timeout_s
@@ -76,6 +83,8 @@ class SerialLine:
         self._closing = False
         self._port: Port | None = None
         self._failure: DeviceError | None = None  # raised while writing on a caller's thread
+        self._received_at = 0.0
+        self._stopped_unread = False
         self._sending = b""  # lines, or the rest of one, not yet written to the kernel
         self._busy_until = 0.0  # when all written bytes have had time to be sent
         self._blocked_since: float | None = None
@@ -106,6 +115,9 @@ class SerialLine:
 
         One that could not be sent for ``valid_s``, or for ``drive_timeout_s``, becomes a stop.
         """
+        if self._may_be_unread():
+            self.unread += 1
+            return self._stop_unread()
         return self._hand_over(lambda now: self.outbox.drive(line, now, valid_s), line if valid_s > 0 else b"")
 
     def halt(self) -> bool:
@@ -136,6 +148,19 @@ class SerialLine:
         os.close(self._wakeup_write)
 
     # -- any thread
+
+    def _may_be_unread(self) -> bool:
+        port = self._port
+        hidden = port is not None and port.hides_queue and self.reports_at_rest and self._state is LineState.READY
+        return hidden and time.monotonic() - self._received_at > _UNREAD_S
+
+    def _stop_unread(self) -> bool:
+        """Send one stop in place of all drive lines until the device is heard again."""
+        if self._stopped_unread:
+            return True
+        self._stopped_unread = True
+        log.warning("%s: silent for %g s, and perhaps not read: stopped until it reports again", self.path, _UNREAD_S)
+        return self.halt()
 
     def _hand_over(self, place: Callable[[float], None], line: bytes) -> bool:
         """Write ``line`` at once, on the caller's thread, or ``place`` it in the outbox if it has to wait."""
@@ -255,12 +280,17 @@ class SerialLine:
     def _receive(self, chunk: bytes) -> None:
         if chunk and self._state is LineState.READY:
             self.received += 1
+            self._received_at, self._stopped_unread = time.monotonic(), False
             self._on_bytes(chunk)
 
     def _become_ready(self) -> None:
         with self._lock:
             self._sending += self._stop
+            self._received_at, self._stopped_unread = time.monotonic(), False
+            hidden = self._port is not None and self._port.hides_queue
         self._set_state(LineState.READY)
+        if hidden and self._stop:
+            log.info("%s is a pseudo-terminal: a reader that stands still may obey drive lines late", self.path)
 
     def _write_waiting(self, now: float) -> None:
         """Write what waits; raise DeviceError for a device that accepts nothing. Lock held."""
