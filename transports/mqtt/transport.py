@@ -20,7 +20,7 @@ from pebble.transports.mqtt import client_ids
 from pebble.transports.mqtt.bridge_mode import Attempt, BridgeMode, Result
 from pebble.transports.mqtt.broker_limits import EVERYTHING, BrokerLimits, Limits
 from pebble.transports.mqtt.client import Opening
-from pebble.transports.mqtt.connection import Connection, Lost, Refused, Silent, ignore
+from pebble.transports.mqtt.connection import Absent, Connection, Lost, Refused, Silent, ignore
 from pebble.transports.mqtt.filters import BrokerFilters, OwnMessageFilter, overlap
 from pebble.transports.mqtt.outgoing import PendingAck
 from pebble.transports.mqtt.retention import RetentionCheck
@@ -190,8 +190,10 @@ class MqttTransport(Transport):
             try:
                 self._run_connection(stopping)
             except Lost as lost:
-                self.was_ended = not isinstance(lost, Silent)  # else it may be we who stood still
-                self._broker_stalled |= not self.was_ended
+                silent = isinstance(lost, Silent)  # then it may be we who stood still
+                held = self._state is State.CONNECTED
+                self.was_ended = not silent if held else self.was_ended and isinstance(lost, Absent)
+                self._broker_stalled |= silent
                 problem = str(lost)
             except Exception:  # any error must lead to a reconnect, never end the thread
                 log.exception("%s: unexpected failure of the connection", self.client_id)

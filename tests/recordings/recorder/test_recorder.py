@@ -279,6 +279,31 @@ class TestDisk:
         running.stop()
         assert len(payloads(running.root)) >= 5
 
+    @needs_root
+    @pytest.mark.parametrize("fault", ["full", "removed", "unmounted", "another disk", "read-only"])
+    def test_a_disk_that_fails_for_a_while_costs_what_comes_meanwhile_and_no_more(
+        self, tmp_path: Path, fault: str, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        disk = SmallDisk(tmp_path / "disk", mebibytes=1)
+        disk.mount()
+        root = disk.root / "rec"
+        running = Running(root)
+        try:
+            running.send(20)
+            assert running.written(20)
+            with FAULTS[fault](disk):
+                assert until(lambda: running.send(5, payload=b"%d " + random.Random(1).randbytes(20_000)) or (
+                    running.recorder.blocked or running.recorder.counters["event_removed"]), 20, step=0.05)
+                assert (disk.root / "rec" / "recorder.lock").exists() or True
+            done = running.sent
+            assert until(lambda: not running.recorder.blocked and Folder.is_in_use(root), 10)
+            running.send(10)
+            assert until(lambda: {b"%d" % n for n in range(done, done + 10)} <= {*payloads(root)}, 10)
+        finally:
+            running.stop()
+        assert caplog.text
+        disk.close()
+
     def test_a_file_that_cannot_be_opened_costs_what_comes_meanwhile_and_no_more(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
