@@ -39,6 +39,7 @@ class Database:
         self._path, self._tables, self._upgrade = path, tables, upgrade
         self._own: OwnFile | None = None
         self._beside: list[tuple[Path, OwnFile]] = []
+        self._closed = True
         self.opened = 0  # files so far
         try:
             self._open()
@@ -73,10 +74,8 @@ class Database:
 
     def _current(self) -> sqlite3.Connection:
         if self._own is not None and self._own.replaced:
-            self._connection.close()
-            for path, beside in self._beside:  # SQLite would read it as changes of the new file
-                if beside.in_place:
-                    path.unlink()
+            self._close()
+        if self._closed:
             self._open()
         return self._connection
 
@@ -96,6 +95,15 @@ class Database:
     def close(self) -> None:
         self._connection.close()
 
+    def _close(self) -> None:
+        """Another file has taken the place of this one."""
+        self._closed = True
+        self._connection.close()
+        for path, beside in self._beside:  # SQLite would read it as changes of the new file
+            if beside.in_place:
+                path.unlink()
+        self._beside = []
+
     def _open(self) -> None:
         """Raises OSError and sqlite3.Error."""
         path = self._path
@@ -111,7 +119,7 @@ class Database:
         connection.executescript(self._tables)
         self._upgrade(connection)
         self.opened += 1
-        self._connection = connection
+        self._connection, self._closed = connection, False
         if path is not None:
             self._own = OwnFile(path)
             beside = (path.with_name(path.name + end) for end in ("-wal", "-shm"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
@@ -10,6 +11,8 @@ import httpx
 import pytest
 
 from pebble.fleet.audit import Audit
+from pebble.runtime.rate_limit import RateLimitedLog
+from pebble.web import login
 from tests.small_disk import SmallDisk
 from tests.support import Broker, needs_root, until
 from tests.web.attacker import PASSWORDS, Hall
@@ -75,8 +78,9 @@ def disk(tmp_path: Path) -> Iterator[SmallDisk]:
 
 @pytest.mark.parametrize("name", FAULTS)
 def test_a_login_says_what_is_wrong_and_what_is_driven_stays_so(
-    broker: Broker, disk: SmallDisk, name: str, caplog: pytest.LogCaptureFixture
+    broker: Broker, disk: SmallDisk, name: str, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(login, "_log", RateLimitedLog(logging.getLogger("login")))  # else it may have said so already
     fault, status, line = FAULTS[name]
     ref = f"pebble/robots/goob-{list(FAULTS).index(name)}"
     with (

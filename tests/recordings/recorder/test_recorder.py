@@ -292,8 +292,14 @@ class TestDisk:
             running.send(20)
             assert running.written(20)
             with FAULTS[fault](disk):
-                assert until(lambda: running.send(5, payload=b"%d " + random.Random(1).randbytes(20_000)) or (
-                    running.recorder.blocked or running.recorder.counters["event_removed"]), 20, step=0.05)
+                assert until(
+                    lambda: (
+                        running.send(5, payload=b"%d " + random.Random(1).randbytes(20_000))
+                        or (running.recorder.blocked or running.recorder.counters["event_removed"])
+                    ),
+                    20,
+                    step=0.05,
+                )
                 assert (disk.root / "rec" / "recorder.lock").exists() or True
             done = running.sent
             assert until(lambda: not running.recorder.blocked and Folder.is_in_use(root), 10)
