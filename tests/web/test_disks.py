@@ -77,10 +77,10 @@ def disk(tmp_path: Path) -> Iterator[SmallDisk]:
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_a_login_says_what_is_wrong_and_what_is_driven_stays_so(
+def test_a_login_names_what_is_wrong_and_what_is_driven_stays_so(
     broker: Broker, disk: SmallDisk, name: str, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(login, "_log", RateLimitedLog(logging.getLogger("login")))  # else it may have said so already
+    monkeypatch.setattr(login, "_log", RateLimitedLog(logging.getLogger("login")))  # else it may have been logged already
     fault, status, line = FAULTS[name]
     ref = f"pebble/robots/goob-{list(FAULTS).index(name)}"
     with (

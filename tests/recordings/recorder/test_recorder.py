@@ -310,7 +310,7 @@ class TestDisk:
     def test_a_disk_that_fails_for_a_while_costs_what_comes_meanwhile_and_no_more(
         self, tmp_path: Path, fault: str, caplog: pytest.LogCaptureFixture
     ) -> None:
-        (work, said), disk = FAULTS[fault], SmallDisk(tmp_path / "disk", mebibytes=1)
+        (work, line), disk = FAULTS[fault], SmallDisk(tmp_path / "disk", mebibytes=1)
         disk.mount()
         root = disk.root / "rec"
         running = Running(root)
@@ -324,7 +324,7 @@ class TestDisk:
             with beside(send, ending):
                 assert running.written(20)
                 with work(disk):
-                    assert until(lambda: said in caplog.text, 20)
+                    assert until(lambda: line in caplog.text, 20)
                 assert until(lambda: not running.recorder.blocked and running.recorder.folder.in_place, 20)
                 done = running.recorder.counters["written"]
                 assert running.written(done + 20)
