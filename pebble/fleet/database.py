@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sqlite3
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +42,9 @@ class Database:
         self._closed = True
         self.opened = 0  # files so far
         try:
+            if path is not None:
+                path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+                os.close(os.open(path, os.O_RDWR | os.O_CREAT, 0o600))
             self._open()
         except (OSError, sqlite3.Error) as error:
             why = DatabaseError(path, error).why
@@ -98,6 +101,8 @@ class Database:
     def _close(self) -> None:
         """Another file has taken the place of this one."""
         self._closed = True
+        with suppress(sqlite3.Error):  # it may come back
+            self._connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
         self._connection.close()
         for path, beside in self._beside:  # SQLite would read it as changes of the new file
             if beside.in_place:
@@ -108,8 +113,7 @@ class Database:
         """Raises OSError and sqlite3.Error."""
         path = self._path
         if path is not None:
-            path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-            os.close(os.open(path, os.O_RDWR | os.O_CREAT, 0o600))
+            os.close(os.open(path, os.O_RDWR))  # it may be gone again: SQLite would make an empty one
             path.chmod(0o600)
         where = ":memory:" if path is None else str(path)
         connection = sqlite3.connect(where, timeout=_BUSY_S, isolation_level=None, check_same_thread=False)
