@@ -80,7 +80,7 @@ def disk(tmp_path: Path) -> Iterator[SmallDisk]:
 def test_a_login_names_what_is_wrong_and_what_is_driven_stays_so(
     broker: Broker, disk: SmallDisk, name: str, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(login, "_log", RateLimitedLog(logging.getLogger("login")))  # else it may have been logged already
+    monkeypatch.setattr(login, "_log", RateLimitedLog(logging.getLogger("login")))  # it has logged nothing yet
     fault, status, line = FAULTS[name]
     ref = f"pebble/robots/goob-{list(FAULTS).index(name)}"
     with (
