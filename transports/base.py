@@ -194,7 +194,8 @@ class Transport(ABC):
     #: Whether the other end had older values of what only we publish when the newest connection began: it was restored
     #: from an earlier save, or is another one. A backend that cannot notice it leaves it False.
     went_back: bool = False
-    #: Whether the other end closed the newest connection, or was gone: then no client could publish there meanwhile.
+    #: Whether the other end closed the newest connection and, at each try to connect since, was gone: then no client
+    #: could publish there meanwhile, unless we would have received it.
     was_ended: bool = True
     #: Deliver retained messages also after a live one of their topic (T8): it may have been our own. The owner decides.
     delivers_late: bool = False

@@ -16,6 +16,15 @@ def sweep(folder: Path = SHM) -> int:
     return sum(map(_remove_if_unused, folder.glob("*.zenoh")))
 
 
+def has_room(size: int, folder: Path = SHM) -> bool:
+    """Whether a segment of ``size`` bytes may be made now."""
+    try:
+        found = os.statvfs(folder)
+    except OSError:
+        return False
+    return found.f_bavail * found.f_frsize >= size and not found.f_flag & os.ST_RDONLY
+
+
 def mappings() -> list[tuple[int, int, str]]:
     """The mapped segments of this process: first address, the one after the last, and the file."""
     found = []

@@ -10,7 +10,7 @@ from dataclasses import astuple
 from pathlib import Path
 
 from pebble.fleet.audit_rows import Entry, Merging, new
-from pebble.fleet.database import open_database
+from pebble.fleet.database import Database, DatabaseError
 
 log = logging.getLogger(__name__)
 
@@ -44,10 +44,9 @@ class Audit:
     """
 
     def __init__(self, path: Path | None) -> None:
-        self._database = open_database(path, _TABLES)
+        self._database = Database(path, _TABLES, _add_columns)
+        self._opened = self._database.opened
         self._lock = threading.Lock()
-        with self._lock:
-            _add_columns(self._database)
         self._changed = threading.Condition()  # guards what follows
         self._rows = Merging()
         self._closing = threading.Event()
@@ -79,11 +78,11 @@ class Audit:
     def read(self, limit: int) -> list[Entry]:
         """The newest rows of both tables in the order of their first time, the newest last."""
         with self._lock:
-            rows = self._database.execute(
+            rows = self._database.rows(
                 f"SELECT {_FIELDS}, number FROM audit UNION ALL SELECT {_FIELDS}, number FROM refused "  # noqa: S608
                 "ORDER BY at DESC, number DESC LIMIT ?",
                 (limit,),
-            ).fetchall()
+            )
         return [Entry(*row) for row in reversed(rows)]
 
     def close(self) -> None:
@@ -104,51 +103,61 @@ class Audit:
                 self._changed.wait_for(lambda: self._closing.is_set() or self._rows.waits)
                 ends, rows = self._closing.is_set(), self._rows.take()
             error = self._store(rows)
-            if error is not None and (ends or not failed):
-                log.error("audit: entries %s: %s", "are lost" if ends else "wait to be written", error)
+            lost = self.dropped - dropped
+            if error is not None and ends and (rows or lost):
+                log.error("audit: %d entries are lost: %s", len(rows) + lost, error)
+            elif error is not None and not ends and not failed:
+                log.error("audit: entries wait to be written: %s", error)
             failed = error is not None
             if ends:
                 return
             if failed:
                 with self._changed:
                     self._rows.give_back(rows)
-            elif self.dropped != dropped:
-                lost, dropped = self.dropped - dropped, self.dropped
+            elif lost:
+                dropped += lost
+                log.warning("audit: %d entries are lost: too many waited to be written", lost)
                 self.write("audit-dropped", count=lost)
             self._closing.wait(_ROUND_S)
 
-    def _store(self, rows: list[Entry]) -> Exception | None:
-        """All rows or, when this returns an error, none: a full disk must not end the thread."""
-        numbers = []
+    def _store(self, rows: list[Entry]) -> object:
+        """All rows or, when this returns why not, none: a full disk must not end the thread."""
         try:
             with self._lock:
-                self._database.execute("BEGIN IMMEDIATE")
-                try:
-                    numbers = [self._put(row) for row in rows]
+                if removed := self._database.removed:
+                    return removed
+                with self._database.transaction() as connection:
+                    if self._database.opened != self._opened:
+                        self._opened = self._database.opened
+                        self._begin_again(rows)
+                    numbers = [self._put(connection, row) for row in rows]
                     self._written += len(rows)
                     if self._written >= _TRIM_PERIOD:
                         self._written = 0
-                        self._database.execute(_TRIM.format(table="audit", who="user"), (MAX_ACTS,))
-                        self._database.execute(_TRIM.format(table="refused", who="address"), (MAX_REFUSED,))
-                    self._database.execute("COMMIT")
-                except sqlite3.Error:
-                    self._database.execute("ROLLBACK")
-                    raise
-        except sqlite3.Error as error:
+                        connection.execute(_TRIM.format(table="audit", who="user"), (MAX_ACTS,))
+                        connection.execute(_TRIM.format(table="refused", who="address"), (MAX_REFUSED,))
+        except (DatabaseError, sqlite3.Error, OSError) as error:
             return error
         for row, number in zip(rows, numbers, strict=True):
             row.number = number
         return None
 
-    def _put(self, row: Entry) -> int:
+    def _begin_again(self, rows: list[Entry]) -> None:
+        """Another file has taken the place of the one that has the numbers of rows."""
+        with self._changed:
+            self._rows.begin_again()
+        for row in rows:
+            row.number = 0
+
+    def _put(self, connection: sqlite3.Connection, row: Entry) -> int:
         table = "refused" if row.refused else "audit"
         if row.number:
-            self._database.execute(
+            connection.execute(
                 f"UPDATE {table} SET user = ?, address = ?, count = ?, last = ? WHERE number = ?",  # noqa: S608
                 (row.user, row.address, row.count, row.last, row.number),
             )
             return row.number
-        cursor = self._database.execute(
+        cursor = connection.execute(
             f"INSERT INTO {table} ({_FIELDS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",  # noqa: S608
             astuple(row)[:-1],
         )

@@ -83,6 +83,13 @@ class Merging:
             again = {id(row): row for row in rows if row.refused is refused}
             self._waiting[refused] = {**again, **waiting}
 
+    def begin_again(self) -> None:
+        """Rows have no numbers any more."""
+        self._since = float("-inf")
+        for waiting in self._waiting.values():
+            for row in waiting.values():
+                row.number = 0
+
     def _key(self, entry: Entry) -> object:
         """What the row has in common with those that are merged with it. Beyond the quotas it loses its own texts."""
         groups = self._groups[entry.what]

@@ -1,33 +1,130 @@
-"""Opens the SQLite file of people, sessions and the audit log."""
+"""The SQLite file of people, sessions and the audit log: opened, and followed while others replace it."""
 
 from __future__ import annotations
 
 import os
 import sqlite3
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 from pebble.errors import PebbleError
+from pebble.transports.own_file import OwnFile
 
 _BUSY_S = 5.0  # another process may be writing
 
 
-def open_database(path: Path | None, tables: str) -> sqlite3.Connection:
-    """A connection for use under a lock, each statement a transaction. ``path`` None: in memory. Raises PebbleError.
+class DatabaseError(PebbleError):
+    """The file cannot be read or written now. Example: ``people.sqlite: database or disk is full``."""
 
-    A new file, and what SQLite writes beside it, may be read by its owner only.
+    def __init__(self, path: Path | None, error: Exception) -> None:
+        self.why = (error.strerror or str(error)) if isinstance(error, OSError) else str(error)
+        super().__init__(f"{path}: {self.why}")
+
+
+class Database:
+    """A connection for use under a lock, each statement a transaction. ``path`` None: in memory.
+
+    A file that has taken the place of this one, as a backup, is opened. While there is none the connection goes on:
+    then what is written is lost with this process.
+
+    A new file, and what SQLite writes beside it, may be read by its owner only. Raises PebbleError if it cannot be
+    opened; ``upgrade`` changes the tables of older versions.
     """
-    try:
+
+    def __init__(
+        self, path: Path | None, tables: str, upgrade: Callable[[sqlite3.Connection], None] = lambda _connection: None
+    ) -> None:
+        self._path, self._tables, self._upgrade = path, tables, upgrade
+        self._own: OwnFile | None = None
+        self._beside: list[tuple[Path, OwnFile]] = []
+        self._closed = True
+        self.opened = 0  # files so far
+        try:
+            if path is not None:
+                path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+                os.close(os.open(path, os.O_RDWR | os.O_CREAT, 0o600))
+            self._open()
+        except (OSError, sqlite3.Error) as error:
+            why = DatabaseError(path, error).why
+            raise PebbleError(f"{path}: cannot be used: {why}; name another file with --people FILE") from None
+
+    @property
+    def removed(self) -> str:
+        """An error if its file is not where others find it; else empty."""
+        gone = self._own is not None and not self._own.in_place and not self._own.replaced
+        return f"{self._path} was removed: put it back, or start the page again" if gone else ""
+
+    def rows(self, statement: str, values: Sequence[Any] = ()) -> list[Any]:
+        """Raises DatabaseError."""
+        with self._errors():
+            return self._current().execute(statement, values).fetchall()
+
+    def execute(self, statement: str, values: Sequence[Any] = ()) -> sqlite3.Cursor:
+        """Raises DatabaseError; IntegrityError for what the tables forbid."""
+        with self._errors():
+            return self._current().execute(statement, values)
+
+    @contextmanager
+    def _errors(self) -> Iterator[None]:
+        try:
+            yield
+        except sqlite3.IntegrityError:
+            raise
+        except (OSError, sqlite3.Error) as error:
+            raise DatabaseError(self._path, error) from None
+
+    def _current(self) -> sqlite3.Connection:
+        if self._own is not None and self._own.replaced:
+            self._close()
+        if self._closed:
+            self._open()
+        return self._connection
+
+    @contextmanager
+    def transaction(self) -> Iterator[sqlite3.Connection]:
+        """All that is executed on the connection, or nothing. Raises DatabaseError."""
+        with self._errors():
+            connection = self._current()
+            connection.execute("BEGIN IMMEDIATE")
+            try:
+                yield connection
+                connection.execute("COMMIT")
+            except BaseException:
+                connection.rollback()  # a full disk may have done so
+                raise
+
+    def close(self) -> None:
+        self._connection.close()
+
+    def _close(self) -> None:
+        """Another file has taken the place of this one."""
+        self._closed = True
+        with suppress(sqlite3.Error):  # it may come back
+            self._connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+        self._connection.close()
+        for path, beside in self._beside:  # SQLite would read it as changes of the new file
+            if beside.in_place:
+                path.unlink()
+        self._beside = []
+
+    def _open(self) -> None:
+        """Raises OSError and sqlite3.Error."""
+        path = self._path
         if path is not None:
-            path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-            os.close(os.open(path, os.O_RDWR | os.O_CREAT, 0o600))
+            os.close(os.open(path, os.O_RDWR))  # it may be gone again: SQLite would make an empty one
             path.chmod(0o600)
         where = ":memory:" if path is None else str(path)
-        database = sqlite3.connect(where, timeout=_BUSY_S, isolation_level=None, check_same_thread=False)
-        database.execute("PRAGMA journal_mode = WAL")
-        database.execute("PRAGMA synchronous = NORMAL")
-        database.execute("PRAGMA foreign_keys = ON")
-        database.executescript(tables)
-    except (OSError, sqlite3.Error) as error:
-        why = error.strerror if isinstance(error, OSError) else error
-        raise PebbleError(f"{path}: cannot be used: {why}; name another file with --people FILE") from None
-    return database
+        connection = sqlite3.connect(where, timeout=_BUSY_S, isolation_level=None, check_same_thread=False)
+        connection.execute("PRAGMA journal_mode = WAL")
+        connection.execute("PRAGMA synchronous = NORMAL")
+        connection.execute("PRAGMA foreign_keys = ON")
+        connection.executescript(self._tables)
+        self._upgrade(connection)
+        self.opened += 1
+        self._connection, self._closed = connection, False
+        if path is not None:
+            self._own = OwnFile(path)
+            beside = (path.with_name(path.name + end) for end in ("-wal", "-shm"))
+            self._beside = [(file, OwnFile(file)) for file in beside]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import hmac
+import logging
 import re
 import secrets
 import sqlite3
@@ -15,15 +16,19 @@ from pathlib import Path
 from typing import Any
 
 from pebble.errors import PebbleError
-from pebble.fleet.database import open_database
+from pebble.fleet.database import Database, DatabaseError
 from pebble.fleet.roles import Role, Session
 from pebble.fleet.tries import Tries, network_of
-from pebble.transports.own_file import OwnFile
+from pebble.runtime.rate_limit import RateLimitedLog
+from pebble.transports.bounds import BoundedTable
+
+log = logging.getLogger(__name__)
 
 NAME = re.compile(r"[a-z0-9_-]{1,32}")
 SESSION_S = 7 * 24 * 3600.0  # a session ends after this long, whether it is used or not
 MIN_PASSWORD = 8
 MAX_PASSWORD = 256  # longer ones are refused unread: hashing them costs time
+_SESSIONS = 1000  # that are remembered for when the file cannot be read
 _SESSIONS_EACH = 20  # of one person; the oldest ends when there are more
 _TABLES = """
 CREATE TABLE IF NOT EXISTS people (name TEXT PRIMARY KEY, role TEXT NOT NULL, salt BLOB NOT NULL, hash BLOB NOT NULL);
@@ -69,8 +74,11 @@ class People:
         monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
         self._lock = threading.Lock()
-        self._path = path
-        self._database = self._open()
+        self._database = Database(path, _TABLES)
+        self._removed = ""
+        self._log = RateLimitedLog(log, period_s=60.0)
+        #: What the file said of each session when it could be read last, and when that session ends.
+        self._seen = BoundedTable[tuple[Session, float]](_SESSIONS, _SESSIONS << 10, lambda _: 1)
         self._clock = clock
         self._addresses, self._names = Tries(monotonic), Tries(monotonic)
         self._no_hash = _hash("", b"no such person..")  # compared where the name is unknown: the same time
@@ -78,18 +86,6 @@ class People:
     def close(self) -> None:
         with self._lock:
             self._database.close()
-
-    def _open(self) -> sqlite3.Connection:
-        database = open_database(self._path, _TABLES)
-        self._own = None if self._path is None else OwnFile(self._path)
-        return database
-
-    def _current(self) -> sqlite3.Connection:
-        """The database. While its file is gone it goes on; one that has taken its place, as a backup, is opened."""
-        if self._own is not None and self._own.replaced:
-            self._database.close()  # first: it removes what SQLite wrote beside the old file
-            self._database = self._open()
-        return self._database
 
     # -- people
 
@@ -171,14 +167,29 @@ class People:
         return token
 
     def session(self, token: str) -> Session | None:
-        """The running session of this token, with the person's role of now."""
-        rows = self._rows(
-            "SELECT sessions.id, people.name, people.role FROM sessions JOIN people USING (name) "
-            "WHERE digest = ? AND expires > ?",
-            _digest(token),
-            self._clock(),
-        )
-        return Session(rows[0][0], rows[0][1], Role(rows[0][2])) if rows else None
+        """The running session of this token, with the person's role of now.
+
+        While the file cannot be read it is what it was: who drives can go on, and stop robots.
+        """
+        digest, now = _digest(token), self._clock()
+        try:
+            rows = self._rows(
+                "SELECT sessions.id, people.name, people.role, expires FROM sessions JOIN people USING (name) "
+                "WHERE digest = ? AND expires > ?",
+                digest,
+                now,
+            )
+        except DatabaseError as error:
+            self._log.log("unreadable", logging.ERROR, "%s: who is logged in stays so until it can be read", error)
+            session, expires = self._seen.get(digest.hex(), (None, now))
+            return session if expires > now else None
+        if not rows:
+            self._seen.pop(digest.hex(), None)
+            return None
+        id_, name, role, expires = rows[0]
+        session = Session(id_, name, Role(role))
+        self._seen[digest.hex()] = session, expires
+        return session
 
     def end_session(self, token: str) -> None:
         self._change("DELETE FROM sessions WHERE digest = ?", _digest(token))
@@ -212,12 +223,23 @@ class People:
             raise TooManyTriesError(wait_s)
 
     def _rows(self, statement: str, *values: Any) -> Sequence[Any]:
+        """Raises DatabaseError, as all methods do."""
         with self._lock:
-            return self._current().execute(statement, values).fetchall()
+            self._note_place()
+            return self._database.rows(statement, values)
 
     def _change(self, statement: str, *values: Any) -> int:
         with self._lock:
-            return self._current().execute(statement, values).rowcount
+            self._note_place()
+            return self._database.execute(statement, values).rowcount
+
+    def _note_place(self) -> None:
+        removed = self._database.removed
+        if removed and not self._removed:
+            log.error("%s; until then who logs in, and who did what, is not stored", removed)
+        elif self._removed and not removed:
+            log.info("people, sessions and the audit log are stored again")
+        self._removed = removed
 
     def _change_one(self, name: str, statement: str, *values: Any) -> None:
         if self._change(statement, *values) == 0:

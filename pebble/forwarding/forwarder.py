@@ -178,6 +178,12 @@ class Forwarder:
     def _was_brief(self, side: Side) -> bool:
         return self._clock() - self._lost_at[side] < _RESTORED_S
 
+    def _has_gone_back(self, side: Side) -> bool:
+        """Whether an earlier value that ``side`` retains is an old one: no program can have chosen it again."""
+        if side is self._winner or not self._went_back[side]:
+            return self._went_back[side]
+        return self._was_brief(side) or self._transports[side].was_ended
+
     def subscribed(self, side: Side) -> None:
         """``side`` is connected and subscribed to, and its retained messages have arrived."""
         self._subscribed_at[side] = now = self._clock()
@@ -412,7 +418,7 @@ class Forwarder:
             payload,
             retained=retained,
             other_away=away,
-            went_back=self._went_back[side] and (side is self._winner or self._was_brief(side)),
+            went_back=self._has_gone_back(side),
         )
         if resolution is Resolution.PASS:
             self._on_value(subject, payload)

@@ -15,6 +15,7 @@ import msgspec
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
 from pebble.client.estop_states import Reset
+from pebble.fleet.database import DatabaseError
 from pebble.fleet.roles import Session, rights
 from pebble.transports.clock import since_boot as clock
 from pebble.web import messages as m
@@ -80,7 +81,10 @@ class Control:
                 wait_s = self._pace.take(_WATCH_COST if isinstance(op, m.Watch) else 1, time.monotonic())
                 if wait_s:
                     await asyncio.sleep(min(wait_s, _STOP_WAITS_S) if isinstance(op, m.EstopOp | m.StopOp) else wait_s)
-                self._handle(op)
+                try:
+                    self._handle(op)
+                except DatabaseError as error:
+                    self._refuse(op, f"The server cannot store this: {error.why}")
         except Leave as reason:
             await self._leave(reason)
         except TimeoutError:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 import html
+import logging
 import socket
 from concurrent.futures import ThreadPoolExecutor
 from typing import Annotated
@@ -15,11 +16,14 @@ from starlette.requests import HTTPConnection, Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
+from pebble.fleet.database import DatabaseError
 from pebble.fleet.people import SESSION_S, TooManyTriesError, User
 from pebble.fleet.roles import LOCAL, Session
+from pebble.runtime.rate_limit import RateLimitedLog
 from pebble.web.settings import WebSettings
 
 _WAITING = 32  # logins that wait for the thread; each takes some 20 ms
+_log = RateLimitedLog(logging.getLogger(__name__), period_s=60.0)
 _NO_STORE = {"cache-control": "no-store"}
 
 
@@ -116,11 +120,17 @@ async def _login(request: Request) -> Response:
         audit.write("login-limited", user=login.user, address=address)
         wait = max(1, round(error.wait_s))
         return _answer(429, f"Too many tries: wait {wait} s", **{"retry-after": str(wait)})
+    except DatabaseError as error:
+        return _unavailable("log in", error)
     if user is None:
         audit.write("login-refused", user=login.user, address=address)
         return _answer(401, "User or password is wrong")
+    try:
+        response = _logged_in(request, user, address)
+    except DatabaseError as error:
+        return _unavailable("log in", error)
     audit.write("login", user=user.name, address=address)
-    return _logged_in(request, user, address)
+    return response
 
 
 def _logged_in(request: Request, user: User, address: str) -> Response:
@@ -143,13 +153,21 @@ def _logged_in(request: Request, user: User, address: str) -> Response:
 async def _logout(request: Request) -> Response:
     settings, people = request.app.state.settings, request.app.state.people
     session = session_of(request)
-    if settings.login and session is not None:
-        people.end_session(request.cookies[_cookie(settings)])
-        request.app.state.audit.write("logout", user=session.user, address=_address(request))
     response = _answer(200, "")
+    if settings.login and session is not None:
+        try:
+            people.end_session(request.cookies[_cookie(settings)])
+        except DatabaseError as error:  # this browser forgets it in any case
+            response = _unavailable("log out", error)
+        request.app.state.audit.write("logout", user=session.user, address=_address(request))
     secure = settings.certificate is not None
     response.delete_cookie(_cookie(settings), path="/", secure=secure, httponly=True, samesite="strict")
     return response
+
+
+def _unavailable(what: str, error: DatabaseError) -> JSONResponse:
+    _log.log(what, logging.ERROR, "%s: nobody can %s", error, what)
+    return _answer(503, f"The server cannot store that you {what}: {error.why}")
 
 
 def _answer(status: int, why: str, **headers: str) -> JSONResponse:

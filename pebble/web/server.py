@@ -6,7 +6,6 @@ import asyncio
 import logging
 import secrets
 import socket
-import sqlite3
 import time
 from collections.abc import Coroutine
 from contextlib import suppress
@@ -21,6 +20,7 @@ from pebble.contract.payloads import Driver
 from pebble.contract.payloads import Driving as DrivingPayload
 from pebble.errors import ConfigError, PayloadError
 from pebble.fleet.audit import Audit
+from pebble.fleet.database import DatabaseError
 from pebble.fleet.people import People
 from pebble.fleet.roles import Session
 from pebble.transports import Message
@@ -221,7 +221,11 @@ class Server:
             self._show_picture_from(ref)
 
     def _show_picture_from(self, ref: str) -> None:
-        source = self.people.get(f"picture-from {ref}") or ""
+        try:
+            source = self.people.get(f"picture-from {ref}") or ""
+        except DatabaseError as error:
+            log.warning("where the picture of %s comes from is not known: %s", ref, error)
+            return
         self.robots.sources.pop(ref, None)
         if source:
             self.robots.sources[ref] = source
@@ -294,7 +298,7 @@ class Server:
         try:
             for ref, value in changes.items():
                 await asyncio.to_thread(self.people.set, _KNOWN + ref, value)
-        except sqlite3.Error as error:
+        except DatabaseError as error:
             log.warning("which robots are known is not saved: %s", error)
         finally:
             self._saving = False

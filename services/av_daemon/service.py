@@ -67,9 +67,11 @@ class AvDaemon(Service):
 
     @every(1.0)
     def look(self) -> None:
-        """End, to be started again, when what readers need was removed from the run directory or from /dev/shm."""
+        """End, to be started again, when what readers need was removed, or room in /dev/shm is there at last."""
         if not all(writer.in_place for writer in self._writers):
             raise DeviceError("the socket or the shared memory of the frames was removed: starting again with new ones")
+        if any(writer.may_share for writer in self._writers):
+            raise DeviceError("there is room for the frames in shared memory now: starting again to use it")
 
     @every(1.0)
     def publish_status(self) -> None:

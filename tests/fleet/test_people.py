@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from pebble.errors import PebbleError
+from pebble.fleet.database import DatabaseError
 from pebble.fleet.people import SESSION_S, People, PeopleError, TooManyTriesError, User
 from pebble.fleet.roles import LOCAL, Role, rights
 from pebble.fleet.tries import TRIES, WINDOW_S, network_of
@@ -274,3 +275,22 @@ def test_a_file_that_is_gone_costs_nothing_and_one_in_its_place_counts_at_once(t
         backup.rename(file)
         assert people.check("alice", PASSWORD, HERE) is None
         assert people.check("bob", PASSWORD, HERE) == User("bob", Role.VIEWER)
+
+
+def test_while_there_is_no_usable_file_a_session_stays_what_it_was_and_no_empty_one_is_made(tmp_path: Path) -> None:
+    file = tmp_path / "people"
+    with closing(People(file)) as people:
+        people.add("alice", PASSWORD, Role.DRIVER)
+        token = people.start_session(User("alice", Role.DRIVER))
+        session = people.session(token)
+        good = file.rename(tmp_path / "good")
+        for bad in (lambda: file.write_text("no database" * 100), file.unlink, file.mkdir):
+            bad()
+            assert people.session(token) == session != people.session("of nobody")
+            with pytest.raises(DatabaseError, match="people"):
+                people.start_session(User("alice", Role.DRIVER))
+        file.rmdir()
+        good.rename(file)
+        assert people.session(token) == session
+        people.end_session(token)
+        assert people.session(token) is None

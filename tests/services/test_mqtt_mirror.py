@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 
 from pebble.config import Config, parse
+from pebble.forwarding import forwarder as forwarder_module
 from pebble.forwarding.forwarder import Gate
 from pebble.forwarding.probes import PROBE_REQUEST
 from pebble.services import mqtt_mirror as mirror_module
@@ -23,7 +24,10 @@ from pebble.services.mqtt_mirror import MqttMirror
 from pebble.transports import MqttSettings, State, create
 from pebble.transports.memory import MemoryHub, MemoryTransport
 from tests.services.mqtt_bridge.bridge_rig import Client, Quiet, Running, gate_of
-from tests.support import AmqttBroker, Broker, free_port, until
+from tests.services.mqtt_bridge.restoring import FALSE as OFF
+from tests.services.mqtt_bridge.restoring import HISTORIES, OwnBroker, play
+from tests.services.mqtt_bridge.restoring import TRUE as ON
+from tests.support import AmqttBroker, Broker, free_port, some, until
 from tests.tcp_proxy import BridgelessProxy, TcpProxy
 
 DRIVE = "incoming/drive-values"
@@ -285,6 +289,39 @@ class TestMeeting:
         retained = {"outgoing/status": b"state", "outgoing/programs/reading": b"2"}
         assert until(lambda: rig.retained_on_local() == retained)
         assert rig.retained_on_broker() == retained
+
+
+@pytest.mark.parametrize("longer", [False, True], ids=["brief", "longer"])
+@pytest.mark.parametrize("history", some(HISTORIES, 4))
+def test_what_was_switched_off_stays_off_when_the_broker_is_restored(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rigs: Rigs, history: str, longer: bool
+) -> None:
+    """The operator is at the robot's own side here, and programs are at the mirror's broker."""
+    monkeypatch.setattr(forwarder_module, "_RESTORED_S", 0.0 if longer else 30.0)
+    broker = OwnBroker(tmp_path)
+    try:
+        rig = rigs(broker.port)
+        mirror = rig.start()
+        once = rig.program_client()
+
+        def set_flag(who: str, value: bytes) -> None:
+            setter = {"operator": rig.local, "program": rig.program, "once": once}[who]
+            setter.publish(FLAG, value, retain=True)
+            once.transport._own.clear()
+            assert until(lambda: rig.retained_on_local().get(FLAG) == rig.retained_on_broker().get(FLAG) == value)
+
+        play(history, set_flag, broker.save)
+        before, seen = mirror._broker.counters["connected"], len(rig.local.payloads(FLAG))
+        broker.stop()
+        assert until(lambda: mirror._broker.state is not State.CONNECTED)
+        broker.restore()
+        assert until(lambda: mirror._broker.counters["connected"] > before)
+        Quiet(rig.local, rig.program).wait(1.0)
+        assert until(lambda: rig.retained_on_broker().get(FLAG) == OFF)
+        assert rig.retained_on_local()[FLAG] == OFF
+        assert ON not in rig.local.payloads(FLAG)[seen:]
+    finally:
+        broker.stop()
 
 
 def heartbeat(age_s: float = 0.0, **more: Any) -> bytes:

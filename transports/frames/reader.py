@@ -64,6 +64,7 @@ class FrameReader:
         self._last: tuple[int, int] = (0, 0)  # writer and number of the newest frame that arrived
         self._previous_writer = -1  # the writer before that
         self._sharing_ended = threading.Event()
+        self._lacked_room = False  # in shared memory, when the session was opened
         self._changing = threading.Lock()
         self._closed = True
         self._pid = 0
@@ -105,6 +106,7 @@ class FrameReader:
                 return open_reading(self._folder, self._names, shared=True)
             except SharingError as error:
                 self.problem = f"{error}; the frames are sent as bytes"
+                self._lacked_room = True
         return open_reading(self._folder, self._names, shared=False)
 
     def _stop(self) -> None:
@@ -221,12 +223,16 @@ class FrameReader:
         if sample.kind != zenoh.SampleKind.PUT:
             self._writers.pop(writer_id, None)
             return
-        if writer_id not in self._seen_writer_ids:
+        new = writer_id not in self._seen_writer_ids
+        if new:
             self._seen_writer_ids.add(writer_id)
             self.counters.add("writers")
         self._writers[writer_id] = memory
+        if new and memory.size and self._lacked_room:  # it has found room: so may this reader
+            self._lacked_room = False
+            self._reopen_soon("")
         if memory.size and self.shared and (problem := self._why_not_map(memory)):
-            self._stop_sharing(problem)
+            self._reopen_soon(problem)
 
     def _why_not_map(self, memory: WriterMemory) -> str:
         if reclaim.is_reclaimed(memory):
@@ -242,8 +248,8 @@ class FrameReader:
         needed = memory.size + METADATA
         return "" if shared_memory.lockable(needed) else self._memlock_problem(needed)
 
-    def _stop_sharing(self, problem: str) -> None:
-        """Have the next `read` reopen the session without sharing: it cannot be closed on this thread."""
+    def _reopen_soon(self, problem: str) -> None:
+        """Have the next `read` reopen the session, without sharing if there is a problem: not on this thread."""
         self.problem = problem
         self._sharing_ended.set()
         self._latest.wake()

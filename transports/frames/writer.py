@@ -31,10 +31,12 @@ Bytes = np.ndarray[Any, np.dtype[np.uint8]]
 Data = bytes | bytearray | memoryview | np.ndarray[Any, Any]
 
 SMALL = 16 << 10  # bytes: frames up to this size are sent as bytes, which is as fast and pins no memory
+RETRY_S = 30.0  # from the opening without room in shared memory until it is looked for again
 STARVED_S = 1.0  # after this long without a free slot, slots of dead or stopped readers are reclaimed
 #: What happens to a frame when a reader accepts nothing; neither blocks the writer. DROP: it is dropped after a
 #: millisecond, which is right for small messages: sound, and the reference to a picture in shared memory.
 #: A picture sent as bytes takes longer than that: BLOCK_FIRST lets one wait and drops those after it.
+_NEVER = float("inf")
 _DROP, _BLOCK_FIRST = zenoh.CongestionControl.DROP, zenoh.CongestionControl.BLOCK_FIRST
 
 
@@ -58,6 +60,7 @@ class FrameWriter:
         self._pool_size = 0 if capacity <= SMALL else slots * capacity + MARGIN
         self.counters = Counters()
         self.problem = ""
+        self._retry_at = _NEVER
         self._writer_id = 0
         self._pid = 0
         self._sequence = 0
@@ -86,8 +89,11 @@ class FrameWriter:
         self._lock = FileLock.wait(self._names.lock_path(self._writer_id))  # another writer may be checking it
         close_at_exit(self)
         self._pool = self._make_pool()
+        self._retry_at = _NEVER
         if self.problem:
             log.warning("%s", self.problem)
+            if not self._has_room():
+                self._retry_at = time.monotonic() + RETRY_S
         self._publisher = self._declare_publisher(session, _DROP)
         self._bulk = self._declare_publisher(session, _BLOCK_FIRST) if self._pool_size else self._publisher
         follow = zenoh.handlers.Callback(self._on_reader, indirect=False)
@@ -115,6 +121,14 @@ class FrameWriter:
             log.debug("the frames of %s: %s", self._stream, error)
             return True
         return False
+
+    @property
+    def may_share(self) -> bool:
+        """Whether there was no room in shared memory when this writer was opened, and there is now."""
+        return time.monotonic() >= self._retry_at and self._has_room()
+
+    def _has_room(self) -> bool:
+        return segments.has_room(self._pool_size + 2 * METADATA)
 
     def _declare_publisher(self, session: zenoh.Session, when_full: zenoh.CongestionControl) -> zenoh.Publisher:
         return session.declare_publisher(

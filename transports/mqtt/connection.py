@@ -70,6 +70,10 @@ class Silent(Lost):
     """The other side does not answer."""
 
 
+class Absent(Lost):
+    """Nothing listens there."""
+
+
 class Refused(Lost):
     """The broker refused our CONNECT, or closed the connection instead of answering."""
 
@@ -197,7 +201,8 @@ class Connection:
         try:
             self._client.open()
         except (OSError, ValueError) as error:
-            raise Lost(f"{self.where} cannot be reached: {error}") from None
+            kind = Absent if isinstance(error, ConnectionRefusedError) else Lost
+            raise kind(f"{self.where} cannot be reached: {error}") from None
         self.dialling = False
         self._answered_at = clock.since_boot()
         deadline = time.monotonic() + hosts.CONNECT_TIMEOUT_S

@@ -20,7 +20,7 @@ from pebble.transports.mqtt import client_ids
 from pebble.transports.mqtt.bridge_mode import Attempt, BridgeMode, Result
 from pebble.transports.mqtt.broker_limits import EVERYTHING, BrokerLimits, Limits
 from pebble.transports.mqtt.client import Opening
-from pebble.transports.mqtt.connection import Connection, Lost, Refused, Silent, ignore
+from pebble.transports.mqtt.connection import Absent, Connection, Lost, Refused, Silent, ignore
 from pebble.transports.mqtt.filters import BrokerFilters, OwnMessageFilter, overlap
 from pebble.transports.mqtt.outgoing import PendingAck
 from pebble.transports.mqtt.retention import RetentionCheck
@@ -35,6 +35,7 @@ _CLOSING_S = 1.0  # longest wait for unacknowledged messages when closing
 _DIALLING_S = 0.2  # longest wait for a thread that may be in connect(2)
 _RETRY_S = 0.05  # second attempt to connect; doubles up to settings.reconnect_max_s
 _CATCH_UP_S = 0.5  # time for a broker that was suspended to deliver its backlog before we subscribe
+_ENDING_S = 1.0  # so long a broker that ends may still accept connections, and hang up on them
 _STEADY_S = 2.0  # after a connection this long the first retry is immediate
 _REPEAT_LOG_S = 30.0  # between two equal log lines
 _TRY_S = 0.25  # between two looks whether a topic that is withheld may be tried
@@ -67,6 +68,7 @@ class MqttTransport(Transport):
         self._thread: threading.Thread | None = None
         self._bridge_mode, self._limits = BridgeMode(), BrokerLimits()  # of the broker at this address:
         self._address: Address | None = None
+        self._gone_at = float("-inf")  # when the broker was last known to be gone
         self._broker_stalled = False  # the broker may have been suspended, and have old messages to forward first
         self._logged = ("", 0.0)  # the newest problem in the log, and when it went there
         self._own_message_filter = OwnMessageFilter()
@@ -190,8 +192,9 @@ class MqttTransport(Transport):
             try:
                 self._run_connection(stopping)
             except Lost as lost:
-                self.was_ended = not isinstance(lost, Silent)  # else it may be we who stood still
-                self._broker_stalled |= not self.was_ended
+                silent = isinstance(lost, Silent)  # then it may be we who stood still
+                self._broker_stalled |= silent
+                self._note_end(lost, silent=silent)
                 problem = str(lost)
             except Exception:  # any error must lead to a reconnect, never end the thread
                 log.exception("%s: unexpected failure of the connection", self.client_id)
@@ -208,6 +211,16 @@ class MqttTransport(Transport):
             if not self._limits.asks_again:
                 failures = min(failures + 1, 20)
             stopping.wait(pause * random.uniform(0.5, 1.0))  # noqa: S311  (jitter, no secret)
+
+    def _note_end(self, lost: Lost, *, silent: bool) -> None:
+        """Whether the other end is gone: nothing listens, or it hangs up as one that is just ending does."""
+        now = time.monotonic()
+        if self._state is State.CONNECTED:
+            self.was_ended, self._gone_at = not silent, now
+        elif isinstance(lost, Absent):
+            self._gone_at = now
+        elif silent or now - self._gone_at > _ENDING_S:
+            self.was_ended = False
 
     def _run_connection(self, stopping: threading.Event) -> None:
         """Run one connection from its start to its end; raises Lost unless it ends by `close`."""

@@ -14,6 +14,7 @@ from typing import BinaryIO, Final
 
 from pebble.recordings.files.reader import RecordingError
 from pebble.recordings.library import ACTIVE, SUFFIX
+from pebble.transports.own_file import OwnFile
 
 STATE: Final = "state"
 MEDIA: Final = "media."
@@ -56,6 +57,7 @@ class Folder:
         self.root = root
         self._number = 0
         self._lock = ExitStack()
+        self._own = OwnFile(root / LOCK)
 
     def take(self) -> None:
         """Make the folder, and lock it against a second recorder. Raises RecordingError."""
@@ -65,7 +67,13 @@ class Folder:
             raise RecordingError(f"{self.root}: {error.strerror}: name another folder with --into") from None
         used = f"{self.root}: another recorder writes here: name another folder with --into"
         self._lock.enter_context(_locked(self.root / LOCK, used))
-        self._number = max((entry.number for entry in self.entries()), default=0)
+        self._own = OwnFile(self.root / LOCK)
+        self._number = max((self._number, *(entry.number for entry in self.entries())))
+
+    @property
+    def in_place(self) -> bool:
+        """Whether it is the folder that was taken: it may be removed, or its disk taken away or brought back."""
+        return self._own.in_place
 
     def release(self) -> None:
         self._lock.close()

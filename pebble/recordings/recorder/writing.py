@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from pebble.recordings.files.mcap import Packer
+from pebble.recordings.files.reader import RecordingError
 from pebble.recordings.recorder.background import Background
 from pebble.recordings.recorder.disk_space import Disk, outdated, surplus
 from pebble.recordings.recorder.due import Due
@@ -69,7 +70,8 @@ class Writing:
 
     def mend_leftovers(self) -> int:
         """Finish what a recorder before this one has left; returns how many files."""
-        left = [entry.path for entry in self._folder.entries() if entry.is_active]
+        ours = {file.path for file in self._files.values()}
+        left = [entry.path for entry in self._folder.entries() if entry.is_active and entry.path not in ours]
         for path in left:
             self._finisher.mend(path)
         return len(left)
@@ -231,8 +233,11 @@ class Writing:
             return
         limits = self._options.limits
         try:
-            self._folder.root.mkdir(mode=0o750, parents=True, exist_ok=True)
+            self._follow_folder()
             disk = _disk(self._folder.root)
+        except RecordingError as error:
+            self._stand_still(str(error))
+            return
         except OSError as error:
             self._stand_still(f"{self._folder.root}: {error.strerror}")
             return
@@ -248,6 +253,16 @@ class Writing:
             self._stand_still(f"the disk is full ({free} MB are free, and {wanted} MB must stay)", full=True)
         elif self._blocked is not None and (disk.free_bytes >= limits.free_bytes or not self._blocked.full):
             self.try_again()
+
+    def _follow_folder(self) -> None:
+        """Use the folder that is there now. Raises RecordingError and OSError."""
+        if self._folder.in_place:
+            return
+        self.flush()  # forgets the files that are not there any more
+        self._folder.release()
+        self._folder.take()
+        self.mend_leftovers()
+        log.warning("%s was removed, or is on another disk now: recording into what is there", self._folder.root)
 
     def _make_room(self, disk: Disk, due: Due, now_s: float) -> None:
         entries, limits = self._folder.entries(), self._options.limits

@@ -11,7 +11,8 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,8 @@ from pebble.recordings.recorder import lane as lane_module
 from pebble.recordings.recorder.folder import Folder
 from pebble.recordings.recorder.intake import EVENTS, Clocks
 from pebble.recordings.recorder.recorder import Options, Recorder
-from tests.support import until
+from tests.small_disk import SmallDisk
+from tests.support import beside, needs_root, until
 
 BASE = "pebble/robots/goob"
 ONLINE, CAMERA = f"{BASE}/outgoing/online", f"{BASE}/outgoing/front-camera"
@@ -200,6 +202,30 @@ class TestFiles:
         assert not Folder.is_in_use(running.root)
 
 
+@contextmanager
+def _removed(disk: SmallDisk) -> Iterator[None]:
+    (disk.root / "rec").rename(disk.root / "away")
+    yield
+    shutil.rmtree(disk.root / "rec")
+    (disk.root / "away").rename(disk.root / "rec")
+
+
+@contextmanager
+def _unmounted(disk: SmallDisk) -> Iterator[None]:
+    """Something else is mounted over it meanwhile."""
+    disk.mount()
+    yield
+    disk.unmount()
+
+
+#: What happens to the disk, and what the log says.
+FAULTS: dict[str, tuple[Callable[[SmallDisk], AbstractContextManager[None]], str]] = {
+    "full": (SmallDisk.full, "the disk is full: nothing is recorded until that is mended"),
+    "removed": (_removed, "was removed, or is on another disk now"),
+    "unmounted": (_unmounted, "was removed, or is on another disk now"),
+}
+
+
 class TestDisk:
     def test_a_slow_disk_blocks_no_sender_and_costs_pictures_first(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -278,6 +304,36 @@ class TestDisk:
         running.send(5)
         running.stop()
         assert len(payloads(running.root)) >= 5
+
+    @needs_root
+    @pytest.mark.parametrize("fault", FAULTS)
+    def test_a_disk_that_fails_for_a_while_costs_what_comes_meanwhile_and_no_more(
+        self, tmp_path: Path, fault: str, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        (work, line), disk = FAULTS[fault], SmallDisk(tmp_path / "disk", mebibytes=1)
+        disk.mount()
+        root = disk.root / "rec"
+        running = Running(root)
+        ending = threading.Event()
+
+        def send() -> None:
+            while not ending.wait(0.01):
+                running.send(payload=b"%d " + random.Random(running.sent).randbytes(500))
+
+        try:
+            with beside(send, ending):
+                assert running.written(20)
+                with work(disk):
+                    assert until(lambda: line in caplog.text, 20)
+                assert until(lambda: not running.recorder.blocked and running.recorder.folder.in_place, 20)
+                done = running.recorder.counters["written"]
+                assert running.written(done + 20)
+                assert Folder.is_in_use(root)
+        finally:
+            running.stop()
+            found = {int(payload.split()[0]) for payload in payloads(root)} if root.exists() else set()
+            disk.close()
+        assert {*range(20), running.sent - 1} <= found
 
     def test_a_file_that_cannot_be_opened_costs_what_comes_meanwhile_and_no_more(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -17,7 +17,7 @@ from pebble.runtime.connections import local_transport
 from pebble.service import Service
 from pebble.services.mqtt_bridge import service as bridge_module
 from pebble.services.mqtt_bridge.service import MqttBridge
-from pebble.transports import Message, MqttSettings, QoS, State, Transport, create
+from pebble.transports import Message, MqttSettings, QoS, State, Transport, ZenohSettings, create
 from pebble.transports.memory import MemoryHub, MemoryTransport
 from tests.support import until
 
@@ -29,11 +29,13 @@ def make_config(
     robot: str = "rover",
     local_mqtt: dict[str, Any] | None = None,
     av_daemon: dict[str, Any] | None = None,
+    transport: dict[str, Any] | None = None,
     **bridge: Any,
 ) -> Config:
     """A robot with a bridge; further keywords are keys of services.mqtt_bridge."""
     raw = {
         "robot": {"id": robot},
+        **({} if transport is None else {"transport": transport}),
         "local_mqtt": local_mqtt or {},
         "services": {
             "av_daemon": av_daemon or {},
@@ -175,14 +177,23 @@ class MqttRig:
     """The same over real brokers: the bridge as its process would make it, clients that are no clients of ours."""
 
     def __init__(
-        self, local: dict[str, Any], remote: dict[str, Any], *, uplink: int | None = None, **section: Any
+        self,
+        local: dict[str, Any] | ZenohSettings,
+        remote: dict[str, Any],
+        *,
+        uplink: int | None = None,
+        **section: Any,
     ) -> None:
-        """``uplink`` is a port to the remote broker that only the bridge uses."""
+        """``local``: where the robot's broker is, or its hub; ``uplink``: a port of the remote one, for the bridge."""
         robot = f"r{next(_numbers)}"
         self.base = f"pebble/robots/{robot}"
         remote_mqtt = {**remote, "port": uplink or remote["port"]}
-        self._config = make_config(robot, local, remote_mqtt=remote_mqtt, **section)
-        self._where = (local, remote)
+        if isinstance(local, ZenohSettings):
+            section["transport"] = {"kind": "zenoh", "run_dir": str(local.run_dir)}
+        self._config = make_config(
+            robot, None if isinstance(local, ZenohSettings) else local, remote_mqtt=remote_mqtt, **section
+        )
+        self._where: tuple[dict[str, Any] | ZenohSettings, dict[str, Any]] = (local, remote)
         self._clients: list[Client] = []
         self._running: Running | None = None
         self.bridge: MqttBridge
@@ -191,8 +202,12 @@ class MqttRig:
     def client(self, side: str, *, listen: bool = True) -> Client:
         """A client on that side. It does not receive its own messages."""
         where = self._where[side == "remote"]
-        settings = MqttSettings(**{**where, "as_published": True})
-        client = Client(create("mqtt", f"{self.base}-{side}-{len(self._clients)}", settings), self.base, listen=listen)
+        name = f"{self.base}-{side}-{len(self._clients)}"
+        if isinstance(where, ZenohSettings):
+            transport = create("zenoh", name.rpartition("/")[2], where)
+        else:
+            transport = create("mqtt", name, MqttSettings(**{**where, "as_published": True}))
+        client = Client(transport, self.base, listen=listen)
         self._clients.append(client)
         return client
 

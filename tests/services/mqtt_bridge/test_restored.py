@@ -1,4 +1,4 @@
-"""A remote broker that has gone back to an older save, or still has what the robot took back while no bridge ran."""
+"""A side that has gone back to an older save, or still has what the robot took back while no bridge ran."""
 
 from __future__ import annotations
 
@@ -7,16 +7,19 @@ from pathlib import Path
 
 import pytest
 
+from pebble.forwarding import forwarder as forwarder_module
 from pebble.services.mqtt_bridge import service as bridge_module
+from pebble.services.mqtt_bridge.media import MEDIA, Media
 from pebble.transports import State
 from tests.services.mqtt_bridge.bridge_rig import BASE, MemoryRig, MqttRig, Quiet
+from tests.services.mqtt_bridge.restoring import FALSE, HISTORIES, TRUE, OwnBroker, OwnHub, play
 from tests.sparing_broker import SparingBroker
-from tests.support import Broker, until
+from tests.support import Broker, some, until
 from tests.tcp_proxy import TcpProxy
 
 AUDIO_FLAG = "incoming/flags/mqtt-audio"
 STATUS = "outgoing/autonomy-status"
-TRUE, FALSE = b'{"value": true}', b'{"value": false}'
+_AUDIO = MEDIA[1]
 
 
 @pytest.fixture
@@ -82,35 +85,75 @@ def test_a_broker_that_was_restored_from_an_older_save_gets_the_newest_values(
     assert rig.local.payloads(AUDIO_FLAG) == [FALSE, TRUE]
 
 
-@pytest.mark.parametrize("by", ["remote", "local"])
-def test_the_robots_own_broker_that_was_restored_from_an_older_save_gets_the_newest_flag(
-    tmp_path: Path, by: str
+@pytest.mark.parametrize("longer", [False, True], ids=["brief", "longer"])
+@pytest.mark.parametrize("history", some(HISTORIES, 4))
+@pytest.mark.parametrize("own", [OwnBroker, OwnHub])
+def test_a_microphone_that_was_switched_off_stays_off_when_the_robots_own_side_is_restored(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, own: type[OwnBroker | OwnHub], history: str, longer: bool
 ) -> None:
-    own, remote = Broker(tmp_path, persistence=True), Broker(tmp_path)
-    rig = MqttRig(*({"host": "127.0.0.1", "port": broker.port} for broker in (own, remote)))
-    rig.start()
+    """``longer``: it was away for longer than an outage in which an operator could choose an earlier value again."""
+    monkeypatch.setattr(forwarder_module, "_RESTORED_S", 0.0 if longer else 30.0)
+    side, remote = own(tmp_path), Broker(tmp_path)
+    rig = MqttRig(side.address, {"host": "127.0.0.1", "port": remote.port})
     try:
-        setter, other = (rig.remote, rig.local) if by == "remote" else (rig.local, rig.remote)
-        saved: dict[Path, bytes] = {}
-        for value in (TRUE, FALSE):
+        bridge = rig.start()
+        once = rig.client("local")
+
+        def set_microphone(who: str, value: bytes) -> None:
+            setter = {"operator": rig.remote, "program": rig.local, "once": once}[who]
             setter.publish(AUDIO_FLAG, value, retain=True)
-            setter.transport._own.clear()
-            assert until(lambda: other.payloads(AUDIO_FLAG)[-1:] == [value])  # noqa: B023
-            if not saved:
-                own.save()
-                saved = {file: file.read_bytes() for file in own.store.iterdir()}
-        own.kill()
-        for file, data in saved.items():
-            file.write_bytes(data)
-        before = rig.bridge.transport.counters["connected"]
-        own.start()
-        assert until(lambda: rig.bridge.transport.counters["connected"] > before)
-        assert until(lambda: rig.retained("local").get(AUDIO_FLAG) == FALSE)
+            once.transport._own.clear()
+            rig.remote.transport._own.clear()
+            assert until(lambda: bridge._forwarder._reconciliation.value(f"{rig.base}/{AUDIO_FLAG}") == value)
+            assert until(lambda: {rig.retained(name).get(AUDIO_FLAG) for name in ("local", "remote")} == {value})
+
+        play(history, set_microphone, side.save)
+        assert until(lambda: bridge._media._media._allowed[_AUDIO] is False)
+        allowed: list[bool] = []
+        monkeypatch.setattr(bridge._media, "allow", lambda _flag, on: allowed.append(on))
+        before = bridge.transport.counters["connected"]
+        side.stop()
+        assert until(lambda: bridge.transport.state is not State.CONNECTED)
+        side.restore()
+        assert until(lambda: bridge.transport.counters["connected"] > before)
+        Quiet(rig.remote, rig.local).wait(1.0)
+        assert until(lambda: rig.retained("local").get(AUDIO_FLAG) == FALSE), rig.retained("local")
         assert rig.retained("remote")[AUDIO_FLAG] == FALSE
-        assert TRUE not in rig.remote.payloads(AUDIO_FLAG)[2:]
+        assert True not in allowed
     finally:
         rig.close()
-        own.kill()
+        side.stop()
+        remote.stop()
+
+
+@pytest.mark.parametrize("history", some(HISTORIES, 4))
+@pytest.mark.parametrize("own", [OwnBroker, OwnHub])
+def test_it_stays_off_when_the_robots_own_side_is_restored_while_the_robot_is_off(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, own: type[OwnBroker | OwnHub], history: str
+) -> None:
+    allowed: list[bool] = []
+    monkeypatch.setattr(Media, "allow", lambda _media, _flag, on: allowed.append(on))
+    side, remote = own(tmp_path), Broker(tmp_path)
+    rig = MqttRig(side.address, {"host": "127.0.0.1", "port": remote.port})
+    try:
+        rig.start()
+
+        def set_microphone(who: str, value: bytes) -> None:
+            setter = rig.remote if who == "operator" else rig.local
+            setter.publish(AUDIO_FLAG, value, retain=True)
+            assert until(lambda: {rig.retained(name).get(AUDIO_FLAG) for name in ("local", "remote")} == {value})
+
+        play(history, set_microphone, side.save)
+        rig.close()
+        side.stop()
+        allowed.clear()
+        side.restore()
+        rig.start()
+        assert until(lambda: rig.retained("local").get(AUDIO_FLAG) == FALSE)
+        assert (rig.retained("remote")[AUDIO_FLAG], True in allowed) == (FALSE, False)
+    finally:
+        rig.close()
+        side.stop()
         remote.stop()
 
 

@@ -251,6 +251,35 @@ def test_without_room_in_shared_memory_frames_are_sent_as_bytes(tmp_path: Path, 
     assert subprocess.check_output(command, timeout=30, text=True) == "900000 False True\n"
 
 
+@needs_root
+@pytest.mark.parametrize(
+    ("at_first", "then"),
+    [
+        ("size=1m", "mount -o remount,size=64m /dev/shm"),
+        ("size=64m,ro", "mount -o remount,rw /dev/shm"),
+        ("size=64m", "rm /dev/shm/others"),
+    ],
+)
+def test_frames_are_shared_once_there_is_room(tmp_path: Path, at_first: str, then: str) -> None:
+    """The writer is opened again for it, as av_daemon is; a reader that had no room either finds it by itself."""
+    program = (
+        "import subprocess, sys, time; from pathlib import Path; from pebble.transports.frames import *\n"
+        "from pebble.transports.frames import writer; writer.RETRY_S = 0\n"
+        "folder = Path(sys.argv[1]); w = FrameWriter(folder, 'camera', capacity=900_000).open()\n"
+        "with FrameReader(folder, 'camera') as r:\n"
+        "    before = w.may_share, r.shared\n"
+        "    subprocess.run(sys.argv[2], shell=True, check=True)\n"
+        "    assert w.may_share; w.close(); w.open(); frame = None; end = time.monotonic() + 15\n"
+        "    while not (frame and frame.shared) and time.monotonic() < end:\n"
+        "        w.write(b'x' * 900_000, FrameInfo()); frame = r.read(0.2) or frame\n"
+        "    print(before, w.problem, r.problem, frame and frame.shared, w.may_share); w.close()"
+    )
+    mount = f"mount -t tmpfs -o {at_first} none /dev/shm && (dd if=/dev/zero of=/dev/shm/others bs=1M || true)"
+    command = ["unshare", "-m", "sh", "-c", mount + ' 2>/dev/null; exec "$@"', "sh", sys.executable, "-c", program]
+    printed = subprocess.check_output([*command, str(tmp_path), then], timeout=40, text=True)
+    assert printed == "(False, False)   True False\n"
+
+
 def test_a_closed_reader_stops_reading(tmp_path: Path) -> None:
     reader = FrameReader(tmp_path, "camera").open()
     frames: list[object] = []

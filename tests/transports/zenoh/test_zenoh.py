@@ -259,6 +259,31 @@ def test_no_value_is_lost_or_old_while_the_hub_is_killed_again_and_again(tmp_pat
         robot.end()
 
 
+def test_a_journal_whose_folder_is_mounted_late_is_taken_up_and_what_is_newer_stays(tmp_path: Path) -> None:
+    state, disk = tmp_path / "state", tmp_path / "disk"
+    for folder in (state, disk):
+        folder.mkdir()
+    before = HubProcess(tmp_path / "run", disk / "journal").start()
+    with create("zenoh", "before", before.settings) as client:
+        for name in ("kept", "changed"):
+            client.publish(f"a/{name}", b"old", qos=DELIVERED, retain=True)
+        before.wait_until_stored()
+    before.kill()
+    hub = HubProcess(tmp_path / "run", state / "journal").start()
+    found: dict[str, bytes] = {}
+    with create("zenoh", "now", hub.settings) as client:
+        client.publish("a/changed", b"new", qos=DELIVERED, retain=True)
+        hub.wait_until_stored()
+        state.rename(tmp_path / "hidden")
+        disk.rename(state)
+        hub.wait_until_stored()
+        with create("zenoh", "late", hub.settings) as late:
+            late.subscribe("a/+", lambda message: found.__setitem__(message.topic, message.payload))
+            assert until(lambda: found == {"a/kept": b"old", "a/changed": b"new"}), found
+    hub.end()
+    assert b"a/kept" in (state / "journal").read_bytes()
+
+
 class History:
     """A handler that remembers the newest number of each topic, and each time an older one came after it."""
 

@@ -385,6 +385,8 @@ class HubWorker:
 
         Never before: the file would be lost.
         """
+        if journal.appeared:
+            self._recalled = False
         self._recalled = self._recalled or self._recall(journal)
         if self._recalled:
             journal.rewrite(map(wire.encode, self._store.records()))

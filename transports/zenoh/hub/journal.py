@@ -45,6 +45,7 @@ class Journal:
         self._due = _NEVER  # when to rewrite
         self._failing = False
         self._own = OwnFile(path)
+        self._began_anew = False  # there was no file to load
         self._dirty = threading.Event()
         self._closing = threading.Event()
         self._lock = threading.Lock()  # the file may be replaced while the syncer uses it
@@ -70,6 +71,14 @@ class Journal:
         except OSError:  # what is there cannot be seen
             return True
 
+    @property
+    def appeared(self) -> bool:
+        """Whether there was no file at first, and another process's is there now: its folder was mounted late."""
+        try:
+            return self._began_anew and self._own.replaced
+        except OSError:  # what is there cannot be seen
+            return False
+
     def load(self) -> list[bytes] | None:
         """The records of the last run, oldest first, up to the first damaged one; None while they cannot be read.
 
@@ -78,10 +87,12 @@ class Journal:
         try:
             data = self.path.read_bytes()
         except FileNotFoundError:
+            self._began_anew = True
             return []
         except OSError as error:
             self._fail(error)
             return None
+        self._began_anew = False
         records, end = _records(data)
         if end < len(data):
             bad = self.path.with_name(self.path.name + ".bad")
