@@ -161,6 +161,20 @@ class MotorGuard:
         if self._barred and not self._barred_file.busy and not self._barred_file.in_place:
             self._barred_file.save(self._barred)
 
+    def appeared_stop(self) -> EstopCommand | None:
+        """A stop that is in a file that has just appeared, as its folder was mounted late, and is not known here."""
+        saved = None if self._file.busy or not self._can_save else self._file.appeared()
+        if saved is None:
+            return None
+        found = Latch("", NAMES, operator.sub)
+        found.restore(saved)
+        newest = found.recent[0] if found.recent else secrets.token_hex(8)
+        if found.latched and not self.latched and newest not in self._latch.recent:
+            log.warning("%s has appeared, with an emergency stop", self._file.path)
+            return EstopCommand(stop=newest, by=found.by, why=found.why)
+        self._save()  # what is known here is newer
+        return None
+
     def repeat_state(self, now: float) -> None:
         """Publish the state again: a broker that was restored from an older save retains an older one."""
         self._changed(now)

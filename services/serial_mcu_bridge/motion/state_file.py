@@ -69,6 +69,13 @@ class StateFile:
         except (OSError, ValueError, RecursionError):
             return Unreadable()
 
+    def appeared(self) -> Any:
+        """As :meth:`load`, of a file that is not from this process; None without one, or if that cannot be seen."""
+        try:
+            return None if self._own is not None and not self._own.replaced else self.load()
+        except OSError:
+            return None
+
     def save(self, value: Any) -> int:
         """Write ``value`` soon; returns at once."""
         with self._changed:

@@ -227,7 +227,11 @@ class MotorBridge(SerialService):
 
     @every(_SAVE_AGAIN_S)
     def save_again(self) -> None:
-        self._guard.save_again()
+        stop = self._guard.appeared_stop() if self._latches else None
+        if stop is not None:
+            self.receive_stop(stop, self.clock())
+        else:
+            self._guard.save_again()
 
     @every(_REPEAT_S)
     def repeat_state(self) -> None:

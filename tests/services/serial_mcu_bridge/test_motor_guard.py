@@ -301,6 +301,52 @@ def test_a_stop_whose_file_was_removed_is_written_again(tmp_path: Path, remove: 
     again.close()
 
 
+OLD = {"latched": True, "recent": [B], "by": "eve", "why": "before the power cut", "since": 1}
+
+
+@pytest.mark.parametrize(
+    ("before", "content", "found"),
+    [
+        ("nothing", json.dumps(OLD), B),  # the folder is mounted late
+        ("nothing", json.dumps({**OLD, "latched": False}), ""),
+        ("nothing", "{", "a new name"),  # as at the start, what cannot be read counts as a stop
+        ("nothing", None, ""),
+        ("a reset", json.dumps(OLD), B),
+        ("a reset", json.dumps({**OLD, "recent": [A]}), ""),  # known, and reset: the folder came back as it was
+        ("a stop", json.dumps(OLD), ""),  # stopped already
+    ],
+)
+def test_a_stop_in_a_file_that_appears(tmp_path: Path, before: str, content: str | None, found: str) -> None:
+    path = tmp_path / "state" / "estop.json"
+    rig = Rig(path)
+    if before != "nothing":
+        rig.stop(A)
+    if before == "a reset":
+        rig.reset(rig.state)
+    assert before == "nothing" or rig.written()
+    assert until(lambda: not rig.file.busy)
+    other = tmp_path / "mounted" / "estop.json"
+    other.parent.mkdir()
+    if content is not None:
+        other.write_text(content)
+    if (tmp_path / "state").is_dir():
+        shutil.rmtree(tmp_path / "state")
+    other.parent.rename(tmp_path / "state")
+    stop = rig.guard.appeared_stop()
+    assert bool(stop) == bool(found)
+    if stop is not None:
+        assert found in (stop.stop, "a new name")
+        rig.guard.stop(stop, rig.now)
+        assert (rig.state.latched, rig.state.by) == (True, "" if content == "{" else "eve")
+    elif content is not None:
+        assert rig.written()
+    assert rig.guard.appeared_stop() is None
+    rig.close()
+    again = Rig(path)
+    assert again.state.latched == (bool(found) or before == "a stop")
+    again.close()
+
+
 def test_a_folder_that_can_be_written_later_gets_the_stop(tmp_path: Path) -> None:
     (tmp_path / "state").write_text("in the way")
     rig = Rig(tmp_path / "state" / "estop.json")
