@@ -20,7 +20,7 @@ class Mcu(NamedTuple):
 
     state: str
     silent_ms: int | None  # how long ago its board sent anything: 0, 1000 or 10000, at least; None: never since opening
-    why: str = ""  # it is absent
+    why: str = ""  # it is absent, or was never heard
 
     @property
     def shown(self) -> dict[str, Any]:
@@ -39,7 +39,7 @@ class Mcu(NamedTuple):
             case "booting":
                 return _UNKNOWN, "its board is starting"
         if self.silent_ms is None:
-            return _UNKNOWN, "its board has sent nothing yet"
+            return _UNKNOWN, self.why or "its board has sent nothing yet"
         return (_YES, "") if self.silent_ms < 10_000 else (_UNKNOWN, "its board has sent nothing for 10 s")
 
 

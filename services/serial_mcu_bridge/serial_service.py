@@ -17,6 +17,7 @@ from pebble.runtime.service import Service, every
 from pebble.services.serial_mcu_bridge.line.serial_line import LineState, SerialLine
 from pebble.services.serial_mcu_bridge.line.silence import CHECK_S, Silence
 
+_MISREAD = "what its board sends is not understood: another baud rate or firmware, or noise"
 _INPUT_LIMIT = 65_536  # bytes waiting for the service's thread; 1.4 s of a full 460,800 baud line
 
 
@@ -39,6 +40,8 @@ class SerialService(Service, ABC):
         self._input = bytearray()
         self._input_lock = threading.Lock()
         self._silence = Silence()
+        self._misread = False
+        self._heard = (0, 0)  # which opening of the line, and how often its board was heard since
         self.notifier = Notifier()
         self._reported: tuple[str, int | None, str] | None = None  # of the MCU, to the launcher
         self.line = SerialLine(
@@ -95,15 +98,24 @@ class SerialService(Service, ABC):
         self.report_mcu()
         self.on_line_state(state)
 
+    def note_heard(self, heard: bool) -> None:
+        """Something has come: ``heard`` if it is of the board's protocol, and neither noise nor other text."""
+        if heard:
+            opened, times = self._heard
+            self._heard = self.line.opened, times + 1 if opened == self.line.opened else 1
+
     @every(CHECK_S)
     def report_mcu(self) -> None:
         """Report to the launcher what has changed of the MCU."""
         line, now = self.line, time.monotonic()  # the line's clock
         if line.state is LineState.CLOSED:
             return
-        idle = now - line.sent_until >= CHECK_S
-        state, silent_ms = self._silence.check(line.state, line.opened, line.received, now, idle=idle)
-        found = state, silent_ms, line.problem
+        idle, (opened, heard) = now - line.sent_until >= CHECK_S, self._heard
+        heard = heard if opened == line.opened else 0
+        state, silent_ms = self._silence.check(line.state, line.opened, heard, now, idle=idle)
+        misread = silent_ms is None and line.state is LineState.READY and line.received > 0
+        found = state, silent_ms, _MISREAD if misread and self._misread else line.problem
+        self._misread = misread  # a line may be under way
         if found != self._reported and self.notifier.mcu(*found):
             self._reported = found
 

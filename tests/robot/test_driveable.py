@@ -98,13 +98,17 @@ def test_what_silence_means_depends_on_what_the_board_did_before(tmp_path: Path)
     board = Terminal(tmp_path)
     with Rig("mqtt", motors=board) as rig:
         assert shows(rig, "unknown", "its board has sent nothing yet")
+        for noise in (b"\xff\x00\x80\n" * 40, b">>> \n", b"M 0.000 0.000\n", b"T a0=\n"):
+            board.send(noise)
+        assert shows(rig, "unknown", "what its board sends is not understood")
+        assert "heard_ms" not in _mcu(rig)
         board.send(b"Done!\n")
         assert shows(rig, "yes")
         assert shows(rig, "unknown", "its board has sent nothing for 10 s")
         end = time.monotonic() + 8
         until(lambda: board.send(b"C chg=0 v=7.5\n") or time.monotonic() > end, 10)  # type: ignore[func-returns-value]
         assert shows(rig, "yes")
-        assert shows(rig, "no", "its board has stopped sending")
+        assert until(lambda: board.send(b"\xff\xfe\n") or shows(rig, "no", "its board has stopped sending", 0.5), 20)  # type: ignore[func-returns-value]
         assert _mcu(rig) == {"state": "silent", "heard_ms": 10_000}
 
 

@@ -26,8 +26,8 @@ class Silence:
     def check(self, state: LineState, opened: int, received: int, now: float, *, idle: bool) -> tuple[str, int | None]:
         """The state of the line, and how long ago its board was heard: 0, 1000 or 10000 ms, at least.
 
-        ``opened`` counts openings, ``received`` what was received since the last one; ``idle``: nothing was sent to the
-        board for a second.
+        ``opened`` counts openings, ``received`` what of the board's protocol was received since the last one; ``idle``:
+        nothing was sent to the board for a second.
         """
         if opened != self._opened:
             self._opened, self._received, self._received_at, self._in_row = opened, 0, None, 0

@@ -118,6 +118,7 @@ class Session:
     def __init__(self, base: str = "") -> None:
         """``base`` is what the robot's topics begin with."""
         self.manifest: Manifest | None = None
+        self.frames = 0  # valid ones from a device
         self._base = base
         self._splitter = LineSplitter(FRAME_LIMIT, END)
         self._too_long = 0
@@ -194,6 +195,7 @@ class Session:
             frame = decode(stuffed)
             self._received_at = now
             yield from self._understand(frame, now)
+            self.frames += 1
         except FrameError as error:
             yield RefusedInput(error.subject, str(error))
         except PayloadError as error:

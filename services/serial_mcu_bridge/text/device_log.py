@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 LIMIT = 200  # characters
 
 
 @dataclass(frozen=True, slots=True)
 class DeviceLogLine:
-    """A line for the log: an answer, a boot message, a malformed report. ``level`` is one of logging's."""
+    """A line for the log: an answer, a boot message, a malformed report. ``level`` is one of logging's.
+
+    ``known``: it is in the protocol's own words; other text may be noise, or come from whatever else runs there.
+    """
 
     level: int
     text: str
+    known: bool = field(default=False, compare=False)
+
+
+def is_known(report: object) -> bool:
+    """Whether a report of a text protocol shows that the board speaks it."""
+    return not isinstance(report, DeviceLogLine) or report.known
 
 
 def printable(raw: bytes) -> str:

@@ -1,7 +1,7 @@
 """The text protocol ``goob_base_v1`` of the motor MCUs of Goob and Fred: bytes in and out, no I/O.
 
 Host to MCU: ``M <left> <right>``, ``L <b> <g> <r>``, ``F <b> <g> <r> <period>``. MCU to host: ``T`` (sensors), ``C``
-(battery), ``OK``/``WARN``/``ERR`` (answers), anything else is a log line.
+(battery), ``OK``/``WARN``/``ERR`` (answers), ``Done!`` (it has started), anything else is a log line.
 A line ends with LF, a CR before it is ignored.
 """
 
@@ -21,7 +21,7 @@ SHORTEST_FLASH_S, LONGEST_FLASH_S = 0.05, 3600.0  # one full fade in and out
 _TOUCH_NAMES = ((b"a0", b"a1", b"a2"), (b"t0", b"t1", b"t2"))  # Goob's and Fred's spelling
 _INTEGER = re.compile(rb"[+-]?[0-9]{1,6}\Z")  # an ADC has at most 16 bits
 _DECIMAL = re.compile(rb"[+-]?[0-9]{1,6}(?:\.[0-9]{0,9})?\Z")  # what printf("%.3f") makes; never nan or inf
-_LEVELS = {b"OK": logging.DEBUG, b"WARN": logging.WARNING, b"ERR": logging.ERROR}
+_LEVELS = {b"OK": logging.DEBUG, b"WARN": logging.WARNING, b"ERR": logging.ERROR, b"Done!": logging.INFO}
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +62,7 @@ def parse(line: bytes) -> list[Report]:
         reports += _charging(fields) + _level(fields)
         return reports or [DeviceLogLine(logging.WARNING, f"not understood: {printable(line)}")]
     text = printable(line)
-    return [DeviceLogLine(_LEVELS.get(kind, logging.INFO), text)] if text else []
+    return [DeviceLogLine(_LEVELS.get(kind, logging.INFO), text, known=kind in _LEVELS)] if text else []
 
 
 def mix(x: float, z: float) -> tuple[float, float]:

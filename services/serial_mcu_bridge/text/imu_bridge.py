@@ -13,7 +13,7 @@ from pebble.runtime.service import every
 from pebble.services.serial_mcu_bridge.devices.imu import ImuReports, ImuWatchdog
 from pebble.services.serial_mcu_bridge.line.serial_line import LineState
 from pebble.services.serial_mcu_bridge.serial_service import SerialService
-from pebble.services.serial_mcu_bridge.text.device_log import DeviceLogLine
+from pebble.services.serial_mcu_bridge.text.device_log import DeviceLogLine, is_known
 from pebble.services.serial_mcu_bridge.text.imu_mpu6050 import Motion, Report, Summary, parse
 
 _WATCH_S = 0.5
@@ -46,6 +46,7 @@ class ImuBridge(SerialService):
         for line in self._splitter.feed(chunk):
             report = parse(line)
             if report is not None:
+                self.note_heard(is_known(report))
                 self._report(report)
         self.count_discarded(self._splitter.discarded_lines)
 

@@ -38,7 +38,7 @@ from pebble.services.serial_mcu_bridge.motion.motor_guard import MotorGuard
 from pebble.services.serial_mcu_bridge.motion.state_file import StateFile
 from pebble.services.serial_mcu_bridge.serial_service import SerialService
 from pebble.services.serial_mcu_bridge.text import goob_base
-from pebble.services.serial_mcu_bridge.text.device_log import DeviceLogLine
+from pebble.services.serial_mcu_bridge.text.device_log import DeviceLogLine, is_known
 from pebble.services.serial_mcu_bridge.text.goob_base import Charging, Level, Report, Touch
 
 _LIGHTS = "lights"  # a steady colour and a fade replace one another
@@ -269,6 +269,7 @@ class MotorBridge(SerialService):
     def on_input(self, chunk: bytes) -> None:
         for line in self._splitter.feed(chunk):
             for report in self.protocol.parse(line):
+                self.note_heard(is_known(report))
                 self._report(report)
         self.count_discarded(self._splitter.discarded_lines)
 
