@@ -34,19 +34,19 @@ class _Robot:
         self.due = inf  # when it is asked for next
         self.asked = 0
         self._began: float | None = None  # its first heartbeat
-        self._beat_at = -inf  # its newest one
+        self._newest_at = -inf  # its newest one
         self._pauses: Iterator[float] = iter(_PAUSES_S)
 
     @property
     def lasts(self) -> bool:
         """Whether it goes on sending heartbeats: it takes more to invent many such robots."""
-        return self._began is not None and self._beat_at - self._began >= _LASTS_S
+        return self._began is not None and self._newest_at - self._began >= _LASTS_S
 
     def may_go(self, now: float) -> bool:
-        return self.due == inf or now - self._beat_at > _SILENT_S
+        return self.due == inf or now - self._newest_at > _SILENT_S
 
-    def beat(self, now: float) -> None:
-        self._beat_at = now
+    def heartbeat(self, now: float) -> None:
+        self._newest_at = now
         if self._began is None:
             self._began = now
             self.due = now + next(self._pauses)
@@ -95,13 +95,13 @@ class ByName:
         if address is None or address.direction is not Direction.OUTGOING or not message.payload:
             return
         metric = address.metric
-        beats = metric in _HEARTBEATS
-        if beats and message.retain:
+        is_heartbeat = metric in _HEARTBEATS
+        if is_heartbeat and message.retain:
             return  # no sign of life
-        if beats or metric == CAPABILITIES.metric or metric.startswith("estop/"):
+        if is_heartbeat or metric == CAPABILITIES.metric or metric.startswith("estop/"):
             robot = None if address.identity.is_server else self._robot(address.identity.base, now)
-            if robot is not None and beats:
-                robot.beat(now)
+            if robot is not None and is_heartbeat:
+                robot.heartbeat(now)
             elif robot is not None:
                 robot.receive(message, now)
 
@@ -125,8 +125,8 @@ class ByName:
             return robot
         if len(self._robots) >= MAX_ROBOTS and now - self._swept_at >= _SWEEP_S:
             self._swept_at = now
-            kept = {name: one for name, one in self._robots.items() if self._is_known(name) or not one.may_go(now)}
-            self._robots = kept
+            rest = {name: one for name, one in self._robots.items() if self._is_known(name) or not one.may_go(now)}
+            self._robots = rest
         if len(self._robots) >= MAX_ROBOTS and not self._is_known(base):
             self.omitted += 1
             if self.omitted & (self.omitted - 1) == 0:  # the 1st, 2nd, 4th, 8th …

@@ -20,12 +20,12 @@ OWNERS = [f"{GOOB}/outgoing/estop/{owner}" for owner in ("left", "right")]
 Arriving = Iterable[tuple[float, Message]]
 
 
-def beat(base: str = GOOB, *, retain: bool = False, metric: str = "online") -> Message:
+def heartbeat(base: str = GOOB, *, retain: bool = False, metric: str = "online") -> Message:
     return Message(f"{base}/outgoing/{metric}", json.dumps({"t": 1, "online": True}).encode(), retain=retain)
 
 
-def beats(base: str = GOOB, first: float = 0.0, last: float = 600.0) -> Arriving:
-    return [(first + 0.25 * n, beat(base)) for n in range(int(4 * (last - first)))]
+def heartbeats(base: str = GOOB, first: float = 0.0, last: float = 600.0) -> Arriving:
+    return [(first + 0.25 * n, heartbeat(base)) for n in range(int(4 * (last - first)))]
 
 
 class Asked:
@@ -53,28 +53,32 @@ class Asked:
 
 #: What arrives by itself, what the broker has under exact names, and what is asked for when.
 CASES: dict[str, tuple[Arriving, list[Message], list[tuple[float, list[str]]]]] = {
-    "only for exact names": (beats(), [CAPABILITIES, *STATES], [(1.0, ALL), (1.1, OWNERS)]),
-    "for wildcards too": ([(0.0, one) for one in (CAPABILITIES, *STATES)] + list(beats()), [], []),
-    "late copies": ([(0.9, one) for one in (CAPABILITIES, *STATES)] + list(beats()), [], []),
-    "very late copies": ([(3.0, one) for one in (CAPABILITIES, *STATES)] + list(beats()), [], [(1.0, ALL)]),
-    "live capabilities, states by name": ([*beats(), (0.5, CAPABILITIES)], STATES, [(1.5, OWNERS)]),
-    "one state of two": ([*beats(), (0.5, CAPABILITIES), (0.5, STATES[0])], STATES, [(1.5, OWNERS[1:])]),
-    "it has none": (beats(), [], [(1.0, ALL), (6.0, ALL), (36.0, ALL)]),
-    "it appears later": (beats(first=100.0), [CAPABILITIES, *STATES], [(101.0, ALL), (101.1, OWNERS)]),
-    "one heartbeat": ([(0.0, beat())], [CAPABILITIES, *STATES], [(1.0, ALL), (1.1, OWNERS)]),
-    "an older name of it": ([(0.0, beat(metric="heartbeat"))], [CAPABILITIES, *STATES], [(1.0, ALL), (1.1, OWNERS)]),
-    "it sends one a minute": (
-        [(60.0 * n, beat()) for n in range(9)],
+    "only for exact names": (heartbeats(), [CAPABILITIES, *STATES], [(1.0, ALL), (1.1, OWNERS)]),
+    "for wildcards too": ([(0.0, one) for one in (CAPABILITIES, *STATES)] + list(heartbeats()), [], []),
+    "late copies": ([(0.9, one) for one in (CAPABILITIES, *STATES)] + list(heartbeats()), [], []),
+    "very late copies": ([(3.0, one) for one in (CAPABILITIES, *STATES)] + list(heartbeats()), [], [(1.0, ALL)]),
+    "live capabilities, states by name": ([*heartbeats(), (0.5, CAPABILITIES)], STATES, [(1.5, OWNERS)]),
+    "one state of two": ([*heartbeats(), (0.5, CAPABILITIES), (0.5, STATES[0])], STATES, [(1.5, OWNERS[1:])]),
+    "it has none": (heartbeats(), [], [(1.0, ALL), (6.0, ALL), (36.0, ALL)]),
+    "it appears later": (heartbeats(first=100.0), [CAPABILITIES, *STATES], [(101.0, ALL), (101.1, OWNERS)]),
+    "one heartbeat": ([(0.0, heartbeat())], [CAPABILITIES, *STATES], [(1.0, ALL), (1.1, OWNERS)]),
+    "an older name of it": (
+        [(0.0, heartbeat(metric="heartbeat"))],
         [CAPABILITIES, *STATES],
         [(1.0, ALL), (1.1, OWNERS)],
     ),
-    "a retained heartbeat": ([(0.0, beat(retain=True))], [CAPABILITIES], []),
+    "it sends one a minute": (
+        [(60.0 * n, heartbeat()) for n in range(9)],
+        [CAPABILITIES, *STATES],
+        [(1.0, ALL), (1.1, OWNERS)],
+    ),
+    "a retained heartbeat": ([(0.0, heartbeat(retain=True))], [CAPABILITIES], []),
     "an empty one": ([(0.0, Message(f"{GOOB}/outgoing/online", b""))], [CAPABILITIES], []),
     "a command": ([(0.0, Message(f"{GOOB}/incoming/online", b"{}"))], [CAPABILITIES], []),
-    "a server": ([(0.0, beat("pebble/servers/hall"))], [], []),
+    "a server": ([(0.0, heartbeat("pebble/servers/hall"))], [], []),
     "retained, but it is off": ([(0.0, CAPABILITIES)], STATES, []),
     "its capabilities are damaged": (
-        beats(),
+        heartbeats(),
         [Message(CAPABILITIES.topic, b"{", retain=True)],
         [(1.0, ALL), (6.0, ALL), (36.0, ALL)],
     ),
@@ -92,15 +96,17 @@ def test_a_robot_is_asked_for_what_does_not_come_by_itself(
 
 def test_what_came_before_an_outage_is_asked_for_again() -> None:
     robots = Asked([CAPABILITIES, *STATES])
-    robots.run(beats(), 100)
+    robots.run(heartbeats(), 100)
     robots.by_name.reset()
-    robots.run(beats(first=120), 200, since=110)
+    robots.run(heartbeats(first=120), 200, since=110)
     assert robots.of(GOOB) == [1.0, 1.1, 121.0, 121.1]
 
 
 def flood(count: int, *, lasting: bool, last: float = 100.0) -> Arriving:
     for n in range(count):
-        yield from beats(f"evil/robots/e{n}", 0.001, last) if lasting else [(0.001, beat(f"evil/robots/e{n}"))]
+        yield from (
+            heartbeats(f"evil/robots/e{n}", 0.001, last) if lasting else [(0.001, heartbeat(f"evil/robots/e{n}"))]
+        )
 
 
 @pytest.mark.parametrize(
@@ -118,7 +124,7 @@ def test_robots_that_are_invented_cause_no_flood_and_keep_none_waiting(
     invented: Arriving, known: bool, within_s: float
 ) -> None:
     robots = Asked([CAPABILITIES, *STATES], lambda base: known and base == GOOB)
-    robots.run([*invented, *beats(first=0.3, last=100)], 100)
+    robots.run([*invented, *heartbeats(first=0.3, last=100)], 100)
     assert robots.of(GOOB)[0] <= within_s
     assert len(robots.of(GOOB)) == 2
     assert len(robots.asks) <= 100 / EACH_S

@@ -249,8 +249,8 @@ DRIVEABLE = {
 
 @pytest.mark.parametrize(("states", "expected"), DRIVEABLE.values(), ids=DRIVEABLE)
 def test_a_robot_that_is_driven_and_can_no_longer_be(states: str, expected: list[str]) -> None:
-    said = [[{"state": one.lower(), "why": "no board"}, one.isupper()] for one in states.split()]
-    assert notices(f"for (const one of {json.dumps(said)}) watcher.driveable('a', ...one, ++at);") == expected
+    reported = [[{"state": one.lower(), "why": "no board"}, one.isupper()] for one in states.split()]
+    assert notices(f"for (const one of {json.dumps(reported)}) watcher.driveable('a', ...one, ++at);") == expected
 
 
 def test_a_voltage_is_low_only_below_a_limit_of_the_user() -> None:
