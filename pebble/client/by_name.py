@@ -30,7 +30,8 @@ class _Robot:
     """A robot as the present connection shows it. Times are None or infinite until there is one."""
 
     def __init__(self, base: str) -> None:
-        self.estop = RobotEstop(base)
+        self.base = base
+        self.estop: RobotEstop | None = None  # since it was asked for
         self.due = inf  # when it is asked for next
         self.asked = 0
         self._began: float | None = None  # its first heartbeat
@@ -49,18 +50,22 @@ class _Robot:
         self._newest_at = now
         if self._began is None:
             self._began = now
-            self.due = now + next(self._pauses)
+            self.due = now + next(self._pauses, inf)
 
     def receive(self, message: Message, now: float) -> None:
+        """Capabilities, or the state of a motor owner."""
+        if self.estop is None:
+            if message.topic == CAPABILITIES.topic(self.base):  # they come by themselves, and so does the rest
+                self._pauses, self.due = iter(()), inf
+            return
         had = self.estop.has_capabilities
         self.estop.receive(message)
-        if self.estop.has_capabilities and not had and self._began is not None:
-            self._pauses = iter(_PAUSES_S)  # now for the states of the motor owners that they list
-            self.due = now if self.asked else now + next(self._pauses)
+        if self.estop.has_capabilities and not had:
+            self._pauses, self.due = iter(_PAUSES_S[1:]), now  # for the states of the owners that they list
 
     def ask(self, now: float, channels: Collection[Channel]) -> list[str]:
         """The topics to ask for; empty: nothing is missing."""
-        estop = self.estop
+        estop = self.estop = self.estop or RobotEstop(self.base)
         topics = estop.missing if estop.has_capabilities else [channel.topic(estop.base) for channel in channels]
         self.asked += bool(topics)
         self.due = now + next(self._pauses, inf) if topics else inf
@@ -70,8 +75,8 @@ class _Robot:
 class ByName:
     """Decides which robots are asked for, and for what: those whose capabilities do not come by themselves.
 
-    A robot is asked for 1 s after its first heartbeat on the present connection, then twice more; once its capabilities
-    are there, for the states of the motor owners that they list. Anybody can invent robots: one is asked for at a time,
+    A robot is asked for 1 s after its first heartbeat on the present connection, then twice more; when it answers, for
+    the states of the motor owners that its capabilities list. Anybody can invent robots: one is asked for at a time,
     first those known from before, those that have answered, and those that go on sending heartbeats.
     One thread may receive, and another ask.
     """
@@ -116,8 +121,8 @@ class ByName:
         return []
 
     def _rank(self, robot: _Robot) -> tuple[bool, bool, bool, int, float]:
-        estop = robot.estop
-        return not self._is_known(estop.base), not estop.has_capabilities, not robot.lasts, robot.asked, robot.due
+        has_answered = robot.estop is not None and robot.estop.has_capabilities
+        return not self._is_known(robot.base), not has_answered, not robot.lasts, robot.asked, robot.due
 
     def _robot(self, base: str, now: float) -> _Robot | None:
         robot = self._robots.get(base)

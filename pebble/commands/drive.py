@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pebble.client.by_name import ByName, ask_beside
 from pebble.client.connection import Target, connected, target_of
 from pebble.client.driver_lease import ANSWER_S, DriverLease
 from pebble.client.key_decoder import END, KeyDecoder
@@ -108,8 +107,6 @@ class _Loop:
         self._in_flight = InFlight(_OVERHEAD)
         self._arrived: deque[tuple[Message, float, float]] = deque(maxlen=_ARRIVED)
         self._shown, self._shown_at = "", float("-inf")
-        self._by_name = ByName()
-        ask_beside(transport, self._by_name)
         for filter_ in driver.filters:
             transport.subscribe(filter_, self._take, qos=QoS.DELIVERED, direct=True)
 
@@ -128,7 +125,6 @@ class _Loop:
 
     def _take(self, message: Message) -> None:
         self._arrived.append((message, clock(), time.time()))
-        self._by_name.receive(message, time.monotonic())
 
     def _step(self, terminal: Terminal) -> None:
         due = self._decoder.due
