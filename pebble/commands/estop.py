@@ -249,7 +249,9 @@ def _reset(target: Target) -> int:
     with connected(target) as (transport, names):
         robot, name = RobotEstop(names.base), show.printable(id_of(names.base))
         robot.subscribe(transport)
-        _wait(lambda: robot.has_capabilities and len(robot.states) >= len(robot.owners))
+        _wait(lambda: robot.has_capabilities)
+        transport.ask(robot.missing)  # the capabilities may have come after the subscription
+        _wait(lambda: not robot.missing)
         if not robot.states:
             raise PebbleError(f"{name} publishes no emergency stop: {_absent(robot)}")
         reset = Reset(robot, me())
