@@ -15,6 +15,7 @@ from typing import Annotated
 
 import typer
 
+from pebble.client.by_name import ByName, ask_beside
 from pebble.client.connection import Listener, Target, connected, target_of
 from pebble.client.discovery import ALL_OUTGOING, Discovery
 from pebble.client.driveable import Driveable
@@ -27,7 +28,7 @@ from pebble.config.visible import shown
 from pebble.contract import CAPABILITIES, ESTOP_STATE, ONLINE, STATUS
 from pebble.errors import PebbleError, TransportError
 from pebble.runtime.signals import interrupted_by_signals
-from pebble.transports import State, Transport
+from pebble.transports import Message, State, Transport
 
 _VERBS = ("reset", "status")
 _TICK_S = 0.25
@@ -130,8 +131,10 @@ def _stop(target: Target, why: str, *, every: bool, hold: bool) -> int:
         try:
             _publish(transport, sender)
             listener = _listen(transport, [ALL_OUTGOING] if every else _filters(names.base))
+            by_name = ByName([STATUS])
+            ask_beside(transport, by_name)
             while not sender.finished:
-                _receive(listener, sender)
+                _receive(listener, sender, by_name)
                 _publish(transport, sender)
                 report.connection("" if transport.state is State.CONNECTED else transport.problem or "no connection")
                 report.update(time.monotonic())
@@ -157,7 +160,7 @@ def _filters(base: str) -> list[str]:
     return [channel.filter(base) for channel in (ESTOP_STATE, STATUS, CAPABILITIES, ONLINE)]
 
 
-def _receive(listener: Listener, sender: StopSender) -> None:
+def _receive(listener: Listener, sender: StopSender, by_name: ByName) -> None:
     """Handle what has arrived; wait for something if nothing has, until something is due."""
     due = sender.due
     left = _TICK_S if due is None else min(_TICK_S, due - time.monotonic())
@@ -166,6 +169,7 @@ def _receive(listener: Listener, sender: StopSender) -> None:
         if message is None:
             return
         sender.receive(message, time.monotonic())
+        by_name.receive(message, time.monotonic())
         left = 0.0
 
 
@@ -246,7 +250,9 @@ def _reset(target: Target) -> int:
     with connected(target) as (transport, names):
         robot, name = RobotEstop(names.base), shown(id_of(names.base))
         robot.subscribe(transport)
-        _wait(lambda: robot.has_capabilities and len(robot.states) >= len(robot.owners))
+        _wait(lambda: robot.has_capabilities)
+        transport.ask(robot.missing)  # the capabilities may have come after the subscription
+        _wait(lambda: not robot.missing)
         if not robot.states:
             raise PebbleError(f"{name} publishes no emergency stop: {_absent(robot)}")
         reset = Reset(robot, me())
@@ -267,18 +273,23 @@ def _reset(target: Target) -> int:
 
 def _status(target: Target, *, every: bool) -> int:
     with connected(target) as (transport, names):
-        discovery = Discovery()
+        discovery, by_name = Discovery(), ByName([STATUS])
+
+        def take(message: Message) -> None:
+            discovery.receive(message, time.monotonic(), time.time())
+            by_name.receive(message, time.monotonic())
+
         is_remote = target.remote or str(target.url).startswith("mqtt")  # within a robot there is no heartbeat
         for channel in (ESTOP_STATE, STATUS, CAPABILITIES, *((ONLINE,) if is_remote else ())):
-            transport.subscribe(
-                channel.filter(names.base),
-                lambda message: discovery.receive(message, time.monotonic(), time.time()),
-                direct=True,
-            )
+            transport.subscribe(channel.filter(names.base), take, direct=True)
+        ask_beside(transport, by_name)
         if not every:
             _wait(lambda: names.base in discovery.robots and discovery.robots[names.base].estop.has_capabilities)
+            transport.ask([topic for robot in discovery.all_robots() for topic in robot.estop.missing])
         if is_remote:
-            _wait(lambda: all(robot.liveness.received_at for robot in discovery.all_robots()), _HEARTBEAT_S)
+            found = discovery.all_robots
+            _wait(lambda: bool(found()) and all(one.liveness.received_at for one in found()), _HEARTBEAT_S)
+            _wait(lambda: not any(one.liveness.received_at and one.estop.lacks for one in found()))
         robots = sorted(discovery.all_robots(), key=lambda robot: robot.base)
     for robot in robots:
         _print_states(robot.estop, robot.driveable, silent=is_remote and robot.liveness.received_at is None)

@@ -11,6 +11,7 @@ from typing import Annotated
 
 import typer
 
+from pebble.client.by_name import ByName, ask_beside
 from pebble.client.connection import Listener, Target, connected
 from pebble.client.estop_states import RobotEstop
 from pebble.client.names import Names, id_of
@@ -18,11 +19,11 @@ from pebble.commands import show
 from pebble.commands.draft import Draft, draft
 from pebble.commands.options import CaCert, ConfigOption, PasswordFile, RemoteOption, UrlOption
 from pebble.config.visible import shown
-from pebble.contract import DRIVE, codec
+from pebble.contract import CHANNELS, DRIVE, ONLINE, codec
 from pebble.contract.identity import parse_topic
 from pebble.errors import PayloadError, PebbleError, TransportError
 from pebble.media.rate_meter import RateMeter
-from pebble.transports import QoS, Transport
+from pebble.transports import Message, QoS, Transport
 from pebble.transports.topics import is_pattern
 
 _TICK_S = 0.2
@@ -75,13 +76,21 @@ def list_(
         pebble topic list 'pebble/+/+/outgoing/#' --url mqtt://127.0.0.1 -s 5
     """
     with connected(_target(config, url, robot, remote, password_file, ca_cert)) as (transport, names):
-        listing = show.Listing(names)
+        listing, by_name = show.Listing(names), ByName(CHANNELS)
+
+        def note(message: Message) -> None:
+            by_name.receive(message, time.monotonic())
+
+        if filter_ is not None:
+            transport.subscribe(ONLINE.filter(names.base), note, direct=True)
         listener = Listener(transport, [filter_ or ("#" if robot is None else f"{names.base}/#")])
+        ask_beside(transport, by_name)
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0:
             message = listener.next(left)
             if message is not None:
                 listing.add(message, time.monotonic())
+                note(message)
         show.print_listing(listing, time.monotonic(), time.time())
         for line in show.stopped_robots(listing, time.time()):
             typer.echo(line)

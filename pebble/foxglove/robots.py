@@ -7,6 +7,7 @@ import logging
 import time
 from typing import Any, Final
 
+from pebble.client.by_name import ByName
 from pebble.client.viewer import Medium
 from pebble.contract import CAPABILITIES, Channel, codec
 from pebble.contract.channels import channel_of
@@ -45,6 +46,7 @@ class Robots:
 
     def __init__(self, broker: Broker, server: Server, schemas: Schemas) -> None:
         self.bases: set[str] = set()
+        self.by_name = ByName((*FLEET, *WATCHED))
         self._refused = 0  # messages that are no JSON, and those of a robot too many
         self._broker, self._server, self._schemas = broker, server, schemas
         self._telemetry = Telemetry(schemas)
@@ -70,6 +72,7 @@ class Robots:
         if not self._knows(address.identity):
             self._refused += 1
             return
+        self.by_name.receive(message, at)
         channel = channel_of(f"{address.direction}/{address.metric}")
         if channel is CAPABILITIES:
             self._update(address.identity.base, message.payload)

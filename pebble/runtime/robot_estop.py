@@ -62,6 +62,16 @@ class RobotEstop:
         return max(self.latched.values(), key=lambda state: state.since, default=None)
 
     @property
+    def lacks(self) -> bool:
+        """Whether its capabilities, or a state that they list, have not come."""
+        return not self.has_capabilities or bool(self.missing)
+
+    @property
+    def missing(self) -> list[str]:
+        """The topics of its listed owners' states that have not come."""
+        return [ESTOP_STATE.topic(self.base, owner=owner) for owner in self.owners if owner not in self._states]
+
+    @property
     def old(self) -> bool:
         """Whether it is known to have no emergency stop; one that announces it, but cannot receive it, is not old."""
         return self.has_capabilities and not self.announces
@@ -74,6 +84,7 @@ class RobotEstop:
 
         for channel in (ESTOP_STATE, CAPABILITIES):
             transport.subscribe(channel.filter(self.base), take, direct=True)
+        transport.ask(self.missing)
 
     def receive(self, message: Message) -> bool:
         """Update from one message of this robot; False if it is about something else, or malformed."""

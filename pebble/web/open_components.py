@@ -73,6 +73,10 @@ class OpenComponents:
         self._flags: dict[str, FlagsView] = {}
         broker.on_state(self._forget_flags)
 
+    def __contains__(self, ref: object) -> bool:
+        """Whether a page has it open."""
+        return ref in self._pages
+
     def open(self, ref: str) -> None:
         """A page has opened this component."""
         self._pages[ref] += 1

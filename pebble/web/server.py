@@ -13,6 +13,7 @@ from typing import Any
 
 import msgspec
 
+from pebble.client.by_name import ByName
 from pebble.client.estop import send
 from pebble.contract import CAPABILITIES, DRIVE, DRIVING, ONLINE, codec
 from pebble.contract.identity import Identity, parse_topic
@@ -67,6 +68,7 @@ class Server:
         self.media = MediaHub(self.broker, self.robots)
         self.sound = SoundHub(self.broker, self.robots, self._note_talk)
         self.open_components = OpenComponents(self.broker, self.robots, self.spawn)
+        self.by_name = ByName(FLEET, lambda ref: ref in self.known or ref in self.open_components)
         self.drive_changed: set[str] = set()
         self._tasks: set[asyncio.Task[None]] = set()
         self._saving = False
@@ -83,6 +85,7 @@ class Server:
             await self.broker.subscribe(channel.filter("+/+/+"), self._receive, deferred=deferred)
         await self.broker.subscribe(DRIVING.filter("+/+/+"), self._announced)
         self.spawn(self._tick())
+        self.spawn(self.broker.ask(self.by_name))
 
     async def close(self) -> None:
         """Stop what pages move, then disconnect."""
@@ -109,6 +112,7 @@ class Server:
         if address is None:
             return
         self.robots.receive(message, now)
+        self.by_name.receive(message, now)
         ref = address.identity.base
         self._send(self.stops.receive(message, clock()))
         if ref not in self.robots.components:

@@ -41,7 +41,7 @@ class SerialService(Service, ABC):
         self._input_lock = threading.Lock()
         self._silence = Silence()
         self._misread = False
-        self._heard = (0, 0)  # which opening of the line, and how often its board was heard since
+        self._understood = (0, 0)  # which opening of the line, and how often its board was heard since
         self.notifier = Notifier()
         self._reported: tuple[str, int | None, str] | None = None  # of the MCU, to the launcher
         self.line = SerialLine(
@@ -98,11 +98,11 @@ class SerialService(Service, ABC):
         self.report_mcu()
         self.on_line_state(state)
 
-    def note_heard(self, heard: bool) -> None:
-        """Something has come: ``heard`` if it is of the board's protocol, and neither noise nor other text."""
-        if heard:
-            opened, times = self._heard
-            self._heard = self.line.opened, times + 1 if opened == self.line.opened else 1
+    def note_report(self, understood: bool) -> None:
+        """Something has come: ``understood`` if it is of the board's protocol, and neither noise nor other text."""
+        if understood:
+            opened, times = self._understood
+            self._understood = self.line.opened, times + 1 if opened == self.line.opened else 1
 
     @every(CHECK_S)
     def report_mcu(self) -> None:
@@ -110,9 +110,9 @@ class SerialService(Service, ABC):
         line, now = self.line, time.monotonic()  # the line's clock
         if line.state is LineState.CLOSED:
             return
-        idle, (opened, heard) = now - line.sent_until >= CHECK_S, self._heard
-        heard = heard if opened == line.opened else 0
-        state, silent_ms = self._silence.check(line.state, line.opened, heard, now, idle=idle)
+        idle, (opened, number) = now - line.sent_until >= CHECK_S, self._understood
+        number = number if opened == line.opened else 0
+        state, silent_ms = self._silence.check(line.state, line.opened, number, now, idle=idle)
         line.reports_at_rest = self._silence.reports_at_rest
         misread = silent_ms is None and line.state is LineState.READY and line.received > 0
         found = state, silent_ms, _MISREAD if misread and self._misread else line.problem

@@ -52,6 +52,10 @@ class LiveRobot:
         body = json.dumps({"stop": name, "by": by, "why": why}).encode()
         self._take(Message(f"{self.base}/incoming/estop", body))
 
+    def set_flag(self, flag: str) -> None:
+        """As an operator."""
+        self._transport.publish(f"{self.base}/incoming/flags/{flag}", b"true", retain=True)
+
     def publish_heartbeat(self) -> None:
         heartbeat = json.dumps({"t": int(1000 * time.time()), "online": True}).encode()
         self._transport.publish(f"{self.base}/outgoing/online", heartbeat)

@@ -229,6 +229,30 @@ def test_a_service_that_ends_again_and_again() -> None:
     assert last == ["a service imu fails again and again (exit code 1) 3x"]
 
 
+UNPLUGGED = "a cannot be driven: no board"
+#: States of *driveable*, those of a robot that is driven in capitals, and the notices.
+DRIVEABLE = {
+    "it is lost": ("YES NO", [UNPLUGGED]),
+    "it comes back": ("YES NO YES", ["a can be driven again 2x"]),
+    "it comes back after its driver has gone": ("YES NO yes", ["a can be driven again 2x"]),
+    "again and again": ("YES NO YES NO", [f"{UNPLUGGED} 3x"]),
+    "not known in between": ("YES UNKNOWN NO UNKNOWN YES", ["a can be driven again 2x"]),
+    "it was lost all the time": ("NO NO YES", []),
+    "not driven": ("yes no yes", []),
+    "taken when it is lost": ("yes no NO YES", []),
+    "driven later": ("yes YES NO", [UNPLUGGED]),
+    "said once": ("YES NO NO NO", [UNPLUGGED]),
+    "not known": ("YES UNKNOWN", []),
+    "another word": ("YES MAYBE NO", [UNPLUGGED]),
+}
+
+
+@pytest.mark.parametrize(("states", "expected"), DRIVEABLE.values(), ids=DRIVEABLE)
+def test_a_robot_that_is_driven_and_can_no_longer_be(states: str, expected: list[str]) -> None:
+    reported = [[{"state": one.lower(), "why": "no board"}, one.isupper()] for one in states.split()]
+    assert notices(f"for (const one of {json.dumps(reported)}) watcher.driveable('a', ...one, ++at);") == expected
+
+
 def test_a_voltage_is_low_only_below_a_limit_of_the_user() -> None:
     assert notices("level(0.5); level(NaN); level('2');") == []
     steps = "const low = { limit: 7 }; level(7.2, low); level(6.9, low); level(7.01, low); level(6.8, low); "
@@ -244,5 +268,6 @@ def test_per_cent_are_low_below_20_unless_the_user_has_another_limit() -> None:
 
 @pytest.mark.parametrize("odd", ["null", "3", "[]", '"x"', "{}", "{ services: 1, __proto__: null }"])
 def test_states_of_any_shape_are_no_notices(odd: str) -> None:
-    steps = f"for (const name of ['online', 'stop', 'script', 'services']) watcher[name]('a', {odd}, 1);"
+    calls = f"watcher[name]('a', {odd}, 1); watcher.driveable('a', {odd}, true, 1);"
+    steps = f"for (const name of ['online', 'stop', 'script', 'services']) {{ {calls} }}"
     assert notices(steps) == []

@@ -9,12 +9,13 @@ from playwright.sync_api import Browser
 
 from tests.web.browser import tab
 from tests.web.canned import CannedServer, serving
-from tests.web.states import STATES
+from tests.web.states import GOOB, STATES
 
 pytestmark = pytest.mark.page
 
 SCREEN = "**/ui/robot.js"
 LATER = "fleet", "cards", "drive", "stick", "video", "settings"
+SHOWN = "document.querySelector('.vital .chip:last-child').innerText + document.querySelector('.pad-words').innerText"
 HERE = r"performance.getEntriesByType('resource').map((one) => one.name.match(/(\w+).js$/)?.[1])"
 
 
@@ -65,6 +66,24 @@ def test_only_one_panel_is_open(server: CannedServer, browser: Browser):
         opened.test("bell").click()
         opened.test("panel-notices").wait_for()
         assert opened.until(lambda: opened.page.locator("dialog").count() == 1)
+
+
+def test_a_driver_sees_that_the_robot_can_no_longer_be_driven_and_then_that_it_can(
+    server: CannedServer, browser: Browser
+):
+    with tab(browser, server.url + STATES["driving"].path) as opened:
+        opened.test("bell").wait_for()
+        for state, chip, hint in (
+            ("yes", "You drive", "drag the stick"),
+            ("no", "Not driving", ""),
+            ("unknown", "You drive", "drag the stick"),
+            ("yes", "You drive", "drag the stick"),
+        ):
+            status = {"value": {"services": {}, "driveable": {"state": state, "why": "serial: no board"}}}
+            opened.page.evaluate("([ref, status]) => pebble.store.set(ref, 'status', status)", [GOOB, status])
+            assert opened.until(f"{SHOWN} === '{chip}{hint}'"), opened.page.evaluate(SHOWN)
+        opened.test("bell").click()
+        assert opened.until("document.querySelector('.notice-driveable').innerText.includes('can be driven again 2')")
 
 
 def test_a_button_that_is_switched_off_while_it_is_held_does_nothing(browser: Browser):

@@ -101,7 +101,7 @@ class DescribedBridge(SerialService):
     def on_input(self, chunk: bytes) -> None:
         before = self._session.frames
         self._handle_events(self._session.feed(chunk, self.clock()))
-        self.note_heard(self._session.frames != before)
+        self.note_report(self._session.frames != before)
         self._arm()
 
     @every(_WATCH_S)

@@ -46,7 +46,7 @@ class ImuBridge(SerialService):
         for line in self._splitter.feed(chunk):
             report = parse(line)
             if report is not None:
-                self.note_heard(is_known(report))
+                self.note_report(is_known(report))
                 self._report(report)
         self.count_discarded(self._splitter.discarded_lines)
 

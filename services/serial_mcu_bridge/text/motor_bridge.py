@@ -273,7 +273,7 @@ class MotorBridge(SerialService):
     def on_input(self, chunk: bytes) -> None:
         for line in self._splitter.feed(chunk):
             for report in self.protocol.parse(line):
-                self.note_heard(is_known(report))
+                self.note_report(is_known(report))
                 self._report(report)
         self.count_discarded(self._splitter.discarded_lines)
 

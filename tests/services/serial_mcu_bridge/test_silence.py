@@ -55,15 +55,15 @@ NOISE = [b"", b"\r", b" ", b"\0", b"\xff\xfe\x80", b"\x00\xf8\x00\xf8", b"~", b"
 
 
 @pytest.mark.parametrize("protocol", KNOWN)
-def test_only_lines_of_the_protocol_are_heard_from_its_board(protocol: ModuleType) -> None:
-    def heard(line: bytes) -> bool:
+def test_only_lines_of_the_protocol_count_as_received_from_its_board(protocol: ModuleType) -> None:
+    def understood(line: bytes) -> bool:
         found = protocol.parse(line)
         reports = found if isinstance(found, list) else [found] if found is not None else []
         return any(map(is_known, reports))
 
-    assert [line for line in KNOWN[protocol] if not heard(line)] == []
+    assert [line for line in KNOWN[protocol] if not understood(line)] == []
     others = [line for other, lines in KNOWN.items() for line in lines if other is not protocol]
-    assert [line for line in (*NOISE, *others) if heard(line)] == []
+    assert [line for line in (*NOISE, *others) if understood(line)] == []
 
 
 ECHO = Frame(Type.PING, sequence=1)
@@ -81,7 +81,7 @@ FRAMES = {
 
 
 @pytest.mark.parametrize(("data", "frames"), FRAMES.values(), ids=FRAMES)
-def test_only_frames_of_a_device_are_heard_from_it(data: bytes, frames: int) -> None:
+def test_only_frames_of_a_device_count_as_received_from_it(data: bytes, frames: int) -> None:
     session = Session()
     session.opened(0.0)
     session.feed(data, 1.0)

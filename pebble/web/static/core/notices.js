@@ -9,7 +9,7 @@ const LOW_PERCENT = 20;
 const HYSTERESIS = 1.02; // times the limit: a battery above it is no longer low
 const LONGEST = 160; // characters of what a robot reports of itself
 
-/** @typedef {"offline" | "online" | "stop" | "battery" | "script" | "service"} Kind */
+/** @typedef {"offline" | "online" | "stop" | "battery" | "script" | "service" | "undriveable" | "driveable"} Kind */
 /**
  * One line of the list: what happens again and again is one line with a count. Times are epoch ms.
  * @typedef {{key: string, ref: string, kind: Kind, text: string, at: number, since: number, count: number,
@@ -46,7 +46,7 @@ export class Notices {
 }
 
 /** The last state of one component. @typedef {{online?: boolean, latched?: boolean, failure?: string, low?: boolean,
- *  services?: Map<string, {failed: boolean, restarts: number}>}} Known */
+ *  driveable?: string, undriveable?: boolean, services?: Map<string, {failed: boolean, restarts: number}>}} Known */
 
 /** Compares the states of components with those before. The first state of each is only remembered. */
 export class Watcher {
@@ -77,6 +77,22 @@ export class Watcher {
       this.notices.add({ ref, kind: "stop", text: `was stopped by ${short(view.by) || "an unknown sender"}`, at });
     }
     known.latched = latched;
+  }
+
+  /**
+   * That it can no longer be driven, while a person or a script drives it; and then that it can again.
+   * @param {string} ref @param {unknown} value of its status @param {boolean} driven @param {number} at
+   */
+  driveable(ref, value, driven, at) {
+    const { state, why } = isObject(value) ? value : {};
+    if (state !== "yes" && state !== "no") return; // not known
+    const known = this.known(ref);
+    const lost = state === "no" && known.driveable === "yes" && driven;
+    known.driveable = state;
+    if (lost) this.notices.add({ key: "driveable", ref, kind: "undriveable", text: `cannot be driven${why ? `: ${short(why)}` : ""}`, at });
+    else if (state === "yes" && known.undriveable) this.notices.add({ key: "driveable", ref, kind: "driveable", text: "can be driven again", at });
+    else return;
+    known.undriveable = lost;
   }
 
   /** @param {string} ref @param {unknown} status of autonomy @param {number} at */

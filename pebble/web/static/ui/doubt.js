@@ -27,7 +27,7 @@ export function DoubtMark({ at }) {
     return () => void (driver.doubt = null);
   }, [at, no, text]);
   if (!text) return null;
-  return html`<span class=${no ? "bad" : "late"} title=${text} data-test="doubt-mark"
+  return html`<span class=${`doubt-mark ${no ? "bad" : "late"}`} title=${text} data-test="doubt-mark"
     ><span aria-hidden="true">${no ? "▲" : "?"}</span> <span class="sr">${text}</span></span
   >`;
 }

@@ -93,7 +93,7 @@ export function DrivePad() {
   const words = [forward, turn].filter(Boolean).join(" · ");
   return html`<div class="pad">
     <${Stick} driver=${driver} />
-    <p class="pad-words">${words || (driver.reason() ? "" : "drag the stick")}</p>
+    <p class="pad-words">${words || ((driver.reason() ?? driver.doubt) ? "" : "drag the stick")}</p>
   </div>`;
 }
 

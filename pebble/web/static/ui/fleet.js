@@ -160,7 +160,17 @@ function ServiceFact({ at }) {
   const ill = Object.keys(services).filter((name) => ["failed", "restarting"].includes(services[name]?.state));
   if (!ill.length) return null;
   const words = `${ill[0].replaceAll("_", " ")} ${services[ill[0]].state}`;
-  return html`<li class="fact bad"><span><span aria-hidden="true">▲ </span>${words}</span></li>`;
+  return html`<${Told} sign="▲" className="bad">${words}<//>`;
+}
+
+/** What is said in a sentence, with its sign before all of its lines. */
+const Told = ({ sign, className, children }) =>
+  html`<li class=${`fact told ${className}`}><span aria-hidden="true">${sign}</span><span>${children}</span></li>`;
+
+/** Whether its motors obey. */
+function DoubtFact({ at }) {
+  const { no, text } = doubtOf(useValue(at, "status"));
+  return text ? html`<${Told} sign=${no ? "▲" : "?"} className=${no ? "bad" : "dim"}>${text}<//>` : null;
 }
 
 function FleetCard({ at }) {
@@ -191,6 +201,7 @@ function FleetCard({ at }) {
       : typeOf(at) === "robots" && html`<div class="thumbnail">no camera</div>`)}
     <ul class="facts">
       <${BatteryFact} at=${at} online=${connection.isOpen} />
+      ${connection.isOpen && html`<${DoubtFact} at=${at} />`}
       <${DriverFact} at=${at} offers=${offers} online=${connection.isOpen} stopped=${estop?.latched} />
       <${ScriptFact} at=${at} online=${connection.isOpen} />
       ${typeOf(at) !== "robots" ? html`<${StatusFact} at=${at} />` : html`<${ServiceFact} at=${at} />`}
@@ -229,16 +240,11 @@ function BatteryFact({ at, online }) {
 
 function DriverFact({ at, offers, online, stopped }) {
   const view = useValue(at, "web/driver");
-  const doubt = doubtOf(useValue(at, "status"));
+  const doubt = doubtOf(useValue(at, "status")).text;
   if (!online) return null;
   if (!offers.known && !offers.drives) return null;
-  if (doubt.text) {
-    return html`<li class=${`fact ${doubt.no ? "bad" : "dim"}`}>
-      <span><span aria-hidden="true">${doubt.no ? "▲" : "○"} </span>${doubt.text}</span>
-    </li>`;
-  }
   if (!offers.drives) return html`<li class="fact dim"><${Icon} name="wheel" />does not drive</li>`;
-  if (!view?.by) return stopped ? null : html`<li class="fact dim"><${Icon} name="wheel" />free to drive</li>`;
+  if (!view?.by) return stopped || doubt ? null : html`<li class="fact dim"><${Icon} name="wheel" />free to drive</li>`;
   return html`<li class="fact">
     <${Icon} name="wheel" />${view.you ? html`<b>driven by you</b>` : `driven by ${driverName(view)}`}
   </li>`;

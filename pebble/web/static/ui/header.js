@@ -126,7 +126,8 @@ export function Liveness({ at }) {
 
 function Vital({ at }) {
   const { connection, driver } = usePage();
-  const fails = useModel(driver).failed.size > 0;
+  const { failed, doubt } = useModel(driver);
+  const rests = doubt || failed.size;
   const level = useMetric(at, "charging-level");
   const charging = useValue(at, "charging-status");
   const view = useValue(at, "web/driver");
@@ -140,11 +141,9 @@ function Vital({ at }) {
     >`}
     ${connection.isOpen &&
     view?.by &&
-    html`<span class=${`chip ${view.you ? "mine" : ""}`}><${Icon} name="wheel" />${fails && view.you ? "Not driving" : whoDrives(view)}</span>`}
+    html`<span class=${`chip ${view.you ? (rests ? "bad" : "mine") : ""}`}><${Icon} name="wheel" />${view.you ? (rests ? "Not driving" : "You drive") : `${driverName(view)} drives`}</span>`}
   </div>`;
 }
-
-const whoDrives = (view) => (view.you ? "You drive" : `${driverName(view)} drives`);
 
 function ConnectionState() {
   const { connection } = usePage();

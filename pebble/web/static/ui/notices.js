@@ -13,7 +13,7 @@ import { battery, inner, isObject, nameOf } from "./words.js";
 
 const LIMITS = "battery limits"; // by component, in the unit that it reports
 const METRICS = ["web/liveness", "web/estop", "autonomy-status", "status", "charging-level", "charging-status"];
-const SIGNS = { offline: "✖", online: "●", stop: "■", battery: "▲", script: "✖", service: "▲" };
+const SIGNS = { offline: "✖", online: "●", stop: "■", battery: "▲", script: "✖", service: "▲", undriveable: "▲", driveable: "●" };
 
 /** Follows all components, from when it is made. */
 class NoticeModel extends Model {
@@ -66,11 +66,17 @@ class NoticeModel extends Model {
         break;
       case "status":
         this.watcher.services(ref, inner(value(metric))?.services, now);
+        this.watcher.driveable(ref, inner(value(metric))?.driveable, this.isDriven(ref), now);
         break;
       default:
         this.battery(ref, value("charging-level"), value("charging-status"), now);
     }
     if (this.notices.list !== before) this.tally();
+  }
+
+  isDriven(ref) {
+    const value = (name) => this.store.get(ref, name)?.value;
+    return Boolean(value("web/driver")?.by || value("autonomy-status")?.running);
   }
 
   battery(ref, level, status, now) {
@@ -160,7 +166,7 @@ export function Bell({ at, wide }) {
 /** Read aloud, at most one a second. Of the component that is open the banners are read. */
 function Announcement({ newest }) {
   const { route } = usePage();
-  const banner = newest && newest.ref === route.ref && ["offline", "stop"].includes(newest.kind);
+  const banner = newest && newest.ref === route.ref && ["offline", "stop", "undriveable"].includes(newest.kind);
   const text = useCalm(newest?.unread && !banner ? `${nameOf(newest.ref)} ${newest.text}` : "");
   return html`<span class="sr" role="status" data-test="announcement">${text}</span>`;
 }
