@@ -198,6 +198,9 @@ class Transport(ABC):
     was_ended: bool = True
     #: Deliver retained messages also after a live one of their topic (T8): it may have been our own. The owner decides.
     delivers_late: bool = False
+    #: Which retained topics there are, by a message of a robot: some brokers send them to no wildcard, so that they are
+    #: asked for by name. For programs that subscribe to robots they do not know yet; it is called often, so be quick.
+    retained_names: Callable[[Message], Collection[str]] | None = None
     #: Whether retained messages of a topic (UTF-8) may be discarded before anything else is done with them: strangers
     #: plant 100,000. Called with locks held: it must neither wait nor publish. A backend may ignore it.
     skips_retained: Callable[[bytes], bool] = staticmethod(lambda _topic: False)

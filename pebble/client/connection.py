@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from pebble.client.names import ANY_ROBOT, Names, base_of
+from pebble.client.retained_names import retained_names
 from pebble.client.url import settings_of
 from pebble.config import Config, load
 from pebble.config.text_files import read_password
@@ -55,6 +56,7 @@ def connected(target: Target) -> Iterator[tuple[Transport, Names]]:
     """Connect, and disconnect at the end. Raises PebbleError with a remedy if the connection fails."""
     kind, settings, names, where = resolve(target)
     transport = create(kind, f"pebble-tool-{os.getpid()}", settings)
+    transport.retained_names = retained_names
     with closing(transport.open(_OPEN_TIMEOUT_S)):
         if transport.state is not State.CONNECTED:
             why = transport.problem or f"no answer within {_OPEN_TIMEOUT_S:g} s"

@@ -74,6 +74,8 @@ class RobotEstop:
 
         for channel in (ESTOP_STATE, CAPABILITIES):
             transport.subscribe(channel.filter(self.base), take, direct=True)
+        missing = [owner for owner in self.owners if owner not in self.states]
+        transport.ask([ESTOP_STATE.topic(self.base, owner=owner) for owner in missing])  # it came to no wildcard
 
     def receive(self, message: Message) -> bool:
         """Update from one message of this robot; False if it is about something else, or malformed."""

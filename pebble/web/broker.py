@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Final
 
 from pebble.client.driver_lease import ANSWER_S
+from pebble.client.retained_names import retained_names
 from pebble.errors import TransportError
 from pebble.transports import Message, MqttSettings, QoS, State, Subscription, Transport, create
 from pebble.web.arrived import Arrived, Handler
@@ -25,6 +26,7 @@ class Broker:
     def __init__(self, settings: MqttSettings, name: str = "pebble-web") -> None:
         """``name``: what the broker's log calls it."""
         self.transport: Transport = create("mqtt", f"{name}-{secrets.token_hex(4)}", settings)
+        self.transport.retained_names = retained_names
         self._loop: asyncio.AbstractEventLoop | None = None
         self._watchers: list[Callable[[], None]] = []
         self._arrived = Arrived()

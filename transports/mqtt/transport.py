@@ -40,6 +40,7 @@ _REPEAT_LOG_S = 30.0  # between two equal log lines
 _TRY_S = 0.25  # between two looks whether a topic that is withheld may be tried
 _NOT_TAKEN_S = 600.0  # between two log lines about one topic that the broker does not take
 _TRIED_S = 1.0  # after which a connection shows what the broker has
+_NAMED = 10_000  # names to ask for on one connection
 _IDLE_S = 60.0  # the connection wakes up earlier, for its pings
 
 
@@ -62,6 +63,7 @@ class MqttTransport(Transport):
         self._connection: Connection | None = None  # the same, once it can be used
         self._routing = threading.RLock()  # guards the broker's filters, and the connection they belong to
         self._filters = BrokerFilters()
+        self._named: set[str] | None = set()  # names asked for on this connection; None: it needs no asking
         self._stopping = threading.Event()
         self._will_on_close: Message | None = None
         self._thread: threading.Thread | None = None
@@ -156,13 +158,36 @@ class MqttTransport(Transport):
             connection, names = self._connection, [topic for topic in topics if topic not in self._filters]
             if connection is None or not names:
                 return
-            for name in names:
-                self._own_message_filter.subscribe_again(name)
-            asked = connection.subscribe([(name, self._no_local(name)) for name in names], QoS.LATEST)
-            acks = [asked, connection.ping(), connection.unsubscribe(names)]
+            acks = self._subscribe_briefly(connection, names)
         deadline = time.monotonic() + _ANSWER_S
         for ack in acks:
             ack.wait(deadline - time.monotonic())
+
+    def _subscribe_briefly(self, connection: Connection, names: list[str]) -> list[PendingAck]:
+        for name in names:
+            self._own_message_filter.subscribe_again(name)
+        asked = connection.subscribe([(name, self._no_local(name)) for name in names], QoS.LATEST)
+        return [asked, connection.ping(), connection.unsubscribe(names)]
+
+    def _ask_by_name(self, messages: list[Message]) -> None:
+        """Ask for what ``retained_names`` knows, of a broker that has sent nothing retained to a wildcard."""
+        named, names_after = self._named, self.retained_names
+        assert named is not None  # noqa: S101 - the caller looked
+        assert names_after is not None  # noqa: S101
+        with self._routing:
+            for message in messages:
+                topic = message.topic
+                if message.retain and not (topic in named or topic in self._filters or topic in self._own):
+                    self._named = None
+                    return
+                new = [
+                    name
+                    for name in names_after(message)
+                    if name not in named and name not in self._filters and self._matching(name)
+                ]
+                if new and self._connection is not None and len(named) < _NAMED:
+                    named.update(new)
+                    self._subscribe_briefly(self._connection, new)
 
     def _undeclare(self, subscription: Subscription) -> None:  # noqa: ARG002  (the ones that stay decide)
         with self._routing:
@@ -433,6 +458,7 @@ class MqttTransport(Transport):
         """Query which of our retained messages the broker has, subscribe, and send what it lacks."""
         self._renew()
         self._own_message_filter.begin()
+        self._named = set()
         if self._broker_stalled or connection.hesitated:
             self._let_catch_up(connection, stopping)
         known = self._query_own(connection, stopping)
@@ -522,6 +548,8 @@ class MqttTransport(Transport):
                 repeat = self._own_message_filter.is_repeat(message)
             for subscription in self._matched.get(message.topic) or self._matching(message.topic):
                 subscription.offer(message, repeat=repeat)
+        if self.retained_names is not None and self._named is not None:
+            self._ask_by_name(messages)
 
     def _note_answers(self, refused: Mapping[str, bool]) -> None:
         if self._connection is None:
