@@ -11,7 +11,7 @@ as_root() {
 }
 
 # What begins at the next boot, on one line.
-units() { echo $(find /etc/systemd/system -type l -path '*.wants/*' -printf '%f\n'); }
+links() { echo $(find /etc/systemd/system -type l -path '*.wants/*'); }
 
 without() { echo "pebble: continuing without $1" >&2; }
 
@@ -24,14 +24,14 @@ install_rabbitmq() {
         trap 'exit 1' INT TERM
         printf '#!/bin/sh\nexit 101\n' | as_root tee $policy >/dev/null && as_root chmod 755 $policy || return
     fi
-    before=$(units)
+    before=$(links)
     sh tools/debian-packages.sh =rabbitmq-server || return
     [ -z "$ours" ] || as_root rm -f $policy
     as_root update-rc.d -f rabbitmq-server remove
-    for unit in $(units); do
+    for link in $(links); do
         case " $before " in
-        *" $unit "*) ;;
-        *) as_root deb-systemd-helper disable "$unit" ;;
+        *" $link "*) ;;
+        *) as_root rm -f "$link" ;; # as systemctl disable does, which a container may lack
         esac
     done
 }

@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import Any
 
 from pebble.client.names import ANY_ROBOT, Names, base_of
-from pebble.client.retained_names import retained_names
 from pebble.client.url import settings_of
 from pebble.config import Config, load
 from pebble.config.text_files import read_password
 from pebble.errors import ConfigError, PebbleError, TransportError
 from pebble.runtime.addresses import Addresses
 from pebble.runtime.connections import REMOTE_RECONNECT_S, local_settings, mqtt_settings, zenoh_settings
+from pebble.runtime.retained_names import retained_names
 from pebble.transports import Message, QoS, State, Transport, create
 
 PASSWORD = "PEBBLE_PASSWORD"  # noqa: S105 - the name of an environment variable

@@ -10,8 +10,8 @@ from collections.abc import Callable
 from typing import Final
 
 from pebble.client.driver_lease import ANSWER_S
-from pebble.client.retained_names import retained_names
 from pebble.errors import TransportError
+from pebble.runtime.retained_names import retained_names
 from pebble.transports import Message, MqttSettings, QoS, State, Subscription, Transport, create
 from pebble.web.arrived import Arrived, Handler
 

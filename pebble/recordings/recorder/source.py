@@ -9,6 +9,7 @@ from functools import partial
 from typing import Any, Final
 
 from pebble.recordings.recorder.recorder import Recorder
+from pebble.runtime.retained_names import retained_names
 from pebble.transports import Message, MqttSettings, QoS, State, Transport, create
 from pebble.transports.topics import matches
 
@@ -132,6 +133,7 @@ class _Copies:
         id_ = settings.client_id and f"{settings.client_id}-retained"
         plain = replace(settings, as_published=False, sends_retained=True, max_qos=0, client_id=id_)
         self._transport = create("mqtt", "pebble-recorder-retained", plain)
+        self._transport.retained_names = retained_names
         self._transport.on_state(self._watch)
         self._transport.open(0.0)
         for filter_, receive in _once(filters, self._receive):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from pebble.client.retained_names import retained_names
+from pebble.runtime.retained_names import retained_names
 from pebble.transports import Message
 
 BASE = "pebble/robots/größe"
