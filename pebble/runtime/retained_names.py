@@ -9,7 +9,7 @@ from pebble.contract import CAPABILITIES, CHANNELS, ONLINE, OUTGOING
 from pebble.contract.channels import Kind
 from pebble.transports import Message
 
-_MOST = 200  # names in one robot's capabilities
+_MOST = 100  # names in one robot's capabilities
 _LONGEST = 200  # characters of a robot's base, and of a name below it
 _STATES = tuple(one for one in CHANNELS if one.kind is Kind.STATE and one.remote and not one.is_pattern)
 _HEARTBEATS = (ONLINE.suffix, *(one.suffix for one in CHANNELS if one.synonym_of == ONLINE.metric))

@@ -38,5 +38,5 @@ def test_names(suffix: str, payload: str, retain: bool, names: list[str]) -> Non
 
 def test_they_are_bounded() -> None:
     many = "".join(f'"{OWN}/{number}"' for number in range(1000)).encode()
-    assert len(retained_names(Message(f"{OWN}/capabilities", many, retain=True))) == 200
+    assert len(retained_names(Message(f"{OWN}/capabilities", many, retain=True))) == 100
     assert not retained_names(Message(f"pebble/robots/{'x' * 500}/outgoing/online", b""))

@@ -108,7 +108,7 @@ def test_a_will_is_published_at_once_and_retained(broker: Broker, base: str) -> 
             assert late.until(b"gone")
 
 
-def test_what_an_account_may_not_publish_costs_it_that_and_is_said(
+def test_what_an_account_may_not_publish_costs_it_that_and_is_reported(
     maker: Maker, broker: Broker, base: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(suspects, "HOLD_S", 0.5)
@@ -129,8 +129,8 @@ def test_what_an_account_may_not_publish_costs_it_that_and_is_said(
         robot.publish(state, b"1", qos=QoS.DELIVERED, retain=True)
         with beside(publish, done):
             for topic in (stream, state) if maker.closes else (state,):
-                said = "is not sent" if maker.closes else "has not kept"
-                assert until(lambda: any(said in one and topic in one for one in caplog.messages), 30), caplog.messages  # noqa: B023
+                report = "is not sent" if maker.closes else "has not kept"
+                assert until(lambda: any(report in one and topic in one for one in caplog.messages), 30), caplog.messages  # noqa: B023
             assert until(lambda: robot.state is State.CONNECTED)
             held = robot.counters["connected"]
             before = len(seen.messages)
@@ -172,11 +172,11 @@ def test_an_operators_tool_finds_the_states_of_an_idle_robot(broker: Broker, bas
         for name, value in states.items():
             robot.publish(f"{base}/outgoing/{name}", json.dumps(value).encode(), qos=QoS.DELIVERED, retain=True)
 
-        def beat() -> None:
+        def heartbeat() -> None:
             while not done.wait(0.1):
                 robot.publish(f"{base}/outgoing/online", b'{"t": 1}', qos=QoS.DELIVERED, retain=True)
 
-        with beside(beat, done):
+        with beside(heartbeat, done):
             for port in (broker.port, front.port):
                 discovery = Discovery()
                 with connected(Target(url=f"mqtt://127.0.0.1:{port}")) as (tool, _):

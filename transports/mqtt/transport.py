@@ -169,11 +169,10 @@ class MqttTransport(Transport):
         asked = connection.subscribe([(name, self._no_local(name)) for name in names], QoS.LATEST)
         return [asked, connection.ping(), connection.unsubscribe(names)]
 
-    def _ask_by_name(self, messages: list[Message]) -> None:
-        """Ask for what ``retained_names`` knows, of a broker that has sent nothing retained to a wildcard."""
-        named, names_after = self._named, self.retained_names
-        assert named is not None  # noqa: S101 - the caller looked
-        assert names_after is not None  # noqa: S101
+    def _ask_by_name(
+        self, messages: list[Message], named: set[str], names_after: Callable[[Message], Collection[str]]
+    ) -> None:
+        """Ask once for each topic that ``names_after`` knows, until something retained has come to a wildcard."""
         with self._routing:
             for message in messages:
                 topic = message.topic
@@ -549,7 +548,7 @@ class MqttTransport(Transport):
             for subscription in self._matched.get(message.topic) or self._matching(message.topic):
                 subscription.offer(message, repeat=repeat)
         if self.retained_names is not None and self._named is not None:
-            self._ask_by_name(messages)
+            self._ask_by_name(messages, self._named, self.retained_names)
 
     def _note_answers(self, refused: Mapping[str, bool]) -> None:
         if self._connection is None:
