@@ -16,6 +16,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from pebble.doctor.broker_probe import probe
+from pebble.transports import MqttSettings
 from tests.support import ROOT, Broker, Child, free_port, until
 
 ROBOT: Mapping[str, str] = {"username": "robot", "password": "secret"}
@@ -109,6 +111,10 @@ class _RabbitMq(_Other):
         self._mapper = Child(self._epmd, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         self._process = Child(self._command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         assert until(self._answers, 60, step=0.05), "RabbitMQ did not start"
+
+    def _answers(self) -> bool:
+        """It listens some time before it lets a client in."""
+        return super()._answers() and probe(MqttSettings(host=self.host, port=self.port), login=False).code == 0
 
     def _end(self, how: Callable[[subprocess.Popen[bytes]], None]) -> None:
         super()._end(how)
