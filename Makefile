@@ -5,7 +5,7 @@ VENV := .venv/bin/python
 
 .DEFAULT_GOAL := help
 unexport PYTHONDONTWRITEBYTECODE  # every test starts programs: compiling them each time would cost a third of the time
-.PHONY: help demo test thorough stops soak floods schedules script-schedules page-schedules page-tests check firmware report clean lock audit sbom check-types check-names check-collection test-running test-robots test-pages test-computing
+.PHONY: help demo test thorough stops soak floods schedules script-schedules page-schedules page-tests brokers check firmware report clean lock audit sbom check-types check-names check-collection test-running test-robots test-pages test-computing
 
 help:
 	@echo "make demo             four simulated robots, on Zenoh, on MQTT and on MCUs, driven through a broker; Ctrl-C ends it"
@@ -19,6 +19,7 @@ help:
 	@echo "make script-schedules  200 of them with whole robots, 30 minutes"
 	@echo "make page-tests       every state, card, interruption and finger at the operator page in Chromium, 20 minutes"
 	@echo "make page-schedules   200 random sequences of inputs and faults at the operator page in Chromium, 15 minutes"
+	@echo "make brokers          install NATS, RabbitMQ and aedes where that is possible, and test robots with them, two minutes"
 	@echo "make check            lint, types, imports and names only"
 	@echo "make firmware         measure the firmware's use of each board in the real MicroPython; writes docs/firmware.md"
 	@echo "make report           run every comparison and pebble impair, an hour and a half; writes docs/results"
@@ -80,6 +81,12 @@ thorough:
 page-tests: .venv/.ready-dev
 	@sh tools/debian-packages.sh mosquitto=mosquitto chromium=chromium
 	@$(VENV) tools/run_tests.py -m page tests/web
+
+# Brokers of other makers; where they are installed, make test tests them as well.
+brokers: .venv/.ready-dev
+	@sh tools/debian-packages.sh mosquitto=mosquitto
+	@sh tools/brokers.sh
+	@$(VENV) tools/run_tests.py -ra tests/transports/test_brokers.py tests/transports/test_client_ids.py
 
 # What violates a rule is described in build/stops; the seed in its name repeats it.
 stops: .venv/.ready-dev

@@ -15,7 +15,6 @@ from typing import Annotated
 
 import typer
 
-from pebble.client.by_name import ByName, ask_beside
 from pebble.client.connection import Listener, Target, connected, target_of
 from pebble.client.discovery import ALL_OUTGOING, Discovery
 from pebble.client.driveable import Driveable
@@ -27,6 +26,7 @@ from pebble.commands.options import CaCert, ConfigOption, PasswordFile, RemoteOp
 from pebble.config.visible import shown
 from pebble.contract import CAPABILITIES, ESTOP_STATE, ONLINE, STATUS
 from pebble.errors import PebbleError, TransportError
+from pebble.runtime.by_name import ByName, ask_beside
 from pebble.runtime.signals import interrupted_by_signals
 from pebble.transports import Message, State, Transport
 

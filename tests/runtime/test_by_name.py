@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterable
 
 import pytest
 
-from pebble.client.by_name import EACH_S, MAX_ROBOTS, ByName
 from pebble.contract import CHARGING_LEVEL, DRIVE, ESTOP_STATE, ONLINE, STATUS
+from pebble.runtime.by_name import EACH_S, MAX_ROBOTS, ByName
 from pebble.transports import Message
 from tests.client.estop_robot import Robot
 

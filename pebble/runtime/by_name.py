@@ -90,6 +90,11 @@ class ByName:
         self._next = self._swept_at = -inf
         self.omitted = 0  # messages of robots for which there was no place
 
+    @property
+    def waits(self) -> bool:
+        """Whether a robot has not been asked for yet that will be."""
+        return any(robot.due < inf and not robot.asked for robot in list(self._robots.values()))
+
     def reset(self) -> None:
         """The connection is lost: what comes by the next one is not known."""
         self._robots = {}

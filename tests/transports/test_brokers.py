@@ -1,0 +1,240 @@
+"""Brokers of several makers: what a robot and its operators have of each, whatever it forbids or lacks."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pebble.client.connection import Target, connected
+from pebble.client.discovery import ALL_OUTGOING, Discovery
+from pebble.contract import CHANNELS
+from pebble.runtime.by_name import ByName, ask_beside
+from pebble.runtime.robot_estop import RobotEstop
+from pebble.transports import Message, MqttSettings, QoS, State
+from pebble.transports.mqtt import suspects
+from pebble.transports.mqtt.transport import MqttTransport
+from tests.robot.operator import Operator
+from tests.robot.rig import BASE, STOP, Rig
+from tests.services.mqtt_bridge.bridge_rig import MqttRig, Quiet
+from tests.sparing_broker import SparingBroker
+from tests.support import Broker, beside, until
+from tests.transports.brokers import MAKERS, ROBOT, Maker, sparing_aedes
+from tests.transports.net import ProcessPeer
+from tests.transports.received import Received
+
+pytestmark = pytest.mark.alone  # deadlines are checked
+
+FLAG = "incoming/flags/mqtt-audio"
+STOPPED = {"latched": True, "boot": "b", "count": 1, "recent": [], "by": "ann", "why": "", "since": 1}
+TRUE, FALSE = b'{"value": true}', b'{"value": false}'
+
+
+def needed(name: str) -> Maker:
+    if MAKERS[name].missing():
+        pytest.skip(f"needs {name}: make brokers")
+    return MAKERS[name]
+
+
+@pytest.fixture(scope="module", params=MAKERS)
+def maker(request: pytest.FixtureRequest) -> Maker:
+    return needed(request.param)
+
+
+@pytest.fixture(scope="module")
+def running(maker: Maker, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Broker]:
+    broker = maker.make(tmp_path_factory.mktemp("broker"))
+    yield broker
+    broker.stop()
+
+
+@pytest.fixture
+def broker(running: Broker) -> Broker:
+    if not running.running:
+        running.start()
+    return running
+
+
+def settings(broker: Broker, **more: Any) -> MqttSettings:
+    return MqttSettings(host="127.0.0.1", port=broker.port, **more)
+
+
+@pytest.fixture
+def base(request: pytest.FixtureRequest) -> str:
+    return f"pebble/robots/{request.node.originalname.rpartition('_')[2]}"
+
+
+def test_every_retained_message_comes_by_its_exact_name_and_wildcard_where_the_broker_has_that(
+    maker: Maker, broker: Broker, base: str
+) -> None:
+    names = [f"{base}/outgoing/state-{number}" for number in range(30)]
+    with MqttTransport("writer", settings(broker, as_published=True)) as writer:
+        assert writer.as_published is maker.bridge_mode
+        for name in names:
+            writer.publish(name, b"1", qos=QoS.DELIVERED, retain=True)
+        assert until(lambda: not writer.outgoing.waiting)
+        with MqttTransport("late", settings(broker)) as late:
+            seen = Received()
+            late.subscribe(f"{base}/#", seen)
+            assert until(lambda: maker.by_name or len(seen.messages) == len(names))
+            assert len(seen.messages) == (0 if maker.by_name else len(names))
+            late.ask(names)
+            assert until(lambda: {one.topic for one in seen.messages if one.retain} == {*names})
+        for name in names:
+            writer.publish(name, b"", qos=QoS.DELIVERED, retain=True)
+    with MqttTransport("later", settings(broker)) as later:
+        left = Received()
+        later.subscribe(f"{base}/#", left)
+        later.ask(names)
+        time.sleep(0.2)
+        assert left.messages == []
+
+
+def test_a_will_is_published_at_once_and_retained(broker: Broker, base: str) -> None:
+    topic, seen, late = f"{base}/outgoing/online", Received(), Received()
+    will = Message(topic, b"gone", QoS.DELIVERED, retain=True)
+    with MqttTransport("operator", settings(broker)) as operator:
+        operator.subscribe(topic, seen)
+        robot = ProcessPeer("mqtt", "robot", settings(broker, as_published=True), will)
+        robot.publish(topic, b"here", retain=True)
+        assert until(lambda: seen.payloads == [b"here"])
+        robot.kill()
+        assert until(lambda: seen.payloads == [b"here", b"gone"])
+        with MqttTransport("late", settings(broker)) as transport:
+            transport.subscribe(topic, late)
+            assert late.until(b"gone")
+
+
+def test_what_an_account_may_not_publish_costs_it_that_and_is_reported(
+    maker: Maker, broker: Broker, base: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(suspects, "HOLD_S", 0.5)
+    stream, state, command = (f"{base}/{one}" for one in ("outgoing/touch-sensors", "outgoing/forbidden", "incoming/x"))
+    more = {"as_published": True, "vital": (f"{base}/outgoing/online",), "reconnect_max_s": 0.2, **ROBOT}
+    robot = MqttTransport("robot", settings(broker, **more))
+    with robot, MqttTransport("operator", settings(broker)) as operator:
+        seen, commands, done = Received(), Received(), threading.Event()
+        operator.subscribe(f"{base}/outgoing/#", seen)
+        robot.subscribe(command, commands, echo=False)
+
+        def publish() -> None:
+            while not done.wait(0.02):
+                robot.publish(stream, b"1")
+                robot.publish(f"{base}/outgoing/imu", b"1")
+                robot.publish(f"{base}/outgoing/online", b"1", qos=QoS.DELIVERED, retain=True)
+
+        robot.publish(state, b"1", qos=QoS.DELIVERED, retain=True)
+        with beside(publish, done):
+            for topic in (stream, state) if maker.closes else (state,):
+                words = {"is not sent" if maker.closes else "has not kept", topic}
+                assert until(lambda: any(all(word in one for word in words) for one in caplog.messages), 30)  # noqa: B023
+            assert until(lambda: robot.state is State.CONNECTED)
+            held = robot.counters["connected"]
+            before = len(seen.messages)
+            for number in range(50):
+                operator.publish(command, b"%d" % number, qos=QoS.DELIVERED)
+            assert until(lambda: commands.payloads[-50:] == [b"%d" % number for number in range(50)])
+            assert until(lambda: len(seen.messages) > before + 50)
+            assert robot.counters["connected"] == held
+        assert {one.topic for one in seen.messages} == {f"{base}/outgoing/imu", f"{base}/outgoing/online"}
+
+
+def test_an_operators_flag_is_not_overwritten_by_a_robot_that_starts(broker: Broker, tmp_path: Path) -> None:
+    own = Broker(tmp_path)
+    rig = MqttRig(*({"host": "127.0.0.1", "port": one.port} for one in (own, broker)))
+    try:
+        rig.local.publish(FLAG, TRUE, retain=True)
+        rig.remote.publish(FLAG, FALSE, retain=True)
+        for client in (rig.local, rig.remote):
+            client.transport.close()
+        rig.start()
+        Quiet(rig.client("local")).wait(0.5)
+        assert rig.retained("local")[FLAG] == FALSE
+        operator = rig.client("remote")
+        operator.transport.ask([f"{rig.base}/{FLAG}"])
+        assert until(lambda: {*operator.payloads(FLAG)} == {FALSE}), operator.payloads(FLAG)
+    finally:
+        rig.close()
+        own.stop()
+
+
+def test_an_operators_tool_finds_the_states_of_an_idle_robot(broker: Broker, base: str) -> None:
+    """Its heartbeat is all that comes to a wildcard by itself from brokers that send retained messages by name."""
+    front, done = SparingBroker(broker.port, by_name=True), threading.Event()
+    drives = {"drive": {"topic": f"{base}/incoming/drive-values"}}
+    estop = {"available": True, "owners": ["serial"], "status_topics": [f"{base}/outgoing/estop/serial"]}
+    states: dict[str, Any] = {"capabilities": {"t": 1, "value": {**drives, "estop": estop}}}
+    states["charging-level"] = {"value": 12.5}
+    states["estop/serial"] = STOPPED
+    with MqttTransport("robot", settings(broker)) as robot:
+        for name, value in states.items():
+            robot.publish(f"{base}/outgoing/{name}", json.dumps(value).encode(), qos=QoS.DELIVERED, retain=True)
+
+        def heartbeat() -> None:
+            while not done.wait(0.1):
+                robot.publish(f"{base}/outgoing/online", b'{"t": 1}', qos=QoS.DELIVERED, retain=True)
+
+        with beside(heartbeat, done):
+            for port in (broker.port, front.port):
+                discovery, by_name = Discovery(), ByName(CHANNELS)
+
+                def take(message: Message) -> None:
+                    discovery.receive(message, 0.0, 0.0)  # noqa: B023
+                    by_name.receive(message, time.monotonic())  # noqa: B023
+
+                with connected(Target(url=f"mqtt://127.0.0.1:{port}")) as (tool, _):
+                    tool.subscribe(ALL_OUTGOING, take, direct=True)
+                    ask_beside(tool, by_name)
+                    assert until(lambda: base in discovery.robots and discovery.robots[base].volts)  # noqa: B023
+                    assert until(lambda: discovery.robots[base].latched)  # noqa: B023
+                with connected(Target(url=f"mqtt://127.0.0.1:{port}", robot=base)) as (tool, _):
+                    one = RobotEstop(base)
+                    one.subscribe(tool)
+                    assert until(lambda: [state.by for state in one.latched.values()] == ["ann"])  # noqa: B023
+    front.close()
+
+
+def test_a_whole_robot_is_driven_and_stopped_although_it_may_not_publish_a_stream(maker: Maker, broker: Broker) -> None:
+    uplink = {"host": "127.0.0.1", "port": broker.port, **ROBOT}
+    with Rig("zenoh", remote=broker, mqtt_bridge={"remote_mqtt": uplink}) as rig:
+        assert not maker.closes or until(lambda: "outgoing/touch-sensors" in rig.log.read_text())
+        ending = threading.Event()
+
+        def drive() -> None:
+            while not ending.wait(0.05):
+                rig.operator.send("incoming/drive-values", {"x": 0, "z": 0.5})
+
+        with beside(drive, ending):
+            assert until(rig.mcu.moving)
+            rig.operator.send("incoming/estop", {"stop": "a", "by": "ann", "why": ""})
+            assert until(lambda: not rig.mcu.moving())
+            stopped = time.monotonic()
+            rig.operator.wait_for("outgoing/online", since=stopped)
+        assert {wheels for _, wheels in rig.mcu.drives(stopped)} <= {STOP}
+        for name in ("outgoing/capabilities", "outgoing/status", "outgoing/estop/serial"):
+            late = Operator(broker.port, BASE, name)
+            late.wait_for(name)
+            late.close()
+        assert not rig.operator.on("outgoing/touch-sensors")
+
+
+def test_messages_pass_both_ways_over_a_broker_that_hangs_up_on_retained_messages_and_on_qos_1(
+    tmp_path: Path, base: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    needed("aedes")
+    broker = sparing_aedes(tmp_path)
+    often = settings(broker, reconnect_max_s=0.2)
+    with MqttTransport("robot", often) as robot, MqttTransport("operator", often) as operator:
+        seen, commands = Received(), Received()
+        operator.subscribe(f"{base}/outgoing/#", seen)
+        robot.subscribe(f"{base}/incoming/#", commands)
+        robot.publish(f"{base}/outgoing/status", b"1", qos=QoS.DELIVERED, retain=True)
+        assert until(lambda: b"1" in seen.payloads, 20)
+        assert until(lambda: operator.publish(f"{base}/incoming/x", b"", qos=QoS.DELIVERED) and commands.payloads, 20)
+        assert until(lambda: any("keeps no retained messages" in one for one in caplog.messages))
+    broker.stop()
