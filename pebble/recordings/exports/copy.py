@@ -3,17 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import BinaryIO
 
 from pebble.recordings.files.mcap import Recorded
-from pebble.recordings.files.rewrite import Copy
+from pebble.recordings.files.reader import mapped
+from pebble.recordings.files.rewrite import Copy, copy_beside
 from pebble.recordings.files.writer import LIBRARY, McapWriter
 
 
-def write_copy(messages: Iterable[Recorded], out: BinaryIO, *, on_time: Callable[[int], None]) -> int:
-    """Write ``messages`` as MCAP; returns how many there were. ``on_time`` gets the time of each."""
+def write_copy(
+    messages: Iterable[Recorded], out: BinaryIO, *, on_time: Callable[[int], None], beside: Iterable[Path] = ()
+) -> int:
+    """Write ``messages`` as MCAP; returns how many there were. ``on_time`` gets the time of each.
+
+    ``beside``: files whose metadata and attachments go with them.
+    """
     writer = McapWriter(_Whole(out), library=LIBRARY)
     writer.metadata("pebble.recording", {"format": "1", "exported": "1"})
+    for path in beside:
+        with mapped(path) as data:
+            copy_beside(data, writer)
     copy = Copy(writer)
     for message in messages:
         copy.add(message)

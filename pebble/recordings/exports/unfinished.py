@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from pebble.recordings.files.reader import RecordingError
+from pebble.recordings.files.mcap import RecordingError
 
 
 @contextmanager

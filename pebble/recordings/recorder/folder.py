@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import stat
@@ -12,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, Final
 
-from pebble.recordings.files.reader import RecordingError
+from pebble.recordings.files.mcap import RecordingError
 from pebble.recordings.library import ACTIVE, SUFFIX
 
 STATE: Final = "state"
@@ -140,6 +141,14 @@ def _locked(path: Path, used: str) -> Iterator[None]:
 def finished_path(path: Path) -> Path:
     """The name of a file that was ``.mcap.active``, once it is finished."""
     return path.with_name(path.name.removesuffix(ACTIVE) + SUFFIX)
+
+
+def rename(path: Path, target: Path) -> None:
+    """Durably; never over another file. Raises OSError."""
+    if target.exists():
+        raise FileExistsError(errno.EEXIST, "there is another file of this name", str(target))
+    path.rename(target)
+    sync_folder(path.parent)
 
 
 def sync_folder(folder: Path) -> None:

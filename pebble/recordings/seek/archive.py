@@ -11,8 +11,7 @@ from typing import Final, NamedTuple
 
 from pebble.contract.channels import LOGS
 from pebble.contract.identity import Direction, parse_topic
-from pebble.recordings.files.mcap import Channel, DamageError, Recorded
-from pebble.recordings.files.reader import RecordingError
+from pebble.recordings.files.mcap import Channel, DamageError, Recorded, RecordingError
 from pebble.recordings.library import ACTIVE, SUFFIX
 from pebble.recordings.recorder.folder import MEDIA
 from pebble.recordings.recorder.lane import OTHER_MEDIA, lane_of

@@ -10,8 +10,18 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from pebble.recordings.files import mcap
-from pebble.recordings.files.mcap import HEAD, MESSAGE, Channel, ChunkIndex, DamageError, Op, Recorded, Statistics
-from pebble.recordings.files.reader import RecordingError, mapped
+from pebble.recordings.files.mcap import (
+    HEAD,
+    MESSAGE,
+    Channel,
+    ChunkIndex,
+    DamageError,
+    Op,
+    Recorded,
+    RecordingError,
+    Statistics,
+)
+from pebble.recordings.files.reader import mapped
 from pebble.recordings.library import ACTIVE, robot_of
 from pebble.recordings.recorder.lane import CARRIED
 
