@@ -268,10 +268,13 @@ def export(
     query = Query(base, tuple(topic or ()))
     damages = Damages()
     beside = paths if form is Form.MCAP and query == Query() else []
-    with _progress_of_time(paths, since_ns, until_ns) as on_time:
-        messages = merged(paths, since_ns=since_ns, until_ns=until_ns, chooses=query.chooses, damages=damages)
-        typer.echo(_export(form, messages, target, base or "", on_time, beside))
-    return _say_unread(problems(damages))
+    try:
+        with _progress_of_time(paths, since_ns, until_ns) as on_time:
+            messages = merged(paths, since_ns=since_ns, until_ns=until_ns, chooses=query.chooses, damages=damages)
+            typer.echo(_export(form, messages, target, base or "", on_time, beside))
+    finally:
+        code = _say_unread(problems(damages))
+    return code
 
 
 def import_(

@@ -105,7 +105,8 @@ def test_damage_is_counted(tmp_path: Path) -> None:
     data = bytearray(path.read_bytes())
     data[400:420] = bytes(20)
     path.write_bytes(data)
-    rewrite(path, path)
+    rewrite(path, tmp_path / "copy")
+    (tmp_path / "copy").replace(path)
     os.utime(path, (BEGAN + 900, BEGAN + 900))
     assert any("messages of the last day are missing: files were damaged" in one.text for one in findings(tmp_path))
 

@@ -34,11 +34,11 @@ class Rewritten:
     is_empty: bool  # neither messages nor attachments are in it
 
 
-def rewrite(source: Path, target: Path, *, keeps: Keeps = lambda _message: True) -> Rewritten:
+def rewrite(source: Path, target: Path, *, keeps: Keeps | None = None) -> Rewritten:
     """Write the messages of ``source`` to ``target``, in the order of time; both may be the same file.
 
-    A file is only replaced by a copy of all that is in it: otherwise, and where the copy cannot be read again, it stays
-    as it is. Raises RecordingError, OSError.
+    A file is only replaced by a copy of all that is in it that ``keeps`` accepts: it stays as it is if not all could be
+    read, if the copy cannot be read again, and if nothing is left out. Raises RecordingError, OSError.
     """
     in_place = target.exists()
     part = target.with_name(f".{target.name}.{os.getpid()}{PART}")
@@ -52,7 +52,7 @@ def rewrite(source: Path, target: Path, *, keeps: Keeps = lambda _message: True)
             copy_beside(data, writer)
             copy = Copy(writer)
             for message in read(data, damage):
-                if keeps(message):
+                if keeps is None or keeps(message):
                     copy.add(message)
                 else:
                     left_out += 1
@@ -66,6 +66,8 @@ def rewrite(source: Path, target: Path, *, keeps: Keeps = lambda _message: True)
         contents = writer.contents
         is_empty = not (contents.messages or contents.attachments)
         made = Rewritten(contents.messages, left_out, missing, writer.size, damage.says(), is_empty)
+        if in_place and keeps is not None and not left_out:
+            return made
         _check(part, made)
         if _state(source) != before:
             raise RecordingError(f"{source}: was changed meanwhile")

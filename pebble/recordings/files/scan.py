@@ -87,6 +87,12 @@ def is_of_others(data: Any) -> bool:
     return _after_header(data)[1] is None
 
 
+def begins_as_ours(data: Any) -> bool:
+    """Whether the header is that of a recorder, and not damaged."""
+    begin, file = _after_header(data)
+    return bool(begin) and file is not None
+
+
 def blocks(data: Any, damage: Damage, at: int = 0) -> Iterator[Block]:
     """The records in the data of a file, from ``at`` on, in its order; what lies between them is noted in ``damage``.
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import BinaryIO, Final
 
 from pebble.recordings.files.mcap import RecordingError
+from pebble.recordings.files.rewrite import PART
 from pebble.recordings.library import ACTIVE, SUFFIX
 
 STATE: Final = "state"
@@ -24,6 +25,7 @@ _MAINTENANCE: Final = "maintenance.lock"
 _NAME: Final = re.compile(
     r"(?P<stamp>\d{8}T\d{6}Z)-(?P<number>\d{6,})\.(?P<lane>state|media\.[A-Za-z0-9_.-]{1,120})\.mcap(?P<state>|\.active|\.damaged)"
 )
+_COPY: Final = re.compile(rf"\.{_NAME.pattern}\.\d+{re.escape(PART)}")
 _DAY: Final = "%Y/%m/%d"
 
 
@@ -73,8 +75,14 @@ class Folder:
 
     @contextmanager
     def maintained(self) -> Iterator[None]:
-        """While files are written again: against a second one who does so. Raises RecordingError."""
+        """While files are written again: against a second one who does so. Raises RecordingError, OSError.
+
+        Copies that such a one has left when it was killed are deleted.
+        """
         with _locked(self.root / _MAINTENANCE, f"{self.root}: is being compacted or cleaned: try again later"):
+            for path in self._files():
+                if _COPY.fullmatch(path.name):
+                    path.unlink(missing_ok=True)
             yield
 
     @classmethod
