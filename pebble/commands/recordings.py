@@ -234,17 +234,20 @@ def compact(folder: Annotated[Path, typer.Argument(help="Folder of a recorder.",
     return 1 if left else 0
 
 
-def index(folder: Annotated[Path, typer.Argument(help="Folder of a recorder.", metavar="DIR")]) -> None:
+def index(folder: Annotated[Path, typer.Argument(help="Folder of a recorder.", metavar="DIR")]) -> int:
     """Index recordings for `pebble analyse`, as Parquet files."""
     from pebble.recordings.traffic.duck import require_packages
 
     require_packages("duckdb", "matplotlib")
-    due = not_indexed(folder)
+    due, unread = not_indexed(folder), []
     with _progress("indexing", len(due)) as advance:
         for number, path in enumerate(due, 1):
-            Index(folder).add(path)
+            entry = Index(folder).add(path)
+            if entry.unread:
+                unread.append(f"{path}: {entry.unread}")
             advance(number)
     typer.echo(f"{len(due)} recordings indexed")
+    return _say_unread(unread)
 
 
 def export(
@@ -336,10 +339,11 @@ def rm(
             except (PebbleError, OSError) as error:
                 left += _say_left(error)
                 continue
-            deleted += made.left_out
-            Index(folder).remove(path)
-            if made.is_empty:
-                path.unlink()
+            if made.left_out:
+                deleted += made.left_out
+                Index(folder).remove(path)
+                if made.is_empty:
+                    path.unlink()
             advance(number)
     typer.echo(f"{deleted:,} messages deleted")
     if left:

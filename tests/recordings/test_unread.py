@@ -19,9 +19,13 @@ from pebble.recordings.files.finish import finish
 from pebble.recordings.files.mcap import RecordingError
 from pebble.recordings.files.rewrite import rewrite
 from pebble.recordings.files.scan import Damage, blocks
-from pebble.recordings.library import robot_of
+from pebble.recordings.library import problems
+from pebble.recordings.recorder.disk_space import Disk, Limits, outdated, surplus
+from pebble.recordings.recorder.folder import Folder
+from pebble.recordings.replay.source import ReplaySource
 from pebble.recordings.seek.archive import Archive
 from pebble.recordings.seek.days import Days
+from pebble.recordings.traffic.index import Index
 from tests.commands.command_line import Run
 from tests.recordings.messages import contents, write
 from tests.recordings.others import (
@@ -45,6 +49,8 @@ from tests.support import cases
 
 EXPECTED = [(FRED if number % 4 == 3 else GOOB, payload(number)) for number in range(COUNT)]
 OF_GOOB = [one for one in EXPECTED if one[0] == GOOB]
+pytest.importorskip("duckdb")
+pytest.importorskip("matplotlib")
 NAME = "20261122T100030Z-000001.state.mcap"
 
 
@@ -58,10 +64,6 @@ def stored(folder: Path, data: bytes, name: str = NAME) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(data)
     return path
-
-
-def of_goob(message: Any) -> bool:
-    return robot_of(message.channel) == "pebble/robots/goob"
 
 
 @pytest.mark.parametrize("name", VALID)
@@ -81,6 +83,11 @@ def test_a_file_of_another_program_is_read_in_the_order_of_time(tmp_path: Path, 
     assert [(one.channel.topic, one.payload) for one in found] == OF_GOOB
     assert archive.unread() == {}
     archive.close()
+    replayed = ReplaySource([path])
+    assert [(one.channel.topic, one.payload) for one in replayed.messages()] == EXPECTED
+    assert problems(replayed.damages) == []
+    indexed = Index(tmp_path / "rec").add(path)
+    assert (indexed.rows, indexed.unread) == (COUNT, "")
 
 
 @pytest.mark.parametrize("name", VALID)
@@ -140,30 +147,27 @@ def test_topics_of_no_robot_are_named_with_their_encodings(tmp_path: Path, run: 
 
 
 READERS = [
-    ["list"],
-    ["info"],
-    ["search"],
-    ["export", "{out}.jsonl"],
-    ["export", "{out}.mcap"],
-    ["export", "{out}.wav", "-r", "goob"],
-]
+    ["list"], ["info"], ["search"], ["export", "{out}.jsonl"], ["export", "{out}.mcap"],
+    ["export", "{out}.wav", "-r", "goob"], ["index"], ["analyse", "--output", "{out}"],
+]  # fmt: skip
 WRITERS = [
-    ["rm", "--robot", "nosuch", "--yes"],
-    ["rm", "--robot", "fred", "--yes"],
-    ["rm", "--since", "2000-01-01", "--yes"],
+    ["rm", "--robot", "nosuch", "--yes"], ["rm", "--robot", "fred", "--yes"], ["rm", "--since", "2000-01-01", "--yes"],
     ["compact"],
-]
+]  # fmt: skip
+
+
+def on(folder: Path, command: list[str], out: Path) -> list[str | Path]:
+    group = [] if command[0] == "analyse" else ["recordings"]
+    return [*group, command[0], folder, *(one.replace("{out}", str(out)) for one in command[1:])]
 
 
 @pytest.mark.parametrize("name", DAMAGED)
 def test_what_cannot_be_read_is_named_and_not_touched(tmp_path: Path, run: Run, name: str) -> None:
     data, said = DAMAGED[name]
     path = stored(tmp_path, data)
-    for number, (command, *rest) in enumerate([*READERS, *WRITERS]):
-        options = [one.replace("{out}", str(tmp_path / str(number))) for one in rest]
-        code = run("recordings", command, tmp_path / "rec", *options)
-        assert (code, NAME in run.err) == (1, True), (command, run.out, run.err)
-        assert said in run.err, (command, run.err)
+    for number, command in enumerate([*READERS, *WRITERS]):
+        code = run(*on(tmp_path / "rec", command, tmp_path / str(number)))
+        assert (code, NAME in run.err, said in run.err) == (1, True, True), (command, run.out, run.err)
         assert path.read_bytes() == data
     days = Days(Archive(tmp_path / "rec")).all()
     assert any(said in line for day in days for line in day.unread), days
@@ -202,13 +206,10 @@ def test_without_a_module_the_extra_is_named(
 ) -> None:
     path = stored(tmp_path, by_package(compression=LZ4))
     monkeypatch.setitem(sys.modules, "lz4.frame", None)
-    rest = [one.replace("{out}", str(tmp_path / "out")) for one in command[1:]]
-    if command[0] in ("list", "info"):
-        rest += ["--check"]
-    assert run("recordings", command[0], tmp_path / "rec", *rest) == 1
+    assert run(*on(tmp_path / "rec", command, tmp_path / "out")) == 1
     assert 'compressed by lz4: pip install "pebble-robot[record]"' in run.err
     assert path.read_bytes() == by_package(compression=LZ4)
-    assert not list(tmp_path.glob("out*"))
+    assert not [one for one in tmp_path.glob("out*") if one.is_file()]
 
 
 class TestInterrupted:
@@ -321,6 +322,17 @@ class TestNames:
         assert "there is another file of this name" in run.err
         assert whole_.read_bytes() == VALID["zstd"]
         assert active.stat().st_size >= before
+
+
+def test_what_was_not_read_makes_no_room(tmp_path: Path) -> None:
+    """Files that could not be finished are neither deleted for their size and age nor is another one for theirs."""
+    for number, end in enumerate(["", ".damaged", "", ".damaged"], 1):
+        stored(tmp_path, bytes(1000), f"{NAME.replace('001', f'{number:03}')}{end}")
+    entries = Folder(tmp_path / "rec").entries()
+    assert [one.number for one in surplus(entries, Limits(keep_bytes=1500), Disk(1 << 40))] == [1]
+    assert surplus(entries, Limits(keep_bytes=2000), Disk(1 << 40)) == []
+    old = outdated(entries[1:], Limits(keep_state_days=1.0), entries[0].ended + 1e6)
+    assert old is None
 
 
 class TestFinishing:
