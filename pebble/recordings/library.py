@@ -33,7 +33,7 @@ def files(places: Iterable[Path]) -> list[Path]:
     for place in places:
         if place.is_dir():
             found += sorted(path for path in place.rglob(f"*{SUFFIX}*") if path.name.endswith((SUFFIX, ACTIVE)))
-        elif _begins_as_mcap(place):
+        elif _begins_as_mcap(place) or place.name.endswith((SUFFIX, ACTIVE)):
             found.append(place)
         else:
             raise RecordingError(f"{place}: is not a recording (MCAP)")

@@ -93,8 +93,8 @@ def _finish(file: BinaryIO, path: Path) -> Finished:
             contents.add(block, data)
         if not contents.end_at:
             raise RecordingError(f"{path}: nothing in it can be read")
-        if damage.torn and not is_cut_off(data, contents.end_at):
-            damage.spans.append((contents.end_at, len(data)))
+        if damage.torn and not is_cut_off(data, len(data) - damage.torn):
+            damage.spans.append((len(data) - damage.torn, len(data)))
             contents.end_at = len(data)
         contents.complete(Summary.of(data))
         covers = _joined(contents.wrong + damage.spans)

@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from pebble.recordings.files import mcap
 from pebble.recordings.files.channels import ChannelTable
-from pebble.recordings.files.mcap import FILE_TOPIC, Metadata, Op, Recorded, RecordingError
+from pebble.recordings.files.mcap import Metadata, Op, Recorded, RecordingError
 from pebble.recordings.files.reader import DAMAGE, MISSING, mapped, metadata_of, read
 from pebble.recordings.files.scan import Damage, blocks
 from pebble.recordings.files.writer import LIBRARY, McapWriter
@@ -122,8 +122,6 @@ class Copy:
 
     def add(self, message: Recorded) -> None:
         channel = message.channel
-        if channel.topic == FILE_TOPIC:
-            return
         schema = channel.described
         key = (channel.topic, channel.encoding, tuple(sorted(channel.metadata.items())), schema)
         number = self._channels.find(key)

@@ -54,9 +54,10 @@ class Days:
                 _merge(found.setdefault(day.day, Day(day.day, first=day.first)), day)
         for path, why in self._archive.unread().items():
             with suppress(OSError):  # it is deleted by now
-                at = path.stat().st_mtime
-                name = _day_of(int(at))
-                found.setdefault(name, Day(name, first=at * 1e3, last=at * 1e3)).unread.append(f"{path.name}: {why}")
+                about = path.stat()
+                name, ms = _day_of(int(about.st_mtime)), about.st_mtime * 1e3
+                day = found.setdefault(name, Day(name, bytes=about.st_size, first=ms, last=ms))
+                day.unread.append(f"{path.name}: {why}")
         return sorted(found.values(), key=lambda day: day.day, reverse=True)
 
 

@@ -73,7 +73,7 @@ function Day({ one: { day, robots, bytes, first, last, gaps, unread } }) {
     <div>
       <h2>${longDay(day)}</h2>
       <p class="dim">${facts.filter(Boolean).join(" · ")}</p>
-      ${unread.map((line) => html`<p key=${line} class="failed">Not all can be read of ${line}</p>`)}
+      ${unread?.map((line) => html`<p key=${line} class="failed">Not all can be read of ${line}</p>`)}
     </div>
     <ul class="replay-robots">
       ${robots.map(
