@@ -335,12 +335,16 @@ def rm(
     with Folder(folder).maintained(), _progress("deleting", len(due)) as advance:
         for number, path in enumerate(due, 1):
             try:
+                names = path.stat().st_nlink
                 made = rewrite(path, path, keeps=keeps)
             except (PebbleError, OSError) as error:
                 left += _say_left(error)
                 continue
             if made.left_out:
                 deleted += made.left_out
+                if names > 1:
+                    left += 1
+                    typer.echo(f"pebble: {path}: has other names (hard links), which keep all of it", err=True)
                 Index(folder).remove(path)
                 if made.is_empty:
                     path.unlink()

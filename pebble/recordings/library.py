@@ -32,7 +32,7 @@ def files(places: Iterable[Path]) -> list[Path]:
     found: list[Path] = []
     for place in places:
         if place.is_dir():
-            found += sorted(path for path in place.rglob(f"*{SUFFIX}*") if path.name.endswith((SUFFIX, ACTIVE)))
+            found += sorted(path for path in place.rglob(f"*{SUFFIX}*") if _is_recording(path))
         elif _begins_as_mcap(place) or place.name.endswith((SUFFIX, ACTIVE)):
             found.append(place)
         else:
@@ -40,6 +40,11 @@ def files(places: Iterable[Path]) -> list[Path]:
     if not found:
         raise RecordingError(f"{', '.join(map(str, places))}: there is no recording")
     return found
+
+
+def _is_recording(path: Path) -> bool:
+    """By its name; a link that leads nowhere is one that cannot be read."""
+    return path.name.endswith((SUFFIX, ACTIVE)) and (path.is_file() or path.is_symlink())
 
 
 def span(path: Path, damage: Damage | None = None) -> Span | None:

@@ -140,6 +140,9 @@ VALID: Final[dict[str, bytes]] = {
     "numbers equal": by_package(sequence=lambda _: 7),
     "no library": by_package(library=""),
     "our own library": by_package(library="pebble 1.0"),
+    "a library like a name of ours": by_package(library="tool 0123456789abcdef"),
+    "a library of that length": by_package(library="pebble rosbag2-recorder"),
+    "empty chunks of zstd": whole(SCHEMA_RECORD, CHANNELS, chunk(compression="zstd"), chunk(*MESSAGES)),
     "metadata and attachments": by_package(beside=True),
     "metadata and attachments, no chunks": by_package(beside=True, use_chunking=False),
 }  # fmt: skip

@@ -23,6 +23,8 @@ def unfinished(target: Path, *, overwrite: bool) -> Iterator[Path]:
     path = target.with_name(f".{target.name}.{os.getpid()}")
     try:
         yield path
+        if target.exists() and not overwrite:
+            raise RecordingError(f"{target} exists already")
         path.replace(target)
     except OSError as error:
         raise RecordingError(f"{target}: {error.strerror or error}") from None

@@ -50,6 +50,7 @@ FILE: Final = "file"
 _DIGITS: Final = 18  # of a number in metadata
 _LARGEST_SUMMARY: Final = 256 << 20
 _NAME_LENGTH: Final = 16  # hexadecimal digits
+_HEXADECIMAL: Final = frozenset("0123456789abcdef")
 
 HEAD: Final = struct.Struct("<BQ")  # opcode, length of what follows
 MESSAGE: Final = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
@@ -232,8 +233,10 @@ def file_of_header(body: bytes) -> str | None:
     """The name of a file in its header; None for a file of another program. Raises DamageError."""
     with _Reading(body) as reading:
         reading.text()
-        word = reading.text().rpartition(" ")[2]
-        return _name(word) if len(word) == _NAME_LENGTH else None
+        library, _, name = reading.text().rpartition(" ")
+    digits = sum(digit in _HEXADECIMAL for digit in name)  # a flipped bit costs one
+    is_ours = library.startswith("pebble") and len(name) == _NAME_LENGTH and digits >= _NAME_LENGTH - 1
+    return _name(name) if is_ours else None
 
 
 def file_of_chunk(records: bytes) -> str:
@@ -477,7 +480,7 @@ class _Reading:
 
 
 def _name(text: str) -> str:
-    return text if len(text) == _NAME_LENGTH and all(digit in "0123456789abcdef" for digit in text) else ""
+    return text if len(text) == _NAME_LENGTH and all(digit in _HEXADECIMAL for digit in text) else ""
 
 
 def _text(text: str) -> bytes:

@@ -17,6 +17,7 @@ from pebble.recordings.files.scan import Damage, blocks
 from pebble.recordings.files.writer import LIBRARY, McapWriter
 
 REWRITTEN: Final = "pebble.rewritten"
+_PLAIN: Final = frozenset({"", "json", "application/octet-stream"})  # what the shared channel may hold
 PART: Final = ".part"  # the end of a copy's name while it is written
 
 Keeps = Callable[[Recorded], bool]
@@ -128,8 +129,8 @@ class Copy:
         if number is None:
             number = self._channels.declare(key, channel.topic, channel.encoding, channel.metadata, schema)
         if number is None:
-            if schema is not None:
-                raise RecordingError(f"{channel.topic}: there is no room for more topics with a schema")
+            if schema is not None or channel.encoding not in _PLAIN:
+                raise RecordingError(f"{channel.topic}: there is no room for more topics that are not JSON or bytes")
             self._channels.add_other(
                 channel.topic, channel.metadata, message.log_ns, message.payload, message.publish_ns
             )
