@@ -122,7 +122,7 @@ def list_(places: Places, since: Since = None, until: Until = None, check: Check
         total.update(files=1, messages=one.messages, size=one.size)
     _console().print(table)
     typer.echo(f"{total['files']} files, {total['messages']:,} messages, {show.size(total['size'])}")
-    return _say_unread(unread)
+    return _report_unread(unread)
 
 
 def info(places: Places, since: Since = None, until: Until = None, check: Check = False) -> int:
@@ -157,7 +157,7 @@ def info(places: Places, since: Since = None, until: Until = None, check: Check 
     if len(others) > _SHOWN_TOPICS:
         typer.echo(f"  … and {len(others) - _SHOWN_TOPICS} topics more")
     _print_events(one.path for one in looked if one.readable)
-    return _say_unread(unread)
+    return _report_unread(unread)
 
 
 def search(
@@ -184,7 +184,7 @@ def search(
         if found == count:
             break
     typer.echo(f"{found:,} messages", err=True)
-    return _say_unread(problems(damages))
+    return _report_unread(problems(damages))
 
 
 def finish(folder: Annotated[Path, typer.Argument(help="Folder of a recorder.", metavar="DIR")]) -> int:
@@ -226,7 +226,7 @@ def compact(folder: Annotated[Path, typer.Argument(help="Folder of a recorder.",
                 try:
                     made = rewrite(entry.path, entry.path)
                 except (PebbleError, OSError) as error:
-                    left += _say_left(error)
+                    left += _report_left(error)
                     continue
                 before, after = before + entry.size, after + made.size
                 advance(number)
@@ -247,7 +247,7 @@ def index(folder: Annotated[Path, typer.Argument(help="Folder of a recorder.", m
                 unread.append(f"{path}: {entry.unread}")
             advance(number)
     typer.echo(f"{len(due)} recordings indexed")
-    return _say_unread(unread)
+    return _report_unread(unread)
 
 
 def export(
@@ -276,7 +276,7 @@ def export(
             messages = merged(paths, since_ns=since_ns, until_ns=until_ns, chooses=query.chooses, damages=damages)
             typer.echo(_export(form, messages, target, base or "", on_time, beside))
     finally:
-        code = _say_unread(problems(damages))
+        code = _report_unread(problems(damages))
     return code
 
 
@@ -326,7 +326,7 @@ def rm(
     if Folder.is_in_use(_existing(folder)):
         raise PebbleError(f"{folder}: a recorder writes here, and would write retained values again: stop it first")
     entries = Folder(folder).entries()
-    left = sum(_say_left(f"{entry.path}: is not finished, or damaged") for entry in entries if not entry.is_finished)
+    left = sum(_report_left(f"{entry.path}: is not finished, or damaged") for entry in entries if not entry.is_finished)
     due = [entry.path for entry in entries if entry.is_finished and _reaches_into(entry.path, since_ns, until_ns)]
     what = f"{show.printable(base)} " if base else "everything "
     if not yes and not typer.confirm(f"Delete {what}from {len(due)} files in {folder}?"):
@@ -338,7 +338,7 @@ def rm(
                 names = path.stat().st_nlink
                 made = rewrite(path, path, keeps=keeps)
             except (PebbleError, OSError) as error:
-                left += _say_left(error)
+                left += _report_left(error)
                 continue
             if made.left_out:
                 deleted += made.left_out
@@ -384,12 +384,12 @@ def _delete_whole(path: Path, *, yes: bool) -> int:
     return 0
 
 
-def _say_left(error: object) -> int:
+def _report_left(error: object) -> int:
     typer.echo(f"pebble: left as it is: {show.printable(str(error))}", err=True)
     return 1
 
 
-def _say_unread(lines: list[str]) -> int:
+def _report_unread(lines: list[str]) -> int:
     """The exit code: 1 if there is a line."""
     for line in lines:
         typer.echo(f"pebble: {show.printable(line)}", err=True)

@@ -120,7 +120,7 @@ def replay(
     source = ReplaySource(paths)
     rules = Rules(options, source.channels)
     if not rules.robots:
-        _say_unread(source)
+        _report_unread(source)
         raise PebbleError("there is nothing to publish in this recording; see --only and --incoming")
     if missing := sum(look_at(path).missing for path in paths):
         typer.echo(f"pebble: {missing:,} messages are missing in this recording: files were damaged", err=True)
@@ -153,7 +153,7 @@ def replay(
         console.attach(player, robots)
         player.run()
     typer.echo(f"{player.sent} sent, {player.skipped} skipped")
-    unread = _say_unread(source)
+    unread = _report_unread(source)
     return 0 if console.ended in ("", "SIGINT", END) and not unread else 1
 
 
@@ -161,7 +161,7 @@ def register(app: typer.Typer) -> None:
     app.command("replay")(replay)
 
 
-def _say_unread(source: ReplaySource) -> bool:
+def _report_unread(source: ReplaySource) -> bool:
     """Name the files that could not be read completely; returns whether there are any."""
     lines = problems(source.damages)
     for line in lines:

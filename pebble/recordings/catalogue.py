@@ -80,7 +80,7 @@ def _read_all(info: FileInfo, data: Any) -> None:
         info.messages += 1
         _count(info, message.channel, 1)
     info.finished, info.missing, info.damaged = damage.finished, damage.missing, bool(damage.spans)
-    info.problem = damage.says(active=info.is_active)
+    info.problem = damage.report(active=info.is_active)
 
 
 def _count(info: FileInfo, channel: Channel, count: int) -> None:

@@ -86,7 +86,7 @@ def merged(
 
 def problems(damages: Damages) -> list[str]:
     """A line for each file that could not be read completely."""
-    found = ((path, damage.says(active=path.name.endswith(ACTIVE))) for path, damage in damages.items())
+    found = ((path, damage.report(active=path.name.endswith(ACTIVE))) for path, damage in damages.items())
     return [f"{path}: {text}" for path, text in found if text]
 
 

@@ -70,7 +70,7 @@ def stored(folder: Path, data: bytes, name: str = NAME) -> Path:
 def test_a_file_of_another_program_is_read_in_the_order_of_time(tmp_path: Path, run: Run, name: str) -> None:
     path, damage, copy = stored(tmp_path, VALID[name]), Damage(), tmp_path / "copy.mcap"
     assert contents(path, damage) == EXPECTED
-    assert damage.says() == ""
+    assert damage.report() == ""
     for check in ([], ["--check"]):
         assert (run("recordings", "list", tmp_path / "rec", *check, columns=200), run.err) == (0, "")
         assert f" {COUNT} " in run.out
@@ -163,14 +163,14 @@ def on(folder: Path, command: list[str], out: Path) -> list[str | Path]:
 
 @pytest.mark.parametrize("name", DAMAGED)
 def test_what_cannot_be_read_is_named_and_not_touched(tmp_path: Path, run: Run, name: str) -> None:
-    data, said = DAMAGED[name]
+    data, wanted = DAMAGED[name]
     path = stored(tmp_path, data)
     for number, command in enumerate([*READERS, *WRITERS]):
         code = run(*on(tmp_path / "rec", command, tmp_path / str(number)))
-        assert (code, NAME in run.err, said in run.err) == (1, True, True), (command, run.out, run.err)
+        assert (code, NAME in run.err, wanted in run.err) == (1, True, True), (command, run.out, run.err)
         assert path.read_bytes() == data
     days = Days(Archive(tmp_path / "rec")).all()
-    assert any(said in line for day in days for line in day.unread), days
+    assert any(wanted in line for day in days for line in day.unread), days
     assert run("recordings", "rm", path, "--yes") == 0
     assert not path.exists()
 
@@ -269,16 +269,16 @@ class TestInterrupted:
 class TestNames:
     """Links, files that are not finished, and names that are taken."""
 
-    def test_what_a_deletion_does_not_look_into_is_said(self, tmp_path: Path, run: Run) -> None:
+    def test_what_a_deletion_does_not_look_into_is_named(self, tmp_path: Path, run: Run) -> None:
         whole_ = stored(tmp_path, VALID["zstd"])
         left = [
             stored(tmp_path, VALID["zstd"], f"{NAME.replace('001', '002')}{end}") for end in (".active", ".damaged")
         ]
         assert run("recordings", "rm", tmp_path / "rec", "--robot", "fred", "--yes") == 1
         assert contents(whole_) == OF_GOOB
-        said = run.err
+        wanted = run.err
         for path in left:
-            assert path.name in said
+            assert path.name in wanted
             assert path.read_bytes() == VALID["zstd"]
             assert run("recordings", "rm", path, "--yes") == 0
             assert not path.exists()

@@ -17,19 +17,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from pebble.recordings.files import mcap
-from pebble.recordings.files.mcap import (
-    MESSAGE,
-    Channel,
-    ChunkIndex,
-    DamageError,
-    Metadata,
-    Op,
-    Recorded,
-    RecordingError,
-    Schema,
-    Statistics,
-    UnreadableError,
-)
+from pebble.recordings.files.mcap import MESSAGE, Channel, ChunkIndex, DamageError, Metadata, Op, Recorded, Statistics
 from pebble.recordings.files.reading_lock import share
 from pebble.recordings.files.scan import Block, Damage, block_at, blocks, is_of_others
 
@@ -66,11 +54,11 @@ def mapped(path: Path) -> Iterator[Any]:
             with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
                 yield data
     except OSError as error:
-        raise RecordingError(f"{path}: {error.strerror or error}") from None
-    except UnreadableError as error:
-        raise UnreadableError(f"{path}: {error}") from None
+        raise mcap.RecordingError(f"{path}: {error.strerror or error}") from None
+    except mcap.UnreadableError as error:
+        raise mcap.UnreadableError(f"{path}: {error}") from None
     except DamageError as error:
-        raise RecordingError(f"{path}: {error}") from None
+        raise mcap.RecordingError(f"{path}: {error}") from None
 
 
 def read(
@@ -148,7 +136,7 @@ class _Reading:
         self._data, self._damage, self._chooses = data, damage, chooses
         self._is_of_others = is_of_others(data)
         self._summary = Summary.of(data)
-        self._schemas: dict[int, Schema] = {}
+        self._schemas: dict[int, mcap.Schema] = {}
         self._declared: dict[int, Channel] = {}
         self._channels: dict[int, Channel | None] = {}  # None: not chosen
         self._counts = Counter[int]()  # messages by channel, of a first reading
@@ -244,7 +232,7 @@ class _Reading:
         block = block_at(self._data, at, end)
         self._open += len(block.body)
         if self._open > _MOST_OPEN:
-            raise UnreadableError(
+            raise mcap.UnreadableError(
                 f"over {_MOST_OPEN >> 20} MB of it are not in the order of time: `mcap sort` puts them so"
             )
         found = []
@@ -288,7 +276,7 @@ class _Reading:
     def _declare(self, op: int, body: bytes) -> None:
         """Take over a record of a chunk that is no message."""
         if op == Op.SCHEMA:
-            schema = Schema.unpack(body)
+            schema = mcap.Schema.unpack(body)
             self._refuse_another(self._schemas.setdefault(schema.id, schema), schema)
         elif op == Op.CHANNEL:
             channel = Channel.unpack(body)
@@ -298,9 +286,9 @@ class _Reading:
         elif op != Op.MESSAGE_INDEX:
             self._damage.private += 1
 
-    def _refuse_another(self, known: Channel | Schema, one: Channel | Schema) -> None:
+    def _refuse_another(self, known: Channel | mcap.Schema, one: Channel | mcap.Schema) -> None:
         if self._is_of_others and known != one:
-            raise UnreadableError(f"{type(one).__name__.lower()} {one.id} is declared as two different ones")
+            raise mcap.UnreadableError(f"{type(one).__name__.lower()} {one.id} is declared as two different ones")
 
     def _add(self, channel: Channel) -> None:
         if channel.topic.startswith(UNNAMED):
@@ -320,7 +308,7 @@ class Summary:
     chunks: list[ChunkIndex]
     statistics: Statistics
     metadata: list[int]  # where they are
-    schemas: dict[int, Schema]
+    schemas: dict[int, mcap.Schema]
 
     @classmethod
     def of(cls, data: Any) -> Summary | None:
@@ -332,7 +320,7 @@ class Summary:
         if found is None:
             return None
         channels: dict[int, Channel] = {}
-        schemas: dict[int, Schema] = {}
+        schemas: dict[int, mcap.Schema] = {}
         chunks, statistics, metadata = [], None, []
         try:
             for op, begin, end in mcap.records(found[1]):
@@ -341,7 +329,7 @@ class Summary:
                     channel = Channel.unpack(body)
                     channels[channel.id] = channel
                 elif op == Op.SCHEMA:
-                    schema = Schema.unpack(body)
+                    schema = mcap.Schema.unpack(body)
                     schemas[schema.id] = schema
                 elif op == Op.CHUNK_INDEX:
                     chunks.append(ChunkIndex.unpack(body))

@@ -66,7 +66,7 @@ def rewrite(source: Path, target: Path, *, keeps: Keeps | None = None) -> Rewrit
             os.fsync(file.fileno())
         contents = writer.contents
         is_empty = not (contents.messages or contents.attachments)
-        made = Rewritten(contents.messages, left_out, missing, writer.size, damage.says(), is_empty)
+        made = Rewritten(contents.messages, left_out, missing, writer.size, damage.report(), is_empty)
         if in_place and keeps is not None and not left_out:
             return made
         _check(part, made)
@@ -99,8 +99,8 @@ def _state(path: Path) -> tuple[int, ...]:
 
 
 def _why(damage: Damage) -> str:
-    if said := damage.says():
-        return f"{said}; `pebble recordings recover` copies what can be read"
+    if text := damage.report():
+        return f"{text}; `pebble recordings recover` copies what can be read"
     if damage.covered:
         return f"{damage.covered:,} damaged bytes were covered when it was finished, and would be lost"
     return f"{damage.private:,} records in it are known only to the program that wrote it, and would be lost"
@@ -112,7 +112,7 @@ def _check(part: Path, made: Rewritten) -> None:
     with mapped(part) as data:
         messages = sum(1 for _ in read(data, damage))
     if messages != made.messages or damage.spans or damage.torn or damage.unended:
-        raise RecordingError(f"{part.name}: cannot be read again ({damage.says() or 'other messages'})")
+        raise RecordingError(f"{part.name}: cannot be read again ({damage.report() or 'other messages'})")
 
 
 class Copy:

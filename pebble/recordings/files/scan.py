@@ -68,7 +68,7 @@ class Damage:
     def note(self, why: object) -> None:
         self.why = self.why or str(why)
 
-    def says(self, *, active: bool = False) -> str:
+    def report(self, *, active: bool = False) -> str:
         """What could not be read, in words; "" if all was. One that is ``active`` needs no end."""
         spans, size = len(self.spans), sum(end - begin for begin, end in self.spans)
         found = [

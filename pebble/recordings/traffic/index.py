@@ -165,7 +165,7 @@ class Index:
         ):
             rows = _Rows(connection)
             damage = rows.read(recording, advance)
-            unread = damage.says(active=recording.name.endswith(ACTIVE))
+            unread = damage.report(active=recording.name.endswith(ACTIVE))
             making = _Making(self, connection, Path(scratch), self._name(recording), _key(self._name(recording)))
             entry = Entry(
                 _FORMAT, self._name(recording), about.st_size, about.st_mtime_ns, rows.count, damage.missing,
