@@ -270,7 +270,7 @@ def export(
         base = base or _only_robot(paths)
     query = Query(base, tuple(topic or ()))
     damages = Damages()
-    beside = paths if form is Form.MCAP and query == Query() else []
+    beside = damages if query == Query() else ()  # those that were read
     try:
         with _progress_of_time(paths, since_ns, until_ns) as on_time:
             messages = merged(paths, since_ns=since_ns, until_ns=until_ns, chooses=query.chooses, damages=damages)
@@ -494,7 +494,7 @@ def _export(
     target: Path,
     robot: str,
     on_time: Callable[[int], None],
-    beside: list[Path],
+    beside: Iterable[Path],
 ) -> str:
     if form is Form.FOXGLOVE:
         counts = write_foxglove(messages, target, on_time=on_time)

@@ -111,6 +111,13 @@ def test_damage_is_counted(tmp_path: Path) -> None:
     assert any("messages of the last day are missing: files were damaged" in one.text for one in findings(tmp_path))
 
 
+def test_what_could_not_be_finished_is_named(tmp_path: Path) -> None:
+    path = recorded(tmp_path)
+    path.rename(path.with_name(f"{path.name}.damaged"))
+    (found,) = [one for one in findings(tmp_path) if "could not be finished" in one.text]
+    assert (found.level, f"{path}.damaged" in found.text) == (Level.WARN, True)
+
+
 def test_how_long_there_is_room(tmp_path: Path) -> None:
     assert "is not known yet" in findings(tmp_path)[-1].text
     path = recorded(tmp_path, seconds=3600.0)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, Final
 
 from pebble.recordings.files.mcap import Recorded
-from pebble.recordings.files.reader import mapped
-from pebble.recordings.files.rewrite import Copy, copy_beside
+from pebble.recordings.files.reader import DAMAGE, mapped
+from pebble.recordings.files.rewrite import REWRITTEN, Copy, copy_beside
 from pebble.recordings.files.writer import LIBRARY, McapWriter
+
+_ABOUT: Final = "pebble.recording"
 
 
 def write_copy(
@@ -17,17 +19,18 @@ def write_copy(
 ) -> int:
     """Write ``messages`` as MCAP; returns how many there were. ``on_time`` gets the time of each.
 
-    ``beside``: files whose metadata and attachments go with them.
+    ``beside``: files whose metadata and attachments go with them, as they are known after the last message.
     """
     writer = McapWriter(_Whole(out), library=LIBRARY)
-    writer.metadata("pebble.recording", {"format": "1", "exported": "1"})
-    for path in beside:
-        with mapped(path) as data:
-            copy_beside(data, writer)
+    writer.metadata(_ABOUT, {"format": "1", "exported": "1"})
     copy = Copy(writer)
     for message in messages:
         copy.add(message)
         on_time(message.log_ns)
+    for path in beside:
+        if path.exists():  # not deleted meanwhile, to make room
+            with mapped(path) as data:
+                copy_beside(data, writer, (_ABOUT, DAMAGE, REWRITTEN))
     writer.finish()
     return writer.contents.messages
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -81,12 +81,12 @@ def rewrite(source: Path, target: Path, *, keeps: Keeps | None = None) -> Rewrit
     return made
 
 
-def copy_beside(data: Any, writer: McapWriter) -> None:
-    """Add the metadata and attachments of a file, without what ours say about its damage."""
+def copy_beside(data: Any, writer: McapWriter, without: Container[str] = (DAMAGE, REWRITTEN)) -> None:
+    """Add the metadata and attachments of a file, without metadata of some names."""
     for block in blocks(data, Damage()):
         if block.op is Op.METADATA:
             metadata = Metadata.unpack(block.body)
-            if metadata.name not in (DAMAGE, REWRITTEN):
+            if metadata.name not in without:
                 writer.metadata(metadata.name, metadata.items)
         elif block.op is Op.ATTACHMENT:
             writer.attach(data[block.at : block.end])
