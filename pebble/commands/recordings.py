@@ -408,6 +408,8 @@ def _finish_all(folder: Folder) -> int:
             failed += 1
             continue
         lost = f", {made.missing:,} missing" if made.missing else ""
+        lost += f", {made.damaged_bytes:,} damaged bytes" if made.damaged_bytes else ""
+        failed += bool(lost)
         typer.echo(f"{finished_path(path).name}: {made.messages:,} messages{lost}")
     if not left:
         typer.echo("nothing to finish")

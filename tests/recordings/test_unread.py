@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import random
+import re
 import signal
 import subprocess
 import sys
@@ -344,6 +345,21 @@ class TestFinishing:
         assert run("recordings", "finish", tmp_path / "rec") == 1
         assert "another program wrote it" in run.err
         assert path.read_bytes() == VALID[name]
+
+    def test_what_a_finished_file_lacks_is_counted(self, tmp_path: Path, run: Run) -> None:
+        path = stored(tmp_path, b"", f"{NAME}.active")
+        write(path, 100, finish=False, each=20, channels=1)
+        second = list(blocks(path.read_bytes(), Damage()))[2]
+        path.write_bytes(flipped(path.read_bytes(), second.at + 200))
+        assert run("recordings", "finish", tmp_path / "rec") == 1
+        assert re.fullmatch(rf"{NAME}: 80 messages, 20 missing, [\d,]+ damaged bytes\n", run.out)
+        whole_ = path.with_name(NAME)
+        before = whole_.read_bytes()
+        assert run("recordings", "compact", tmp_path / "rec") == 1
+        assert "damaged bytes were covered" in run.err
+        assert whole_.read_bytes() == before
+        assert run("recordings", "list", tmp_path / "rec", columns=200) == 0
+        assert "20 missing" in run.out
 
     def test_only_the_begin_of_a_record_is_cut_off(self, tmp_path: Path) -> None:
         """A damaged last chunk stays in the file, and so do all bytes of it."""
