@@ -53,6 +53,7 @@ class RecordingFile:
         """Raises RecordingError."""
         self.path = path
         self.problem = ""  # what could not be read of it
+        self._is_copied = False
         try:
             self._descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
         except OSError as error:
@@ -98,7 +99,8 @@ class RecordingFile:
         return self._scanned if self._statistics is None else self._chunks
 
     def size(self) -> int:
-        return os.fstat(self._descriptor).st_size
+        """Of the file itself, also where a copy is read."""
+        return self.path.stat().st_size if self._is_copied else os.fstat(self._descriptor).st_size
 
     def robots(self) -> set[str]:
         """All that a channel with messages belongs to."""
@@ -150,7 +152,7 @@ class RecordingFile:
             raise UnreadableError(f"{self.path}: {why}")
         with tempfile.TemporaryDirectory(prefix="pebble-recording-") as folder:
             copy = Path(folder, self.path.name)
-            self.problem = rewrite(self.path, copy).unread
+            self.problem, self._is_copied = rewrite(self.path, copy).unread, True
             os.close(self._descriptor)
             self._descriptor = os.open(copy, os.O_RDONLY | os.O_CLOEXEC)
             with mapped(copy) as data:
