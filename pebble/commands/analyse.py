@@ -62,6 +62,7 @@ def analyse(
     require_packages("duckdb", "matplotlib")
     from pebble.bench.engine import check_folder
     from pebble.client.names import base_of
+    from pebble.config.visible import shown
     from pebble.recordings.period import parse_period
     from pebble.recordings.traffic.analysis import analyse as analyse_traffic
     from pebble.recordings.traffic.report import write_report
@@ -73,12 +74,14 @@ def analyse(
     with tempfile.TemporaryDirectory(prefix="pebble-analyse-") as folder, _progress() as progress:
         scratch = Path(folder)
         found = sources(places, scratch, robots=bases, since_ns=since_ns, until_ns=until_ns, progress=progress)
+        for line in found.unread:
+            typer.echo(f"pebble: {shown(line)}", err=True)
         traffic = analyse_traffic(
             found, scratch, since_ns=since_ns, until_ns=until_ns, overhead=overhead, progress=progress
         )
         written = write_report(traffic, output, csv=csv, advance=progress)
     _print(traffic, written)
-    return 0
+    return 1 if found.unread else 0
 
 
 @contextmanager

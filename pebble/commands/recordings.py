@@ -31,19 +31,31 @@ from pebble.recordings.exports.lines import BadLine, Imported, read_lines, write
 from pebble.recordings.exports.mongo import read_mongo, write_mongo
 from pebble.recordings.exports.unfinished import unfinished
 from pebble.recordings.files.finish import finish as finish_file
-from pebble.recordings.files.mcap import Recorded
-from pebble.recordings.files.reader import RecordingError
+from pebble.recordings.files.mcap import Recorded, RecordingError
 from pebble.recordings.files.rewrite import rewrite
+from pebble.recordings.files.scan import Damage
 from pebble.recordings.files.writer import LIBRARY, McapWriter
-from pebble.recordings.library import FOREVER_NS, files, merged, robot_of, span
+from pebble.recordings.library import (
+    ACTIVE,
+    FOREVER_NS,
+    SUFFIX,
+    Damages,
+    files,
+    merged,
+    problems,
+    robot_in,
+    robot_of,
+    span,
+)
 from pebble.recordings.period import SINCE_HELP, UNTIL_HELP, parse_period
-from pebble.recordings.recorder.folder import Folder, finished_path, sync_folder
+from pebble.recordings.recorder.folder import DAMAGED, Folder, finished_path, rename
 from pebble.recordings.stamps import stamp_ns
-from pebble.recordings.traffic.index import Index, not_indexed
+from pebble.recordings.traffic.index import Index, archive_of, not_indexed
 
 _QUIET_S = 2.0  # before progress is shown
 _SHOWN_TOPICS = 30
 _ONE_LINE = 1 << 20  # columns
+_CHECKED = 256 << 20  # bytes of files that are read as a whole without being asked to
 
 Places = Annotated[list[Path], typer.Argument(help="Recordings, or folders of them.", metavar="DIR|FILE…")]
 Since = Annotated[str | None, typer.Option(help=SINCE_HELP, metavar="TIME")]
@@ -51,6 +63,7 @@ Until = Annotated[str | None, typer.Option(help=UNTIL_HELP, metavar="TIME")]
 RobotOption = Annotated[
     str | None, typer.Option("--robot", "-r", help="Only this one.", metavar="[SYSTEM/TYPE/]ID", show_default=False)
 ]
+Check = Annotated[bool, typer.Option("--check", help="Read all of it; without, of much only the summaries.")]
 Topics = Annotated[
     list[str] | None,
     typer.Option(
@@ -98,22 +111,24 @@ def register(app: typer.Typer) -> None:
     app.add_typer(group, name="recordings")
 
 
-def list_(places: Places, since: Since = None, until: Until = None) -> None:
+def list_(places: Places, since: Since = None, until: Until = None, check: Check = False) -> int:
     """List the files, their times, sizes and state."""
     table = Table(*_columns("begins", "lasts", "what", "messages", "size", "state"), box=box.SIMPLE, pad_edge=False)
     total = Counter[str]()
-    for one in _looked_at(places, since, until):
+    looked, unread = _looked_at(places, since, until, check=check)
+    for one in looked:
         lasts = show.duration((one.last_ns - one.first_ns) / 1e9) if one.messages else ""
         begins = _local(one.first_ns) if one.messages else ""
         table.add_row(begins, lasts, _lane(one.path), f"{one.messages:,}", show.size(one.size), _state(one))
         total.update(files=1, messages=one.messages, size=one.size)
     _console().print(table)
     typer.echo(f"{total['files']} files, {total['messages']:,} messages, {show.size(total['size'])}")
+    return _report_unread(unread)
 
 
-def info(places: Places, since: Since = None, until: Until = None) -> None:
+def info(places: Places, since: Since = None, until: Until = None, check: Check = False) -> int:
     """Show robots, topics, and what happened to the recording."""
-    looked = list(_looked_at(places, since, until))
+    looked, unread = _looked_at(places, since, until, check=check)
     topics, sizes = Counter[str](), sum(one.size for one in looked)
     for one in looked:
         topics.update(one.topics)
@@ -134,7 +149,16 @@ def info(places: Places, since: Since = None, until: Until = None) -> None:
             typer.echo(f"  {number:>10,}  {_one_line(shown(topic))}")
         if len(own) > _SHOWN_TOPICS:
             typer.echo(f"  … and {len(own) - _SHOWN_TOPICS} topics more")
-    _print_events(one.path for one in looked)
+    encodings = {topic: name for one in looked for topic, name in one.encodings.items() if robot_in(topic) is None}
+    others = Counter({topic: topics[topic] for topic in encodings if not topic.startswith("$recorder/")})
+    if others:
+        typer.echo(f"\nTopics that are of no robot: {others.total():,} messages")
+    for topic, number in others.most_common(_SHOWN_TOPICS):
+        typer.echo(f"  {number:>10,}  {_one_line(shown(f'{topic} {encodings[topic]}'))}")
+    if len(others) > _SHOWN_TOPICS:
+        typer.echo(f"  … and {len(others) - _SHOWN_TOPICS} topics more")
+    _print_events(one.path for one in looked if one.readable)
+    return _report_unread(unread)
 
 
 def search(
@@ -145,12 +169,12 @@ def search(
     topic: Topics = None,
     text: Annotated[str | None, typer.Option(help="Somewhere in the payload.", metavar="TEXT")] = None,
     count: Annotated[int, typer.Option("--count", "-n", min=0, help="Stop after so many; 0: never.")] = 0,
-) -> None:
+) -> int:
     """Print the messages that match, in the order of time."""
     since_ns, until_ns = _period(since, until)
     query = Query(None if robot is None else base_of(robot), tuple(topic or ()), text)
-    found = 0
-    for message in merged(files(places), since_ns=since_ns, until_ns=until_ns, chooses=query.chooses):
+    found, damages = 0, Damages()
+    for message in merged(files(places), since_ns=since_ns, until_ns=until_ns, chooses=query.chooses, damages=damages):
         if not query.accepts(message):
             continue
         flag = " (retained)" if message.channel.metadata.get("retained") else ""
@@ -161,6 +185,7 @@ def search(
         if found == count:
             break
     typer.echo(f"{found:,} messages", err=True)
+    return _report_unread(problems(damages))
 
 
 def finish(folder: Annotated[Path, typer.Argument(help="Folder of a recorder.", metavar="DIR")]) -> int:
@@ -179,44 +204,51 @@ def finish(folder: Annotated[Path, typer.Argument(help="Folder of a recorder.", 
 def recover(
     source: Annotated[Path, typer.Argument(help="A damaged recording; it stays as it is.", metavar="FILE")],
     target: Annotated[Path, typer.Argument(help="A new file.", metavar="OUT")],
-) -> None:
+) -> int:
     """Copy what can be read of a recording into a new file."""
     files([source])
     if target.exists():
         raise PebbleError(f"{target} exists already")
     made = rewrite(source, target)
     typer.echo(f"{target}: {made.messages:,} messages, {made.missing:,} missing")
+    if made.unread:
+        typer.echo(f"pebble: {source}: {shown(made.unread)}", err=True)
+    return 0 if made.messages else 1
 
 
-def compact(folder: Annotated[Path, typer.Argument(help="Folder of a recorder.", metavar="DIR")]) -> None:
+def compact(folder: Annotated[Path, typer.Argument(help="Folder of a recorder.", metavar="DIR")]) -> int:
     """Write files again in larger pieces, which are smaller."""
-    before = after = 0
+    before = after = left = 0
     owner = Folder(_existing(folder))
     with owner.maintained():
         entries = [entry for entry in owner.entries() if entry.is_finished]
         with _progress("compacting", len(entries)) as advance:
             for number, entry in enumerate(entries, 1):
                 try:
-                    made = rewrite(entry.path, entry.path, whole=True)
-                except (RecordingError, OSError) as error:
-                    typer.echo(f"pebble: left as it is: {error}", err=True)
+                    made = rewrite(entry.path, entry.path)
+                except (PebbleError, OSError) as error:
+                    left += _report_left(error)
                     continue
                 before, after = before + entry.size, after + made.size
                 advance(number)
     typer.echo(f"{show.size(before)} became {show.size(after)}")
+    return 1 if left else 0
 
 
-def index(folder: Annotated[Path, typer.Argument(help="Folder of a recorder.", metavar="DIR")]) -> None:
+def index(folder: Annotated[Path, typer.Argument(help="Folder of a recorder.", metavar="DIR")]) -> int:
     """Index recordings for `pebble analyse`, as Parquet files."""
     from pebble.recordings.traffic.duck import require_packages
 
     require_packages("duckdb", "matplotlib")
-    due = not_indexed(folder)
+    due, unread = not_indexed(folder), []
     with _progress("indexing", len(due)) as advance:
         for number, path in enumerate(due, 1):
-            Index(folder).add(path)
+            entry = Index(folder).add(path)
+            if entry.unread:
+                unread.append(f"{path}: {entry.unread}")
             advance(number)
     typer.echo(f"{len(due)} recordings indexed")
+    return _report_unread(unread)
 
 
 def export(
@@ -227,7 +259,7 @@ def export(
     since: Since = None,
     until: Until = None,
     topic: Topics = None,
-) -> None:
+) -> int:
     """Export to JSON lines, MongoDB, Foxglove, a film, MCAP."""
     form = form or _BY_SUFFIX.get(target.suffix)
     if form is None:
@@ -238,9 +270,15 @@ def export(
     if form in (Form.MKV, Form.MP4, Form.WAV):
         base = base or _only_robot(paths)
     query = Query(base, tuple(topic or ()))
-    with _progress_of_time(paths, since_ns, until_ns) as on_time:
-        messages = merged(paths, since_ns=since_ns, until_ns=until_ns, chooses=query.chooses)
-        typer.echo(_export(form, messages, target, base or "", on_time))
+    damages = Damages()
+    beside = damages if query == Query() else ()  # those that were read
+    try:
+        with _progress_of_time(paths, since_ns, until_ns) as on_time:
+            messages = merged(paths, since_ns=since_ns, until_ns=until_ns, chooses=query.chooses, damages=damages)
+            typer.echo(_export(form, messages, target, base or "", on_time, beside))
+    finally:
+        code = _report_unread(problems(damages))
+    return code
 
 
 def import_(
@@ -263,13 +301,20 @@ def import_(
 
 
 def rm(
-    folder: Annotated[Path, typer.Argument(help="Folder of a recorder.", metavar="DIR")],
+    folder: Annotated[
+        Path, typer.Argument(help="Folder of a recorder; or one file, which goes as a whole.", metavar="DIR|FILE")
+    ],
     robot: RobotOption = None,
     since: Since = None,
     until: Until = None,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
 ) -> int:
-    """Delete what was recorded of a robot, or in a period. Files that hold more are written again without it."""
+    """Delete what was recorded of a robot, or in a period. Files that hold more are written again without it.
+
+    A file that cannot be read completely stays as it is. One that is named is deleted, whatever is in it.
+    """
+    if not folder.is_dir() and robot is None and since is None and until is None:
+        return _delete_whole(folder, yes=yes)
     if robot is None and since is None and until is None:
         raise PebbleError("what to delete is missing: name --robot, --since or --until")
     since_ns, until_ns = _period(since, until)
@@ -281,26 +326,75 @@ def rm(
 
     if Folder.is_in_use(_existing(folder)):
         raise PebbleError(f"{folder}: a recorder writes here, and would write retained values again: stop it first")
-    entries = [entry for entry in Folder(folder).entries() if entry.is_finished]
-    due = [
-        entry.path
-        for entry in entries
-        if (one := span(entry.path)) and one.last_ns >= since_ns and one.first_ns < until_ns
-    ]
+    entries = Folder(folder).entries()
+    left = sum(_report_left(f"{entry.path}: is not finished, or damaged") for entry in entries if not entry.is_finished)
+    due = [entry.path for entry in entries if entry.is_finished and _reaches_into(entry.path, since_ns, until_ns)]
     what = f"{shown(base)} " if base else "everything "
     if not yes and not typer.confirm(f"Delete {what}from {len(due)} files in {folder}?"):
         return 1
     deleted = 0
     with Folder(folder).maintained(), _progress("deleting", len(due)) as advance:
         for number, path in enumerate(due, 1):
-            made = rewrite(path, path, keeps=keeps)
-            deleted += made.left_out
-            Index(folder).remove(path)
-            if not made.messages:
-                path.unlink()
+            try:
+                names = path.stat().st_nlink
+                made = rewrite(path, path, keeps=keeps)
+            except (PebbleError, OSError) as error:
+                left += _report_left(error)
+                continue
+            if made.left_out:
+                deleted += made.left_out
+                if names > 1:
+                    left += 1
+                    typer.echo(f"pebble: {path}: has other names (hard links), which keep all of it", err=True)
+                Index(folder).remove(path)
+                if made.is_empty:
+                    path.unlink()
             advance(number)
     typer.echo(f"{deleted:,} messages deleted")
+    if left:
+        typer.echo(
+            f"pebble: {left} files may hold more of it: pebble recordings rm FILE deletes one as a whole", err=True
+        )
+    return 1 if left else 0
+
+
+def _reaches_into(path: Path, since_ns: int, until_ns: int) -> bool:
+    """Whether a file may hold messages of a period: one that cannot be read may."""
+    damage = Damage()
+    try:
+        one = span(path, damage)
+    except RecordingError:
+        return True
+    return damage.unread if one is None else one.last_ns >= since_ns and one.first_ns < until_ns
+
+
+def _delete_whole(path: Path, *, yes: bool) -> int:
+    """Raises PebbleError for what is no file of a recorder, or is being written."""
+    if path.is_symlink():
+        raise PebbleError(f"{path} is a link: name the file itself")
+    if not path.is_file() or not path.name.endswith((SUFFIX, ACTIVE, DAMAGED)):
+        raise PebbleError(f"{path}: there is no such folder or recording")
+    archive = archive_of(path.parent)
+    if path.name.endswith(ACTIVE) and Folder.is_in_use(archive):
+        raise PebbleError(f"{path}: is being written: stop the recorder first")
+    if not yes and not typer.confirm(f"Delete {path}?"):
+        return 1
+    path.unlink()
+    Index(archive).remove(path)
+    typer.echo(f"{path.name}: deleted")
     return 0
+
+
+def _report_left(error: object) -> int:
+    typer.echo(f"pebble: left as it is: {shown(str(error))}", err=True)
+    return 1
+
+
+def _report_unread(lines: list[str]) -> int:
+    """The exit code: 1 if there is a line."""
+    for line in lines:
+        typer.echo(f"pebble: {shown(line)}", err=True)
+    return 1 if lines else 0
 
 
 def _finish_all(folder: Folder) -> int:
@@ -309,13 +403,14 @@ def _finish_all(folder: Folder) -> int:
     for path in left:
         try:
             made = finish_file(path)
-            path.rename(finished_path(path))
-            sync_folder(path.parent)
+            rename(path, finished_path(path))
         except (PebbleError, OSError) as error:
             typer.echo(f"pebble: {path.name}: {shown(str(error))}", err=True)
             failed += 1
             continue
         lost = f", {made.missing:,} missing" if made.missing else ""
+        lost += f", {made.damaged_bytes:,} damaged bytes" if made.damaged_bytes else ""
+        failed += bool(lost)
         typer.echo(f"{finished_path(path).name}: {made.messages:,} messages{lost}")
     if not left:
         typer.echo("nothing to finish")
@@ -335,20 +430,34 @@ def _columns(*names: str) -> Iterator[Any]:
         yield Column(name, justify="right" if name in ("messages", "size") else "left")
 
 
-def _looked_at(places: list[Path], since: str | None, until: str | None) -> Iterator[FileInfo]:
+def _looked_at(
+    places: list[Path], since: str | None, until: str | None, *, check: bool
+) -> tuple[list[FileInfo], list[str]]:
+    """The files of a period by their times, and a line for each that cannot be read completely.
+
+    They are read as a whole with ``check``, or if that takes no more than seconds; else their summaries count.
+    """
     since_ns, until_ns = _period(since, until)
     paths = files(places)
-    looked = []
+    looked, unread = [], []
+    size = sum(path.stat().st_size for path in paths if path.exists())
     with _progress("reading", len(paths)) as advance:
         for number, path in enumerate(paths, 1):
             try:
-                one = catalogue.look_at(path)
-            except RecordingError:  # finished, renamed or deleted meanwhile
-                continue
+                one = catalogue.look_at(path, whole=check or size <= _CHECKED)
+            except RecordingError as error:
+                if not path.exists():  # finished, renamed or deleted meanwhile
+                    continue
+                one = FileInfo(path, path.stat().st_size, readable=False)
+                unread.append(str(error))
+            if one.problem:
+                unread.append(f"{path}: {one.problem}")
             if one.first_ns < until_ns and (one.last_ns >= since_ns or not one.messages):
                 looked.append(one)
             advance(number)
-    return iter(sorted(looked, key=lambda one: (one.first_ns, one.path.name)))
+    if size > _CHECKED and not check:
+        typer.echo(f"pebble: {show.size(size)} were not read but for their summaries: add --check", err=True)
+    return sorted(looked, key=lambda one: (one.first_ns, one.path.name)), unread
 
 
 def _lane(path: Path) -> str:
@@ -364,7 +473,9 @@ def _state(one: FileInfo) -> str:
         return "being written"
     if one.missing:
         return f"{one.missing:,} missing"
-    return "damaged" if one.damaged else "" if one.finished else "unfinished"
+    if not one.readable:
+        return "cannot be read"
+    return "damaged" if one.damaged or one.problem else "" if one.finished else "unfinished"
 
 
 def _print_events(paths: Iterable[Path]) -> None:
@@ -380,7 +491,14 @@ def _print_events(paths: Iterable[Path]) -> None:
         typer.echo(f"  {_local(at * 10**6)}  {shown(f'{name}: {details}')}")
 
 
-def _export(form: Form, messages: Iterable[Recorded], target: Path, robot: str, on_time: Callable[[int], None]) -> str:
+def _export(
+    form: Form,
+    messages: Iterable[Recorded],
+    target: Path,
+    robot: str,
+    on_time: Callable[[int], None],
+    beside: Iterable[Path],
+) -> str:
     if form is Form.FOXGLOVE:
         counts = write_foxglove(messages, target, on_time=on_time)
         return f"{target}: " + ", ".join(f"{count:,} {name}" for name, count in counts.items())
@@ -396,7 +514,7 @@ def _export(form: Form, messages: Iterable[Recorded], target: Path, robot: str, 
         elif form is Form.MONGO:
             count = write_mongo(messages, out, on_time=on_time)
         else:
-            count = write_copy(messages, out, on_time=on_time)
+            count = write_copy(messages, out, on_time=on_time, beside=beside)
     return f"{target}: {count:,} messages"
 
 

@@ -22,7 +22,7 @@ from pebble.commands.options import CaCert, PasswordFile
 from pebble.config.visible import shown
 from pebble.errors import PebbleError
 from pebble.recordings.catalogue import look_at
-from pebble.recordings.library import files
+from pebble.recordings.library import files, problems
 from pebble.recordings.period import SINCE_HELP, UNTIL_HELP, parse_period
 from pebble.recordings.replay.player import FASTEST, SLOWEST, Player
 from pebble.recordings.replay.robots import ReplayedRobots
@@ -120,6 +120,7 @@ def replay(
     source = ReplaySource(paths)
     rules = Rules(options, source.channels)
     if not rules.robots:
+        _report_unread(source)
         raise PebbleError("there is nothing to publish in this recording; see --only and --incoming")
     if missing := sum(look_at(path).missing for path in paths):
         typer.echo(f"pebble: {missing:,} messages are missing in this recording: files were damaged", err=True)
@@ -152,11 +153,20 @@ def replay(
         console.attach(player, robots)
         player.run()
     typer.echo(f"{player.sent} sent, {player.skipped} skipped")
-    return 0 if console.ended in ("", "SIGINT", END) else 1
+    unread = _report_unread(source)
+    return 0 if console.ended in ("", "SIGINT", END) and not unread else 1
 
 
 def register(app: typer.Typer) -> None:
     app.command("replay")(replay)
+
+
+def _report_unread(source: ReplaySource) -> bool:
+    """Name the files that could not be read completely; returns whether there are any."""
+    lines = problems(source.damages)
+    for line in lines:
+        typer.echo(f"pebble: {shown(line)}", err=True)
+    return bool(lines)
 
 
 def _check(options: Options, base: str | None, url: str, *, paused: bool, terminal: bool) -> None:

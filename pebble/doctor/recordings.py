@@ -79,6 +79,10 @@ def _missed(entries: list[Entry], now: float) -> Iterator[Finding]:
     if gaps:
         why = str(gaps[-1].get("why", "unknown"))[:100]
         yield Finding(Level.WARN, _WHAT, f"{len(gaps)} gaps in the last hour, the last one because of: {why}")
+    damaged = [entry for entry in entries if not (entry.is_finished or entry.is_active)]
+    if damaged:
+        text = f"{len(damaged)} files could not be finished, and are kept: {damaged[0].path}"
+        yield Finding(Level.WARN, _WHAT, text, "pebble recordings recover FILE OUT, or pebble recordings rm FILE")
     finished = [entry for entry in entries if entry.is_finished and now - entry.ended <= _DAY_S]
     missing = sum(catalogue.look_at(entry.path).missing for entry in finished)
     if missing:

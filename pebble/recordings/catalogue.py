@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from pebble.recordings.files.mcap import FILE_TOPIC, Channel, Recorded, number_in
-from pebble.recordings.files.reader import DAMAGE, MISSING, RecordingError, Summary, mapped, metadata_of, read
+from pebble.recordings.files.mcap import FILE_TOPIC, Channel, Recorded, RecordingError, number_in
+from pebble.recordings.files.reader import DAMAGE, MISSING, Summary, mapped, metadata_of, read
 from pebble.recordings.files.rewrite import REWRITTEN
 from pebble.recordings.files.scan import Damage
 from pebble.recordings.library import ACTIVE, merged, robot_of
@@ -32,7 +32,10 @@ class FileInfo:
     missing: int = 0
     finished: bool = True
     damaged: bool = False
+    readable: bool = True
+    problem: str = ""  # what could not be read of it now
     topics: Counter[str] = field(default_factory=Counter)  # messages by topic
+    encodings: dict[str, str] = field(default_factory=dict)  # by topic
     robots: set[str] = field(default_factory=set)
 
     @property
@@ -40,8 +43,8 @@ class FileInfo:
         return self.path.name.endswith(ACTIVE)
 
 
-def look_at(path: Path) -> FileInfo:
-    """What a file holds; one without a summary is read as a whole. Raises RecordingError."""
+def look_at(path: Path, *, whole: bool = False) -> FileInfo:
+    """What a file holds, by its summary; one without, or ``whole``, is read completely. Raises RecordingError."""
     try:
         size = path.stat().st_size
     except OSError as error:
@@ -49,19 +52,21 @@ def look_at(path: Path) -> FileInfo:
     info = FileInfo(path, size)
     with mapped(path) as data:
         summary = Summary.of(data)
-        if summary is None:
+        if summary is None or whole:
             _read_all(info, data)
         else:
-            _take_over(info, summary, data)
+            _take_over(info, summary)
+        if summary is not None:
+            about = metadata_of(data)
+            before, rewritten = (number_in(about.get(name, {}), MISSING) for name in (DAMAGE, REWRITTEN))
+            info.missing = max(info.missing, before) + rewritten
+            info.damaged = info.damaged or DAMAGE in about
     return info
 
 
-def _take_over(info: FileInfo, summary: Summary, data: Any) -> None:
+def _take_over(info: FileInfo, summary: Summary) -> None:
     statistics = summary.statistics
     info.messages, info.first_ns, info.last_ns = statistics.messages, statistics.first_ns, statistics.last_ns
-    about = metadata_of(data)
-    info.missing = sum(number_in(about.get(name, {}), MISSING) for name in (DAMAGE, REWRITTEN))
-    info.damaged = DAMAGE in about
     for number, count in statistics.counts.items():
         if number in summary.channels:
             _count(info, summary.channels[number], count)
@@ -70,17 +75,19 @@ def _take_over(info: FileInfo, summary: Summary, data: Any) -> None:
 def _read_all(info: FileInfo, data: Any) -> None:
     damage = Damage()
     for message in read(data, damage):
-        info.first_ns = info.first_ns or message.log_ns
-        info.last_ns = max(info.last_ns, message.log_ns)
+        info.first_ns = message.log_ns if not info.messages else info.first_ns
+        info.last_ns = message.log_ns
         info.messages += 1
         _count(info, message.channel, 1)
-    info.finished, info.missing, info.damaged = False, damage.missing, bool(damage.spans)
+    info.finished, info.missing, info.damaged = damage.finished, damage.missing, bool(damage.spans)
+    info.problem = damage.report(active=info.is_active)
 
 
 def _count(info: FileInfo, channel: Channel, count: int) -> None:
     if channel.topic == FILE_TOPIC:
         return
     info.topics[channel.topic] += count
+    info.encodings[channel.topic] = channel.encoding
     robot = robot_of(channel)
     if robot is not None:
         info.robots.add(robot)

@@ -83,6 +83,7 @@ class Job:
         self.done = 0.0  # the share of the work
         self.ready = False
         self.why = ""  # it failed
+        self.unread = ""  # it is ready, but this could not be read
         self._answers, theirs = _SPAWN.Pipe(duplex=False)
         self._process = _SPAWN.Process(target=function, args=(theirs, *arguments), daemon=True)
         self._process.start()
@@ -119,6 +120,6 @@ class Job:
         if what == "done":
             self.done = value
         elif what == "ready":
-            self.ready = True
+            self.ready, self.unread = True, value
         else:
             self.why = value

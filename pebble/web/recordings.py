@@ -269,7 +269,8 @@ async def _export(request: Request, recordings: Recordings) -> Response:
         return PlainTextResponse("there is no such export", 404)
     state = "running" if one.job.running else "ready" if one.job.ready else "failed"
     size = one.target.stat().st_size if state == "ready" else 0
-    return JSONResponse({"state": state, "done": one.job.done, "why": one.job.why, "name": one.name, "bytes": size})
+    why = one.job.why or one.job.unread
+    return JSONResponse({"state": state, "done": one.job.done, "why": why, "name": one.name, "bytes": size})
 
 
 async def _file(request: Request, recordings: Recordings) -> Response:

@@ -105,9 +105,17 @@ def test_damage_is_counted(tmp_path: Path) -> None:
     data = bytearray(path.read_bytes())
     data[400:420] = bytes(20)
     path.write_bytes(data)
-    rewrite(path, path)
+    rewrite(path, tmp_path / "copy")
+    (tmp_path / "copy").replace(path)
     os.utime(path, (BEGAN + 900, BEGAN + 900))
     assert any("messages of the last day are missing: files were damaged" in one.text for one in findings(tmp_path))
+
+
+def test_what_could_not_be_finished_is_named(tmp_path: Path) -> None:
+    path = recorded(tmp_path)
+    path.rename(path.with_name(f"{path.name}.damaged"))
+    (found,) = [one for one in findings(tmp_path) if "could not be finished" in one.text]
+    assert (found.level, f"{path}.damaged" in found.text) == (Level.WARN, True)
 
 
 def test_how_long_there_is_room(tmp_path: Path) -> None:

@@ -53,7 +53,7 @@ def ms(at: float) -> int:
 
 def write(path: Path, lines: Iterable[Line], *, finished: bool = True) -> Path:
     with path.open("wb", buffering=0) as file:
-        writer = McapWriter(file, library="test")
+        writer = McapWriter(file, library="pebble test")
         numbers: dict[tuple[str, str], int] = {}
         for line in lines:
             key = line.topic, str(line.metadata)

@@ -68,6 +68,16 @@ def test_lines_there_and_back(folder: Path, tmp_path: Path) -> None:
     assert recordings("export", folder, lines).stderr == f"pebble: {lines} exists already\n"
 
 
+def test_an_import_in_another_order_is_read_in_that_of_time(tmp_path: Path) -> None:
+    lines, made = tmp_path / "a.jsonl", tmp_path / "a.mcap"
+    numbers = [3, 1, 2, *range(40_000, 10, -1)]
+    line = '{"timestamp": %d, "topic": "pebble/robots/goob/outgoing/online", "payload_b64": ""}'
+    lines.write_text("\n".join(line % number for number in numbers))
+    assert recordings("import", lines, made).returncode == 0
+    read = [one.log_ns for one in library.merged([made])]
+    assert read == sorted(number * 10**9 for number in numbers)
+
+
 def test_one_robot_is_deleted(folder: Path) -> None:
     done = recordings("rm", folder, "--robot", "fred", "--yes")
     assert done.stdout == "100 messages deleted\n"

@@ -161,7 +161,7 @@ def _media(since: int, until: int) -> list[Recorded]:
 def _write(path: Path, messages: list[Recorded]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("wb", buffering=0) as file:
-        writer = McapWriter(file, library="test")
+        writer = McapWriter(file, library="pebble test")
         channels: dict[str, int] = {}
         second = 0
         for at, topic, payload in messages:

@@ -19,6 +19,8 @@ from pebble.fleet.roles import Role
 from pebble.recordings.library import files
 from pebble.recordings.seek.segment import Flag, unpacked
 from pebble.web import recordings as routes
+from tests.recordings.messages import START_NS
+from tests.recordings.others import DAMAGED
 from tests.recordings.playing import GOOB, js, ms
 from tests.recordings.seek.filming import CAMERA, FPS, film
 from tests.support import Broker, until
@@ -115,6 +117,20 @@ def test_a_stretch_is_exported_and_fetched(archive: Served, tmp_path: Path, form
     assert seconds == ([target] if form == "mcap" else pytest.approx(10, abs=0.2))
     assert post(archive, f"{place}/end", {}).status_code == 200
     assert get(archive, place).status_code == 404
+
+
+def test_what_cannot_be_read_is_named_beside_its_day_and_export(broker: Broker, tmp_path: Path) -> None:
+    (tmp_path / "a.mcap").write_bytes(DAMAGED["a chunk"][0])
+    (tmp_path / "b.mcap").write_bytes(b"no recording")
+    with Served(broker.port, recordings=tmp_path) as served:
+        unread = [line for day in get(served, "days").json() for line in day["unread"]]
+        assert [line.split(": ")[0] for line in sorted(unread)] == ["a.mcap", "b.mcap"]
+        begin = START_NS / 1e6
+        wanted = {"robot": GOOB, "since": begin, "until": begin + 1000, "as": "mcap"}
+        place = f"exports/{post(served, 'exports', wanted).json()['id']}"
+        assert until(lambda: get(served, place).json()["state"] != "running", 60, step=0.1)
+        state = get(served, place).json()
+        assert (state["state"], "1 damaged parts" in state["why"]) == ("ready", True)
 
 
 def test_one_export_at_a_time_and_it_can_be_ended(archive: Served) -> None:

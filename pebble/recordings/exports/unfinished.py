@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from pebble.recordings.files.reader import RecordingError
+from pebble.recordings.files.mcap import RecordingError
 
 
 @contextmanager
@@ -23,6 +23,8 @@ def unfinished(target: Path, *, overwrite: bool) -> Iterator[Path]:
     path = target.with_name(f".{target.name}.{os.getpid()}")
     try:
         yield path
+        if target.exists() and not overwrite:
+            raise RecordingError(f"{target} exists already")
         path.replace(target)
     except OSError as error:
         raise RecordingError(f"{target}: {error.strerror or error}") from None

@@ -1,8 +1,9 @@
 """Finishes in place what a killed recorder has left: no copy is made, so it works on a full disk.
 
-The torn end is cut off and the summary is written. Damaged bytes between records are covered by a record that every
-reader of MCAP skips: of them only the first nine change, unless they held the names of channels. These are written
-there again, because readers from the begin to the end refuse a message whose channel comes later.
+A torn end is cut off, if it is the begin of one record or zeros, and the summary is written. Damaged bytes, also at the
+end, are covered by a record that every reader of MCAP skips: of them only the first nine change, unless they held the
+names of channels. These are written there again, because readers from the begin to the end refuse a message whose
+channel comes later.
 """
 
 from __future__ import annotations
@@ -26,11 +27,13 @@ from pebble.recordings.files.mcap import (
     Metadata,
     Op,
     Packer,
+    RecordingError,
     Schema,
+    UnreadableError,
 )
-from pebble.recordings.files.reader import DAMAGE, MISSING, RecordingError, Summary, mapped, unnamed
+from pebble.recordings.files.reader import DAMAGE, MISSING, Summary, mapped, unnamed
 from pebble.recordings.files.reading_lock import own
-from pebble.recordings.files.scan import Block, Damage, blocks
+from pebble.recordings.files.scan import Block, Damage, blocks, is_cut_off, is_of_others
 from pebble.recordings.files.writer import Contents
 
 _TORN, _DAMAGED = "torn_bytes", "damaged_bytes"
@@ -56,7 +59,7 @@ class Finished:
 def finish(path: Path) -> Finished:
     """Make ``path`` a finished file. May be interrupted at any moment, and called again.
 
-    Raises RecordingError; OSError, also while it is being read.
+    Raises RecordingError, also for a file of another program; OSError, also while it is being read.
     """
     with path.open("r+b", buffering=0) as file:
         finished = _finish(file, path)
@@ -68,6 +71,9 @@ def main(arguments: list[str]) -> int:
     """``python -m pebble.recordings.files.finish PATH``: prints what the file holds now, as JSON."""
     try:
         made = finish(Path(arguments[0]))
+    except UnreadableError as error:
+        sys.stderr.write(f"{error}\n")
+        return 1
     except (RecordingError, DamageError) as error:
         sys.stderr.write(f"{error}\n")
         return CANNOT_BE_READ
@@ -81,10 +87,15 @@ def main(arguments: list[str]) -> int:
 def _finish(file: BinaryIO, path: Path) -> Finished:
     damage, contents = Damage(), _Contents()
     with mapped(path) as data:
+        if is_of_others(data):
+            raise RecordingError(f"{path}: another program wrote it: `pebble recordings recover` makes a finished copy")
         for block in blocks(data, damage):
             contents.add(block, data)
         if not contents.end_at:
             raise RecordingError(f"{path}: nothing in it can be read")
+        if damage.torn and not is_cut_off(data, len(data) - damage.torn):
+            damage.spans.append((len(data) - damage.torn, len(data)))
+            contents.end_at = len(data)
         contents.complete(Summary.of(data))
         covers = _joined(contents.wrong + damage.spans)
         damaged = max(contents.covered, contents.damaged_before) + sum(end - begin for begin, end in covers)
@@ -160,6 +171,8 @@ class _Contents(Contents):
                 self.damaged_before = mcap.number_in(metadata.items, _DAMAGED)
                 return
             self.metadata.append((metadata, block.at))
+        elif block.op is Op.ATTACHMENT:
+            self.attachments.append(mcap.attachment_index(data[block.at : block.end], block.at))
         elif block.op is Op.PADDING:
             self.covered += block.end - block.at
         elif block.op is Op.CHUNK:

@@ -50,6 +50,7 @@ FILE: Final = "file"
 _DIGITS: Final = 18  # of a number in metadata
 _LARGEST_SUMMARY: Final = 256 << 20
 _NAME_LENGTH: Final = 16  # hexadecimal digits
+_HEXADECIMAL: Final = frozenset("0123456789abcdef")
 
 HEAD: Final = struct.Struct("<BQ")  # opcode, length of what follows
 MESSAGE: Final = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
@@ -62,30 +63,16 @@ _STATISTICS: Final = struct.Struct("<QHIIIIQQ")
 _FOOTER: Final = struct.Struct("<QQI")
 
 
+class RecordingError(PebbleError):
+    """A file that cannot be read as a recording. Example: ``walk.mcap: No such file or directory``."""
+
+
+class UnreadableError(RecordingError):
+    """What is in a file is not damaged, but cannot be read here. Example: ``a chunk is compressed by lz4: …``."""
+
+
 class DamageError(PebbleError):
     """Bytes that are not the record they should be. Example: ``a chunk's checksum is wrong``."""
-
-
-@dataclass(frozen=True, slots=True)
-class Channel:
-    """What the messages of one topic have in common; several channels may share a topic."""
-
-    id: int
-    topic: str
-    encoding: str  # of its messages: json, protobuf, application/octet-stream
-    metadata: Mapping[str, str] = field(default_factory=dict)
-    schema: int = 0  # 0: none
-
-    def pack(self) -> bytes:
-        body = struct.pack("<HH", self.id, self.schema) + _text(self.topic) + _text(self.encoding)
-        return record(Op.CHANNEL, body + _texts(self.metadata))
-
-    @classmethod
-    def unpack(cls, body: bytes) -> Channel:
-        """Raises DamageError."""
-        with _Reading(body) as reading:
-            number, schema = reading.u16(), reading.u16()
-            return cls(number, reading.text(), reading.text(), reading.texts(), schema)
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,6 +93,29 @@ class Schema:
         """Raises DamageError."""
         with _Reading(body) as reading:
             return cls(reading.u16(), reading.text(), reading.text(), reading.take(reading.u32()))
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """What the messages of one topic have in common; several channels may share a topic."""
+
+    id: int
+    topic: str
+    encoding: str  # of its messages: json, protobuf, application/octet-stream
+    metadata: Mapping[str, str] = field(default_factory=dict)
+    schema: int = 0  # 0: none
+    described: Schema | None = field(default=None, compare=False)  # that schema, if its file has it
+
+    def pack(self) -> bytes:
+        body = struct.pack("<HH", self.id, self.schema) + _text(self.topic) + _text(self.encoding)
+        return record(Op.CHANNEL, body + _texts(self.metadata))
+
+    @classmethod
+    def unpack(cls, body: bytes) -> Channel:
+        """Raises DamageError."""
+        with _Reading(body) as reading:
+            number, schema = reading.u16(), reading.u16()
+            return cls(number, reading.text(), reading.text(), reading.texts(), schema)
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,6 +187,7 @@ class Statistics:
     first_ns: int
     last_ns: int
     counts: Mapping[int, int]  # of messages, by channel
+    attachments: int = 0
 
     def pack(self) -> bytes:
         counts = b"".join(_OFFSET.pack(*item) for item in self.counts.items())
@@ -184,7 +195,7 @@ class Statistics:
             self.messages,
             self.schemas,
             self.channels,
-            0,
+            self.attachments,
             self.metadata,
             self.chunks,
             self.first_ns,
@@ -196,11 +207,11 @@ class Statistics:
     def unpack(cls, body: bytes) -> Statistics:
         """Raises DamageError."""
         with _Reading(body) as reading:
-            messages, schemas, channels, _, metadata, chunks, first, last = _STATISTICS.unpack(
+            messages, schemas, channels, attachments, metadata, chunks, first, last = _STATISTICS.unpack(
                 reading.take(_STATISTICS.size)
             )
             counts = dict(_OFFSET.iter_unpack(reading.take(reading.u32())))
-            return cls(messages, schemas, channels, metadata, chunks, first, last, counts)
+            return cls(messages, schemas, channels, metadata, chunks, first, last, counts, attachments)
 
 
 def number_in(items: Mapping[str, str], name: str) -> int:
@@ -218,11 +229,14 @@ def header(library: str, file: str) -> bytes:
     return MAGIC + record(Op.HEADER, _text("") + _text(f"{library} {file}"))
 
 
-def file_of_header(body: bytes) -> str:
-    """The name of a file in its header; "" where it has none, or is of another program. Raises DamageError."""
+def file_of_header(body: bytes) -> str | None:
+    """The name of a file in its header; None for a file of another program. Raises DamageError."""
     with _Reading(body) as reading:
         reading.text()
-        return _name(reading.text().rpartition(" ")[2])
+        library, _, name = reading.text().rpartition(" ")
+    digits = sum(digit in _HEXADECIMAL for digit in name)  # a flipped bit costs one
+    is_ours = library.startswith("pebble") and len(name) == _NAME_LENGTH and digits >= _NAME_LENGTH - 1
+    return _name(name) if is_ours else None
 
 
 def file_of_chunk(records: bytes) -> str:
@@ -276,6 +290,16 @@ def metadata_index(metadata: Metadata, at: int) -> bytes:
     return record(Op.METADATA_INDEX, _PAIR.pack(at, len(metadata.pack())) + _text(metadata.name))
 
 
+def attachment_index(attachment: bytes, at: int) -> bytes:
+    """``attachment``: its whole record. Raises DamageError."""
+    with _Reading(attachment) as reading:
+        reading.take(HEAD.size)
+        times, name, media_type = reading.take(_PAIR.size), reading.text(), reading.text()
+        size = reading.u64()
+    body = _PAIR.pack(at, len(attachment)) + times + _U64.pack(size) + _text(name) + _text(media_type)
+    return record(Op.ATTACHMENT_INDEX, body)
+
+
 def end(at: int, groups: Iterable[tuple[Op, list[bytes]]]) -> bytes:
     """The end of a file whose data end at ``at``: DataEnd, the summary, its offsets, the footer."""
     data_end = record(Op.DATA_END, _U32.pack(0))
@@ -305,6 +329,7 @@ def summary_of(data: Any) -> tuple[int, bytes] | None:
     if op != Op.FOOTER or length != _FOOTER.size:
         return None
     start, offsets, checksum = _FOOTER.unpack_from(data, at + HEAD.size)
+    start = start or at  # 0: there is none
     if at - start > _LARGEST_SUMMARY or not len(MAGIC) <= start <= at or not (start <= offsets <= at or offsets == 0):
         return None
     if checksum and zlib.crc32(data[start : at + HEAD.size + _PAIR.size]) != checksum:
@@ -378,16 +403,35 @@ def zstandard_or_none() -> Any:
 
 
 def _unpack(name: str, packed: bytes, size: int) -> bytes:
-    if name != "zstd":
-        raise DamageError(f"a chunk is compressed by {name}, which recordings do not use")
-    zstandard = zstandard_or_none()
-    if zstandard is None:
-        raise PebbleError('this recording is compressed: pip install "pebble-robot[record]"')
+    """At most one byte more than ``size``."""
+    unpackers = {"zstd": _unpack_zstd, "lz4": _unpack_lz4}
+    if name not in unpackers:
+        raise DamageError(f"a chunk is compressed by {name[:_NAME_LENGTH]!r}, which is none of MCAP's")
     try:
-        if zstandard.frame_content_size(packed) > size:
-            raise DamageError("a chunk is larger than it says")
-        unpacked: bytes = zstandard.ZstdDecompressor().decompress(packed, max_output_size=size)
+        return unpackers[name](packed, size)
+    except ImportError:
+        raise UnreadableError(f'it is compressed by {name}: pip install "pebble-robot[record]"') from None
+
+
+def _unpack_zstd(packed: bytes, size: int) -> bytes:
+    zstandard = importlib.import_module("zstandard")
+    try:
+        with zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True) as reader:
+            unpacked: bytes = reader.read(size + 1)
     except zstandard.ZstdError as error:
+        raise DamageError(f"a chunk cannot be unpacked: {error}") from None
+    return unpacked
+
+
+def _unpack_lz4(packed: bytes, size: int) -> bytes:
+    lz4 = importlib.import_module("lz4.frame")
+    unpacked = b""
+    try:
+        while packed and len(unpacked) <= size:
+            frame = lz4.LZ4FrameDecompressor()
+            unpacked += frame.decompress(packed, max_length=size + 1 - len(unpacked))
+            packed = frame.unused_data or b""
+    except RuntimeError as error:
         raise DamageError(f"a chunk cannot be unpacked: {error}") from None
     return unpacked
 
@@ -436,7 +480,7 @@ class _Reading:
 
 
 def _name(text: str) -> str:
-    return text if len(text) == _NAME_LENGTH and all(digit in "0123456789abcdef" for digit in text) else ""
+    return text if len(text) == _NAME_LENGTH and all(digit in _HEXADECIMAL for digit in text) else ""
 
 
 def _text(text: str) -> bytes:

@@ -51,6 +51,7 @@ class Contents:
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
         self.metadata: list[tuple[Metadata, int]] = []  # and where each is
+        self.attachments: list[bytes] = []  # their indexes, packed
         self.counts: dict[int, int] = {}
         self.messages = self.first_ns = self.last_ns = 0
 
@@ -71,12 +72,14 @@ class Contents:
             self.first_ns,
             self.last_ns,
             self.counts,
+            len(self.attachments),
         )
         groups = (
             (Op.SCHEMA, [schema.pack() for schema in self.schemas.values()]),
             (Op.CHANNEL, [channel.pack() for channel in self.channels.values()]),
             (Op.STATISTICS, [statistics.pack()]),
             (Op.CHUNK_INDEX, [indexes]),
+            (Op.ATTACHMENT_INDEX, self.attachments),
             (Op.METADATA_INDEX, [mcap.metadata_index(metadata, where) for metadata, where in self.metadata]),
         )
         return mcap.end(at, groups)
@@ -109,6 +112,12 @@ class McapWriter:
         metadata = Metadata(name, items)
         self.contents.metadata.append((metadata, self.size))
         self._write(metadata.pack())
+
+    def attach(self, attachment: bytes) -> None:
+        """Add the record of an attachment as it is. Raises DamageError."""
+        self._cut()
+        self.contents.attachments.append(mcap.attachment_index(attachment, self.size))
+        self._write(attachment)
 
     def schema(self, name: str, encoding: str, data: bytes) -> int:
         """Declare what messages look like; returns its number for :meth:`channel`."""

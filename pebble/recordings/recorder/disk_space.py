@@ -31,9 +31,10 @@ class Disk:
 def surplus(entries: Iterable[Entry], limits: Limits, disk: Disk) -> list[Entry]:
     """What to delete now to keep the limits of space: the oldest first, pictures and sound before state.
 
-    Files that are being written are never among them. The newest file of each kind stays.
+    Files that are being written are never among them, nor those that could not be finished: these may hold what was
+    not read, and do not count. The newest file of each kind stays.
     """
-    listed = list(entries)
+    listed = [entry for entry in entries if entry.is_active or entry.is_finished]
     used, free = sum(entry.size for entry in listed), disk.free_bytes
     deleted = []
     for entry in _deletable(listed):
@@ -58,7 +59,7 @@ def outdated(entries: Iterable[Entry], limits: Limits, now: float) -> Entry | No
 
 def _deletable(entries: list[Entry]) -> list[Entry]:
     """In the order in which they go."""
-    finished = sorted((entry for entry in entries if not entry.is_active), key=lambda entry: entry.number)
+    finished = sorted((entry for entry in entries if entry.is_finished), key=lambda entry: entry.number)
     media = [entry for entry in finished if entry.is_media]
     state = [entry for entry in finished if not entry.is_media]
     return media[:-1] + state[:-1]

@@ -13,9 +13,9 @@ from typing import Final
 import msgspec
 
 from pebble.recordings.files.finish import CANNOT_BE_READ, Finished
-from pebble.recordings.library import ACTIVE, SUFFIX
+from pebble.recordings.library import SUFFIX
 from pebble.recordings.recorder.background import Background
-from pebble.recordings.recorder.folder import DAMAGED, finished_path, sync_folder
+from pebble.recordings.recorder.folder import DAMAGED, finished_path, rename
 from pebble.recordings.recorder.lane import OpenFile
 
 log = logging.getLogger(__name__)
@@ -68,8 +68,8 @@ class Finisher:
             self._mended(path, msgspec.json.decode(done.stdout, type=Finished))
         elif done.returncode == CANNOT_BE_READ or done.returncode < 0:
             why = done.stderr.strip() or f"its reader was ended by signal {-done.returncode}"
-            path.rename(path.with_name(path.name.removesuffix(ACTIVE) + SUFFIX + DAMAGED))
-            self._event("damaged", file=path.name, why=why)
+            if self._renamed(path, finished_path(path).with_suffix(SUFFIX + DAMAGED)):
+                self._event("damaged", file=path.name, why=why)
         else:
             self._later(path, done.stderr.strip())
 
@@ -77,10 +77,18 @@ class Finisher:
         if made.messages == 0 and made.whole:
             path.unlink()
             return
-        path.rename(finished_path(path))
-        sync_folder(path.parent)
+        if not self._renamed(path, finished_path(path)):
+            return
         self._event("recovered", file=path.name, messages=made.messages, missing=made.missing, torn=made.torn_bytes)
         self._on_finished()
+
+    def _renamed(self, path: Path, target: Path) -> bool:
+        try:
+            rename(path, target)
+        except OSError as error:
+            self._later(path, f"{target.name}: {error.strerror or error}")
+            return False
+        return True
 
     def _later(self, path: Path, why: str) -> None:
         """It stays as it is, and can be read, until there is room."""

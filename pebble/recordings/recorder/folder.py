@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import stat
@@ -12,7 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, Final
 
-from pebble.recordings.files.reader import RecordingError
+from pebble.recordings.files.mcap import RecordingError
+from pebble.recordings.files.rewrite import PART
 from pebble.recordings.library import ACTIVE, SUFFIX
 from pebble.transports.own_file import OwnFile
 
@@ -24,6 +26,7 @@ _MAINTENANCE: Final = "maintenance.lock"
 _NAME: Final = re.compile(
     r"(?P<stamp>\d{8}T\d{6}Z)-(?P<number>\d{6,})\.(?P<lane>state|media\.[A-Za-z0-9_.-]{1,120})\.mcap(?P<state>|\.active|\.damaged)"
 )
+_COPY: Final = re.compile(rf"\.{_NAME.pattern}\.\d+{re.escape(PART)}")
 _DAY: Final = "%Y/%m/%d"
 
 
@@ -80,8 +83,14 @@ class Folder:
 
     @contextmanager
     def maintained(self) -> Iterator[None]:
-        """While files are written again: against a second one who does so. Raises RecordingError."""
+        """While files are written again: against a second one who does so. Raises RecordingError, OSError.
+
+        Copies that such a one has left when it was killed are deleted.
+        """
         with _locked(self.root / _MAINTENANCE, f"{self.root}: is being compacted or cleaned: try again later"):
+            for path in self._files():
+                if _COPY.fullmatch(path.name):
+                    path.unlink(missing_ok=True)
             yield
 
     @classmethod
@@ -148,6 +157,14 @@ def _locked(path: Path, used: str) -> Iterator[None]:
 def finished_path(path: Path) -> Path:
     """The name of a file that was ``.mcap.active``, once it is finished."""
     return path.with_name(path.name.removesuffix(ACTIVE) + SUFFIX)
+
+
+def rename(path: Path, target: Path) -> None:
+    """Durably; never over another file. Raises OSError."""
+    if target.exists():
+        raise FileExistsError(errno.EEXIST, "there is another file of this name", str(target))
+    path.rename(target)
+    sync_folder(path.parent)
 
 
 def sync_folder(folder: Path) -> None:

@@ -10,7 +10,7 @@ from typing import BinaryIO, Final, NamedTuple
 from pebble.recordings.files.channels import ChannelTable
 from pebble.recordings.files.mcap import Packer
 from pebble.recordings.files.writer import LIBRARY, McapWriter
-from pebble.recordings.recorder.folder import MEDIA, STATE, Folder, finished_path, sync_folder
+from pebble.recordings.recorder.folder import MEDIA, STATE, Folder, finished_path, rename
 from pebble.recordings.stamps import stamp_ns
 
 #: Of a retained value that is written again at the begin of a file.
@@ -89,8 +89,7 @@ class OpenFile:
         try:
             self.writer.finish()
             os.fsync(self.file.fileno())
-            self.path.rename(finished_path(self.path))
-            sync_folder(self.path.parent)
+            rename(self.path, finished_path(self.path))
         finally:
             self.file.close()
 

@@ -10,8 +10,7 @@ from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from pebble.recordings.files.mcap import Packer
-from pebble.recordings.files.reader import RecordingError
+from pebble.recordings.files.mcap import Packer, RecordingError
 from pebble.recordings.recorder.background import Background
 from pebble.recordings.recorder.disk_space import Disk, outdated, surplus
 from pebble.recordings.recorder.due import Due

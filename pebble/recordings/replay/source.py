@@ -9,7 +9,8 @@ from typing import Final
 from pebble.contract import HEARTBEAT, ONLINE, OUTGOING, Kind, channel_of
 from pebble.recordings.files.mcap import Channel, Recorded
 from pebble.recordings.files.reader import Chooses, Summary, mapped, read
-from pebble.recordings.library import FOREVER_NS, Span, merged, span
+from pebble.recordings.files.scan import Damage
+from pebble.recordings.library import FOREVER_NS, Damages, Span, merged, span
 from pebble.recordings.stamps import is_keyframe, is_picture
 
 #: How far before a time its state and its last key frame are looked for. A file of states is then read from its begin.
@@ -24,7 +25,15 @@ class ReplaySource:
 
     def __init__(self, paths: Iterable[Path]) -> None:
         """Reads the end of each file, or all of one that is not finished. Raises RecordingError."""
-        self._files = [(path, found, list(_channels(path))) for path in paths if (found := span(path)) is not None]
+        self._files: list[tuple[Path, Span, list[Channel]]] = []
+        self.damages = Damages()  # of what was read
+        for path in paths:
+            damage = Damage()
+            found = span(path, damage)
+            if found is None:
+                self.damages[path] = damage
+            else:
+                self._files.append((path, found, list(_channels(path))))
 
     @property
     def channels(self) -> list[Channel]:
@@ -32,7 +41,8 @@ class ReplaySource:
 
     def messages(self, since_ns: int = 0, until_ns: int = FOREVER_NS) -> Iterator[Recorded]:
         """By the time at which they were received; ``until_ns`` is not included."""
-        return merged([path for path, _, _ in self._files], since_ns=since_ns, until_ns=until_ns)
+        paths = [path for path, _, _ in self._files]
+        return merged(paths, since_ns=since_ns, until_ns=until_ns, damages=self.damages)
 
     def state_before(self, at_ns: int, publishes: Chooses = lambda _channel: True) -> list[Recorded]:
         """The newest retained message of each topic, then all pictures since each topic's last key frame.

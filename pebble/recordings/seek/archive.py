@@ -11,8 +11,8 @@ from typing import Final, NamedTuple
 
 from pebble.contract.channels import LOGS
 from pebble.contract.identity import Direction, parse_topic
-from pebble.recordings.files.mcap import Channel, DamageError, Recorded
-from pebble.recordings.files.reader import RecordingError
+from pebble.errors import PebbleError
+from pebble.recordings.files.mcap import Channel, Recorded
 from pebble.recordings.library import ACTIVE, SUFFIX
 from pebble.recordings.recorder.folder import MEDIA
 from pebble.recordings.recorder.lane import OTHER_MEDIA, lane_of
@@ -45,6 +45,7 @@ class Archive:
         self._named: list[_Named] = []
         self._listed_at = float("-inf")
         self._open: dict[Path, RecordingFile] = {}
+        self._failed: dict[Path, str] = {}  # those that cannot be opened, and why
 
     def close(self) -> None:
         while self._open:
@@ -136,7 +137,7 @@ class Archive:
             if named.begins_ns and not since_ns - _LONGEST_FILE_NS <= named.begins_ns < until_ns:
                 continue
             file = self._opened(named.path)
-            if file is None or not file.first_ns or file.first_ns >= until_ns or file.last_ns < since_ns:
+            if file is None or not file.chunks or file.first_ns >= until_ns or file.last_ns < since_ns:
                 continue
             found.append(file)
         return sorted(found, key=lambda one: one.first_ns)
@@ -148,6 +149,10 @@ class Archive:
             if file is not None:
                 yield file
 
+    def unread(self) -> dict[Path, str]:
+        """What could not be read of each file, as far as that is known."""
+        return self._failed | {path: file.problem for path, file in self._open.items() if file.problem}
+
     # -- files
 
     def _list(self) -> list[_Named]:
@@ -158,6 +163,7 @@ class Archive:
             there = {named.path for named in self._named}
             for path in [path for path in self._open if path not in there]:
                 self._open.pop(path).close()
+            self._failed = {path: why for path, why in self._failed.items() if path in there}
         return self._named
 
     def _opened(self, path: Path) -> RecordingFile | None:
@@ -170,8 +176,10 @@ class Archive:
             if file is None:
                 file = RecordingFile(path)
             file.refresh()
-        except (RecordingError, DamageError, OSError):
+        except (PebbleError, OSError) as error:
+            self._failed[path] = str(error).removeprefix(f"{path}: ")
             return None
+        self._failed.pop(path, None)
         self._open[path] = file  # the last one used is the last one closed
         while len(self._open) > _MOST_OPEN:
             self._open.pop(next(iter(self._open))).close()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
@@ -11,13 +13,17 @@ from msgspec import Struct, field
 
 from pebble.recordings.recorder.intake import EVENTS
 from pebble.recordings.seek.archive import Archive
-from pebble.recordings.seek.file import RecordingFile
+from pebble.recordings.seek.file import Chunk, RecordingFile
 
 DAY_NS: Final = 86_400 * 10**9
+_MOST_DAYS: Final = 31  # of one chunk
 
 
 class Day(Struct):
-    """One day of UTC; ``first`` and ``last`` in epoch milliseconds, ``gaps``: of the recording itself."""
+    """One day of UTC; ``first`` and ``last`` in epoch milliseconds, ``gaps``: of the recording itself.
+
+    ``unread``: a line for each file that cannot be read completely, on the day when it was written last.
+    """
 
     day: str
     robots: list[str] = field(default_factory=list)
@@ -25,6 +31,7 @@ class Day(Struct):
     first: float = 0.0
     last: float = 0.0
     gaps: int = 0
+    unread: list[str] = field(default_factory=list)
 
 
 class Days:
@@ -45,22 +52,38 @@ class Days:
                     self._known[file.path] = days
             for day in days:
                 _merge(found.setdefault(day.day, Day(day.day, first=day.first)), day)
+        for path, why in self._archive.unread().items():
+            with suppress(OSError):  # it is deleted by now
+                about = path.stat()
+                name, ms = _day_of(int(about.st_mtime)), about.st_mtime * 1e3
+                day = found.setdefault(name, Day(name, bytes=about.st_size, first=ms, last=ms))
+                day.unread.append(f"{path.name}: {why}")
         return sorted(found.values(), key=lambda day: day.day, reverse=True)
 
 
 def _days(file: RecordingFile) -> list[Day]:
-    if not file.first_ns:
+    if not file.chunks:
         return []
     gaps = _gaps(file)
     days: list[Day] = []
-    for number in range(file.first_ns // DAY_NS, file.last_ns // DAY_NS + 1):
+    for number in sorted({number for chunk in file.chunks for number in _day_numbers(chunk)}):
         begin, end = number * DAY_NS, (number + 1) * DAY_NS
         first, last = max(file.first_ns, begin), min(file.last_ns, end - 1)
         size = 0 if days else file.size()
         within = sum(begin <= ns < end for ns in gaps)
-        name = datetime.fromtimestamp(number * 86_400, UTC).strftime("%Y-%m-%d")
-        days.append(Day(name, sorted(file.robots()), size, first / 1e6, last / 1e6, within))
+        days.append(Day(_day_of(number * 86_400), sorted(file.robots()), size, first / 1e6, last / 1e6, within))
     return days
+
+
+def _day_of(seconds: int) -> str:
+    return datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%d")
+
+
+def _day_numbers(chunk: Chunk) -> Iterator[int]:
+    """The days that a chunk reaches into: of a clock that was set only the first ones, and the last."""
+    first, last = chunk.start_ns // DAY_NS, chunk.end_ns // DAY_NS
+    yield from range(first, min(last, first + _MOST_DAYS))
+    yield last
 
 
 def _merge(day: Day, other: Day) -> None:

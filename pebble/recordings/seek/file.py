@@ -3,21 +3,37 @@
 from __future__ import annotations
 
 import os
+import tempfile
 from collections import OrderedDict
 from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
 from typing import Final, NamedTuple
 
+from pebble.errors import PebbleError
 from pebble.recordings.files import mcap
-from pebble.recordings.files.mcap import HEAD, MESSAGE, Channel, ChunkIndex, DamageError, Op, Recorded, Statistics
-from pebble.recordings.files.reader import RecordingError, mapped
+from pebble.recordings.files.mcap import (
+    HEAD,
+    MESSAGE,
+    Channel,
+    ChunkIndex,
+    DamageError,
+    Op,
+    Recorded,
+    RecordingError,
+    Statistics,
+    UnreadableError,
+)
+from pebble.recordings.files.reader import mapped
+from pebble.recordings.files.rewrite import rewrite
+from pebble.recordings.files.scan import begins_as_ours
 from pebble.recordings.library import ACTIVE, robot_of
 from pebble.recordings.recorder.lane import CARRIED
 
 _CACHED: Final = 4  # chunks that stay unpacked: the next question is mostly about the same time
 _SCANNED: Final = (Op.HEADER, Op.METADATA, Op.CHUNK, Op.MESSAGE_INDEX, Op.PADDING, Op.ATTACHMENT)
 _INDEXES: Final = 64 << 10  # bytes that are read at once behind a chunk
+_LARGEST_COPY: Final = 128 << 20  # bytes of a file that is copied to be read
 
 
 class Chunk(NamedTuple):
@@ -36,6 +52,8 @@ class RecordingFile:
     def __init__(self, path: Path) -> None:
         """Raises RecordingError."""
         self.path = path
+        self.problem = ""  # what could not be read of it
+        self._is_copied = False
         try:
             self._descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
         except OSError as error:
@@ -46,8 +64,14 @@ class RecordingFile:
         self._unpacked: OrderedDict[int, list[Recorded]] = OrderedDict()
         self._scanned: list[Chunk] = []
         self._end = len(mcap.MAGIC)  # of what was scanned
-        self._read_summary()
-        self.refresh()
+        self._about = os.fstat(self._descriptor)
+        try:
+            if not path.name.endswith(ACTIVE):
+                self._read_finished()
+            self.refresh()
+        except (PebbleError, OSError):
+            self.close()
+            raise
 
     def close(self) -> None:
         os.close(self._descriptor)
@@ -75,7 +99,8 @@ class RecordingFile:
         return self._scanned if self._statistics is None else self._chunks
 
     def size(self) -> int:
-        return os.fstat(self._descriptor).st_size
+        """Of the file itself, also where a copy is read."""
+        return self.path.stat().st_size if self._is_copied else os.fstat(self._descriptor).st_size
 
     def robots(self) -> set[str]:
         """All that a channel with messages belongs to."""
@@ -91,7 +116,9 @@ class RecordingFile:
 
     def is_replaced(self) -> bool:
         """Whether its name leads to another file now: it was compacted, or cleaned. Raises OSError."""
-        return not os.path.samestat(self.path.stat(), os.fstat(self._descriptor))
+        now, then = self.path.stat(), self._about
+        grown = not self.path.name.endswith(ACTIVE) and now.st_size != then.st_size
+        return grown or not os.path.samestat(now, then)
 
     def refresh(self) -> None:
         """Find the chunks that were written since; one that is finished does not change."""
@@ -110,11 +137,28 @@ class RecordingFile:
 
     # -- finished files
 
-    def _read_summary(self) -> None:
-        if self.path.name.endswith(ACTIVE):
-            return
+    def _read_finished(self) -> None:
+        """One of another program, or whose summary is damaged, is read from a copy, in which all is in its order."""
         with mapped(self.path) as data:
-            found = mcap.summary_of(data)
+            summary = mcap.summary_of(data) if begins_as_ours(data) else None
+        if summary is not None:
+            self._read_summary(summary)
+        if self._statistics is not None:
+            return
+        if self.size() > _LARGEST_COPY:
+            why = (
+                "another program wrote it, or its end is damaged: pebble recordings recover makes a copy for this page"
+            )
+            raise UnreadableError(f"{self.path}: {why}")
+        with tempfile.TemporaryDirectory(prefix="pebble-recording-") as folder:
+            copy = Path(folder, self.path.name)
+            self.problem, self._is_copied = rewrite(self.path, copy).unread, True
+            os.close(self._descriptor)
+            self._descriptor = os.open(copy, os.O_RDONLY | os.O_CLOEXEC)
+            with mapped(copy) as data:
+                self._read_summary(mcap.summary_of(data))
+
+    def _read_summary(self, found: tuple[int, bytes] | None) -> None:
         try:
             for op, begin, end in () if found is None else mcap.records(found[1]):
                 self._take_over(op, found[1][begin:end] if found else b"")
@@ -134,7 +178,7 @@ class RecordingFile:
     def _chunks(self) -> list[Chunk]:
         found = (ChunkIndex.unpack(body) for body in self._indexes)
         chunks = [
-            Chunk(one.start_ns, one.end_ns, one.at, one.length, frozenset(one.indexes)) for one in found if one.start_ns
+            Chunk(one.start_ns, one.end_ns, one.at, one.length, frozenset(one.indexes)) for one in found if one.indexes
         ]
         self._indexes = []
         return sorted(chunks)
@@ -203,8 +247,8 @@ class RecordingFile:
                         channel, payload = mcap.unpack_other(channel, payload)
                     if channel is not None:
                         yield Recorded(channel, sequence, log_ns, publish_ns, payload)
-        except DamageError:
-            return
+        except DamageError as error:
+            self.problem = self.problem or f"a part of it is damaged ({error})"
 
     def _unpack(self, chunk: Chunk) -> bytes:
         return mcap.unpack_chunk(self._pread(chunk.length - HEAD.size, chunk.at + HEAD.size))

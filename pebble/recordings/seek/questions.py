@@ -20,7 +20,7 @@ from pebble.errors import PebbleError
 from pebble.recordings.exports.copy import write_copy
 from pebble.recordings.exports.film import write_film
 from pebble.recordings.exports.unfinished import unfinished
-from pebble.recordings.library import ACTIVE, merged, robot_of
+from pebble.recordings.library import ACTIVE, Damages, merged, problems, robot_of
 from pebble.recordings.seek.archive import Archive
 from pebble.recordings.seek.days import Days
 from pebble.recordings.seek.segment import Segment
@@ -79,13 +79,14 @@ def make_timeline_job(
     """Index what is not indexed, and write the timeline to ``target``, as JSON."""
     _in_background(_NICE)
 
-    def work() -> None:
+    def work() -> str:
         if os.access(folder, os.W_OK):
             (folder / FOLDER).mkdir(mode=0o750, exist_ok=True)
         places, progress = [Path(path) for path in paths], _Progress(answer)
         with tempfile.TemporaryDirectory(dir=target.parent) as scratch:
             made = make_timeline(places, Path(scratch), robot, *period, progress.share)
         target.write_bytes(msgspec.json.encode(made))
+        return ""
 
     _answer(answer, work)
 
@@ -97,12 +98,14 @@ def export_job(
     _in_background(_NICE)
     since_ns, until_ns = period
 
-    def work() -> None:
+    def work() -> str:
+        damages = Damages()
         messages = merged(
             [Path(path) for path in paths],
             since_ns=since_ns,
             until_ns=until_ns,
             chooses=lambda channel: robot_of(channel) == robot,
+            damages=damages,
         )
         progress = _Progress(answer)
 
@@ -115,6 +118,7 @@ def export_job(
             with unfinished(target, overwrite=False) as path, path.open("wb") as out:
                 if not write_copy(messages, out, on_time=on_time):
                     raise PebbleError(f"there is no message of {robot} in this stretch")
+        return "; ".join(problems(damages))
 
     _answer(answer, work)
 
@@ -132,10 +136,10 @@ class _Progress:
             self._answer.send(("done", percent / 100))
 
 
-def _answer(answer: Connection, work: Callable[[], None]) -> None:
+def _answer(answer: Connection, work: Callable[[], str]) -> None:
+    """``work`` returns what it could not read."""
     try:
-        work()
-        answer.send(("ready", None))
+        answer.send(("ready", work()[:_LONGEST_WHY]))
     except PebbleError as error:
         answer.send(("failed", str(error).partition("\n")[0][:_LONGEST_WHY]))
     except OSError as error:

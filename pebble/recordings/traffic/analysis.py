@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from msgspec import Struct
 
-from pebble.recordings.files.reader import RecordingError
+from pebble.recordings.files.mcap import RecordingError
 from pebble.recordings.library import FOREVER_NS
 from pebble.recordings.traffic.duck import connected, parquet
 from pebble.recordings.traffic.queries import RobotQueries
@@ -77,6 +77,7 @@ def analyse(
     return Traffic(
         since_ns=min(spans), until_ns=max(spans), recordings=sources.recordings, missing=sources.missing,
         dropped=recorder.dropped, gaps=recorder.gaps, robots=robots, overhead=overhead,
+        unread=sources.unread,
     )  # fmt: skip
 
 

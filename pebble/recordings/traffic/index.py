@@ -27,8 +27,8 @@ import msgspec
 
 from pebble.contract.channels import HEARTBEAT, ONLINE
 from pebble.contract.identity import parse_topic
-from pebble.recordings.files.mcap import Channel, Recorded
-from pebble.recordings.files.reader import RecordingError, Summary, mapped, read
+from pebble.recordings.files.mcap import Channel, Recorded, RecordingError
+from pebble.recordings.files.reader import Summary, mapped, read
 from pebble.recordings.files.scan import Damage
 from pebble.recordings.library import ACTIVE, SUFFIX, files
 from pebble.recordings.media_numbers import media_number
@@ -121,6 +121,7 @@ class Entry(msgspec.Struct, frozen=True):
     missing: int  # messages that damage has taken
     parts: list[Part]
     events: list[str]  # Parquet files in the index
+    unread: str | None = None  # what could not be read, in words; None: not known, of an older version
 
 
 class Index:
@@ -133,7 +134,7 @@ class Index:
     def entry(self, recording: Path) -> Entry | None:
         """What is indexed of a recording; None if that is not how the file is now."""
         entry = _load(self._entry_path(recording))
-        if entry is None or entry.format != _FORMAT:
+        if entry is None or entry.format != _FORMAT or entry.unread is None:
             return None
         about = recording.stat()
         if (entry.recording, entry.size, entry.changed_ns) != (self._name(recording), about.st_size, about.st_mtime_ns):
@@ -163,11 +164,12 @@ class Index:
             connected(Path(scratch), memory_mb=_MEMORY_MB) as connection,
         ):
             rows = _Rows(connection)
-            missing = rows.read(recording, advance)
+            damage = rows.read(recording, advance)
+            unread = damage.report(active=recording.name.endswith(ACTIVE))
             making = _Making(self, connection, Path(scratch), self._name(recording), _key(self._name(recording)))
             entry = Entry(
-                _FORMAT, self._name(recording), about.st_size, about.st_mtime_ns, rows.count, missing, making.parts(),
-                making.events(),
+                _FORMAT, self._name(recording), about.st_size, about.st_mtime_ns, rows.count, damage.missing,
+                making.parts(), making.events(), unread,
             )  # fmt: skip
             self._delete_parts(recording, spared=_paths(entry))
             made = Path(scratch, "entry")
@@ -226,8 +228,8 @@ class _Rows:
         self._heartbeats: set[int] = set()
         self._events: set[int] = set()
 
-    def read(self, recording: Path, advance: Advance) -> int:
-        """Returns how many messages are missing. Raises RecordingError."""
+    def read(self, recording: Path, advance: Advance) -> Damage:
+        """Returns what could not be read. Raises RecordingError."""
         damage = Damage()
         with mapped(recording) as data:
             summary = Summary.of(data)
@@ -235,12 +237,15 @@ class _Rows:
             for message in read(data, damage):
                 if message.log_ns <= _LATEST_NS:
                     self._add(message)
+                else:
+                    damage.missing += 1
+                    damage.note("times after 2262")
                 if len(self._batch) >= _BATCH:
                     self._flush()
                     advance(min(1.0, self.count / expected) if expected else 0.5)
         self._flush()
         advance(1.0)
-        return damage.missing
+        return damage
 
     def _add(self, message: Recorded) -> None:
         channel, payload = message.channel.id, message.payload

@@ -98,6 +98,7 @@ def remarks(traffic: Traffic) -> list[str]:
             f"{traffic.dropped} messages were not recorded for lack of room or speed, "
             f"and {traffic.missing} were lost to damage of recordings."
         )
+    found += [f"Not all could be read of {line}." for line in traffic.unread]
     for robot in traffic.robots:
         found += [f"{_id(robot)}: {remark}." for remark in _robot_remarks(robot)]
     return found

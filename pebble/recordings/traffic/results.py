@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from msgspec import Struct
+from msgspec import Struct, field
 
 from pebble.recordings.media_numbers import NAMES
 
@@ -173,6 +173,7 @@ class Traffic(Struct, kw_only=True):
     until_ns: int  # of the last one
     recordings: int
     missing: int  # messages that damage of recordings has taken
+    unread: list[str] = field(default_factory=list)  # a line for each recording that could not be read completely
     dropped: int  # messages that the recorder could not write
     gaps: list[Gap]
     robots: list[RobotTraffic]

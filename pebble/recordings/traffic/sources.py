@@ -10,7 +10,7 @@ from typing import Final
 
 from msgspec import Struct, field
 
-from pebble.recordings.files.reader import RecordingError
+from pebble.recordings.files.mcap import RecordingError
 from pebble.recordings.library import ACTIVE, files
 from pebble.recordings.recorder.folder import finished_path
 from pebble.recordings.traffic.index import FOLDER, NO_ROBOT, Entry, Index, archive_of
@@ -28,9 +28,12 @@ class Sources(Struct):
     events: list[Path] = field(default_factory=list)
     recordings: int = 0
     missing: int = 0  # messages that damage has taken
+    unread: list[str] = field(default_factory=list)  # a line for each file that could not be read completely
 
     def add(self, index: Index, entry: Entry, chosen: Collection[str], days: tuple[str, str]) -> None:
         """Take over what an index holds of one recording, as far as it belongs to the robots and days."""
+        if entry.unread:
+            self.unread.append(f"{entry.recording}: {entry.unread}")
         self.events += [index.folder / path for path in entry.events]
         parts = [part for part in entry.parts if part.robot != NO_ROBOT and days[0] <= part.day <= days[1]]
         parts = [part for part in parts if not chosen or part.robot in chosen]

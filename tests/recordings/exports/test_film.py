@@ -23,8 +23,7 @@ from pebble.media.video import make_encoder
 from pebble.recordings.exports.film import write_film, write_wav
 from pebble.recordings.exports.film_pictures import parameter_sets
 from pebble.recordings.exports.film_sound import RATE
-from pebble.recordings.files.mcap import Channel, Recorded
-from pebble.recordings.files.reader import RecordingError
+from pebble.recordings.files.mcap import Channel, Recorded, RecordingError
 
 ROBOT = "pebble/robots/goob"
 T0_MS = 1_732_300_000_000

@@ -15,8 +15,8 @@ from typing import BinaryIO
 import pytest
 
 from pebble.recordings.files.finish import Finished, finish
-from pebble.recordings.files.mcap import FILE_TOPIC, HEAD, Op, Packer
-from pebble.recordings.files.reader import RecordingError, Summary, mapped
+from pebble.recordings.files.mcap import FILE_TOPIC, HEAD, Op, Packer, RecordingError
+from pebble.recordings.files.reader import Summary, mapped
 from pebble.recordings.files.scan import Damage, blocks
 from pebble.recordings.files.writer import McapWriter
 from tests.recordings.files.other_readers import Counted, by_mcap, by_mcap_core

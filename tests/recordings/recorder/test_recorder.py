@@ -20,8 +20,8 @@ import pytest
 
 from pebble.recordings import library
 from pebble.recordings.files.finish import finish
-from pebble.recordings.files.mcap import Recorded
-from pebble.recordings.files.reader import RecordingError, mapped, metadata_of, read
+from pebble.recordings.files.mcap import Recorded, RecordingError
+from pebble.recordings.files.reader import mapped, metadata_of, read
 from pebble.recordings.recorder import lane as lane_module
 from pebble.recordings.recorder.folder import Folder
 from pebble.recordings.recorder.intake import EVENTS, Clocks

@@ -299,6 +299,10 @@ def test_what_damage_has_taken_is_counted(tmp_path: Path, at: tuple[str, str], r
     assert run("replay", path, *at, "--speed", "100") == 0
     assert run.err == "pebble: 100 messages are missing in this recording: files were damaged\n"
     assert run.out.splitlines()[-1] == "300 sent, 0 skipped"
+    path.write_bytes(data)
+    assert run("replay", path, *at, "--speed", "100") == 1
+    assert "1 damaged parts" in run.err
+    assert run.out.splitlines()[-1] == "300 sent, 0 skipped"
 
 
 @pytest.mark.parametrize(("answer", "code", "sent"), [("fred\n", 1, []), ("", 130, []), ("goob\n", 0, [b"true"])])

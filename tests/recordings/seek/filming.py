@@ -82,7 +82,7 @@ def film(
 
 def _write(path: Path, lines: list[Line], *, finished: bool) -> None:
     with path.open("wb", buffering=0) as file:
-        writer = McapWriter(file, library="test")
+        writer = McapWriter(file, library="pebble test")
         numbers: dict[tuple[str, str], int] = {}
         second = 0
         for line in lines:

@@ -67,12 +67,13 @@ export function Choose() {
   </div>`;
 }
 
-function Day({ one: { day, robots, bytes, first, last, gaps } }) {
+function Day({ one: { day, robots, bytes, first, last, gaps, unread } }) {
   const facts = [`${shortTime(first)} to ${shortTime(last)}`, sizeWords(bytes), gaps ? `${gaps} ${gaps === 1 ? "gap" : "gaps"}` : ""];
   return html`<li class="replay-day" data-test=${`day-${day}`}>
     <div>
       <h2>${longDay(day)}</h2>
       <p class="dim">${facts.filter(Boolean).join(" · ")}</p>
+      ${unread?.map((line) => html`<p key=${line} class="failed">Not all can be read of ${line}</p>`)}
     </div>
     <ul class="replay-robots">
       ${robots.map(

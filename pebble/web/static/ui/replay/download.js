@@ -100,6 +100,7 @@ function Job({ job, onEnd }) {
     return html`<p class="download-job" role="status">
       <a class="button primary" data-test="download-file" href=${Archive.file(job.id)} download=${job.name}>Save ${job.name}</a>
       <span class="dim">${sizeWords(job.bytes)}</span>
+      ${job.why && html`<span class="bad">Not all could be read: ${job.why}</span>`}
       <button type="button" class="quiet" data-test="download-end" onClick=${onEnd}>Remove</button>
     </p>`;
   }

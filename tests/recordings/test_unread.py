@@ -1,0 +1,376 @@
+"""What other programs wrote is read completely, or named; and no file is replaced by a part of it."""
+
+from __future__ import annotations
+
+import errno
+import os
+import random
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mcap.reader import make_reader
+
+from pebble.recordings.files import rewrite as rewriting
+from pebble.recordings.files.finish import finish
+from pebble.recordings.files.mcap import RecordingError
+from pebble.recordings.files.rewrite import rewrite
+from pebble.recordings.files.scan import Damage, blocks
+from pebble.recordings.library import problems
+from pebble.recordings.recorder.disk_space import Disk, Limits, outdated, surplus
+from pebble.recordings.recorder.folder import Folder
+from pebble.recordings.replay.source import ReplaySource
+from pebble.recordings.seek.archive import Archive
+from pebble.recordings.seek.days import Days
+from pebble.recordings.traffic.index import Index
+from tests.commands.command_line import Run
+from tests.recordings.messages import contents, write
+from tests.recordings.others import (
+    COUNT,
+    DAMAGED,
+    FRED,
+    GOOB,
+    LZ4,
+    MESSAGES,
+    OTHERS,
+    SCHEMA,
+    VALID,
+    by_package,
+    channel,
+    chunk,
+    flipped,
+    payload,
+    whole,
+)
+from tests.support import cases
+
+EXPECTED = [(FRED if number % 4 == 3 else GOOB, payload(number)) for number in range(COUNT)]
+OF_GOOB = [one for one in EXPECTED if one[0] == GOOB]
+pytest.importorskip("duckdb")
+pytest.importorskip("matplotlib")
+NAME = "20261122T100030Z-000001.state.mcap"
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
+    return Run(monkeypatch, capsys)
+
+
+def stored(folder: Path, data: bytes, name: str = NAME) -> Path:
+    path = folder / "rec" / "2026" / "11" / "22" / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(data)
+    return path
+
+
+@pytest.mark.parametrize("name", VALID)
+def test_a_file_of_another_program_is_read_in_the_order_of_time(tmp_path: Path, run: Run, name: str) -> None:
+    path, damage, copy = stored(tmp_path, VALID[name]), Damage(), tmp_path / "copy.mcap"
+    assert contents(path, damage) == EXPECTED
+    assert damage.report() == ""
+    for check in ([], ["--check"]):
+        assert (run("recordings", "list", tmp_path / "rec", *check, columns=200), run.err) == (0, "")
+        assert f" {COUNT} " in run.out
+    assert run("recordings", "search", path) == 0
+    assert [line.split("  ")[-1] for line in run.out.splitlines()] == [one.decode() for _, one in EXPECTED]
+    assert run("recordings", "export", path, copy) == 0
+    assert exported(copy) == [(*SCHEMA, *one) for one in EXPECTED]
+    archive = Archive(tmp_path / "rec")
+    found = archive.messages("pebble/robots/goob", 0, 1 << 63)
+    assert [(one.channel.topic, one.payload) for one in found] == OF_GOOB
+    assert archive.unread() == {}
+    archive.close()
+    replayed = ReplaySource([path])
+    assert [(one.channel.topic, one.payload) for one in replayed.messages()] == EXPECTED
+    assert problems(replayed.damages) == []
+    indexed = Index(tmp_path / "rec").add(path)
+    assert (indexed.rows, indexed.unread) == (COUNT, "")
+
+
+@pytest.mark.parametrize("name", VALID)
+def test_only_what_is_named_is_deleted_of_it(tmp_path: Path, run: Run, name: str) -> None:
+    path, is_private = stored(tmp_path, VALID[name]), "private" in name
+    assert run("recordings", "rm", tmp_path / "rec", "--robot", "nosuch", "--yes") == is_private
+    assert path.read_bytes() == VALID[name]
+    assert run("recordings", "rm", tmp_path / "rec", "--robot", "fred", "--yes") == is_private
+    assert contents(path) == (EXPECTED if is_private else OF_GOOB)
+    assert run("recordings", "compact", tmp_path / "rec") == is_private
+    assert contents(path) == (EXPECTED if is_private else OF_GOOB)
+    assert (path.read_bytes() == VALID[name]) == is_private
+    assert run("recordings", "rm", tmp_path / "rec", "--robot", "goob", "--yes") == is_private
+    assert path.exists() == (is_private or "attachments" in name)
+
+
+def exported(path: Path) -> list[tuple[Any, ...]]:
+    """As the package reads it: name, encoding and data of the schema, topic, payload."""
+    with path.open("rb") as file:
+        found = make_reader(file, validate_crcs=True).iter_messages()
+        return [
+            (*((schema.name, schema.encoding, schema.data) if schema else ()), channel.topic, message.data)
+            for schema, channel, message in found
+        ]
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_other_topics_times_and_encodings(tmp_path: Path, run: Run, name: str) -> None:
+    data, count = OTHERS[name]
+    path, copy = stored(tmp_path, data), tmp_path / "copy.mcap"
+    for command in (["list"], ["info"], ["search"]):
+        assert run("recordings", *command, tmp_path / "rec", columns=200) == 0
+        assert f"{count} messages" in run.out + run.err
+    assert run("recordings", "export", path, copy) == 0
+    assert (len(exported(copy)), len(contents(path))) == (count, count)
+    for _ in range(2):
+        assert run("recordings", "compact", tmp_path / "rec") == 0
+        assert len(contents(path)) == count
+
+
+def test_metadata_and_attachments_go_with_an_export_and_stay_at_a_deletion(tmp_path: Path, run: Run) -> None:
+    path, copy = stored(tmp_path, by_package(beside=True)), tmp_path / "copy.mcap"
+    assert run("recordings", "export", path, copy) == 0
+    assert run("recordings", "rm", tmp_path / "rec", "--robot", "goob", "--yes") == 0
+    for one in (path, copy):
+        with one.open("rb") as file:
+            reader = make_reader(file, validate_crcs=True)
+            assert [each.data for each in reader.iter_attachments()] == [b"walls"]
+            places = [each.metadata["place"] for each in reader.iter_metadata() if each.name == "about"]
+            assert places == ["hall", "yard"]
+
+
+def test_topics_of_no_robot_are_named_with_their_encodings(tmp_path: Path, run: Run) -> None:
+    path = stored(tmp_path, whole(channel(1, "/imu", encoding="cdr"), channel(2, FRED), chunk(*MESSAGES)))
+    assert run("recordings", "info", path) == 0
+    assert "Topics that are of no robot: 30 messages\n          30  /imu cdr\n" in run.out
+
+
+READERS = [
+    ["list"], ["info"], ["search"], ["export", "{out}.jsonl"], ["export", "{out}.mcap"],
+    ["export", "{out}.wav", "-r", "goob"], ["index"], ["analyse", "--output", "{out}"],
+]  # fmt: skip
+WRITERS = [
+    ["rm", "--robot", "nosuch", "--yes"], ["rm", "--robot", "fred", "--yes"], ["rm", "--since", "2000-01-01", "--yes"],
+    ["compact"],
+]  # fmt: skip
+
+
+def on(folder: Path, command: list[str], out: Path) -> list[str | Path]:
+    group = [] if command[0] == "analyse" else ["recordings"]
+    return [*group, command[0], folder, *(one.replace("{out}", str(out)) for one in command[1:])]
+
+
+@pytest.mark.parametrize("name", DAMAGED)
+def test_what_cannot_be_read_is_named_and_not_touched(tmp_path: Path, run: Run, name: str) -> None:
+    data, wanted = DAMAGED[name]
+    path = stored(tmp_path, data)
+    for number, command in enumerate([*READERS, *WRITERS]):
+        code = run(*on(tmp_path / "rec", command, tmp_path / str(number)))
+        assert (code, NAME in run.err, wanted in run.err) == (1, True, True), (command, run.out, run.err)
+        assert path.read_bytes() == data
+    days = Days(Archive(tmp_path / "rec")).all()
+    assert any(wanted in line for day in days for line in day.unread), days
+    assert run("recordings", "rm", path, "--yes") == 0
+    assert not path.exists()
+
+
+@pytest.mark.parametrize("kind", ["ours", "lz4", "no chunks"])
+def test_a_flipped_bit_anywhere_costs_no_message_at_a_deletion(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "a.mcap"
+    if kind == "ours":
+        write(path, 60, channels=2, each=20)
+    else:
+        chunks = {"compression": LZ4} if kind == "lz4" else {"use_chunking": False}
+        path.write_bytes(by_package(**chunks, enable_data_crcs=True))
+    data, chance = path.read_bytes(), random.Random(kind)
+    expected = [one for one in contents(path) if "/r0/" not in one[0] and "/fred/" not in one[0]]
+    assert len(expected) in range(20, 40)
+    refused = 0
+    for at in range(chance.randrange(7), len(data), 7 * cases(1, 2)):
+        raw = flipped(data, at, chance.randrange(8))
+        path.write_bytes(raw)
+        try:
+            rewrite(path, path, keeps=lambda one: "/r0/" not in one.channel.topic and "/fred/" not in one.channel.topic)
+        except RecordingError:
+            assert path.read_bytes() == raw
+            refused += 1
+        else:
+            assert contents(path) == expected, at
+    assert refused > 20
+
+
+@pytest.mark.parametrize("command", [*READERS, *WRITERS])
+def test_without_a_module_the_extra_is_named(
+    tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch, command: list[str]
+) -> None:
+    path = stored(tmp_path, by_package(compression=LZ4))
+    monkeypatch.setitem(sys.modules, "lz4.frame", None)
+    assert run(*on(tmp_path / "rec", command, tmp_path / "out")) == 1
+    assert 'compressed by lz4: pip install "pebble-robot[record]"' in run.err
+    assert path.read_bytes() == by_package(compression=LZ4)
+    assert not [one for one in tmp_path.glob("out*") if one.is_file()]
+
+
+class TestInterrupted:
+    """A deletion that does not come to its end leaves the file as it was, and nothing beside it."""
+
+    @pytest.fixture
+    def path(self, tmp_path: Path) -> Path:
+        return stored(tmp_path, VALID["lz4"])
+
+    def test_a_full_disk(self, path: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+        def full(_descriptor: int) -> None:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+        monkeypatch.setattr(rewriting.os, "fsync", full)
+        assert run("recordings", "rm", path.parents[3], "--robot", "fred", "--yes") == 1
+        assert "No space left on device" in run.err
+        assert path.read_bytes() == VALID["lz4"]
+        assert list(path.parent.iterdir()) == [path]
+
+    @pytest.mark.parametrize("how", ["replaced", "grown"])
+    def test_another_program_writes_meanwhile(
+        self, path: Path, run: Run, monkeypatch: pytest.MonkeyPatch, how: str
+    ) -> None:
+        other = path.with_name("other")
+
+        def meanwhile(part: Path, made: Any) -> None:
+            other.write_bytes(VALID["lz4"] + (b"more" if how == "grown" else b""))
+            other.replace(path) if how == "replaced" else path.write_bytes(other.read_bytes())
+
+        monkeypatch.setattr(rewriting, "_check", meanwhile)
+        assert run("recordings", "rm", path.parents[3], "--robot", "fred", "--yes") == 1
+        assert "was changed meanwhile" in run.err
+        assert path.read_bytes().startswith(VALID["lz4"])
+
+    def test_a_kill_before_the_copy_takes_its_place(self, path: Path, run: Run) -> None:
+        kill = "rewriting._check = lambda *_: os.kill(os.getpid(), signal.SIGKILL)"
+        code = (
+            f"import os, signal, sys; from pebble.recordings.files import rewrite as rewriting; {kill};"
+            "from pebble.cli import main; sys.argv = ['pebble', *sys.argv[1:]]; main()"
+        )
+        arguments = ["recordings", "rm", str(path.parents[3]), "--robot", "fred", "--yes"]
+        killed = subprocess.run([sys.executable, "-c", code, *arguments], check=False, timeout=60)
+        assert killed.returncode == -signal.SIGKILL
+        assert path.read_bytes() == VALID["lz4"]
+        assert len(list(path.parent.iterdir())) == 2
+        assert run(*arguments) == 0
+        assert list(path.parent.iterdir()) == [path]
+        assert contents(path) == OF_GOOB
+
+    def test_a_copy_that_cannot_be_read_again(self, path: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr("pebble.recordings.files.writer.McapWriter.finish", lambda _: None)
+        assert run("recordings", "rm", path.parents[3], "--robot", "fred", "--yes") == 1
+        assert "cannot be read again" in run.err
+        assert path.read_bytes() == VALID["lz4"]
+
+
+class TestNames:
+    """Links, files that are not finished, and names that are taken."""
+
+    def test_what_a_deletion_does_not_look_into_is_named(self, tmp_path: Path, run: Run) -> None:
+        whole_ = stored(tmp_path, VALID["zstd"])
+        left = [
+            stored(tmp_path, VALID["zstd"], f"{NAME.replace('001', '002')}{end}") for end in (".active", ".damaged")
+        ]
+        assert run("recordings", "rm", tmp_path / "rec", "--robot", "fred", "--yes") == 1
+        assert contents(whole_) == OF_GOOB
+        wanted = run.err
+        for path in left:
+            assert path.name in wanted
+            assert path.read_bytes() == VALID["zstd"]
+            assert run("recordings", "rm", path, "--yes") == 0
+            assert not path.exists()
+
+    @pytest.mark.parametrize("make", [Path.symlink_to, Path.hardlink_to])
+    def test_a_link(self, tmp_path: Path, run: Run, make: Any) -> None:
+        target = tmp_path / "kept.mcap"
+        target.write_bytes(VALID["zstd"])
+        path = stored(tmp_path, b"")
+        path.unlink()
+        make(path, target)
+        run("recordings", "rm", tmp_path / "rec", "--robot", "fred", "--yes")
+        run("recordings", "compact", tmp_path / "rec")
+        assert target.read_bytes() == VALID["zstd"]
+        assert contents(path) == (EXPECTED if path.is_symlink() else OF_GOOB)
+        assert run("recordings", "rm", path, "--yes") == path.is_symlink()
+
+    @pytest.mark.parametrize("name", ["notes.txt", "none.mcap"])
+    def test_only_a_recording_is_deleted_by_its_name(self, tmp_path: Path, run: Run, name: str) -> None:
+        (tmp_path / "notes.txt").write_text("notes")
+        assert run("recordings", "rm", tmp_path / name, "--yes") == 1
+        assert run("recordings", "rm", tmp_path / "notes.txt", "--yes") == 1
+        assert (tmp_path / "notes.txt").exists()
+
+    @pytest.mark.parametrize("ending", ["mcap", "jsonl"])
+    def test_an_export_replaces_no_file(self, tmp_path: Path, run: Run, ending: str) -> None:
+        path = stored(tmp_path, VALID["zstd"])
+        taken = path if ending == "mcap" else tmp_path / "a.jsonl"
+        before = VALID["zstd"] if ending == "mcap" else b"kept"
+        taken.write_bytes(before)
+        assert run("recordings", "export", path, taken) == 1
+        assert run("recordings", "recover", path, taken) == 1
+        assert taken.read_bytes() == before
+
+    def test_finishing_takes_no_name_that_is_taken(self, tmp_path: Path, run: Run) -> None:
+        whole_ = stored(tmp_path, VALID["zstd"])
+        active = whole_.with_name(f"{NAME}.active")
+        write(active, 100, finish=False)
+        before = active.stat().st_size
+        assert run("recordings", "finish", tmp_path / "rec") == 1
+        assert "there is another file of this name" in run.err
+        assert whole_.read_bytes() == VALID["zstd"]
+        assert active.stat().st_size >= before
+
+
+def test_what_was_not_read_makes_no_room(tmp_path: Path) -> None:
+    """Files that could not be finished are neither deleted for their size and age nor is another one for theirs."""
+    for number, end in enumerate(["", ".damaged", "", ".damaged"], 1):
+        stored(tmp_path, bytes(1000), f"{NAME.replace('001', f'{number:03}')}{end}")
+    entries = Folder(tmp_path / "rec").entries()
+    assert [one.number for one in surplus(entries, Limits(keep_bytes=1500), Disk(1 << 40))] == [1]
+    assert surplus(entries, Limits(keep_bytes=2000), Disk(1 << 40)) == []
+    old = outdated(entries[1:], Limits(keep_state_days=1.0), entries[0].ended + 1e6)
+    assert old is None
+
+
+class TestFinishing:
+    """What finishing a file in place may cut off."""
+
+    @pytest.mark.parametrize("name", ["lz4", "no chunks", "our own library"])
+    def test_a_file_of_another_program_is_left_alone(self, tmp_path: Path, run: Run, name: str) -> None:
+        path = stored(tmp_path, VALID[name], f"{NAME}.active")
+        assert run("recordings", "finish", tmp_path / "rec") == 1
+        assert "another program wrote it" in run.err
+        assert path.read_bytes() == VALID[name]
+
+    def test_what_a_finished_file_lacks_is_counted(self, tmp_path: Path, run: Run) -> None:
+        path = stored(tmp_path, b"", f"{NAME}.active")
+        write(path, 100, finish=False, each=20, channels=1)
+        second = list(blocks(path.read_bytes(), Damage()))[2]
+        path.write_bytes(flipped(path.read_bytes(), second.at + 200))
+        assert run("recordings", "finish", tmp_path / "rec") == 1
+        assert re.fullmatch(rf"{NAME}: 80 messages, 20 missing, [\d,]+ damaged bytes\n", run.out)
+        whole_ = path.with_name(NAME)
+        before = whole_.read_bytes()
+        assert run("recordings", "compact", tmp_path / "rec") == 1
+        assert "damaged bytes were covered" in run.err
+        assert whole_.read_bytes() == before
+        assert run("recordings", "list", tmp_path / "rec", columns=200) == 0
+        assert "20 missing" in run.out
+
+    def test_only_the_begin_of_a_record_is_cut_off(self, tmp_path: Path) -> None:
+        """A damaged last chunk stays in the file, and so do all bytes of it."""
+        path = tmp_path / "a.mcap"
+        written = write(path, 100, finish=False, each=20)
+        data = path.read_bytes()
+        last = list(blocks(data, Damage()))[-1]
+        half = (last.at + last.record_end) // 2
+        for at in range(last.at, len(data), 7):
+            path.write_bytes(flipped(data, at, at % 8))
+            finish(path)
+            assert len(contents(path)) in (80, 100)
+            rest = path.read_bytes()[half : last.record_end]
+            assert contents(path) == written or rest == flipped(data, at, at % 8)[half : last.record_end], at
