@@ -29,7 +29,7 @@ from pebble.web.messages import EstopOp
 from pebble.web.recordings import Recordings
 from pebble.web.server import Server
 from pebble.web.settings import WebSettings
-from pebble.web.static_files import FOREVER, NO_STORE, StaticFiles
+from pebble.web.static_files import FOREVER, NO_STORE, StaticFiles, root_of
 
 _ENCODINGS = frozenset({"json", "pbvd", "pbvz", "h264", "jpeg"})
 _estop_decoder = msgspec.json.Decoder(EstopOp)
@@ -91,7 +91,7 @@ async def _page(request: Request) -> Response:
     if login.session_of(request) is None:
         wanted = request.url.path + ("?watch" if "watch" in request.query_params else "")
         then = "" if wanted == "/" else f"?next={quote(wanted)}"
-        return Response(status_code=303, headers={"location": f"/login{then}", **NO_STORE})
+        return Response(status_code=303, headers={"location": f"{root_of(request)}login{then}", **NO_STORE})
     return _static_of(request).page(request, {**NO_STORE, **_policy(request)})
 
 

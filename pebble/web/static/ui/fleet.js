@@ -1,5 +1,6 @@
 // All components at a glance: who is there, who drives, what is stopped.
 
+import { ROOT } from "../core/browser.js";
 import { doubtOf } from "./doubt.js";
 import { RouteLink, Liveness } from "./header.js";
 import {
@@ -270,7 +271,7 @@ function Thumbnail({ at, picture }) {
     return html`<div class="thumbnail"><${Icon} name="camera" />camera rests</div>`;
   }
   return html`<div class="thumbnail">
-    <img alt=${`What ${nameOf(at)} sees`} src=${`/api/snapshot.jpg?ref=${encodeURIComponent(at)}&n=${count}`} />
+    <img alt=${`What ${nameOf(at)} sees`} src=${`${ROOT}api/snapshot.jpg?ref=${encodeURIComponent(at)}&n=${count}`} />
   </div>`;
 }
 
