@@ -48,7 +48,8 @@ class StaticFiles:
         for name, screen in _SCREENS.items():
             links = [_link(one) for one in (screen, *self._imported("main.js", screen))]
             if name in _SHEETS:
-                links.insert(0, b'<link rel="preload" as="style" href="{root}static/{version}/%s">' % _SHEETS[name].encode())
+                sheet = _SHEETS[name].encode()
+                links.insert(0, b'<link rel="preload" as="style" href="{root}static/{version}/%s">' % sheet)
             self.files[name] = index.replace(_MODULES, b"\n    ".join(links))
         for name in self.files:
             if name.endswith(".html"):

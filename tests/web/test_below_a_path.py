@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -14,7 +14,7 @@ from tests.support import Broker
 from tests.tcp_proxy import PrefixProxy
 from tests.web.attacker import PASSWORDS, Hall
 from tests.web.browser import tab
-from tests.web.console import REST, console
+from tests.web.console import REST, Console, console
 from tests.web.stage import Stage
 
 pytestmark = pytest.mark.page
@@ -66,11 +66,18 @@ def test_a_login_leads_to_the_screen_that_was_asked_for_and_each_screen_leads_on
         assert proxy.outside == []
 
 
+@contextmanager
+def console_behind(proxy: PrefixProxy, browser: Browser, stage: Stage) -> Iterator[Console]:
+    proxy.lead_to(urlsplit(stage.url).port or 0)
+    with console(browser, stage, "minilamp", url=url_of(proxy)) as one:
+        yield one
+
+
 def test_a_robot_is_driven_and_stopped(browser: Browser) -> None:
     """With its picture, and with all that the page fetches later."""
-    with PrefixProxy(1, "/robots/") as proxy, Stage("minilamp", names=["127.0.0.1", f"127.0.0.1:{proxy.port}"]) as stage:
-        proxy.lead_to(urlsplit(stage.url).port or 0)
-        with console(browser, stage, "minilamp", url=url_of(proxy)) as one:
+    with PrefixProxy(1, "/robots/") as proxy:
+        names = ["127.0.0.1", f"127.0.0.1:{proxy.port}"]
+        with Stage("minilamp", names=names) as stage, console_behind(proxy, browser, stage) as one:
             one.take()
             assert one.drive()
             one.let_go()

@@ -32,13 +32,15 @@ export class Archive {
   }
 
   /**
-   * Waits while the day is being indexed.
+   * Waits while the day is being indexed. ``again``: also if that has failed before.
    * @param {string} day @param {string} robot @param {(share: number) => void} onIndexing @param {AbortSignal} signal
+   * @param {boolean} [again]
    * @returns {Promise<Timeline>}
    */
-  async timeline(day, robot, onIndexing, signal) {
-    for (;;) {
-      const answer = await this.get(`${ROOT}archive/timeline?${query({ day, robot })}`, signal);
+  async timeline(day, robot, onIndexing, signal, again = false) {
+    for (;; again = false) {
+      const asked = query({ day, robot, ...(again ? { again: 1 } : {}) });
+      const answer = await this.get(`${ROOT}archive/timeline?${asked}`, signal);
       const value = await answer.json();
       if (answer.status !== 202) return value;
       onIndexing(value.indexing ?? 0);
