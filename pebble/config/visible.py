@@ -44,6 +44,29 @@ def without_hidden(text: str) -> str:
     return "".join(char for char in text if not _is_hidden(char)).strip()
 
 
+def shown(text: str) -> str:
+    """``text`` for a terminal or a log: what is not seen, or steers what shows it, is its code, such as ``\\u202e``.
+
+    Tabs, line ends and blanks of all kinds stay, and what joins the parts of an emoji or of a Persian word.
+    """
+    if text.isascii() and text.isprintable():
+        return text
+    return "".join(_coded(char) if _steers(text, place) else char for place, char in enumerate(text))
+
+
+def _steers(text: str, place: int) -> bool:
+    import unicodedata
+
+    char = text[place]
+    if char in "\t\n" or not _is_hidden(char) or _joins(text, place):
+        return "\ud800" <= char <= "\udfff"
+    return unicodedata.category(char) != "Zs"
+
+
+def _coded(char: str) -> str:
+    return f"\\u{ord(char):04x}" if ord(char) < 0x10000 else f"\\U{ord(char):08x}"
+
+
 def code_point(char: str) -> str:
     """Example: ``U+00A0 (no-break space)``."""
     import unicodedata
