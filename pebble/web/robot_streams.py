@@ -32,7 +32,7 @@ class OwnHosts:
     """The hosts by which browsers may open this server, however they are spelt: they may have its cookie for them."""
 
     def __init__(self, settings: WebSettings) -> None:
-        self._names = {name if name.count(":") > 1 else name.partition(":")[0] for name in host_names(settings)}
+        self._names = {canonical(_without_port(name)) for name in host_names(settings)}
         self._reached = not is_loopback(settings.host)  # at each address of this machine
 
     def __contains__(self, host: object) -> bool:
@@ -46,6 +46,10 @@ class OwnHosts:
         )
 
 
+def _without_port(name: str) -> str:
+    return name if name.count(":") > 1 and "]" not in name else re.sub(r":[0-9]+$", "", name)
+
+
 def _as_browsers_read(host: str) -> str:
     """One spelling of a host: 127.1, 0x7f.1 and 2130706433 are 127.0.0.1."""
     name = host.strip("[]").rstrip(".")
@@ -57,11 +61,11 @@ def _as_browsers_read(host: str) -> str:
 
 def _is_here(address: str) -> bool:
     """Whether it is an address of this machine."""
-    with socket.socket(socket.AF_INET6 if ":" in address else socket.AF_INET) as one:
-        try:
+    try:
+        with socket.socket(socket.AF_INET6 if ":" in address else socket.AF_INET) as one:
             one.bind((address, 0))
-        except OSError:
-            return False
+    except OSError:
+        return False
     return True
 
 

@@ -21,9 +21,9 @@ from tests.web.in_node import evaluate
 from tests.web.served import RecordingRobot, Served
 
 HOST = "pebble.local"
-OWN = OwnHosts(
-    WebSettings(broker=MqttSettings(host="127.0.0.1"), names=(HOST, "*.hall.example", "[fd00::7]:9", "lab.example:443"))
-)
+NAMES = (HOST, "*.hall.example", "[fd00::7]:9", "lab.example:443")
+BROKER = MqttSettings(host="127.0.0.1")
+OWN = OwnHosts(WebSettings(broker=BROKER, names=NAMES))
 
 GOOD = {
     "http://pitcam.local:8889/cam": "http://pitcam.local:8889",
@@ -196,9 +196,7 @@ def test_the_addresses_of_a_machine_are_its_own_where_the_page_is_reached_by_the
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.connect(("192.0.2.1", 9))  # sends nothing
         address = probe.getsockname()[0]
-    local, reached = (
-        OwnHosts(WebSettings(broker=MqttSettings(host="x"), host=one)) for one in ("127.0.0.1", "0.0.0.0")
-    )
+    local, reached = (OwnHosts(WebSettings(broker=BROKER, host=one)) for one in ("127.0.0.1", "0.0.0.0"))
     assert (address in local, address in reached, "192.0.2.1" in reached) == (False, True, False)
     assert socket.gethostname() in reached
 
