@@ -122,6 +122,48 @@ class TcpProxy:
         return self._passing.wait(_STEP_S)
 
 
+class PrefixProxy(TcpProxy):
+    """Shows a web server below a path, as a reverse proxy does: ``prefix``, which it takes away, ends with a slash.
+
+    ``outside``: what was asked for elsewhere, and was answered 404.
+    """
+
+    def __init__(self, target: int, prefix: str) -> None:
+        self.prefix, self.outside = prefix.encode(), list[str]()
+        super().__init__(target)
+
+    def _join_to_target(self, near: socket.socket) -> None:
+        threading.Thread(target=self._ask, args=(near,), daemon=True).start()  # browsers open some before they ask
+
+    def _ask(self, near: socket.socket) -> None:
+        asked = b""
+        with suppress(OSError):
+            while b"\r\n\r\n" not in asked:
+                if not (data := near.recv(65536)):
+                    return near.close()
+                asked += data
+            method, path, rest = asked.split(b" ", 2)
+            if not path.startswith(self.prefix):
+                self.outside.append(path.decode())
+                near.sendall(b"HTTP/1.1 404 \r\ncontent-length: 0\r\nconnection: close\r\n\r\n")
+                return near.close()
+            rest = rest.replace(b"Connection: keep-alive", b"Connection: close")  # one request on each
+            far = socket.create_connection(("127.0.0.1", self._target), 2)
+            far.settimeout(None)
+            far.sendall(b" ".join((method, b"/" + path.removeprefix(self.prefix), rest)))
+            threading.Thread(target=_carry, args=(near, far), daemon=True).start()
+            _carry(far, near)
+        return near.close()
+
+
+def _carry(source: socket.socket, sink: socket.socket) -> None:
+    """Until the end of what comes, which is then the end of what goes."""
+    with suppress(OSError):
+        while data := source.recv(65536):
+            sink.sendall(data)
+        sink.shutdown(socket.SHUT_WR)
+
+
 class BridgelessProxy(TcpProxy):
     """Makes any broker one that hangs up on bridge mode, as RabbitMQ does, while ``bridgeless`` is set."""
 

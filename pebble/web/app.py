@@ -29,7 +29,7 @@ from pebble.web.messages import EstopOp
 from pebble.web.recordings import Recordings
 from pebble.web.server import Server
 from pebble.web.settings import WebSettings
-from pebble.web.static_files import FOREVER, NO_STORE, StaticFiles
+from pebble.web.static_files import FOREVER, NO_STORE, StaticFiles, root_of
 
 _ENCODINGS = frozenset({"json", "pbvd", "pbvz", "h264", "jpeg"})
 _estop_decoder = msgspec.json.Decoder(EstopOp)
@@ -91,14 +91,14 @@ async def _page(request: Request) -> Response:
     if login.session_of(request) is None:
         wanted = request.url.path + ("?watch" if "watch" in request.query_params else "")
         then = "" if wanted == "/" else f"?next={quote(wanted)}"
-        return Response(status_code=303, headers={"location": f"/login{then}", **NO_STORE})
+        return Response(status_code=303, headers={"location": f"{root_of(request)}login{then}", **NO_STORE})
     return _static_of(request).page(request, {**NO_STORE, **_policy(request)})
 
 
 def _policy(request: Request) -> dict[str, str]:
     """The page may show the streams of robots in a frame: exactly the origins that they report now."""
     robots, ref = request.app.state.robots, request.path_params.get("ref", "")
-    allowed = robot_streams.origins(robots, ref, request.url.hostname or "")
+    allowed = robot_streams.origins(robots, ref, request.app.state.server.own_hosts)
     if not allowed:
         return {}
     return {"content-security-policy": f"{CONTENT_SECURITY_POLICY}; frame-src {' '.join(allowed)}"}

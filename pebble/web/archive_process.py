@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import multiprocessing
+import signal
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -20,6 +21,7 @@ log = logging.getLogger(__name__)
 MOST_WAITING: Final = 64  # questions
 _SPAWN: Final = multiprocessing.get_context("spawn")
 _END_S: Final = 2.0
+SILENT_S: Final = 300.0  # after a sign of life of a job
 
 AnswerT = TypeVar("AnswerT")
 
@@ -46,6 +48,8 @@ class ArchiveProcess:
         except BrokenProcessPool:
             self.close()
             raise PebbleError("the process that reads recordings has ended: try again") from None
+        except (OSError, ImportError, MemoryError) as error:
+            raise PebbleError(questions.reason(error)) from None
         finally:
             self._waiting -= 1
 
@@ -84,11 +88,14 @@ class Job:
         self.ready = False
         self.why = ""  # it failed
         self.unread = ""  # it is ready, but this could not be read
-        self._answers, theirs = _SPAWN.Pipe(duplex=False)
+        answers, theirs = _SPAWN.Pipe(duplex=False)
         self._process = _SPAWN.Process(target=function, args=(theirs, *arguments), daemon=True)
-        self._process.start()
+        try:
+            self._process.start()
+        except OSError as error:
+            self.why = f"no process could be started: {error.strerror or error}"
         theirs.close()
-        self._task = asyncio.create_task(self._follow(self._answers))
+        self._task = asyncio.create_task(self._follow(answers))
 
     @property
     def running(self) -> bool:
@@ -104,17 +111,21 @@ class Job:
         loop.add_reader(answers.fileno(), readable.set)
         try:
             while not self.ready and not self.why:
-                await readable.wait()
+                await asyncio.wait_for(readable.wait(), SILENT_S)
                 readable.clear()
                 while not self.ready and not self.why and answers.poll():
                     self._take(*answers.recv())  # it is short, and comes as a whole
         except EOFError:
-            self.why = self.why or "it was ended"
+            await asyncio.to_thread(self._process.join, _END_S)
+            self.why = _ended(self._process.exitcode)
+        except TimeoutError:
+            self.why = f"it did nothing for {SILENT_S:.0f} s and was ended: look at the disk, then try again"
         finally:
             loop.remove_reader(answers.fileno())
             answers.close()
-            await asyncio.to_thread(self._process.join, _END_S)
-            self._process.kill()
+            if self._process.pid is not None:
+                self._process.kill()
+                await asyncio.to_thread(self._process.join, _END_S)
 
     def _take(self, what: str, value: Any) -> None:
         if what == "done":
@@ -123,3 +134,10 @@ class Job:
             self.ready, self.unread = True, value
         else:
             self.why = value
+
+
+def _ended(code: int | None) -> str:
+    """Why a process said nothing more; ``code`` is what it ended with."""
+    if code == -signal.SIGKILL:
+        return "its process was killed, as it is where memory runs out: end other programs, or choose less"
+    return f"its process has ended ({code}): the log of the server says why"

@@ -104,16 +104,16 @@ class Guard:
         if port != own_port:
             return False
         wildcard = "*." + host.partition(".")[2]
-        return host in self._names or wildcard in self._names or host == _canonical(own_address)
+        return host in self._names or wildcard in self._names or host == canonical(own_address)
 
 
 def host_names(settings: WebSettings) -> frozenset[str]:
     """The names by which browsers may address the server, besides the address at which a request arrives."""
     names: set[str] = {"127.0.0.1", "::1", "localhost", *settings.names}
-    if not _is_loopback(settings.host):
+    if not is_loopback(settings.host):
         names.add(settings.host)
         names |= _of_machine() if settings.certificate is None else {*certificates.show(settings.certificate).names}
-    return frozenset(map(_canonical, names))
+    return frozenset(map(canonical, names))
 
 
 def _of_machine() -> set[str]:
@@ -121,14 +121,14 @@ def _of_machine() -> set[str]:
     return {name, f"{name.partition('.')[0]}.local"}
 
 
-def _is_loopback(host: str) -> bool:
+def is_loopback(host: str) -> bool:
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
         return host == "localhost"
 
 
-def _canonical(name: str) -> str:
+def canonical(name: str) -> str:
     """One spelling of a host name or address; also of ``name:port``."""
     try:
         address = ipaddress.ip_address(name.strip("[]").partition("%")[0])
@@ -147,7 +147,7 @@ def _split(host: str, default_port: int) -> tuple[str, int] | None:
         return None
     if not name or not port.isascii() or not port.isdigit() or len(port) > 5:
         return None
-    return _canonical(name), int(port)
+    return canonical(name), int(port)
 
 
 def _is_own_origin(scope: Scope, headers: Headers) -> bool:

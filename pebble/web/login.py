@@ -21,6 +21,7 @@ from pebble.fleet.people import SESSION_S, TooManyTriesError, User
 from pebble.fleet.roles import LOCAL, Session
 from pebble.runtime.rate_limit import RateLimitedLog
 from pebble.web.settings import WebSettings
+from pebble.web.static_files import root_of
 
 _WAITING = 32  # logins that wait for the thread; each takes some 20 ms
 _log = RateLimitedLog(logging.getLogger(__name__), period_s=60.0)
@@ -100,11 +101,11 @@ def _cookie(settings: WebSettings) -> str:
 
 async def _page(request: Request) -> Response:
     if session_of(request) is not None:
-        return Response(status_code=303, headers={"location": "/", **_NO_STORE})
+        return Response(status_code=303, headers={"location": root_of(request), **_NO_STORE})
     state = request.app.state
     name = html.escape(state.settings.server or socket.gethostname())
     page = state.static.files["login.html"].decode()
-    page = page.replace("{version}", state.static.version).replace("{server}", name)
+    page = page.replace("{version}", state.static.version).replace("{root}", root_of(request)).replace("{server}", name)
     return Response(page, media_type="text/html; charset=utf-8", headers=_NO_STORE)
 
 

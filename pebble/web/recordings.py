@@ -92,6 +92,11 @@ class Recordings:
         self._timelines: dict[tuple[str, str], _Timeline] = {}
         self._export: _Export | None = None
 
+    @property
+    def scratch(self) -> Path:
+        """Where jobs write."""
+        return Path(self._scratch.name)
+
     async def close(self) -> None:
         self.process.close()
         for one in self._timelines.values():
@@ -100,18 +105,21 @@ class Recordings:
             await self._export.job.end()
         self._scratch.cleanup()
 
-    async def timeline(self, day: str, robot: str) -> bytes | float:
-        """JSON, or the share of the work that is done. Raises PebbleError."""
+    async def timeline(self, day: str, robot: str, *, again: bool = False) -> bytes | float:
+        """JSON, or the share of the work that is done. Raises PebbleError.
+
+        What has failed is done anew only ``again``, or for other recordings.
+        """
         key, period = (day, robot), _period_of(day)
         paths, active = await self.process.ask(questions.files, robot, *period)
         known = self._timelines.pop(key, None)
-        if known is None or self._is_old(known, paths, active=active):
+        if known is None or self._is_old(known, paths, active=active, again=again):
             before = None if known is None else known.take()
             known = self._begin(robot, period, paths, active=active, before=before)
-        if known.job.why:
-            raise PebbleError(known.job.why)
         self._timelines[key] = known  # the last one used is the last one forgotten
         await self._forget()
+        if known.job.why:
+            raise PebbleError(known.job.why)
         made = known.take()
         return known.job.done if made is None else made
 
@@ -127,7 +135,7 @@ class Recordings:
             raise PebbleError(f"nothing is recorded of {wanted.robot} in this time")
         await self.end_export()
         number = secrets.token_hex(8)
-        target = Path(self._scratch.name, f"{number}.{wanted.form}")
+        target = self._target(f"{number}.{wanted.form}")
         job = Job(questions.export_job, paths, target, wanted.robot, period, wanted.form)
         began = datetime.fromtimestamp(wanted.since / 1000, UTC).strftime("%Y%m%dT%H%M%SZ")
         name = f"{wanted.robot.rpartition('/')[2]}-{began}.{wanted.form}"
@@ -146,15 +154,25 @@ class Recordings:
     def _begin(
         self, robot: str, period: tuple[int, int], paths: list[str], *, active: bool, before: bytes | None
     ) -> _Timeline:
-        target = Path(self._scratch.name, f"{secrets.token_hex(8)}.json")
+        target = self._target(f"{secrets.token_hex(8)}.json")
         job = Job(questions.make_timeline_job, self.folder, paths, target, robot, period)
         return _Timeline(paths, active, target, job, clock(), before)
 
-    def _is_old(self, known: _Timeline, paths: list[str], *, active: bool) -> bool:
+    def _target(self, name: str) -> Path:
+        """Where a job writes; systems may have cleaned the folder away."""
+        try:
+            self.scratch.mkdir(mode=0o700, exist_ok=True)
+        except OSError as error:
+            raise PebbleError(questions.reason(error)) from None
+        return self.scratch / name
+
+    def _is_old(self, known: _Timeline, paths: list[str], *, active: bool, again: bool) -> bool:
         if known.job.running:
             return False
+        if known.job.why:
+            return again or paths != known.paths
         changed = paths != known.paths or known.active or active
-        return bool(known.job.why) or (changed and clock() - known.began_at > _ACTIVE_S)
+        return changed and clock() - known.began_at > _ACTIVE_S
 
     async def _forget(self) -> None:
         while len(self._timelines) > _TIMELINES:
@@ -217,7 +235,8 @@ async def _days(_: Request, recordings: Recordings) -> Response:
 
 
 async def _timeline(request: Request, recordings: Recordings) -> Response:
-    made = await recordings.timeline(request.query_params.get("day", ""), _robot(request))
+    asked = request.query_params
+    made = await recordings.timeline(asked.get("day", ""), _robot(request), again=asked.get("again") == "1")
     return JSONResponse({"indexing": made}, 202) if isinstance(made, float) else _json(made)
 
 

@@ -5,12 +5,17 @@ They decide which origins the page may show in a frame.
 
 from __future__ import annotations
 
+import ipaddress
 import re
+import socket
+from collections.abc import Container
 from typing import Any, Final
 
 from pebble.contract import STATUS, codec
 from pebble.errors import PayloadError
+from pebble.web.guard import canonical, host_names, is_loopback
 from pebble.web.robots import Robots
+from pebble.web.settings import WebSettings
 
 KEYS: Final = ("webrtc_url", "webrtcUrl", "url")  # of the status; robots of the original use all of them
 MAX_ORIGINS: Final = 16  # in one header
@@ -23,25 +28,66 @@ _URL: Final = re.compile(
 )
 
 
-def origin(url: object, own_host: str = "") -> str:
+class OwnHosts:
+    """The hosts by which browsers may open this server, however they are spelt: they may have its cookie for them."""
+
+    def __init__(self, settings: WebSettings) -> None:
+        self._names = {canonical(_without_port(name)) for name in host_names(settings)}
+        self._reached = not is_loopback(settings.host)  # at each address of this machine
+
+    def __contains__(self, host: object) -> bool:
+        name = _as_browsers_read(str(host))
+        try:
+            address = ipaddress.ip_address(name)
+        except ValueError:
+            return not {name, "*." + name.partition(".")[2]}.isdisjoint(self._names) or name.endswith(".localhost")
+        return (
+            address.is_loopback or address.is_unspecified or name in self._names or (self._reached and _is_here(name))
+        )
+
+
+def _without_port(name: str) -> str:
+    return name if name.count(":") > 1 and "]" not in name else re.sub(r":[0-9]+$", "", name)
+
+
+def _as_browsers_read(host: str) -> str:
+    """One spelling of a host: 127.1, 0x7f.1 and 2130706433 are 127.0.0.1."""
+    name = host.strip("[]").rstrip(".")
+    try:
+        return socket.inet_ntoa(socket.inet_aton(name))
+    except OSError:
+        return canonical(name)
+
+
+def _is_here(address: str) -> bool:
+    """Whether it is an address of this machine."""
+    try:
+        with socket.socket(socket.AF_INET6 if ":" in address else socket.AF_INET) as one:
+            one.bind((address, 0))
+    except OSError:
+        return False
+    return True
+
+
+def origin(url: object, own: Container[str] = ()) -> str:
     """Scheme, host and port of a stream that may be shown; empty if it may not.
 
-    Not of the page's own host, on whatever port: a browser sends the cookie of the login there as well.
+    Not of the page's own hosts, on whatever port: a browser sends the cookie of the login there as well.
     """
     found = _URL.fullmatch(url) if isinstance(url, str) and len(url) <= _MAX_URL else None
     if found is None:
         return ""
     scheme, host, port = (part.lower() if part else "" for part in found.groups())
-    if host.strip("[]") == own_host.lower().strip("[]").rstrip(".") or not 0 < int(port[1:] or "1") <= 65535:
+    if host in own or not 0 < int(port[1:] or "1") <= 65535:
         return ""
     return f"{scheme}://{host}{port}"
 
 
-def origins(robots: Robots, ref: str, own_host: str) -> list[str]:
+def origins(robots: Robots, ref: str, own: Container[str]) -> list[str]:
     """Of all that robots report now, or that were entered for them; those for the page of ``ref`` first."""
     found: dict[str, None] = {}
     for one in (ref, robots.sources.get(ref, ref), *robots.components):
-        if allowed := origin(robots.streams.get(one) or _reported(robots, one), own_host):
+        if allowed := origin(robots.streams.get(one) or _reported(robots, one), own):
             found[allowed] = None
         if len(found) == MAX_ORIGINS:
             break

@@ -33,7 +33,7 @@ from pebble.web.driving import Command, Driving
 from pebble.web.known_robots import KnownRobots
 from pebble.web.media import MediaHub
 from pebble.web.open_components import OpenComponents
-from pebble.web.robot_streams import origin
+from pebble.web.robot_streams import OwnHosts, origin
 from pebble.web.robots import FLEET, SYNONYMS, Component, Robots, section_of
 from pebble.web.settings import WebSettings
 from pebble.web.sound import SoundHub
@@ -63,6 +63,7 @@ class Server:
         self.robots, self.stops, self.driving = Robots(), Stops(), Driving(self.id)
         self.known = KnownRobots(people.all(_KNOWN))
         self.robots.before = self.known
+        self.own_hosts = OwnHosts(settings)
         self.broker.is_known = lambda topic: "/".join(topic.split("/", 3)[:3]) in self.known
         self.robots.streams.update(people.all(_STREAM_ADDRESS))
         self.media = MediaHub(self.broker, self.robots)
@@ -245,6 +246,8 @@ class Server:
             return "unknown component"
         if url and not origin(url):
             return "No stream: an address begins with http:// or https://, and has no login"
+        if url and not origin(url, self.own_hosts):
+            return "No stream: the page can be opened by this name or address, and browsers would send its login there"
         self.people.set(_STREAM_ADDRESS + ref, url)
         self.robots.streams[ref] = url
         self._show_stream_address(ref)

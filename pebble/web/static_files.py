@@ -24,13 +24,15 @@ _TYPES = {
     "webmanifest": "application/manifest+json",
 }
 _VERSION = b"{version}"  # in the pages, replaced by that of the files
+_ROOT = b"{root}"  # replaced by root_of(): a proxy may show the server below a path that only browsers know
 _MODULES = b"{modules}"  # replaced by links to all that is imported: browsers need not discover them one by one
 _SCREENS = {"fleet.html": "ui/fleet.js", "robot.html": "ui/robot.js"}  # index.html, with what that screen needs
 _SHEETS = {"fleet.html": "fleet.css"}  # that the screen needs beside app.css
 _IMPORT = re.compile(rb'^(?:import|export|\}).*?"(\.\.?/[^"]+)";?$', re.MULTILINE)
 _COMMENTS = re.compile(r"^[ \t]*(?:/\*.*?\*/|//[^\n]*)[ \t]*$", re.MULTILINE | re.DOTALL)
 _LINE_ENDS = re.compile(r"(?<=\S)[ \t]+//[ ][^\"'`\n]*$", re.MULTILINE)  # one with quotes may be the end of a string
-_INDENTATION = re.compile(r"^[ \t]+", re.MULTILINE)
+_LOOSE = re.compile(r" (?=\{$)|(^[\w-]+:) ", re.MULTILINE)  # in style sheets
+_INDENTATION = re.compile(r"^\s+", re.MULTILINE)
 
 
 class StaticFiles:
@@ -46,8 +48,9 @@ class StaticFiles:
         for name, screen in _SCREENS.items():
             links = [_link(one) for one in (screen, *self._imported("main.js", screen))]
             if name in _SHEETS:
-                links.insert(0, b'<link rel="preload" as="style" href="/static/{version}/%s">' % _SHEETS[name].encode())
-            self.files[name] = index.replace(_MODULES, b"\n    ".join(links))
+                sheet = _SHEETS[name].encode()
+                links.insert(0, b'<link rel="preload" as="style" href="{root}static/{version}/%s">' % sheet)
+            self.files[name] = index.replace(_MODULES, b"\n".join(links))
         for name in self.files:
             if name.endswith(".html"):
                 self.files[name] = self.files[name].replace(_VERSION, self.version.encode())
@@ -66,22 +69,32 @@ class StaticFiles:
 
     def page(self, request: Request, headers: dict[str, str]) -> Response:
         """The operator page; which screen it shows is up to its address."""
-        return self.answer(request, "robot.html" if request.url.path.startswith("/r/") else "fleet.html", headers)
+        name = "robot.html" if request.url.path.startswith("/r/") else "fleet.html"
+        content = self.files[name].replace(_ROOT, root_of(request).encode())
+        return _response(request, name, content, gzip.compress(content, 9), headers)
 
     def answer(self, request: Request, name: str, headers: dict[str, str]) -> Response:
         """The file ``name``, compressed if the browser takes that; 404 if there is none."""
         if name not in self.files:
             return PlainTextResponse("not found", 404)
-        headers = {**headers, "vary": "accept-encoding"}
-        packed = "gzip" in request.headers.get("accept-encoding", "")
-        content = self._packed[name] if packed else self.files[name]
-        if packed:
-            headers["content-encoding"] = "gzip"
-        return Response(content, media_type=_TYPES[name.rpartition(".")[2]], headers=headers)
+        return _response(request, name, self.files[name], self._packed[name], headers)
+
+
+def root_of(request: Request) -> str:
+    """The way from the address of ``request`` to where the server begins: ``./``, ``../../``."""
+    path: bytes = request.scope["raw_path"]
+    return "../" * (path.count(b"/") - 1) or "./"
+
+
+def _response(request: Request, name: str, content: bytes, packed: bytes, headers: dict[str, str]) -> Response:
+    headers = {**headers, "vary": "accept-encoding"}
+    if "gzip" in request.headers.get("accept-encoding", ""):
+        content, headers["content-encoding"] = packed, "gzip"
+    return Response(content, media_type=_TYPES[name.rpartition(".")[2]], headers=headers)
 
 
 def _link(module: str) -> bytes:
-    return b'<link rel="modulepreload" href="/static/{version}/%s">' % module.encode()
+    return b'<link rel="modulepreload" href="{root}static/{version}/%s">' % module.encode()
 
 
 def _read(folder: Traversable, path: str) -> Iterator[tuple[str, bytes]]:
@@ -91,12 +104,15 @@ def _read(folder: Traversable, path: str) -> Iterator[tuple[str, bytes]]:
             yield from _read(entry, f"{path}{entry.name}/")
         elif suffix in _TYPES:
             content = entry.read_bytes()
-            yield path + entry.name, stripped(content, suffix) if suffix in ("css", "js", "mjs") else content
+            yield path + entry.name, stripped(content, suffix)
 
 
 def stripped(source: bytes, suffix: str) -> bytes:
-    """Without indentation and comments: a sixth less to send, and every line keeps its number."""
-    text = _COMMENTS.sub(lambda found: "\n" * found[0].count("\n"), source.decode())
-    if suffix != "css":
+    """Without indentation, comments and empty lines: a sixth less to send."""
+    text = source.decode()
+    if suffix in ("css", "js", "mjs"):
+        text = _COMMENTS.sub("", text)
+    if suffix in ("js", "mjs"):
         text = _LINE_ENDS.sub("", text)
-    return _INDENTATION.sub("", text).encode()
+    text = _INDENTATION.sub("", text)
+    return (_LOOSE.sub(r"\1", text) if suffix == "css" else text).encode()

@@ -507,11 +507,11 @@ def test_odd_bodies_stop_nothing(hall: Hall, everything: Everything, body: bytes
 
 def test_the_login_leads_back_to_the_page_that_was_asked_for(hall: Hall) -> None:
     with hall.client() as client:
-        assert client.get(f"/r/{GOOB}").headers["location"] == f"/login?next=/r/{GOOB}"
-        assert client.get("/").headers["location"] == "/login"
+        assert client.get(f"/r/{GOOB}").headers["location"] == f"../../../login?next=/r/{GOOB}"
+        assert client.get("/").headers["location"] == "./login"
         assert client.get("/r/%0d%0aset-cookie:%20x=y").status_code == 404
         odd = client.get("/r/%22%3E//evil.test?x=y&next=//evil.test")
-        assert odd.headers["location"] == "/login?next=/r/%22%3E//evil.test"
+        assert odd.headers["location"] == "../../../login?next=/r/%22%3E//evil.test"
 
 
 # -- slow and many

@@ -239,7 +239,7 @@ def test_without_login_everybody_is_admin() -> None:
     site = Site(login_=False, https=False)
     assert site.run(lambda client: client.get("/who")).json() == ["local", "admin"]
     answer = site.run(lambda client: client.get("/login"))
-    assert (answer.status_code, answer.headers["location"]) == (303, "/")
+    assert (answer.status_code, answer.headers["location"]) == (303, "./")
     assert site.run(lambda client: site.post(client, "/api/logout", {})).status_code == 200
     site.close()
 
@@ -261,10 +261,10 @@ def test_the_page_names_the_server_and_needs_no_session(site: Site) -> None:
     assert answer.headers["content-type"] == "text/html; charset=utf-8"
     assert answer.headers["cache-control"] == "no-store"
     assert '<span class="server">&lt;fair&gt; &amp; co</span>' in answer.text
-    assert "/static/0123456789ab/login.js" in answer.text
+    assert "./static/0123456789ab/login.js" in answer.text
     assert "{" not in answer.text
     assert "style=" not in answer.text
-    assert answer.text.count("<script") == answer.text.count('<script type="module" src="/static/')
+    assert answer.text.count("<script") == answer.text.count('<script type="module" src="./static/')
 
 
 def test_who_is_logged_in_goes_to_the_fleet(site: Site) -> None:
@@ -273,7 +273,7 @@ def test_who_is_logged_in_goes_to_the_fleet(site: Site) -> None:
         return await client.get("/login")
 
     answer = site.run(work)
-    assert (answer.status_code, answer.headers["location"]) == (303, "/")
+    assert (answer.status_code, answer.headers["location"]) == (303, "./")
 
 
 def test_logins_by_get_and_from_other_sites_are_refused(site: Site) -> None:

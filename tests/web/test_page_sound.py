@@ -160,7 +160,7 @@ def test_a_page_that_stood_still_learns_that_its_talk_has_ended() -> None:
     steps = """const define = (name, value) => Object.defineProperty(globalThis, name, { value, configurable: true });
     const said = [];
     define("self", { postMessage: (message) => said.push(message) });
-    define("location", { protocol: "http:", host: "127.0.0.1" });
+    define("location", { origin: "http://127.0.0.1" });
     define("WebSocket", class { static OPEN = 1; });
     let now = 0;
     performance.now = () => now;

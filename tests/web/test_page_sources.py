@@ -100,7 +100,7 @@ def test_a_load_of_the_page_is_small(screen: str):
     names = {str(path.relative_to(STATIC.resolve())) for one in modules for path in _imported(one.resolve())}
     names |= {f"{screen}.html", "app.css", "icons.svg", "manifest.webmanifest"}
     names |= {f"{screen}.css"} & set(served)
-    size = sum(len(gzip.compress(served[name], 9)) for name in names)
+    size = sum(len(gzip.compress(served[name].replace(b"{root}", b"../../../../"), 9)) for name in names)
     assert size <= 1000 * MOST_KB, f"{size} bytes in {len(names)} files"
 
 
@@ -126,8 +126,8 @@ def test_style_sheets_that_are_fetched_later_do_not_restyle_each_other():
 def test_comments_and_indentation_are_left_out():
     code = ['const a = "// no"; // it\'s kept: a quote follows', "b = 1 /* in */ + 2;", "c = `// ${a}`;"]
     source = f"/** What.\n * @param {{string}} a */\n  {code[0]}\n  // gone\n{code[1]} // gone\n{code[2]}\n"
-    assert stripped(source.encode(), "js").decode() == f"\n\n{code[0]}\n\n{code[1]}\n{code[2]}\n"
-    assert stripped(b"a {\n  b: url(//c); /* d */\n}\n", "css") == b"a {\nb: url(//c); /* d */\n}\n"
+    assert stripped(source.encode(), "js").decode() == f"{code[0]}\n{code[1]}\n{code[2]}\n"
+    assert stripped(b"a {\n  b: url(//c); /* d */\n\n}\n", "css") == b"a{\nb:url(//c); /* d */\n}\n"
 
 
 def test_what_is_sent_is_the_same_program(tmp_path: Path):

@@ -5,8 +5,14 @@ from __future__ import annotations
 import io
 import json
 import os
+import signal
+import sys
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
+from itertools import product
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +23,9 @@ import pytest
 from pebble.fleet.people import People
 from pebble.fleet.roles import Role
 from pebble.recordings.library import files
+from pebble.recordings.seek import questions
 from pebble.recordings.seek.segment import Flag, unpacked
+from pebble.web import archive_process
 from pebble.web import recordings as routes
 from tests.recordings.messages import START_NS
 from tests.recordings.others import DAMAGED
@@ -239,6 +247,135 @@ def test_what_was_recorded_may_be_read_with_the_json_that_the_page_reads(archive
     assert imu == [js(t=ms(1 + 0.1 * number), n=50 + 5 * number) for number in range(10)]
     assert json.loads(imu[0])["n"] == 50
     assert CAMERA.endswith("front-camera")
+
+
+# -- jobs that fail
+
+
+def without(package: str, answer: Connection, *arguments: Any) -> None:
+    sys.modules[package] = None  # type: ignore[assignment]
+    _job_of(arguments)(answer, *arguments)
+
+
+def full(answer: Connection, *_: Any) -> None:
+    _fail(answer, OSError(28, "No space left on device", "/tmp/x"))
+
+
+def locked(answer: Connection, *arguments: Any) -> None:
+    _fail(answer, PermissionError(13, "Permission denied", "/data/index"))
+
+
+def faulty(answer: Connection, *_: Any) -> None:
+    _fail(answer, ValueError("a fault\nof two lines"))
+
+
+def too_large(answer: Connection, *_: Any) -> None:
+    _fail(answer, MemoryError())
+
+
+def killed(answer: Connection, *_: Any) -> None:
+    answer.send(("done", 0.5))
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def ended(_answer: Connection, *_: Any) -> None:
+    sys.exit(3)
+
+
+def silent(_answer: Connection, *_: Any) -> None:
+    threading.Event().wait()
+
+
+def stopped(answer: Connection, *_: Any) -> None:
+    answer.send(("done", 0.5))
+    os.kill(os.getpid(), signal.SIGSTOP)
+
+
+def _job_of(arguments: tuple[Any, ...]) -> Callable[..., None]:
+    return questions.make_timeline_job if isinstance(arguments[0], Path) else questions.export_job
+
+
+def _fail(answer: Connection, error: Exception) -> None:
+    def work() -> None:
+        raise error
+
+    questions.answer_with(answer, work)
+
+
+FAILURES: dict[str, tuple[Callable[..., None], str]] = {
+    "DuckDB is missing": (partial(without, "duckdb"), 'this needs DuckDB: pip install "pebble-robot[archive]"'),
+    "zstandard is missing": (partial(without, "zstandard"), 'pip install "pebble-robot['),
+    "PyAV is missing": (partial(without, "av"), "film needs PyAV: pip install 'pebble-robot[media]'"),
+    "the disk is full": (full, "No space left on device; make room on its disk"),
+    "the folder is closed": (locked, "/data/index: Permission denied; give the user of this server access to it"),
+    "a fault": (faulty, "ValueError: a fault"),
+    "no memory": (too_large, "there is too little memory: end other programs, or choose less"),
+    "killed": (killed, "its process was killed, as it is where memory runs out"),
+    "ended": (ended, "its process has ended (3): the log of the server says why"),
+    "silent": (silent, "it did nothing for 3 s and was ended: look at the disk, then try again"),
+    "stopped": (stopped, "it did nothing for 3 s and was ended: look at the disk, then try again"),
+}
+NOT_OF = {  # they do without
+    ("timeline", "PyAV is missing"),
+    ("timeline", "zstandard is missing"),
+    ("export", "DuckDB is missing"),
+}
+
+
+@pytest.mark.parametrize(
+    ("kind", "failure"), [one for one in product(["timeline", "export"], FAILURES) if one not in NOT_OF]
+)
+def test_a_job_that_fails_is_shown_with_its_reason_until_a_person_tries_again(
+    broker: Broker, folder: Path, monkeypatch: pytest.MonkeyPatch, kind: str, failure: str
+) -> None:
+    job, why = FAILURES[failure]
+    asked = partial(get, path="timeline", day=DAY, robot=GOOB)
+    with Served(broker.port, recordings=folder) as running, monkeypatch.context() as patched:
+        patched.setattr(archive_process, "SILENT_S", 3.0 if job in (silent, stopped) else archive_process.SILENT_S)
+        patched.setattr(questions, "make_timeline_job" if kind == "timeline" else "export_job", job)
+        if kind == "timeline":
+            assert until(lambda: asked(running).status_code != 202, 30, step=0.1)
+            answers = [asked(running) for _ in range(3)]
+            assert [(one.status_code, why in one.text, "\n" in one.text) for one in answers] == 3 * [(422, True, False)]
+        else:
+            wanted = {"robot": GOOB, "since": ms(5), "until": ms(6), "as": "mkv"}
+            place = f"exports/{post(running, 'exports', wanted).json()['id']}"
+            assert until(lambda: get(running, place).json()["state"] != "running", 30, step=0.1)
+            shown = get(running, place).json()
+            assert (shown["state"], why in shown["why"]) == ("failed", True), shown
+        patched.undo()
+        if kind == "timeline":
+            pytest.importorskip("duckdb")
+            assert asked(running, again=1).status_code == 202
+            assert until(lambda: asked(running).status_code == 200, 30, step=0.1)
+        else:
+            assert post(running, "exports", wanted).status_code == 202
+
+
+@pytest.mark.parametrize(
+    ("break_it", "why"),
+    [
+        (lambda archive, _: (archive / "index").write_text(""), "index: File exists; move it away"),
+        (lambda archive, _: _flip(next(archive.rglob("*.state.mcap"))), "state.mcap: is not a recording (MCAP)"),
+        (lambda _, scratch: scratch.rmdir(), ""),
+    ],
+)
+def test_a_timeline_of_a_folder_that_is_not_as_it_was(
+    broker: Broker, tmp_path: Path, break_it: Callable[[Path, Path], object], why: str
+) -> None:
+    pytest.importorskip("duckdb")
+    archive = film(tmp_path, "h264", 2)
+    with Served(broker.port, recordings=archive) as running:
+        break_it(archive, Path(running.app.state.recordings.scratch))
+        asked = partial(get, running, "timeline", day=DAY, robot=GOOB)
+        assert until(lambda: asked().status_code != 202, 30, step=0.1)
+        assert [why in one.text for one in (asked(), asked(), asked())] == [True] * 3
+        assert asked().status_code == (422 if why else 200)
+
+
+def _flip(file: Path) -> None:
+    with file.open("r+b") as opened:
+        opened.write(b"x")
 
 
 def _is_zombie(pid: int) -> bool:

@@ -253,6 +253,30 @@ def test_a_day_that_is_being_indexed(server: CannedServer, browser: Browser):
         opened.page.get_by_text("not recorded (1)").wait_for()
 
 
+@pytest.mark.parametrize("size", ["desktop", "phone"])
+def test_a_day_that_cannot_be_indexed_is_tried_again_by_people_only(browser: Browser, server: CannedServer, size):
+    server.show(STATES["replay"])
+    asked: list[str] = []
+
+    def failing(route: Route) -> None:
+        asked.append(route.request.url)
+        if "again=1" in route.request.url:
+            route.continue_()
+        else:
+            route.fulfill(status=422, body='this needs DuckDB: pip install "pebble-robot[archive]"')
+
+    with tab(browser, "about:blank", size) as opened:
+        opened.context.route(re.compile("/archive/timeline"), failing)
+        opened.page.goto(server.url + STATES["replay"].path)
+        opened.page.get_by_text("this needs DuckDB: pip install").wait_for()
+        opened.page.wait_for_timeout(1500)  # three questions of a page that would go on
+        before = len(asked)
+        assert before <= 2
+        opened.test("try-again").click()
+        assert opened.until("!!window.pebble?.replay?.timeline", 30)
+        assert len(asked) == before + 1
+
+
 def test_the_timeline_is_zoomed_moved_and_clicked(replay: Tab):
     canvas = replay.test("timeline")
     box = canvas.bounding_box()

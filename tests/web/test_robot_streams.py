@@ -5,19 +5,25 @@ What the server allows is in the policy of the page; the page checks each addres
 
 from __future__ import annotations
 
+import socket
 from collections.abc import Iterator
 
 import httpx
 import msgspec
 import pytest
 
+from pebble.transports import MqttSettings
 from pebble.web.guard import CONTENT_SECURITY_POLICY
-from pebble.web.robot_streams import MAX_ORIGINS, origin
+from pebble.web.robot_streams import MAX_ORIGINS, OwnHosts, origin
+from pebble.web.settings import WebSettings
 from tests.support import Broker, until
 from tests.web.in_node import evaluate
 from tests.web.served import RecordingRobot, Served
 
 HOST = "pebble.local"
+NAMES = (HOST, "*.hall.example", "[fd00::7]:9", "lab.example:443")
+BROKER = MqttSettings(host="127.0.0.1")
+OWN = OwnHosts(WebSettings(broker=BROKER, names=NAMES))
 
 GOOD = {
     "http://pitcam.local:8889/cam": "http://pitcam.local:8889",
@@ -74,21 +80,45 @@ BAD = [
     "https://PEBBLE.LOCAL:1/",
     "http://pebble.local./",
 ]
+#: The page's own hosts by other names and in other spellings, which browsers may have its cookie for.
+ALIASES = [
+    "http://127.0.0.1:8889/",
+    "http://127.1/",
+    "http://2130706433/",
+    "http://0x7f.1:8889/",
+    "http://0177.0.0.1/",
+    "http://0x7F000001/",
+    "http://127.8.9.10/",
+    "http://[::1]:8889/",
+    "http://[0:0:0::1]/",
+    "http://[::ffff:127.0.0.1]/",
+    "http://[::ffff:7f00:1]/",
+    "http://0.0.0.0:8889/",
+    "http://0/",
+    "http://[::]/",
+    "http://localhost/",
+    "http://LocalHost:8889/",
+    "http://localhost./",
+    "http://pebble.localhost/",
+    "http://cam.hall.example/",
+    "https://[fd00:0::7]/",
+    "http://lab.example/",
+]
 
 
 @pytest.mark.parametrize("url", GOOD)
 def test_an_origin_is_scheme_host_and_port(url: str) -> None:
-    assert origin(url, HOST) == GOOD[url]
+    assert origin(url, OWN) == GOOD[url]
 
 
-@pytest.mark.parametrize("url", BAD)
+@pytest.mark.parametrize("url", [*BAD, *ALIASES])
 def test_tricks_are_no_origin(url: str) -> None:
-    assert origin(url, HOST) == ""
+    assert origin(url, OWN) == ""
 
 
 @pytest.mark.parametrize("value", [None, 7, True, {"url": "http://a.b"}, ["http://a.b"]])
 def test_what_is_no_text_is_no_origin(value: object) -> None:
-    assert origin(value, HOST) == ""
+    assert origin(value, OWN) == ""
 
 
 def test_the_page_refuses_the_same() -> None:
@@ -152,10 +182,23 @@ def test_what_may_not_be_shown_changes_no_policy(served: Served, robot: Recordin
         assert policy(served) == policy(served, f"/r/{robot.base}") == CONTENT_SECURITY_POLICY, url
 
 
-def test_the_own_host_is_refused_by_whichever_name_the_page_was_opened(served: Served, robot: RecordingRobot) -> None:
-    report(served, robot, "http://localhost:8889/cam")
-    assert "frame-src http://localhost:8889" in policy(served)
-    assert policy(served, host="localhost") == CONTENT_SECURITY_POLICY
+def test_the_own_hosts_are_refused_by_whichever_name_the_page_was_opened(served: Served, robot: RecordingRobot) -> None:
+    for url in ("http://localhost:8889/cam", "http://127.1:8889/cam"):
+        report(served, robot, url)
+        assert policy(served) == policy(served, host="localhost") == CONTENT_SECURITY_POLICY
+        with served.page() as page:
+            page.send("stream-address", ref=robot.base, url=url)
+            assert until(lambda page=page: page.refused)
+            assert "browsers would send its login there" in page.refused[0]["why"]
+
+
+def test_the_addresses_of_a_machine_are_its_own_where_the_page_is_reached_by_them() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.connect(("192.0.2.1", 9))  # sends nothing
+        address = probe.getsockname()[0]
+    local, reached = (OwnHosts(WebSettings(broker=BROKER, host=one)) for one in ("127.0.0.1", "0.0.0.0"))
+    assert (address in local, address in reached, "192.0.2.1" in reached) == (False, True, False)
+    assert socket.gethostname() in reached
 
 
 def test_the_open_robot_comes_first_and_the_header_stays_short(

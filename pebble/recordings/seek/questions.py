@@ -6,9 +6,11 @@ otherwise delay the loop that passes on drive commands.
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import tempfile
+import time
 from collections.abc import Callable
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -35,6 +37,19 @@ from pebble.runtime.parent import end_with_parent
 FILMS: Final = frozenset({"mkv", "mp4"})
 _LONGEST_WHY: Final = 500  # characters: a message is sent as a whole
 _NICE: Final = 10  # driving comes first
+_ALIVE_S: Final = 5.0  # between two signs of life of a job
+_ACCESS: Final = "give the user of this server access to it"
+_ROOM: Final = "make room on its disk"
+_MENDS: Final = {
+    errno.ENOSPC: _ROOM,
+    errno.EDQUOT: _ROOM,
+    errno.EACCES: _ACCESS,
+    errno.EPERM: _ACCESS,
+    errno.EROFS: _ACCESS,
+    errno.EEXIST: "move it away",
+    errno.ENOTDIR: "move it away",
+    errno.EIO: "look at the disk (dmesg)",
+}
 _archive: Archive
 _days: Days
 
@@ -88,7 +103,7 @@ def make_timeline_job(
         target.write_bytes(msgspec.json.encode(made))
         return ""
 
-    _answer(answer, work)
+    answer_with(answer, work)
 
 
 def export_job(
@@ -120,30 +135,47 @@ def export_job(
                     raise PebbleError(f"there is no message of {robot} in this stretch")
         return "; ".join(problems(damages))
 
-    _answer(answer, work)
+    answer_with(answer, work)
 
 
 class _Progress:
-    """Sends the share of the work that is done, in steps of a percent."""
+    """Sends the share of the work that is done: in steps of a percent, and as a sign of life."""
 
     def __init__(self, answer: Connection) -> None:
-        self._answer, self._sent = answer, -1
+        self._answer, self._sent, self._sent_at = answer, -1, 0.0
 
     def share(self, _what: str, share: float) -> None:
-        percent = int(100 * max(0.0, min(1.0, share)))
-        if percent > self._sent:
-            self._sent = percent
-            self._answer.send(("done", percent / 100))
+        percent, now = int(100 * max(0.0, min(1.0, share))), time.monotonic()
+        if percent > self._sent or now - self._sent_at > _ALIVE_S:
+            self._sent, self._sent_at = max(percent, self._sent), now
+            self._answer.send(("done", self._sent / 100))
 
 
-def _answer(answer: Connection, work: Callable[[], str]) -> None:
-    """``work`` returns what it could not read."""
+def answer_with(answer: Connection, work: Callable[[], str]) -> None:
+    """Do the work of a job, and answer what came of it. ``work`` returns what it could not read."""
     try:
         answer.send(("ready", work()[:_LONGEST_WHY]))
-    except PebbleError as error:
-        answer.send(("failed", str(error).partition("\n")[0][:_LONGEST_WHY]))
-    except OSError as error:
-        answer.send(("failed", f"{error.filename or 'a file'}: {error.strerror or error}"[:_LONGEST_WHY]))
+    except Exception as error:
+        answer.send(("failed", reason(error)))
+        if not isinstance(error, (PebbleError, OSError, ImportError)):
+            raise  # its traceback is for the log
+
+
+def reason(error: Exception) -> str:
+    """What has failed and what helps, in one line."""
+    match error:
+        case PebbleError():
+            words = str(error)
+        case ImportError():
+            words = f'{error.name or error} is missing: pip install "pebble-robot[archive,media]"'
+        case MemoryError():
+            words = "there is too little memory: end other programs, or choose less"
+        case OSError():
+            mend = _MENDS.get(error.errno or 0, "")
+            words = f"{error.filename or 'a file'}: {error.strerror or error}{mend and f'; {mend}'}"
+        case _:
+            words = f"{type(error).__name__}: {error}; the log of the server says where"
+    return words.partition("\n")[0][:_LONGEST_WHY]
 
 
 def _in_background(nice: int) -> None:

@@ -6,6 +6,8 @@ const password = /** @type {HTMLInputElement} */ (document.getElementById("passw
 const submit = /** @type {HTMLButtonElement} */ (document.getElementById("submit"));
 const why = document.getElementById("why");
 
+const ROOT = new URL("../../", import.meta.url); // where our server begins, below any path of a proxy
+
 /**
  * Where to go after the login: the screen that was asked for, else the fleet. Never to another site.
  * @param {string} search the query of this page, `?next=/r/pebble/robots/goob`
@@ -22,7 +24,7 @@ export function nextPage(search) {
 async function logIn() {
   let response;
   try {
-    response = await fetch("/api/login", {
+    response = await fetch(new URL("api/login", ROOT), {
       method: "POST",
       headers: { "content-type": "application/json" },
       body: JSON.stringify({ user: user.value.trim(), password: password.value }),
@@ -40,7 +42,8 @@ form?.addEventListener("submit", async (event) => {
   why.textContent = "";
   const refused = await logIn();
   if (!refused) {
-    location.assign(nextPage(location.search));
+    const next = new URL(`.${nextPage(location.search)}`, ROOT);
+    location.assign(next.href.startsWith(ROOT.href) ? next : ROOT);
     return;
   }
   submit.disabled = false;

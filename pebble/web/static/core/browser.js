@@ -80,9 +80,12 @@ export const fullScreen = {
 /** @param {URL | string} url of a module @returns {Worker} or an error is thrown */
 export const worker = (url) => new Worker(url, { type: "module" });
 
-/** @param {string} path at our server @returns {WebSocket | null} */
+/** Where our server begins: below any path of a proxy, modules are three folders further. "/", "/robots/" */
+export const ROOT = new URL("../../../", import.meta.url).pathname;
+
+/** @param {string} path below ROOT @returns {WebSocket | null} */
 export const webSocket = (path) =>
-  attempt(() => new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}${path}`), null);
+  attempt(() => new WebSocket(`${location.origin.replace("http", "ws")}${ROOT}${path}`), null);
 
 /** @param {string} name of a class or function @returns {any} undefined: it is not here */
 export const find = (name) => attempt(() => globalThis[name], undefined);

@@ -37,7 +37,7 @@ export class ControlSocket {
   }
 
   connect() {
-    const socket = browser.webSocket("/ws/control");
+    const socket = browser.webSocket("ws/control");
     if (!socket) return this.lost(0);
     this.socket = socket;
     this.heardAt = performance.now();
@@ -154,7 +154,7 @@ export class ControlSocket {
 /** A refused handshake looks like a lost connection: only a request tells whether the session has ended. */
 async function askForLogin() {
   try {
-    const answer = await fetch("/", { redirect: "manual", cache: "no-store" });
+    const answer = await fetch(browser.ROOT, { redirect: "manual", cache: "no-store" });
     if (answer.type === "opaqueredirect") location.reload(); // to the login, which leads back here
   } catch {
     // there is no server at the moment

@@ -35,7 +35,7 @@ export class Estop {
     pressed.reached = false;
     try {
       const headers = { "content-type": "application/json" };
-      const url = `/api/estop?name=${encodeURIComponent(this.socket.you?.user ?? "")}`;
+      const url = `${browser.ROOT}api/estop?name=${encodeURIComponent(this.socket.you?.user ?? "")}`;
       const answer = await fetch(url, { method: "POST", headers, body: JSON.stringify(op), keepalive: true });
       pressed.reached = answer.ok;
     } catch {

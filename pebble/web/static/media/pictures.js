@@ -82,7 +82,7 @@ export class Pictures {
     if (connection !== this.connection) return; // stopped meanwhile
     this.worker ??= this.startWorker();
     const query = new URLSearchParams({ ref: this.state.ref, can: can.join(",") });
-    const socket = browser.webSocket(`/ws/media?${query}`);
+    const socket = browser.webSocket(`ws/media?${query}`);
     if (!socket) return this.lost();
     socket.binaryType = "arraybuffer";
     socket.onopen = () => this.change({ connection: "open" });

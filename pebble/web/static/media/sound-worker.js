@@ -49,7 +49,7 @@ async function open(message) {
 }
 
 function connect() {
-  const mine = browser.webSocket(`/ws/sound?${new URLSearchParams({ ref, can, name, device })}`);
+  const mine = browser.webSocket(`ws/sound?${new URLSearchParams({ ref, can, name, device })}`);
   if (!mine) return lost();
   mine.binaryType = "arraybuffer";
   received = 0;

@@ -5,7 +5,7 @@ import { Banners } from "./banner.js";
 import { Header } from "./header.js";
 import { Boundary, fetchRest, html, styled, useEffect, useMedia, useModel, usePage, useState } from "./hooks.js";
 import { Part } from "./parts.js";
-import { nameOf } from "./words.js";
+import { nameOf, visible } from "./words.js";
 
 /** What is fetched when it is first shown, so that the first screen is there soon; main.js fetches the rest later. */
 export const PARTS = {
@@ -40,7 +40,7 @@ export function App() {
   const { shown } = useModel(panels);
   const [drawer, setDrawer] = useState(false);
   useEffect(() => {
-    document.title = ref ? `${nameOf(ref)} – Pebble` : replay === null ? "Pebble" : "Recordings – Pebble";
+    document.title = ref ? `${visible(nameOf(ref))} – Pebble` : replay === null ? "Pebble" : "Recordings – Pebble";
     setDrawer(false);
   }, [ref, replay]);
   const toggle = () => panels.toggle("settings");

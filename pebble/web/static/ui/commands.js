@@ -1,5 +1,7 @@
 // What the cards and panels can ask for, besides driving and stops.
 
+import { ROOT } from "../core/browser.js";
+
 /** @param {any} page */
 export function install(page) {
   const { commands, settings, connection: { socket } } = page;
@@ -32,8 +34,8 @@ export function install(page) {
     },
     async logOut() {
       const headers = { "content-type": "application/json" };
-      await fetch("/api/logout", { method: "POST", headers, body: "{}" }).catch(() => {});
-      location.assign("/login");
+      await fetch(`${ROOT}api/logout`, { method: "POST", headers, body: "{}" }).catch(() => {});
+      location.assign(`${ROOT}login`);
     },
   });
 }

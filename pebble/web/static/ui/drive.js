@@ -1,5 +1,6 @@
 // Driving: who may, why not, the stick, and how fast.
 
+import { ROOT } from "../core/browser.js";
 import { html, styled, useCalm, useModel, usePage, useValue } from "./hooks.js";
 import { Card, HoldButton, Icon, Part } from "./parts.js";
 import { Stick } from "./stick.js";
@@ -69,7 +70,7 @@ function ReasonAction({ action }) {
         ${action.label}
       </button>`;
     case "login":
-      return html`<a class="button" href="/login">${action.label}</a>`;
+      return html`<a class="button" href=${`${ROOT}login`}>${action.label}</a>`;
     case "reload":
       return html`<button type="button" onClick=${() => location.reload()}>${action.label}</button>`;
     default:

@@ -1,5 +1,6 @@
 // All components at a glance: who is there, who drives, what is stopped.
 
+import { ROOT } from "../core/browser.js";
 import { doubtOf } from "./doubt.js";
 import { RouteLink, Liveness } from "./header.js";
 import {
@@ -19,7 +20,7 @@ import { Offers, Route, WATCHES } from "./models.js";
 import { charging, plain, shortTime } from "./more-words.js";
 import { Icon, Live, StopButton } from "./parts.js";
 import { RecordingsLink } from "./recordings-link.js";
-import { battery, clockTime, driverName, inner, isObject, kindOf, nameOf, roughly, typeOf } from "./words.js";
+import { battery, clockTime, driverName, inner, isObject, kindOf, nameOf, roughly, typeOf, visible } from "./words.js";
 
 const THUMBNAIL_MS = 1000;
 const SORTS = { name: "name", type: "type", battery: "battery" };
@@ -276,7 +277,7 @@ function Thumbnail({ at, picture }) {
     return html`<div class="thumbnail"><${Icon} name="camera" />camera rests</div>`;
   }
   return html`<div class="thumbnail">
-    <img alt=${`What ${nameOf(at)} sees`} src=${`/api/snapshot.jpg?ref=${encodeURIComponent(at)}&n=${count}`} />
+    <img alt=${`What ${visible(nameOf(at))} sees`} src=${`${ROOT}api/snapshot.jpg?ref=${encodeURIComponent(at)}&n=${count}`} />
   </div>`;
 }
 

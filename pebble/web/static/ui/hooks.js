@@ -1,12 +1,22 @@
 // What every widget is made of: templates, the page's services, and values that follow the store.
 
 import * as browser from "../core/browser.js";
-import { Component, createContext, h } from "../vendor/preact.mjs";
+import { visible } from "../core/json.js";
+import { Component, createContext, h, options } from "../vendor/preact.mjs";
 import { useContext, useEffect, useReducer, useRef, useState } from "../vendor/hooks.mjs";
 import htm from "../vendor/htm.mjs";
 
 export { useContext, useEffect, useRef, useState };
 export const html = htm.bind(h);
+
+const LABEL = "aria-label";
+
+/** All that is drawn or read out passes here. @param {any} node */
+options.vnode = (node) => {
+  const { type, props } = node;
+  if (type === null) node.props = visible(props);
+  else if (props[LABEL]) props[LABEL] = visible(props[LABEL]);
+};
 
 /** The services that main.js makes: store, connection, commands, driver, video, settings, route. */
 export const Page = createContext(null);

@@ -89,17 +89,17 @@ export class Route extends Model {
   }
 
   get ref() {
-    return below("/r/") ?? "";
+    return below("r/") ?? "";
   }
 
   /** Of which component the recordings are shown; "" one is to be chosen; null: no recordings are. @returns {string | null} */
   get replay() {
-    return below("/replay")?.slice(1) ?? null;
+    return below("replay")?.slice(1) ?? null;
   }
 
   /** @param {string} ref @returns {string} the address of its screen, which only watches if this one does */
   static path(ref, watches = WATCHES) {
-    const path = ref ? `/r/${ref.split("/").map(encodeURIComponent).join("/")}` : "/";
+    const path = browser.ROOT + (ref && `r/${ref.split("/").map(encodeURIComponent).join("/")}`);
     return watches ? `${path}?watch` : path;
   }
 
@@ -115,15 +115,11 @@ export class Route extends Model {
   }
 }
 
-/** @param {string} folder @returns {string | null} the rest of the page's path; null: it is elsewhere */
+/** @param {string} folder below ROOT @returns {string | null} the rest of the page's path; null: it is elsewhere */
 function below(folder) {
   const path = location.pathname;
-  if (!path.startsWith(folder)) return null;
-  try {
-    return decodeURIComponent(path.slice(folder.length));
-  } catch {
-    return "";
-  }
+  const begin = browser.ROOT + folder;
+  return path.startsWith(begin) ? browser.attempt(() => decodeURIComponent(path.slice(begin.length)), "") : null;
 }
 
 /** What is remembered in this browser. Private windows may refuse to remember anything. */

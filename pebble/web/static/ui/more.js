@@ -1,5 +1,6 @@
 // What is not needed at once: actions of keys and gamepad besides driving, the screen that stays on, and wall screens.
 
+import { ROOT } from "../core/browser.js";
 import * as more from "../core/browser-more.js";
 import { Actions } from "../core/actions.js";
 import { Awake } from "../core/awake.js";
@@ -115,7 +116,7 @@ class Wall {
   /** Without an answer the browser would show a page of its own, and stay there. */
   async reload() {
     this.uselessSince = performance.now(); // of the next attempt
-    const answer = await fetch("/healthz", { cache: "no-store" }).catch(() => null);
+    const answer = await fetch(`${ROOT}healthz`, { cache: "no-store" }).catch(() => null);
     if (answer?.ok) location.reload();
   }
 }

@@ -1,5 +1,6 @@
 // The address of this screen as a QR code; or why a phone cannot open it.
 
+import { ROOT } from "../core/browser.js";
 import { qrCode, pathOf } from "../core/qr.js";
 import { html, useModel, usePage } from "./hooks.js";
 import { Route } from "./models.js";
@@ -21,7 +22,7 @@ export const isLoopback = (host) => /^(127\.[\d.]+|0\.0\.0\.0|\[::1?\]|localhost
 function Code({ at }) {
   const whole = location.origin + Route.path(at, false);
   const grid = qrCode(whole);
-  const address = grid ? whole : location.origin;
+  const address = grid ? whole : location.origin + ROOT;
   return html`<div class="panel-text">
     <${Drawn} grid=${grid ?? qrCode(address)} text=${address} />
     <p class="address" data-test="address">${address}</p>
@@ -31,7 +32,7 @@ function Code({ at }) {
     </p>
     ${location.protocol === "https:" &&
     html`<p class="dim">
-      If the phone does not trust the certificate: let it install <span class="address">${location.origin}/ca.pem</span>
+      If the phone does not trust the certificate: let it install <span class="address">${location.origin}${ROOT}ca.pem</span>
     </p>`}
   </div>`;
 }

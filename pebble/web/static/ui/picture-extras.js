@@ -7,7 +7,7 @@ import { Model, read, write } from "./models.js";
 import { Icon, Why } from "./parts.js";
 import { useStream } from "./video.js";
 import { NewestOverlays, STALE_MS, contained, drawOverlays } from "../media/overlays.js";
-import { nameOf } from "./words.js";
+import { nameOf, visible } from "./words.js";
 
 const OVERLAYS = "video-overlays";
 
@@ -92,7 +92,8 @@ function paint(canvas, picture, overlays) {
   if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
   const context = canvas.getContext("2d");
   context.clearRect(0, 0, width, height);
-  drawOverlays(context, overlays, contained(picture.width, picture.height, width, height), scale);
+  const labels = overlays.labels.map((one) => ({ ...one, text: visible(one.text) }));
+  drawOverlays(context, { ...overlays, labels }, contained(picture.width, picture.height, width, height), scale);
 }
 
 /** Buttons below the picture of ``source``. ``wanted``: whether pictures are. */

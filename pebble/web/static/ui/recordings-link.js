@@ -1,12 +1,13 @@
 // The way to what was recorded, where this server has recordings; fetched after the first picture.
 
+import { ROOT } from "../core/browser.js";
 import { RouteLink } from "./header.js";
 import { html, useModel, usePage } from "./hooks.js";
 import { Route, WATCHES } from "./models.js";
 import { Icon } from "./parts.js";
 
 /** @param {string} ref "": all @returns {string} the address of its recordings */
-export const recordingsOf = (ref) => `/replay${ref && Route.path(ref, false).slice(2)}`;
+export const recordingsOf = (ref) => `${ROOT}replay${ref && Route.path(ref, false).slice(`${ROOT}r`.length)}`;
 
 /** @param {{at?: string, className?: string}} props ``at``: of this component only */
 export function RecordingsLink({ at = "", className = "button" }) {

@@ -1,8 +1,8 @@
 // How values are written for people. Everything of a robot is text, whatever type it claims to be.
 
-import { isObject } from "../core/json.js";
+import { isObject, visible } from "../core/json.js";
 
-export { isObject };
+export { isObject, visible };
 
 const time = new Intl.DateTimeFormat("en-GB", { hour: "2-digit", minute: "2-digit", second: "2-digit" });
 

@@ -1,5 +1,6 @@
 /** The recordings of the server, as its /archive/ offers them. No framework, no DOM. */
 
+import { ROOT } from "../browser.js";
 import { readFrames } from "./frames.js";
 
 const MOST_BYTES = 24_000_000; // of one segment: the server ends one at 8 MB of pictures
@@ -27,17 +28,19 @@ export class Archive {
 
   /** @param {AbortSignal} [signal] @returns {Promise<Day[]>} newest first */
   async days(signal) {
-    return (await this.get("/archive/days", signal)).json();
+    return (await this.get(`${ROOT}archive/days`, signal)).json();
   }
 
   /**
-   * Waits while the day is being indexed.
+   * Waits while the day is being indexed. ``again``: also if that has failed before.
    * @param {string} day @param {string} robot @param {(share: number) => void} onIndexing @param {AbortSignal} signal
+   * @param {boolean} [again]
    * @returns {Promise<Timeline>}
    */
-  async timeline(day, robot, onIndexing, signal) {
-    for (;;) {
-      const answer = await this.get(`/archive/timeline?${query({ day, robot })}`, signal);
+  async timeline(day, robot, onIndexing, signal, again = false) {
+    for (;; again = false) {
+      const asked = query({ day, robot, ...(again ? { again: 1 } : {}) });
+      const answer = await this.get(`${ROOT}archive/timeline?${asked}`, signal);
       const value = await answer.json();
       if (answer.status !== 202) return value;
       onIndexing(value.indexing ?? 0);
@@ -51,7 +54,7 @@ export class Archive {
    */
   async segment(robot, at, lasts, seek, signal) {
     const asked = query({ robot, at: Math.floor(at), for: Math.ceil(lasts), ...(seek ? { seek: 1 } : {}) });
-    const answer = await this.get(`/archive/segment?${asked}`, signal);
+    const answer = await this.get(`${ROOT}archive/segment?${asked}`, signal);
     const bytes = await answer.arrayBuffer();
     if (bytes.byteLength > MOST_BYTES) throw new RefusedError(`${bytes.byteLength} bytes in one segment are too many`);
     const until = Math.floor(at) + Math.ceil(lasts);
@@ -67,33 +70,33 @@ export class Archive {
 
   /** @param {string} robot @param {number} at @param {number} w @returns {string} the address of a picture */
   static frame(robot, at, w) {
-    return `/archive/frame?${query({ robot, at: Math.round(at), w })}`;
+    return `${ROOT}archive/frame?${query({ robot, at: Math.round(at), w })}`;
   }
 
   /** @param {string} robot @param {number} since @param {number} step @param {number} count @returns {string} */
   static strip(robot, since, step, count) {
-    return `/archive/strip?${query({ robot, since: Math.round(since), step: Math.round(step), count, w: 160 })}`;
+    return `${ROOT}archive/strip?${query({ robot, since: Math.round(since), step: Math.round(step), count, w: 160 })}`;
   }
 
   /** @param {string} robot @param {Stretch} stretch @param {"mkv" | "mp4" | "mcap"} as @returns {Promise<string>} its id */
   async begin(robot, { since, until }, as) {
     const body = { robot, since: Math.floor(since), until: Math.ceil(until), as };
-    return (await (await this.post("/archive/exports", body)).json()).id;
+    return (await (await this.post(`${ROOT}archive/exports`, body)).json()).id;
   }
 
   /** @param {string} id @param {AbortSignal} signal @returns {Promise<ExportState>} */
   async progress(id, signal) {
-    return (await this.get(`/archive/exports/${encodeURIComponent(id)}`, signal)).json();
+    return (await this.get(`${ROOT}archive/exports/${encodeURIComponent(id)}`, signal)).json();
   }
 
   /** Ends an export, or removes what it has made. @param {string} id */
   async end(id) {
-    await this.post(`/archive/exports/${encodeURIComponent(id)}/end`, {});
+    await this.post(`${ROOT}archive/exports/${encodeURIComponent(id)}/end`, {});
   }
 
   /** @param {string} id @returns {string} the address of its file */
   static file(id) {
-    return `/archive/exports/${encodeURIComponent(id)}/file`;
+    return `${ROOT}archive/exports/${encodeURIComponent(id)}/file`;
   }
 
   /** @param {string} url @param {AbortSignal} [signal] */

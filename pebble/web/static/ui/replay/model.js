@@ -91,6 +91,8 @@ export class Replay extends Model {
     this.timeline = null;
     this.indexing = -1; // share; -1: it is not
     this.dayProblem = "";
+    this.then = () => {}; // once the timeline is here
+    this.start = () => {}; // choose a day
     this.dayAbort = new AbortController();
     this.connection = new Recorded(page.connection);
     /** What widgets get instead of the page's own services. */
@@ -175,19 +177,28 @@ export class Replay extends Model {
     return this.markIn === null && this.markOut === null ? null : this.stretch;
   }
 
-  /** @param {string} day @param {() => void} [then] once its timeline is here */
-  async openDay(day, then = () => {}) {
+  /** After what is in dayProblem. */
+  tryAgain() {
+    if (this.day) return this.openDay(this.day, this.then, true);
+    this.dayProblem = "";
+    this.changed();
+    return this.start();
+  }
+
+  /** @param {string} day @param {() => void} [then] once its timeline is here @param {boolean} [again] after a failure */
+  async openDay(day, then = () => {}, again = false) {
     if (this.closed || (day === this.day && !this.dayProblem)) return;
     this.dayAbort.abort();
     const { signal } = (this.dayAbort = new AbortController());
     if (day !== this.day) this.view = new View(day);
     this.day = day;
+    this.then = then;
     this.timeline = null;
     this.indexing = -1;
     this.dayProblem = "";
     this.changed();
     try {
-      this.timeline = await this.archive.timeline(day, this.ref, (share) => this.index(share), signal);
+      this.timeline = await this.archive.timeline(day, this.ref, (share) => this.index(share), signal, again);
       this.view.show(...extentOf(this.timeline, this.view));
       then();
     } catch (error) {

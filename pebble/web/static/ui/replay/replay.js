@@ -40,7 +40,8 @@ function Opened({ at }) {
     const go = () => live.route.replay === at && start(made);
     addEventListener("popstate", go);
     document.addEventListener("keydown", keysOf(made));
-    start(made);
+    made.start = () => start(made);
+    made.start();
     return () => {
       removeEventListener("popstate", go);
       document.removeEventListener("keydown", keysOf(made));

@@ -74,7 +74,10 @@ export function TimelineCard({ replay }) {
         ></canvas>
         <div class="playhead" hidden></div>
         ${hover && html`<${Hover} replay=${replay} ...${hover} />`}
-        ${!timeline && html`<p class="timeline-cover" role="status">${coverWords(indexing, dayProblem)}</p>`}
+        ${!timeline && html`<div class="timeline-cover" role="status">
+          <p>${coverWords(indexing, dayProblem)}</p>
+          ${dayProblem && html`<button type="button" data-test="try-again" onClick=${() => replay.tryAgain()}>Try again</button>`}
+        </div>`}
       </div>
       <${Strip} replay=${replay} shown=${shown} />
     </div>
