@@ -67,7 +67,7 @@ class LinuxRobot(Robot):
                 "service_restart_control": {"command": _RESTART},
                 "media": {"audio_receiver": {"command": [*_loudspeaker(self.voice), *raw]}},
             },
-            "serial_mcu_bridge": {"instances": instances},
+            "serial_mcu_bridge": {"instances": instances, "telemetry": {"publish_touch_sensors": self.has_scripts}},
             "av_daemon": MEDIA["av_daemon"],
         }
 

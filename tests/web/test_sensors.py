@@ -18,7 +18,7 @@ from playwright.sync_api import Browser
 
 from tests.web.browser import PIXELS, Tab, tab
 from tests.web.canned import CannedServer, State, serving
-from tests.web.states import GOOB, MINE, SENSORS, STATES, STREAM, at, changed, fleet, liveness, with_stream
+from tests.web.states import GOOB, MINE, SENSORS, STATES, STREAM, asked, at, changed, fleet, liveness, with_stream
 
 pytestmark = pytest.mark.page
 
@@ -249,6 +249,17 @@ _TRAIL = """() => { PIXELS
 def trail(opened: Tab) -> dict[str, int]:
     found: dict[str, int] = opened.page.evaluate(_TRAIL)
     return found
+
+
+@pytest.mark.parametrize("samples", [True, False])
+def test_a_position_that_cannot_change_is_explained(server: CannedServer, browser: Browser, samples: bool) -> None:
+    odometry = asked(telemetry={"touch_sensors": samples})
+    with showing(server, browser, replace(SENSORS, values=changed(SENSORS.values, odometry))) as opened:
+        see(opened, "map")
+        assert opened.until(lambda: opened.test("map-pose").inner_text().startswith("x "))
+        lacks = opened.test("map-lacks")
+        assert lacks.count() == (not samples)
+        assert samples or "publish_touch_sensors" in lacks.inner_text()
 
 
 def test_the_map_has_the_trail_and_the_component_in_its_middle(sensors: Tab) -> None:

@@ -27,8 +27,8 @@ export function Autonomy({ at }) {
   const parts = { at, page, entry, status };
   return html`<div class="autonomy">
     <${Running} ...${parts} script=${find(status.file)} />
-    ${!listed && html`<p class="dim">No list of scripts was received yet.</p>`}
-    ${listed?.length === 0 && html`<p class="dim">${nameOf(at)} has no scripts.</p>`}
+    ${!listed && html`<p class="dim">No list of scripts was received yet: is autonomy_manager enabled in its config?</p>`}
+    ${listed?.length === 0 && html`<p class="dim">${nameOf(at)} has no scripts: put a folder with a run.py into its autonomy folder.</p>`}
     ${Boolean(listed?.length) &&
     html`<label class="field wide">
         <span>script</span>

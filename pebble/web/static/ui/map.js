@@ -4,7 +4,7 @@ import * as browser from "../core/browser.js";
 import * as more from "../core/browser-more.js";
 import { differs, pieces, poseOf, poseWords } from "../core/trail.js";
 import { html, useEffect, useMetrics, useOnline, usePage, useRef, useState, useTick } from "./hooks.js";
-import { Gone, isGone } from "./parts.js";
+import { Gone, Icon, isGone } from "./parts.js";
 import { recorderOf } from "./recorder.js";
 
 const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
@@ -18,7 +18,11 @@ const ZOOM = { start: 120, least: 2, most: 1200 }; // pixels per metre
 const GRIDS = [0.5, 1, 5, 10, 50, 100, 500]; // metres
 const GRID_PIXELS = 24; // lines are not nearer
 
-export function Odometry({ at }) {
+/** Why the position of a robot with working scripts stays where it is. */
+const NO_SAMPLES =
+  "Its hall samples are off, so turning wheels do not move it here: set services.serial_mcu_bridge.telemetry.publish_touch_sensors in its config.";
+
+export function Odometry({ at, offers }) {
   const page = usePage();
   const metrics = useMetrics(at);
   const sources = Object.keys(SOURCES).filter((one) => metrics.includes(one));
@@ -44,6 +48,9 @@ export function Odometry({ at }) {
     <p class="map-words" data-test="map-pose">
       ${gone && series.newest ? html`<${Gone} age=${age}>${words}<//>` : words}
     </p>
+    ${source === "wheel-odometry" &&
+    offers.section("telemetry").touch_sensors === false &&
+    html`<p class="map-words" data-test="map-lacks"><${Icon} name="plug" /> ${NO_SAMPLES}</p>`}
     <div class="map-tools">
       <button type="button" data-test="map-in" aria-label="Zoom in" onClick=${() => view.current?.zoom(1.5)}>+</button>
       <button type="button" data-test="map-out" aria-label="Zoom out" onClick=${() => view.current?.zoom(1 / 1.5)}>−</button>

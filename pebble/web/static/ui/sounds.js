@@ -70,7 +70,7 @@ function Clips({ at, page, sounds, why }) {
   const { filter } = sounds;
   const shown = useMemo(() => grouped(files ?? [], filter, MOST), [files, filter]);
   const now = playing(useValue(at, "soundboard-status")).file;
-  if (!files) return html`<p class="dim">No list of clips was received yet.</p>`;
+  if (!files) return html`<p class="dim">No list of clips was received yet: is soundboard_handler enabled in its config?</p>`;
   if (!files.length) return html`<p class="dim">No clips: put sound files into ${nameOf(at)}'s folder of sounds.</p>`;
   return html`<input
       type="search"
