@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import queue
-from collections.abc import Iterable, Iterator
+import time
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,9 +18,11 @@ from pebble.config.text_files import read_password
 from pebble.errors import ConfigError, PebbleError, TransportError
 from pebble.runtime.addresses import Addresses
 from pebble.runtime.connections import REMOTE_RECONNECT_S, local_settings, mqtt_settings, zenoh_settings
+from pebble.runtime.robot_estop import RobotEstop
 from pebble.transports import Message, QoS, State, Transport, create
 
 PASSWORD = "PEBBLE_PASSWORD"  # noqa: S105 - the name of an environment variable
+_LATE_S = 0.25  # some brokers send what is retained so long after they have acknowledged a subscription
 _OPEN_TIMEOUT_S = 3.0
 _WAITING = 10_000  # messages that wait to be printed before new ones are dropped
 
@@ -131,3 +134,19 @@ class Listener:
             self._waiting.put_nowait(message)
         except queue.Full:
             self.dropped += 1
+
+
+def subscribed_stop(transport: Transport, base: str) -> RobotEstop:
+    """The emergency stop of a robot, with what is retained of it, also from a broker that sends it a moment later."""
+    robot = RobotEstop(base)
+    robot.subscribe(transport)
+    _wait(lambda: robot.has_capabilities)
+    transport.ask(robot.missing)
+    _wait(lambda: not robot.missing)
+    return robot
+
+
+def _wait(arrived: Callable[[], bool]) -> None:
+    end = time.monotonic() + _LATE_S
+    while not arrived() and time.monotonic() < end:
+        time.sleep(_LATE_S / 25)

@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-from pebble.client.connection import Listener, Target, connected
+from pebble.client.connection import Listener, Target, connected, subscribed_stop
 from pebble.client.estop_states import RobotEstop
 from pebble.client.names import Names, id_of
 from pebble.commands import show
@@ -285,9 +285,7 @@ def _estop(transport: Transport, names: Names, topic: str) -> RobotEstop | None:
     base = names.base if address is None else address.identity.base
     if is_pattern(base):
         return None
-    robot = RobotEstop(base)
-    robot.subscribe(transport)
-    return robot
+    return subscribed_stop(transport, base)
 
 
 def _warn_of_dropped(listener: Listener) -> None:

@@ -1,10 +1,8 @@
-"""The emergency stop of a robot as its motor owners publish it."""
+"""The emergency stop of a robot as its motor owners publish it. Pure."""
 
 from __future__ import annotations
 
 import re
-import time
-from collections.abc import Callable
 from typing import Any
 
 import msgspec
@@ -20,7 +18,6 @@ from pebble.transports.topics import check_topic
 MAX_OWNERS = 16  # of one robot; a robot that lists more is never confirmed
 _STATE_BYTES = 1024  # the contract allows 400
 _CAPABILITIES_BYTES = 64 * 1024
-_LATE_S = 0.25
 _NAMES = 8  # in ``recent``
 _LATEST_MS = 253_402_300_800_000  # the year 10000
 
@@ -87,9 +84,7 @@ class RobotEstop:
 
         for channel in (ESTOP_STATE, CAPABILITIES):
             transport.subscribe(channel.filter(self.base), take, direct=True)
-        _wait(lambda: self.has_capabilities)
         transport.ask(self.missing)
-        _wait(lambda: not self.missing)
 
     def receive(self, message: Message) -> bool:
         """Update from one message of this robot; False if it is about something else, or malformed."""
@@ -144,13 +139,6 @@ class RobotEstop:
 def _section(value: dict[str, Any], name: str) -> dict[str, Any]:
     section = value.get(name)
     return section if isinstance(section, dict) else {}
-
-
-def _wait(arrived: Callable[[], bool]) -> None:
-    """Wait for what some brokers send a moment after they have acknowledged a subscription."""
-    end = time.monotonic() + _LATE_S
-    while not arrived() and time.monotonic() < end:
-        time.sleep(_LATE_S / 25)
 
 
 def _owners(listed: object) -> tuple[str, ...]:

@@ -11,11 +11,10 @@ from typing import Any
 
 import pytest
 
-from pebble.client.connection import Target, connected
+from pebble.client.connection import Target, connected, subscribed_stop
 from pebble.client.discovery import ALL_OUTGOING, Discovery
 from pebble.contract import CHANNELS
 from pebble.runtime.by_name import ByName, ask_beside
-from pebble.runtime.robot_estop import RobotEstop
 from pebble.transports import Message, MqttSettings, QoS, State
 from pebble.transports.mqtt import suspects
 from pebble.transports.mqtt.transport import MqttTransport
@@ -193,8 +192,7 @@ def test_an_operators_tool_finds_the_states_of_an_idle_robot(broker: Broker, bas
                     assert until(lambda: base in discovery.robots and discovery.robots[base].volts)  # noqa: B023
                     assert until(lambda: discovery.robots[base].latched)  # noqa: B023
                 with connected(Target(url=f"mqtt://127.0.0.1:{port}", robot=base)) as (tool, _):
-                    one = RobotEstop(base)
-                    one.subscribe(tool)
+                    one = subscribed_stop(tool, base)
                     assert until(lambda: [state.by for state in one.latched.values()] == ["ann"])  # noqa: B023
     front.close()
 
