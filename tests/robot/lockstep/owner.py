@@ -115,6 +115,9 @@ class MemoryFile:
     def load(self) -> Any:
         return msgspec.json.decode(self._disk[self.path]) if self.path in self._disk else None
 
+    def appeared(self) -> Any:
+        """Nothing: what is on the disk was there at the start, or is from this process."""
+
     def save(self, value: Any) -> int:
         self._number += 1
         number, life = self._number, self._process.connection
