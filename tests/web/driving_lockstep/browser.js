@@ -266,7 +266,7 @@ export function install() {
   define("document", () => pageDocument);
   define("navigator", () => ({ userAgent: "Linux", getGamepads: () => (current.pad ? [current.pad] : []) }));
   define("screen", () => ({ orientation: { addEventListener: (...what) => current.listen("screen", ...what) } }));
-  define("location", () => ({ protocol: "http:", host: "127.0.0.1:8080", assign: () => {} }));
+  define("location", () => ({ protocol: "http:", host: "127.0.0.1:8080", origin: "http://127.0.0.1:8080", assign: () => {} }));
   define("sessionStorage", () => pageStorage);
   define("matchMedia", () => () => ({ matches: false }));
   define("fetch", () => () => new Promise(() => {}));
