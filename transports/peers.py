@@ -12,6 +12,7 @@ import fcntl
 import logging
 import os
 import stat
+import threading
 from contextlib import suppress
 from pathlib import Path
 
@@ -121,18 +122,25 @@ class FileLock:
 
 
 class PresenceLock:
-    """The lock that marks one running process in the run directory, and the path of its socket."""
+    """The lock that marks one running process in the run directory, and the path of its socket.
+
+    One thread may renew it while another releases it.
+    """
 
     def __init__(self, run_dir: Path, name: str, owner: str, lock: FileLock) -> None:
         self.name, self._owner = name, owner
         self.socket = run_dir / f"{name}.sock"
         self._lock = lock
         self._listening = OwnFile(self.socket)
+        self._changing = threading.Lock()  # guards what follows, and the descriptor of the lock
+        self._released = False
 
     def ready(self) -> None:
         """Mark the process as reachable: from now on newcomers wait for its answer."""
         self._listening = OwnFile(self.socket)
-        self._lock.write(self._owner.encode() or b"?")
+        with self._changing:
+            if not self._released:
+                self._lock.write(self._owner.encode() or b"?")
 
     @property
     def in_place(self) -> bool:
@@ -144,15 +152,21 @@ class PresenceLock:
 
     def renew(self) -> None:
         """Lock a file that was removed again; not `ready` any more. Raises TransportError if there can be none."""
-        if not self._lock.in_place:
-            lock = FileLock.wait(self._lock.path)
-            self._lock.release()
-            self._lock = lock
-        self._lock.write(b"")
+        with self._changing:
+            if self._released:
+                return
+            if not self._lock.in_place:
+                lock = FileLock.wait(self._lock.path)
+                self._lock.release()
+                self._lock = lock
+            self._lock.write(b"")
 
     def release(self) -> None:
         _clear_socket(self.socket)
-        self._lock.release()
+        with self._changing:
+            if not self._released:
+                self._released = True
+                self._lock.release()
 
 
 class PeerRegistry:
