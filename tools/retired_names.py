@@ -1,10 +1,12 @@
-"""Finds identifiers with a retired word, and names the standard term: ``python tools/retired_names.py``.
+"""Finds identifiers with a retired word, and docstrings that are no sentence: ``python tools/retired_names.py``.
 
-It checks each word of the identifiers in tracked Python files, but no comments and no strings.
+It checks each word of the identifiers in tracked Python files, and names the standard term; comments and other strings
+are not checked. A docstring that begins with a preposition, as in "Of what is sent.", has no subject.
 """
 
 from __future__ import annotations
 
+import ast
 import io
 import re
 import subprocess
@@ -44,6 +46,7 @@ RETIRED = {
     "whoever|somebody|nobody|anybody": "a name of what it is",
 }
 _WORDS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+")
+_FRAGMENT = re.compile(r"(As|For|In|Of|With) [a-z`]")
 _PATTERNS = {re.compile(pattern): instead for pattern, instead in RETIRED.items()}
 
 
@@ -63,16 +66,29 @@ def identifiers(source: str) -> Iterator[tuple[int, str]]:
             yield token.start[0], token.string
 
 
+def fragments(source: str) -> Iterator[tuple[int, str]]:
+    """Line number and first line of every docstring that begins with a preposition."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            text = ast.get_docstring(node) or ""
+            if _FRAGMENT.match(text):
+                yield node.body[0].lineno, text.splitlines()[0]
+
+
 def main() -> int:
     files = subprocess.run(["git", "ls-files", "*.py"], capture_output=True, text=True, check=True).stdout.splitlines()
     found = 0
     for path in map(Path, files):
         if path.is_symlink() or not path.is_file():
             continue
-        for line, name in identifiers(path.read_text()):
+        source = path.read_text()
+        for line, name in identifiers(source):
             if instead := retired(name):
                 found += 1
                 print(f"{path}:{line}: {name} is retired; use {instead}")
+        for line, text in fragments(source):
+            found += 1
+            print(f'{path}:{line}: "{text}" is no sentence; begin with its subject')
     return int(found > 0)
 
 

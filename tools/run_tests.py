@@ -50,7 +50,10 @@ def run(arguments: list[str]) -> int:
 
 
 def pytest(arguments: list[str], list_: Path) -> int:
-    command = [sys.executable, "-m", "pytest", "-p", "tools.failed_tests", f"--failed-list={list_}", *arguments]
+    records = ["-p", "tools.test_records", f"--failed-list={list_}"]
+    if times := os.environ.get("PEBBLE_TEST_TIMES"):
+        records.append(f"--times={times}")
+    command = [sys.executable, "-m", "pytest", *records, *arguments]
     return subprocess.run(command, check=False).returncode
 
 

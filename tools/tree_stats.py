@@ -1,13 +1,16 @@
 """Counts what a tree of this project consists of, at one revision or side by side at several.
 
 ``python tools/tree_stats.py [REVISION …]``, by default the first commit before the folders were rearranged, and HEAD.
-Counted are tracked Python files of the product: everything but tests and tools.
+Counted are tracked Python files of the product: everything but tests and tools; then what tests, pages and documents
+consist of.
 """
 
 from __future__ import annotations
 
 import ast
 import io
+import posixpath
+import re
 import statistics
 import subprocess
 import sys
@@ -16,7 +19,7 @@ from collections import Counter, defaultdict
 from collections.abc import Iterator
 from pathlib import PurePosixPath
 
-from retired_names import identifiers, retired
+from retired_names import fragments, identifiers, retired
 
 BEFORE = "456f31d"
 SMALL = 40  # lines
@@ -24,6 +27,10 @@ SMALL = 40  # lines
 OFF_ROBOT = ("bench", "client", "commands", "demo", "doctor", "flash", "impair", "rig", "simulation")
 #: Top-level folders that are imported as parts of the package (docs/decisions/0002).
 LINKED = ("bench", "rig", "services", "simulation", "transports")
+MANY = 15  # attributes of one class
+#: Methods of named tuples, which are public in spite of their names.
+PUBLIC = {"_asdict", "_fields", "_make", "_replace"}
+_JS_IMPORT = re.compile(r"""(?:from|import|import\()\s*["'](\.[^"']+\.js)["']""")
 
 
 class Tree:
@@ -33,13 +40,26 @@ class Tree:
         archive = subprocess.run(["git", "archive", revision], capture_output=True, check=True).stdout
         self.product: dict[str, str] = {}
         self.all: dict[str, str] = {}
+        self.scripts: dict[str, str] = {}  # modules of the page
+        self.words = 0  # in documents
+        self.folders: Counter[str] = Counter()
         with tarfile.open(fileobj=io.BytesIO(archive)) as files:
             for member in files:
-                if member.isfile() and member.name.endswith(".py"):
-                    source = (files.extractfile(member) or io.BytesIO()).read().decode()
+                suffix = PurePosixPath(member.name).suffix
+                if not member.isfile() or suffix not in (".py", ".js", ".md"):
+                    continue
+                source = (files.extractfile(member) or io.BytesIO()).read().decode()
+                is_product = not member.name.startswith(("tests/", "tools/"))
+                if suffix == ".py":
                     self.all[member.name] = source
-                    if not member.name.startswith(("tests/", "tools/")):
-                        self.product[member.name] = source
+                if suffix == ".py" and is_product:
+                    self.product[member.name] = source
+                if suffix == ".js" and is_product and "vendor" not in member.name:
+                    self.scripts[member.name] = source
+                if suffix == ".md" and member.name.startswith(("docs/", "README", "CHANGELOG")):
+                    self.words += len(source.split())
+                if suffix != ".md" and is_product:
+                    self.folders[str(PurePosixPath(member.name).parent)] += 1
         self.parsed = {path: ast.parse(source) for path, source in self.product.items()}
         self.modules = {_module(path): path for path in self.product}
 
@@ -50,6 +70,28 @@ class Tree:
             names = set(_imported(tree, self.modules)) & self.modules.keys()
             found[_module(path)] = names - {_module(path)}
         return found
+
+    def page_imports(self) -> dict[str, set[str]]:
+        """Which modules of the page each of them imports, at once or later."""
+        return {
+            path: {posixpath.normpath(posixpath.join(posixpath.dirname(path), to)) for to in _JS_IMPORT.findall(source)}
+            for path, source in self.scripts.items()
+        }
+
+    def private_uses(self) -> int:
+        """How many times tests name what begins with an underscore in something that is not theirs."""
+        tests = (ast.parse(source) for path, source in self.all.items() if path.startswith("tests/"))
+        return sum(_is_private_use(node) for tree in tests for node in ast.walk(tree))
+
+
+def _is_private_use(node: ast.AST) -> bool:
+    return (
+        isinstance(node, ast.Attribute)
+        and node.attr.startswith("_")
+        and not node.attr.startswith("__")
+        and node.attr not in PUBLIC
+        and not (isinstance(node.value, ast.Name) and node.value.id in ("self", "cls"))
+    )
 
 
 def _module(path: str) -> str:
@@ -123,10 +165,9 @@ def statistics_of(revision: str) -> dict[str, str]:
     total = sum(lines.values())
     imports = tree.imports()
     importers = Counter(target for targets in imports.values() for target in targets)
-    folders = Counter(str(PurePosixPath(path).parent) for path in tree.product)
     attributes = {
-        node.name: _attributes(node)
-        for parsed in tree.parsed.values()
+        f"{path}:{node.name}": _attributes(node)
+        for path, parsed in tree.parsed.items()
         for node in ast.walk(parsed)
         if isinstance(node, ast.ClassDef)
     }
@@ -141,9 +182,11 @@ def statistics_of(revision: str) -> dict[str, str]:
         for _, name in identifiers(source):
             if retired(name):
                 names[name] += 1
-    folder, files = folders.most_common(1)[0]
-    other, other_files = next((f, n) for f, n in folders.most_common() if not _is_bench(f + "/"))
+    tests = sum(_lines(source) for path, source in tree.all.items() if path.startswith("tests/"))
+    folder, files = tree.folders.most_common(1)[0]
+    other, other_files = next((f, n) for f, n in tree.folders.most_common() if not _is_bench(f + "/"))
     largest = max(attributes, key=attributes.__getitem__)
+    class_ = largest.partition(":")[2]
     busiest = max(imports, key=lambda module: len(imports[module]))
     return {
         "product files": str(len(tree.product)),
@@ -154,12 +197,18 @@ def statistics_of(revision: str) -> dict[str, str]:
         "modules with one importer": str(sum(importers[module] == 1 for module in tree.modules)),
         "largest folder": f"{folder} {files}",
         "largest folder but bench": f"{other} {other_files}",
-        "most attributes in one class": f"{largest} {attributes[largest]}",
+        "most attributes in one class": f"{class_} {attributes[largest]}",
         "most project imports in one module": f"{busiest} {len(imports[busiest])}",
+        f"classes with more than {MANY} attributes": str(sum(n > MANY for n in attributes.values())),
         "import circles": str(_circles(imports)),
+        "import circles of the page": str(_circles(tree.page_imports())),
         "median function, lines": f"{statistics.median(functions):.0f}",
         "longest function, lines": str(max(functions)),
         "retired identifiers, tests included": f"{len(names)} ({sum(names.values())} places)",
+        "docstrings that are fragments": str(sum(len(list(fragments(source))) for source in tree.all.values())),
+        "lines of tests": str(tests),
+        "private uses in tests": str(tree.private_uses()),
+        "words in documents": str(tree.words),
     }
 
 
