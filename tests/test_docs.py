@@ -67,6 +67,11 @@ def test_every_page_can_be_found_from_the_index() -> None:
     assert pages - linked - {ROOT / "docs" / "README.md"} == set()
 
 
+def test_a_term_has_one_entry_in_the_glossary() -> None:
+    terms = re.findall(r"^\| (?!term|---)(.+?) \|", (ROOT / "docs" / "glossary.md").read_text(), re.MULTILINE)
+    assert sorted(terms) == sorted(set(terms))
+
+
 def test_the_first_service_and_its_test_run_as_they_stand(tmp_path: Path) -> None:
     text = (ROOT / "docs" / "my-first-service.md").read_text()
     service, test = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
