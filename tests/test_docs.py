@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+import os
 import re
+import shlex
+import subprocess
+import sys
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import pytest
+import typer
 
+from pebble.commands.app import COMMANDS
 from tests.support import ROOT
 
 GENERATED = ("topics.md", "configuration.md", "web-messages.md")
@@ -31,14 +39,76 @@ def test_links_lead_somewhere(document: Path) -> None:
     assert broken == []
 
 
-#: A decision is left as it was written: the files it names are those of its time.
-OF_TODAY = [path for path in DOCUMENTS if path.parent.name != "decisions"]
+DECISIONS = sorted((ROOT / "docs" / "decisions").glob("*.md"))
+#: The files that a decision named when it was written, and where they are now.
+NOW_AT = re.compile(r"^Now at: (.+)\.$", re.MULTILINE)
+MOVED = re.compile(r"`([^`]+)` → `[^`]+`")
 
 
-@pytest.mark.parametrize("document", OF_TODAY, ids=lambda path: str(path.relative_to(ROOT)))
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
 def test_files_it_names_exist(document: Path) -> None:
-    missing = [name for name in CODE.findall(document.read_text()) if not _exists(name)]
-    assert missing == []
+    text = document.read_text()
+    moved = MOVED.findall("".join(NOW_AT.findall(text)))
+    assert [name for name in CODE.findall(text) if name not in moved and not _exists(name)] == []
+
+
+@pytest.mark.parametrize("decision", DECISIONS, ids=lambda path: path.stem)
+def test_a_decision_explains_no_path_without_need(decision: Path) -> None:
+    text = decision.read_text()
+    moved, rest = MOVED.findall("".join(NOW_AT.findall(text))), NOW_AT.sub("", text)
+    assert [old for old in moved if _exists(old) or f"`{old}`" not in rest] == []
+
+
+def test_every_page_can_be_found_from_the_index() -> None:
+    index = (ROOT / "docs" / "README.md").read_text()
+    linked = {(ROOT / "docs" / link).resolve() for link in LINK.findall(index)}
+    pages = {path for path in DOCUMENTS if path.is_relative_to(ROOT / "docs") and path not in DECISIONS}
+    pages |= {ROOT / "docs" / name for name in GENERATED}
+    assert pages - linked - {ROOT / "docs" / "README.md"} == set()
+
+
+def test_a_term_has_one_entry_in_the_glossary() -> None:
+    terms = re.findall(r"^\| (?!term|---)(.+?) \|", (ROOT / "docs" / "glossary.md").read_text(), re.MULTILINE)
+    assert sorted(terms) == sorted(set(terms))
+
+
+def test_the_first_service_and_its_test_run_as_they_stand(tmp_path: Path) -> None:
+    text = (ROOT / "docs" / "my-first-service.md").read_text()
+    service, test = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    (tmp_path / "battery_alarm.py").write_text(service)
+    (tmp_path / "test_battery_alarm.py").write_text(test)
+    command = [sys.executable, "-m", "pytest", "--quiet", "test_battery_alarm.py"]
+    done = subprocess.run(
+        command, cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, check=False
+    )
+    assert b"1 passed" in done.stdout, done.stdout.decode()
+
+
+#: A command line in a block of code.
+COMMAND = re.compile(r"^(?: {4}|\$ )(?:\.venv/bin/)?pebble (.+)$", re.MULTILINE)
+WRITTEN = sorted({line for path in DOCUMENTS for line in COMMAND.findall(path.read_text())})
+
+
+@pytest.fixture(scope="module")
+def pebble() -> Any:
+    app = typer.Typer()
+    app.callback()(lambda: None)
+    for module in dict.fromkeys(COMMANDS.values()):
+        import_module(f"pebble.commands.{module}").register(app)
+    return typer.main.get_command(app)
+
+
+@pytest.mark.parametrize("line", WRITTEN)
+def test_a_command_line_is_one_that_exists(pebble: Any, line: str) -> None:
+    """It is parsed with all its options, and not run; files that it names need not be there."""
+    command, words = pebble, shlex.split(line, comments=True)
+    try:
+        while hasattr(command, "resolve_command"):
+            context = command.make_context("pebble", words)
+            _, command, words = command.resolve_command(context, [*context._protected_args, *context.args])
+        command.make_context("pebble", words)
+    except typer.BadParameter as error:
+        assert "does not exist" in error.message  # noqa: PT017
 
 
 #: Names of constants that limit what others can add, and tokens of docs/bounds.md such as `web/stops.py:MAX_STOPS`.

@@ -1,7 +1,5 @@
 """Puts the pictures of the page's states in build/page together: docs/page-states-desktop.jpg and -phone.jpg.
 
-One state on both sizes is docs/page.jpg, which the README shows.
-
 Run it after ``pytest tests/web/test_look.py``, and look at both.
 """
 
@@ -44,21 +42,7 @@ def sheet(size: str) -> int:
     return target.stat().st_size
 
 
-def example() -> None:
-    """Write the picture of one state on a desktop, with the phone beside it."""
-    desktop, phone = (
-        Image.open(PICTURES / f"driving-{size}-light.png").convert("RGB") for size in ("desktop", "phone")
-    )
-    phone.thumbnail((800, desktop.height), Image.Resampling.LANCZOS)
-    whole = Image.new("RGB", (desktop.width + GAP + phone.width, desktop.height), BACKGROUND)
-    whole.paste(desktop, (0, 0))
-    whole.paste(phone, (desktop.width + GAP, 0))
-    whole.thumbnail((1100, 1100), Image.Resampling.LANCZOS)
-    whole.save(DOCS / "page.jpg", quality=70, optimize=True)
-
-
 if __name__ == "__main__":
-    example()
     total = sum(map(sheet, SHEETS))
     print(f"{total} bytes")
     if total > MOST_BYTES:
