@@ -27,7 +27,7 @@ from pebble.transports.mqtt import reasons
 from pebble.transports.mqtt.bridge_mode import Result
 from pebble.transports.mqtt.broker_limits import EVERYTHING, Limits
 from pebble.transports.mqtt.client import Client, Opening
-from pebble.transports.mqtt.incoming import BrokerDelay, WaitingTime, readable_bytes
+from pebble.transports.mqtt.read_age import BrokerDelay, WaitingTime, readable_bytes
 from pebble.transports.mqtt.outgoing import (
     Backlog,
     InFlightTable,
