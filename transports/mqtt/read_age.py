@@ -1,4 +1,4 @@
-"""How long what is received may have waited (T19): in the kernel, which does not say when it came, or at the broker."""
+"""Since when what is read may have waited (T19): in the kernel, which does not say when it came, or at the broker."""
 
 from __future__ import annotations
 
@@ -7,6 +7,10 @@ import sys
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
+from math import inf
+
+from pebble.transports import clock
+from pebble.transports.mqtt.outgoing import present_round_trip_s
 
 try:
     import fcntl
@@ -106,7 +110,7 @@ class BrokerDelay:
         self._newest = min(self._newest, now - sent_at)
 
     def seconds(self, now: float, round_trip_s: Callable[[], float]) -> float:
-        """Of what is received at ``now``; ``round_trip_s`` asks for TCP's present round trip, if that matters."""
+        """What is received at ``now`` waited so long; ``round_trip_s`` asks for TCP's present one, if that matters."""
         waited = self._newest
         if self._asked:
             oldest, sent_at = next(((since, sent_at) for since, sent_at, clear in self._asked if clear), (now, now))
@@ -121,10 +125,37 @@ class BrokerDelay:
         return waited - max(self._shortest, min(round_trip_s(), self._shortest + _UPLINK_S))
 
 
-def readable_bytes(sock: socket.socket) -> int:
+class ReadAge:
+    """Since when the batch that is being read may have waited, in the socket or at the broker."""
+
+    def __init__(self, now: float) -> None:
+        self.waiting, self.delay = WaitingTime(now), BrokerDelay()
+        self.since = now  # the answer
+        self.received_at = now  # before the socket was emptied, or a piece of what is in it taken out
+        #: When there was the last sign that answers are behind retained messages, or behind a long one.
+        self.arriving_at = -inf
+        self.has_retained = False  # there are retained messages in the batch
+
+    def update(self, now: float, sock: socket.socket | None) -> None:
+        """Set `since` for what is read next, at ``now``."""
+        self.since = self.waiting.since
+        waited = self.delay.seconds(now, lambda: 0.0 if sock is None else present_round_trip_s(sock))
+        if waited > 0:
+            self.since = min(self.since, now - waited)
+
+    def note_arriving(self) -> None:
+        self.arriving_at = clock.since_boot()
+
+    def note_handled(self) -> None:
+        """Retained messages were handled: that may have taken longer than an answer may."""
+        self.note_arriving()
+        self.has_retained = False
+
+
+def readable_bytes(sock: socket.socket | None) -> int:
     """Bytes that the kernel has received and we have not read (FIONREAD); 0 where the system does not say."""
     size = bytearray(4)
-    if not _can_measure:
+    if sock is None or not _can_measure:
         return 0
     with suppress(OSError, ValueError):  # closed, or no socket
         fcntl.ioctl(sock.fileno(), termios.FIONREAD, size)

@@ -20,7 +20,8 @@ from pebble.transports.mqtt import client_ids
 from pebble.transports.mqtt.bridge_mode import Attempt, BridgeMode, Result
 from pebble.transports.mqtt.broker_limits import EVERYTHING, BrokerLimits, Limits
 from pebble.transports.mqtt.client import Opening
-from pebble.transports.mqtt.connection import Absent, Connection, Lost, Refused, Silent, ignore
+from pebble.transports.mqtt.connection import Connection, client_class, ignore
+from pebble.transports.mqtt.ending import Absent, Lost, Refused, Silent
 from pebble.transports.mqtt.filters import BrokerFilters, OwnMessageFilter, overlap
 from pebble.transports.mqtt.outgoing import PendingAck
 from pebble.transports.mqtt.retention import RetentionCheck
@@ -35,6 +36,7 @@ _ANSWER_S = 2.0  # longest wait for a SUBACK, and for the retained messages afte
 _CLOSING_S = 1.0  # longest wait for unacknowledged messages when closing
 _DIALLING_S = 0.2  # longest wait for a thread that may be in connect(2)
 _RETRY_S = 0.05  # second attempt to connect; doubles up to settings.reconnect_max_s
+_HESITATION_S = 0.5  # a CONNACK that takes longer comes over a very slow connection, or from a suspended broker
 _CATCH_UP_S = 0.5  # time for a broker that was suspended to deliver its backlog before we subscribe
 _ENDING_S = 1.0  # so long a broker that ends may still accept connections, and hang up on them
 _STEADY_S = 2.0  # after a connection this long the first retry is immediate
@@ -52,6 +54,7 @@ class MqttTransport(Transport):
         super().__init__(client_id, will=will)
         if settings.protocol not in ("3.1.1", "5"):
             raise TransportError(f'protocol must be "3.1.1" or "5", not "{settings.protocol}"')
+        client_class(settings.client)  # a package that is missing is an error now, not in a thread
         self.settings = settings
         # It stays the same over reconnects: the broker closes our own half-dead connection at once.
         self._mqtt_client_id = client_ids.unique(client_id) if settings.client_id is None else settings.client_id
@@ -121,7 +124,7 @@ class MqttTransport(Transport):
             return False
         if not connection.takes(message):
             why = f"{len(message.payload)} bytes, but it takes packets of {connection.max_packet} at most"
-            self._report_not_taken(connection, message.topic, why, logging.ERROR)
+            self._report_not_taken(connection.where, message.topic, why, logging.ERROR)
             self.counters.add("too_large")
             return True
         tried = False
@@ -130,7 +133,7 @@ class MqttTransport(Transport):
             if not tried:
                 self.counters.add("withheld")
                 return True  # as if it were sent: nothing may wait behind it
-            connection.doubtful.add(message.topic)
+            connection.pings.doubtful.add(message.topic)
         expires_s = ceil(self.settings.silence_s) if urgent and not message.retain else None
         if message.retain:
             self._own_message_filter.note_own(message)
@@ -374,30 +377,27 @@ class MqttTransport(Transport):
         assert self._address is not None  # noqa: S101 - both callers run at an address
         assert self._credentials is not None  # noqa: S101 - and while it is open
         settings = replace(self.settings, password=self._credentials.password())
-        connection = Connection(
+        return Connection(
             Opening(self._mqtt_client_id, settings, self._credentials.context(), will, self._address),
             self.counters,
+            self,
             where=self._where,
             as_published=as_published,
             limits=self._limits.limits,
-            on_answers=self._note_answers,
-            skips_retained=lambda topic: self.skips_retained(topic),
-            is_stop=lambda topic: self.is_stop(topic),
-            on_refusal=lambda topic, why: self._report_not_taken(connection, topic, why),
         )
-        return connection
 
     def _connect(self, connection: Connection, stopping: threading.Event) -> None:
         try:
-            connection.connect(stopping)
+            self._broker_stalled |= connection.connect(stopping) > _HESITATION_S
         except Lost as lost:
             self._note_result(lost.result if isinstance(lost, Refused) else Result.FAILED)
             raise
         self._note_result(Result.ACCEPTED)
         if self.settings.as_published:
-            if self.as_published and not connection.as_published:
+            as_published = connection.incoming.as_published
+            if self.as_published and not as_published:
                 log.warning("%s has no bridge mode: own messages come back on this connection", connection.where)
-            self.as_published = self.exact_echo = connection.as_published
+            self.as_published = self.exact_echo = as_published
 
     @property
     def _asks_for_bridge_mode(self) -> bool:
@@ -434,8 +434,8 @@ class MqttTransport(Transport):
     def _tries_less(self, connection: Connection, *, held: bool) -> bool:
         """Whether the connection may be lost because of what the broker lacks: the next one uses less."""
         now = time.monotonic()
-        if connection.lacks is not None:
-            self._limits.note_connect(connection.lacks, now, last=True)
+        if (lacks := connection.incoming.ending.lacks) is not None:
+            self._limits.note_connect(lacks, now, last=True)
             return True
         in_flight = Limits(bool(connection.unconfirmed_retained()), int(connection.unacked > 0))
         return self._limits.note_loss(in_flight, connection.confirmed, now, held=held)
@@ -451,7 +451,7 @@ class MqttTransport(Transport):
         """Query which of our retained messages the broker has, subscribe, and send what it lacks."""
         self._renew()
         self._own_message_filter.begin()
-        if self._broker_stalled or connection.hesitated:
+        if self._broker_stalled:
             self._let_catch_up(connection, stopping)
         known = self._query_own(connection, stopping)
         with self._routing:
@@ -463,7 +463,7 @@ class MqttTransport(Transport):
         now = time.monotonic()
         with self._publishing:
             self._suspects.connected(now)
-            connection.doubtful |= self._suspects.doubtful
+            connection.pings.doubtful |= self._suspects.doubtful
         self._initial_sync(known)
         self._retention = None
         if self._address is not None and self._address.text not in self._checked:
@@ -517,7 +517,7 @@ class MqttTransport(Transport):
         while not ack.done:
             if stopping.is_set():
                 raise Lost("closed")
-            left = max(asked_at, connection.arriving_at) + _ANSWER_S - clock.since_boot()
+            left = max(asked_at, connection.incoming.age.arriving_at) + _ANSWER_S - clock.since_boot()
             if left < 0:
                 raise Silent(f"{connection.where} does not answer")
             connection.pump(left, receive)
@@ -541,7 +541,7 @@ class MqttTransport(Transport):
             for subscription in self._matched.get(message.topic) or self._matching(message.topic):
                 subscription.offer(message, repeat=repeat)
 
-    def _note_answers(self, refused: Mapping[str, bool]) -> None:
+    def note_answers(self, refused: Mapping[str, bool]) -> None:
         if self._connection is None:
             return  # to the query of our own retained messages
         if self._retention is not None:
@@ -552,6 +552,9 @@ class MqttTransport(Transport):
                 for subscription in self._subscriptions:
                     if overlap(subscription.filter, filter_):  # the filter that covers it: no other one overlaps
                         subscription.refused = is_refused
+
+    def note_refusal(self, topic: str, why: str) -> None:
+        self._report_not_taken(self._where, topic, why)
 
     def _finish(self, connection: Connection) -> None:
         """Publish the will, wait (bounded) until everything is acknowledged, then send DISCONNECT."""
@@ -571,12 +574,12 @@ class MqttTransport(Transport):
                 if message.topic not in self._pending:
                     self._remember(message, sent=False)
 
-    def _report_not_taken(self, connection: Connection, topic: str, why: str, level: int = logging.WARNING) -> None:
+    def _report_not_taken(self, where: str, topic: str, why: str, level: int = logging.WARNING) -> None:
         """Once for each topic, and again after a while: any number of messages may follow."""
         now = time.monotonic()
         if now - self.not_taken.get(topic, ("", -inf))[1] >= _NOT_TAKEN_S:
             self.not_taken[topic] = why, now
-            log.log(level, "%s: %s does not take a message on %s: %s", self.client_id, connection.where, topic, why)
+            log.log(level, "%s: %s does not take a message on %s: %s", self.client_id, where, topic, why)
 
     def _report_problem(self, problem: str, *, logged: bool) -> None:
         self.problem = problem

@@ -1,0 +1,199 @@
+"""What a broker sends on one MQTT connection: read in batches, and made into messages that know how long they waited."""
+
+from __future__ import annotations
+
+import logging
+from typing import Protocol
+
+from pebble.transports import clock
+from pebble.transports.base import Message, QoS
+from pebble.transports.counters import Counters
+from pebble.transports.mqtt import reasons
+from pebble.transports.mqtt.client import AnyClient
+from pebble.transports.mqtt.ending import Ending, Lost, Silent
+from pebble.transports.mqtt.outgoing import InFlightTable
+from pebble.transports.mqtt.packets import ANY_QOS, RETAIN, Accepted, MalformedError
+from pebble.transports.mqtt.pings import Pings
+from pebble.transports.mqtt.read_age import ReadAge, readable_bytes
+from pebble.transports.settings import MqttSettings
+from pebble.transports.topics import MAX_BYTES
+
+log = logging.getLogger(__name__)
+
+OVERSLEPT_S = 0.1  # poll took so much longer than asked for: the process was stopped, or the machine suspended
+_LOGGED = 200  # bytes of a topic
+_BATCH = 64  # messages read in a row before they are delivered
+
+
+class Sink(Protocol):
+    """What is called on the network thread with the connection's lock held: it must neither wait nor publish."""
+
+    def skips_retained(self, topic: bytes, /) -> bool:
+        """Whether a retained message of this topic is not wanted."""
+
+    def note_refusal(self, topic: str, why: str) -> None:
+        """The broker does not take a message of this topic (MQTT 5)."""
+
+
+class Incoming:
+    """Listens to the client of a connection. Not locked: the connection is."""
+
+    def __init__(
+        self,
+        settings: MqttSettings,
+        sink: Sink,
+        counters: Counters,
+        in_flight: InFlightTable,
+        *,
+        where: str,
+        as_published: bool,
+    ) -> None:
+        self.answered_at = clock.since_boot()
+        self.silence_s = settings.silence_s
+        self.as_published = as_published
+        self.accepted: Accepted | None = None  # what the broker said when it accepted us
+        self.ending = Ending(where, settings)
+        self.messages: list[Message] = []  # read, and not delivered yet
+        self.answers: dict[str, bool] = {}  # filters answered since that was last looked at: refused?
+        self.more = False  # a batch ended before the socket was empty
+        self.age = ReadAge(self.answered_at)
+        self.pings = Pings(settings, in_flight, self.age)
+        self._packets = 0  # received so far
+        self._sink, self._counters, self._in_flight = sink, counters, in_flight
+
+    # -- called by the connection
+
+    def check_silence(self, now: float) -> None:
+        """Raises Silent if the broker has not answered for too long."""
+        if self.accepted is None:
+            return  # `connect` has its own deadline, and gives the first round trip
+        silence_s = now - max(self.answered_at, self.age.arriving_at)
+        if silence_s > self.silence_s and silence_s > (limit := self.pings.silence_limit_s):
+            self._counters.add("silences")
+            raise Silent(f"{self.ending.where} has not answered for {limit:.1f} s")
+
+    def read(self, client: AnyClient, now: float) -> None:
+        """Read up to a batch: several times, where more than fits at once has come, or a piece of what TLS unpacks.
+
+        ``now``: a time before anything is read. Raises Lost.
+        """
+        age, waiting, first, size = self.age, self.age.waiting, self._packets, 0
+        unread = client.unread if self.more else 0
+        self.more = True
+        while self.more and self._packets - first < _BATCH:
+            before = self._packets
+            if not unread:
+                age.received_at = now
+                if now - waiting.checked_at > OVERSLEPT_S and self.accepted is not None:
+                    self.pings.send_after_stall(client, now)
+                unread = client.receive()
+                waiting.found(unread if client.drained else unread + readable_bytes(client.socket), now)
+            age.update(now, client.socket)
+            try:
+                left = client.read(_BATCH - (before - first))
+            except MalformedError as error:
+                raise Lost(f"{self.ending.where} does not speak MQTT: {error}") from None
+            if self.ending.begun:
+                self._end(client)
+            size += unread - left
+            self.more = left > 0 or not client.drained
+            if not self.more:
+                break
+            waiting.read(unread - left)
+            if self._packets == before:
+                break
+            unread, now = left, clock.since_boot()
+        if age.has_retained or (size and self._packets == first):  # the latter is a piece of a long message
+            age.note_arriving()
+        if not self.more:
+            waiting.empty(age.received_at)
+
+    def _end(self, client: AnyClient) -> None:
+        if self.ending.refusal is not None:
+            raise self.ending.refusal
+        client.close()
+
+    # -- called by the client
+
+    def _note_answer(self) -> None:
+        self._packets += 1
+        self.answered_at = clock.since_boot()
+
+    def _note_connack(self) -> None:
+        started = self.answered_at
+        self._note_answer()
+        self._in_flight.measured(self.answered_at - started)
+        self.age.delay.usual(self.answered_at - started)
+
+    def on_accepted(self, accepted: Accepted) -> None:
+        self._note_connack()
+        self.pings.begin(self.answered_at)
+        self.accepted = accepted
+
+    def on_refused(self, code: int) -> None:
+        self._note_connack()
+        self.ending.refuse(code)
+
+    def on_disconnect(self, code: int) -> None:
+        self.ending.disconnect(code)
+
+    def on_pong(self) -> None:
+        self._note_answer()
+        self._in_flight.pong(self.answered_at)
+        self.age.delay.answered(self.answered_at)
+
+    def on_answer(self, mid: int, codes: bytes) -> None:
+        self._note_answer()
+        answers = list(zip(self._in_flight.answer(mid), codes, strict=False))
+        self.answers.update((filter_, code >= reasons.FAILURE) for filter_, code in answers)
+        refused = [f"{filter_} ({reasons.words(code)})" for filter_, code in answers if code >= reasons.FAILURE]
+        if refused:
+            self._counters.add("subscriptions_refused")
+            log.warning("%s refused to subscribe us to %s", self.ending.where, ", ".join(refused))
+
+    def on_puback(self, mid: int, code: int) -> None:
+        now = clock.since_boot()
+        if code >= reasons.FAILURE and (topic := self._in_flight.topic_of(mid)) is not None:
+            self._counters.add("publications_refused")
+            self._sink.note_refusal(topic, reasons.words(code))
+        sent_at = self._in_flight.acknowledge(mid, now)
+        if sent_at is not None:
+            self._packets += 1
+            self.answered_at = now
+            self.age.delay.acknowledged(sent_at, now)
+
+    def on_publication(self, topic: bytes, payload: bytes, first: int) -> None:
+        """Hot."""
+        age, retain = self.age, bool(first & RETAIN)
+        if retain:
+            age.has_retained = True
+        if len(topic) > MAX_BYTES:  # no transport carries it, and much would be remembered of many
+            self.on_too_long(topic, len(topic) + len(payload))
+            return
+        self._packets += 1
+        try:
+            text = topic.decode()
+        except UnicodeDecodeError:
+            self._counters.add("malformed")
+            return
+        retain_requested = retain if self.as_published else (True if retain else None)
+        qos = QoS.DELIVERED if first & ANY_QOS else QoS.LATEST
+        self.messages.append(Message(text, payload, qos, retain, retain_requested, age.since))
+
+    def skips(self, topic: bytes) -> bool:
+        if self.messages:
+            return False  # what came before may change the answer
+        try:
+            skipped = self._sink.skips_retained(topic)
+        except Exception:  # foreign code on our thread
+            log.exception("asking whether to skip a retained message of %r failed", topic)
+            return False
+        if skipped:
+            self._packets += 1
+            self.age.note_arriving()
+        return skipped
+
+    def on_too_long(self, topic: bytes, length: int) -> None:
+        self._packets += 1
+        self._counters.add("too_long")
+        log.debug("%s sent %d bytes on %r…: discarded", self.ending.where, length, topic[:_LOGGED])
