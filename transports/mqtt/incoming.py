@@ -1,4 +1,4 @@
-"""What a broker sends on one MQTT connection: read in batches, and made into messages that know how long they waited."""
+"""What a broker sends on one MQTT connection: read in batches, and made into messages that have an age."""
 
 from __future__ import annotations
 
