@@ -48,6 +48,10 @@ class Mqtt(Section, frozen=True, kw_only=True):
     password_env: Annotated[str | None, doc("Environment variable that holds the password.")] = None
     tls: Annotated[Tls, doc("Encryption.")] = Tls()
     protocol: Annotated[Literal["3.1.1", "5"], doc("Version of MQTT to use.")] = "3.1.1"
+    client: Annotated[
+        Literal["pebble", "paho"],
+        doc("Library that speaks MQTT: Pebble's own, or paho, which takes half as much processor time again."),
+    ] = "pebble"
     silence_seconds: Annotated[
         Silence, doc("A connection that does not answer for this many seconds is closed and opened again.")
     ] = 2.0

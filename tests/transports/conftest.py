@@ -14,31 +14,31 @@ import pytest
 from tests.transports.net import Net
 
 
-def _memory(_folder: Path) -> Net:
+def _memory(_folder: Path, _client: str) -> Net:
     from tests.transports.memory_net import MemoryNet
 
     return MemoryNet()
 
 
-def _mqtt311(folder: Path) -> Net:
+def _mqtt311(folder: Path, client: str) -> Net:
     from tests.transports.mqtt_net import MqttNet
 
-    return MqttNet(folder, "3.1.1")
+    return MqttNet(folder, "3.1.1", client)
 
 
-def _mqtt5(folder: Path) -> Net:
+def _mqtt5(folder: Path, client: str) -> Net:
     from tests.transports.mqtt_net import MqttNet
 
-    return MqttNet(folder, "5")
+    return MqttNet(folder, "5", client)
 
 
-def _zenoh(folder: Path) -> Net:
+def _zenoh(folder: Path, _client: str) -> Net:
     from tests.transports.zenoh_net import ZenohNet
 
     return ZenohNet(folder)
 
 
-NETS: dict[str, Callable[[Path], Net]] = {"memory": _memory, "mqtt311": _mqtt311, "mqtt5": _mqtt5, "zenoh": _zenoh}
+NETS: dict[str, Callable[[Path, str], Net]] = {"memory": _memory, "mqtt311": _mqtt311, "mqtt5": _mqtt5, "zenoh": _zenoh}
 _numbers = itertools.count(1)
 
 
@@ -51,13 +51,11 @@ KINDS = [(kind, "") for kind in NETS] + [
 @pytest.fixture(scope="module", params=KINDS, ids=lambda one: "-".join(filter(None, one)))
 def network(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Net]:
     """One per module and kind; its broker or hub is started."""
-    kind, library = request.param
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PEBBLE_MQTT_CLIENT", library)
-        net = NETS[kind](tmp_path_factory.mktemp("net"))
-        net.start_network()
-        yield net
-        net.stop()
+    kind, client = request.param
+    net = NETS[kind](tmp_path_factory.mktemp("net"), client or "pebble")
+    net.start_network()
+    yield net
+    net.stop()
 
 
 @pytest.fixture

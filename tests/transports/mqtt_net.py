@@ -13,13 +13,13 @@ from tests.transports.net import Net
 class MqttNet(Net):
     kind = "mqtt"
 
-    def __init__(self, folder: Path, protocol: str) -> None:
+    def __init__(self, folder: Path, protocol: str, client: str) -> None:
         super().__init__()
-        self._protocol = protocol
+        self._library = {"protocol": protocol, "client": client}
         self._broker = Broker(folder, persistence=True)
 
     def settings(self, **changes: Any) -> Any:
-        settings = {"host": "127.0.0.1", "port": self._broker.port, "protocol": self._protocol, **changes}
+        settings = {"host": "127.0.0.1", "port": self._broker.port, **self._library, **changes}
         return MqttSettings(**settings)
 
     def echoless_settings(self) -> Any:

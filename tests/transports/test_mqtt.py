@@ -21,7 +21,8 @@ from pebble.transports import Message, MqttSettings, QoS, State, TlsSettings, Tr
 from pebble.transports.mqtt import retention, suspects
 from pebble.transports.mqtt import transport as transport_module
 from pebble.transports.mqtt.client import Client
-from pebble.transports.mqtt.connection import UNACKED_LIMIT, UNACKED_RESERVE, Connection
+from pebble.transports.mqtt.connection import UNACKED_LIMIT, UNACKED_RESERVE
+from pebble.transports.mqtt.incoming import Incoming
 from pebble.transports.mqtt.packets import MAX_PACKET
 from pebble.transports.topics import MAX_BYTES
 from tests.services.autonomy_manager.gate.mqtt_bytes import connect, publish
@@ -412,14 +413,14 @@ def test_a_server_that_speaks_no_mqtt_is_a_problem_in_words(clients: Clients) ->
 def test_a_stop_of_the_process_while_it_reads_counts(
     broker: Broker, clients: Clients, topic: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    stops, now, read = [0.0], clock.since_boot, Connection.on_publication
+    stops, now, read = [0.0], clock.since_boot, Incoming.on_publication
     monkeypatch.setattr(clock, "since_boot", lambda: now() + stops[0])
 
     def read_late(*arguments: Any) -> None:
         stops[0] += 0.6
         read(*arguments)
 
-    monkeypatch.setattr(Connection, "on_publication", read_late)
+    monkeypatch.setattr(Incoming, "on_publication", read_late)
     waited: list[float] = []
     robot, operator = clients(broker.port), connect_as(broker, "operator")
     robot.subscribe(topic, lambda message: waited.append(message.waited_s))
@@ -1178,13 +1179,13 @@ def test_a_refused_query_of_own_retained_topics_refuses_no_subscription(
     client.publish(f"{topic}/own", b"1", qos=DELIVERED, retain=True)
     subscription = client.subscribe(f"{topic}/+", received)
     answers: list[tuple[list[str], bool]] = []
-    note = client._note_answers  # type: ignore[attr-defined]
+    note = client.note_answers  # type: ignore[attr-defined]
 
     def note_answers(refused: dict[str, bool]) -> None:
         note(refused)
         answers.append((list(refused), subscription.refused))
 
-    client._note_answers = note_answers  # type: ignore[attr-defined]
+    client.note_answers = note_answers  # type: ignore[attr-defined]
     refusing.refuse(f"{topic}/own")
     assert reconnected(client)
     assert client.counters["subscriptions_refused"] == 1

@@ -67,19 +67,18 @@ def names(monkeypatch: pytest.MonkeyPatch) -> Names:
     return give
 
 
-CLIENTS = [(client, protocol) for client in ("ours", "paho") for protocol in ("3.1.1", "5")]
+CLIENTS = [(client, protocol) for client in ("pebble", "paho") for protocol in ("3.1.1", "5")]
 
 
 @pytest.fixture(params=CLIENTS, ids="-".join)
 def made(
-    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+    request: pytest.FixtureRequest,
 ) -> Iterator[Callable[[MqttSettings], Transport]]:
     client, protocol = request.param
-    monkeypatch.setenv("PEBBLE_MQTT_CLIENT", client)
     with ExitStack() as closing:
 
         def make(settings: MqttSettings) -> Transport:
-            transport = create("mqtt", "tool", replace(settings, protocol=protocol))
+            transport = create("mqtt", "tool", replace(settings, protocol=protocol, client=client))
             closing.callback(transport.close)
             return transport
 
@@ -115,12 +114,11 @@ def test_whatever_way_the_first_one_fails(
 
 
 @pytest.mark.parametrize("failing", ["stalled handshake", "wrong name", "closing", "no TLS"])
-@pytest.mark.parametrize("client", ["ours", "paho"])
+@pytest.mark.parametrize("client", ["pebble", "paho"])
 def test_tls_checks_the_name_at_every_address(
     tmp_path: Path, names: Names, monkeypatch: pytest.MonkeyPatch, failing: str, client: str
 ) -> None:
     """The broker's certificate names localhost, whose addresses are these."""
-    monkeypatch.setenv("PEBBLE_MQTT_CLIENT", client)
     wrong = certificate_of("elsewhere", tmp_path)
     behaviour = {"stalled handshake": mute, "wrong name": showing(wrong), "no TLS": BEHAVIOURS["no MQTT"]}
     files = [f"cafile {CERTS}/ca.crt", f"certfile {CERTS}/server.crt", f"keyfile {CERTS}/server.key"]
@@ -129,7 +127,7 @@ def test_tls_checks_the_name_at_every_address(
     monkeypatch.setattr("pebble.transports.hosts.CONNECT_TIMEOUT_S", 1.0)
     trusted = tmp_path / "both.crt"
     trusted.write_text((CERTS / "ca.crt").read_text() + (wrong / "server.pem").read_text())
-    settings = MqttSettings(host="localhost", port=secured.port, tls=TlsSettings(ca_cert=trusted))
+    settings = MqttSettings(host="localhost", port=secured.port, tls=TlsSettings(ca_cert=trusted), client=client)
     failing_server = serving(BAD, secured.port, behaviour.get(failing, BEHAVIOURS["closing"]))
     with failing_server, create("mqtt", "tool", settings) as transport:
         assert transport.state is State.CONNECTED, transport.problem

@@ -19,6 +19,7 @@ from pebble.transports.mqtt import packets
 from pebble.transports.mqtt.client import Client, Opening
 from pebble.transports.mqtt.connection import Connection
 from pebble.transports.mqtt.packets import Filter
+from pebble.transports.mqtt.transport import MqttTransport
 from tests.support import until
 from tests.transports.test_mqtt_packets import Noted, packet
 
@@ -185,11 +186,9 @@ def test_a_message_is_acknowledged_when_it_was_handled_even_if_that_failed(fails
         connection = Connection(
             opening(settings),
             Counters(),
+            MqttTransport("client", settings),
             where="broker",
             as_published=False,
-            on_answers=lambda _answers: None,
-            skips_retained=lambda _topic: False,
-            on_refusal=lambda _topic, _why: None,
         )
         stack.callback(connection.discard)
         connecting = threading.Thread(target=connection.connect, args=(threading.Event(),))

@@ -18,8 +18,10 @@ from paho.mqtt.subscribeoptions import SubscribeOptions
 
 from pebble.transports.base import Message, QoS
 from pebble.transports.mqtt import packets, reasons
+from pebble.transports.mqtt.client import SendQuota
 from pebble.transports.mqtt.packets import ANY_QOS, MAX_PACKET, RETAIN, Accepted, Filter, MalformedError, Reader
 
+NO_QUOTA = SendQuota(lambda _packet: None)
 V3, V5 = MQTTProtocolVersion.MQTTv311, MQTTProtocolVersion.MQTTv5
 Seen = tuple[Any, ...]
 both_versions = pytest.mark.parametrize("modern", [False, True])
@@ -62,7 +64,7 @@ class Noted:
 def read(data: bytes, *, modern: bool, pieces: int = 1, most: int = 64, skipped: bytes = b"\0") -> tuple[Noted, Reader]:
     """``data`` in so many pieces of random sizes."""
     noted = Noted(skipped)
-    reader = Reader(noted, modern=modern)
+    reader = Reader(noted, NO_QUOTA, modern=modern)
     rng = random.Random(pieces)
     cuts = sorted(rng.randrange(len(data) + 1) for _ in range(pieces - 1))
     for begin, end in zip([0, *cuts], [*cuts, len(data)], strict=True):
@@ -201,14 +203,14 @@ class TestRead:
         assert reader.unread == reader.partial == 0
 
     def test_no_more_than_asked_for(self) -> None:
-        reader = Reader(noted := Noted(), modern=False)
+        reader = Reader(noted := Noted(), NO_QUOTA, modern=False)
         reader.feed(5 * packet(0x30, b"\0\1ax"))
         assert [reader.read(2) for _ in range(4)] == [2, 2, 1, 0]
         assert len(noted.seen) == 5
 
     def test_a_long_packet_in_small_pieces_is_copied_once(self) -> None:
         long = packet(0x30, b"\0\1a" + bytes(MAX_PACKET - 3))
-        reader, copied = Reader(noted := Noted(), modern=False), 0
+        reader, copied = Reader(noted := Noted(), NO_QUOTA, modern=False), 0
         for begin in range(0, len(long), 500):
             reader.feed(long[begin : begin + 500])
             copied += reader.unread
@@ -298,7 +300,7 @@ class TestRead:
     def test_random_bytes_are_read_or_refused(self, modern: bool) -> None:
         rng, refused = random.Random(3), 0
         for _ in range(2000):
-            reader = Reader(Noted(), modern=modern)
+            reader = Reader(Noted(), NO_QUOTA, modern=modern)
             try:
                 for _ in range(3):
                     reader.feed(bytes((rng.choice((0x30, 0x32, 0x20, 0x40, 0x90, 0xE0, rng.randrange(256))),)))

@@ -10,15 +10,20 @@ from __future__ import annotations
 import socket
 import ssl
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 from pebble.transports.base import Message
 from pebble.transports.hosts import Address, dial
 from pebble.transports.mqtt import packets
-from pebble.transports.mqtt.packets import Accepted, Filter, Listener, Reader
+from pebble.transports.mqtt.packets import Filter, Listener, Reader
 from pebble.transports.settings import MqttSettings
+
+if TYPE_CHECKING:
+    from pebble.transports.mqtt.paho_client import PahoClient
+
+AnyClient: TypeAlias = "Client | PahoClient"
 
 SEND_BUFFER = 64 * 1024  # bytes in the kernel for a slow connection: with its default a stream would lag by minutes
 _PIECE = 64 * 1024  # bytes that are read at once
@@ -41,6 +46,32 @@ def is_hang_up(error: OSError | None) -> bool:
     return error is None or isinstance(error, ConnectionError | ssl.SSLEOFError)
 
 
+class SendQuota:
+    """How many messages of QoS 1 the broker takes without an answer (Receive Maximum); it holds those beyond that."""
+
+    def __init__(self, send: Callable[[bytes], None]) -> None:
+        self._send = send
+        self._left = self._most = _MOST_IDS
+        self._held: deque[bytes] = deque()
+
+    def begin(self, most: int) -> None:
+        self._left = self._most = most
+
+    def takes(self, packet: bytes) -> bool:
+        """Whether ``packet`` may be sent now; else it is sent later."""
+        if self._left <= 0:
+            self._held.append(packet)
+            return False
+        self._left -= 1
+        return True
+
+    def acknowledged(self) -> None:
+        if self._held:
+            self._send(self._held.popleft())
+        else:
+            self._left = min(self._left + 1, self._most)
+
+
 class Client:
     """`open` waits for TCP and TLS, everything else returns at once. ``listener`` is called by `read`."""
 
@@ -50,8 +81,9 @@ class Client:
         self.unwritten = 0  # bytes that the kernel has not accepted yet
         self.drained = True  # `receive` has taken out everything that had come
         self.hung_up = False  # the other side has ended the connection, in whatever way
+        self.waiting: deque[bytes] = deque()  # to be written, once the socket accepts more
         self._modern = settings.protocol == "5"
-        self._address, self._settings, self._context = opening.address, settings, opening.context
+        self._opening = opening
         self._hello = packets.connect(
             opening.client_id,
             modern=self._modern,
@@ -61,28 +93,19 @@ class Client:
             username=settings.username,
             password=settings.password,
         )
-        self._reader = Reader(self, modern=self._modern)
-        self.waiting: deque[bytes] = deque()  # to be written, once the socket accepts more
         self._mid = 0  # the newest message id
-        self._quota = self._receive_maximum = _MOST_IDS  # messages of QoS 1 that the broker takes without an answer
-        self._held: deque[bytes] = deque()  # such messages beyond that
-        self._listener = listener
-        self.on_publication, self.skips, self.on_too_long = (
-            listener.on_publication,
-            listener.skips,
-            listener.on_too_long,
-        )
-        self.on_answer, self.on_pong = listener.on_answer, listener.on_pong
-        self.on_refused, self.on_disconnect = listener.on_refused, listener.on_disconnect
+        self._quota = SendQuota(self._send)
+        self._reader = Reader(listener, self._quota, modern=self._modern)
 
     def open(self) -> None:
         """Connect, and send CONNECT. Raises OSError; ValueError for a host that cannot be a name."""
-        sock = dial(self._address)
+        opening = self._opening
+        sock = dial(opening.address)
         try:
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
-            if self._context is not None:
-                sock = self._context.wrap_socket(sock, server_hostname=self._settings.host)
+            if opening.context is not None:
+                sock = opening.context.wrap_socket(sock, server_hostname=opening.settings.host)
             sock.setblocking(False)
         except BaseException:
             sock.close()
@@ -122,7 +145,7 @@ class Client:
             self.hung_up = is_hang_up(error)
             self.close()
         # What TLS has unpacked is no measure of what the socket has.
-        self.drained = not data or (len(data) < _PIECE and self._context is None)
+        self.drained = not data or (len(data) < _PIECE and self._opening.context is None)
         self._reader.feed(data)
         return len(data)
 
@@ -143,18 +166,6 @@ class Client:
         acks, reader.acks = bytes(reader.acks), bytearray()
         self._send(acks)
 
-    def on_accepted(self, accepted: Accepted) -> None:
-        if accepted.receive_maximum is not None:
-            self._quota = self._receive_maximum = accepted.receive_maximum
-        self._listener.on_accepted(accepted)
-
-    def on_puback(self, mid: int, code: int) -> None:
-        if self._held:
-            self._send(self._held.popleft())
-        else:
-            self._quota = min(self._quota + 1, self._receive_maximum)
-        self._listener.on_puback(mid, code)
-
     # -- writing
 
     def write(self) -> None:
@@ -169,10 +180,7 @@ class Client:
         if qos:
             mid = self._mid = self._mid % _MOST_IDS + 1
         packet = packets.publish(topic, payload, qos, mid, retain=retain, modern=self._modern, expires_s=expires_s)
-        if qos and self._quota <= 0:
-            self._held.append(packet)
-        else:
-            self._quota -= qos
+        if not qos or self._quota.takes(packet):
             self._send(packet)
         return mid
 

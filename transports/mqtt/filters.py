@@ -7,6 +7,7 @@ messages that it matches in excess are sorted out by exact matching on arrival.
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterable, Iterator
 from hashlib import blake2b
 
@@ -47,6 +48,7 @@ class BrokerFilters:
     """The filters a client has subscribed to at its broker; no two of them overlap."""
 
     def __init__(self) -> None:
+        self.lock = threading.RLock()  # to be held: it guards these, and the connection that they belong to
         self._subscribed: list[str] = []
 
     def __iter__(self) -> Iterator[str]:

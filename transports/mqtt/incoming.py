@@ -1,131 +1,199 @@
-"""How long what is received may have waited (T19): in the kernel, which does not say when it came, or at the broker."""
+"""What a broker sends on one MQTT connection: read in batches, and made into messages that have an age."""
 
 from __future__ import annotations
 
-import socket
-import sys
-from collections import deque
-from collections.abc import Callable
-from contextlib import suppress
+import logging
+from typing import Protocol
 
-try:
-    import fcntl
-    import termios
-except ImportError:  # Windows has neither
-    _can_measure = False
-else:
-    _can_measure = True
+from pebble.transports import clock
+from pebble.transports.base import Message, QoS
+from pebble.transports.counters import Counters
+from pebble.transports.mqtt import reasons
+from pebble.transports.mqtt.client import AnyClient
+from pebble.transports.mqtt.ending import Ending, Lost, Silent
+from pebble.transports.mqtt.outgoing import InFlightTable
+from pebble.transports.mqtt.packets import ANY_QOS, RETAIN, Accepted, MalformedError
+from pebble.transports.mqtt.pings import Pings
+from pebble.transports.mqtt.read_age import ReadAge, readable_bytes
+from pebble.transports.settings import MqttSettings
+from pebble.transports.topics import MAX_BYTES
 
-_FAR_S = 1.0  # no round trip of a usable link is longer
-_NOTICED_S = 0.1
-_BACKLOG_S = 0.2  # after a stall, for what others had sent to the broker meanwhile
-_NEAR_S = 0.05  # of a broker further away PUBACKs must show what is lost
-_LOST = 8  # prompt answers in a row
-_UPLINK_S = 0.5  # TCP's round trips may be so much longer than usual: more may as well be the way to us
+log = logging.getLogger(__name__)
 
-
-class WaitingTime:
-    """Since when the bytes that are read next may have waited in a socket; all times are of one clock.
-
-    Known is when the socket was last empty, and how many bytes were in it at another moment: what is read after these
-    has arrived later.
-    """
-
-    def __init__(self, now: float) -> None:
-        self.since = now
-        self.checked_at = now  # all but the counted bytes have arrived in the socket since then
-        self._counted = 0
-
-    def empty(self, now: float) -> None:
-        """The socket was empty at ``now``."""
-        self.checked_at, self._counted = now, 0
-
-    def found(self, size: int, now: float) -> None:
-        """``size`` bytes are in the socket at ``now``."""
-        if self._counted <= 0:
-            self.since, self.checked_at, self._counted = self.checked_at, now, size
-
-    def read(self, size: int) -> None:
-        """``size`` bytes were taken out of it."""
-        self._counted -= size
+OVERSLEPT_S = 0.1  # poll took so much longer than asked for: the process was stopped, or the machine suspended
+_LOGGED = 200  # bytes of a topic
+_BATCH = 64  # messages read in a row before they are delivered
 
 
-class BrokerDelay:
-    """How long what is received now has waited at the broker, which sends the answer to a ping after it.
+class Sink(Protocol):
+    """What is called on the network thread with the connection's lock held: it must neither wait nor publish."""
 
-    A ping of which the way there took long itself, behind our own data, says nothing. What is usual is no delay: the
-    shortest answer of this connection, and TCP's own round trips, which do not wait for the broker.
+    def skips_retained(self, topic: bytes, /) -> bool:
+        """Whether a retained message of this topic is not wanted."""
 
-    A broker that stood still reads what its clients have sent meanwhile a packet of each in turn: it may have answered
-    all of our pings before it has read the last old message of another client. So if nothing at all has come since an
-    overdue ping was sent, what comes in the next moment counts as having waited as long.
-
-    Answers carry no number, and mosquitto drops them where a client's queue is full. A later PUBACK shows that, and so
-    do answers that always come right after the newest ping, which is not sent at regular intervals.
-    """
-
-    def __init__(self) -> None:
-        #: Unanswered pings: since when what comes before the answer may have waited, when sent, do they say something.
-        self._asked: deque[tuple[float, float, bool]] = deque()
-        self._shortest = _FAR_S
-        self._newest = 0.0  # seconds until the newest answer
-        self._came_at = 0.0  # when something was received last
-        self._stall = 0.0  # how long the newest one took, which counts
-        self._until = 0.0  # then
-        self._prompt = 0  # answers in a row that came right after the newest of several pings
-
-    def usual(self, seconds: float) -> None:
-        """An answer took so long that waited for nothing."""
-        self._shortest = min(self._shortest, seconds)
-
-    def asked(self, now: float, *, clear: bool) -> None:
-        """A ping was sent; ``clear``: nothing of ours was on its way."""
-        self._asked.append((now, now, clear))
-
-    def stalled(self, since: float, now: float) -> None:
-        """A ping was sent after nothing was read ``since`` then: what fits into no socket has waited at the broker."""
-        self._asked.append((since, now, True))
-
-    def answered(self, now: float) -> None:
-        """The oldest ping was answered."""
-        if self._asked:
-            _, sent_at, clear = self._asked.popleft()
-            self._newest = now - sent_at if clear else 0.0
-            self.usual(now - sent_at)
-        near = self._shortest <= _NEAR_S
-        prompt = near and bool(self._asked) and now - self._asked[-1][1] <= self._shortest + _NEAR_S
-        self._prompt = self._prompt + 1 if prompt else 0
-        if self._prompt >= _LOST:
-            self._asked.clear()
-            self._newest = 0.0
-
-    def acknowledged(self, sent_at: float, now: float) -> None:
-        """What was sent at ``sent_at`` was answered: so were all pings before it, or their answers are lost."""
-        while self._asked and self._asked[0][1] < sent_at:
-            self._asked.popleft()
-        self._newest = min(self._newest, now - sent_at)
-
-    def seconds(self, now: float, round_trip_s: Callable[[], float]) -> float:
-        """Of what is received at ``now``; ``round_trip_s`` asks for TCP's present round trip, if that matters."""
-        waited = self._newest
-        if self._asked:
-            oldest, sent_at = next(((since, sent_at) for since, sent_at, clear in self._asked if clear), (now, now))
-            waited = max(waited, now - oldest)
-            if self._came_at <= sent_at and now - sent_at > self._shortest + _NOTICED_S:
-                self._stall, self._until = now - sent_at, now + _BACKLOG_S
-        self._came_at = now
-        if now < self._until:
-            waited = max(waited, self._stall)
-        if waited <= self._shortest + _NOTICED_S:
-            return 0.0
-        return waited - max(self._shortest, min(round_trip_s(), self._shortest + _UPLINK_S))
+    def note_refusal(self, topic: str, why: str) -> None:
+        """The broker does not take a message of this topic (MQTT 5)."""
 
 
-def readable_bytes(sock: socket.socket) -> int:
-    """Bytes that the kernel has received and we have not read (FIONREAD); 0 where the system does not say."""
-    size = bytearray(4)
-    if not _can_measure:
-        return 0
-    with suppress(OSError, ValueError):  # closed, or no socket
-        fcntl.ioctl(sock.fileno(), termios.FIONREAD, size)
-    return int.from_bytes(size, sys.byteorder)
+class Incoming:
+    """Listens to the client of a connection. Not locked: the connection is."""
+
+    def __init__(
+        self,
+        settings: MqttSettings,
+        sink: Sink,
+        counters: Counters,
+        in_flight: InFlightTable,
+        *,
+        where: str,
+        as_published: bool,
+    ) -> None:
+        self.answered_at = clock.since_boot()
+        self.silence_s = settings.silence_s
+        self.as_published = as_published
+        self.accepted: Accepted | None = None  # what the broker said when it accepted us
+        self.ending = Ending(where, settings)
+        self.messages: list[Message] = []  # read, and not delivered yet
+        self.answers: dict[str, bool] = {}  # filters answered since that was last looked at: refused?
+        self.more = False  # a batch ended before the socket was empty
+        self.age = ReadAge(self.answered_at)
+        self.pings = Pings(settings, in_flight, self.age)
+        self._packets = 0  # received so far
+        self._sink, self._counters, self._in_flight = sink, counters, in_flight
+
+    # -- called by the connection
+
+    def check_silence(self, now: float) -> None:
+        """Raises Silent if the broker has not answered for too long."""
+        if self.accepted is None:
+            return  # `connect` has its own deadline, and gives the first round trip
+        silence_s = now - max(self.answered_at, self.age.arriving_at)
+        if silence_s > self.silence_s and silence_s > (limit := self.pings.silence_limit_s):
+            self._counters.add("silences")
+            raise Silent(f"{self.ending.where} has not answered for {limit:.1f} s")
+
+    def read(self, client: AnyClient, now: float) -> None:
+        """Read up to a batch: several times, where more than fits at once has come, or a piece of what TLS unpacks.
+
+        ``now``: a time before anything is read. Raises Lost.
+        """
+        age, waiting, first, size = self.age, self.age.waiting, self._packets, 0
+        unread = client.unread if self.more else 0
+        self.more = True
+        while self.more and self._packets - first < _BATCH:
+            before = self._packets
+            if not unread:
+                age.received_at = now
+                if now - waiting.checked_at > OVERSLEPT_S and self.accepted is not None:
+                    self.pings.send_after_stall(client, now)
+                unread = client.receive()
+                waiting.found(unread if client.drained else unread + readable_bytes(client.socket), now)
+            age.update(now, client.socket)
+            try:
+                left = client.read(_BATCH - (before - first))
+            except MalformedError as error:
+                raise Lost(f"{self.ending.where} does not speak MQTT: {error}") from None
+            if self.ending.begun:
+                self._end(client)
+            size += unread - left
+            self.more = left > 0 or not client.drained
+            if not self.more:
+                break
+            waiting.read(unread - left)
+            if self._packets == before:
+                break
+            unread, now = left, clock.since_boot()
+        if age.has_retained or (size and self._packets == first):  # the latter is a piece of a long message
+            age.note_arriving()
+        if not self.more:
+            waiting.empty(age.received_at)
+
+    def _end(self, client: AnyClient) -> None:
+        if self.ending.refusal is not None:
+            raise self.ending.refusal
+        client.close()
+
+    # -- called by the client
+
+    def _note_answer(self) -> None:
+        self._packets += 1
+        self.answered_at = clock.since_boot()
+
+    def _note_connack(self) -> None:
+        started = self.answered_at
+        self._note_answer()
+        self._in_flight.measured(self.answered_at - started)
+        self.age.delay.usual(self.answered_at - started)
+
+    def on_accepted(self, accepted: Accepted) -> None:
+        self._note_connack()
+        self.pings.begin(self.answered_at)
+        self.accepted = accepted
+
+    def on_refused(self, code: int) -> None:
+        self._note_connack()
+        self.ending.refuse(code)
+
+    def on_disconnect(self, code: int) -> None:
+        self.ending.disconnect(code)
+
+    def on_pong(self) -> None:
+        self._note_answer()
+        self._in_flight.pong(self.answered_at)
+        self.age.delay.answered(self.answered_at)
+
+    def on_answer(self, mid: int, codes: bytes) -> None:
+        self._note_answer()
+        answers = list(zip(self._in_flight.answer(mid), codes, strict=False))
+        self.answers.update((filter_, code >= reasons.FAILURE) for filter_, code in answers)
+        refused = [f"{filter_} ({reasons.words(code)})" for filter_, code in answers if code >= reasons.FAILURE]
+        if refused:
+            self._counters.add("subscriptions_refused")
+            log.warning("%s refused to subscribe us to %s", self.ending.where, ", ".join(refused))
+
+    def on_puback(self, mid: int, code: int) -> None:
+        now = clock.since_boot()
+        if code >= reasons.FAILURE and (topic := self._in_flight.topic_of(mid)) is not None:
+            self._counters.add("publications_refused")
+            self._sink.note_refusal(topic, reasons.words(code))
+        sent_at = self._in_flight.acknowledge(mid, now)
+        if sent_at is not None:
+            self._packets += 1
+            self.answered_at = now
+            self.age.delay.acknowledged(sent_at, now)
+
+    def on_publication(self, topic: bytes, payload: bytes, first: int) -> None:
+        """Hot."""
+        age, retain = self.age, bool(first & RETAIN)
+        if retain:
+            age.has_retained = True
+        if len(topic) > MAX_BYTES:  # no transport carries it, and much would be remembered of many
+            self.on_too_long(topic, len(topic) + len(payload))
+            return
+        self._packets += 1
+        try:
+            text = topic.decode()
+        except UnicodeDecodeError:
+            self._counters.add("malformed")
+            return
+        retain_requested = retain if self.as_published else (True if retain else None)
+        qos = QoS.DELIVERED if first & ANY_QOS else QoS.LATEST
+        self.messages.append(Message(text, payload, qos, retain, retain_requested, age.since))
+
+    def skips(self, topic: bytes) -> bool:
+        if self.messages:
+            return False  # what came before may change the answer
+        try:
+            skipped = self._sink.skips_retained(topic)
+        except Exception:  # foreign code on our thread
+            log.exception("asking whether to skip a retained message of %r failed", topic)
+            return False
+        if skipped:
+            self._packets += 1
+            self.age.note_arriving()
+        return skipped
+
+    def on_too_long(self, topic: bytes, length: int) -> None:
+        self._packets += 1
+        self._counters.add("too_long")
+        log.debug("%s sent %d bytes on %r…: discarded", self.ending.where, length, topic[:_LOGGED])

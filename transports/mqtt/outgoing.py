@@ -11,6 +11,7 @@ import struct
 import sys
 import threading
 from collections import deque
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -132,7 +133,7 @@ class InFlightTable:
         self._acked_at = float("-inf")  # the newest acknowledgement
         self._unconfirmed: dict[str, _Unconfirmed] = {}  # newest retained message of each topic, oldest first
         self.has_acknowledged = self.has_retained = False  # the broker, a DELIVERED or a retained message
-        self._requests: dict[int, PendingAck] = {}
+        self._requests: dict[int, tuple[PendingAck, Sequence[str]]] = {}  # unanswered, with the filters of a SUBSCRIBE
         self.answered: list[PendingAck] = []  # and not completed yet
         #: Unanswered: when sent, what waits for it, and what was written before it and after the ping before.
         self._pings: deque[tuple[float, PendingAck | None, dict[str, tuple[float, int]]]] = deque()
@@ -208,14 +209,17 @@ class InFlightTable:
 
     # -- requests and pings
 
-    def ask(self, mid: int, ack: PendingAck) -> None:
-        """Track a SUBSCRIBE or UNSUBSCRIBE."""
-        self._requests[mid] = ack
+    def ask(self, mid: int, ack: PendingAck, filters: Sequence[str] = ()) -> None:
+        """Track a SUBSCRIBE of ``filters``, or an UNSUBSCRIBE."""
+        self._requests[mid] = ack, filters
 
-    def answer(self, mid: int) -> None:
-        """Process a SUBACK or UNSUBACK."""
-        if mid in self._requests:
-            self.answered.append(self._requests.pop(mid))
+    def answer(self, mid: int) -> Sequence[str]:
+        """Process a SUBACK or UNSUBACK: returns which filters are subscribed to, or refused."""
+        if mid not in self._requests:
+            return ()
+        ack, filters = self._requests.pop(mid)
+        self.answered.append(ack)
+        return filters
 
     def complete(self) -> None:
         """Complete the answered requests, once the messages received before the answers have been delivered."""
@@ -255,7 +259,7 @@ class InFlightTable:
     def end(self) -> None:
         """Complete everything: no answer can come any more."""
         self.complete()
-        for ack in [*self._requests.values(), *(ack for _, ack, _ in self._pings if ack)]:
+        for ack in [*(ack for ack, _ in self._requests.values()), *(ack for _, ack, _ in self._pings if ack)]:
             ack.complete()
         self._requests.clear()
         self._pings.clear()

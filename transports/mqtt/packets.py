@@ -177,12 +177,21 @@ class Listener(Protocol):
         """Whether a retained message of this topic is not wanted."""
 
 
+class Quota(Protocol):
+    """Counts the messages that the broker has not acknowledged; it is called before the listener."""
+
+    def begin(self, most: int) -> None:
+        """The broker takes so many of them."""
+
+    def acknowledged(self) -> None: ...
+
+
 class Reader:
     """Makes packets out of bytes as they come; ``acks`` collects the answers that are to be written."""
 
-    def __init__(self, listener: Listener, *, modern: bool) -> None:
+    def __init__(self, listener: Listener, quota: Quota, *, modern: bool) -> None:
         self.acks = bytearray()
-        self._listener, self._modern = listener, modern
+        self._listener, self._quota, self._modern = listener, quota, modern
         self._data, self._at = b"", 0  # what was not read yet begins there
         self._partial = bytearray()  # a packet that is not whole
         self._needed = 0  # bytes of it until more can be read
@@ -244,6 +253,7 @@ class Reader:
             if data[at] & 0xF0 == _PUBLISH:
                 self._publish(data, data[at], start, stop)
             elif data[at] == _PUBACK and size >= _SHORTEST[_PUBACK]:
+                self._quota.acknowledged()
                 self._listener.on_puback(data[start] << 8 | data[start + 1], data[start + 2] if size > 2 else 0)
             else:
                 self._other(data[at], data[start:stop])
@@ -306,7 +316,10 @@ class Reader:
             return
         found = properties(body[2 : 2 + self._properties_size(body, 2)])
         wanted = (_MAXIMUM_PACKET, _RECEIVE_MAXIMUM, _MAXIMUM_QOS, _RETAIN_AVAILABLE)
-        self._listener.on_accepted(Accepted(*map(found.get, wanted)))
+        accepted = Accepted(*map(found.get, wanted))
+        if accepted.receive_maximum is not None:
+            self._quota.begin(accepted.receive_maximum)
+        self._listener.on_accepted(accepted)
 
     # -- packets that are too long
 

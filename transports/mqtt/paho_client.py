@@ -1,6 +1,6 @@
-"""The same as `client.Client`, by paho: chosen with ``PEBBLE_MQTT_CLIENT=paho``, should the other one fail somewhere.
+"""The same as `client.Client`, by paho: ``"client": "paho"`` in the MQTT section of a config chooses it.
 
-Needs paho-mqtt. Costs about half as much again in processor time, and 5 MB.
+It costs about half as much again in processor time, and 5 MB.
 """
 
 from __future__ import annotations

@@ -1,11 +1,13 @@
-"""Asks a broker once which of our own retained messages it has: nothing else shows what it silently drops. Pure."""
+"""Asks a broker once which of our own retained messages it has: nothing else shows what it silently drops."""
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from math import inf
 
-from pebble.transports.base import Message
+from pebble.transports.base import Message, QoS
+from pebble.transports.mqtt.connection import Connection
+from pebble.transports.mqtt.outgoing import PendingAck
 
 AFTER_S = 2.0  # from the first connection to the question
 LATE_S = 1.0  # without another message, after which none comes any more
@@ -13,7 +15,7 @@ TOPICS = 200  # at most are asked for
 
 
 class RetentionCheck:
-    """One question to one broker: subscribe to `topics`, hand over what comes, and see what is `missing`."""
+    """One question to one broker; no I/O: subscribe to `topics`, hand over what comes, and see what is `missing`."""
 
     def __init__(self, now: float) -> None:
         self.topics: list[str] = []
@@ -47,3 +49,37 @@ class RetentionCheck:
             self._newest_at = min(self._newest_at, now)
         left = [topic for topic in self.topics if topic not in self._found]
         return None if left and now - self._newest_at < LATE_S else left
+
+
+class RetentionChecks:
+    """Asks each broker that a transport connects to, once."""
+
+    def __init__(self) -> None:
+        self.current: RetentionCheck | None = None
+        self._answer = PendingAck()
+        self._address = ""
+        self._checked: set[str] = set()  # addresses of brokers that were asked
+
+    def begin(self, address: str, now: float) -> None:
+        """There is a new connection, to the broker at ``address``."""
+        self._address, self.current = address, None if address in self._checked else RetentionCheck(now)
+
+    def proceed(self, connection: Connection, now: float, own_topics: Callable[[], list[str]]) -> list[str]:
+        """Ask for each of ``own_topics`` by name once it is time; returns those that the broker has not sent."""
+        check = self.current
+        if check is None:
+            return []
+        if check.is_due(now):
+            if topics := check.begin(own_topics()):
+                connection.subscribe([(topic, False) for topic in topics], QoS.LATEST)
+                self._answer = connection.ping()
+            else:
+                self.current = None
+            return []
+        missing = check.missing(now, answered=self._answer.done) if check.topics else None
+        if missing is None:
+            return []
+        connection.unsubscribe(check.topics)
+        self.current = None
+        self._checked.add(self._address)
+        return missing

@@ -7,26 +7,20 @@ import random
 import threading
 import time
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import replace
-from math import ceil, inf
+from math import ceil
 
 from pebble.errors import TransportError
 from pebble.transports import clock
 from pebble.transports.base import Message, Outgoing, QoS, State, Subscription, Transport
-from pebble.transports.bounds import BoundedTable
-from pebble.transports.credentials import Credentials
-from pebble.transports.hosts import Address, Turns
-from pebble.transports.mqtt import client_ids
-from pebble.transports.mqtt.bridge_mode import Attempt, BridgeMode, Result
-from pebble.transports.mqtt.broker_limits import EVERYTHING, BrokerLimits, Limits
-from pebble.transports.mqtt.client import Opening
-from pebble.transports.mqtt.connection import Absent, Connection, Lost, Refused, Silent, ignore
+from pebble.transports.mqtt.connection import Connection, client_class, ignore
+from pebble.transports.mqtt.dialler import Dialler
+from pebble.transports.mqtt.ending import Lost, Silent
 from pebble.transports.mqtt.filters import BrokerFilters, OwnMessageFilter, overlap
 from pebble.transports.mqtt.outgoing import PendingAck
-from pebble.transports.mqtt.retention import RetentionCheck
-from pebble.transports.mqtt.suspects import TOPICS, Kind, SuspectTopics, Written, is_large, named
+from pebble.transports.mqtt.refused_topics import RefusedTopics
+from pebble.transports.mqtt.retention import RetentionChecks
+from pebble.transports.mqtt.suspects import is_large, named
 from pebble.transports.settings import MqttSettings
-from pebble.transports.topics import MAX_BYTES
 
 log = logging.getLogger(__name__)
 
@@ -36,13 +30,16 @@ _CLOSING_S = 1.0  # longest wait for unacknowledged messages when closing
 _DIALLING_S = 0.2  # longest wait for a thread that may be in connect(2)
 _RETRY_S = 0.05  # second attempt to connect; doubles up to settings.reconnect_max_s
 _CATCH_UP_S = 0.5  # time for a broker that was suspended to deliver its backlog before we subscribe
-_ENDING_S = 1.0  # so long a broker that ends may still accept connections, and hang up on them
 _STEADY_S = 2.0  # after a connection this long the first retry is immediate
 _REPEAT_LOG_S = 30.0  # between two equal log lines
-_TRY_S = 0.25  # between two looks whether a topic that is withheld may be tried
-_NOT_TAKEN_S = 600.0  # between two log lines about one topic that the broker does not take
 _TRIED_S = 1.0  # after which a connection shows what the broker has
 _IDLE_S = 60.0  # the connection wakes up earlier, for its pings
+
+
+class _Stop(threading.Event):
+    """Ends one run of the network thread, which then publishes the will."""
+
+    will: Message | None = None
 
 
 class MqttTransport(Transport):
@@ -52,40 +49,28 @@ class MqttTransport(Transport):
         super().__init__(client_id, will=will)
         if settings.protocol not in ("3.1.1", "5"):
             raise TransportError(f'protocol must be "3.1.1" or "5", not "{settings.protocol}"')
+        client_class(settings.client)  # a package that is missing is an error now, not in a thread
         self.settings = settings
-        # It stays the same over reconnects: the broker closes our own half-dead connection at once.
-        self._mqtt_client_id = client_ids.unique(client_id) if settings.client_id is None else settings.client_id
-        self._broker = f"broker {settings.host}:{settings.port}"
-        self._turns = Turns(settings.host, settings.port)
         self.as_published = settings.as_published
         self.exact_echo = settings.as_published or settings.protocol == "5"
-        self._credentials: Credentials | None = None  # read when it opens
-        self._attempt: Connection | None = None  # the newest connection, in any state
-        self._connection: Connection | None = None  # the same, once it can be used
-        self._routing = threading.RLock()  # guards the broker's filters, and the connection they belong to
+        self._dialler = Dialler(client_id, settings, will)
+        self._connection: Connection | None = None  # the newest one, once it can be used
         self._filters = BrokerFilters()
-        self._stopping = threading.Event()
-        self._will_on_close: Message | None = None
-        self._thread: threading.Thread | None = None
-        self._bridge_mode, self._limits = BridgeMode(), BrokerLimits()  # of the broker at this address:
-        self._address: Address | None = None
-        self._gone_at = float("-inf")  # when the broker was last known to be gone
-        self._broker_stalled = False  # the broker may have been suspended, and have old messages to forward first
-        self._logged = ("", 0.0)  # the newest problem in the log, and when it went there
         self._own_message_filter = OwnMessageFilter()
-        self._suspects = SuspectTopics(settings.vital)  # guarded by _publishing
-        self._tried_at = 0.0  # when it was last looked whether one of them may be tried
-        self._arrived_at = float("-inf")  # the newest message
-        self._checked: set[str] = set()  # addresses of brokers that were asked what they retain
-        self._retention: RetentionCheck | None = None
-        self._retention_answer = PendingAck()
-        #: Topics on which the broker takes no messages: why, and when that was last in the log.
-        self.not_taken = BoundedTable[tuple[str, float]](TOPICS, TOPICS * MAX_BYTES, lambda _: 0)
-        self._reported = EVERYTHING  # what the log says the broker has
+        self._stopping = _Stop()
+        self._thread: threading.Thread | None = None
+        self._refused = RefusedTopics(client_id, settings.vital)
+        self._retention = RetentionChecks()
+        self._logged = ("", 0.0)  # the newest problem in the log, and when it went there
+
+    @property
+    def not_taken(self) -> Mapping[str, tuple[str, float]]:
+        """Topics on which the broker takes no messages: why, and when that was last in the log."""
+        return self._refused.not_taken
 
     @property
     def untried(self) -> bool:
-        return self._turns.untried
+        return self._dialler.turns.untried
 
     @property
     def outgoing(self) -> Outgoing:
@@ -95,11 +80,10 @@ class MqttTransport(Transport):
     # -- the interface to base
 
     def _open(self, timeout: float) -> None:  # noqa: ARG002  (base waits)
-        self._credentials = Credentials(self.settings)
+        self._dialler.open()
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join(_ANSWER_S)  # closed while it was dialling
-        self._will_on_close = None
-        self._stopping = stopping = threading.Event()
+        self._stopping = stopping = _Stop()
         self._thread = threading.Thread(
             target=self._run, args=(stopping,), name=f"pebble-mqtt {self.client_id}", daemon=True
         )
@@ -107,9 +91,9 @@ class MqttTransport(Transport):
 
     def _close(self, will: Message | None) -> None:
         """Do not wait for a thread that is connecting: it ends by itself, within CONNECT_TIMEOUT_S."""
-        self._will_on_close = will
+        self._stopping.will = will
         self._stopping.set()
-        attempt = self._attempt
+        attempt = self._dialler.attempt
         if attempt is not None:
             attempt.wake()
         if self._thread is not None and self._thread is not threading.current_thread():
@@ -121,26 +105,26 @@ class MqttTransport(Transport):
             return False
         if not connection.takes(message):
             why = f"{len(message.payload)} bytes, but it takes packets of {connection.max_packet} at most"
-            self._report_not_taken(connection, message.topic, why, logging.ERROR)
+            self._refused.report(connection.where, message.topic, why, logging.ERROR)
             self.counters.add("too_large")
             return True
         tried = False
-        if self._suspects.withheld and not self._suspects.accepts(message):
-            tried = self._suspects.tries(message, time.monotonic(), self._arrived_at)
+        if self._refused.withheld and not self._refused.suspects.accepts(message):
+            tried = self._refused.suspects.tries(message, time.monotonic(), self._refused.arrived_at)
             if not tried:
                 self.counters.add("withheld")
                 return True  # as if it were sent: nothing may wait behind it
-            connection.doubtful.add(message.topic)
+            connection.pings.doubtful.add(message.topic)
         expires_s = ceil(self.settings.silence_s) if urgent and not message.retain else None
         if message.retain:
             self._own_message_filter.note_own(message)
         accepted = connection.publish(message, expires_s=expires_s)
         if tried and not accepted:
-            self._suspects.give_up()
+            self._refused.suspects.give_up()
         return accepted
 
     def _declare(self, subscription: Subscription) -> None:
-        with self._routing:
+        with self._filters.lock:
             filter_, replaced = self._filters.add(subscription.filter)
             connection = self._connection
             if connection is None:
@@ -162,7 +146,7 @@ class MqttTransport(Transport):
                 ack.wait(deadline - time.monotonic())
 
     def _ask(self, topics: list[str]) -> list[PendingAck]:
-        with self._routing:
+        with self._filters.lock:
             connection, names = self._connection, [topic for topic in topics if topic not in self._filters]
             if connection is None or not names:
                 return []
@@ -172,7 +156,7 @@ class MqttTransport(Transport):
             return [asked, connection.ping(), connection.unsubscribe(names)]
 
     def _undeclare(self, subscription: Subscription) -> None:  # noqa: ARG002  (the ones that stay decide)
-        with self._routing:
+        with self._filters.lock:
             with self._lock:
                 wanted = [other.filter for other in self._subscriptions]
             idle = self._filters.prune(wanted)
@@ -190,161 +174,111 @@ class MqttTransport(Transport):
 
     # -- the network thread
 
-    def _run(self, stopping: threading.Event) -> None:
+    def _run(self, stopping: _Stop) -> None:
         failures = 0
         while not stopping.is_set():
             began, problem = time.monotonic(), "failed unexpectedly"
             try:
                 self._run_connection(stopping)
             except Lost as lost:
-                silent = isinstance(lost, Silent)  # then it may be we who stood still
-                self._broker_stalled |= silent
-                self._note_end(lost, silent=silent)
+                connected = self._state is State.CONNECTED
+                self.was_ended = self._dialler.is_gone(lost, connected=connected, was_ended=self.was_ended)
                 problem = str(lost)
             except Exception:  # any error must lead to a reconnect, never end the thread
                 log.exception("%s: unexpected failure of the connection", self.client_id)
             if stopping.is_set():
                 return
             held_s = time.monotonic() - began if self._state is State.CONNECTED else 0.0
-            self._note_failure(problem, held_s)
+            problem, logged = self._dialler.failed(problem, held_s)
+            if problem:
+                self.problem = problem
+            if logged:
+                self._log(logging.WARNING, problem)
             if held_s > _STEADY_S:
                 failures = 0
             self._set_state(State.CONNECTING)
-            if self._turns.several and not self._turns.is_over:
+            if self._dialler.turns.several and not self._dialler.turns.is_over:
                 continue  # the next address
             pause = min(self.settings.reconnect_max_s, _RETRY_S * 2 ** (failures - 1)) if failures else 0.0
-            if not self._limits.asks_again:
+            if not self._dialler.limits.asks_again:
                 failures = min(failures + 1, 20)
             stopping.wait(pause * random.uniform(0.5, 1.0))  # noqa: S311  (jitter, no secret)
 
-    def _note_end(self, lost: Lost, *, silent: bool) -> None:
-        """Whether the other end is gone: nothing listens, or it hangs up as one that is just ending does."""
-        now = time.monotonic()
-        if self._state is State.CONNECTED:
-            self.was_ended, self._gone_at = not silent, now
-        elif isinstance(lost, Absent):
-            self._gone_at = now
-        elif silent or now - self._gone_at > _ENDING_S:
-            self.was_ended = False
-
-    def _run_connection(self, stopping: threading.Event) -> None:
+    def _run_connection(self, stopping: _Stop) -> None:
         """Run one connection from its start to its end; raises Lost unless it ends by `close`."""
-        self._address = self._next_address()
-        self._limits.begin(time.monotonic())
-        if self._limits.wants_probe or (self._asks_for_bridge_mode and self._bridge_mode.next_attempt is Attempt.PROBE):
-            self._probe(stopping)
-        plain = self._asks_for_bridge_mode and self._bridge_mode.next_attempt is Attempt.PLAIN
-        as_published = self.settings.as_published and not plain
-        will = self._limits.limits.fit_will(self.will)
-        connection = self._attempt = self._make_connection(will, as_published=as_published)
+        self._dialler.begin()
+        connection = self._dialler.connect(self, self.counters, stopping)
         try:
-            self._connect(connection, stopping)
+            if self.settings.as_published:
+                as_published = connection.incoming.as_published
+                if self.as_published and not as_published:
+                    log.warning("%s has no bridge mode: own messages come back on this connection", connection.where)
+                self.as_published = self.exact_echo = as_published
             self._serve(connection, stopping)
-            self._finish(connection)
+            self._finish(connection, stopping.will)
         finally:
-            with self._routing:
+            with self._filters.lock:
                 self._connection = None
             connection.discard()
             self._keep_unconfirmed(connection)
 
-    def _next_address(self) -> Address:
-        self._attempt = None  # a resolver cannot be interrupted
-        try:
-            address = self._turns.address()
-        except (OSError, ValueError) as error:
-            raise Lost(f"{self._broker} cannot be reached: {error}") from None
-        if address != self._address:
-            self._bridge_mode, self._limits = BridgeMode(), BrokerLimits()
-        return address
-
-    @property
-    def _where(self) -> str:
-        return f"{self._broker} at {self._address.text}" if self._address and self._turns.several else self._broker
-
-    def _note_failure(self, problem: str, held_s: float) -> None:
-        """The turn of the address is over, unless its broker is to be asked once more in another way."""
-        turns = self._turns
-        if self._is_last_attempt and not self._limits.asks_again:
-            failed = turns.failed(problem.removeprefix(f"{self._where} "), held_s)
-            if turns.several:
-                problem = f"{self._broker}: {failed}"
-        if not self._limits.asks_again or held_s > 0:
-            self._report_problem(problem, logged=held_s > 0 or turns.is_over or not turns.several)
-
-    def _serve(self, connection: Connection, stopping: threading.Event) -> None:
+    def _serve(self, connection: Connection, stopping: _Stop) -> None:
         tried_at = time.monotonic() + _TRIED_S
         try:
             self._synchronize(connection, stopping)
-            if failed := self._turns.succeeded():
+            if failed := self._dialler.turns.succeeded():
                 self._log(logging.INFO, f"connected to {connection.where}; before it {failed}")
             while not stopping.is_set():
-                connection.pump(_IDLE_S, self._deliver_all if self._retention is None else self._deliver_and_note)
-                if connection.limits is not self._reported and time.monotonic() > tried_at:
+                receive = self._deliver_all if self._retention.current is None else self._deliver_and_note
+                connection.pump(_IDLE_S, receive)
+                if connection.limits is not self._dialler.reported and time.monotonic() > tried_at:
                     self._report_limits(connection)
                 if self._pending and connection.has_room:
                     self._sync_retained(self._own.keys())
-                if self._suspects.withheld:
+                if self._refused.withheld:
                     self._try_withheld(connection)
-                if self._retention is not None:
+                if self._retention.current is not None:
                     self._check_retention(connection)
         except Silent:
-            self._note_loss(connection, None)
+            with self._publishing:
+                self._refused.note_loss(connection.where, None)
             raise
         except Lost:
             # First whether it lacks what all such messages need: else each of their topics would seem to be at fault.
-            less, written = (
-                self._tries_less(connection, held=time.monotonic() > tried_at),
-                connection.written_before_loss(),
-            )
-            if not (less or self._limits.undecided) or is_large(written):
-                self._note_loss(connection, written)
+            less = self._dialler.tries_less(connection, held=time.monotonic() > tried_at)
+            written = connection.written_before_loss()
+            if not (less or self._dialler.limits.undecided) or is_large(written):
+                with self._publishing:
+                    self._refused.note_loss(connection.where, written)
             raise
-
-    def _note_loss(self, connection: Connection, written: Mapping[str, Written] | None) -> None:
-        with self._publishing:
-            assessment = self._suspects.lost(written, time.monotonic())
-        if assessment is not None:
-            level = logging.WARNING if assessment.kind is Kind.SUSPECTED else logging.ERROR
-            log.log(level, "%s: %s", self.client_id, assessment.text(connection.where))
 
     def _try_withheld(self, connection: Connection) -> None:
         """See whether the broker accepts the message that is tried, and send the next one that is retained."""
-        now = time.monotonic()
         with self._publishing:
-            confirmed = self._suspects.confirm(now, connection.has_accepted)
-            if confirmed is not None:
-                tried, reported = confirmed
-                if reported:
-                    log.info("%s: %s accepts messages on %s again", self.client_id, connection.where, tried.topic)
-                if (newest := self._own.get(tried.topic)) is not None and newest is not tried:
-                    self._remember(newest, sent=self._send(newest, False))
-            elif now - self._tried_at < _TRY_S:
-                return
-            self._tried_at = now
-            for topic in self._suspects.due(now, self._arrived_at):
-                message = self._own.get(topic)
-                if message is not None and not self._suspects.accepts(message):
-                    self._remember(message, sent=self._send(message, False))
-                    return
+            for message in self._refused.to_try(connection, self._own):
+                self._remember(message, sent=self._send(message, False))
 
     def _check_retention(self, connection: Connection) -> None:
-        """Ask once for each of our retained messages by name, and report which ones the broker does not have."""
-        check, now = self._retention, time.monotonic()
-        assert check is not None  # noqa: S101 - the caller looked
-        if check.is_due(now):
-            if topics := check.begin(self._own_topics_apart(connection)):
-                connection.subscribe([(topic, False) for topic in topics], QoS.LATEST)
-                self._retention_answer = connection.ping()
-            else:
-                self._retention = None
-        elif check.topics:
-            missing = check.missing(now, answered=self._retention_answer.done)
-            if missing is not None:
-                self._end_retention_check(connection, check, missing)
+        """Report which of our retained messages the broker does not have."""
+        missing = [
+            topic
+            for topic in self._retention.proceed(
+                connection, time.monotonic(), lambda: self._own_topics_apart(connection)
+            )
+            if topic in self._own and topic not in self.not_taken
+        ]
+        if missing:
+            log.warning(
+                "%s: %s has not kept what was published on %s: may this account publish there and read it, "
+                "and does the broker keep retained messages?",
+                self.client_id,
+                connection.where,
+                named(missing),
+            )
 
     def _own_topics_apart(self, connection: Connection) -> list[str]:
         """Topics of our retained messages that the broker should have, and that no subscription of ours receives."""
-        with self._routing:
+        with self._filters.lock:
             filters = list(self._filters)
         with self._publishing:
             return [
@@ -355,106 +289,21 @@ class MqttTransport(Transport):
                 if topic not in self.not_taken and not any(overlap(topic, filter_) for filter_ in filters)
             ]
 
-    def _end_retention_check(self, connection: Connection, check: RetentionCheck, missing: list[str]) -> None:
-        connection.unsubscribe(check.topics)
-        self._retention = None
-        if self._address is not None:
-            self._checked.add(self._address.text)
-        missing = [topic for topic in missing if topic in self._own and topic not in self.not_taken]
-        if missing:
-            log.warning(
-                "%s: %s has not kept what was published on %s: may this account publish there and read it, "
-                "and does the broker keep retained messages?",
-                self.client_id,
-                connection.where,
-                named(missing),
-            )
-
-    def _make_connection(self, will: Message | None, *, as_published: bool) -> Connection:
-        assert self._address is not None  # noqa: S101 - both callers run at an address
-        assert self._credentials is not None  # noqa: S101 - and while it is open
-        settings = replace(self.settings, password=self._credentials.password())
-        connection = Connection(
-            Opening(self._mqtt_client_id, settings, self._credentials.context(), will, self._address),
-            self.counters,
-            where=self._where,
-            as_published=as_published,
-            limits=self._limits.limits,
-            on_answers=self._note_answers,
-            skips_retained=lambda topic: self.skips_retained(topic),
-            is_stop=lambda topic: self.is_stop(topic),
-            on_refusal=lambda topic, why: self._report_not_taken(connection, topic, why),
-        )
-        return connection
-
-    def _connect(self, connection: Connection, stopping: threading.Event) -> None:
-        try:
-            connection.connect(stopping)
-        except Lost as lost:
-            self._note_result(lost.result if isinstance(lost, Refused) else Result.FAILED)
-            raise
-        self._note_result(Result.ACCEPTED)
-        if self.settings.as_published:
-            if self.as_published and not connection.as_published:
-                log.warning("%s has no bridge mode: own messages come back on this connection", connection.where)
-            self.as_published = self.exact_echo = connection.as_published
-
-    @property
-    def _asks_for_bridge_mode(self) -> bool:
-        """MQTT 5 has options of its own for the same."""
-        return self.settings.as_published and self.settings.protocol == "3.1.1"
-
-    def _probe(self, stopping: threading.Event) -> None:
-        """Connect without bridge mode, and leave in order; without our will, which a failure would publish."""
-        probe = self._attempt = self._make_connection(None, as_published=False)
-        try:
-            probe.connect(stopping)
-            probe.disconnect()
-        except Lost:
-            self._note_probe(Result.FAILED)
-            raise
-        finally:
-            probe.discard()
-        self._note_probe(Result.ACCEPTED)
-
-    @property
-    def _is_last_attempt(self) -> bool:
-        return not self._asks_for_bridge_mode or self._bridge_mode.next_attempt is Attempt.BRIDGE
-
-    def _note_result(self, result: Result) -> None:
-        self._bridge_mode.note(result)
-        if self.will is not None or result is Result.ACCEPTED:  # without a will nothing is left to refuse
-            self._limits.note_connect(result, time.monotonic(), last=self._is_last_attempt)
-
-    def _note_probe(self, result: Result) -> None:
-        if self._bridge_mode.next_attempt is Attempt.PROBE:
-            self._bridge_mode.note(result)
-        self._limits.note_probe(result)
-
-    def _tries_less(self, connection: Connection, *, held: bool) -> bool:
-        """Whether the connection may be lost because of what the broker lacks: the next one uses less."""
-        now = time.monotonic()
-        if connection.lacks is not None:
-            self._limits.note_connect(connection.lacks, now, last=True)
-            return True
-        in_flight = Limits(bool(connection.unconfirmed_retained()), int(connection.unacked > 0))
-        return self._limits.note_loss(in_flight, connection.confirmed, now, held=held)
-
     def _report_limits(self, connection: Connection) -> None:
         limits = connection.limits
-        if limits.losses and limits != self._reported:
+        if limits.losses and limits != self._dialler.reported:
             level = logging.WARNING if self.will is not None or self._own else logging.INFO  # it loses nothing
             log.log(level, "%s: %s %s", self.client_id, connection.where, limits.losses)
-        self._reported = limits
+        self._dialler.reported = limits
 
-    def _synchronize(self, connection: Connection, stopping: threading.Event) -> None:
+    def _synchronize(self, connection: Connection, stopping: _Stop) -> None:
         """Query which of our retained messages the broker has, subscribe, and send what it lacks."""
         self._renew()
         self._own_message_filter.begin()
-        if self._broker_stalled or connection.hesitated:
+        if self._dialler.stalled:
             self._let_catch_up(connection, stopping)
         known = self._query_own(connection, stopping)
-        with self._routing:
+        with self._filters.lock:
             self._connection = connection
             subscribed = connection.subscribe([(filter_, self._no_local(filter_)) for filter_ in self._filters])
             copied = connection.ping()
@@ -462,21 +311,19 @@ class MqttTransport(Transport):
         self._await(connection, copied, stopping, self._deliver_all)
         now = time.monotonic()
         with self._publishing:
-            self._suspects.connected(now)
-            connection.doubtful |= self._suspects.doubtful
+            self._refused.suspects.connected(now)
+            connection.pings.doubtful |= self._refused.suspects.doubtful
         self._initial_sync(known)
-        self._retention = None
-        if self._address is not None and self._address.text not in self._checked:
-            self._retention = RetentionCheck(now)
+        self._retention.begin(self._dialler.address, now)
 
-    def _let_catch_up(self, connection: Connection, stopping: threading.Event) -> None:
+    def _let_catch_up(self, connection: Connection, stopping: _Stop) -> None:
         """Wait before subscribing: a broker that was suspended first forwards old messages of others."""
         end = time.monotonic() + _CATCH_UP_S
         while not stopping.is_set() and (left := end - time.monotonic()) > 0:
             connection.pump(left, ignore)
-        self._broker_stalled = False
+        self._dialler.stalled = False
 
-    def _query_own(self, connection: Connection, stopping: threading.Event) -> set[str]:
+    def _query_own(self, connection: Connection, stopping: _Stop) -> set[str]:
         """Own topics of which the broker has our newest retained message, or that others publish on as well.
 
         A ping's answer follows these messages (QoS 0).
@@ -504,32 +351,32 @@ class MqttTransport(Transport):
 
     def _accepts(self, connection: Connection, message: Message) -> bool:
         """Whether the broker has, as far as is known, accepted this retained message."""
-        return connection.takes(message) and self._suspects.accepts(message)
+        return connection.takes(message) and self._refused.suspects.accepts(message)
 
     def _await(
         self,
         connection: Connection,
         ack: PendingAck,
-        stopping: threading.Event,
+        stopping: _Stop,
         receive: Callable[[list[Message]], None],
     ) -> None:
         asked_at = clock.since_boot()
         while not ack.done:
             if stopping.is_set():
                 raise Lost("closed")
-            left = max(asked_at, connection.arriving_at) + _ANSWER_S - clock.since_boot()
+            left = max(asked_at, connection.incoming.age.arriving_at) + _ANSWER_S - clock.since_boot()
             if left < 0:
                 raise Silent(f"{connection.where} does not answer")
             connection.pump(left, receive)
 
     def _deliver_and_note(self, messages: list[Message]) -> None:
-        if self._retention is not None:
-            self._retention.note(messages, time.monotonic())
+        if self._retention.current is not None:
+            self._retention.current.note(messages, time.monotonic())
         self._deliver_all(messages)
 
     def _deliver_all(self, messages: list[Message]) -> None:
-        if self._suspects.withheld:
-            self._arrived_at = time.monotonic()
+        if self._refused.withheld:
+            self._refused.arrived_at = time.monotonic()
         for message in messages:
             self.count_received()
             repeat = False
@@ -541,22 +388,25 @@ class MqttTransport(Transport):
             for subscription in self._matched.get(message.topic) or self._matching(message.topic):
                 subscription.offer(message, repeat=repeat)
 
-    def _note_answers(self, refused: Mapping[str, bool]) -> None:
+    def note_answers(self, refused: Mapping[str, bool]) -> None:
         if self._connection is None:
             return  # to the query of our own retained messages
-        if self._retention is not None:
+        if self._retention.current is not None:
             for filter_ in [filter_ for filter_, is_refused in refused.items() if is_refused]:
-                self._retention.refused(filter_)
+                self._retention.current.refused(filter_)
         with self._lock:
             for filter_, is_refused in refused.items():
                 for subscription in self._subscriptions:
                     if overlap(subscription.filter, filter_):  # the filter that covers it: no other one overlaps
                         subscription.refused = is_refused
 
-    def _finish(self, connection: Connection) -> None:
+    def note_refusal(self, topic: str, why: str) -> None:
+        self._refused.report(self._dialler.where, topic, why)
+
+    def _finish(self, connection: Connection, will: Message | None) -> None:
         """Publish the will, wait (bounded) until everything is acknowledged, then send DISCONNECT."""
-        if self._will_on_close is not None:
-            connection.publish(self._will_on_close)
+        if will is not None:
+            connection.publish(will)
         last = connection.ping()
         deadline = time.monotonic() + _CLOSING_S
         while time.monotonic() < deadline and not (last.done and connection.drained):
@@ -570,18 +420,6 @@ class MqttTransport(Transport):
             for message in connection.unconfirmed_retained():
                 if message.topic not in self._pending:
                     self._remember(message, sent=False)
-
-    def _report_not_taken(self, connection: Connection, topic: str, why: str, level: int = logging.WARNING) -> None:
-        """Once for each topic, and again after a while: any number of messages may follow."""
-        now = time.monotonic()
-        if now - self.not_taken.get(topic, ("", -inf))[1] >= _NOT_TAKEN_S:
-            self.not_taken[topic] = why, now
-            log.log(level, "%s: %s does not take a message on %s: %s", self.client_id, connection.where, topic, why)
-
-    def _report_problem(self, problem: str, *, logged: bool) -> None:
-        self.problem = problem
-        if logged:
-            self._log(logging.WARNING, problem)
 
     def _log(self, level: int, line: str) -> None:
         now = time.monotonic()

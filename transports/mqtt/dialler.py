@@ -1,0 +1,170 @@
+"""Makes the connections to one broker: at the address whose turn it is, in a way that this broker accepts."""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import replace
+
+from pebble.transports.base import Message
+from pebble.transports.counters import Counters
+from pebble.transports.credentials import Credentials
+from pebble.transports.hosts import Address, Turns
+from pebble.transports.mqtt import client_ids
+from pebble.transports.mqtt.bridge_mode import Attempt, BridgeMode, Result
+from pebble.transports.mqtt.broker_limits import EVERYTHING, BrokerLimits, Limits
+from pebble.transports.mqtt.client import Opening
+from pebble.transports.mqtt.connection import Connection, Owner
+from pebble.transports.mqtt.ending import Absent, Lost, Refused, Silent
+from pebble.transports.settings import MqttSettings
+
+_ENDING_S = 1.0  # so long a broker that ends may still accept connections, and hang up on them
+_HESITATION_S = 0.5  # a CONNACK that takes longer comes over a very slow connection, or from a suspended broker
+
+
+class Dialler:
+    """Remembers how the attempts at a broker have ended, and makes the next one."""
+
+    def __init__(self, client_id: str, settings: MqttSettings, will: Message | None) -> None:
+        # It stays the same over reconnects: the broker closes our own half-dead connection at once.
+        self._client_id = client_ids.unique(client_id) if settings.client_id is None else settings.client_id
+        self._settings, self._will = settings, will
+        self.broker = f"broker {settings.host}:{settings.port}"
+        self.turns = Turns(settings.host, settings.port)
+        self.attempt: Connection | None = None  # the newest connection, in any state
+        self.stalled = False  # the broker may have been suspended, and have old messages to forward first
+        self._credentials: Credentials | None = None
+        self._address: Address | None = None
+        self._bridge_mode, self.limits = BridgeMode(), BrokerLimits()  # of the broker at this address
+        self.reported = EVERYTHING  # what the log says it has
+        self._gone_at = float("-inf")  # when the broker was last known to be gone
+
+    def open(self) -> None:
+        """Read the credentials. Raises TransportError."""
+        self._credentials = Credentials(self._settings)
+
+    # -- one attempt
+
+    def begin(self) -> None:
+        """Raises Lost if the name of the broker has no address."""
+        self.attempt = None  # a resolver cannot be interrupted
+        try:
+            address = self.turns.address()
+        except (OSError, ValueError) as error:
+            raise Lost(f"{self.broker} cannot be reached: {error}") from None
+        if address != self._address:
+            self._bridge_mode, self.limits = BridgeMode(), BrokerLimits()
+        self._address = address
+        self.limits.begin(time.monotonic())
+
+    @property
+    def address(self) -> str:
+        """The address of the newest attempt, in words; empty before that."""
+        return "" if self._address is None else self._address.text
+
+    @property
+    def where(self) -> str:
+        """The broker in words, with the address if it has several."""
+        return f"{self.broker} at {self.address}" if self._address and self.turns.several else self.broker
+
+    def connect(self, owner: Owner, counters: Counters, stopping: threading.Event) -> Connection:
+        """A connection that is accepted. Raises Lost."""
+        if self.limits.wants_probe or (self._asks_for_bridge_mode and self._bridge_mode.next_attempt is Attempt.PROBE):
+            self._probe(owner, counters, stopping)
+        plain = self._asks_for_bridge_mode and self._bridge_mode.next_attempt is Attempt.PLAIN
+        as_published = self._settings.as_published and not plain
+        connection = self._make(self.limits.limits.fit_will(self._will), owner, counters, as_published=as_published)
+        try:
+            self.stalled |= connection.connect(stopping) > _HESITATION_S
+        except Lost as lost:
+            self._note_result(lost.result if isinstance(lost, Refused) else Result.FAILED)
+            raise
+        finally:
+            if connection.incoming.accepted is None:
+                connection.discard()
+        self._note_result(Result.ACCEPTED)
+        return connection
+
+    def _make(self, will: Message | None, owner: Owner, counters: Counters, *, as_published: bool) -> Connection:
+        assert self._address is not None  # noqa: S101 - both callers run at an address
+        assert self._credentials is not None  # noqa: S101 - and while it is open
+        settings = replace(self._settings, password=self._credentials.password())
+        self.attempt = Connection(
+            Opening(self._client_id, settings, self._credentials.context(), will, self._address),
+            counters,
+            owner,
+            where=self.where,
+            as_published=as_published,
+            limits=self.limits.limits,
+        )
+        return self.attempt
+
+    @property
+    def _asks_for_bridge_mode(self) -> bool:
+        """MQTT 5 has options of its own for the same."""
+        return self._settings.as_published and self._settings.protocol == "3.1.1"
+
+    def _probe(self, owner: Owner, counters: Counters, stopping: threading.Event) -> None:
+        """Connect without bridge mode, and leave in order; without our will, which a failure would publish."""
+        probe = self._make(None, owner, counters, as_published=False)
+        try:
+            probe.connect(stopping)
+            probe.disconnect()
+        except Lost:
+            self._note_probe(Result.FAILED)
+            raise
+        finally:
+            probe.discard()
+        self._note_probe(Result.ACCEPTED)
+
+    # -- how it ended
+
+    @property
+    def _is_last_attempt(self) -> bool:
+        return not self._asks_for_bridge_mode or self._bridge_mode.next_attempt is Attempt.BRIDGE
+
+    def _note_result(self, result: Result) -> None:
+        self._bridge_mode.note(result)
+        if self._will is not None or result is Result.ACCEPTED:  # without a will nothing is left to refuse
+            self.limits.note_connect(result, time.monotonic(), last=self._is_last_attempt)
+
+    def _note_probe(self, result: Result) -> None:
+        if self._bridge_mode.next_attempt is Attempt.PROBE:
+            self._bridge_mode.note(result)
+        self.limits.note_probe(result)
+
+    def tries_less(self, connection: Connection, *, held: bool) -> bool:
+        """Whether the connection may be lost because of what the broker lacks: the next one uses less."""
+        now = time.monotonic()
+        if (lacks := connection.incoming.ending.lacks) is not None:
+            self.limits.note_connect(lacks, now, last=True)
+            return True
+        in_flight = Limits(bool(connection.unconfirmed_retained()), int(connection.unacked > 0))
+        return self.limits.note_loss(in_flight, connection.confirmed, now, held=held)
+
+    def is_gone(self, lost: Lost, *, connected: bool, was_ended: bool) -> bool:
+        """Whether the other end is gone: nothing listens, or it hangs up as one that is just ending does."""
+        now, silent = time.monotonic(), isinstance(lost, Silent)  # then it may be we who stood still
+        self.stalled |= silent
+        if connected:
+            self._gone_at = now
+            return not silent
+        if isinstance(lost, Absent):
+            self._gone_at = now
+        elif silent or now - self._gone_at > _ENDING_S:
+            return False
+        return was_ended
+
+    def failed(self, problem: str, held_s: float) -> tuple[str, bool]:
+        """The turn of the address is over, unless its broker is to be asked once more in another way.
+
+        Returns the problem in words, empty if it is none yet, and whether it is worth a line in the log.
+        """
+        turns, asks_again = self.turns, self.limits.asks_again
+        if self._is_last_attempt and not asks_again:
+            failed = turns.failed(problem.removeprefix(f"{self.where} "), held_s)
+            if turns.several:
+                problem = f"{self.broker}: {failed}"
+        if asks_again and held_s <= 0:
+            return "", False
+        return problem, held_s > 0 or turns.is_over or not turns.several

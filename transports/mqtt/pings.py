@@ -1,0 +1,58 @@
+"""The pings of one MQTT connection: answers show that the broker lives, how far it has read, and how late it is."""
+
+from __future__ import annotations
+
+import random
+from math import inf
+
+from pebble.transports import clock
+from pebble.transports.mqtt.client import AnyClient
+from pebble.transports.mqtt.outgoing import InFlightTable, PendingAck, unconfirmed_bytes
+from pebble.transports.mqtt.read_age import ReadAge
+from pebble.transports.settings import MqttSettings
+
+_CLEAR = 8 * 1024  # bytes ahead of a ping that do not delay it much
+_LEAST_S = 0.05  # between two pings, however short the allowed silence
+_LEAST_SHARE = 0.75  # of the interval between pings: answers to regular ones could not be told apart
+
+
+class Pings:
+    """Decides when a ping is due, and sends it. The connection's lock is held."""
+
+    def __init__(self, settings: MqttSettings, in_flight: InFlightTable, age: ReadAge) -> None:
+        self._in_flight, self._age = in_flight, age
+        self._silence_s = max(settings.silence_s, 4 * _LEAST_S)
+        self._interval_s = max(_LEAST_S, min(settings.silence_s, settings.keepalive_s or inf) / 4)  # keepalive 0: none
+        self.due_at = inf  # once accepted they are sent regularly: other answers come only to what we publish
+        self._stalled_since = (
+            age.waiting.checked_at
+        )  # when the last time without reading began, for which a ping was sent
+        #: Topics whose next message is followed by a ping at once: its answer shows that the broker accepts it.
+        self.doubtful: set[str] = set()
+
+    def begin(self, now: float) -> None:
+        """The broker has accepted us."""
+        self.due_at = now + self._interval_s
+
+    def send(self, client: AnyClient, ack: PendingAck | None = None) -> None:
+        sock = client.socket
+        ahead = client.unwritten + (0 if sock is None else unconfirmed_bytes(sock))
+        now = clock.since_boot()
+        self.due_at = now + self._interval_s * random.uniform(_LEAST_SHARE, 1.0)  # noqa: S311  (no secret)
+        self._in_flight.ping(now, ack)
+        self._age.delay.asked(now, clear=ahead <= _CLEAR)
+        client.ping()
+
+    def send_after_stall(self, client: AnyClient, now: float) -> None:
+        """Send one for each time without reading: its answer comes after what has waited at the broker meanwhile."""
+        since = self._age.waiting.checked_at
+        if since != self._stalled_since:
+            self._stalled_since = since
+            self._in_flight.ping(now, None)
+            self._age.delay.stalled(since, now)
+            client.ping()
+
+    @property
+    def silence_limit_s(self) -> float:
+        """After so long without an answer the broker is silent."""
+        return max(self._silence_s, 4 * self._in_flight.round_trip_s)

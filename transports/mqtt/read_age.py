@@ -1,0 +1,162 @@
+"""Since when what is read may have waited (T19): in the kernel, which does not say when it came, or at the broker."""
+
+from __future__ import annotations
+
+import socket
+import sys
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+from math import inf
+
+from pebble.transports import clock
+from pebble.transports.mqtt.outgoing import present_round_trip_s
+
+try:
+    import fcntl
+    import termios
+except ImportError:  # Windows has neither
+    _can_measure = False
+else:
+    _can_measure = True
+
+_FAR_S = 1.0  # no round trip of a usable link is longer
+_NOTICED_S = 0.1
+_BACKLOG_S = 0.2  # after a stall, for what others had sent to the broker meanwhile
+_NEAR_S = 0.05  # of a broker further away PUBACKs must show what is lost
+_LOST = 8  # prompt answers in a row
+_UPLINK_S = 0.5  # TCP's round trips may be so much longer than usual: more may as well be the way to us
+
+
+class WaitingTime:
+    """Since when the bytes that are read next may have waited in a socket; all times are of one clock.
+
+    Known is when the socket was last empty, and how many bytes were in it at another moment: what is read after these
+    has arrived later.
+    """
+
+    def __init__(self, now: float) -> None:
+        self.since = now
+        self.checked_at = now  # all but the counted bytes have arrived in the socket since then
+        self._counted = 0
+
+    def empty(self, now: float) -> None:
+        """The socket was empty at ``now``."""
+        self.checked_at, self._counted = now, 0
+
+    def found(self, size: int, now: float) -> None:
+        """``size`` bytes are in the socket at ``now``."""
+        if self._counted <= 0:
+            self.since, self.checked_at, self._counted = self.checked_at, now, size
+
+    def read(self, size: int) -> None:
+        """``size`` bytes were taken out of it."""
+        self._counted -= size
+
+
+class BrokerDelay:
+    """How long what is received now has waited at the broker, which sends the answer to a ping after it.
+
+    A ping of which the way there took long itself, behind our own data, says nothing. What is usual is no delay: the
+    shortest answer of this connection, and TCP's own round trips, which do not wait for the broker.
+
+    A broker that stood still reads what its clients have sent meanwhile a packet of each in turn: it may have answered
+    all of our pings before it has read the last old message of another client. So if nothing at all has come since an
+    overdue ping was sent, what comes in the next moment counts as having waited as long.
+
+    Answers carry no number, and mosquitto drops them where a client's queue is full. A later PUBACK shows that, and so
+    do answers that always come right after the newest ping, which is not sent at regular intervals.
+    """
+
+    def __init__(self) -> None:
+        #: Unanswered pings: since when what comes before the answer may have waited, when sent, do they say something.
+        self._asked: deque[tuple[float, float, bool]] = deque()
+        self._shortest = _FAR_S
+        self._newest = 0.0  # seconds until the newest answer
+        self._came_at = 0.0  # when something was received last
+        self._stall = 0.0  # how long the newest one took, which counts
+        self._until = 0.0  # then
+        self._prompt = 0  # answers in a row that came right after the newest of several pings
+
+    def usual(self, seconds: float) -> None:
+        """An answer took so long that waited for nothing."""
+        self._shortest = min(self._shortest, seconds)
+
+    def asked(self, now: float, *, clear: bool) -> None:
+        """A ping was sent; ``clear``: nothing of ours was on its way."""
+        self._asked.append((now, now, clear))
+
+    def stalled(self, since: float, now: float) -> None:
+        """A ping was sent after nothing was read ``since`` then: what fits into no socket has waited at the broker."""
+        self._asked.append((since, now, True))
+
+    def answered(self, now: float) -> None:
+        """The oldest ping was answered."""
+        if self._asked:
+            _, sent_at, clear = self._asked.popleft()
+            self._newest = now - sent_at if clear else 0.0
+            self.usual(now - sent_at)
+        near = self._shortest <= _NEAR_S
+        prompt = near and bool(self._asked) and now - self._asked[-1][1] <= self._shortest + _NEAR_S
+        self._prompt = self._prompt + 1 if prompt else 0
+        if self._prompt >= _LOST:
+            self._asked.clear()
+            self._newest = 0.0
+
+    def acknowledged(self, sent_at: float, now: float) -> None:
+        """What was sent at ``sent_at`` was answered: so were all pings before it, or their answers are lost."""
+        while self._asked and self._asked[0][1] < sent_at:
+            self._asked.popleft()
+        self._newest = min(self._newest, now - sent_at)
+
+    def seconds(self, now: float, round_trip_s: Callable[[], float]) -> float:
+        """What is received at ``now`` waited so long; ``round_trip_s`` asks for TCP's present one, if that matters."""
+        waited = self._newest
+        if self._asked:
+            oldest, sent_at = next(((since, sent_at) for since, sent_at, clear in self._asked if clear), (now, now))
+            waited = max(waited, now - oldest)
+            if self._came_at <= sent_at and now - sent_at > self._shortest + _NOTICED_S:
+                self._stall, self._until = now - sent_at, now + _BACKLOG_S
+        self._came_at = now
+        if now < self._until:
+            waited = max(waited, self._stall)
+        if waited <= self._shortest + _NOTICED_S:
+            return 0.0
+        return waited - max(self._shortest, min(round_trip_s(), self._shortest + _UPLINK_S))
+
+
+class ReadAge:
+    """Since when the batch that is being read may have waited, in the socket or at the broker."""
+
+    def __init__(self, now: float) -> None:
+        self.waiting, self.delay = WaitingTime(now), BrokerDelay()
+        self.since = now  # the answer
+        self.received_at = now  # before the socket was emptied, or a piece of what is in it taken out
+        #: When there was the last sign that answers are behind retained messages, or behind a long one.
+        self.arriving_at = -inf
+        self.has_retained = False  # there are retained messages in the batch
+
+    def update(self, now: float, sock: socket.socket | None) -> None:
+        """Set `since` for what is read next, at ``now``."""
+        self.since = self.waiting.since
+        waited = self.delay.seconds(now, lambda: 0.0 if sock is None else present_round_trip_s(sock))
+        if waited > 0:
+            self.since = min(self.since, now - waited)
+
+    def note_arriving(self) -> None:
+        self.arriving_at = clock.since_boot()
+
+    def note_handled(self) -> None:
+        """Retained messages were handled: that may have taken longer than an answer may."""
+        self.note_arriving()
+        self.has_retained = False
+
+
+def readable_bytes(sock: socket.socket | None) -> int:
+    """Bytes that the kernel has received and we have not read (FIONREAD); 0 where the system does not say."""
+    size = bytearray(4)
+    if sock is None or not _can_measure:
+        return 0
+    with suppress(OSError, ValueError):  # closed, or no socket
+        fcntl.ioctl(sock.fileno(), termios.FIONREAD, size)
+    return int.from_bytes(size, sys.byteorder)
