@@ -13,9 +13,11 @@ from typing import Any
 from pebble.contract import BRIDGE_PROBE, INCOMING, ONLINE, OUTGOING, codec
 from pebble.errors import ConfigError, PayloadError
 from pebble.forwarding.cycles import PROBE_PERIOD_S
-from pebble.forwarding.forwarder import INITIAL_SYNC_S, Forwarder, Gate, barrier
+from pebble.forwarding.forwarder import Forwarder, barrier
 from pebble.forwarding.probes import PROBE_REQUEST, Probes
+from pebble.forwarding.retained_window import INITIAL_SYNC_S
 from pebble.forwarding.routing import MIRROR, Side
+from pebble.forwarding.side import Gate
 from pebble.forwarding.subjects import Subjects
 from pebble.runtime.connections import mirror_transport
 from pebble.runtime.process import run

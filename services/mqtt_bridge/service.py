@@ -10,8 +10,10 @@ from pebble.contract import BRIDGE_PROBE, DRIVE, INCOMING, ONLINE, OUTGOING, REM
 from pebble.contract.payloads import MediaRequest
 from pebble.errors import PayloadError
 from pebble.forwarding.cycles import PROBE_PERIOD_S
-from pebble.forwarding.forwarder import INITIAL_SYNC_S, QUIET_S, Forwarder, Gate, Routed, barrier
+from pebble.forwarding.forwarder import Forwarder, Routed, barrier
+from pebble.forwarding.retained_window import INITIAL_SYNC_S, QUIET_S
 from pebble.forwarding.routing import TABLE_A1, Drop, Forward, Side
+from pebble.forwarding.side import Gate
 from pebble.forwarding.subjects import Subject, Subjects
 from pebble.runtime.connections import remote_transport
 from pebble.runtime.parent import Notifier, earlier_requests
@@ -138,7 +140,7 @@ class MqttBridge(Service):
         if self._forwarder.gate is not Gate.OPEN or not self._same_broker.both_connected:
             self._look_later()
             return
-        gone = self._leftovers.remove(self._forwarder.retained_lock)
+        gone = self._leftovers.remove(partial(self._forwarder.remove_retained, Side.REMOTE))
         if gone:
             self.log.info("removed %d retained topics that the robot no longer has: %s", len(gone), _few(gone))
 

@@ -427,7 +427,7 @@ class TestGate:
 
     def receive(self, forwarder: Forwarder, monkeypatch: pytest.MonkeyPatch, change: Callable[[], None]) -> None:
         """Receive an event, and ``change`` the gate just before it waits."""
-        events = forwarder._events[REMOTE]
+        events = forwarder._sides[REMOTE].events
         hold = events.hold
 
         def hold_late(message: Message) -> None:

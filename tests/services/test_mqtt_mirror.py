@@ -15,9 +15,9 @@ from typing import Any
 import pytest
 
 from pebble.config import Config, parse
-from pebble.forwarding import forwarder as forwarder_module
-from pebble.forwarding.forwarder import Gate
+from pebble.forwarding import side as side_module
 from pebble.forwarding.probes import PROBE_REQUEST
+from pebble.forwarding.side import Gate
 from pebble.services import mqtt_mirror as mirror_module
 from pebble.services.mqtt_bridge.service import MqttBridge
 from pebble.services.mqtt_mirror import MqttMirror
@@ -297,7 +297,7 @@ def test_what_was_switched_off_stays_off_when_the_broker_is_restored(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rigs: Rigs, history: str, longer: bool
 ) -> None:
     """The operator is at the robot's own side here, and programs are at the mirror's broker."""
-    monkeypatch.setattr(forwarder_module, "_RESTORED_S", 0.0 if longer else 30.0)
+    monkeypatch.setattr(side_module, "_RESTORED_S", 0.0 if longer else 30.0)
     broker = OwnBroker(tmp_path)
     try:
         rig = rigs(broker.port)

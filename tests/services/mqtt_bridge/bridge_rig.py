@@ -12,7 +12,7 @@ from typing import Any, cast
 import pytest
 
 from pebble.config import Config, parse
-from pebble.forwarding.forwarder import Gate
+from pebble.forwarding.side import Gate
 from pebble.runtime.connections import local_transport
 from pebble.service import Service
 from pebble.services.mqtt_bridge import service as bridge_module

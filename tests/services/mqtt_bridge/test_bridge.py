@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from pebble.forwarding.event_buffer import LIMIT
-from pebble.forwarding.forwarder import Gate
+from pebble.forwarding.side import Gate
 from pebble.transports import State
 from pebble.transports.memory import MemoryTransport
 from tests.recordings.demo_robots import DRIVE as RECORDED_DRIVE

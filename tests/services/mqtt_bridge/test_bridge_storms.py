@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from pebble.forwarding.admission import MAX_UNKNOWN_FLAGS
-from pebble.forwarding.forwarder import Gate
 from pebble.forwarding.routing import Drop
+from pebble.forwarding.side import Gate
 from pebble.transports import State
 from tests.services.mqtt_bridge.bridge_rig import Client, MqttRig, Quiet, gate_of
 from tests.support import AmqttBroker, Broker, some, until

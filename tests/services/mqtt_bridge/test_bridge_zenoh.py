@@ -11,7 +11,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from pebble.forwarding.forwarder import Gate
+from pebble.forwarding.side import Gate
 from pebble.services.mqtt_bridge.service import MqttBridge
 from pebble.transports import State, ZenohSettings, create
 from pebble.transports.memory import MemoryHub, MemoryTransport

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from pebble.forwarding import cycles
-from pebble.forwarding.forwarder import Gate
+from pebble.forwarding.side import Gate
 from pebble.services.mqtt_bridge import service as bridge_module
 from pebble.transports.memory import MemoryTransport
 from tests.services.mqtt_bridge import bridge_rig
@@ -93,7 +93,7 @@ class TestMosquitto:
         Quiet(robot.local, robot.remote).wait(0.2)
         assert len(errors(caplog)) == 1
         other_way.cut()
-        assert until(lambda: not robot.bridge._forwarder._cycles.closed_ways)
+        assert until(lambda: not robot.bridge._forwarder.status.circulating)
         before = moves(robot.local)
         robot.remote.publish(DRIVE, MOVE)
         assert until(lambda: moves(robot.local) == before + 1)

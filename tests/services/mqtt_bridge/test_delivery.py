@@ -203,10 +203,10 @@ class Rig:
         return self._instance._forwarder.synchronized
 
     def is_synchronized(self, side: Side) -> bool:
-        return self._instance._forwarder._reconciliation._synchronized[side]
+        return side in self._instance._forwarder.status.synchronized
 
     def state(self, side: Side) -> State:
-        return self._instance._forwarder._transports[side].state
+        return self._instance._forwarder._sides[side].transport.state
 
     def publish_table(self, situation: str) -> None:
         for cell in TABLE:

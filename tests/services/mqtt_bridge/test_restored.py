@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from pebble.forwarding import forwarder as forwarder_module
+from pebble.forwarding import side as side_module
 from pebble.services.mqtt_bridge import service as bridge_module
 from pebble.services.mqtt_bridge.media import MEDIA, Media
 from pebble.transports import State
@@ -92,7 +92,7 @@ def test_a_microphone_that_was_switched_off_stays_off_when_the_robots_own_side_i
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, own: type[OwnBroker | OwnHub], history: str, longer: bool
 ) -> None:
     """``longer``: it was away for longer than an outage in which an operator could choose an earlier value again."""
-    monkeypatch.setattr(forwarder_module, "_RESTORED_S", 0.0 if longer else 30.0)
+    monkeypatch.setattr(side_module, "_RESTORED_S", 0.0 if longer else 30.0)
     side, remote = own(tmp_path), Broker(tmp_path)
     rig = MqttRig(side.address, {"host": "127.0.0.1", "port": remote.port})
     try:
@@ -104,7 +104,7 @@ def test_a_microphone_that_was_switched_off_stays_off_when_the_robots_own_side_i
             setter.publish(AUDIO_FLAG, value, retain=True)
             once.transport._own.clear()
             rig.remote.transport._own.clear()
-            assert until(lambda: bridge._forwarder._reconciliation.value(f"{rig.base}/{AUDIO_FLAG}") == value)
+            assert until(lambda: bridge._forwarder.value(f"{rig.base}/{AUDIO_FLAG}") == value)
             assert until(lambda: {rig.retained(name).get(AUDIO_FLAG) for name in ("local", "remote")} == {value})
 
         play(history, set_microphone, side.save)

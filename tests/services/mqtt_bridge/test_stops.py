@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from pebble.forwarding.forwarder import Gate
+from pebble.forwarding.side import Gate
 from pebble.transports import QoS, State
 from pebble.transports.memory import MemoryTransport
 from tests.services.mqtt_bridge.bridge_rig import BASE, Client, MemoryRig, MqttRig, Quiet, gate_of
@@ -106,7 +106,7 @@ class TestUrgency:
     @pytest.mark.parametrize("retain", [False, True])
     def test_it_waits_for_no_lock_of_retained_messages(self, memory: MemoryRig, *, retain: bool) -> None:
         bridge = memory.bridge()
-        with bridge._forwarder._lock:
+        with bridge._forwarder._retained._lock:
             memory.remote.publish(STOP, PRESS, retain=retain)
             assert until(lambda: memory.local.payloads(STOP) == [PRESS], 5)
 
