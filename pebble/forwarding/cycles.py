@@ -37,7 +37,7 @@ SUSPICIOUS, _WINDOW_S = 5, 2.0
 #: No operator and no script repeats a payload so often in this time.
 STORM = 150
 PROBE_PERIOD_S, _PERIOD_IN_STORM_S = 1.0, 0.1  # between two probes of a topic
-_UNANSWERED = 3  # probes, after which the other way is gone
+UNANSWERED = 3  # probes, after which the other way is gone
 #: A stop is published again after 0.5 s at the earliest; what comes back is faster.
 _STOP_PERIOD_S = 0.25
 #: Where a mirror and its robot's bridge are on one way, the bridge logs it; it probes every second what circulates.
@@ -147,7 +147,7 @@ class Cycles:
             for key in [
                 key for key in self.closed_ways if self._clock() - self._ways[key].probed_at >= PROBE_PERIOD_S / 2
             ]:
-                if self._ways[key].unanswered >= _UNANSWERED:
+                if self._ways[key].unanswered >= UNANSWERED:
                     self._open(*key)
                 else:
                     due.append(key)

@@ -89,7 +89,7 @@ class Forwarder:
         self._quiet_log = RateLimitedLog(log, period_s=60.0)
         self._mirroring = self._mirror_refused = False
         for transport in transports.values():
-            transport.is_stop = self._is_stop
+            transport.judge_topics(is_stop=self._is_stop)
 
     @property
     def gate(self) -> Gate:

@@ -73,7 +73,7 @@ class RetainedTopics:
         """The retained messages of ``side`` have arrived: publish what they have left open."""
         with self._lock:
             self._begin_restarted()
-            self._sides[side].settle()
+            self._sides[side].arrived()
             for to, topic, payload in self._reconciliation.synchronize(side):
                 subject, newest = self._subjects[topic], self._reconciliation.value(topic)
                 if subject is not None and newest is not None:

@@ -13,7 +13,7 @@ from pebble.transports import State, Transport
 from pebble.transports.counters import Counters
 
 #: After a longer outage an earlier value at a broker that was restored may have been chosen again by somebody.
-_RESTORED_S = 30.0
+RESTORED_S = 30.0
 #: What circulates comes back within this time; the same message later is new.
 _RETURN_S = 2.0
 
@@ -73,13 +73,13 @@ class SideState:
             return self._went_back
         return self._was_brief or self.transport.was_ended
 
-    def settle(self) -> None:
+    def arrived(self) -> None:
         """What it retains has arrived: an earlier value from now on was chosen again."""
         self._went_back = False
 
     @property
     def _was_brief(self) -> bool:
-        return self._clock() - self._lost_at < _RESTORED_S
+        return self._clock() - self._lost_at < RESTORED_S
 
 
 class Sides(dict[Side, SideState]):
