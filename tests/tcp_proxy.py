@@ -42,6 +42,11 @@ class TcpProxy:
         self._thread: threading.Thread | None = None
         self.mend()
 
+    @property
+    def in_use(self) -> bool:
+        """Whether a connection has been made through it."""
+        return bool(self._pairs)
+
     def blackhole(self) -> None:
         self._passing.clear()
 

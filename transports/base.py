@@ -247,6 +247,20 @@ class Transport(ABC):
         """Whether the name of the broker has addresses that have not had their first turn yet."""
         return False
 
+    def judge_topics(
+        self,
+        *,
+        is_stop: Callable[[str], bool] | None = None,
+        is_invented: Callable[[str], bool] | None = None,
+        skips_retained: Callable[[bytes], bool] | None = None,
+        delivers_late: bool | None = None,
+    ) -> None:
+        """Set what the owner knows of topics and wants of retained messages, before :meth:`open`; None: as it was."""
+        self.is_stop = is_stop or self.is_stop
+        self.is_invented = is_invented or self.is_invented
+        self.skips_retained = skips_retained or self.skips_retained
+        self.delivers_late = self.delivers_late if delivers_late is None else delivers_late
+
     def on_state(self, watcher: Watcher) -> None:
         """Call ``watcher`` on every change of state, in order, on a thread of the transport: it must return at once."""
         self._watchers.append(watcher)

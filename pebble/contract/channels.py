@@ -6,6 +6,7 @@ and written nowhere else. Sources: paper Tables 3.1 and A.2 to A.6.
 
 from __future__ import annotations
 
+import math
 import re
 from enum import Enum
 from functools import cached_property
@@ -16,6 +17,8 @@ from msgspec import Struct
 from pebble.contract import payloads as p
 
 INCOMING, OUTGOING = "incoming", "outgoing"
+WAITS_S = 0.5  # how long what happens once may wait; in the connection another 2 s at most
+_PATIENT_S = 2.0  # the same, where it moves nothing
 
 
 class Kind(Enum):
@@ -33,6 +36,8 @@ class Kind(Enum):
 
     def __init__(self, direction: str, qos: int, retain: bool, meaning: str) -> None:
         self.direction, self.qos, self.retain, self.meaning = direction, qos, retain, meaning
+        #: Whether it means something that happens once: a retained message of it is stale.
+        self.one_shot = direction == INCOMING and not retain
 
 
 class Override(Struct, frozen=True):
@@ -48,7 +53,8 @@ class Channel(Struct, frozen=True, kw_only=True, dict=True):
 
     ``metric`` may hold ``{names}``, one level each. With ``remote=False`` it never leaves the robot. With
     ``bridged=False`` its own process is connected to the remote broker. With ``newest``, only the newest of several
-    waiting messages is handled.
+    waiting messages is handled. A one-shot message that has waited for longer than ``waits_s``, in a process or at a
+    broker, is stale, unless it ends something.
     """
 
     metric: str
@@ -59,6 +65,7 @@ class Channel(Struct, frozen=True, kw_only=True, dict=True):
     remote: bool = True
     bridged: bool = True
     newest: bool = False
+    waits_s: float = WAITS_S
     qos: int = -1  # -1: that of the kind
     retain: bool | None = None  # None: that of the kind
     override: Override | None = None
@@ -76,6 +83,10 @@ class Channel(Struct, frozen=True, kw_only=True, dict=True):
     def default_retain(self) -> bool:
         return self.kind.retain if self.retain is None else self.retain
 
+    @property
+    def one_shot(self) -> bool:
+        return self.kind.one_shot
+
     @cached_property
     def is_pattern(self) -> bool:
         return "{" in self.metric
@@ -92,6 +103,10 @@ class Channel(Struct, frozen=True, kw_only=True, dict=True):
     def filter(self, base: str) -> str:
         """What to subscribe to in order to receive this channel of ``base`` (which may hold ``+`` levels)."""
         return f"{base}/{re.sub(r'{[^}]*}', '+', self.suffix)}"
+
+    def ends(self, value: Any) -> bool:
+        """Whether ``value``, a payload of this channel, can only bring something to rest."""
+        return issubclass(self.payload, p.Payload) and value.ends()
 
     def names(self, topic: str) -> dict[str, str]:
         """The names in one of this pattern's topics: ``{"program": "camera_publisher"}``."""
@@ -124,23 +139,23 @@ _MEDIA = "services.mqtt_bridge.media"
 # -- incoming: motion, stops and lights
 DRIVE = _c("drive-values", Kind.COMMAND, p.Drive, "Wanted steering x and throttle z, each -1..1; optional y.",
            rate_hz=20, newest=True, override=_serial("drive_values"))  # fmt: skip
-ESTOP = _c("estop", Kind.COMMAND, p.EstopCommand, "Emergency stop: nothing moves until a reset.")
+ESTOP = _c("estop", Kind.COMMAND, p.EstopCommand, "Emergency stop: nothing moves until a reset.", waits_s=math.inf)
 ESTOP_RESET = _c("estop-reset", Kind.COMMAND, p.EstopReset, "Ends the emergency stop of one motor owner.")
 LIGHTS_SOLID = _c("lights-solid", Kind.COMMAND, p.LightsSolid, "A steady colour.",
-                  newest=True, override=_serial("lights_solid"))  # fmt: skip
+                  newest=True, waits_s=_PATIENT_S, override=_serial("lights_solid"))  # fmt: skip
 LIGHTS_FLASH = _c("lights-flash", Kind.COMMAND, p.LightsFlash, "A colour fading in and out.",
-                  newest=True, override=_serial("lights_flash"))  # fmt: skip
+                  newest=True, waits_s=_PATIENT_S, override=_serial("lights_flash"))  # fmt: skip
 
 # -- incoming: media, sounds, scripts
 VIDEO_CONTROL = _c("front-camera", Kind.COMMAND, p.MediaRequest, "Start or stop remote video.",
-                   override=_bridge("video_control"))  # fmt: skip
+                   waits_s=_PATIENT_S, override=_bridge("video_control"))  # fmt: skip
 AUDIO_CONTROL = _c("audio", Kind.COMMAND, p.MediaRequest, "Start or stop remote audio, both directions.",
-                   override=_bridge("audio_control"))  # fmt: skip
+                   waits_s=_PATIENT_S, override=_bridge("audio_control"))  # fmt: skip
 AUDIO_STREAM = _c("audio-stream", Kind.FEED, bytes, "An operator's voice as PBAT packets.",
                   rate_hz=50, bridged=False, override=Override(f"{_MEDIA}.audio_receiver.topic",
                                                                f"{_MEDIA}.audio_receiver.qos"))  # fmt: skip
 SOUNDBOARD_COMMAND = _c("soundboard-command", Kind.COMMAND, p.SoundboardCommand, "Play or stop a sound clip.",
-                        override=_service("soundboard_handler", "command"))  # fmt: skip
+                        waits_s=_PATIENT_S, override=_service("soundboard_handler", "command"))  # fmt: skip
 AUTONOMY_COMMAND = _c("autonomy-command", Kind.COMMAND, p.AutonomyCommand, "Start or stop an autonomy script.",
                       override=_service("autonomy_manager", "command"))  # fmt: skip
 

@@ -14,14 +14,12 @@ from pebble.contract import INCOMING, Channel
 from pebble.contract.payloads import (
     LAST_RUN,
     SCRIPT,
-    STOP_WORDS,
     AutonomyCommand,
     Drive,
     EstopCommand,
     LightsFlash,
     LightsSolid,
     MediaRequest,
-    OutletCommand,
     SoundboardCommand,
 )
 from pebble.errors import PayloadError
@@ -118,17 +116,6 @@ def _stop(channel: Channel, raw: bytes) -> EstopCommand:
     except PayloadError:
         return EstopCommand()
     return EstopCommand(stop=name or UNSET, by=by, why=why)
-
-
-def ends(command: Any) -> bool:
-    """Whether a command can only bring something to rest: a zero, and the end of a script, a sound or a picture."""
-    if isinstance(command, Drive):
-        return not command.moves
-    if isinstance(command, AutonomyCommand | SoundboardCommand) and command.action:  # it wins over ``enabled``
-        return command.action.strip().lower() in STOP_WORDS
-    if isinstance(command, OutletCommand):
-        return not command.on
-    return isinstance(command, AutonomyCommand | SoundboardCommand | MediaRequest) and command.enabled is False
 
 
 def is_blank(raw: bytes) -> bool:

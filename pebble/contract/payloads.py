@@ -24,6 +24,10 @@ class Payload(Struct, frozen=True, kw_only=True, omit_defaults=False):
             if isinstance(value, float) and not math.isfinite(value):
                 raise ValueError(f"{name} is not a finite number")
 
+    def ends(self) -> bool:
+        """Whether it can only bring something to rest: a zero, and the end of a script, a sound or a picture."""
+        return False
+
 
 def _clamp(payload: Payload, low: float, high: float, *names: str) -> None:
     for name in names:
@@ -60,6 +64,9 @@ class Drive(Payload, frozen=True, kw_only=True):
     def moves(self) -> bool:
         """Whether any axis is not 0; a command without is called a zero."""
         return self.x != 0.0 or self.z != 0.0 or self.y != 0.0
+
+    def ends(self) -> bool:
+        return not self.moves
 
     @property
     def signed(self) -> bool:
@@ -119,6 +126,9 @@ class SoundboardCommand(Payload, frozen=True, kw_only=True):
     file: str | None = None
     repeat: Annotated[int, Meta(ge=0)] | bool | UnsetType | None = UNSET  # 0, false and null: once
 
+    def ends(self) -> bool:
+        return _switches_off(self.action, self.enabled)
+
 
 class AutonomyCommand(Payload, frozen=True, kw_only=True, omit_defaults=True):
     """Start or stop one script (paper A.8.11)."""
@@ -128,6 +138,13 @@ class AutonomyCommand(Payload, frozen=True, kw_only=True, omit_defaults=True):
     file: str | None = None
     config: dict[str, Any] | None = None
 
+    def ends(self) -> bool:
+        return _switches_off(self.action, self.enabled)
+
+
+def _switches_off(action: str | None, enabled: bool | None) -> bool:
+    return action.strip().lower() in STOP_WORDS if action else enabled is False
+
 
 class MediaRequest(Payload, frozen=True, kw_only=True, omit_defaults=True):
     """Start or stop remote video or audio; ``encoding`` None or unknown: as configured."""
@@ -136,11 +153,17 @@ class MediaRequest(Payload, frozen=True, kw_only=True, omit_defaults=True):
     encoding: str | None = None
     keyframe: bool = False  # request a full picture
 
+    def ends(self) -> bool:
+        return not self.enabled
+
 
 class OutletCommand(Payload, frozen=True, kw_only=True):
     """Switch an outlet; only a JSON boolean switches anything."""
 
     on: bool
+
+    def ends(self) -> bool:
+        return not self.on
 
 
 # -- outgoing

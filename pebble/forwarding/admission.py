@@ -1,12 +1,13 @@
-"""How much a robot takes from outside: everybody at the remote broker may send it anything."""
+"""What a robot takes: how much from outside, where everybody may send it anything, and how late."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
 
-from pebble.contract import INCOMING, Channel, Kind
+from pebble.contract import INCOMING, Channel, Kind, codec
 from pebble.contract.codec import MAX_COMMAND_BYTES
+from pebble.errors import PayloadError
 from pebble.forwarding.routing import Drop, Side
 from pebble.forwarding.subjects import Subject
 from pebble.transports import Message
@@ -17,7 +18,7 @@ MAX_UNKNOWN_FLAGS = 64  # each is retained on the robot: in its broker or hub, a
 
 
 class Admission:
-    """Bounds the messages to a robot: by size, and by number what is no command of the contract.
+    """Bounds what a robot takes: by size, by how long it waited, and by number what is no command of the contract.
 
     Flags that the contract does not know: what the robot itself has set counts as well, so a restarted bridge begins no
     new number, but is always admitted.
@@ -33,12 +34,16 @@ class Admission:
         return len(self._flags)
 
     def refuse(self, side: Side, subject: Subject, message: Message) -> Drop | None:
-        """Why this message may not pass; None if it may."""
-        is_bounded = subject.kind.direction == INCOMING and not subject.is_stop  # any payload is a stop
-        if side is Side.REMOTE and is_bounded and len(message.payload) > MAX_COMMAND_BYTES:
+        """Why this message may not pass; None if it may. Hot."""
+        if side is Side.REMOTE and len(message.payload) > MAX_COMMAND_BYTES and _is_bounded(subject):
             return Drop.TOO_LARGE
-        if subject.channel is not None and subject.kind is not Kind.ACTION:
-            return None
+        if subject.counted and (drop := self._count(side, subject, message)):
+            return drop
+        if subject.one_shot and message.waited_s > subject.waits_s and not _ends_something(subject, message):
+            return Drop.LATE
+        return None
+
+    def _count(self, side: Side, subject: Subject, message: Message) -> Drop | None:
         if side is Side.REMOTE and self._is_too_often(subject, message):
             return Drop.TOO_OFTEN
         if subject.kind is not Kind.FLAG or subject.channel is not None:
@@ -73,3 +78,17 @@ class Admission:
             self._counts.clear()
         count = self._counts[key] = self._counts.get(key, 0) + 1
         return count > most
+
+
+def _is_bounded(subject: Subject) -> bool:
+    return subject.kind.direction == INCOMING and not subject.is_stop  # any payload is a stop
+
+
+def _ends_something(subject: Subject, message: Message) -> bool:
+    """Whether a late message passes, because it can only bring something to rest."""
+    if subject.channel is None:
+        return False
+    try:
+        return subject.channel.ends(codec.decode(subject.channel, message.payload))
+    except PayloadError:
+        return False

@@ -16,7 +16,10 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any, Final
 
+from pebble.contract import OUTGOING, Kind
 from pebble.forwarding.routing import Side
+from pebble.forwarding.subjects import Subject
+from pebble.transports import Message
 
 log = logging.getLogger(__name__)
 
@@ -34,7 +37,7 @@ SUSPICIOUS, _WINDOW_S = 5, 2.0
 #: No operator and no script repeats a payload so often in this time.
 STORM = 150
 PROBE_PERIOD_S, _PERIOD_IN_STORM_S = 1.0, 0.1  # between two probes of a topic
-_UNANSWERED = 3  # probes, after which the other way is gone
+UNANSWERED = 3  # probes, after which the other way is gone
 #: A stop is published again after 0.5 s at the earliest; what comes back is faster.
 _STOP_PERIOD_S = 0.25
 #: Where a mirror and its robot's bridge are on one way, the bridge logs it; it probes every second what circulates.
@@ -89,14 +92,15 @@ class Cycles:
         self.closed_ways: Final[set[tuple[Side, str]]] = set()
         self._unlogged: tuple[Side, str, float] | None = None  # circulates, and since when this is known
 
-    def receive(
-        self, side: Side, topic: str, payload: bytes, *, once: bool, runs: bool = False, after: int = SUSPICIOUS
-    ) -> Finding:
-        """``side`` has sent a message that may be forwarded.
+    def examine(self, side: Side, subject: Subject, message: Message) -> Finding:
+        """``side`` has sent a message that may be forwarded. Hot.
 
-        ``once``: it means something that happens once; ``runs``: of that, what may pass while it circulates, because
-        the caller recognises what comes back; ``after``: so many equal ones within 2 s are not suspicious.
+        What runs something may pass while it circulates, because the caller recognises what comes back.
         """
+        topic, payload = message.topic, message.payload
+        if subject.is_stop:
+            return Finding.CIRCULATES if self._repeats_stop(side, topic, payload) else Finding.PASS
+        once, after = subject.one_shot, _after(subject)
         number = _number_of(payload) if payload[-1:] in _DIGITS else None
         with self._lock:
             if number is not None:
@@ -104,7 +108,7 @@ class Cycles:
             way, now = self._ways.get((side, topic)) or self._way(side, topic), self._clock()
             count = way.count(payload, now)
             # Of what the caller knows more than one copy may come back.
-            if way.closed and ((once and not runs) or count > SUSPICIOUS):
+            if way.closed and ((once and not subject.runs) or count > SUSPICIOUS):
                 return Finding.CIRCULATES
             period = _PERIOD_IN_STORM_S if count > STORM and not way.closed else PROBE_PERIOD_S
             never_probed = way.probed_at == float("-inf")
@@ -115,7 +119,7 @@ class Cycles:
             )  # the other way may be younger than the last probe
             return Finding.SUSPECT if suspicious and due else Finding.PASS
 
-    def repeats_stop(self, side: Side, topic: str, payload: bytes) -> bool:
+    def _repeats_stop(self, side: Side, topic: str, payload: bytes) -> bool:
         """Whether an emergency stop returns too fast for its sender. Stops are not probed: any payload is one."""
         with self._lock:
             now, key = self._clock(), (side, payload)
@@ -143,7 +147,7 @@ class Cycles:
             for key in [
                 key for key in self.closed_ways if self._clock() - self._ways[key].probed_at >= PROBE_PERIOD_S / 2
             ]:
-                if self._ways[key].unanswered >= _UNANSWERED:
+                if self._ways[key].unanswered >= UNANSWERED:
                     self._open(*key)
                 else:
                     due.append(key)
@@ -208,6 +212,19 @@ class Cycles:
                 del self._ways[next(key for key in self._ways if key not in self.closed_ways)]
             way = self._ways[side, topic] = _Way(self._clock())
         return way
+
+
+def _after(subject: Subject) -> int:
+    """How many equal messages within 2 s are not suspicious: of what runs something, none that could run it twice.
+
+    Actions are probed at once. Programs of others need to know of probes on those topics already; on those of other
+    commands they see one only after a repetition.
+    """
+    if subject.kind.direction == OUTGOING:
+        return STORM
+    if subject.kind is Kind.ACTION:
+        return 0
+    return 1 if subject.runs else SUSPICIOUS
 
 
 def _number_of(payload: bytes) -> bytes | None:

@@ -64,10 +64,9 @@ class Reconciliation:
         self._synchronized = dict.fromkeys(Side, False)
         self._overtaken: set[str] = set()  # changed by the loser while the winner was away
 
-    @property
-    def synchronized(self) -> bool:
-        """Whether the retained messages of both sides have arrived."""
-        return all(self._synchronized.values())
+    def has_synchronized(self, *sides: Side) -> bool:
+        """Whether the retained messages of ``sides`` have arrived."""
+        return all(self._synchronized[side] for side in sides)
 
     def value(self, topic: str) -> bytes | None:
         """The newest value; None if there is none."""

@@ -9,11 +9,10 @@ from typing import Final
 
 from msgspec import Struct
 
-from pebble.contract import DRIVE, INCOMING, Kind
+from pebble.contract import INCOMING, Kind
 from pebble.forwarding.subjects import Subject
 from pebble.transports import Message, QoS
 
-ONE_SHOT: Final = frozenset({Kind.COMMAND, Kind.ACTION, Kind.FEED})
 URGENT: Final = frozenset({Kind.COMMAND, Kind.ACTION, Kind.FLAG})
 
 
@@ -95,14 +94,14 @@ def route(rules: Rules, side: Side, subject: Subject | None, message: Message, *
         return Drop.MEDIA
     if subject.stays and rules.leaves_robot:
         return Drop.STAYS
-    if subject.kind in ONE_SHOT and (message.retain or message.retain_requested):
+    if subject.one_shot and (message.retain or message.retain_requested):
         return Drop.STALE  # or was published to be retained: some brokers hide which
     if subject.kind not in rules.passes[side]:
         if subject.kind not in rules.mirrored.get(side, ()):
             return Drop.ONE_WAY
         if not mirroring:
             return Drop.NOT_MIRRORED
-    unsigned = subject.channel is DRIVE and side is Side.REMOTE and rules.leaves_robot
+    unsigned = subject.drives and side is Side.REMOTE and rules.leaves_robot
     return Forward(_qos(subject, message), _retain(subject, message), subject.kind in URGENT, unsigned)
 
 
@@ -115,7 +114,7 @@ def _qos(subject: Subject, message: Message) -> QoS:
 
 def _retain(subject: Subject, message: Message) -> bool:
     """As published, if that is known; a flag is always retained on both sides."""
-    if subject.kind in ONE_SHOT:
+    if subject.one_shot:
         return False
     if subject.kind is Kind.FLAG and subject.retain:
         return True

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache, cached_property
+from math import inf
 
 from pebble.config import Config
-from pebble.contract import CHANNELS, DRIVE, ESTOP, INCOMING, OUTGOING, Channel, Kind
+from pebble.contract import CHANNELS, INCOMING, OUTGOING, WAITS_S, Channel, Kind
+from pebble.contract.payloads import Drive, EstopCommand
 from pebble.errors import TransportError
 from pebble.runtime.addresses import Addresses
 from pebble.runtime.process import view_of
@@ -45,13 +47,38 @@ class Subject:
         return self.channel is None or self.channel.bridged
 
     @cached_property
+    def one_shot(self) -> bool:
+        return self.kind.one_shot
+
+    @cached_property
+    def waits_s(self) -> float:
+        """For how long a message may wait before it is stale."""
+        if not self.one_shot:
+            return inf
+        return WAITS_S if self.channel is None else self.channel.waits_s
+
+    @cached_property
     def is_stop(self) -> bool:
-        return self.channel is ESTOP
+        return self.channel is not None and self.channel.payload is EstopCommand
+
+    @cached_property
+    def drives(self) -> bool:
+        return self.channel is not None and self.channel.payload is Drive
 
     @cached_property
     def runs(self) -> bool:
         """Whether the robot does something because of one message: once, although it may circulate."""
-        return self.kind in (Kind.COMMAND, Kind.ACTION) and self.channel is not DRIVE and not self.is_stop
+        return self.kind in (Kind.COMMAND, Kind.ACTION) and not self.drives and not self.is_stop
+
+    @cached_property
+    def counted(self) -> bool:
+        """Whether a robot takes a bounded number: of actions, and of what is not in the contract."""
+        return self.channel is None or self.kind is Kind.ACTION
+
+    @cached_property
+    def is_two_way(self) -> bool:
+        """Whether it is forwarded both ways even while remote-mirror is off, so that a broker may send it back."""
+        return self.kind in (Kind.FLAG, Kind.ACTION)
 
 
 class Subjects(dict[str, Subject | None]):
@@ -105,6 +132,12 @@ class Subjects(dict[str, Subject | None]):
     def flags(self) -> list[str]:
         """The topics of the contract's flags."""
         return self.topics(*(one for one in CHANNELS if one.kind is Kind.FLAG and not one.is_pattern))
+
+    @cached_property
+    def probed(self) -> list[str]:
+        """The topics on which cycles are looked for at each connection, before they are used."""
+        actions = (one for one in CHANNELS if one.kind is Kind.ACTION)
+        return self.topics(*(one for one in CHANNELS if one.payload is Drive), *actions)
 
     def _find(self, topic: str) -> Subject | None:
         try:

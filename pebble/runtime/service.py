@@ -22,7 +22,6 @@ from pebble.transports import Message, QoS, State, Subscription, Transport
 from pebble.transports.counters import Counters, bounds_reached
 
 _QOS = {int(one): one for one in QoS}  # to look one up costs a third of a call of the class
-_ONE_SHOT = (Kind.COMMAND, Kind.ACTION, Kind.FEED)
 _SENDERS = 16  # whose commands are remarked upon one by one
 _SENDER_SHOWN = 40  # characters
 WAIT_LIMIT_S = 0.5  # of a drive command in the inbox; with a transport's silence limit of 2 s, none acts after 2.5 s
@@ -317,7 +316,7 @@ class Service:
 
     def _receive(self, channel: Channel, method: Callable[..., None], message: Message, *, direct: bool) -> None:
         """Refuse what is stale or malformed *before* it can replace a valid message in the inbox."""
-        if message.retain and channel.kind in _ONE_SHOT:
+        if message.retain and channel.one_shot:
             self.counters.add("stale")
             self._quiet_log.warning(f"{channel.metric} retained", "refused a retained message on %s", channel.metric)
             return
@@ -349,7 +348,7 @@ class Service:
         if channel.newest:
             self._inbox.post(handle, newest_of=message.topic)
         else:
-            self._inbox.post(handle, last_of=message.topic if codec.ends(value) else None)
+            self._inbox.post(handle, last_of=message.topic if channel.ends(value) else None)
 
     def _remark(self, channel: Channel, sender: str, text: str) -> None:
         """Log what a command does that its sender may not mean, once a minute and sender."""

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from pebble.cameras import Picture
     from pebble.script.pictures import Pictures
 
-_ONE_SHOT = (Kind.COMMAND, Kind.ACTION, Kind.FEED)
 #: What no script publishes, and why; the gate of `autonomy_manager` drops the same from scripts of others.
 _REFUSED = {
     DRIVE: "use robot.drive() to move",
@@ -225,7 +224,7 @@ class Robot:
 
     def _subscribe(self, channel: Channel, handler: Callable[..., None]) -> None:
         def receive(message: Message) -> None:
-            if message.retain and channel.kind in _ONE_SHOT:
+            if message.retain and channel.one_shot:
                 return  # stale
             names = channel.names(message.topic) if channel.is_pattern else {}
             try:

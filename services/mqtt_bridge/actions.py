@@ -56,12 +56,16 @@ class Action:
         self._warned = False
         self._log = RateLimitedLog(log, period_s=2.0)  # all actions together: six lines a second
 
+    @property
+    def running(self) -> bool:
+        return self._process is not None and self._process.poll() is None
+
     def request(self) -> bool:
         """Run the command; False, with a log line, if that is refused."""
         if not self.control.command:
             self._warn_of_missing_command()
             return False
-        if self._process is not None and self._process.poll() is None:
+        if self.running:
             self._log.warning("refused", "%s refused: it is still running", self.name)
             return False
         now = self._clock()

@@ -6,14 +6,21 @@ retained topics that nobody but the robot publishes.
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager
+from collections.abc import Callable
+from typing import Protocol
 
 from pebble.contract import CHANNELS, MCU_DESCRIBE, MCU_VALUE, ONLINE, OUTGOING, Kind
 from pebble.forwarding.subjects import Subjects
-from pebble.transports import Message, QoS, Subscription, Transport
+from pebble.transports import Message, Subscription, Transport
 
 _TOPICS = 10_000  # noted of each side; with more nothing is removed
 _NOT_HERE = (ONLINE, MCU_DESCRIBE)  # the bridge's own, and what MCU_VALUE covers
+
+
+class Remove(Protocol):
+    """Removes what the broker retains on a topic, unless there is a reason not to; returns whether it was removed."""
+
+    def __call__(self, topic: str, *, unless: Callable[[str], bool]) -> bool: ...
 
 
 class Leftovers:
@@ -58,21 +65,16 @@ class Leftovers:
             self._next = len(self._filters)
         return True
 
-    def remove(self, lock: AbstractContextManager[object]) -> list[str]:
-        """Remove what only the broker retains, and return these topics; the last call.
-
-        With ``lock`` held nothing is forwarded: what a service publishes meanwhile comes after the removal.
-        """
+    def remove(self, remove: Remove) -> list[str]:
+        """Remove what only the broker retains, and return these topics; the last call."""
         self._close()
-        gone = []
-        for topic in sorted(self._there):
-            with lock:
-                here = self._here or set()
-                if topic not in here and max(len(here), len(self._there)) <= _TOPICS:
-                    self._remote.publish(topic, b"", qos=QoS.DELIVERED, retain=True)
-                    gone.append(topic)
+        gone = [topic for topic in sorted(self._there) if remove(topic, unless=self._stays)]
         self._here = None
         return gone
+
+    def _stays(self, topic: str) -> bool:
+        here = self._here or set()
+        return topic in here or max(len(here), len(self._there)) > _TOPICS
 
     def _close(self) -> None:
         subscriptions, self._subscriptions = self._subscriptions, []

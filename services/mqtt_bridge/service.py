@@ -6,16 +6,18 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from pebble.contract import BRIDGE_PROBE, DRIVE, INCOMING, ONLINE, OUTGOING, REMOTE_MIRROR, Channel, codec
+from pebble.contract import BRIDGE_PROBE, DRIVE, ONLINE, REMOTE_MIRROR, Channel, codec
 from pebble.contract.payloads import MediaRequest
 from pebble.errors import PayloadError
-from pebble.forwarding.cycles import PROBE_PERIOD_S
-from pebble.forwarding.forwarder import INITIAL_SYNC_S, QUIET_S, Forwarder, Gate, Routed, barrier
+from pebble.forwarding.forwarder import Routed, barrier
+from pebble.forwarding.retained_window import INITIAL_SYNC_S
 from pebble.forwarding.routing import TABLE_A1, Drop, Forward, Side
-from pebble.forwarding.subjects import Subject, Subjects
+from pebble.forwarding.service import ForwardingService
+from pebble.forwarding.side import Gate
+from pebble.forwarding.subjects import Subject
 from pebble.runtime.connections import remote_transport
 from pebble.runtime.parent import Notifier, earlier_requests
-from pebble.runtime.service import Service, every
+from pebble.runtime.service import every
 from pebble.runtime.timers import Timer
 from pebble.services.mqtt_bridge.actions import ACTIONS, SystemActions
 from pebble.services.mqtt_bridge.heartbeat import Heartbeat
@@ -24,30 +26,27 @@ from pebble.services.mqtt_bridge.media import MEDIA, Media, MediaRequests
 from pebble.services.mqtt_bridge.motor_owners import CHECK_S, MotorOwners
 from pebble.services.mqtt_bridge.private_topics import PrivateTopics
 from pebble.services.mqtt_bridge.same_broker import SameBrokerProbe, now_ms
-from pebble.transports import Message, State, Subscription
+from pebble.transports import Message, State, Transport
 
 #: After the barrier, for brokers that pass messages between connections with a delay.
 _PROBE_WAIT_S = 0.1
 _RETRY_S = 1.0
-_ARRIVING_S = 2.0  # longest wait for retained messages that still come after the subscription
 _IGNORED = (Drop.ECHO, Drop.LATE, Drop.PROBE)  # nothing that a person or a program requests of the bridge now
-_CHECK_AGAIN_S = 30.0  # while nothing is mirrored
-_LEFTOVERS_AFTER_S = 30.0  # by then all services have published what they retain; so long after the start, or later
+LEFTOVERS_AFTER_S = 30.0  # by then all services have published what they retain; so long after the start, or later
 _LOGGED = 200  # characters of a topic
-_ASK_S = 0.2  # between two questions about what is left at the remote broker
+ASK_S = 0.2  # between two questions about what is left at the remote broker
 
 
-class MqttBridge(Service):
-    """Forwards by Table A.1, once its two sides are known not to be one broker.
-
-    Messages are forwarded on the transports' receiving threads (see pebble.forwarding.forwarder); everything else
-    happens on the service's own thread, so a burst of messages delays neither the heartbeat nor a probe.
-    """
+class MqttBridge(ForwardingService):
+    """Forwards by Table A.1, once its two sides are known not to be one broker."""
 
     name = "mqtt_bridge"
     publishes = (ONLINE, BRIDGE_PROBE)
     client_name = "local-bridge"
-    as_published = True
+    rules = TABLE_A1
+    winner = Side.REMOTE
+    probed_sides = (Side.REMOTE,)
+    arriving_s = 2.0
 
     @classmethod
     def handles(cls) -> tuple[Channel, ...]:
@@ -58,32 +57,17 @@ class MqttBridge(Service):
         super().__init__(*arguments, **options)
         section = self.config.services.mqtt_bridge
         self._heartbeat = Heartbeat(self.addresses[ONLINE]) if section.heartbeat.enabled else None
-        will = self._heartbeat.will(now_ms()) if self._heartbeat is not None else None
-        self._remote = remote_transport(self.config, "remote-bridge", will=will)
-        self._remote_epoch = 0  # counts lost connections
-        self._local_subscriptions: list[Subscription] = []
-        self._remote_subscriptions: list[Subscription] = []
-        self._same_broker = SameBrokerProbe(self.config, self.transport, self._remote, self.clock)
+        self._same_broker = SameBrokerProbe(self.config, self.transport, self.remote, self.clock)
         self._actions = SystemActions(section, folder=self.config.state_dir(), clock=self.clock)
         notifier = Notifier()
         self._media = MediaRequests(Media(self.config.on_demand_programs(), earlier_requests()), notifier.request)
         owners = map(self.config.motor_owner, self.config.motor_lines())
         self._owners = MotorOwners(self.config.base, owners, notifier)
         self._private = PrivateTopics(self.config.base)
-        self._subjects = Subjects(self.config)
-        self._leftovers = Leftovers(self.config.base, self._subjects, self._remote)
+        self._leftovers = Leftovers(self.config.base, self.subjects, self.remote)
         self._leftover_timer: Timer | None = None
-        self._forwarder = Forwarder(
-            self._subjects,
-            TABLE_A1,
-            {Side.LOCAL: self.transport, Side.REMOTE: self._remote},
-            winner=Side.REMOTE,
-            on_value=self._on_flag,
-            clock=self.clock,
-        )
-        self.transport.is_invented = lambda topic: self._subjects.invented(topic.encode()) is not None
-        self._remote.delivers_late = True
-        self._remote.skips_retained = partial(self._forwarder.skips_retained, Side.REMOTE)
+        self.transport.judge_topics(is_invented=lambda topic: self.subjects.invented(topic.encode()) is not None)
+        self.remote.judge_topics(skips_retained=partial(self.forwarder.skips_retained, Side.REMOTE), delivers_late=True)
         #: What the bridge itself does about a message, and about a flag's value, by channel.
         self._message_reactions: dict[str, Callable[[bytes], None]] = {
             **{row.request.suffix: partial(self._on_media_request, row.request) for row in MEDIA},
@@ -94,28 +78,23 @@ class MqttBridge(Service):
             REMOTE_MIRROR.suffix: self._on_remote_mirror,
         }
 
+    def make_remote(self) -> Transport:
+        enabled = self.config.services.mqtt_bridge.heartbeat.enabled
+        will = Heartbeat(self.addresses[ONLINE]).will(now_ms()) if enabled else None
+        return remote_transport(self.config, "remote-bridge", will=will)
+
     def start(self) -> None:
-        self.transport.on_state(partial(self._on_side_state, Side.LOCAL))
-        self._remote.on_state(partial(self._on_side_state, Side.REMOTE))
-        self._remote.open(timeout=0.0)
-        self.on_stop(self._remote.close)
+        super().start()
         if self._heartbeat is not None:
             interval = self.config.services.mqtt_bridge.heartbeat.interval_seconds
             self.timers.add(self.clock(), self._publish_heartbeat, period=interval)
         self._look_later()
-        self.post(self._subscribe_local)
-
-    def dropped(self) -> dict[str, int]:
-        return self._forwarder.dropped()
-
-    def stop(self) -> None:
-        self.log.info("forwarded and dropped: %s", self._forwarder.counters.snapshot())
 
     # -- the service's thread
 
     def _publish_heartbeat(self) -> None:
         if self._heartbeat is not None:
-            self._heartbeat.publish(self._remote, now_ms())
+            self._heartbeat.publish(self.remote, now_ms())
 
     def _look_later(self) -> None:
         """Wait (again) until all that the robot retains is known, and look for what only the remote side retains."""
@@ -124,84 +103,48 @@ class MqttBridge(Service):
         if self._leftover_timer is not None:
             self._leftover_timer.cancel()
         self._leftovers.begin()
-        self._leftover_timer = self.call_at(self.clock() + _LEFTOVERS_AFTER_S, self._look_for_leftovers)
+        self._leftover_timer = self.call_at(self.clock() + LEFTOVERS_AFTER_S, self._look_for_leftovers)
 
     def _look_for_leftovers(self) -> None:
-        if self._forwarder.gate is not Gate.OPEN or not self._same_broker.both_connected:
+        if self.forwarder.gate is not Gate.OPEN or not self._same_broker.both_connected:
             self._look_later()
             return
         asked = self._leftovers.ask_next()
-        wait, then = (_ASK_S, self._look_for_leftovers) if asked else (INITIAL_SYNC_S, self._remove_leftovers)
+        wait, then = (ASK_S, self._look_for_leftovers) if asked else (INITIAL_SYNC_S, self._remove_leftovers)
         self._leftover_timer = self.call_at(self.clock() + wait, then)
 
     def _remove_leftovers(self) -> None:
-        if self._forwarder.gate is not Gate.OPEN or not self._same_broker.both_connected:
+        if self.forwarder.gate is not Gate.OPEN or not self._same_broker.both_connected:
             self._look_later()
             return
-        gone = self._leftovers.remove(self._forwarder.retained_lock)
+        gone = self._leftovers.remove(partial(self.forwarder.remove_retained, Side.REMOTE))
         if gone:
             self.log.info("removed %d retained topics that the robot no longer has: %s", len(gone), _few(gone))
 
-    def _subscribe_local(self) -> None:
-        self._local_subscriptions = [
-            self.transport.subscribe(filter_, self._on_local, echo=False, direct=True)
-            for filter_ in self._subjects.filters(INCOMING, OUTGOING)
-        ]
-
-    def _connected(self, side: Side, epoch: int) -> None:
-        """A side is connected (again)."""
+    def connected(self, side: Side, epoch: int) -> None:
         if side is Side.REMOTE:
             self._publish_heartbeat()
         else:
             barrier(self.transport, self._same_broker.topic)
-            self._forwarder.subscribed(Side.LOCAL)
-            self._synchronize_later(Side.LOCAL)
-        if self._forwarder.gate is not Gate.OPEN:
+            self.forwarder.subscribed(Side.LOCAL)
+            self.synchronize_later(Side.LOCAL)
+        if self.forwarder.gate is not Gate.OPEN:
             self._check_brokers()
-        elif side is Side.REMOTE and epoch == self._remote_epoch:
+        elif side is Side.REMOTE and epoch == self.epoch:
             self._same_broker.send()
-            self._subscribe_remote()
+            self.subscribe_remote()
         else:
             self._same_broker.send()
 
-    def _disconnected(self, side: Side) -> None:
+    def disconnected(self, side: Side) -> None:
         self._look_later()
-        if side is Side.REMOTE:
-            self._unsubscribe_remote()
+        super().disconnected(side)
 
-    def _synchronize_later(self, side: Side) -> None:
-        epoch = self._remote_epoch
+    def await_retained(self) -> None:
+        self.remote.ask(self.subjects.flags)
 
-        end = self.clock() + _ARRIVING_S
-
-        def synchronize() -> None:
-            if side is Side.REMOTE and self._forwarder.is_arriving(side) and self.clock() < end:
-                self.call_at(self.clock() + QUIET_S, synchronize)
-            elif side is Side.LOCAL or epoch == self._remote_epoch:
-                self._forwarder.synchronize(side)
-                self._forwarder.probe_commands(Side.REMOTE)  # by now a mirror of the wrong broker has stopped
-
-        self.call_at(self.clock() + INITIAL_SYNC_S, synchronize)
-
-    def _subscribe_remote(self) -> None:
-        """Subscribe anew for each connection, after the transport has sent what changed during the outage.
-
-        So a retained message of the remote side is never older than what the robot has changed.
-        """
-        self._unsubscribe_remote()
-        self._forwarder.subscribing(Side.REMOTE)
-        receive = partial(self._on_remote, self._remote_epoch)
-        self._remote_subscriptions = [
-            self._remote.subscribe(filter_, receive, echo=False, direct=True)
-            for filter_ in self._subjects.filters(INCOMING)
-        ]
-        self._remote.ask(self._subjects.flags)
-        self._forwarder.subscribed(Side.REMOTE)
-        self._synchronize_later(Side.REMOTE)
-
-    def _unsubscribe_remote(self) -> None:
-        subscriptions, self._remote_subscriptions = self._remote_subscriptions, []
-        _close_all(subscriptions)
+    def synchronized(self, side: Side) -> None:  # noqa: ARG002  (also when the local side was away)
+        self.forwarder.probe_commands(Side.REMOTE)  # by now a mirror of the wrong broker has stopped
 
     def _check_brokers(self) -> None:
         """Open the gate if the two sides cannot be one broker, or begin a round of probing."""
@@ -209,9 +152,9 @@ class MqttBridge(Service):
             if self._same_broker.announces:
                 self._same_broker.send()  # before anything is forwarded: the mirror may have to shut
             self._open()
-        if self._forwarder.gate is Gate.OPEN or not self._same_broker.both_connected:
+        if self.forwarder.gate is Gate.OPEN or not self._same_broker.both_connected:
             return
-        round_ = self._same_broker.begin_round(self._subjects.topics(DRIVE)[0])
+        round_ = self._same_broker.begin_round(self.subjects.topics(DRIVE)[0])
         if round_ is not None:
             self.call_at(self.clock() + _PROBE_WAIT_S, partial(self._end_round, round_))
 
@@ -221,33 +164,29 @@ class MqttBridge(Service):
             self._open()
 
     def _open(self) -> None:
-        if self._remote.state is not State.CONNECTED or self._forwarder.gate is Gate.OPEN:
+        if self.remote.state is not State.CONNECTED or self.forwarder.gate is Gate.OPEN:
             return
-        was_shut = self._forwarder.gate is Gate.SHUT
-        self._forwarder.open()
+        was_shut = self.forwarder.gate is Gate.SHUT
+        self.forwarder.open()
         if was_shut:  # what was received meanwhile was dropped: a new subscription brings the retained messages again
-            _close_all(self._local_subscriptions)
-            self._forwarder.subscribing(Side.LOCAL)
-            self._subscribe_local()
-            self._forwarder.subscribed(Side.LOCAL)
-        self._subscribe_remote()
+            self.unsubscribe(Side.LOCAL)
+            self.forwarder.subscribing(Side.LOCAL)
+            self.subscribe_local()
+            self.forwarder.subscribed(Side.LOCAL)
+        self.subscribe_remote()
         self.log.info("forwarding between the robot and its remote side")
 
-    def _disable(self) -> None:
-        self._forwarder.shut()  # again: it may just have been opened
-        self._unsubscribe_remote()
-        self.call_at(self.clock() + _CHECK_AGAIN_S, self._check_again)
+    def disable(self) -> None:
+        super().disable()
         self.log.info(
             "the local and the remote side are one broker, or something else forwards outgoing/# to the local one: "
             "nothing is mirrored"
         )
-        self._forwarder.synchronize(Side.REMOTE)  # retained local flags wait for remote ones, which will not come
+        self.forwarder.synchronize(Side.REMOTE)  # retained local flags wait for remote ones, which will not come
 
-    def _check_again(self) -> None:
-        """The cause may be gone, without a reconnect."""
-        if self._forwarder.gate is Gate.SHUT:
-            self._check_brokers()
-            self.call_at(self.clock() + _CHECK_AGAIN_S, self._check_again)
+    def check_again(self, epoch: int) -> None:  # noqa: ARG002  (a round of probes notices a reconnect)
+        self._check_brokers()
+        self.check_later()
 
     def _run_action(self, channel: Channel) -> None:
         self.counters.add("actions" if self._actions.request(channel) else "actions_refused")
@@ -260,29 +199,19 @@ class MqttBridge(Service):
     def _check_owners(self) -> None:
         self._owners.check(self.clock())
 
-    @every(PROBE_PERIOD_S)
-    def _probe_again(self) -> None:
-        self._forwarder.probe_again(Side.REMOTE)
-
     # -- the transports' threads
 
-    def _on_side_state(self, side: Side, state: State) -> None:
-        self._forwarder.watch(side, state)
+    def on_side_state(self, side: Side, state: State) -> None:
         if side is Side.LOCAL:
             self._owners.connected()
-        if state is State.CONNECTED:
-            self.post(partial(self._connected, side, self._remote_epoch))
-            return
-        if side is Side.REMOTE:
-            self._remote_epoch += 1
-        self.post(partial(self._disconnected, side))
+        super().on_side_state(side, state)
 
-    def _on_local(self, message: Message) -> None:
+    def receive_local(self, message: Message) -> None:
         if message.topic == self._same_broker.topic:
             self._on_probe(message)  # probes are never forwarded
             return
         if self._heartbeat is not None and message.topic == self._heartbeat.topic:
-            if self._heartbeat.is_ours(message) and self._forwarder.gate is Gate.OPEN:
+            if self._heartbeat.is_ours(message) and self.forwarder.gate is Gate.OPEN:
                 # one broker after all, or another program's heartbeat of the same millisecond
                 self.post_message(BRIDGE_PROBE, self._same_broker.send_again, newest_of="suspect")
             return
@@ -290,20 +219,18 @@ class MqttBridge(Service):
             self._owners.receive(message.topic)
         self._leftovers.note_local(message)
         for admitted in self._private.admit(message):
-            self._react(Side.LOCAL, admitted, self._forwarder.receive(Side.LOCAL, admitted))
+            self._react(Side.LOCAL, admitted, self.forwarder.receive(Side.LOCAL, admitted))
 
     def _on_probe(self, message: Message) -> None:
         if self._same_broker.proves_same_broker(message):
-            if self._forwarder.gate is not Gate.SHUT:
-                self._forwarder.shut()
-                self.post_message(BRIDGE_PROBE, self._disable)
+            self.shut()
         elif self._same_broker.is_request(message):
             self.post_message(BRIDGE_PROBE, self._same_broker.answer_request, newest_of="request")
 
-    def _on_remote(self, epoch: int, message: Message) -> None:
-        if epoch != self._remote_epoch or self._private.is_known(message.topic):
+    def receive_remote(self, epoch: int, message: Message) -> None:
+        if epoch != self.epoch or self._private.is_known(message.topic):
             return
-        self._react(Side.REMOTE, message, self._forwarder.receive(Side.REMOTE, message))
+        self._react(Side.REMOTE, message, self.forwarder.receive(Side.REMOTE, message))
 
     def _react(self, side: Side, message: Message, routed: Routed) -> None:
         """Do what the message requests of the bridge itself, whether or not a remote side is connected.
@@ -322,14 +249,13 @@ class MqttBridge(Service):
         if reaction is not None and not codec.is_blank(message.payload):
             reaction(message.payload)
 
-    def _on_flag(self, subject: Subject, payload: bytes) -> None:
-        """Called by the forwarder with the value on which both sides agree."""
+    def on_value(self, subject: Subject, payload: bytes) -> None:
         reaction = self._flag_reactions.get(subject.channel.suffix) if subject.channel is not None else None
         if reaction is not None:
             reaction(payload)
 
     def _on_remote_mirror(self, payload: bytes) -> None:
-        self._forwarder.mirroring = self._boolean(REMOTE_MIRROR, payload)
+        self.forwarder.mirroring = self._boolean(REMOTE_MIRROR, payload)
 
     def _on_media_flag(self, flag: Channel, payload: bytes) -> None:
         self.post_message(flag, partial(self._media.allow, flag, self._boolean(flag, payload)), newest_of=flag.metric)
@@ -366,8 +292,3 @@ class MqttBridge(Service):
 
 def _few(topics: list[str]) -> str:
     return ", ".join(topic[:_LOGGED] for topic in topics[:3]) + (", …" if len(topics) > 3 else "")
-
-
-def _close_all(subscriptions: list[Subscription]) -> None:
-    for subscription in subscriptions:
-        subscription.close()

@@ -15,9 +15,11 @@ from typing import Any
 import pytest
 
 from pebble.config import Config, parse
-from pebble.forwarding import forwarder as forwarder_module
-from pebble.forwarding.forwarder import Gate
+from pebble.forwarding import service as service_module
+from pebble.forwarding import side as side_module
 from pebble.forwarding.probes import PROBE_REQUEST
+from pebble.forwarding.routing import Side
+from pebble.forwarding.side import Gate
 from pebble.services import mqtt_mirror as mirror_module
 from pebble.services.mqtt_bridge.service import MqttBridge
 from pebble.services.mqtt_mirror import MqttMirror
@@ -86,12 +88,12 @@ class Rig:
         return self.mirror
 
     def wait_ready(self) -> None:
-        assert until(lambda: self.gate is Gate.OPEN and self.mirror._forwarder.synchronized)
+        assert until(lambda: self.gate is Gate.OPEN and self.mirror.forwarder.synchronized)
 
     def start_bridge(self) -> MqttBridge:
         bridge = MqttBridge(self._config(), MemoryTransport("local-bridge", self.hub))
         self._running.append(Running(bridge))
-        assert until(lambda: gate_of(bridge) is Gate.OPEN and bridge._remote_subscriptions)
+        assert until(lambda: gate_of(bridge) is Gate.OPEN and Side.REMOTE in bridge.status.subscribed)
         return bridge
 
     def _config(self) -> Config:
@@ -104,7 +106,7 @@ class Rig:
 
     @property
     def gate(self) -> Gate:
-        return self.mirror._forwarder.gate
+        return self.mirror.forwarder.gate
 
     def retained_on_broker(self) -> dict[str, bytes]:
         late = self.program_client()
@@ -172,7 +174,7 @@ class TestBothWays:
         for client in (rig.local, rig.program):
             client.publish("incoming/estop", b"old", retain=True)
         rig.start()
-        assert until(lambda: rig.mirror._forwarder.synchronized)
+        assert until(lambda: rig.mirror.forwarder.synchronized)
         for side, client in (("local", rig.local), ("program", rig.program)):
             client.publish("incoming/estop", f"from {side}".encode(), retain=True)
             client.publish("incoming/estop-reset", b"retained", retain=True)
@@ -267,7 +269,7 @@ class TestMeeting:
         rig.program.publish("outgoing/programs/reading", b"1", retain=True)
         assert until(lambda: rig.program.on("outgoing/status") and rig.local.on("outgoing/programs/reading"))
         spare.kill()
-        assert until(lambda: rig.mirror._broker.state is State.CONNECTING)
+        assert until(lambda: rig.mirror.remote.state is State.CONNECTING)
         rig.local.publish("outgoing/status", b"new", retain=True)
         rig.local.publish(DRIVE, b"lost")
         spare.start()
@@ -297,7 +299,7 @@ def test_what_was_switched_off_stays_off_when_the_broker_is_restored(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rigs: Rigs, history: str, longer: bool
 ) -> None:
     """The operator is at the robot's own side here, and programs are at the mirror's broker."""
-    monkeypatch.setattr(forwarder_module, "_RESTORED_S", 0.0 if longer else 30.0)
+    monkeypatch.setattr(side_module, "RESTORED_S", 0.0 if longer else 30.0)
     broker = OwnBroker(tmp_path)
     try:
         rig = rigs(broker.port)
@@ -306,16 +308,15 @@ def test_what_was_switched_off_stays_off_when_the_broker_is_restored(
 
         def set_flag(who: str, value: bytes) -> None:
             setter = {"operator": rig.local, "program": rig.program, "once": once}[who]
-            setter.publish(FLAG, value, retain=True)
-            once.transport._own.clear()
+            setter.publish(FLAG, value, retain=True, remember=who != "once")
             assert until(lambda: rig.retained_on_local().get(FLAG) == rig.retained_on_broker().get(FLAG) == value)
 
         play(history, set_flag, broker.save)
-        before, seen = mirror._broker.counters["connected"], len(rig.local.payloads(FLAG))
+        before, seen = mirror.remote.counters["connected"], len(rig.local.payloads(FLAG))
         broker.stop()
-        assert until(lambda: mirror._broker.state is not State.CONNECTED)
+        assert until(lambda: mirror.remote.state is not State.CONNECTED)
         broker.restore()
-        assert until(lambda: mirror._broker.counters["connected"] > before)
+        assert until(lambda: mirror.remote.counters["connected"] > before)
         Quiet(rig.local, rig.program).wait(1.0)
         assert until(lambda: rig.retained_on_broker().get(FLAG) == OFF)
         assert rig.retained_on_local()[FLAG] == OFF
@@ -400,7 +401,7 @@ class TestWrongBroker:
     def test_it_is_checked_again(
         self, broker: Broker, spare: Broker, rigs: Rigs, monkeypatch: pytest.MonkeyPatch, how: str
     ) -> None:
-        monkeypatch.setattr(mirror_module, "_CHECK_AGAIN_S", {"after a while": 0.5, "at a reconnect": 60.0}[how])
+        monkeypatch.setattr(service_module, "CHECK_AGAIN_S", {"after a while": 0.5, "at a reconnect": 60.0}[how])
         with TcpProxy(broker.port) as uplink, TcpProxy(broker.port) as way:
             rig = rigs(**bridge_to(uplink.port))
             rig.mirror_port = way.port
@@ -410,12 +411,12 @@ class TestWrongBroker:
             assert until(lambda: len(rig.retained_on_broker()) == 2)
             bridge = rig.start_bridge()
             assert until(lambda: rig.gate is Gate.SHUT)
-            epoch = bridge._remote_epoch
+            epoch = bridge.status.epoch
             uplink.lead_to(spare.port)  # the bridge serves another broker from now on
-            assert until(lambda: bridge._remote_epoch > epoch)
+            assert until(lambda: bridge.status.epoch > epoch)
             rig.local.publish("outgoing/programs/reading", b"", retain=True)
             rig.local.publish("outgoing/status", b"new", retain=True)
-            assert until(lambda: bridge._remote.state is State.CONNECTED)
+            assert until(lambda: bridge.remote.state is State.CONNECTED)
             {"after a while": lambda: None, "at a reconnect": way.drop}[how]()
             rig.wait_ready()
             rig.program.publish(DRIVE, b"1")
@@ -437,8 +438,8 @@ class TestWrongBroker:
         bridge_lives: bool,
     ) -> None:
         """Also if the bridge cannot be asked: the earlier proof still counts."""
-        monkeypatch.setattr(mirror_module, "_CHECK_AGAIN_S", 0.1)
-        monkeypatch.setattr(mirror_module, "_CHECK_S", 0.3)
+        monkeypatch.setattr(service_module, "CHECK_AGAIN_S", 0.1)
+        monkeypatch.setattr(mirror_module, "CHECK_S", 0.3)
         with TcpProxy(broker.port) as uplink:
             rig = rigs(**bridge_to(uplink.port))
             rig.start_bridge()
@@ -446,10 +447,10 @@ class TestWrongBroker:
             assert until(lambda: rig.gate is Gate.SHUT)
             {True: lambda: None, False: uplink.cut}[bridge_lives]()
             checks: list[int] = []
-            wait = rig.mirror._forwarder.rearm
-            monkeypatch.setattr(rig.mirror._forwarder, "rearm", lambda: checks.append(1) or wait())
+            wait = rig.mirror.forwarder.rearm
+            monkeypatch.setattr(rig.mirror.forwarder, "rearm", lambda: checks.append(1) or wait())
             opened = []
-            monkeypatch.setattr(rig.mirror._forwarder, "open", lambda: opened.append(1))
+            monkeypatch.setattr(rig.mirror.forwarder, "open", lambda: opened.append(1))
             assert until(lambda: len(checks) > 4)
             assert not opened
             assert len(errors(caplog)) == 1
@@ -473,7 +474,7 @@ class TestWrongBroker:
     def test_a_broker_without_bridge_mode_is_refused_for_one_connection_only(
         self, broker: Broker, rigs: Rigs, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
     ) -> None:
-        monkeypatch.setattr(mirror_module, "_CHECK_AGAIN_S", 60.0)
+        monkeypatch.setattr(service_module, "CHECK_AGAIN_S", 60.0)
         with BridgelessProxy(broker.port) as way:
             rig = rigs()
             rig.mirror_port = way.port
@@ -499,7 +500,7 @@ class TestWrongBroker:
                 attempts = way.connections + 2 + more
                 assert until(lambda: way.connections > attempts)  # noqa: B023
                 way.lead_to(broker.port)
-                assert until(lambda: rig.mirror._broker.state is State.CONNECTED)
+                assert until(lambda: rig.mirror.remote.state is State.CONNECTED)
             rig.wait_ready()
             rig.program.publish(DRIVE, b"1")
             assert until(lambda: rig.local.payloads(DRIVE) == [b"1"])

@@ -106,7 +106,7 @@ MUTATIONS = {
     ),
     # -- every service
     "retained commands are obeyed": Mutation(
-        _SERVICE, "if message.retain and channel.kind in _ONE_SHOT:", "if message.retain and not channel.kind:"
+        _SERVICE, "if message.retain and channel.one_shot:", "if message.retain and not channel.kind:"
     ),
     # -- the manager
     "final stops are not signed": Mutation(

@@ -44,7 +44,7 @@ MUTATIONS = (
         "retained copies pass the bridge",
         "retained stop",
         "pebble/forwarding/forwarder.py",
-        "elif not self._is_old_stop(side, message):",
+        "elif not here.window.is_old_stop(message):",
         "else:",
     ),
     Mutation(

@@ -12,7 +12,8 @@ from typing import Any, cast
 import pytest
 
 from pebble.config import Config, parse
-from pebble.forwarding.forwarder import Gate
+from pebble.forwarding.routing import Side
+from pebble.forwarding.side import Gate
 from pebble.runtime.connections import local_transport
 from pebble.service import Service
 from pebble.services.mqtt_bridge import service as bridge_module
@@ -60,9 +61,14 @@ class Client:
         if listen:
             transport.subscribe(f"{base}/#", self._remember, echo=False, direct=True)
 
-    def publish(self, suffix: str, payload: bytes, *, qos: int = 1, retain: bool = False) -> None:
+    def publish(
+        self, suffix: str, payload: bytes, *, qos: int = 1, retain: bool = False, remember: bool = True
+    ) -> None:
+        """``remember`` False: it is not published again at the next connection."""
+        topic = f"{self.base}/{suffix}"
+
         def accepted() -> bool:
-            return self.transport.publish(f"{self.base}/{suffix}", payload, qos=QoS(qos), retain=retain)
+            return self.transport.publish(topic, payload, qos=QoS(qos), retain=retain, remember=remember)
 
         assert until(accepted), self.transport.problem
 
@@ -140,7 +146,7 @@ class MemoryRig:
         self.robot_side = MemoryTransport("local-bridge", self.local_hub)
         bridge = MqttBridge(make_config(**section), self.robot_side)
         self._running.append(Running(bridge))
-        assert until(lambda: bridge._local_subscriptions), "the bridge does not listen"
+        assert until(lambda: Side.LOCAL in bridge.status.subscribed), "the bridge does not listen"
         if ready:
             self.wait_ready(bridge)
         return bridge
@@ -157,7 +163,7 @@ class MemoryRig:
     def wait_ready(self, bridge: MqttBridge) -> None:
         assert until(lambda: gate_of(bridge) is not Gate.WAITING), "the bridge never made up its mind"
         if gate_of(bridge) is Gate.OPEN:
-            assert until(lambda: bridge._remote_subscriptions)
+            assert until(lambda: Side.REMOTE in bridge.status.subscribed)
 
     def stop_bridges(self) -> None:
         while self._running:
@@ -222,7 +228,7 @@ class MqttRig:
         bridge = self.bridge
         assert until(lambda: gate_of(bridge) is not Gate.WAITING), "the bridge never made up its mind"
         if gate_of(bridge) is Gate.OPEN:
-            assert until(lambda: bridge._forwarder.synchronized)
+            assert until(lambda: bridge.forwarder.synchronized)
 
     def retained(self, side: str) -> dict[str, bytes]:
         """What a late subscriber finds on that side."""
@@ -244,7 +250,7 @@ class MqttRig:
 
 
 def gate_of(bridge: MqttBridge) -> Gate:
-    return bridge._forwarder.gate
+    return bridge.status.gate
 
 
 class Quiet:

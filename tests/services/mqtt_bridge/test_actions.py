@@ -33,7 +33,7 @@ def control(code: str, **more: Any) -> SystemControl:
 
 
 def finished(action: Action) -> bool:
-    return until(lambda: action._process is not None and action._process.poll() is not None)
+    return until(lambda: not action.running)
 
 
 def test_the_table_has_a_row_for_every_action_of_the_contract() -> None:

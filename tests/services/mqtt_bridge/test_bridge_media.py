@@ -271,7 +271,7 @@ class TestBridge:
     def test_pictures_and_sound_never_pass(self, rig: MemoryRig) -> None:
         bridge = rig.bridge(av_daemon=DEVICES)
         rig.remote.publish("incoming/flags/remote-mirror", TRUE, retain=True)
-        assert until(lambda: bridge._forwarder.mirroring)
+        assert until(lambda: bridge.forwarder.mirroring)
         for client in (rig.local, rig.remote):
             for suffix in ("outgoing/front-camera", "outgoing/audio", "incoming/audio-stream"):
                 client.publish(suffix, b"\xff\xd8", qos=0)

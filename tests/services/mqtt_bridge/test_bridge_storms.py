@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from pebble.forwarding.admission import MAX_UNKNOWN_FLAGS
-from pebble.forwarding.forwarder import Gate
-from pebble.forwarding.routing import Drop
+from pebble.forwarding.routing import Drop, Side
+from pebble.forwarding.side import Gate
 from pebble.transports import State
 from tests.services.mqtt_bridge.bridge_rig import Client, MqttRig, Quiet, gate_of
 from tests.support import AmqttBroker, Broker, some, until
@@ -198,7 +198,7 @@ class TestBrokersWithoutBridgeMode:
         assert 1 <= len(rig.local.on(AUDIO_FLAG)) <= 1000
         assert rig.remote.payloads(VIDEO_FLAG)[-1] == FALSE
         assert rig.local.payloads(AUDIO_FLAG)[-1] == TRUE
-        too_late = rig.bridge._forwarder.counters[f"remote: {Drop.LATE.value}"]  # on a busy machine, behind the flags
+        too_late = rig.bridge.forwarder.counters[f"remote: {Drop.LATE.value}"]  # on a busy machine, behind the flags
         assert len(rig.local.on("incoming/flags/git-pull")) + too_late == 1
 
     def test_mirroring_is_refused_with_one_clear_error(
@@ -241,8 +241,8 @@ class TestRetained:
         rig.local.publish(MIRROR_FLAG, TRUE, retain=True)
         rig.start()
         link.drop()
-        assert until(lambda: rig.bridge._remote_epoch >= 2)
-        assert until(lambda: rig.bridge._remote_subscriptions)
+        assert until(lambda: rig.bridge.status.epoch >= 2)
+        assert until(lambda: Side.REMOTE in rig.bridge.status.subscribed)
         Quiet(rig.local, rig.remote).wait(0.8)
         crossed = rig.remote if retaining_client == "local" else rig.local
         assert not [m for m in crossed.seen if m.topic.removeprefix(f"{rig.base}/") in ONE_SHOTS]
@@ -315,7 +315,7 @@ class TestDeadLinks:
         rig.local.publish("outgoing/touch-sensors", b"stream")
         rig.remote.publish(AUDIO_FLAG, TRUE, retain=True)
         rig.remote.publish(DRIVE, b"old")
-        assert until(lambda: rig.bridge._remote.state is State.CONNECTING, 10)
+        assert until(lambda: rig.bridge.remote.state is State.CONNECTING, 10)
         rig.local.publish("outgoing/somebody/happened", b"2")
         link.resume()
         assert until(lambda: rig.remote.payloads("outgoing/somebody/happened")[-1:] == [b"2"])
@@ -342,6 +342,6 @@ class TestDeadLinks:
         assert until(lambda: len(other.on("outgoing/touch-sensors")) == 400, 10)
         rig.local.publish("incoming/flags/git-pull", b"true")
         assert until(lambda: (tmp_path / "ran").exists(), 5)
-        assert until(lambda: rig.bridge._remote.state is State.CONNECTING, 10)
+        assert until(lambda: rig.bridge.remote.state is State.CONNECTING, 10)
         spare.thaw()
         assert until(lambda: rig.retained("remote").get("outgoing/status", b"").startswith(b"399 "), 10, step=0.3)

@@ -11,7 +11,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from pebble.forwarding.forwarder import Gate
+from pebble.forwarding.side import Gate
 from pebble.services.mqtt_bridge.service import MqttBridge
 from pebble.transports import State, ZenohSettings, create
 from pebble.transports.memory import MemoryHub, MemoryTransport
@@ -45,20 +45,25 @@ class TestZenohUplink:
         client.transport.close()
 
     @pytest.fixture
-    def local(self) -> Iterator[Client]:
-        client = Client(MemoryTransport("somebody", MemoryHub()))
+    def hub(self) -> MemoryHub:
+        return MemoryHub()
+
+    @pytest.fixture
+    def local(self, hub: MemoryHub) -> Iterator[Client]:
+        client = Client(MemoryTransport("somebody", hub))
         yield client
         client.transport.close()
 
-    def test_everything_that_an_mqtt_uplink_does(self, endpoint: str, operator: Client, local: Client) -> None:
+    def test_everything_that_an_mqtt_uplink_does(
+        self, endpoint: str, operator: Client, hub: MemoryHub, local: Client
+    ) -> None:
         local.publish(FLAG, TRUE, retain=True)
         operator.publish(FLAG, FALSE, retain=True)
         operator.publish("incoming/lights-solid", b"stale", retain=True)
-        assert isinstance(local.transport, MemoryTransport)
         config = make_config(remote={"kind": "zenoh", "connect": [endpoint]})
-        bridge = MqttBridge(config, MemoryTransport("local-bridge", local.transport._hub))
+        bridge = MqttBridge(config, MemoryTransport("local-bridge", hub))
         running = Running(bridge)
-        assert until(lambda: gate_of(bridge) is Gate.OPEN and bridge._forwarder.synchronized)
+        assert until(lambda: gate_of(bridge) is Gate.OPEN and bridge.forwarder.synchronized)
         assert until(lambda: local.payloads(FLAG) == [FALSE])
         for number in range(200):
             operator.publish(DRIVE, b"%d" % number)

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from pebble.forwarding import cycles
-from pebble.forwarding.forwarder import Gate
-from pebble.services.mqtt_bridge import service as bridge_module
+from pebble.forwarding import service as service_module
+from pebble.forwarding.side import Gate
 from pebble.transports.memory import MemoryTransport
 from tests.services.mqtt_bridge import bridge_rig
 from tests.services.mqtt_bridge.bridge_rig import BASE, Client, MemoryRig, MqttRig, Quiet, gate_of
@@ -81,9 +81,9 @@ class TestMosquitto:
         carried: str,
         mirroring: bytes,
     ) -> None:
-        monkeypatch.setattr(cycles, "_UNANSWERED", 1)
+        monkeypatch.setattr(cycles, "UNANSWERED", 1)
         robot = rig(direction, carried)
-        assert until(lambda: other_way._pairs)
+        assert until(lambda: other_way.in_use)
         robot.start()
         robot.remote.publish(MIRROR_FLAG, mirroring, retain=True)
         assert until(lambda: robot.local.on(MIRROR_FLAG))
@@ -93,7 +93,7 @@ class TestMosquitto:
         Quiet(robot.local, robot.remote).wait(0.2)
         assert len(errors(caplog)) == 1
         other_way.cut()
-        assert until(lambda: not robot.bridge._forwarder._cycles.closed_ways)
+        assert until(lambda: not robot.bridge.status.circulating)
         before = moves(robot.local)
         robot.remote.publish(DRIVE, MOVE)
         assert until(lambda: moves(robot.local) == before + 1)
@@ -151,7 +151,7 @@ def test_a_probe_of_a_media_request_requests_nothing(rig: MemoryRig) -> None:
 
 def test_one_broker_that_becomes_two(rig: MemoryRig, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without a reconnect: something else forwarded outgoing/# and does so no more."""
-    monkeypatch.setattr(bridge_module, "_CHECK_AGAIN_S", 0.2)
+    monkeypatch.setattr(service_module, "CHECK_AGAIN_S", 0.2)
     joint = Client(MemoryTransport("joint", rig.remote_hub), listen=False)
     onto = Client(MemoryTransport("onto", rig.local_hub), listen=False)
     joint.transport.subscribe(f"{BASE}/outgoing/#", lambda m: onto.transport.publish(m.topic, m.payload), echo=False)

@@ -200,13 +200,13 @@ class Rig:
 
     @property
     def synchronized(self) -> bool:
-        return self._instance._forwarder.synchronized
+        return self._instance.forwarder.synchronized
 
     def is_synchronized(self, side: Side) -> bool:
-        return self._instance._forwarder._reconciliation._synchronized[side]
+        return side in self._instance.status.synchronized
 
     def state(self, side: Side) -> State:
-        return self._instance._forwarder._transports[side].state
+        return {LOCAL: self._instance.transport, REMOTE: self._instance.remote}[side].state
 
     def publish_table(self, situation: str) -> None:
         for cell in TABLE:

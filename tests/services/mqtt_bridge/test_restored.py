@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from pebble.forwarding import forwarder as forwarder_module
+from pebble.forwarding import side as side_module
 from pebble.services.mqtt_bridge import service as bridge_module
-from pebble.services.mqtt_bridge.media import MEDIA, Media
+from pebble.services.mqtt_bridge.media import Media
 from pebble.transports import State
 from tests.services.mqtt_bridge.bridge_rig import BASE, MemoryRig, MqttRig, Quiet
 from tests.services.mqtt_bridge.restoring import FALSE, HISTORIES, TRUE, OwnBroker, OwnHub, play
@@ -19,7 +20,6 @@ from tests.tcp_proxy import TcpProxy
 
 AUDIO_FLAG = "incoming/flags/mqtt-audio"
 STATUS = "outgoing/autonomy-status"
-_AUDIO = MEDIA[1]
 
 
 @pytest.fixture
@@ -50,8 +50,7 @@ def rig(brokers: tuple[Broker, Broker], way: TcpProxy) -> Iterator[MqttRig]:
 def set_flag(rig: MqttRig, value: bytes, *, here: bool = True) -> None:
     """By an operator, who is not asked to repeat it; ``here``: it arrives at the robot now."""
     before = len(rig.local.on(AUDIO_FLAG))
-    rig.remote.publish(AUDIO_FLAG, value, retain=True)
-    rig.remote.transport._own.clear()
+    rig.remote.publish(AUDIO_FLAG, value, retain=True, remember=False)
     assert not here or until(lambda: rig.local.payloads(AUDIO_FLAG)[before:] == [value])
 
 
@@ -61,7 +60,7 @@ def set_status(rig: MqttRig, value: bytes) -> None:
 
 
 def connections(rig: MqttRig) -> int:
-    return rig.bridge._remote.counters["connected"]
+    return rig.bridge.remote.counters["connected"]
 
 
 def test_a_broker_that_was_restored_from_an_older_save_gets_the_newest_values(
@@ -78,7 +77,7 @@ def test_a_broker_that_was_restored_from_an_older_save_gets_the_newest_values(
     for file, saved in older.items():
         file.write_bytes(saved)
     brokers[1].start()
-    assert until(lambda: connections(rig) > before and rig.bridge._remote.state is State.CONNECTED)
+    assert until(lambda: connections(rig) > before and rig.bridge.remote.state is State.CONNECTED)
     assert until(lambda: rig.retained("remote") == {STATUS: b"new", AUDIO_FLAG: TRUE}, 5)
     Quiet(rig.local, rig.remote).wait(0.7)
     assert rig.retained("local")[AUDIO_FLAG] == TRUE
@@ -92,7 +91,9 @@ def test_a_microphone_that_was_switched_off_stays_off_when_the_robots_own_side_i
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, own: type[OwnBroker | OwnHub], history: str, longer: bool
 ) -> None:
     """``longer``: it was away for longer than an outage in which an operator could choose an earlier value again."""
-    monkeypatch.setattr(forwarder_module, "_RESTORED_S", 0.0 if longer else 30.0)
+    monkeypatch.setattr(side_module, "RESTORED_S", 0.0 if longer else 30.0)
+    allowed: list[bool] = []
+    monkeypatch.setattr(Media, "allow", lambda _media, _flag, on: allowed.append(on))
     side, remote = own(tmp_path), Broker(tmp_path)
     rig = MqttRig(side.address, {"host": "127.0.0.1", "port": remote.port})
     try:
@@ -101,16 +102,13 @@ def test_a_microphone_that_was_switched_off_stays_off_when_the_robots_own_side_i
 
         def set_microphone(who: str, value: bytes) -> None:
             setter = {"operator": rig.remote, "program": rig.local, "once": once}[who]
-            setter.publish(AUDIO_FLAG, value, retain=True)
-            once.transport._own.clear()
-            rig.remote.transport._own.clear()
-            assert until(lambda: bridge._forwarder._reconciliation.value(f"{rig.base}/{AUDIO_FLAG}") == value)
+            setter.publish(AUDIO_FLAG, value, retain=True, remember=setter is rig.local)
+            assert until(lambda: bridge.forwarder.value(f"{rig.base}/{AUDIO_FLAG}") == value)
             assert until(lambda: {rig.retained(name).get(AUDIO_FLAG) for name in ("local", "remote")} == {value})
 
         play(history, set_microphone, side.save)
-        assert until(lambda: bridge._media._media._allowed[_AUDIO] is False)
-        allowed: list[bool] = []
-        monkeypatch.setattr(bridge._media, "allow", lambda _flag, on: allowed.append(on))
+        assert until(lambda: allowed[-1:] == [False])
+        allowed.clear()
         before = bridge.transport.counters["connected"]
         side.stop()
         assert until(lambda: bridge.transport.state is not State.CONNECTED)
@@ -163,7 +161,7 @@ def test_a_value_that_an_operator_chose_again_during_an_outage_is_no_older_one(r
     set_flag(rig, TRUE)
     before = connections(rig)
     way.cut()
-    assert until(lambda: rig.bridge._remote.state is not State.CONNECTED)
+    assert until(lambda: rig.bridge.remote.state is not State.CONNECTED)
     set_flag(rig, FALSE, here=False)
     way.mend()
     assert until(lambda: connections(rig) > before)
@@ -196,13 +194,16 @@ def test_an_operators_flag_counts_however_late_the_broker_sends_it(
 class TestLeftovers:
     @pytest.fixture
     def memory(self, monkeypatch: pytest.MonkeyPatch) -> Iterator[MemoryRig]:
-        monkeypatch.setattr(bridge_module, "_LEFTOVERS_AFTER_S", 0.3)
-        monkeypatch.setattr(bridge_module, "_ASK_S", 0.0)
+        monkeypatch.setattr(bridge_module, "LEFTOVERS_AFTER_S", 0.3)
+        monkeypatch.setattr(bridge_module, "ASK_S", 0.0)
         rig = MemoryRig(monkeypatch)
         yield rig
         rig.close()
 
-    def test_what_was_taken_back_while_no_bridge_ran_is_removed_there(self, memory: MemoryRig) -> None:
+    def test_what_was_taken_back_while_no_bridge_ran_is_removed_there(
+        self, memory: MemoryRig, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        caplog.set_level(logging.INFO)
         gone = ["mcu/m1/describe", "mcu/m1/range", "outlets/1/status", "autonomy-status"]
         stays = ["mcu/m2/describe", "estop/serial", "status"]
         foreign = ["incoming/flags/foreign", "outgoing/video", "outgoing/unknown", "outgoing/online"]
@@ -216,8 +217,8 @@ class TestLeftovers:
             memory.remote.publish(topic, b"1", retain=True)
         for name in gone:
             memory.local.publish(f"outgoing/{name}", b"", retain=True)
-        bridge = memory.bridge()
-        assert until(lambda: bridge._leftovers.done)
+        memory.bridge()
+        assert until(lambda: "removed 4 retained topics" in caplog.text)
         left = {f"{BASE}/{topic}" for topic in (*foreign, *(f"outgoing/{name}" for name in stays))}
         assert until(lambda: {*memory.remote_hub.retained} == left), memory.remote_hub.retained.keys()
 
@@ -227,7 +228,6 @@ class TestLeftovers:
         assert until(lambda: f"{BASE}/outgoing/status" in memory.remote_hub.retained)
         memory.stop_bridges()
         memory.local_hub.stop(forget=True)
-        bridge = memory.bridge(ready=False)
+        memory.bridge(ready=False)
         Quiet(memory.remote).wait(1.0)
         assert f"{BASE}/outgoing/status" in memory.remote_hub.retained
-        assert not bridge._leftovers.done

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from pebble.forwarding.forwarder import Gate
+from pebble.forwarding.routing import Side
+from pebble.forwarding.side import Gate
 from pebble.transports import QoS, State
 from pebble.transports.memory import MemoryTransport
 from tests.services.mqtt_bridge.bridge_rig import BASE, Client, MemoryRig, MqttRig, Quiet, gate_of
@@ -78,7 +80,7 @@ def after_all(speaker: Client, listener: Client) -> None:
 
 def reconnected(rig: MqttRig, epoch: int) -> bool:
     """Whether the bridge has subscribed on a connection after ``epoch``."""
-    return rig.bridge._remote_epoch > epoch and rig.bridge._forwarder.synchronized
+    return rig.bridge.status.epoch > epoch and rig.bridge.forwarder.synchronized
 
 
 class TestUrgency:
@@ -87,12 +89,12 @@ class TestUrgency:
     ) -> None:
         """No queue and no other thread is in between, so nothing can delay it or take its place."""
         memory.bridge()
-        threads: list[int] = []
+        threads: list[str] = []
         publish = MemoryTransport.publish
 
         def record(transport: MemoryTransport, topic: str, *arguments: Any, **options: Any) -> bool:
             if topic.endswith(STOP) and transport is memory.robot_side:
-                threads.append(threading.get_ident())
+                threads.append(threading.current_thread().name)
                 assert options["urgent"]
                 assert options["qos"] is QoS.DELIVERED
             return publish(transport, topic, *arguments, **options)
@@ -100,15 +102,26 @@ class TestUrgency:
         monkeypatch.setattr(MemoryTransport, "publish", record)
         memory.remote.publish(STOP, PRESS, qos=0)
         assert until(lambda: memory.local.on(STOP))
-        assert memory.operator_side._thread is not None
-        assert threads == [memory.operator_side._thread.ident]
+        assert threads == ["pebble-memory remote-bridge"]
 
     @pytest.mark.parametrize("retain", [False, True])
     def test_it_waits_for_no_lock_of_retained_messages(self, memory: MemoryRig, *, retain: bool) -> None:
         bridge = memory.bridge()
-        with bridge._forwarder._lock:
-            memory.remote.publish(STOP, PRESS, retain=retain)
-            assert until(lambda: memory.local.payloads(STOP) == [PRESS], 5)
+        held, over = threading.Event(), threading.Event()
+
+        def hold(_topic: str) -> bool:
+            held.set()
+            return over.wait(10)
+
+        holding = partial(bridge.forwarder.remove_retained, Side.REMOTE, f"{BASE}/{STATE}", unless=hold)
+        threading.Thread(target=holding, daemon=True).start()
+        assert held.wait(5)
+        memory.remote.publish(STOP, PRESS, retain=retain)
+        memory.remote.publish(MIRROR_FLAG, TRUE, retain=True)
+        assert until(lambda: memory.local.payloads(STOP) == [PRESS], 5)
+        assert not memory.local.on(MIRROR_FLAG)
+        over.set()
+        assert until(lambda: memory.local.on(MIRROR_FLAG))
 
     def test_one_that_comes_before_anything_is_forwarded_is_not_delivered_later(self, memory: MemoryRig) -> None:
         """Its sender repeats it. A stop from before an outage must not stop the robot after it."""
@@ -126,7 +139,7 @@ class TestUrgency:
         Quiet(memory.local, memory.remote).wait(0.7)
         assert memory.remote.payloads(STOP) == [b"now"]
 
-    @pytest.mark.parametrize("side", ["transport", "_remote"])
+    @pytest.mark.parametrize("side", ["transport", "remote"])
     def test_it_is_taken_where_too_many_messages_wait(self, memory: MemoryRig, side: str) -> None:
         is_stop = getattr(memory.bridge(), side).is_stop
         found = {suffix: is_stop(f"{BASE}/{suffix}") for suffix in (STOP, RESET, STATE, DRIVE, "incoming/estop/x")}
@@ -169,7 +182,7 @@ class TestRetain:
     ) -> None:
         rig = rigs(at(brokers[0], protocol=protocol), at(brokers[1], protocol=protocol))
         rig.start()
-        assert rig.bridge._remote.as_published
+        assert rig.bridge.remote.as_published
         rig.remote.publish(STOP, PRESS, retain=True)
         rig.remote.publish(STOP, PRESS, retain=True)
         rig.remote.publish(RESET, b"{}", retain=True)
@@ -190,7 +203,7 @@ class TestRetain:
         rig.start()
         for _ in range(3):
             after_all(rig.remote, rig.local)
-            epoch = rig.bridge._remote_epoch
+            epoch = rig.bridge.status.epoch
             link.drop()
             assert until(lambda epoch=epoch: reconnected(rig, epoch))  # type: ignore[misc]
         Quiet(rig.local, rig.remote).wait(0.7)
@@ -210,7 +223,7 @@ class TestRetain:
         rig.start(ready=False)
 
         def arrived() -> int:
-            counted = rig.bridge._forwarder.counters.snapshot()
+            counted = rig.bridge.forwarder.counters.snapshot()
             return sum(number for name, number in counted.items() if name.startswith("remote: "))
 
         assert until(lambda: arrived() >= others, 30)
@@ -226,7 +239,7 @@ class TestRetain:
             rig = rigs(at(brokers[0]), at(amqtt))
             rig.remote.publish(STOP, OLD, retain=True)
             rig.start()
-            assert not rig.bridge._remote.as_published
+            assert not rig.bridge.remote.as_published
             rig.remote.publish(STOP, PRESS, retain=True)
             assert until(lambda: rig.local.on(STOP))
             Quiet(rig.local, rig.remote).wait()
@@ -244,11 +257,11 @@ class TestRetain:
         rig.local.publish(STOP, OLD, retain=True)
         rig.remote.publish(STOP, OLD, retain=True)
         rig.local.publish(MIRROR_FLAG, TRUE, retain=True)
-        assert until(lambda: rig.local.on(STOP) and bridge._forwarder.mirroring)
-        bridge._forwarder.shut()
-        bridge.post(bridge._disable)
-        bridge.post(bridge._open)
-        assert until(lambda: gate_of(bridge) is Gate.OPEN and bridge._remote_subscriptions)
+        assert until(lambda: rig.local.on(STOP) and bridge.forwarder.mirroring)
+        bridge.forwarder.shut()
+        bridge.post(bridge.disable)
+        bridge.post(partial(bridge.check_again, bridge.status.epoch))
+        assert until(lambda: gate_of(bridge) is Gate.OPEN and Side.REMOTE in bridge.status.subscribed)
         Quiet(rig.local, rig.remote).wait(0.7)
         assert rig.local.payloads(STOP) == [OLD]  # the live one
         assert not rig.remote.on(STOP)
@@ -263,7 +276,7 @@ class TestStates:
         rig.start()
         assert until(lambda: rig.remote.payloads(STATE) == [b"free"])
         link.cut()
-        assert until(lambda: rig.bridge._remote.state is State.CONNECTING)
+        assert until(lambda: rig.bridge.remote.state is State.CONNECTING)
         for payload in (b"latched", b"latched and saved"):
             rig.local.publish(STATE, payload, retain=True)
         link.mend()
@@ -287,7 +300,7 @@ class TestStates:
         rig.local.publish(STATE, b"free", retain=True)
         assert until(lambda: rig.remote.payloads(STATE)[-1] == b"free" and rig.local.payloads(STOP)[-1] == b"")
         before = len(rig.local.on(STOP))
-        epoch = rig.bridge._remote_epoch
+        epoch = rig.bridge.status.epoch
         rig.remote.transport.close()
         remote.kill()
         saved.write_bytes(older)
@@ -311,7 +324,7 @@ class TestNothingCirculates:
         rig = rigs(at(brokers[0], protocol=protocol), at(brokers[1], protocol=protocol))
         rig.start()
         rig.local.publish(MIRROR_FLAG, TRUE, retain=True)
-        assert until(lambda: rig.bridge._forwarder.mirroring)
+        assert until(lambda: rig.bridge.forwarder.mirroring)
         presses = [b'{"stop": "%016x"}' % number for number in range(50)]
         for press in presses:
             rig.local.publish(STOP, press, retain=retain)

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pebble.forwarding.forwarder import Gate
+from pebble.forwarding.side import Gate
 from pebble.services.mqtt_bridge.private_topics import PrivateTopics
 from pebble.services.mqtt_bridge.service import MqttBridge
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.manifest import parse_describe

@@ -1,0 +1,102 @@
+"""Publishes on either side of a forwarder, and recognises what of it comes back."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+
+import msgspec
+
+from pebble.contract import Kind, codec
+from pebble.forwarding.cycles import Cycles
+from pebble.forwarding.routing import URGENT, Forward, Side
+from pebble.forwarding.side import Sides, SideState
+from pebble.forwarding.subjects import Subject, Subjects
+from pebble.transports import Message, QoS, State
+from pebble.transports.counters import Counters
+
+
+class Publisher:
+    """Publishes messages, and probes for cycles; ``both_ways`` are the kinds that pass in both directions."""
+
+    def __init__(
+        self, sides: Sides, cycles: Cycles, subjects: Subjects, counters: Counters, both_ways: frozenset[Kind]
+    ) -> None:
+        self._sides, self._cycles, self._subjects = sides, cycles, subjects
+        self._counters, self._both_ways = counters, both_ways
+
+    def publish(self, to: SideState, subject: Subject, message: Message, forward: Forward) -> None:
+        topic, payload, transport = message.topic, message.payload, to.transport
+        if subject.runs or self._cycles.closed_ways:
+            self.note_return(to, subject, message)
+        echoing = not transport.exact_echo and subject.is_two_way
+        if echoing:
+            to.loopback.expect(topic, payload)
+        accepted = transport.publish(
+            topic,
+            payload,
+            qos=forward.qos,
+            retain=forward.retain,
+            urgent=forward.urgent,
+            shared=subject.kind in self._both_ways,
+        )
+        if not accepted:
+            self._counters.add(f"{to.side.value}: refused")
+        if echoing and (not accepted or transport.state is not State.CONNECTED):
+            to.loopback.forget(topic)
+
+    def note_return(self, to: SideState, subject: Subject, message: Message) -> None:
+        """``message`` goes to one side; if its topic circulates, it comes back from the other one.
+
+        What runs something is noted before it is known whether its topic circulates: its probe is still under way.
+        """
+        origin = to.side.other
+        if subject.runs or (not subject.one_shot and (origin, message.topic) in self._cycles.closed_ways):
+            self._sides[origin].returns.expect(message.topic, message.payload)
+
+    def is_echo(self, here: SideState, subject: Subject, message: Message) -> bool:
+        """Whether ``message`` is one of ours, that came back."""
+        topic, payload = message.topic, message.payload
+        if (here.side, topic) in self._cycles.closed_ways and here.returns.is_echo(topic, payload):
+            return True
+        if here.transport.exact_echo or message.retain or not subject.is_two_way:
+            return False
+        return here.loopback.is_echo(topic, payload)
+
+    # -- cycles: what we forward to one side comes back from the other
+
+    def probe_commands(self, *sides: Side) -> None:
+        """Find out whether commands and actions from ``sides`` would circulate; after each connection."""
+        for side, topic in itertools.product(sides, self._subjects.probed):
+            self.probe(side, topic, b"")
+
+    def probe_again(self, sides: tuple[Side, ...], value: Callable[[str], bytes | None]) -> None:
+        """Find out whether what circulated does so still, and commands from ``sides`` as well; once a second.
+
+        ``value`` gives a topic's newest one. Commands were probed when a connection began; the other way may be
+        younger.
+        """
+        for side, topic in self._cycles.poll():
+            self.probe(side, topic, value(topic) or b"")
+        if self._cycles.closed_ways:
+            for side, topic in itertools.product(sides, self._subjects.probed):
+                if (side, topic) not in self._cycles.closed_ways:
+                    self.probe(side, topic, b"")
+
+    def probe(self, side: Side, topic: str, value: bytes) -> None:
+        """Publish a probe on the other side, where something else may lead back to ``side``."""
+        subject, there = self._subjects[topic], self._sides[side.other]
+        if subject is None or not there.connected:
+            return
+        if subject.one_shot or _is_json(value):
+            probe = (b"" if subject.one_shot else value) + self._cycles.probe(side, topic)
+            there.transport.publish(topic, probe, qos=QoS.DELIVERED, urgent=subject.kind in URGENT)
+
+
+def _is_json(value: bytes) -> bool:
+    """Whether white space may follow ``value`` without changing it."""
+    try:
+        msgspec.json.decode(codec.trim(value))
+    except msgspec.DecodeError:
+        return False
+    return True

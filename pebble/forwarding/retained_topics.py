@@ -1,0 +1,159 @@
+"""Passes retained messages under one lock, because both sides may change the same flag at once."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+
+from pebble.contract import Kind
+from pebble.forwarding.publisher import Publisher
+from pebble.forwarding.reconciliation import Reconciliation, Resolution
+from pebble.forwarding.routing import URGENT, Drop, Forward, Side
+from pebble.forwarding.side import Gate, Sides, SideState
+from pebble.forwarding.subjects import Subject, Subjects
+from pebble.transports import Message, QoS
+
+_MAX_WAITING = 4096  # retained messages that wait for the gate to open
+_DROPS = {Resolution.KNOWN: Drop.KNOWN, Resolution.HOLD: Drop.HELD}
+
+
+class RetainedTopics:
+    """What is retained on both sides: messages that wait for the gate, and which of two values counts.
+
+    ``on_value(subject, payload)`` is called with the lock held.
+    """
+
+    def __init__(
+        self,
+        sides: Sides,
+        subjects: Subjects,
+        publisher: Publisher,
+        winner: Side,
+        both_ways: frozenset[Kind],
+        on_value: Callable[[Subject, bytes], None],
+    ) -> None:
+        self._sides, self._subjects, self._publisher = sides, subjects, publisher
+        self._both_ways, self._on_value = both_ways, on_value
+        self._lock = threading.RLock()
+        self._reconciliation = Reconciliation(winner)
+        self._waiting: dict[str, tuple[Subject, Message, Forward]] = {}
+
+    def receive(self, here: SideState, subject: Subject, message: Message, forward: Forward) -> Forward | Drop:
+        """Forward ``message``, which will be retained, or say why not."""
+        with self._lock:
+            self._begin_restarted()
+            if subject.kind in self._both_ways:
+                drop = self._reconcile(here, subject, message)
+                if drop is not None:
+                    return drop
+            gate = self._sides.gate
+            if gate is Gate.OPEN:
+                self._publish(here.side.other, subject, message, forward)
+                return forward
+            if gate is Gate.WAITING and here.side is Side.LOCAL:
+                if message.topic in self._waiting or len(self._waiting) < _MAX_WAITING:
+                    self._waiting[message.topic] = subject, message, forward
+                return Drop.HELD
+            return Drop.CLOSED
+
+    def open(self) -> None:
+        """Open the gate, and publish what has waited."""
+        with self._lock:
+            self._sides.gate = Gate.OPEN
+            waiting, self._waiting = self._waiting, {}
+            for subject, message, forward in waiting.values():
+                self._publish(Side.REMOTE, subject, message, forward)
+
+    def shut(self) -> None:
+        """Shut the gate. Takes no lock: a loop of messages must end at once."""
+        self._sides.gate = Gate.SHUT
+        self._waiting = {}
+
+    def synchronize(self, side: Side) -> None:
+        """The retained messages of ``side`` have arrived: publish what they have left open."""
+        with self._lock:
+            self._begin_restarted()
+            self._sides[side].arrived()
+            for to, topic, payload in self._reconciliation.synchronize(side):
+                subject, newest = self._subjects[topic], self._reconciliation.value(topic)
+                if subject is not None and newest is not None:
+                    self._on_value(subject, newest)
+                self._publish_value(to, topic, payload)
+
+    def synchronized(self, *sides: Side) -> bool:
+        """Whether the retained messages of ``sides`` have arrived."""
+        with self._lock:
+            self._begin_restarted()
+            return self._reconciliation.has_synchronized(*sides)
+
+    def value(self, topic: str) -> bytes | None:
+        """The newest value of a two-way topic."""
+        return self._reconciliation.value(topic)
+
+    def remove(self, side: Side, topic: str, unless: Callable[[str], bool]) -> bool:
+        """Remove what ``side`` retains on ``topic``, unless there is a reason not to; return whether it was removed.
+
+        Until it is removed no retained message passes, so what is published meanwhile comes after it.
+        """
+        with self._lock:
+            if unless(topic):
+                return False
+            self._sides[side].transport.publish(topic, b"", qos=QoS.DELIVERED, retain=True)
+            return True
+
+    # -- with the lock held
+
+    def _reconcile(self, here: SideState, subject: Subject, message: Message) -> Drop | None:
+        """Why a two-way message must not pass; None if it may."""
+        side, topic, payload, transport = here.side, message.topic, message.payload, here.transport
+        if message.retain and topic in here.seen and transport.delivers_late and not transport.as_published:
+            return Drop.KNOWN  # older than what was seen
+        if len(here.seen) < _MAX_WAITING:
+            here.seen.add(topic)
+        retained = self._sides.gate is not Gate.SHUT and self._is_retained(here, message)
+        if not retained and self._own_return and self._reconciliation.value(topic) == payload:
+            return Drop.KNOWN
+        resolution = self._reconciliation.receive(
+            side,
+            topic,
+            payload,
+            retained=retained,
+            other_away=not self._sides[side.other].connected,
+            went_back=here.has_gone_back,
+        )
+        if resolution is Resolution.PASS:
+            self._on_value(subject, payload)
+            return None
+        if resolution is Resolution.RESTORE:
+            self._publish_value(side, topic, payload)
+            self._on_value(subject, payload)
+            return None
+        if resolution is Resolution.CORRECT:
+            self._publish_value(side, topic, self._reconciliation.value(topic) or b"")
+        return _DROPS.get(resolution, Drop.OVERRULED)
+
+    @property
+    def _own_return(self) -> bool:
+        """Whether no side distinguishes our own messages exactly."""
+        return not any(one.transport.exact_echo for one in self._sides.values())
+
+    def _is_retained(self, here: SideState, message: Message) -> bool:
+        if not here.transport.as_published:
+            return message.retain
+        return here.window.may_be_old(message) and not self._reconciliation.has_received(here.side, message.topic)
+
+    def _begin_restarted(self) -> None:
+        for one in self._sides.values():
+            if one.restarted:
+                one.restarted = False
+                self._reconciliation.begin(one.side)
+
+    def _publish_value(self, side: Side, topic: str, payload: bytes) -> None:
+        subject = self._subjects[topic]
+        if self._sides.gate is Gate.OPEN and subject is not None:
+            self._publish(side, subject, Message(topic, payload), Forward(QoS.DELIVERED, True, subject.kind in URGENT))
+
+    def _publish(self, to: Side, subject: Subject, message: Message, forward: Forward) -> None:
+        self._publisher.publish(self._sides[to], subject, message, forward)
+        if subject.kind in self._both_ways:
+            self._reconciliation.note_published(to, message.topic, message.payload)

@@ -1,0 +1,62 @@
+"""Decides whether a message with the retain flag is an old one, or was published just now. Pure but for its clock.
+
+Where a connection marks live messages with the flag, too, only the time since the subscription distinguishes the two.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from pebble.transports import Message, Transport
+
+#: Retained messages closely follow the acknowledgement of a subscription: by then they are here even over a slow link.
+INITIAL_SYNC_S = 0.5
+#: Some brokers send them later: they are all here after a silence this long.
+QUIET_S = 0.25
+#: The first message of a topic within this time after :meth:`RetainedWindow.subscribed` counts as an old one.
+_RETAINED_S = 0.05
+#: A broker sends few retained messages at a time, so over a slow link the last ones arrive long after the first. While
+#: others with the retain flag keep arriving, a stop with it counts as an old one, but not for longer than this.
+_RETAINED_STOPS_S = 10.0
+
+
+class RetainedWindow:
+    """The time after a subscription in which what ``transport`` has retained still arrives."""
+
+    def __init__(self, transport: Transport, clock: Callable[[], float]) -> None:
+        self._transport, self._clock = transport, clock
+        self._subscribed_at = self._until = self._stops_until = float("inf")
+        self._newest_at = float("-inf")  # of the messages that may be old
+
+    @property
+    def is_arriving(self) -> bool:
+        """Whether retained messages have come until just now."""
+        return self._clock() - self._newest_at < QUIET_S
+
+    def subscribing(self) -> None:
+        """Its retained messages arrive from now on."""
+        self._newest_at = float("-inf")
+        self._until = self._stops_until = float("inf")
+
+    def subscribed(self) -> None:
+        """The subscription is complete, and its retained messages have arrived."""
+        self._subscribed_at = now = self._clock()
+        self._until = now + _RETAINED_S
+        self._stops_until = max(self._until, self._newest_at + INITIAL_SYNC_S)
+
+    def note(self) -> None:
+        """A message with the retain flag has arrived: while such come, a stop may be an old one."""
+        now, until = self._clock(), self._stops_until
+        if now >= until:
+            return
+        self._newest_at = now
+        if until < float("inf"):
+            end = self._subscribed_at + _RETAINED_STOPS_S
+            self._stops_until = min(max(now + INITIAL_SYNC_S, until), end)
+
+    def is_old_stop(self, message: Message) -> bool:
+        return message.retain and (not self._transport.as_published or self._clock() < self._stops_until)
+
+    def may_be_old(self, message: Message) -> bool:
+        """Whether ``message``, if it is the first of its topic, is an old one, where live ones have the flag, too."""
+        return message.retain and self._clock() < self._until

@@ -1,0 +1,192 @@
+"""What bridge and mirror share: a connection on each side, a forwarder between them, and the life of both."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from functools import partial
+from typing import Any, ClassVar
+
+from pebble.contract import BRIDGE_PROBE, INCOMING, OUTGOING
+from pebble.forwarding.cycles import PROBE_PERIOD_S
+from pebble.forwarding.forwarder import Forwarder, Status
+from pebble.forwarding.retained_window import INITIAL_SYNC_S, QUIET_S
+from pebble.forwarding.routing import Rules, Side
+from pebble.forwarding.side import Gate
+from pebble.forwarding.subjects import Subject, Subjects
+from pebble.runtime.service import Service, every
+from pebble.transports import Message, State, Subscription, Transport
+
+CHECK_AGAIN_S = 30.0  # while nothing is forwarded
+
+
+class ServiceStatus(Status, frozen=True):
+    """What a forwarding service does now, for tools and tests."""
+
+    epoch: int  # lost connections of the remote side
+    subscribed: frozenset[Side]
+    counts: dict[str, int]  # messages, by side and what became of them
+
+
+class ForwardingService(Service, ABC):
+    """Forwards between the robot's own transport (the local side) and another one (the remote side).
+
+    Messages are forwarded on the transports' receiving threads (see pebble.forwarding.forwarder); everything else
+    happens on the service's own thread, so a burst of messages delays neither a heartbeat nor a probe.
+    """
+
+    as_published = True
+    rules: ClassVar[Rules]
+    winner: ClassVar[Side]
+    probed_sides: ClassVar[tuple[Side, ...]]  # whose commands could circulate
+    arriving_s: ClassVar[float] = 0.0  # longest wait for retained messages that still come after the subscription
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self.remote = self.make_remote()
+        self.subjects = Subjects(self.config)
+        self.forwarder = Forwarder(
+            self.subjects,
+            self.rules,
+            {Side.LOCAL: self.transport, Side.REMOTE: self.remote},
+            winner=self.winner,
+            on_value=self.on_value,
+            clock=self.clock,
+        )
+        self.epoch = 0  # counts lost connections of the remote side
+        self.subscriptions: dict[Side, list[Subscription]] = {side: [] for side in Side}
+
+    @property
+    def status(self) -> ServiceStatus:
+        now = self.forwarder.status
+        subscribed = frozenset(side for side, subscriptions in self.subscriptions.items() if subscriptions)
+        counts = self.forwarder.counters.snapshot()
+        return ServiceStatus(now.gate, now.mirroring, now.synchronized, now.circulating, self.epoch, subscribed, counts)
+
+    # -- to implement
+
+    @abstractmethod
+    def make_remote(self) -> Transport:
+        """The remote side's transport, not yet open; called while the service is made."""
+
+    def on_value(self, subject: Subject, payload: bytes) -> None:
+        """React to the value on which both sides agree; on any thread, with a lock held."""
+
+    @abstractmethod
+    def connected(self, side: Side, epoch: int) -> None:
+        """React to a connection of ``side``, made after ``epoch`` lost ones of the remote side."""
+
+    def disconnected(self, side: Side) -> None:
+        """React to a lost connection."""
+        if side is Side.REMOTE:
+            self.unsubscribe(Side.REMOTE)
+
+    @abstractmethod
+    def await_retained(self) -> None:
+        """Wait, bounded, until the retained messages of the remote side have arrived."""
+
+    @abstractmethod
+    def synchronized(self, side: Side) -> None:
+        """React to the values of ``side`` being known."""
+
+    @abstractmethod
+    def check_again(self, epoch: int) -> None:
+        """Check whether the reason to forward nothing is gone, without a reconnect."""
+
+    @abstractmethod
+    def receive_local(self, message: Message) -> None:
+        """Take a message of the local side, on its thread."""
+
+    @abstractmethod
+    def receive_remote(self, epoch: int, message: Message) -> None:
+        """Take a message of the remote side, on its thread; ``epoch`` is that of its connection."""
+
+    # -- the life of the service
+
+    def start(self) -> None:
+        self.transport.on_state(partial(self.on_side_state, Side.LOCAL))
+        self.remote.on_state(partial(self.on_side_state, Side.REMOTE))
+        self.remote.open(timeout=0.0)
+        self.on_stop(self.remote.close)
+        self.post(self.subscribe_local)
+
+    def dropped(self) -> dict[str, int]:
+        return self.forwarder.dropped()
+
+    def stop(self) -> None:
+        self.log.info("forwarded and dropped: %s", self.forwarder.counters.snapshot())
+
+    # -- the service's thread
+
+    def subscribe_local(self) -> None:
+        self.subscriptions[Side.LOCAL] = [
+            self.transport.subscribe(filter_, self.receive_local, echo=False, direct=True)
+            for filter_ in self.subjects.filters(INCOMING, OUTGOING)
+        ]
+
+    def subscribe_remote(self) -> None:
+        """Subscribe anew for each connection, after the transport has sent what changed during the outage.
+
+        So a retained message of the remote side is never older than what the robot has changed.
+        """
+        self.unsubscribe(Side.REMOTE)
+        self.forwarder.subscribing(Side.REMOTE)
+        receive = partial(self.receive_remote, self.epoch)
+        directions = (INCOMING,) if self.rules.leaves_robot else (INCOMING, OUTGOING)
+        self.subscriptions[Side.REMOTE] = [
+            self.remote.subscribe(filter_, receive, echo=False, direct=True)
+            for filter_ in self.subjects.filters(*directions)
+        ]
+        self.await_retained()
+        self.forwarder.subscribed(Side.REMOTE)
+        self.synchronize_later(Side.REMOTE)
+
+    def unsubscribe(self, side: Side) -> None:
+        subscriptions, self.subscriptions[side] = self.subscriptions[side], []
+        for subscription in subscriptions:
+            subscription.close()
+
+    def synchronize_later(self, side: Side) -> None:
+        epoch, end = self.epoch, self.clock() + self.arriving_s
+
+        def synchronize() -> None:
+            if side is Side.REMOTE and self.forwarder.is_arriving(side) and self.clock() < end:
+                self.call_at(self.clock() + QUIET_S, synchronize)
+            elif side is Side.LOCAL or epoch == self.epoch:
+                self.forwarder.synchronize(side)
+                self.synchronized(side)
+
+        self.call_at(self.clock() + INITIAL_SYNC_S, synchronize)
+
+    @every(PROBE_PERIOD_S)
+    def _probe_again(self) -> None:
+        self.forwarder.probe_again(*self.probed_sides)
+
+    def disable(self) -> None:
+        """Forward nothing until a check finds that the two sides are two brokers."""
+        self.forwarder.shut()  # again: it may just have been opened
+        self.unsubscribe(Side.REMOTE)
+        self.check_later()
+
+    def check_later(self) -> None:
+        self.call_at(self.clock() + CHECK_AGAIN_S, partial(self._check_if_shut, self.epoch))
+
+    def _check_if_shut(self, epoch: int) -> None:
+        if self.forwarder.gate is Gate.SHUT:
+            self.check_again(epoch)
+
+    # -- the transports' threads
+
+    def on_side_state(self, side: Side, state: State) -> None:
+        self.forwarder.watch(side, state)
+        if state is State.CONNECTED:
+            self.post(partial(self.connected, side, self.epoch))
+            return
+        if side is Side.REMOTE:
+            self.epoch += 1
+        self.post(partial(self.disconnected, side))
+
+    def shut(self) -> None:
+        """The two sides may be one broker: forward nothing from now on, and do the rest on the service's thread."""
+        if self.forwarder.gate is not Gate.SHUT:
+            self.forwarder.shut()
+            self.post_message(BRIDGE_PROBE, self.disable)

@@ -1,0 +1,88 @@
+"""What a forwarder knows of each of its two sides, and whether anything passes between them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from enum import Enum
+
+from pebble.forwarding.event_buffer import EventBuffer
+from pebble.forwarding.loopback_filter import LoopbackFilter
+from pebble.forwarding.retained_window import RetainedWindow
+from pebble.forwarding.routing import Side
+from pebble.transports import State, Transport
+from pebble.transports.counters import Counters
+
+#: After a longer outage an earlier value at a broker that was restored may have been chosen again by somebody.
+RESTORED_S = 30.0
+#: What circulates comes back within this time; the same message later is new.
+_RETURN_S = 2.0
+
+
+class Gate(Enum):
+    WAITING = "waiting"  # nothing passes yet; retained messages and events wait
+    OPEN = "open"
+    SHUT = "shut"  # nothing passes
+
+
+class SideState:
+    """One side: its transport, what waits for it, what may come back from it, and what its retained messages prove.
+
+    ``wins``: its retained messages count where those of the two sides differ.
+    """
+
+    def __init__(
+        self, side: Side, transport: Transport, counters: Counters, clock: Callable[[], float], *, wins: bool
+    ) -> None:
+        self.side, self.transport = side, transport
+        self.count_forwarded = counters.adder(f"{side.value}: forwarded")
+        self.events = EventBuffer(transport, counters, clock=clock)
+        self.window = RetainedWindow(transport, clock)
+        self.loopback = LoopbackFilter(clock)  # of a broker without bridge mode
+        self.returns = LoopbackFilter(clock, _RETURN_S)  # what circulates, once each
+        self.seen: set[str] = set()  # two-way topics, since we subscribed
+        self.restarted = False  # its retained messages come (again), which the reconciliation has not been told
+        self._clock, self._wins = clock, wins
+        self._lost_at = float("-inf")  # -inf: before the first connection, too
+        self._went_back = False
+
+    @property
+    def connected(self) -> bool:
+        return self.transport.state is State.CONNECTED
+
+    def subscribing(self) -> None:
+        """The owner is about to subscribe: retained messages arrive from now on."""
+        self.window.subscribing()
+        self.seen.clear()
+
+    def watch(self, state: State) -> None:
+        """Follow the transport's state."""
+        self.events.watch(state)
+        if state is not State.CONNECTED:
+            self.subscribing()  # the transport does so at the next connection
+            self.restarted = True
+            self._lost_at = self._clock()
+            # Known before its retained messages come, which may be before it counts as connected.
+            self._went_back = not self._wins and self.transport.was_ended
+        elif self._wins:
+            self._went_back = self._was_brief and self.transport.went_back
+
+    @property
+    def has_gone_back(self) -> bool:
+        """Whether an earlier value that it retains is an old one: no program can have chosen it again."""
+        if self._wins or not self._went_back:
+            return self._went_back
+        return self._was_brief or self.transport.was_ended
+
+    def arrived(self) -> None:
+        """What it retains has arrived: an earlier value from now on was chosen again."""
+        self._went_back = False
+
+    @property
+    def _was_brief(self) -> bool:
+        return self._clock() - self._lost_at < RESTORED_S
+
+
+class Sides(dict[Side, SideState]):
+    """Both sides; ``gate`` is whether messages pass between them."""
+
+    gate: Gate = Gate.WAITING
