@@ -17,7 +17,7 @@ from pebble.client.key_decoder import END, KeyDecoder
 from pebble.client.key_gesture import PERIOD_S, KeyGesture
 from pebble.client.terminal_driver import TerminalDriver
 from pebble.commands.estop import me
-from pebble.commands.options import CaCert, ConfigOption, PasswordFile, RemoteOption, UrlOption
+from pebble.commands.options import with_target
 from pebble.config.visible import shown
 from pebble.media.in_flight import InFlight
 from pebble.transports import Message, QoS, State, Transport
@@ -42,16 +42,14 @@ RobotArgument = Annotated[
 ]
 
 
+@with_target(program="drive")
 def drive(
     robot: RobotArgument,
     speed: Annotated[float, typer.Option(min=0.05, max=1, help="Throttle of a key, and speed of the grousers.")] = 0.6,
     turn: Annotated[float, typer.Option(min=0.05, max=1, help="Steering of a key.")] = 0.8,
     take_over: Annotated[bool, typer.Option("--take-over", help="Also from another driver.")] = False,
-    config: ConfigOption = None,
-    url: UrlOption = None,
-    remote: RemoteOption = False,
-    password_file: PasswordFile = None,
-    ca_cert: CaCert = None,
+    *,
+    target: Target,
 ) -> int:
     """Drive a robot with the keys of this terminal.
 
@@ -70,10 +68,7 @@ def drive(
     from pebble.client.terminal_keys import check_terminal, opened
 
     check_terminal()
-    target = target_of(
-        robot,
-        Target(config=config, url=url, remote=remote, password_file=password_file, ca_cert=ca_cert, program="drive"),
-    )
+    target = target_of(robot, target)
     with connected(target) as (transport, names):
         device = f"terminal on {socket.gethostname()}"
         lease = DriverLease(names.base, f"drive-{secrets.token_hex(4)}", by=me(), device=device)
