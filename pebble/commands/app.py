@@ -32,7 +32,7 @@ COMMANDS = {
     "web": "web",
     "foxglove": "foxglove",
     "record": "record",
-    "recordings": "recordings",
+    "recordings": "recordings.group",
     "replay": "replay",
     "analyse": "analyse",
     "cert": "cert",
