@@ -19,8 +19,8 @@ from pebble.commands.options import with_target
 from pebble.errors import PebbleError
 from pebble.launcher.sd_notify import SystemdNotifier
 from pebble.recordings.recorder import metrics
-from pebble.recordings.recorder.recorder import Options, Recorder
-from pebble.recordings.recorder.settings import EVERYTHING, Connection, Settings, load
+from pebble.recordings.recorder.recorder import Recorder
+from pebble.recordings.recorder.settings import EVERYTHING, Connection, Options, Settings, load
 from pebble.recordings.recorder.source import Source
 from pebble.recordings.units import seconds, size
 from pebble.runtime.signals import interrupted_by_signals

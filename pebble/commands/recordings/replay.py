@@ -27,7 +27,8 @@ from pebble.config.visible import shown
 from pebble.errors import PebbleError
 from pebble.recordings.catalogue import look_at
 from pebble.recordings.library import files, problems
-from pebble.recordings.replay.player import FASTEST, SLOWEST, Player
+from pebble.recordings.replay.pace import FASTEST, SLOWEST
+from pebble.recordings.replay.player import Player
 from pebble.recordings.replay.robots import Make, ReplayedRobots
 from pebble.recordings.replay.rules import SYSTEM, Options, Rules
 from pebble.recordings.replay.source import ReplaySource
