@@ -14,7 +14,7 @@ from pebble.recordings.replay.rules import ReplayError, is_zero
 from pebble.transports import Message, QoS, State, Transport
 
 _OPEN_S: Final = 3.0
-_CLEAR_S: Final = 5.0  # for a connection that is lost at the end, while topics are still retained
+CLEAR_S: Final = 5.0  # for a connection that is lost at the end, while topics are still retained
 _TICK_S: Final = 0.05
 _MORE: Final = 3  # topics named in an error
 #: Makes a transport that is not opened yet, from a name and a will.
@@ -66,6 +66,11 @@ class ReplayedRobots:
                 f"still retained, because the connection is lost: {', '.join(left[:_MORE])}{more}. "
                 "Remove each: pebble topic pub TOPIC '' --retain"
             )
+
+    @property
+    def live(self) -> str:
+        """A robot of a replayed name that has appeared; empty while there is none."""
+        return self._live.found
 
     def check(self) -> None:
         """Raise ReplayError once a robot of a replayed name is live, or if that cannot be noticed."""
@@ -123,7 +128,7 @@ class ReplayedRobots:
 
     def _clear(self) -> list[str]:
         """Remove what is retained; returns what could not be removed."""
-        end = self._now() + _CLEAR_S
+        end = self._now() + CLEAR_S
         live = self._live.found  # what is retained there is now its own
         topics = [topic for topic in self._retained if base_of_topic(topic) != live]
         while topics and self._now() < end:
