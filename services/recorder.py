@@ -9,7 +9,8 @@ from typing import Any, Final
 
 from pebble.errors import ConfigError
 from pebble.recordings.recorder import metrics
-from pebble.recordings.recorder.recorder import Options, Recorder
+from pebble.recordings.recorder.recorder import Recorder
+from pebble.recordings.recorder.settings import Options
 from pebble.recordings.recorder.source import Source
 from pebble.runtime.connections import REMOTE_RECONNECT_S, local_settings, mqtt_settings
 from pebble.runtime.process import run

@@ -7,29 +7,25 @@ import socket
 import time
 from collections import deque
 from contextlib import suppress
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from pebble.client.connection import Target, connected, target_of
 from pebble.client.driver_lease import ANSWER_S, DriverLease
-from pebble.client.key_decoder import END, KeyDecoder
+from pebble.client.key_decoder import END
 from pebble.client.key_gesture import PERIOD_S, KeyGesture
 from pebble.client.terminal_driver import TerminalDriver
 from pebble.commands.estop import me
-from pebble.commands.options import CaCert, ConfigOption, PasswordFile, RemoteOption, UrlOption
-from pebble.config.visible import shown
+from pebble.commands.options import with_target
+from pebble.commands.terminal_loop import TerminalLoop
 from pebble.media.in_flight import InFlight
 from pebble.transports import Message, QoS, State, Transport
 from pebble.transports.clock import since_boot as clock
 
-if TYPE_CHECKING:
-    from pebble.client.terminal_keys import Terminal
-
 _KEYS = """\
 W A S D or arrows drive, Q E grousers, space stops.
 ! or Esc Esc is the emergency stop, Ctrl-C ends."""
-_SHOW_PERIOD_S = 0.1
 _STOP_S = 3.0  # so long an emergency stop is still sent after the terminal has ended
 _ARRIVED = 1000  # messages that wait to be handled
 _OVERHEAD = 32  # bytes of a message on the wire besides topic and payload
@@ -42,16 +38,14 @@ RobotArgument = Annotated[
 ]
 
 
+@with_target(program="drive")
 def drive(
     robot: RobotArgument,
     speed: Annotated[float, typer.Option(min=0.05, max=1, help="Throttle of a key, and speed of the grousers.")] = 0.6,
     turn: Annotated[float, typer.Option(min=0.05, max=1, help="Steering of a key.")] = 0.8,
     take_over: Annotated[bool, typer.Option("--take-over", help="Also from another driver.")] = False,
-    config: ConfigOption = None,
-    url: UrlOption = None,
-    remote: RemoteOption = False,
-    password_file: PasswordFile = None,
-    ca_cert: CaCert = None,
+    *,
+    target: Target,
 ) -> int:
     """Drive a robot with the keys of this terminal.
 
@@ -70,10 +64,7 @@ def drive(
     from pebble.client.terminal_keys import check_terminal, opened
 
     check_terminal()
-    target = target_of(
-        robot,
-        Target(config=config, url=url, remote=remote, password_file=password_file, ca_cert=ca_cert, program="drive"),
-    )
+    target = target_of(robot, target)
     with connected(target) as (transport, names):
         device = f"terminal on {socket.gethostname()}"
         lease = DriverLease(names.base, f"drive-{secrets.token_hex(4)}", by=me(), device=device)
@@ -87,63 +78,43 @@ def drive(
             take_over=take_over,
             heartbeat=heartbeat,
         )
-        loop = _Loop(transport, driver)
+        driving = _Driving(transport, driver)
         typer.echo(_KEYS)
         with opened() as terminal:
-            return loop.run(terminal)
+            return driving.run(TerminalLoop(terminal, clock))
 
 
 def register(app: typer.Typer) -> None:
     app.command("drive")(drive)
 
 
-class _Loop:
+class _Driving:
     """Passes keys and messages to the driver, and what it returns to the transport, every 50 ms."""
 
     def __init__(self, transport: Transport, driver: TerminalDriver) -> None:
         """Subscribes; on a slow network this takes seconds."""
         self._transport, self._driver = transport, driver
-        self._decoder = KeyDecoder()
         self._in_flight = InFlight(_OVERHEAD)
         self._arrived: deque[tuple[Message, float, float]] = deque(maxlen=_ARRIVED)
-        self._shown, self._shown_at = "", float("-inf")
         for filter_ in driver.filters:
             transport.subscribe(filter_, self._take, qos=QoS.DELIVERED, direct=True)
 
-    def run(self, terminal: Terminal) -> int:
+    def run(self, loop: TerminalLoop) -> int:
         """Until a signal, Ctrl-D, or the end of the terminal."""
         try:
-            while not terminal.ended:
-                self._step(terminal)
-                if terminal.suspended:
-                    self._halt(self._driver.suspend(clock()))
-                    terminal.stand_still()
+            while not loop.ended:
+                keys, now = loop.keys(PERIOD_S), clock()
+                self._driver.press(keys, now)
+                self._tick(now)
+                loop.show(self._driver.status, at_once=bool(keys))
+                loop.suspend(lambda: self._halt(self._driver.suspend(clock())))
         finally:
             self._halt(self._driver.leave(clock(), time.time()))
             self._finish_stop()
-        return 0 if terminal.ended in ("SIGINT", END) else 1
+        return 0 if loop.ended in ("SIGINT", END) else 1
 
     def _take(self, message: Message) -> None:
         self._arrived.append((message, clock(), time.time()))
-
-    def _step(self, terminal: Terminal) -> None:
-        due = self._decoder.due
-        data = terminal.read(PERIOD_S if due is None else min(PERIOD_S, due - clock()))
-        now = clock()
-        keys = self._decoder.feed(data, now)
-        if END in keys:
-            terminal.ended = END
-        self._driver.press(keys, now)
-        self._tick(now)
-        if keys or now - self._shown_at >= _SHOW_PERIOD_S:
-            self._show(terminal, now)
-
-    def _show(self, terminal: Terminal, now: float) -> None:
-        line = shown(self._driver.status())
-        self._shown_at = now
-        if line != self._shown:
-            self._shown = line
-            terminal.show(line)
 
     def _tick(self, now: float) -> None:
         while self._arrived:

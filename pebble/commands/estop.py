@@ -22,7 +22,7 @@ from pebble.client.estop import Progress, RobotStop, StopSender, new_name, send
 from pebble.client.estop_states import Reset, RobotEstop
 from pebble.client.names import id_of
 from pebble.commands import show
-from pebble.commands.options import CaCert, ConfigOption, PasswordFile, RemoteOption, UrlOption
+from pebble.commands.options import with_target
 from pebble.config.visible import shown
 from pebble.contract import CAPABILITIES, ESTOP_STATE, ONLINE, STATUS
 from pebble.errors import PebbleError, TransportError
@@ -39,6 +39,7 @@ _HEARTBEAT_S = 0.6  # more than two periods of a heartbeat
 _BATCH = 1000  # messages that are handled before the next stop is due
 
 
+@with_target(program="estop")
 def estop(
     words: Annotated[
         list[str] | None,
@@ -53,11 +54,8 @@ def estop(
         bool, typer.Option("--hold", help="Until Ctrl-C: also stop robots that come online meanwhile.")
     ] = False,
     why: Annotated[str, typer.Option(help="Shown to others; at most 40 characters.", metavar="TEXT")] = "",
-    config: ConfigOption = None,
-    url: UrlOption = None,
-    remote: RemoteOption = False,
-    password_file: PasswordFile = None,
-    ca_cert: CaCert = None,
+    *,
+    target: Target,
 ) -> int:
     """Stop robots until they are reset.
 
@@ -82,10 +80,7 @@ def estop(
         raise typer.BadParameter(f"give either --all or {robot}")
     if robot is None and not all_ and verb != "status":
         raise typer.BadParameter("name the robot" if verb else "nothing was stopped: name the robot, or add --all")
-    target = target_of(
-        robot,
-        Target(config=config, url=url, remote=remote, password_file=password_file, ca_cert=ca_cert, program="estop"),
-    )
+    target = target_of(robot, target)
     if verb == "reset":
         return _reset(target)
     if verb == "status":

@@ -13,7 +13,7 @@ import typer
 from pebble.client.connection import Target, connected, target_of
 from pebble.client.names import id_of
 from pebble.client.scripts import RobotScripts, options_of
-from pebble.commands.options import CaCert, ConfigOption, PasswordFile, RemoteOption, UrlOption
+from pebble.commands.options import with_target
 from pebble.config.visible import shown
 from pebble.contract.payloads import AutonomyStatus
 from pebble.errors import PebbleError, TransportError
@@ -54,13 +54,10 @@ def new(
         typer.echo(path)
 
 
-def list_(
-    robot: _Robot, config: ConfigOption = None, url: UrlOption = None, remote: RemoteOption = False,
-    password_file: PasswordFile = None, ca_cert: CaCert = None,
-) -> int:  # fmt: skip
+@with_target()
+def list_(robot: _Robot, *, target: Target) -> int:
     """The scripts that a robot offers, and their options."""
-    options = Target(config=config, url=url, remote=remote, password_file=password_file, ca_cert=ca_cert)
-    with _scripts(robot, options) as (_, scripts, name):
+    with _scripts(robot, target) as (_, scripts, name):
         if scripts.files is None:
             raise PebbleError(f"{name} has published no scripts: is it up, and services.autonomy_manager.enabled true?")
         for file, entry in scripts.files.items():
@@ -71,12 +68,14 @@ def list_(
     return 0
 
 
+@with_target()
 def start(
-    context: typer.Context, robot: _Robot,
+    context: typer.Context,
+    robot: _Robot,
     file: Annotated[str, typer.Argument(help="The script; its own options follow.", show_default=False)] = "",
-    config: ConfigOption = None, url: UrlOption = None, remote: RemoteOption = False,
-    password_file: PasswordFile = None, ca_cert: CaCert = None,
-) -> int:  # fmt: skip
+    *,
+    target: Target,
+) -> int:
     """Start a script on its robot, and wait until it has run for a second. A script that runs already is stopped first.
 
     \b
@@ -84,8 +83,7 @@ def start(
     """
     if not file or file.startswith("-"):
         raise PebbleError(f'which script? see "pebble script list {robot}"')
-    options = Target(config=config, url=url, remote=remote, password_file=password_file, ca_cert=ca_cert)
-    with _scripts(robot, options) as (transport, scripts, _):
+    with _scripts(robot, target) as (transport, scripts, _):
         before, answers, began = scripts.status, scripts.answers, time.monotonic()
         _sent(transport, scripts.start(transport, file, context.args))
         _wait(lambda: scripts.answers > answers and _answered(before, scripts.status, file, time.monotonic() - began))
@@ -101,13 +99,10 @@ def start(
     return 0
 
 
-def stop(
-    robot: _Robot, config: ConfigOption = None, url: UrlOption = None, remote: RemoteOption = False,
-    password_file: PasswordFile = None, ca_cert: CaCert = None,
-) -> int:  # fmt: skip
+@with_target()
+def stop(robot: _Robot, *, target: Target) -> int:
     """Stop the script that runs. In an emergency: pebble estop."""
-    options = Target(config=config, url=url, remote=remote, password_file=password_file, ca_cert=ca_cert)
-    with _scripts(robot, options) as (transport, scripts, _):
+    with _scripts(robot, target) as (transport, scripts, _):
         _sent(transport, scripts.stop(transport))
         _wait(lambda: scripts.status is not None and not scripts.status.running)
         if scripts.status is None or scripts.status.running:
@@ -116,13 +111,10 @@ def stop(
     return 0
 
 
-def status(
-    robot: _Robot, config: ConfigOption = None, url: UrlOption = None, remote: RemoteOption = False,
-    password_file: PasswordFile = None, ca_cert: CaCert = None,
-) -> int:  # fmt: skip
+@with_target()
+def status(robot: _Robot, *, target: Target) -> int:
     """What runs, with which settings, and the last error. Exit code 0: a script runs; 1: none."""
-    options = Target(config=config, url=url, remote=remote, password_file=password_file, ca_cert=ca_cert)
-    with _scripts(robot, options) as (_, scripts, name):
+    with _scripts(robot, target) as (_, scripts, name):
         if scripts.status is None:
             raise PebbleError(f"{name} has published nothing about scripts: is it up?")
         _print_status(scripts.status)
@@ -140,9 +132,9 @@ def register(app: typer.Typer) -> None:
 
 
 @contextmanager
-def _scripts(robot: str, options: Target) -> Iterator[tuple[Transport, RobotScripts, str]]:
+def _scripts(robot: str, target: Target) -> Iterator[tuple[Transport, RobotScripts, str]]:
     """The connection, what the robot has published about its scripts, and its name."""
-    with connected(target_of(robot, options)) as (transport, names):
+    with connected(target_of(robot, target)) as (transport, names):
         scripts = RobotScripts(names)
         scripts.subscribe(transport)
         _wait(lambda: scripts.files is not None and scripts.status is not None, 1.0)

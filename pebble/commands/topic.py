@@ -6,7 +6,6 @@ import math
 import shutil
 import sys
 import time
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -16,7 +15,7 @@ from pebble.client.estop_states import RobotEstop
 from pebble.client.names import Names, id_of
 from pebble.commands import show
 from pebble.commands.draft import Draft, draft
-from pebble.commands.options import CaCert, ConfigOption, PasswordFile, RemoteOption, UrlOption
+from pebble.commands.options import with_target
 from pebble.config.visible import shown
 from pebble.contract import CHANNELS, DRIVE, ONLINE, codec
 from pebble.contract.identity import parse_topic
@@ -35,9 +34,6 @@ Name = Annotated[
         help="A metric (drive-values, outgoing/online) or a whole topic; + and # except with pub.",
         show_default=False,
     ),
-]
-RobotOption = Annotated[
-    str | None, typer.Option("--robot", "-r", help="The robot that short names refer to.", metavar="[SYSTEM/TYPE/]ID")
 ]
 SecondsOption = Annotated[float | None, typer.Option("--seconds", "-s", min=0.1, help="Stop after this long.")]
 WindowOption = Annotated[int, typer.Option("--window", "-w", min=2, help="Number of newest messages to measure.")]
@@ -59,15 +55,12 @@ def register(app: typer.Typer) -> None:
     app.add_typer(group, name="topic")
 
 
+@with_target(robot=True)
 def list_(
     filter_: Annotated[str | None, typer.Argument(help="Only topics that match.", metavar="FILTER")] = None,
     seconds: Annotated[float, typer.Option("--seconds", "-s", min=0.1, help="How long to receive.")] = 2.0,
-    config: ConfigOption = None,
-    url: UrlOption = None,
-    robot: RobotOption = None,
-    remote: RemoteOption = False,
-    password_file: PasswordFile = None,
-    ca_cert: CaCert = None,
+    *,
+    target: Target,
 ) -> int:
     """List topics: whether retained, rate, size and age.
 
@@ -75,7 +68,7 @@ def list_(
         pebble topic list -c goob.json
         pebble topic list 'pebble/+/+/outgoing/#' --url mqtt://127.0.0.1 -s 5
     """
-    with connected(_target(config, url, robot, remote, password_file, ca_cert)) as (transport, names):
+    with connected(target) as (transport, names):
         listing, by_name = show.Listing(names), ByName(CHANNELS)
 
         def note(message: Message) -> None:
@@ -83,7 +76,7 @@ def list_(
 
         if filter_ is not None:
             transport.subscribe(ONLINE.filter(names.base), note, direct=True)
-        listener = Listener(transport, [filter_ or ("#" if robot is None else f"{names.base}/#")])
+        listener = Listener(transport, [filter_ or ("#" if target.robot is None else f"{names.base}/#")])
         ask_beside(transport, by_name)
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0:
@@ -97,17 +90,14 @@ def list_(
     return 0 if listing.records else 1
 
 
+@with_target(robot=True)
 def echo(
     topic: Name,
     count: Annotated[int | None, typer.Option("--count", "-n", min=1, help="Stop after this many.")] = None,
     seconds: SecondsOption = None,
     raw: Annotated[bool, typer.Option("--raw", help="Only unchanged payloads, one per line.")] = False,
-    config: ConfigOption = None,
-    url: UrlOption = None,
-    robot: RobotOption = None,
-    remote: RemoteOption = False,
-    password_file: PasswordFile = None,
-    ca_cert: CaCert = None,
+    *,
+    target: Target,
 ) -> int:
     """Print messages as they arrive.
 
@@ -120,7 +110,7 @@ def echo(
         pebble topic echo capabilities -c goob.json --raw -n 1 | jq .value.drive
     """
     printed = 0
-    with connected(_target(config, url, robot, remote, password_file, ca_cert)) as (transport, names):
+    with connected(target) as (transport, names):
         _warn_of_stop(transport, names, topic)
         listener = Listener(transport, names.filters(topic))
         end = _end(seconds)
@@ -139,6 +129,7 @@ def echo(
     return 0 if printed else 1
 
 
+@with_target(robot=True)
 def pub(
     topic: Name,
     payload: Annotated[str, typer.Argument(help="JSON, any text, or @FILE.", show_default=False)],
@@ -154,12 +145,8 @@ def pub(
     count: Annotated[
         int | None, typer.Option("--count", "-n", min=1, help="Stop after this many, with --rate.")
     ] = None,
-    config: ConfigOption = None,
-    url: UrlOption = None,
-    robot: RobotOption = None,
-    remote: RemoteOption = False,
-    password_file: PasswordFile = None,
-    ca_cert: CaCert = None,
+    *,
+    target: Target,
 ) -> int:
     """Publish a message once, or repeatedly.
 
@@ -171,7 +158,7 @@ def pub(
         pebble topic pub flags/mqtt-video true -c fred.json
         pebble topic pub lights-flash @party.json --url mqtt://127.0.0.1 -r goob
     """
-    with connected(_target(config, url, robot, remote, password_file, ca_cert)) as (transport, names):
+    with connected(target) as (transport, names):
         message = draft(names, topic, payload, retain=retain, qos=qos, force=force)
         for warning in message.warnings:
             typer.echo(f"pebble: warning: {warning}", err=True)
@@ -189,42 +176,36 @@ def pub(
     return 0
 
 
+@with_target(robot=True)
 def hz(
     topic: Name,
     window: WindowOption = 100,
     seconds: SecondsOption = None,
-    config: ConfigOption = None,
-    url: UrlOption = None,
-    robot: RobotOption = None,
-    remote: RemoteOption = False,
-    password_file: PasswordFile = None,
-    ca_cert: CaCert = None,
+    *,
+    target: Target,
 ) -> int:
     """Print once a second how often messages arrive. Retained messages do not count.
 
     \b
         pebble topic hz online -c goob.json --remote
     """
-    return _measure("hz", topic, window, seconds, _target(config, url, robot, remote, password_file, ca_cert))
+    return _measure("hz", topic, window, seconds, target)
 
 
+@with_target(robot=True)
 def bw(
     topic: Name,
     window: WindowOption = 100,
     seconds: SecondsOption = None,
-    config: ConfigOption = None,
-    url: UrlOption = None,
-    robot: RobotOption = None,
-    remote: RemoteOption = False,
-    password_file: PasswordFile = None,
-    ca_cert: CaCert = None,
+    *,
+    target: Target,
 ) -> int:
     """Print once a second how many payload bytes arrive per second. Retained messages do not count.
 
     \b
         pebble topic bw front-camera --url mqtt://127.0.0.1 -r goob
     """
-    return _measure("bw", topic, window, seconds, _target(config, url, robot, remote, password_file, ca_cert))
+    return _measure("bw", topic, window, seconds, target)
 
 
 def _measure(what: str, topic: str, window: int, seconds: float | None, target: Target) -> int:
@@ -295,14 +276,3 @@ def _warn_of_dropped(listener: Listener) -> None:
 
 def _end(seconds: float | None) -> float:
     return float("inf") if seconds is None else time.monotonic() + seconds
-
-
-def _target(
-    config: Path | None,
-    url: str | None,
-    robot: str | None,
-    remote: bool,
-    password_file: Path | None,
-    ca_cert: Path | None,
-) -> Target:
-    return Target(config=config, url=url, robot=robot, remote=remote, password_file=password_file, ca_cert=ca_cert)

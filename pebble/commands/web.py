@@ -32,6 +32,14 @@ from pebble.web.extra import require_packages
 if TYPE_CHECKING:
     from pebble.web.settings import WebSettings
 
+Host = Annotated[
+    str | None,
+    typer.Option(help="Address to listen on; 0.0.0.0 is all of this machine. [default: 127.0.0.1]", metavar="HOST"),
+]
+Port = Annotated[
+    int | None, typer.Option(help="TCP port; 0 is a free one. [default: 8080]", metavar="PORT", min=0, max=65535)
+]
+
 
 def serve(
     config: Annotated[
@@ -42,13 +50,8 @@ def serve(
     ] = None,
     password_file: PasswordFile = None,
     ca_cert: CaCert = None,
-    host: Annotated[
-        str | None,
-        typer.Option(help="Address to listen on; 0.0.0.0 is all of this machine. [default: 127.0.0.1]", metavar="HOST"),
-    ] = None,
-    port: Annotated[
-        int | None, typer.Option(help="TCP port; 0 is a free one. [default: 8080]", metavar="PORT", min=0, max=65535)
-    ] = None,
+    host: Host = None,
+    port: Port = None,
     tls: Annotated[
         Path | None, typer.Option(help="Folder with the certificates of `pebble cert init`.", metavar="FOLDER")
     ] = None,

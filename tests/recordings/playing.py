@@ -94,6 +94,8 @@ class Stage:
         self.time = VirtualTime()
         self.sent: list[Sent] = []
         self.refuses = 0  # so many of the next messages
+        self.takes_s = 0.0  # for each message
+        self.waits = 0
         self.actions: list[tuple[float, Any]] = []  # what to do at a time, in order
         source = ReplaySource([path] if isinstance(path, Path) else path)
         self.rules = Rules(options or Options(), source.channels)
@@ -125,10 +127,12 @@ class Stage:
         if self.refuses:
             self.refuses -= 1
             return False
+        self.time.wait(self.takes_s)
         self.sent.append(Sent(self.time.now(), message))
         return True
 
     def _wait(self, seconds: float) -> None:
+        self.waits += 1
         self.time.wait(seconds)
         while self.actions and self.time.now() >= self.actions[0][0]:
             self.actions.pop(0)[1]()

@@ -12,7 +12,8 @@ import pytest
 
 from pebble.recordings import library
 from pebble.recordings.files.writer import McapWriter
-from pebble.recordings.recorder.recorder import Options, Recorder
+from pebble.recordings.recorder.recorder import Recorder
+from pebble.recordings.recorder.settings import Options
 from tests.recordings.messages import START_NS
 
 GOOB, FRED = "pebble/robots/goob", "pebble/robots/fred"
@@ -29,7 +30,7 @@ def folder(tmp_path: Path) -> Path:
     recorder.receive(
         f"{GOOB}/outgoing/logs", json.dumps({"level": "WARNING", "message": "low \n battery"}).encode(), 1, retain=False
     )
-    recorder.event("gap", since=1000, until=61_000, why="no connection")
+    recorder.events.note("gap", since=1000, until=61_000, why="no connection")
     recorder.stop()
     return tmp_path / "rec"
 

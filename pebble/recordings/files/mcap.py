@@ -279,13 +279,6 @@ def message_index(channel: int, entries: Iterable[tuple[int, int]]) -> bytes:
     return record(Op.MESSAGE_INDEX, _U16.pack(channel) + _U32.pack(len(body)) + body)
 
 
-def read_message_index(body: bytes) -> list[tuple[int, int]]:
-    """Raises DamageError."""
-    with _Reading(body) as reading:
-        reading.u16()
-        return list(_PAIR.iter_unpack(reading.take(reading.u32())))
-
-
 def metadata_index(metadata: Metadata, at: int) -> bytes:
     return record(Op.METADATA_INDEX, _PAIR.pack(at, len(metadata.pack())) + _text(metadata.name))
 

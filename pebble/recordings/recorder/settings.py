@@ -8,10 +8,33 @@ from typing import Annotated, Any, Literal
 import msgspec
 
 from pebble.errors import ConfigError
-from pebble.recordings.recorder.recorder import Options
+from pebble.recordings.recorder.disk_space import Limits
 
 #: All robots of a broker, and what belongs to no robot.
 EVERYTHING = ("+/+/+/#", "+/infrastructure")
+
+Positive = Annotated[float, msgspec.Meta(ge=0.1)]
+Size = Annotated[int, msgspec.Meta(ge=0)]
+
+
+class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How a recorder records; sizes in bytes. 0 in ``keep_…``: no limit."""
+
+    rotate_seconds: Positive = 3600.0
+    rotate_bytes: Annotated[int, msgspec.Meta(ge=1 << 16)] = 512 << 20
+    keep_bytes: Size = 0
+    keep_media_days: Annotated[float, msgspec.Meta(ge=0)] = 0.0
+    keep_state_days: Annotated[float, msgspec.Meta(ge=0)] = 0.0
+    free_bytes: Size = 2 << 30
+    flush_seconds: Positive = 1.0
+    sync_seconds: Positive = 5.0
+    level: Annotated[int, msgspec.Meta(ge=0, le=19)] = 3  # of Zstandard's compression; 0: none
+    queue_bytes: Annotated[int, msgspec.Meta(ge=1 << 18)] = 64 << 20
+    media: bool = True
+
+    @property
+    def limits(self) -> Limits:
+        return Limits(self.keep_bytes, self.keep_media_days, self.keep_state_days, self.free_bytes)
 
 
 class Connection(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -64,13 +64,13 @@ class Source:
             new = counted.get(name, 0) - self._losses.get(name, 0)
             if new > 0:
                 self._losses[name] = counted[name]
-                self._recorder.event("dropped", messages=new, why=name, **self._about)
+                self._recorder.events.note("dropped", messages=new, why=name, **self._about)
         copies = self._copies
         if copies is not None and (copies.is_done or self._wants_copies):
             copies.close()
             self._copies = None
             if copies.failed:
-                self._recorder.event("dropped", why="the retained messages cannot be fetched", **self._about)
+                self._recorder.events.note("dropped", why="the retained messages cannot be fetched", **self._about)
         if self._wants_copies:
             self._wants_copies = False
             self._copies = _Copies(self._settings, self._filters, self._record_retained)
@@ -97,15 +97,15 @@ class Source:
         now_ns = self._recorder.clock.now()
         if state is State.CONNECTED:
             if self._lost_at:
-                self._recorder.gap(self._lost_at, "no connection", **self._about)
+                self._recorder.events.gap(self._lost_at, "no connection", **self._about)
             self._lost_at = 0
-            self._recorder.event("connected", **self._about)
+            self._recorder.events.note("connected", **self._about)
             self._wants_copies = self._kind == "mqtt"
             self._recorder.forget_retained(self._name)
             self._was_connected = True
         elif state is State.CONNECTING and self._was_connected and not self._lost_at:
             self._lost_at = now_ns
-            self._recorder.event("lost", why=self.problem, **self._about)
+            self._recorder.events.note("lost", why=self.problem, **self._about)
 
     def _receive(self, message: Message) -> None:
         if message.topic.startswith(self._ignored):

@@ -1,29 +1,29 @@
-"""What the recorder's writer thread does: files that are open, room for them, and what happens when there is none."""
+"""What the recorder's writer thread does: messages into files, room for them, and what happens when there is none."""
 
 from __future__ import annotations
 
 import errno
 import logging
 import os
+from collections import Counter
 from collections.abc import Mapping
 from operator import attrgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from pebble.recordings.files.mcap import Packer, RecordingError
 from pebble.recordings.recorder.background import Background
+from pebble.recordings.recorder.clock import RecordingClock
 from pebble.recordings.recorder.disk_space import Disk, outdated, surplus
 from pebble.recordings.recorder.due import Due
+from pebble.recordings.recorder.events import Events
 from pebble.recordings.recorder.finisher import Finisher
-from pebble.recordings.recorder.folder import STATE
+from pebble.recordings.recorder.folder import STATE, Folder
 from pebble.recordings.recorder.intake import EVENTS, FORGET, Intake
-from pebble.recordings.recorder.lane import OTHER_MEDIA, Item, OpenFile, lane_of
-from pebble.recordings.recorder.retained import RetainedValues
-from pebble.recordings.stamps import is_media
+from pebble.recordings.recorder.lane import Item
+from pebble.recordings.recorder.open_files import OpenFiles
+from pebble.recordings.recorder.settings import Options
 from pebble.runtime.rate_limit import RateLimitedLog
-
-if TYPE_CHECKING:
-    from pebble.recordings.recorder.recorder import Recorder
 
 log = logging.getLogger(__name__)
 
@@ -31,7 +31,6 @@ _SPACE_S: Final = 2.0  # between two looks at the disk
 _LISTED_S: Final = 60.0  # between two looks at all files
 _AGE_S: Final = 60.0  # between two files that are deleted for their age
 _IDLE_NS: Final = 60 * 10**9  # a robot's media file without pictures is finished after this
-_MOST_MEDIA: Final = 32  # lanes
 _when = attrgetter("boot_ns")
 _FULL: Final = (errno.ENOSPC, errno.EDQUOT)
 
@@ -45,18 +44,26 @@ class _Blocked(NamedTuple):
     full: bool
 
 
-class Writing:
-    """The open files of one recorder. Not thread-safe."""
+class Context(NamedTuple):
+    """What the parts of one recorder share."""
 
-    def __init__(self, recorder: Recorder, intake: Intake, background: Background, about: Mapping[str, str]) -> None:
+    folder: Folder
+    options: Options
+    clock: RecordingClock
+    counters: Counter[str]
+    events: Events
+    about: Mapping[str, str]  # of the recording, for each file
+
+
+class Writing:
+    """Writes the messages of one recorder. Not thread-safe."""
+
+    def __init__(self, context: Context, intake: Intake, background: Background) -> None:
         self.slowest_flush_s = 0.0
-        self._recorder, self._intake, self._background, self._about = recorder, intake, background, about
-        self._folder, self._options, self._clock = recorder.folder, recorder.options, recorder.clock
-        self._counters = recorder.counters
-        self._packer = Packer(recorder.options.level)
-        self._files: dict[str, OpenFile] = {}  # by lane
-        self._retained = RetainedValues()
-        self._finisher = Finisher(background, recorder.event, self._note_finished)
+        self._folder, self._options, self._clock, self._counters, self._events, about = context
+        self._intake = intake
+        self._files = OpenFiles(self._folder, about, Packer(self._options.level), background.watch)
+        self._finisher = Finisher(background, self._events.note, self._note_finished)
         self._blocked: _Blocked | None = None
         self._lacking: list[Item] = []  # what no file has taken; bounded: a second of messages
         self._noted_drops = 0
@@ -69,7 +76,7 @@ class Writing:
 
     def mend_leftovers(self) -> int:
         """Finish what a recorder before this one has left; returns how many files."""
-        ours = {file.path for file in self._files.values()}
+        ours = self._files.paths
         left = [entry.path for entry in self._folder.entries() if entry.is_active and entry.path not in ours]
         for path in left:
             self._finisher.mend(path)
@@ -88,11 +95,11 @@ class Writing:
 
     def _add(self, item: Item) -> None:
         if item.topic == FORGET:
-            self._retained.forget(item.source)
+            self._files.retained.forget(item.source)
             return
-        lane = STATE if item.topic == EVENTS else self._lane(item)
+        lane = STATE if item.topic == EVENTS else self._files.lane(item)
         if lane == STATE and item.topic != EVENTS:
-            self._retained.note(item)
+            self._files.retained.note(item)
         if self._blocked is not None:
             if item.topic == EVENTS:
                 self._intake.put_back(item)
@@ -101,7 +108,7 @@ class Writing:
             return
         at_ns = self._clock.at(item.boot_ns)
         try:
-            file = self._open(lane, at_ns)
+            file = self._files.get(lane, now_ns=self._clock.now(), at_ns=at_ns)
         except OSError as error:
             self._lacking.append(item)
             self._block(lane, error)
@@ -111,31 +118,9 @@ class Writing:
         except OSError as error:
             self._fail(lane, error)
 
-    def _lane(self, item: Item) -> str:
-        lane = lane_of(item.topic, is_media=is_media(item.payload))
-        media = len(self._files) - (STATE in self._files)
-        return lane if lane == STATE or lane in self._files or media < _MOST_MEDIA else OTHER_MEDIA
-
-    def _open(self, lane: str, at_ns: int) -> OpenFile:
-        """Raises OSError."""
-        file = self._files.get(lane)
-        if file is not None:
-            return file
-        file = OpenFile(self._folder, lane, self._clock.now(), self._about, self._packer)
-        if lane == STATE:
-            try:
-                for value in self._retained.carried():
-                    file.add(value, at_ns)
-            except OSError:
-                file.discard()
-                raise
-        self._files[lane] = file
-        self._watch()
-        return file
-
     def flush(self) -> None:
         """Give what was added to the files."""
-        for lane, file in list(self._files.items()):
+        for lane, file in self._files.by_lane.items():
             began = self._clock.now()
             try:
                 self._counters["written"] += file.flush()
@@ -149,27 +134,24 @@ class Writing:
     def rotate(self, *, all_of_them: bool = False) -> None:
         """Finish the files that are old, large or idle."""
         now_ns = self._clock.now()
-        for lane, file in list(self._files.items()):
+        for lane, file in self._files.by_lane.items():
             old = now_ns - file.began_ns > self._options.rotate_seconds * 1e9
             idle = lane != STATE and now_ns - max(file.last_ns, file.began_ns) > _IDLE_NS
             if all_of_them or old or idle or file.writer.size > self._options.rotate_bytes:
-                del self._files[lane]
-                self._watch()
-                self._finisher.finish(file)
+                self._finisher.finish(self._files.take(lane))
 
     def note_drops(self) -> None:
         """Write down what was dropped because the queue was full."""
         total = self._counters["dropped"]
         if total > self._noted_drops and self._blocked is None:
-            self._recorder.event("dropped", messages=total - self._noted_drops, why="the disk is too slow")
+            self._events.note("dropped", messages=total - self._noted_drops, why="the disk is too slow")
             self._noted_drops = total
 
     # -- when files cannot be written
 
     def _fail(self, lane: str, error: OSError) -> None:
         """A file is left as it is; what it has not taken is written into the next one."""
-        file = self._files.pop(lane)
-        self._watch()
+        file = self._files.take(lane)
         self._lacking += file.take_lacking()
         self._counters["written"] += file.take_written()
         file.file.close()
@@ -177,11 +159,10 @@ class Writing:
         self._block(lane, error)
 
     def _forget_removed(self, lane: str) -> None:
-        file = self._files.pop(lane)
-        self._watch()
+        file = self._files.take(lane)
         file.file.close()
         self._counters["errors"] += 1
-        self._recorder.event("removed", file=file.path.name, by="another program")
+        self._events.note("removed", file=file.path.name, by="another program")
 
     def _block(self, lane: str, error: OSError) -> None:
         self._counters["errors"] += 1
@@ -202,7 +183,8 @@ class Writing:
             return
         lacking, self._lacking = sorted(self._lacking, key=_when), []
         try:
-            self._open(STATE, self._clock.at(lacking[0].boot_ns) if lacking else self._clock.now())
+            now_ns = self._clock.now()
+            self._files.get(STATE, now_ns=now_ns, at_ns=self._clock.at(lacking[0].boot_ns) if lacking else now_ns)
         except OSError:
             self._lacking = lacking
             return
@@ -214,7 +196,7 @@ class Writing:
             return
         self._finisher.retry()
         dropped = self._counters["dropped"]
-        self._recorder.gap(blocked.since_ns, blocked.why, messages=dropped - blocked.dropped)
+        self._events.gap(blocked.since_ns, blocked.why, messages=dropped - blocked.dropped)
         self._noted_drops = dropped
         log.warning("recording again")
 
@@ -279,10 +261,7 @@ class Writing:
             self._quiet_log.warning("delete", "%s cannot be deleted: %s", path, error.strerror)
             return
         self._counters["pruned_bytes"] += size
-        self._recorder.event("pruned", file=path.name, bytes=size)
-
-    def _watch(self) -> None:
-        self._background.watch(list(self._files.values()))
+        self._events.note("pruned", file=path.name, bytes=size)
 
     def _note_finished(self) -> None:
         self._changed = True

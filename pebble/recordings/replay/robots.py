@@ -2,30 +2,21 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack, suppress
 from typing import Final
 
-from pebble.contract import CAPABILITIES, HEARTBEAT, ONLINE, OUTGOING, STATUS, codec
-from pebble.contract.identity import parse_topic
+from pebble.contract import ONLINE, codec
 from pebble.contract.payloads import Heartbeat
-from pebble.errors import PayloadError, TransportError
+from pebble.errors import TransportError
+from pebble.recordings.replay.live import LiveRobots, base_of_topic
 from pebble.recordings.replay.rules import ReplayError, is_zero
 from pebble.transports import Message, QoS, State, Transport
 
-LISTEN_S: Final = 2.0  # eight heartbeats of a robot
 _OPEN_S: Final = 3.0
-_RETURN_S: Final = 5.0  # for the first own message
-_CLEAR_S: Final = 5.0  # for a connection that is lost at the end, while topics are still retained
+CLEAR_S: Final = 5.0  # for a connection that is lost at the end, while topics are still retained
 _TICK_S: Final = 0.05
-_OWN: Final = 4096  # own messages that may still come back
 _MORE: Final = 3  # topics named in an error
-#: What a robot publishes that is running, wherever its connection leads.
-_SIGNS: Final = (ONLINE, HEARTBEAT, STATUS, CAPABILITIES)
-_SUFFIXES: Final = tuple(channel.suffix for channel in _SIGNS)
-_HEARTBEATS: Final = (ONLINE.suffix, HEARTBEAT.suffix)
-
 #: Makes a transport that is not opened yet, from a name and a will.
 Make = Callable[[str, Message | None], Transport]
 
@@ -50,13 +41,8 @@ class ReplayedRobots:
         self._now, self._wall_ms, self._wait = now, wall_ms, wait
         self._robots: dict[str, Transport] = {}
         self._listener: Transport | None = None
-        self._live = ""  # a robot of that name that has appeared
-        self._own: OrderedDict[tuple[str, bytes], None] = OrderedDict()
-        self._awaited: dict[str, float] = {}  # robots none of whose messages has come back, and since when
-        self._returned: set[str] = set()
+        self._live = LiveRobots(self._bases, now)
         self._retained: dict[str, None] = {}  # topics that hold a message of ours
-        self._taken: set[str] = set()  # topics that held one before
-        self._quiet_at: float | None = None  # when listening again after an outage is over
         self._stack = ExitStack()
 
     def __enter__(self) -> ReplayedRobots:
@@ -66,7 +52,7 @@ class ReplayedRobots:
             self._listen()
             for base in self._bases:
                 self._robots[base] = self._opened(base, self._offline(base))
-            self._quiet_at = None
+            self._live.connected()
             self._stack = stack.pop_all()
         return self
 
@@ -81,26 +67,24 @@ class ReplayedRobots:
                 "Remove each: pebble topic pub TOPIC '' --retain"
             )
 
+    @property
+    def live(self) -> str:
+        """A robot of a replayed name that has appeared; empty while there is none."""
+        return self._live.found
+
     def check(self) -> None:
         """Raise ReplayError once a robot of a replayed name is live, or if that cannot be noticed."""
-        if self._live:
-            raise ReplayError(f"{self._live} is live: the replay has ended, so that it is not mistaken for the robot")
-        for base, since in list(self._awaited.items()):
-            if self._now() - since > _RETURN_S and base not in self._returned:
-                raise ReplayError(
-                    f"the broker does not deliver {base}/{OUTGOING}/# to this login, or not from it: a live robot "
-                    "would not be noticed"
-                )
+        self._live.check()
 
     def publish(self, message: Message) -> bool:
         """Publish in the name of the robot in the topic; False while that is not possible."""
         if not is_zero(message):
             self.check()
-        transport = self._robots[_base(message.topic)]
+        transport = self._robots[base_of_topic(message.topic)]
         if not self._ready(transport):
             return False
-        self._note(message)
-        retain = message.retain and message.topic not in self._taken
+        self._live.note(message)
+        retain = message.retain and message.topic not in self._live.taken
         if not transport.publish(
             message.topic, message.payload, qos=message.qos, retain=retain, remember=False, urgent=False
         ):
@@ -117,29 +101,13 @@ class ReplayedRobots:
             if one is None or one.state is not State.CONNECTED:
                 self.problem = f"no connection: {(one and one.problem) or 'it was lost'}"
                 return False
-        if self._quiet_at is None:
-            return True
-        self._quiet_at = min(self._quiet_at, self._now() + LISTEN_S)
-        self.problem = "connected again, listening for the robots"
-        if self._now() < self._quiet_at:
-            return False
-        self._quiet_at, self.problem = None, ""
-        return True
+        listening = self._live.listening
+        self.problem = "connected again, listening for the robots" if listening else ""
+        return not listening
 
     def _on_state(self, state: State) -> None:
-        """However short an outage is, a robot may have come meanwhile."""
         if state is State.CONNECTING:
-            self._quiet_at = float("inf")
-            self._awaited.clear()
-
-    def _note(self, message: Message) -> None:
-        """Remember a message that will come back, before it is published."""
-        if message.topic.endswith(_SUFFIXES):
-            self._own[message.topic, message.payload] = None
-            if _base(message.topic) not in self._returned:
-                self._awaited.setdefault(_base(message.topic), self._now())
-            if len(self._own) > _OWN:
-                self._own.popitem(last=False)
+            self._live.lost()
 
     def _opened(self, name: str, will: Message | None) -> Transport:
         transport = self._make(f"{name}-replay", will)
@@ -156,42 +124,13 @@ class ReplayedRobots:
         listener.open(_OPEN_S)
         if listener.state is not State.CONNECTED:
             raise TransportError(f"cannot connect: {listener.problem or f'no answer within {_OPEN_S:g} s'}")
-        signs = [listener.subscribe(c.topic(base), self._on_sign) for base in self._bases for c in _SIGNS]
-        # At QoS 1 a broker sends no more than some 1,000 retained messages.
-        everything = [listener.subscribe(f"{base}/{OUTGOING}/#", self._on_any, qos=QoS.LATEST) for base in self._bases]
-        if any(subscription.refused for subscription in (*signs, *everything)):
-            raise ReplayError(
-                "the broker refuses to deliver the topics of these robots: a live one would not be noticed"
-            )
-        end = self._now() + LISTEN_S
-        while self._now() < end and not self._live:
-            self._wait(_TICK_S)
-        for subscription in everything:
-            subscription.close()
-        if self._live:
-            raise ReplayError(f"{self._live} is live: switch it off, or choose a --base at which there is no robot")
-
-    def _on_any(self, message: Message) -> None:
-        if message.retain:
-            self._taken.add(message.topic)
-        else:
-            self._on_sign(message)
-
-    def _on_sign(self, message: Message) -> None:
-        """Anything that is neither old, nor removed, nor ours, nor a will means a live robot."""
-        if (message.topic, message.payload) in self._own:
-            self._returned.add(_base(message.topic))
-            return
-        if message.retain or not message.payload or _is_offline(message):
-            return
-        parsed = parse_topic(message.topic)
-        if parsed is not None:
-            self._live = self._live or parsed.identity.base
+        self._live.listen(listener, self._wait)
 
     def _clear(self) -> list[str]:
         """Remove what is retained; returns what could not be removed."""
-        end = self._now() + _CLEAR_S
-        topics = [topic for topic in self._retained if _base(topic) != self._live]  # now the live robot's own
+        end = self._now() + CLEAR_S
+        live = self._live.found  # what is retained there is now its own
+        topics = [topic for topic in self._retained if base_of_topic(topic) != live]
         while topics and self._now() < end:
             topics = [topic for topic in topics if not self._removed(topic)]
             if topics:
@@ -205,13 +144,13 @@ class ReplayedRobots:
         return any(robot.outgoing.waiting for robot in self._robots.values())
 
     def _removed(self, topic: str) -> bool:
-        transport = self._robots[_base(topic)]
+        transport = self._robots[base_of_topic(topic)]
         return transport.publish(topic, b"", qos=QoS.DELIVERED, retain=True, remember=False)
 
     def _end(self) -> None:
         for base, transport in self._robots.items():
             # Closing publishes the will, now with the right time. A live robot has its own.
-            transport.will = None if base == self._live else self._offline(base)
+            transport.will = None if base == self._live.found else self._offline(base)
             with suppress(TransportError):
                 transport.close()
         if self._listener is not None:
@@ -220,17 +159,3 @@ class ReplayedRobots:
     def _offline(self, base: str) -> Message:
         payload = codec.encode(ONLINE, Heartbeat(t=self._wall_ms(), online=False))
         return Message(ONLINE.topic(base), payload, QoS.DELIVERED)
-
-
-def _base(topic: str) -> str:
-    return "/".join(topic.split("/", 3)[:3])
-
-
-def _is_offline(message: Message) -> bool:
-    if not message.topic.endswith(_HEARTBEATS):
-        return False
-    try:
-        heartbeat: Heartbeat = codec.decode(ONLINE, message.payload)
-    except PayloadError:
-        return True  # no sign of life of any robot
-    return heartbeat.online is False

@@ -260,8 +260,3 @@ class RecordingFile:
 def is_carried(channel: Channel) -> bool:
     """Whether its messages were written again at the begin of the file, and are not of that time."""
     return channel.metadata.get("retained") == CARRIED
-
-
-def is_old(channel: Channel) -> bool:
-    """Whether its messages are old values that a broker sent after subscribing, or carried ones."""
-    return channel.metadata.get("retained", "0") not in ("", "0")

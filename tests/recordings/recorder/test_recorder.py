@@ -25,7 +25,8 @@ from pebble.recordings.files.reader import mapped, metadata_of, read
 from pebble.recordings.recorder import lane as lane_module
 from pebble.recordings.recorder.folder import Folder
 from pebble.recordings.recorder.intake import EVENTS, Clocks
-from pebble.recordings.recorder.recorder import Options, Recorder
+from pebble.recordings.recorder.recorder import Recorder
+from pebble.recordings.recorder.settings import Options
 from tests.small_disk import SmallDisk
 from tests.support import beside, needs_root, until
 
@@ -119,7 +120,7 @@ class TestFiles:
         running = Running(tmp_path / "rec")
         for _ in range(60):
             running.send(payload=b'{"t":%d}' % (time.time_ns() // 10**6))
-            running.recorder.event("late", max_ms=1)
+            running.recorder.events.note("late", max_ms=1)
             time.sleep(0.02)
         running.stop()
         online = [message for message in recorded(running.root) if message.channel.topic == ONLINE]
@@ -436,7 +437,8 @@ class TestClock:
 _CHILD = """
 import sys, time
 from pathlib import Path
-from pebble.recordings.recorder.recorder import Options, Recorder
+from pebble.recordings.recorder.recorder import Recorder
+from pebble.recordings.recorder.settings import Options
 recorder = Recorder(Path(sys.argv[1]), Options(free_bytes=0, sync_seconds=0.3))
 recorder.start()
 number = 0

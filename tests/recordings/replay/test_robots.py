@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from pebble.config import parse
 from pebble.contract import ONLINE
 from pebble.errors import TransportError
+from pebble.recordings.replay import live
 from pebble.recordings.replay import robots as replayed_robots
 from pebble.recordings.replay.robots import ReplayedRobots
 from pebble.recordings.replay.rules import ReplayError, zero
@@ -34,6 +36,7 @@ class Network:
         self.hub = MemoryHub()
         self.clients: list[MemoryTransport] = []
         self.received: list[Message] = []
+        self.wait: Callable[[float], Any] = time.sleep
         self.other = self.make("other", None).open()
         self.other.subscribe("#", self.received.append)
 
@@ -43,7 +46,11 @@ class Network:
 
     def robots(self, *bases: str) -> ReplayedRobots:
         return ReplayedRobots(
-            self.make, bases or (BASE,), now=time.monotonic, wall_ms=lambda: time.time_ns() // 10**6, wait=time.sleep
+            self.make,
+            bases or (BASE,),
+            now=time.monotonic,
+            wall_ms=lambda: time.time_ns() // 10**6,
+            wait=lambda seconds: self.wait(seconds),
         )
 
     def robot(self) -> MemoryTransport:
@@ -58,8 +65,8 @@ class Network:
 
 @pytest.fixture
 def network(monkeypatch: pytest.MonkeyPatch) -> Iterator[Network]:
-    monkeypatch.setattr(replayed_robots, "LISTEN_S", 0.15)
-    monkeypatch.setattr(replayed_robots, "_CLEAR_S", 0.5)
+    monkeypatch.setattr(live, "LISTEN_S", 0.15)
+    monkeypatch.setattr(replayed_robots, "CLEAR_S", 0.5)
     network = Network()
     yield network
     for client in network.clients:
@@ -104,7 +111,7 @@ def test_rule_3_it_refuses_to_begin_while_that_robot_publishes_anything(
     network: Network, topic: str, payload: bytes
 ) -> None:
     robots = network.robots()
-    robots._wait = lambda seconds: (network.other.publish(topic, payload), time.sleep(seconds))[1]
+    network.wait = lambda seconds: (network.other.publish(topic, payload), time.sleep(seconds))[1]
     with pytest.raises(ReplayError, match="replay/robots/goob is live: switch it off"), robots:
         pass
     assert until(lambda: network.payloads(topic))
@@ -115,7 +122,7 @@ def test_rule_3_what_is_old_or_offline_is_no_robot(network: Network) -> None:
     network.other.publish(ONLINE_TOPIC, b'{"t":1}', qos=QoS.DELIVERED, retain=True)
     network.other.publish(STATUS, b'{"value":{}}', qos=QoS.DELIVERED, retain=True)
     robots = network.robots()
-    robots._wait = lambda seconds: (
+    network.wait = lambda seconds: (
         network.other.publish(ONLINE_TOPIC, b'{"online":false,"t":1}'),
         network.other.publish(ONLINE_TOPIC, b"nonsense"),
         network.other.publish(STATUS, b"", retain=True),
@@ -132,7 +139,7 @@ def test_rule_3_it_ends_when_that_robot_comes_online(network: Network, channel: 
     with network.robots() as robots:
         assert robots.publish(heartbeat())
         network.other.publish(f"{BASE}/outgoing/{channel}", js(t=ms(5), value={}))
-        assert until(lambda: robots._live)
+        assert until(lambda: robots.live)
         assert robots.publish(zero(f"{BASE}/incoming/drive-values"))  # always
         with pytest.raises(ReplayError, match="is live: the replay has ended"):
             robots.publish(heartbeat())
@@ -146,7 +153,7 @@ def test_rule_3_a_bridge_that_starts_is_noticed_at_its_first_heartbeat(network: 
     bridge = BridgeHeartbeat(Addresses(config)[ONLINE])
     with network.robots() as robots:
         bridge.publish(network.other, time.time_ns() // 10**6)
-        assert until(lambda: robots._live)
+        assert until(lambda: robots.live)
         with pytest.raises(ReplayError, match="is live"):
             robots.check()
 
@@ -190,7 +197,7 @@ def test_rule_5_what_is_retained_is_removed_at_the_end(network: Network) -> None
         assert robots.publish(Message(f"{BASE}/outgoing/gone", b"1", QoS.DELIVERED, retain=True))
         assert robots.publish(Message(f"{BASE}/outgoing/gone", b"", QoS.DELIVERED, retain=True))
         assert list(network.hub.retained) == [STATUS]
-        robots._wait = lambda _seconds: time.sleep(0.1)
+        network.wait = lambda _seconds: time.sleep(0.1)
     assert network.hub.retained == {}
     assert until(lambda: network.states() == [False])
 
@@ -218,7 +225,7 @@ def test_rule_5_a_connection_that_is_lost_at_the_end_is_waited_for(network: Netw
     with network.robots() as robots:
         robots.publish(Message(STATUS, b"{}", QoS.DELIVERED, retain=True))
         network.hub.stop()
-        robots._wait = lambda _seconds: network.hub.start() if network.hub.era is None else time.sleep(0.01)
+        network.wait = lambda _seconds: network.hub.start() if network.hub.era is None else time.sleep(0.01)
     assert network.hub.retained == {}
 
 

@@ -15,12 +15,12 @@ import typer
 from pebble.client.connection import Target, password, resolve
 from pebble.client.url import settings_of
 from pebble.commands import show
-from pebble.commands.options import CaCert, ConfigOption, PasswordFile, RemoteOption, UrlOption
+from pebble.commands.options import with_target
 from pebble.errors import PebbleError
 from pebble.launcher.sd_notify import SystemdNotifier
 from pebble.recordings.recorder import metrics
-from pebble.recordings.recorder.recorder import Options, Recorder
-from pebble.recordings.recorder.settings import EVERYTHING, Connection, Settings, load
+from pebble.recordings.recorder.recorder import Recorder
+from pebble.recordings.recorder.settings import EVERYTHING, Connection, Options, Settings, load
 from pebble.recordings.recorder.source import Source
 from pebble.recordings.units import seconds, size
 from pebble.runtime.signals import interrupted_by_signals
@@ -32,10 +32,10 @@ _LINE_S = 1.0
 _METRICS_S = 10.0
 
 
+@with_target(program="record")
 def record(
-    config: ConfigOption = None,
-    url: UrlOption = None,
-    remote: RemoteOption = False,
+    *,
+    target: Target,
     filters: Annotated[
         list[str] | None,
         typer.Option("--filter", "-f", help="Record these topics only, + and # allowed; repeatable.", metavar="FILTER"),
@@ -55,8 +55,6 @@ def record(
     settings: Annotated[
         Path | None, typer.Option(help="A recorder's own file instead of all other options.", metavar="FILE")
     ] = None,
-    password_file: PasswordFile = None,
-    ca_cert: CaCert = None,
 ) -> int:
     """Record robots into MCAP files, until Ctrl-C.
 
@@ -82,11 +80,8 @@ def record(
         level=level,
         media=media,
     )
-    target = Target(
-        config=config, url=url, remote=remote, password_file=password_file, ca_cert=ca_cert, program="record"
-    )
     kind, transport, names, where = resolve(target)
-    chosen = tuple(filters) if filters else (f"{names.base}/#",) if config is not None else EVERYTHING
+    chosen = tuple(filters) if filters else (f"{names.base}/#",) if target.config is not None else EVERYTHING
     for filter_ in chosen:
         check_filter(filter_)
     connection = (kind, _modern(transport, protocol), chosen, "", where)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from pebble.commands.options import Output
-from pebble.recordings.period import SINCE_HELP, UNTIL_HELP
+from pebble.commands.recordings.options import Since, Until
 
 if TYPE_CHECKING:
     from pebble.recordings.traffic.results import RobotTraffic, Traffic
@@ -23,8 +23,6 @@ FOLDER: Final = Path("report")
 _QUIET_S: Final = 2.0  # before progress is shown
 
 Places = Annotated[list[Path], typer.Argument(help="Recordings, or folders of them.", metavar="DIR|FILE")]
-Since = Annotated[str | None, typer.Option(help=SINCE_HELP, metavar="TIME")]
-Until = Annotated[str | None, typer.Option(help=UNTIL_HELP, metavar="TIME")]
 Robots = Annotated[
     list[str] | None,
     typer.Option("--robot", "-r", help="Only this one; may be repeated.", metavar="[SYSTEM/TYPE/]ID"),

@@ -9,35 +9,35 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from datetime import datetime
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from pebble.client.connection import password
-from pebble.client.key_decoder import END, LEFT, RIGHT, SPACE, KeyDecoder
+from pebble.client.key_decoder import END, LEFT, RIGHT, SPACE
 from pebble.client.names import id_of
 from pebble.client.url import settings_of
 from pebble.commands.options import CaCert, PasswordFile
+from pebble.commands.recordings.options import Since, Until, period
+from pebble.commands.recordings.report import report_unread
+from pebble.commands.terminal_loop import TerminalLoop
 from pebble.config.visible import shown
 from pebble.errors import PebbleError
 from pebble.recordings.catalogue import look_at
 from pebble.recordings.library import files, problems
-from pebble.recordings.period import SINCE_HELP, UNTIL_HELP, parse_period
-from pebble.recordings.replay.player import FASTEST, SLOWEST, Player
-from pebble.recordings.replay.robots import ReplayedRobots
+from pebble.recordings.replay.pace import FASTEST, SLOWEST
+from pebble.recordings.replay.player import Player
+from pebble.recordings.replay.robots import Make, ReplayedRobots
 from pebble.recordings.replay.rules import SYSTEM, Options, Rules
 from pebble.recordings.replay.source import ReplaySource
 from pebble.transports import Message, Transport, create
-
-if TYPE_CHECKING:
-    from pebble.client.terminal_keys import Terminal
 
 _KEYS = "Space pauses, ← and → go 10 s back and on, + and - change the speed, Ctrl-C ends."
 _STEP_NS = 10 * 10**9
 _FASTER = 2.0
 _WITH_COMMANDS = 1.0  # the lowest speed: a drive command moves a robot until the next one
-_SHOW_PERIOD_S = 0.1
 
 RecordingsArgument = Annotated[
     list[Path],
@@ -55,36 +55,40 @@ class Stamps(StrEnum):
     AS_IS = "as-is"
 
 
+Base = Annotated[str | None, typer.Option(help=f"First level of the new topics. [default: {SYSTEM}]", metavar="SYSTEM")]
+SameBase = Annotated[bool, typer.Option("--same-base", help="Under the recorded topics, while these robots are off.")]
+Speed = Annotated[float, typer.Option(min=SLOWEST, max=FASTEST, help="1: as it was.")]
+Loop = Annotated[bool, typer.Option("--loop", help="Begin again at the end.")]
+Paused = Annotated[bool, typer.Option("--paused", help="Wait for the space key.")]
+Only = Annotated[
+    list[str] | None, typer.Option(help="Only recorded topics that match; may be repeated.", metavar="FILTER")
+]
+Incoming = Annotated[bool, typer.Option("--incoming", help="Drive commands of people, lights and sounds as well.")]
+Actions = Annotated[bool, typer.Option("--actions", help="With --incoming: all other commands as well; asks first.")]
+Keep = Annotated[
+    bool,
+    typer.Option(
+        "--keep", help="Retain what was retained, until the end; a killed process leaves it. Heartbeats never."
+    ),
+]
+StampsOption = Annotated[Stamps, typer.Option(help="Move the stamps in payloads to now, or leave them.")]
+
+
 def replay(
     recordings: RecordingsArgument,
     url: UrlOption,
-    base: Annotated[
-        str | None, typer.Option(help=f"First level of the new topics. [default: {SYSTEM}]", metavar="SYSTEM")
-    ] = None,
-    same_base: Annotated[
-        bool, typer.Option("--same-base", help="Under the recorded topics, while these robots are off.")
-    ] = False,
-    speed: Annotated[float, typer.Option(min=SLOWEST, max=FASTEST, help="1: as it was.")] = 1.0,
-    since: Annotated[str | None, typer.Option(help=SINCE_HELP, metavar="TIME")] = None,
-    until: Annotated[str | None, typer.Option(help=UNTIL_HELP, metavar="TIME")] = None,
-    loop: Annotated[bool, typer.Option("--loop", help="Begin again at the end.")] = False,
-    paused: Annotated[bool, typer.Option("--paused", help="Wait for the space key.")] = False,
-    only: Annotated[
-        list[str] | None, typer.Option(help="Only recorded topics that match; may be repeated.", metavar="FILTER")
-    ] = None,
-    incoming: Annotated[
-        bool, typer.Option("--incoming", help="Drive commands of people, lights and sounds as well.")
-    ] = False,
-    actions: Annotated[
-        bool, typer.Option("--actions", help="With --incoming: all other commands as well; asks first.")
-    ] = False,
-    keep: Annotated[
-        bool,
-        typer.Option(
-            "--keep", help="Retain what was retained, until the end; a killed process leaves it. Heartbeats never."
-        ),
-    ] = False,
-    stamps: Annotated[Stamps, typer.Option(help="Move the stamps in payloads to now, or leave them.")] = Stamps.SHIFT,
+    base: Base = None,
+    same_base: SameBase = False,
+    speed: Speed = 1.0,
+    since: Since = None,
+    until: Until = None,
+    loop: Loop = False,
+    paused: Paused = False,
+    only: Only = None,
+    incoming: Incoming = False,
+    actions: Actions = False,
+    keep: Keep = False,
+    stamps: StampsOption = Stamps.SHIFT,
     password_file: PasswordFile = None,
     ca_cert: CaCert = None,
 ) -> int:
@@ -110,66 +114,28 @@ def replay(
         shift=stamps is Stamps.SHIFT,
         only=tuple(only or ()),
     )
-    terminal = _has_terminal()
-    _check(options, base, url, paused=paused, terminal=terminal)
-    if incoming and speed < _WITH_COMMANDS:
-        raise PebbleError(f"--speed {speed:g} would drive a robot for longer than it was: leave out --incoming")
+    _check(options, base, url, speed, paused=paused)
     connection = settings_of(url, password=password(password_file), password_file=password_file, ca_cert=ca_cert)
-    since_ns, until_ns = parse_period(since, until, now=datetime.now().astimezone())
-    paths = files(recordings)
-    source = ReplaySource(paths)
-    rules = Rules(options, source.channels)
-    if not rules.robots:
-        _report_unread(source)
-        raise PebbleError("there is nothing to publish in this recording; see --only and --incoming")
-    if missing := sum(look_at(path).missing for path in paths):
-        typer.echo(f"pebble: {missing:,} messages are missing in this recording: files were damaged", err=True)
+    since_ns, until_ns = period(since, until)
+    source, rules = _read(recordings, options)
     if actions:
         _confirm(rules)
-    console = _Console()
-    with ExitStack() as stack:
-        stack.enter_context(console.noting_signals())
-        robots = stack.enter_context(
-            ReplayedRobots(_maker(*connection), rules.robots, now=time.monotonic, wall_ms=_wall_ms, wait=console.listen)
-        )
-        player = Player(
-            source,
-            rules,
-            robots.publish,
-            now=time.monotonic,
-            wall_ns=time.time_ns,
-            wait=console.wait,
-            since_ns=since_ns,
-            until_ns=until_ns,
-            speed=speed,
-            slowest=_WITH_COMMANDS if incoming else SLOWEST,
-            loop=loop,
-            paused=paused,
-        )
-        typer.echo(f"{', '.join(shown(one) for one in rules.robots)}{': ' + _KEYS if terminal else ''}")
-        sys.stdout.flush()
-        if terminal:
-            stack.enter_context(console.keys())
-        console.attach(player, robots)
-        player.run()
+    slowest, console = _WITH_COMMANDS if incoming else SLOWEST, _Console()
+    make_player = partial(
+        Player, source, rules, now=time.monotonic, wall_ns=time.time_ns, wait=console.wait,
+        since_ns=since_ns, until_ns=until_ns, speed=speed, slowest=slowest, loop=loop, paused=paused,
+    )  # fmt: skip
+    player = _play(console, _maker(*connection), list(rules.robots), make_player)
     typer.echo(f"{player.sent} sent, {player.skipped} skipped")
-    unread = _report_unread(source)
-    return 0 if console.ended in ("", "SIGINT", END) and not unread else 1
+    unread = report_unread(problems(source.damages))
+    return unread if console.ended in ("", "SIGINT", END) else 1
 
 
 def register(app: typer.Typer) -> None:
     app.command("replay")(replay)
 
 
-def _report_unread(source: ReplaySource) -> bool:
-    """Name the files that could not be read completely; returns whether there are any."""
-    lines = problems(source.damages)
-    for line in lines:
-        typer.echo(f"pebble: {shown(line)}", err=True)
-    return bool(lines)
-
-
-def _check(options: Options, base: str | None, url: str, *, paused: bool, terminal: bool) -> None:
+def _check(options: Options, base: str | None, url: str, speed: float, *, paused: bool) -> None:
     same = options.system is None
     if same and base is not None:
         raise PebbleError("--base and --same-base exclude each other")
@@ -181,8 +147,39 @@ def _check(options: Options, base: str | None, url: str, *, paused: bool, termin
         )
     if options.actions and not options.incoming:
         raise PebbleError("--actions needs --incoming")
-    if paused and not terminal:
+    if paused and not _has_terminal():
         raise PebbleError("--paused needs a terminal, whose space key goes on")
+    if options.incoming and speed < _WITH_COMMANDS:
+        raise PebbleError(f"--speed {speed:g} would drive a robot for longer than it was: leave out --incoming")
+
+
+def _read(recordings: list[Path], options: Options) -> tuple[ReplaySource, Rules]:
+    """What is replayed. Raises PebbleError if that is nothing."""
+    paths = files(recordings)
+    source = ReplaySource(paths)
+    rules = Rules(options, source.channels)
+    if not rules.robots:
+        report_unread(problems(source.damages))
+        raise PebbleError("there is nothing to publish in this recording; see --only and --incoming")
+    if missing := sum(look_at(path).missing for path in paths):
+        typer.echo(f"pebble: {missing:,} messages are missing in this recording: files were damaged", err=True)
+    return source, rules
+
+
+def _play(console: _Console, make: Make, bases: list[str], make_player: Callable[..., Player]) -> Player:
+    """Play to the end, for these robots. Raises ReplayError and TransportError."""
+    terminal = _has_terminal()
+    with ExitStack() as stack:
+        stack.enter_context(console.noting_signals())
+        robots = ReplayedRobots(make, bases, now=time.monotonic, wall_ms=_wall_ms, wait=console.listen)
+        player = make_player(stack.enter_context(robots).publish)
+        typer.echo(f"{', '.join(map(shown, bases))}{': ' + _KEYS if terminal else ''}")
+        sys.stdout.flush()
+        if terminal:
+            stack.enter_context(console.keys())
+        console.attach(player, robots)
+        player.run()
+    return player
 
 
 def _confirm(rules: Rules) -> None:
@@ -194,7 +191,7 @@ def _confirm(rules: Rules) -> None:
             raise PebbleError(f"{shown(base)}: not confirmed")
 
 
-def _maker(kind: str, settings: object) -> Callable[[str, Message | None], Transport]:
+def _maker(kind: str, settings: object) -> Make:
     def make(name: str, will: Message | None) -> Transport:
         return create(kind, name.replace("/", "-"), settings, will=will)
 
@@ -223,9 +220,7 @@ class _Console:
         self.ended = ""  # why, if not by the end of the recording
         self._player: Player | None = None
         self._robots: ReplayedRobots | None = None
-        self._terminal: Terminal | None = None
-        self._decoder = KeyDecoder()
-        self._shown_at = 0.0
+        self._loop: TerminalLoop | None = None
         self._problem = ""
 
     def attach(self, player: Player, robots: ReplayedRobots) -> None:
@@ -249,11 +244,11 @@ class _Console:
         from pebble.client.terminal_keys import opened
 
         with opened() as terminal:
-            self._terminal = terminal
+            self._loop = TerminalLoop(terminal, time.monotonic)
             try:
                 yield
             finally:
-                self._terminal = None
+                self._loop = None
 
     def listen(self, seconds: float) -> None:
         """Before the player starts, and after it has ended."""
@@ -266,12 +261,15 @@ class _Console:
         player, robots = self._player, self._robots
         if player is None or robots is None:
             return
-        if self._terminal is None:
+        if self._loop is None:
             time.sleep(seconds)
             self._report(robots.problem)
         else:
-            self._handle_keys(self._terminal, player, seconds)
-            self._show(self._terminal, player, robots)
+            for key in self._loop.keys(seconds):
+                self._press(key, player)
+            self._loop.suspend(player.pause)
+            self.ended = self.ended or self._loop.ended
+            self._loop.show(lambda: status(player, robots.problem), at_once=False)
         robots.check()
         if self.ended and not player.ended:
             player.stop()
@@ -285,16 +283,6 @@ class _Console:
     def _on_signal(self, number: int, _frame: object) -> None:
         self.ended = self.ended or signal.Signals(number).name
 
-    def _handle_keys(self, terminal: Terminal, player: Player, seconds: float) -> None:
-        due = self._decoder.due
-        data = terminal.read(seconds if due is None else min(seconds, due - time.monotonic()))
-        for key in self._decoder.feed(data, time.monotonic()):
-            self._press(key, player)
-        if terminal.suspended:
-            player.pause()
-            terminal.stand_still()
-        self.ended = self.ended or terminal.ended
-
     def _press(self, key: str, player: Player) -> None:
         if key == SPACE:
             (player.resume if player.paused else player.pause)()
@@ -304,13 +292,6 @@ class _Console:
             player.speed *= _FASTER
         elif key == "-":
             player.speed /= _FASTER
-        elif key == END:
-            self.ended = END
-
-    def _show(self, terminal: Terminal, player: Player, robots: ReplayedRobots) -> None:
-        if (now := time.monotonic()) - self._shown_at >= _SHOW_PERIOD_S:
-            self._shown_at = now
-            terminal.show(shown(status(player, robots.problem)))
 
 
 def status(player: Player, problem: str) -> str:

@@ -1,0 +1,1 @@
+"""``pebble recordings`` and what else works on recordings."""

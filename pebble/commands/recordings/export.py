@@ -1,0 +1,166 @@
+"""``pebble recordings`` export and import: recordings in the formats of other programs."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, BinaryIO
+
+import typer
+
+from pebble.client.names import base_of
+from pebble.commands import show
+from pebble.commands.recordings.options import Places, RobotOption, Since, Topics, Until, period
+from pebble.commands.recordings.progress import progress_of_time
+from pebble.commands.recordings.report import report_unread
+from pebble.config.visible import shown
+from pebble.errors import PebbleError
+from pebble.recordings import catalogue
+from pebble.recordings.catalogue import Query
+from pebble.recordings.exports.copy import write_copy
+from pebble.recordings.exports.film import write_film, write_wav
+from pebble.recordings.exports.foxglove import write_foxglove
+from pebble.recordings.exports.lines import BadLine, Imported, read_lines, write_lines
+from pebble.recordings.exports.mongo import read_mongo, write_mongo
+from pebble.recordings.exports.unfinished import unfinished
+from pebble.recordings.files.mcap import Recorded
+from pebble.recordings.files.writer import LIBRARY, McapWriter
+from pebble.recordings.library import Damages, files, merged, problems
+from pebble.recordings.stamps import stamp_ns
+
+
+class Form(StrEnum):
+    """What recordings can be exported to."""
+
+    LINES = "lines"
+    MONGO = "mongo"
+    FOXGLOVE = "foxglove"
+    MKV = "mkv"
+    MP4 = "mp4"
+    WAV = "wav"
+    MCAP = "mcap"
+
+
+_BY_SUFFIX = {
+    ".jsonl": Form.LINES,
+    ".bson": Form.MONGO,
+    ".mkv": Form.MKV,
+    ".mp4": Form.MP4,
+    ".wav": Form.WAV,
+    ".mcap": Form.MCAP,
+}
+
+
+def export(
+    places: Places,
+    target: Annotated[Path, typer.Argument(help="A new file.", metavar="OUT")],
+    form: Annotated[Form | None, typer.Option("--as", help="What to write. [default: by the name of OUT]")] = None,
+    robot: RobotOption = None,
+    since: Since = None,
+    until: Until = None,
+    topic: Topics = None,
+) -> int:
+    """Export to JSON lines, MongoDB, Foxglove, a film, MCAP."""
+    form = form or _BY_SUFFIX.get(target.suffix)
+    if form is None:
+        raise PebbleError(f"{target}: what to write is not clear from this name: add --as lines, foxglove, mkv …")
+    since_ns, until_ns = period(since, until)
+    paths = files(places)
+    base = None if robot is None else base_of(robot)
+    if form in (Form.MKV, Form.MP4, Form.WAV):
+        base = base or _only_robot(paths)
+    query = Query(base, tuple(topic or ()))
+    damages = Damages()
+    beside = damages if query == Query() else ()  # those that were read
+    try:
+        with progress_of_time(paths, since_ns, until_ns) as on_time:
+            messages = merged(paths, since_ns=since_ns, until_ns=until_ns, chooses=query.chooses, damages=damages)
+            typer.echo(_export(form, messages, target, base or "", on_time, beside))
+    finally:
+        code = report_unread(problems(damages))
+    return code
+
+
+def import_(
+    source: Annotated[Path, typer.Argument(help="logger.jsonl, or messages.bson of mongodump.", metavar="FILE")],
+    target: Annotated[Path, typer.Argument(help="A new recording.", metavar="OUT.mcap")],
+) -> int:
+    """Import what the original's logger or MongoDB recorded."""
+    with _opened(source) as file, unfinished(target, overwrite=False) as path, path.open("wb", buffering=0) as out:
+        writer = McapWriter(out, library=LIBRARY)
+        writer.metadata("pebble.recording", {"format": "1", "imported": source.name})
+        read = read_mongo if ".bson" in source.name else read_lines
+        counted = _import(read(file), writer)
+        writer.finish()
+    typer.echo(f"{target}: {counted['messages']:,} messages")
+    if counted["bad"]:
+        typer.echo(f"pebble: {counted['bad']:,} lines hold no message and were left out", err=True)
+    if counted["truncated"]:
+        typer.echo(f"pebble: {counted['truncated']:,} payloads had been cut before", err=True)
+    return 0 if counted["messages"] else 1
+
+
+def _export(
+    form: Form,
+    messages: Iterable[Recorded],
+    target: Path,
+    robot: str,
+    on_time: Callable[[int], None],
+    beside: Iterable[Path],
+) -> str:
+    if form is Form.FOXGLOVE:
+        counts = write_foxglove(messages, target, on_time=on_time)
+        return f"{target}: " + ", ".join(f"{count:,} {name}" for name, count in counts.items())
+    if form in (Form.MKV, Form.MP4):
+        film = write_film(messages, target, robot, on_time=on_time)
+        sound = "no sound" if film.sound is None else f"{show.duration(film.sound.seconds)} of sound"
+        return f"{target}: {show.duration(film.seconds)}, {film.pictures:,} pictures, {sound}"
+    if form is Form.WAV:
+        return f"{target}: {show.duration(write_wav(messages, target, robot, on_time=on_time).seconds)} of sound"
+    with unfinished(target, overwrite=False) as path, path.open("wb") as out:
+        if form is Form.LINES:
+            count = write_lines(messages, out, on_time=on_time)
+        elif form is Form.MONGO:
+            count = write_mongo(messages, out, on_time=on_time)
+        else:
+            count = write_copy(messages, out, on_time=on_time, beside=beside)
+    return f"{target}: {count:,} messages"
+
+
+def _import(found: Iterable[Imported | BadLine], writer: McapWriter) -> Counter[str]:
+    counted = Counter[str]()
+    channels: dict[tuple[str, str, tuple[tuple[str, str], ...]], int] = {}
+    for one in found:
+        if isinstance(one, BadLine):
+            counted["bad"] += 1
+            if counted["bad"] <= 3:
+                typer.echo(f"pebble: line {one.number}: {shown(one.problem)}", err=True)
+            continue
+        encoding = "json" if one.payload[:1] in (b"{", b"[") else "application/octet-stream"
+        key = (one.topic, encoding, tuple(one.metadata.items()))
+        if key not in channels:
+            channels[key] = writer.channel(one.topic, encoding, one.metadata)
+        writer.add(channels[key], one.log_ns, one.payload, stamp_ns(one.payload))
+        counted["messages"] += 1
+        counted["truncated"] += one.truncated
+    return counted
+
+
+def _only_robot(paths: list[Path]) -> str:
+    robots = set[str]().union(*(catalogue.look_at(path).robots for path in paths))
+    if len(robots) != 1:
+        names = ", ".join(sorted(shown(robot) for robot in robots)) or "none"
+        raise PebbleError(f"whose pictures and sound is not clear: add --robot ({names})")
+    return robots.pop()
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[BinaryIO]:
+    try:
+        with path.open("rb") as file:
+            yield file
+    except OSError as error:
+        raise PebbleError(f"{path}: {error.strerror or error}") from None

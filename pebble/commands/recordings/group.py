@@ -1,0 +1,26 @@
+"""``pebble recordings``: lists, searches, mends, exports and deletes recordings."""
+
+from __future__ import annotations
+
+import typer
+
+from pebble.commands.recordings.export import export, import_
+from pebble.commands.recordings.files import compact, finish, index, recover, rm
+from pebble.commands.recordings.look import info, list_, search
+
+_HELP = """List, search, mend, export and delete recordings.
+
+\b
+    pebble recordings list DIR
+    pebble recordings info DIR --since 10:00
+    pebble recordings search DIR --robot goob -t outgoing/logs --text WARN
+    pebble recordings export DIR walk.mkv -r goob --since 10:00 --until +5m
+    pebble recordings finish DIR     after a power cut, without a recorder
+"""
+
+
+def register(app: typer.Typer) -> None:
+    group = typer.Typer(help=_HELP, rich_markup_mode=None)
+    for command in (list_, info, search, finish, recover, compact, index, export, import_, rm):
+        group.command(command.__name__.rstrip("_"))(command)
+    app.add_typer(group, name="recordings")

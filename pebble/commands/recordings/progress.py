@@ -1,0 +1,47 @@
+"""Progress bars of commands that read or write many recordings."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+from pebble.recordings.library import FOREVER_NS, span
+
+_QUIET_S = 2.0  # before progress is shown
+
+
+@contextmanager
+def progress(what: str, total: int) -> Iterator[Callable[[float], None]]:
+    """Shown on a terminal, and only where it takes longer than two seconds."""
+    began, bar = time.monotonic(), None
+    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+    shown = Progress(*columns, console=Console(stderr=True), transient=True)
+
+    def advance(done: float) -> None:
+        nonlocal bar
+        if bar is None and sys.stderr.isatty() and time.monotonic() - began > _QUIET_S:
+            shown.start()
+            bar = shown.add_task(what, total=total)
+        if bar is not None:
+            shown.update(bar, completed=done)
+
+    try:
+        yield advance
+    finally:
+        if bar is not None:
+            shown.stop()
+
+
+@contextmanager
+def progress_of_time(paths: list[Path], since_ns: int, until_ns: int) -> Iterator[Callable[[int], None]]:
+    spans = [one for path in paths if (one := span(path)) is not None]
+    begin = max(since_ns, min((one.first_ns for one in spans), default=0))
+    end = min(until_ns, max((one.last_ns for one in spans if one.last_ns != FOREVER_NS), default=begin + 1))
+    with progress("exporting", max(1, end - begin)) as advance:
+        yield lambda log_ns: advance(log_ns - begin)

@@ -1,0 +1,31 @@
+"""Lines that commands for recordings print: times, what could not be read, and what was left as it is."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+
+import typer
+
+from pebble.config.visible import shown
+
+
+def report_unread(lines: list[str]) -> int:
+    """The exit code: 1 if there is a line."""
+    for line in lines:
+        typer.echo(f"pebble: {shown(line)}", err=True)
+    return 1 if lines else 0
+
+
+def report_left(error: object) -> int:
+    typer.echo(f"pebble: left as it is: {shown(str(error))}", err=True)
+    return 1
+
+
+def local_time(ns: int, *, fraction: bool = False) -> str:
+    moment = datetime.fromtimestamp(ns / 1e9, UTC).astimezone()
+    text = moment.strftime("%Y-%m-%d %H:%M:%S")
+    return f"{text}.{ns // 10**6 % 1000:03d}" if fraction else text
+
+
+def one_line(text: str) -> str:
+    return " ".join(text.split("\n")).replace("\t", " ")

@@ -1,0 +1,37 @@
+"""The position in a recording that is played at some speed. Pure: the clock is passed in."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+SLOWEST, FASTEST = 0.1, 100.0
+
+
+class Pace:
+    """Positions are in nanoseconds since 1970; ``now`` never goes back, in seconds."""
+
+    def __init__(self, now: Callable[[], float], *, speed: float, slowest: float) -> None:
+        self._now, self._slowest = now, slowest
+        self._speed = min(max(speed, slowest), FASTEST)
+        self.from_ns, self._from = 0, 0.0  # a position, and when playing went on from it
+
+    @property
+    def speed(self) -> float:
+        return self._speed
+
+    def change(self, speed: float, position_ns: int) -> None:
+        """Play at another speed from this position on."""
+        self.go_on_from(position_ns)
+        self._speed = min(max(speed, self._slowest), FASTEST)
+
+    def go_on_from(self, position_ns: int) -> None:
+        self.from_ns, self._from = position_ns, self._now()
+
+    @property
+    def reached_ns(self) -> int:
+        """The position at this moment, if nothing holds it up."""
+        return self.from_ns + int((self._now() - self._from) * self._speed * 1e9)
+
+    def due_s(self, position_ns: int, now: float) -> float:
+        """How long after ``now`` a position is reached; negative if it was reached before."""
+        return (position_ns - self.from_ns) / 1e9 / self._speed + self._from - now
