@@ -14,6 +14,7 @@ from typing import Any
 import msgspec
 
 from pebble.client.estop import send
+from pebble.client.robot_topics import FLEET, SYNONYMS, section_of
 from pebble.contract import CAPABILITIES, DRIVE, DRIVING, ONLINE, codec
 from pebble.contract.identity import Identity, parse_topic
 from pebble.contract.payloads import Driver
@@ -34,7 +35,7 @@ from pebble.web.known_robots import KnownRobots
 from pebble.web.media import MediaHub
 from pebble.web.open_components import OpenComponents
 from pebble.web.robot_streams import OwnHosts, origin
-from pebble.web.robots import FLEET, SYNONYMS, Component, Robots, section_of
+from pebble.web.robots import Component, Robots
 from pebble.web.settings import WebSettings
 from pebble.web.sound import SoundHub
 from pebble.web.stops import Stops
