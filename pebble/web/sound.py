@@ -162,8 +162,8 @@ class SoundStream(MediaStream[SoundPage, SoundView]):
         if problem := self._broker.problem:
             return f"The server cannot reach the broker: {problem}"
         component = self._robots.components.get(self.ref)
-        if component is not None and component.online(time.monotonic()) is False:
-            return f"{component.name} is silent"
+        if component is not None and component.robot.online(time.monotonic()) is False:
+            return f"{component.robot.name} is silent"
         return ""
 
     def _release(self, now: float) -> None:
