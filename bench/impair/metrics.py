@@ -17,7 +17,7 @@ import msgspec
 from pebble.bench.bridge_operator import arrivals
 from pebble.bench.impair.network import Traffic
 from pebble.bench.results import OVER_TIME, Cell, grouped, rounded
-from pebble.client.discovery import Liveness
+from pebble.client.robot_view import Liveness
 from pebble.simulation.loudspeaker import Playback
 from pebble.simulation.trace import Entry
 

@@ -7,24 +7,28 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from pebble.client.discovery import DiscoveredRobot, Discovery
+from pebble.client.drive_reasons import SLOW_S, SLOW_SPEED, Code, Situation, first_reason
 from pebble.client.driver_lease import FILTER, LISTEN_S, DriverLease
 from pebble.client.estop import Progress, StopSender, new_name
 from pebble.client.key_decoder import ESCAPE, SPACE
 from pebble.client.key_gesture import KeyGesture
 from pebble.client.names import id_of
-from pebble.contract import AUTONOMY_STATUS, CAPABILITIES, CHARGING_LEVEL, DRIVE, ESTOP_STATE, ONLINE, codec
+from pebble.client.robot_view import RobotView
+from pebble.contract import AUTONOMY_STATUS, CAPABILITIES, CHARGING_LEVEL, DRIVE, ESTOP_STATE, ONLINE, channel_of, codec
 from pebble.contract.payloads import Drive
 from pebble.transports import Message, QoS
 
-LATE_S = 0.6  # commands that take longer are not sent
-SLOW_S, SLOW_SPEED = 0.3, 0.4  # from this round trip on, the speed is limited
-SILENT_S = 1.5
 TWICE_S = 0.6  # between two presses of Escape
-RESET_S = 0.6  # a robot that was reset refuses its drivers until they have paused for 0.5 s
 
-_TOPICS = 64  # of one robot that are remembered
 _RECEIVED = (ESTOP_STATE, CAPABILITIES, ONLINE, CHARGING_LEVEL, AUTONOMY_STATUS)
+_WORDS = {
+    Code.UNSEEN: "waiting for {name}",
+    Code.STOPPING: "emergency stop",
+    Code.RESET: "it was reset a moment ago",
+    Code.UNKNOWN: "{name} has not published what it can do",
+    Code.NO_DRIVE: "{name} does not drive",
+    Code.LISTENING: "listening for other drivers",
+}
 
 
 class TerminalDriver:
@@ -45,23 +49,25 @@ class TerminalDriver:
         take_over: bool = False,
         heartbeat: bool = True,
     ) -> None:
-        self.base, self.name = base, id_of(base)
+        self.robot = RobotView(base)
         self.gesture, self.lease = gesture, lease
         self.stopping: StopSender | None = None  # the newest emergency stop from here
         self._by, self._take_over, self._heartbeat = by, take_over, heartbeat
-        self._discovery = Discovery()
-        self._robot = self._discovery.robots[base] = DiscoveredRobot(base, self.name)
         self._began = now
-        self._escape_at = self._latched_at = float("-inf")
+        self._escape_at = float("-inf")
         self._reason = "connecting"
         self._connected = False
-        self._known: dict[str, Message] = {}  # the robot's newest messages, for an emergency stop that begins later
         self._out: list[Message] = []
 
     @property
     def filters(self) -> list[str]:
         """What to subscribe to."""
-        return [*(channel.filter(self.base) for channel in _RECEIVED), FILTER]
+        return [*(channel.filter(self.robot.base) for channel in _RECEIVED), FILTER]
+
+    @property
+    def name(self) -> str:
+        """How people name the robot here."""
+        return id_of(self.robot.base)
 
     # -- what arrives
 
@@ -72,10 +78,9 @@ class TerminalDriver:
         if held and not self.lease.held:
             self._take_over = False  # a newer driver is asked for, not fought
             self._drive(self.gesture.interrupt(now, repeat=False))
-        self._discovery.receive(message, now, wall)
-        room = len(self._known) < _TOPICS or message.topic in (*self._known, CAPABILITIES.topic(self.base))
-        if room and message.topic.startswith(f"{self.base}/"):
-            self._known[message.topic] = message
+        if message.topic.startswith(f"{self.robot.base}/"):
+            self.robot.receive(channel_of(message.topic[len(self.robot.base) + 1 :]), message, now, wall)
+            self.robot.remember(message)
         if self.stopping is not None:
             self.stopping.receive(message, now)
 
@@ -101,9 +106,11 @@ class TerminalDriver:
         if not problem and not self._connected:
             self.lease.reconnected()
         self._connected = not problem
-        self._reason = self._why_not(now, problem, late_s)
-        round_trip = self.lease.round_trip_s or 0.0
-        self._drive(self.gesture.update(not self._reason, now, limit=SLOW_SPEED if round_trip >= SLOW_S else 1.0))
+        situation = self._situation(now, problem, late_s)
+        against = first_reason(situation)
+        self._reason = self._words(against, situation, now)
+        limit = SLOW_SPEED if (self.lease.round_trip_s or 0.0) >= SLOW_S else 1.0
+        self._drive(self.gesture.update(against is None, now, limit=limit))
         if self.gesture.active:
             if not self.lease.held:
                 self._take_over = False
@@ -158,85 +165,66 @@ class TerminalDriver:
         """How far the stop from here is, else nothing: the reason names another one."""
         if self.stopping is None or not self.stopping.robots:
             return ""
-        stop = self.stopping.robots[self.base]
+        stop = self.stopping.robots[self.robot.base]
         if stop.progress is Progress.CONFIRMED:
             return "" if stop.estop.latched else "it was reset since"
         return f"EMERGENCY STOP {'sent, ' if stop.sending else ''}NOT CONFIRMED: {stop.why}"
 
     def _battery(self) -> str:
-        return "" if self._robot.volts is None else f"{self._robot.volts:.1f} V"
+        return "" if self.robot.volts is None else f"{self.robot.volts:.1f} V"
 
     def _latency(self) -> str:
         if self.lease.round_trip_s is not None:
             return f"{1000 * self.lease.round_trip_s:.0f} ms"
-        latency = self._robot.liveness.latency_s
+        latency = self.robot.liveness.latency_s
         return "" if latency is None else f"heartbeat {1000 * latency:.0f} ms old"
 
     # -- inside
 
-    def _why_not(self, now: float, problem: str, late_s: float) -> str:
-        """The first reason against driving, in the order of the operator page."""
-        if problem:
-            return f"no connection: {problem}"
-        return self._robot_reason(now) or self._driver_reason(now) or self._moment_reason(now, late_s)
+    def _situation(self, now: float, problem: str, late_s: float) -> Situation:
+        """What speaks for and against driving now."""
+        lease = self.lease
+        other = lease.other(now)
+        situation = self.robot.situation(now)
+        return situation._replace(
+            problem=problem,
+            online=situation.online if self._heartbeat else True,
+            stopping=self.stopping is not None and not self.stopping.finished,
+            driven=other is not None and not self._take_over,
+            listening=not lease.held and other is None and now - self._began < LISTEN_S,
+            late_s=max(late_s, lease.late_s(now), lease.round_trip_s or 0.0),
+        )
 
-    def _robot_reason(self, now: float) -> str:
-        robot = self._robot
-        silent = self._silence(now)
-        if silent:
-            return silent
-        if robot.latched:
-            state = robot.stopped_by
-            by = "unknown" if state is None else state.by or "unknown"
-            why = f" ({state.why})" if state is not None and state.why else ""
-            self._latched_at = now
-            return f"stopped by {by}{why}: pebble estop reset {self.name}"
-        if self.stopping is not None and not self.stopping.finished:
-            return "emergency stop"
-        if now - self._latched_at < RESET_S:
-            return "it was reset a moment ago"
-        if not robot.estop.has_capabilities:
-            return f"{self.name} has not published what it can do"
-        drive = robot.capabilities.get("drive", {})
-        if drive.get("available") is not True or drive.get("controls") is False:
-            return f"{self.name} does not drive"
-        return ""
-
-    def _silence(self, now: float) -> str:
-        liveness = self._robot.liveness
-        age = liveness.age_s(now)
-        if not self._heartbeat:
-            return ""
-        if age is None:
-            return f"no heartbeat of {self.name}: is it on?"
-        online = liveness.online(now)
-        if online is None:
-            return f"waiting for {self.name}"
-        if online or (age < SILENT_S and not liveness.reported_offline):
-            return ""
-        return f"{self.name} is offline" if liveness.reported_offline else f"{self.name} is silent for {age:.0f} s"
-
-    def _driver_reason(self, now: float) -> str:
-        if self.lease.held:
-            return ""
-        other = self.lease.other(now)
-        if other is not None:
-            return "" if self._take_over else f"{other} is driving (--take-over drives instead)"
-        if now - self._began < LISTEN_S:
-            return "listening for other drivers"
-        return ""
-
-    def _moment_reason(self, now: float, late_s: float) -> str:
-        script = self._robot.autonomy
-        if script is not None and script.running and self._robot.capabilities["drive"].get("arbitrates") is not True:
-            return f"{script.file or 'a script'} is driving: stop it first"
-        late = max(late_s, self.lease.late_s(now), self.lease.round_trip_s or 0.0)
-        return f"commands are late ({1000 * late:.0f} ms)" if late >= LATE_S else ""
+    def _words(self, code: Code | None, situation: Situation, now: float) -> str:
+        """The reason against driving as it is shown; empty if there is none."""
+        robot, name = self.robot, self.name
+        match code:
+            case None:
+                return ""
+            case Code.BROKER:
+                return f"no connection: {situation.problem}"
+            case Code.SILENT if robot.liveness.reported_offline:
+                return f"{name} is offline"
+            case Code.SILENT:
+                return f"{name} is silent for {robot.liveness.age_s(now):.0f} s"
+            case Code.UNSEEN if robot.liveness.received_at is None:
+                return f"no heartbeat of {name}: is it on?"
+            case Code.STOPPED:
+                by = robot.stopped_by
+                why = f" ({by.why})" if by is not None and by.why else ""
+                return f"stopped by {(by and by.by) or 'unknown'}{why}: pebble estop reset {name}"
+            case Code.LEASE:
+                return f"{self.lease.other(now)} is driving (--take-over drives instead)"
+            case Code.SCRIPT:
+                return f"{(robot.autonomy and robot.autonomy.file) or 'a script'} is driving: stop it first"
+            case Code.LATE:
+                return f"commands are late ({1000 * situation.late_s:.0f} ms)"
+        return _WORDS[code].format(name=name)
 
     def _estop(self, now: float) -> None:
         if self.stopping is None or self.stopping.finished:
-            self.stopping = StopSender(new_name(), by=self._by, why="", now=now, robots=[self.base])
-            for message in self._known.values():
+            self.stopping = StopSender(new_name(), by=self._by, why="", now=now, robots=[self.robot.base])
+            for message in self.robot.remembered.values():
                 self.stopping.receive(message, now)
             self._out += self.stopping.tick(now)
         self._drive(self.gesture.stop(now))
@@ -245,4 +233,4 @@ class TerminalDriver:
         self._out += map(self._message, commands)
 
     def _message(self, command: Drive) -> Message:
-        return Message(self._robot.estop.drive_topic, codec.encode(DRIVE, command), QoS(DRIVE.default_qos))
+        return Message(self.robot.estop.drive_topic, codec.encode(DRIVE, command), QoS(DRIVE.default_qos))

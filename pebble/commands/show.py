@@ -9,6 +9,7 @@ import statistics
 from itertools import pairwise
 from typing import Any, TextIO
 
+from pebble.client.discovery import Discovery
 from pebble.client.estop_states import RobotEstop
 from pebble.client.names import Names, id_of
 from pebble.config.visible import shown
@@ -199,13 +200,12 @@ def print_listing(listing: Listing, now: float, wall: float) -> None:
 
 def stopped_robots(listing: Listing, wall: float) -> list[str]:
     """A line for each robot in the listing that is stopped."""
-    robots: dict[str, RobotEstop] = {}
-    for topic, record in listing.records.items():
-        address = parse_topic(topic)
-        if address is not None and record.last is not None:
-            base = address.identity.base
-            robots.setdefault(base, RobotEstop(base)).receive(record.last)
-    return [stopped_line(robots[base], wall) for base in sorted(robots) if robots[base].latched]
+    discovery = Discovery()
+    for record in listing.records.values():
+        if record.last is not None:
+            discovery.receive(record.last, record.arrived, wall)
+    robots = sorted(discovery.all_robots(), key=lambda robot: robot.base)
+    return [stopped_line(robot.estop, wall) for robot in robots if robot.latched]
 
 
 def stopped_line(robot: RobotEstop, wall: float) -> str:

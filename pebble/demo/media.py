@@ -13,8 +13,8 @@ from functools import partial
 
 import numpy as np
 
-from pebble.client.discovery import DiscoveredRobot
 from pebble.client.media_receiver import MediaReceiver
+from pebble.client.robot_view import RobotView
 from pebble.client.viewer import Medium
 from pebble.contract import AUDIO_CONTROL, VIDEO_CONTROL, Channel, codec
 from pebble.contract.encodings import ALL_SOUND, ALL_VIDEO
@@ -129,12 +129,12 @@ class MediaCheck:
         self.results: deque[MediaResult] = deque(maxlen=_RESULTS)
         self.rounds = 0
         self._transport = create("mqtt", name, MqttSettings(host="127.0.0.1", port=port))
-        self._robots: Sequence[DiscoveredRobot] = ()
+        self._robots: Sequence[RobotView] = ()
         self._once = False
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
 
-    def begin(self, robots: Sequence[DiscoveredRobot], *, once: bool = False) -> None:
+    def begin(self, robots: Sequence[RobotView], *, once: bool = False) -> None:
         """Start requesting media from these robots, one round after another or ``once``; returns at once."""
         self._robots, self._once = robots, once
         self._thread.start()

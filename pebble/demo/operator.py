@@ -17,10 +17,11 @@ from functools import partial
 from typing import NamedTuple
 
 from pebble import contract
-from pebble.client.discovery import ALL_OUTGOING, DiscoveredRobot, Discovery
+from pebble.client.discovery import ALL_OUTGOING, Discovery
 from pebble.client.driver_lease import FILTER, VALID_S
 from pebble.client.estop import StopSender, new_name
 from pebble.client.estop_states import Reset
+from pebble.client.robot_view import RobotView
 from pebble.contract import APRILTAG_DATA, AUTONOMY_COMMAND, DRIVE, DRIVING, SOUNDBOARD_COMMAND, codec
 from pebble.contract.payloads import AutonomyCommand, Drive, LightsFlash, LightsSolid, SoundboardCommand, TagData
 from pebble.errors import PayloadError
@@ -135,8 +136,8 @@ class Operator:
         self.events: deque[tuple[float, str]] = deque(maxlen=_MOST_WAITING)
         self.completed: deque[CompletedStep | CompletedStop | CompletedFollow] = deque(maxlen=_MOST_WAITING)
         self._doing, self._step_began = "discovering robots", 0.0
-        self._robots: list[DiscoveredRobot] = []  # that take part in the present step
-        self._scripted: DiscoveredRobot | None = None  # if a person takes it, the present step ends
+        self._robots: list[RobotView] = []  # that take part in the present step
+        self._scripted: RobotView | None = None  # if a person takes it, the present step ends
         self._visits: dict[str, tuple[str, float]] = {}  # by base topic: who drives it from the page, announced when
         self._transport = create("mqtt", name, MqttSettings(host="127.0.0.1", port=port))
         self._stopping = threading.Event()
@@ -186,7 +187,7 @@ class Operator:
                 who = f"{driver.by} on {driver.device}" if driver.device else driver.by
                 self._visits[base] = who, time.monotonic()
 
-    def _taken(self, robot: DiscoveredRobot) -> str:
+    def _taken(self, robot: RobotView) -> str:
         """Why people have the control of it now; empty: they have not."""
         who, at = self._visits.get(robot.base, ("", -math.inf))
         if time.monotonic() - at < VALID_S:
@@ -194,7 +195,7 @@ class Operator:
         stop = robot.stopped_by
         return "" if stop is None or stop.by == NAME else f"is stopped by {stop.by or 'unknown'}"
 
-    def _mine(self, robot: DiscoveredRobot) -> bool:
+    def _mine(self, robot: RobotView) -> bool:
         """Whether it may be driven in the present step, in which no person has had it so far."""
         _, at = self._visits.get(robot.base, ("", -math.inf))
         if at < self._step_began and not self._taken(robot):
@@ -228,7 +229,7 @@ class Operator:
             if name not in self.again:
                 return
 
-    def _begin(self, step: str, robots: Sequence[DiscoveredRobot]) -> None:
+    def _begin(self, step: str, robots: Sequence[RobotView]) -> None:
         """With those that are free."""
         self._doing, self._step_began = step, time.monotonic()
         self._robots = [robot for robot in robots if self._mine(robot)]
@@ -291,7 +292,7 @@ class Operator:
         ended = time.monotonic()
         self._complete(*(CompletedStep(robot.name, step, began, released, ended) for robot in self._robots))
 
-    def _stop_all(self, robots: Sequence[DiscoveredRobot]) -> None:
+    def _stop_all(self, robots: Sequence[RobotView]) -> None:
         """Drive all, stop them, drive in vain, reset, drive again; a stop by a person is the person's to reset."""
         received, began = queue.SimpleQueue[Message](), time.monotonic()
         self._begin(EMERGENCY_STOP, robots)
@@ -318,7 +319,7 @@ class Operator:
             confirmed_s, free = sender.robots[robot.base].confirmed_s, bool(reset.shown) and reset.free
             self._complete(CompletedStop(robot.name, began, pressed, confirmed_s, reset_at, free, ended))
 
-    def _take_over(self, robots: Sequence[DiscoveredRobot]) -> None:
+    def _take_over(self, robots: Sequence[RobotView]) -> None:
         """Let each robot with scripts follow a tag, and overrule the script for a moment."""
         for robot in [robot for robot in robots if robot.offers("autonomy")]:
             self._begin("scripts", [robot])
@@ -332,7 +333,7 @@ class Operator:
             self._scripted = None
             self._wait(0.0)
 
-    def _follow(self, robot: DiscoveredRobot) -> CompletedFollow:
+    def _follow(self, robot: RobotView) -> CompletedFollow:
         """Start the script, drive for a moment, and wait until it has arrived. Failures are for the assessment."""
         seen: deque[TagData] = deque(maxlen=1)
 

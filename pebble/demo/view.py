@@ -14,7 +14,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from pebble.client.discovery import DiscoveredRobot
+from pebble.client.robot_view import RobotView
 from pebble.contract.encodings import ALL_SOUND, ALL_VIDEO
 from pebble.demo.emergency import StopResult
 from pebble.demo.following import FollowResult
@@ -112,13 +112,13 @@ class View:
             recorder = self._media.recorders.get(robot.name)
             row["video"] = "" if recorder is None else recorder.summary("video", now)
             row["audio"] = "" if recorder is None else recorder.summary("audio", now)
-        row["messages"] = f"{seen.messages.rate(now):3.0f}/s"
+        row["messages"] = f"{self._operator.discovery.traffic[seen.base].rate(now):3.0f}/s"
         return row
 
-    def _discovered(self, name: str) -> DiscoveredRobot | None:
+    def _discovered(self, name: str) -> RobotView | None:
         return next((seen for seen in self._operator.discovery.all_robots() if seen.name == name), None)
 
-    def _command(self, seen: DiscoveredRobot, now: float) -> str:
+    def _command(self, seen: RobotView, now: float) -> str:
         if seen.base not in self._operator.commands:
             return "none yet"
         drive, sent_at = self._operator.commands[seen.base]
@@ -208,7 +208,7 @@ def _table(columns: Sequence[dict[str, str]]) -> Table:
     return table
 
 
-def _heartbeat(seen: DiscoveredRobot, now: float) -> str:
+def _heartbeat(seen: RobotView, now: float) -> str:
     age, latency = seen.liveness.age_s(now), seen.liveness.latency_s
     if age is None:
         return "none yet"
@@ -225,19 +225,19 @@ def _truth(robot: SimulatedRobot) -> dict[str, str]:
     return {"wheels": wheels, "pose": f"{board.pose.x_mm:+5.0f} {board.pose.y_mm:+5.0f} mm {degrees:+4.0f}°"}
 
 
-def _script(seen: DiscoveredRobot) -> str:
+def _script(seen: RobotView) -> str:
     status = seen.autonomy
     if status is None or not status.running:
         return "none runs"
     return f"{status.file}{', overruled' if status.overridden is True else ''}"
 
 
-def _attitude(seen: DiscoveredRobot) -> str:
+def _attitude(seen: RobotView) -> str:
     attitude = seen.attitude
     return "unknown" if attitude is None else f"roll {attitude.roll:+.1f}° pitch {attitude.pitch:+.1f}°"
 
 
-def _battery(seen: DiscoveredRobot) -> str:
+def _battery(seen: RobotView) -> str:
     if seen.volts is not None:
         return f"{seen.volts:.2f} V"
     return {True: "charging", False: "not charging", None: "unknown"}[seen.charging]

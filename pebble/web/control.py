@@ -264,7 +264,7 @@ class Control:
 
     def _stop(self, op: m.StopOp) -> None:
         component = self._server.robots.components.get(op.ref)
-        if component is not None and (component.drives() or not component.capabilities):
+        if component is not None and (component.robot.drives or not component.robot.capabilities):
             self._server.publish(self._server.driving.stop(op.ref, clock()))
 
     def _end_stop(self, op: m.EstopEndOp) -> None:
@@ -277,7 +277,7 @@ class Control:
         component = self._server.robots.components.get(op.ref)
         if not self._may("reset", op) or component is None:
             return
-        reset = Reset(component.estop, self._session.user)
+        reset = Reset(component.robot.estop, self._session.user)
         shown = {one.owner: (one.boot, one.count) for one in op.owners}
         reset.shown = {
             owner: msgspec.structs.replace(state, boot=shown[owner][0], count=shown[owner][1])

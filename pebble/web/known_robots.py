@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from pebble.web.robots import Component
+from pebble.client.rank import Rank
+from pebble.client.robot_view import RobotView
 
 MAX_KNOWN = 256
 _REMEMBERED_DAYS = 30  # without a sign of it, after which one that only was there gives way to another
@@ -42,12 +43,11 @@ class KnownRobots:
         """A person drives it."""
         self._note(ref, _Entry(operated=True, day=day))
 
-    def seen(self, component: Component, day: int) -> None:
+    def seen(self, robot: RobotView, rank: Rank, day: int) -> None:
         """It is there; what neither drives nor can be stopped is not remembered."""
-        estop = component.estop
-        if component.rank.live and component.rank.has_capabilities and (estop.available or component.drives()):
-            operated = component.ref in self._entries and self._entries[component.ref].operated
-            self._note(component.ref, _Entry(operated=operated, day=day))
+        if rank.live and rank.has_capabilities and (robot.estop.available or robot.drives):
+            operated = robot.base in self._entries and self._entries[robot.base].operated
+            self._note(robot.base, _Entry(operated=operated, day=day))
 
     def changes(self) -> dict[str, str | None]:
         """What has to be saved since the last call; None: it is no longer remembered."""

@@ -10,6 +10,7 @@ from weakref import WeakKeyDictionary
 
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from pebble.client.robot_topics import own_topic
 from pebble.contract import CAMERA
 from pebble.contract.identity import Direction
 from pebble.web.broker import Broker
@@ -18,7 +19,7 @@ from pebble.web.media_stream import Streams
 from pebble.web.messages import PictureView
 from pebble.web.picture_stream import PageViewer, PictureStream, rest
 from pebble.web.rescue import RescuedPicture, newest_jpeg
-from pebble.web.robots import Robots, own_topic
+from pebble.web.robots import Robots
 
 PICTURE_METRIC: Final = "web/picture"
 _ANSWER: Final = struct.Struct(">IB")  # number of a frame, and what became of it

@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections import deque
 from itertools import count
 
+from pebble.client.drive_reasons import LATE_S
 from pebble.errors import PebbleError
 
 PING_S = 0.5
-LATE_S = 0.6  # a round trip, or a command, as old as this
 _EXTRA_S = 0.3  # what a command may be older than the page's usual round trip
 _ECHO_S = 1.0  # without an echo for so long nothing is known any more
 _JUMP_S = 1.0

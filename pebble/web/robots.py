@@ -14,36 +14,26 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from pebble.client.discovery import Liveness
 from pebble.client.rank import Rank, RankedTable
+from pebble.client.robot_topics import FLEET, SYNONYMS, names, section_of
+from pebble.client.robot_view import RobotView
 from pebble.contract import (
-    AUTONOMY_STATUS,
     CAPABILITIES,
-    CHANNELS,
-    CHARGING_LEVEL,
-    CHARGING_STATUS,
     ESTOP_STATE,
     LOGS,
     MCU_DESCRIBE,
-    MEDIA_STATUS,
-    MQTT_AUDIO,
-    MQTT_VIDEO,
     ONLINE,
-    REMOTE_MIRROR,
     SOUNDBOARD_FILES,
     STATUS,
     VIDEO_OVERLAYS,
     Channel,
-    Kind,
     channel_of,
     codec,
     is_reserved,
 )
 from pebble.contract.identity import LEVEL, Direction, parse_topic
-from pebble.errors import PayloadError, TransportError
-from pebble.runtime.robot_estop import RobotEstop
+from pebble.errors import PayloadError
 from pebble.transports import Message
-from pebble.transports.topics import check_topic
 from pebble.web import messages as m
 from pebble.web.log_lines import LogLines
 from pebble.web.recent import Recent
@@ -56,27 +46,9 @@ MAX_BYTES = 32 * 1024 * 1024  # of all values together
 RESERVED_BYTES = 16 * 1024  # of them for each component, whatever the others send
 MAX_ALIASES = 64  # of one component: topics that its microcontrollers declare besides the contract's
 _SERVERS = "servers"  # the type of other servers of this page: they are no components to be shown
-_SILENT_S = 1.5  # a component is not called silent before
 _REFRESH_S = 1.0  # values that change with every heartbeat are sent this often
 _LONGEST_ALIAS = 200  # characters
 _STAMPS = 5  # heartbeats by which a clock of whole seconds is recognised
-
-#: What the page shows of every component, and what only of the one that is open.
-FLEET = (ONLINE, CAPABILITIES, STATUS, ESTOP_STATE, CHARGING_STATUS, CHARGING_LEVEL, AUTONOMY_STATUS, MEDIA_STATUS)
-SYNONYMS = tuple(channel for channel in CHANNELS if channel.synonym_of is not None)
-WATCHED = tuple(
-    channel
-    for channel in CHANNELS
-    if channel.direction == Direction.OUTGOING
-    and channel.payload is not bytes
-    and channel.remote
-    and channel not in FLEET
-    and channel not in SYNONYMS
-    and channel.kind is not Kind.EVENT
-)
-#: Flags, by the section of the capabilities whose ``flag_topic`` may name another topic for it.
-FLAGS = {"": REMOTE_MIRROR, "audio": MQTT_AUDIO, "video": MQTT_VIDEO}
-
 
 _is_level = re.compile(LEVEL).search
 
@@ -91,13 +63,7 @@ class Component:
 
     def __init__(self, ref: str, rank: Rank) -> None:
         self.ref, self.rank = ref, rank
-        self.name = ref.rpartition("/")[2]
-        self.liveness = Liveness()
-        self.estop = RobotEstop(ref)
-        self.was_latched = False
-        self.reset_at = float("-inf")  # when its emergency stop ended, as far as it was seen
-        self.capabilities: dict[str, Any] = {}
-        self.known: dict[str, Message] = {}  # what a stop needs to know of it, by topic
+        self.robot = RobotView(ref)
         self.values: dict[str, _Value] = {}
         self.bytes = 0  # of the values
         self.aliases: dict[str, tuple[str, ...]] = {}  # by metric of the manifest that declares them
@@ -109,41 +75,34 @@ class Component:
     @property
     def live(self) -> bool:
         """Whether anything but retained messages has arrived from it."""
-        return self.liveness.received_at is not None
-
-    def online(self, now: float) -> bool | None:
-        """As the paper's operator page decides it, but nothing is silent after less than 1.5 s."""
-        age, online = self.liveness.age_s(now), self.liveness.online(now)
-        if online is False and not self.liveness.reported_offline and age is not None and age < _SILENT_S:
-            return True
-        return online
-
-    def heartbeat(self, t_ms: int, now: float, wall: float, *, online: bool) -> None:
-        self._stamps.append(t_ms)
-        self.liveness.heartbeat(now, wall - t_ms / 1000, online=online)
+        return self.robot.liveness.received_at is not None
 
     def update_rank(self, *, known: bool) -> None:
         """It falls once the component is silent: what was there long ago must not keep out what is there now."""
-        self.rank = Rank.of(self.estop, known=known, live=self.live and self.sent_online is not False)
+        self.rank = Rank.of(self.robot.estop, known=known, live=self.live and self.sent_online is not False)
+
+    def beats(self, message: Message, now: float, wall: float) -> bool:
+        """Take a heartbeat; whether the component ends with it."""
+        payload = self.robot.heartbeat(message, now, wall)
+        if payload is None:
+            return False
+        self._stamps.append(payload.t)
+        return payload.online is False
 
     def view(self, now: float) -> m.Liveness:
+        liveness = self.robot.liveness
         return m.Liveness(
-            online=self.online(now),
-            silent_s=self.liveness.age_s(now),
-            latency_ms=_ms(self.liveness.latency_s),
-            average_latency_ms=_ms(self.liveness.average_latency_s),
-            interval_ms=_ms(self.liveness.interval_s),
+            online=self.robot.online(now),
+            silent_s=liveness.age_s(now),
+            latency_ms=_ms(liveness.latency_s),
+            average_latency_ms=_ms(liveness.average_latency_s),
+            interval_ms=_ms(liveness.interval_s),
             whole_seconds=len(self._stamps) == _STAMPS and all(stamp % 1000 == 0 for stamp in self._stamps),
         )
 
     def lists(self, metric: str) -> bool:
         """Whether this is the state of a motor owner that its capabilities list."""
-        return metric in [ESTOP_STATE.metric.format(owner=owner) for owner in self.estop.owners]
-
-    def drives(self) -> bool:
-        """Whether it offers driving; without capabilities nothing is assumed (paper A.8.6)."""
-        drive = self.capabilities.get("drive")
-        return isinstance(drive, dict) and drive.get("available") is True and drive.get("controls") is not False
+        return metric in [ESTOP_STATE.metric.format(owner=owner) for owner in self.robot.estop.owners]
 
 
 def _ms(seconds: float | None) -> float | None:
@@ -181,7 +140,7 @@ class Robots:
     def capabilities(self, ref: str) -> dict[str, Any]:
         """Empty until they are known."""
         component = self.components.get(ref)
-        return {} if component is None else component.capabilities
+        return {} if component is None else component.robot.capabilities
 
     def topic(self, ref: str, section: str, key: str, channel: Channel) -> str:
         """The topic that the capabilities name, if they may; else the channel's own."""
@@ -280,7 +239,7 @@ class Robots:
         if channel is LOGS:
             self._log(component, message)
         elif not message.payload:
-            self._remove_value(component, metric, message)
+            self._remove_value(component, metric, message, now)
         else:
             if (raw := codec.trim(message.payload)) != message.payload:  # pages get it as it is
                 message = msgspec.structs.replace(message, payload=raw)
@@ -308,7 +267,7 @@ class Robots:
         self.components.ranks_may_have_fallen()
         older: list[Component] = []
         for component in self.components.values():
-            if component.online(now) is not component.sent_online or component.refreshed_at == float("-inf"):
+            if component.robot.online(now) is not component.sent_online or component.refreshed_at == float("-inf"):
                 self._refresh(component, now)
             elif now - component.refreshed_at >= _REFRESH_S and (component.live or component.sent_online is not None):
                 older.append(component)
@@ -317,7 +276,7 @@ class Robots:
             self._refresh(component, now)
 
     def _refresh(self, component: Component, now: float) -> None:
-        component.sent_online, component.refreshed_at = component.online(now), now
+        component.sent_online, component.refreshed_at = component.robot.online(now), now
         component.update_rank(known=self._is_known(component.ref))
         self.set_server_metric(component.ref, "web/liveness", component.view(now))
         if ONLINE.metric in component.values:
@@ -373,7 +332,7 @@ class Robots:
             self._mark(component.ref, metric)
         return True
 
-    def _remove_value(self, component: Component, metric: str, message: Message) -> None:
+    def _remove_value(self, component: Component, metric: str, message: Message, now: float) -> None:
         """An empty message removes what was retained."""
         old = component.values.pop(metric, None)
         if old is not None:
@@ -381,36 +340,28 @@ class Robots:
             component.bytes -= len(bytes(old.raw))
             self._mark(component.ref, metric)
         component.aliases.pop(metric, None)
-        component.known.pop(message.topic, None)
-        component.estop.receive(message)
+        component.robot.remembered.pop(message.topic, None)
+        component.robot.receive_stop(None, message, now)
 
     def _interpret(self, component: Component, metric: str, channel: Channel, message: Message, now: float) -> None:
+        robot = component.robot
         if channel in (CAPABILITIES, ESTOP_STATE, ONLINE):
-            component.known[message.topic] = message
-        if component.estop.receive(message):
-            component.update_rank(known=self._is_known(component.ref))
-        if channel is CAPABILITIES:
-            component.capabilities = _capabilities(message.payload) or component.capabilities
+            robot.remembered[message.topic] = message  # the table of values bounds how many
+        if channel in (CAPABILITIES, ESTOP_STATE):
+            before = robot.capabilities
+            if robot.receive_stop(channel, message, now):
+                component.update_rank(known=self._is_known(component.ref))
+            robot.capabilities = robot.capabilities or before  # empty ones take nothing away
         elif channel is MCU_DESCRIBE:
             component.aliases[metric] = _aliases(message.payload)
         elif channel is ONLINE or channel in SYNONYMS:
-            self._heartbeat(component, message, now)
+            arrived = time.time() - (time.monotonic() - now)
+            if component.beats(message, now, arrived) and component.sent_online is not False:
+                self._refresh(component, now)  # it may be back before the next round
         elif channel is STATUS and component.restarts.receive(
             message.payload, int(1000 * time.time()), dated=not message.retain
         ):
             self.set_server_metric(component.ref, "web/restarts", component.restarts.view())
-
-    def _heartbeat(self, component: Component, message: Message, now: float) -> None:
-        if message.retain:
-            return  # no sign of life
-        try:
-            payload = codec.decode(ONLINE, message.payload)
-        except PayloadError:
-            return
-        arrived = time.time() - (time.monotonic() - now)
-        component.heartbeat(payload.t, now, arrived, online=payload.online is not False)
-        if payload.online is False and component.sent_online is not False:
-            self._refresh(component, now)  # it may be back before the next round
 
     def _log(self, component: Component, message: Message) -> None:
         lines = self.logs.get(component.ref)
@@ -429,31 +380,6 @@ class Robots:
             if everybody or drawn or interest.watched == ref:
                 interest.dirty.add((ref, metric))
                 interest.notify()
-
-
-def section_of(capabilities: dict[str, Any], name: str) -> dict[str, Any]:
-    """A section of capabilities, or one of a section: ``system.reboot``. Empty if there is none."""
-    found: Any = capabilities
-    for level in name.split("."):
-        found = found.get(level) if isinstance(found, dict) else None
-    return found if isinstance(found, dict) else {}
-
-
-def own_topic(ref: str, topic: object, direction: str) -> bool:
-    """Whether this is a topic of ``ref`` in that direction. Capabilities may name others; they are not used."""
-    if not isinstance(topic, str) or not topic.startswith(f"{ref}/{direction}/") or parse_topic(topic) is None:
-        return False
-    try:
-        return check_topic(topic) == topic
-    except TransportError:
-        return False
-
-
-def names(ref: str, topic: object, channel: Channel) -> bool:
-    """Whether capabilities may name this topic for the channel: the component's own, and no other channel's."""
-    if not own_topic(ref, topic, channel.direction):
-        return False
-    return channel_of(str(topic)[len(ref) + 1 :]) in (None, channel)
 
 
 def _channel(metric: str) -> Channel | None:
@@ -482,11 +408,3 @@ def _may_be_alias(metric: str) -> bool:
         and len(metric) <= _LONGEST_ALIAS
         and all(map(_is_level, metric.split("/")))
     )
-
-
-def _capabilities(payload: bytes) -> dict[str, Any]:
-    try:
-        value = codec.decode(CAPABILITIES, payload).value
-    except PayloadError:
-        return {}
-    return value if isinstance(value, dict) else {}

@@ -13,7 +13,10 @@ from typing import Any
 
 import msgspec
 
+from pebble.client.drive_reasons import SCRIPT_ORDER, SERVER_ORDER, Code, Situation, first_reason
 from pebble.client.estop import send
+from pebble.client.robot_topics import FLEET, SYNONYMS
+from pebble.client.robot_view import RobotView
 from pebble.contract import CAPABILITIES, DRIVE, DRIVING, ONLINE, codec
 from pebble.contract.identity import Identity, parse_topic
 from pebble.contract.payloads import Driver
@@ -34,7 +37,7 @@ from pebble.web.known_robots import KnownRobots
 from pebble.web.media import MediaHub
 from pebble.web.open_components import OpenComponents
 from pebble.web.robot_streams import OwnHosts, origin
-from pebble.web.robots import FLEET, SYNONYMS, Component, Robots, section_of
+from pebble.web.robots import Robots
 from pebble.web.settings import WebSettings
 from pebble.web.sound import SoundHub
 from pebble.web.stops import Stops
@@ -44,7 +47,6 @@ log = logging.getLogger(__name__)
 TICK_S = 0.05
 _REFRESH_S = 0.25
 _ANNOUNCE_S = 1.0
-_RESET_S = 0.6  # robots refuse whoever has not paused for 0.5 s after a reset
 _ANNOUNCED = 64  # robots in one announcement
 _ESTOP_METRIC = "web/estop"
 _STREAM_ADDRESS = "stream-address "  # what a setting of the server begins with; then the component
@@ -120,18 +122,9 @@ class Server:
             return
         if address.metric != ONLINE.metric or self.robots.value(ref, _ESTOP_METRIC) is None:
             self.stops.changed.add(ref)
-            self._note_latch(ref)
         if address.metric == CAPABILITIES.metric:
             for one in (ref, *(page for page, source in self.robots.sources.items() if source == ref)):
                 self.open_components.update(one)
-
-    def _note_latch(self, ref: str) -> None:
-        component = self.robots.components.get(ref)
-        if component is not None:
-            latched = bool(component.estop.latched)
-            if component.was_latched and not latched:
-                component.reset_at = clock()
-            component.was_latched = latched
 
     def _announced(self, message: Message, _now: float) -> None:
         """Another server drives robots."""
@@ -170,7 +163,7 @@ class Server:
         by = f"{session.user} on {device}" if device else session.user
         if ref and not _is_base(ref):
             return
-        known, before = self.robots.components.values(), tuple(self.known)
+        known, before = [one.robot for one in self.robots.components.values()], tuple(self.known)
         self._send(
             self.stops.press(ref, name, by=by, why=why, now=clock(), known=known, before=before, user=session.user)
         )
@@ -180,17 +173,8 @@ class Server:
     def blocked(self, ref: str) -> str:
         """Why this component may not be moved by any page; empty if it may."""
         component = self.robots.components.get(ref)
-        if problem := self.broker.problem:
-            return f"The server cannot reach the broker: {problem}"
-        if component is None or not component.drives():
-            return "This component does not drive"
-        if component.estop.latched:
-            return (
-                f"Stopped by {component.estop.stopped_by.by or 'unknown'}" if component.estop.stopped_by else "Stopped"
-            )
-        if clock() - component.reset_at < _RESET_S:
-            return "It was just reset: wait a moment"
-        return "" if component.online(time.monotonic()) is not False else f"{component.name} is silent"
+        robot = RobotView(ref) if component is None else component.robot
+        return self._words(robot, first_reason(self._situation(robot), SERVER_ORDER))
 
     def refuses(self, op: m.RobotOp) -> str:
         """Why this is not asked of a robot now; empty if it is. What ends something is always asked."""
@@ -199,22 +183,42 @@ class Server:
             return "unknown component"
         if robot_commands.ends(op):
             return "" if self.broker.connected else "The server cannot reach the broker"
-        if problem := self.broker.problem:
-            return f"The server cannot reach the broker: {problem}"
-        if component.online(time.monotonic()) is False and not isinstance(op, m.FlagOp):  # the broker remembers flags
-            return f"{component.name} is silent"
-        why = robot_commands.refusal(op, component.capabilities)
-        return self._script_refused(component) if isinstance(op, m.AutonomyOp) and not why else why
+        robot = component.robot
+        order = (Code.BROKER,) if isinstance(op, m.FlagOp) else (Code.BROKER, Code.SILENT)  # a broker remembers flags
+        why = self._words(robot, first_reason(self._situation(robot), order))
+        why = why or robot_commands.refusal(op, robot.capabilities)
+        return self._script_refused(robot) if isinstance(op, m.AutonomyOp) and not why else why
 
-    def _script_refused(self, component: Component) -> str:
+    def _script_refused(self, robot: RobotView) -> str:
         """Why no script may begin now; empty if one may."""
-        if component.online(time.monotonic()) is not True:
-            return f"{component.name} has not been seen yet"
-        if component.estop.latched:
-            return "Stopped: reset it first"
-        by = self.driving.moved_by(component.ref, clock())
-        arbitrates = section_of(component.capabilities, "drive").get("arbitrates") is True
-        return f"{by} is driving" if by and not arbitrates else ""
+        by = self.driving.moved_by(robot.base, clock())
+        situation = self._situation(robot)._replace(driven=bool(by) and not robot.arbitrates)
+        match first_reason(situation, SCRIPT_ORDER):
+            case Code.UNSEEN:
+                return f"{robot.name} has not been seen yet"
+            case Code.STOPPED:
+                return "Stopped: reset it first"
+            case Code.LEASE:
+                return f"{by} is driving"
+        return ""
+
+    def _situation(self, robot: RobotView) -> Situation:
+        return robot.situation(time.monotonic())._replace(problem=self.broker.problem)
+
+    def _words(self, robot: RobotView, code: Code | None) -> str:
+        match code:
+            case Code.BROKER:
+                return f"The server cannot reach the broker: {self.broker.problem}"
+            case Code.NO_DRIVE:
+                return "This component does not drive"
+            case Code.STOPPED:
+                by = robot.stopped_by
+                return f"Stopped by {by.by or 'unknown'}" if by else "Stopped"
+            case Code.RESET:
+                return "It was just reset: wait a moment"
+            case Code.SILENT:
+                return f"{robot.name} is silent"
+        return ""
 
     def _note_talk(self, ref: str, session: Session, device: str, address: str) -> None:
         self.audit.write("talk", ref=ref, user=session.user, device=device, address=address)
@@ -295,7 +299,7 @@ class Server:
 
     def _remember_robots(self) -> None:
         for component in self.robots.components.values():
-            self.known.seen(component, int(time.time() // _DAY_S))
+            self.known.seen(component.robot, component.rank, int(time.time() // _DAY_S))
         if not self._saving and (changes := self.known.changes()):
             self._saving = True
             self.spawn(self._save(changes))
@@ -332,7 +336,7 @@ class Server:
         for ref in changed:
             component = self.robots.components.get(ref)
             if component is not None:
-                self.robots.set_server_metric(ref, _ESTOP_METRIC, self.stops.view(component.estop))
+                self.robots.set_server_metric(ref, _ESTOP_METRIC, self.stops.view(component.robot.estop))
 
     def _show_drivers(self) -> None:
         changed, self.driving.changed = self.driving.changed, set()

@@ -12,6 +12,7 @@ from typing import Final
 import msgspec
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from pebble.client.robot_topics import own_topic
 from pebble.contract import AUDIO, AUDIO_STREAM
 from pebble.contract.identity import Direction
 from pebble.contract.packets import Codec, Sound
@@ -23,7 +24,7 @@ from pebble.web.media_source import offered, refusal
 from pebble.web.media_stream import MediaStream, Streams
 from pebble.web.messages import SoundView, TalkAnswer
 from pebble.web.pace import Pace
-from pebble.web.robots import Robots, own_topic
+from pebble.web.robots import Robots
 from pebble.web.talk import PIECE_BYTES, SILENT_S, Talk, Voice
 
 SOUND_METRIC: Final = "web/sound"
@@ -161,8 +162,8 @@ class SoundStream(MediaStream[SoundPage, SoundView]):
         if problem := self._broker.problem:
             return f"The server cannot reach the broker: {problem}"
         component = self._robots.components.get(self.ref)
-        if component is not None and component.online(time.monotonic()) is False:
-            return f"{component.name} is silent"
+        if component is not None and component.robot.online(time.monotonic()) is False:
+            return f"{component.robot.name} is silent"
         return ""
 
     def _release(self, now: float) -> None:

@@ -9,11 +9,11 @@ from collections.abc import Collection, Iterable
 
 from pebble.client.estop import COLLECT_S, Progress, RobotStop, StopSender
 from pebble.client.rank import Rank
+from pebble.client.robot_view import RobotView
 from pebble.contract.identity import parse_topic
 from pebble.runtime.robot_estop import RobotEstop
 from pebble.transports import Message
 from pebble.web import messages as m
-from pebble.web.robots import Component
 
 MAX_STOPS = 512  # that are being sent at once: more than one of each robot that is known from before
 MAX_SAME = 64  # of them for the same robot, or for all: the newest are sent,
@@ -47,13 +47,13 @@ class Stops:
         by: str,
         why: str,
         now: float,
-        known: Iterable[Component],
+        known: Iterable[RobotView],
         before: Collection[str] = (),
         user: str = "",
     ) -> list[Message]:
         """Stop one robot, or all if ``ref`` is "".
 
-        ``known`` are the components from which messages were received; those known from ``before`` are stopped with
+        ``known`` are the robots from which messages were received; those known from ``before`` are stopped with
         all, too.
         """
         if name in self._senders:
@@ -61,9 +61,9 @@ class Stops:
         self._make_room(ref, user)
         sender = StopSender(name, by=by, why=why, now=now, robots=[ref] if ref else None, known=before, own_only=True)
         self._senders[name], self._users[name], self._refs[name] = (sender, now), user, ref
-        for component in known:
-            if not ref or component.ref == ref:
-                for message in component.known.values():
+        for robot in known:
+            if not ref or robot.base == ref:
+                for message in robot.remembered.values():
                     sender.receive(message, now)
         return self.tick(now)
 

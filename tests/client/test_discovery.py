@@ -6,7 +6,8 @@ import json
 
 import pytest
 
-from pebble.client.discovery import DiscoveredRobot, Discovery, Liveness
+from pebble.client.discovery import Discovery
+from pebble.client.robot_view import Liveness, RobotView
 from pebble.transports import Message
 from tests.recordings.demo_robots import DRIVE, GOOB, MINILAMP, ROBOTS, messages, received, values
 
@@ -19,7 +20,7 @@ def publish(discovery: Discovery, metric: str, body: object, *, now: float = 0.0
     discovery.receive(message, now, WALL + now)
 
 
-def publish_heartbeats(discovery: Discovery, *times: float) -> DiscoveredRobot:
+def publish_heartbeats(discovery: Discovery, *times: float) -> RobotView:
     for now in times:
         publish(discovery, "online", {"t": int((WALL + now - 0.01) * 1000)}, now=now)
     return discovery.robots[BASE]
@@ -107,9 +108,10 @@ def test_topics_of_another_robot_in_capabilities_are_not_used() -> None:
 
 
 def test_battery_and_message_count() -> None:
-    robots = discovered().robots
-    for base, seen in robots.items():
-        assert seen.messages.count == sum(one.channel.topic.startswith(f"{base}/") for one in messages(DRIVE))
+    discovery = discovered()
+    robots = discovery.robots
+    for base in robots:
+        assert discovery.traffic[base].count == sum(one.channel.topic.startswith(f"{base}/") for one in messages(DRIVE))
     assert robots[GOOB].volts == values(DRIVE, f"{GOOB}/outgoing/charging-level")[-1]["value"]
     assert robots[MINILAMP].volts == values(DRIVE, f"{MINILAMP}/outgoing/charging-level")[-1]["value"]
     assert robots[GOOB].volts != robots[MINILAMP].volts

@@ -7,17 +7,17 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from pebble.client.discovery import DiscoveredRobot
 from pebble.client.driver_lease import VALID_S
+from pebble.client.robot_view import RobotView
 from pebble.contract import DRIVING, codec
 from pebble.contract.payloads import Driver, Driving
 from pebble.demo.operator import Operator
 from pebble.transports import Message
 
-GOOB, FRED = (DiscoveredRobot(f"pebble/robots/{name}", name) for name in ("goob", "fred"))
+GOOB, FRED = (RobotView(f"pebble/robots/{name}") for name in ("goob", "fred"))
 
 
-def announcement(server: str, *robots: DiscoveredRobot, device: str = "phone") -> Message:
+def announcement(server: str, *robots: RobotView, device: str = "phone") -> Message:
     driven = {robot.base: Driver(by="anna", device=device, since=1) for robot in robots}
     return Message(DRIVING.topic(f"pebble/servers/{server}"), codec.encode(DRIVING, Driving(t=1, robots=driven)))
 

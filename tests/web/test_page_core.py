@@ -324,16 +324,11 @@ _GOOD = "mends.forEach((mend) => Object.assign(situation, mend));"
         ("{ liveness: { online: null, silent_s: null } }", None),
         ("{ liveness: undefined }", "silent"),
         ("{ capabilities: { drive: { available: true, controls: false } } }", "no-drive"),
-        ("{ script: { running: true }, capabilities: { drive: { available: true, arbitrates: true } } }", None),
         ("{ loading: true }", "loading"),
         ("{ pictureAgeMs: 1900, inSight: false }", None),
         ("{ pictureAgeMs: null, inSight: false }", None),
         ("{ pictureAgeMs: Infinity, inSight: false }", "picture"),
-        ("{ roundTripMs: 599 }", None),
-        ("{ roundTripMs: 600 }", "late"),
         ("{ focus: false, fromKeys: false }", None),
-        ("{ freeForMs: 599 }", "reset"),
-        ("{ freeForMs: 601 }", None),
     ],
 )
 def test_limits_of_reasons(change: str, code: str | None) -> None:

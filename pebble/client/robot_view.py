@@ -1,0 +1,226 @@
+"""The robot as an operator's program sees it: whether it is there, what it can do, and what holds it. Pure."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any
+
+from pebble.client.drive_reasons import SILENT_S, Situation
+from pebble.client.driveable import Driveable, driveable_of
+from pebble.client.robot_topics import section_of
+from pebble.contract import (
+    AUTONOMY_STATUS,
+    CAPABILITIES,
+    CHARGING_LEVEL,
+    CHARGING_STATUS,
+    ESTOP_STATE,
+    IMU,
+    ONLINE,
+    STATUS,
+    Channel,
+    codec,
+)
+from pebble.contract.identity import is_of_another
+from pebble.contract.payloads import AutonomyStatus, EstopState, Heartbeat, Orientation
+from pebble.errors import PayloadError
+from pebble.runtime.robot_estop import RobotEstop
+from pebble.transports import Message
+
+MAX_REMEMBERED = 64  # topics of one robot
+_HISTORY = 10
+
+
+class Liveness:
+    """Is a component online? As on the paper's operator page, the timeout follows the heartbeat's own interval."""
+
+    def __init__(self) -> None:
+        self.received_at: float | None = None  # monotonic
+        self.reported_offline = False
+        self._intervals: deque[float] = deque(maxlen=_HISTORY)
+        self._latencies: deque[float] = deque(maxlen=_HISTORY)
+
+    def heartbeat(self, now: float, latency_s: float, *, online: bool = True) -> None:
+        if self.received_at is not None and 0.05 <= now - self.received_at <= 10.0:
+            self._intervals.append(now - self.received_at)
+        if -1.0 <= latency_s <= 10.0:
+            self._latencies.append(max(0.0, latency_s))
+        self.received_at, self.reported_offline = now, not online
+
+    @property
+    def latency_s(self) -> float | None:
+        """It is that of the newest heartbeat; correct only if both clocks are synchronised, as on one machine."""
+        return self._latencies[-1] if self._latencies else None
+
+    @property
+    def average_latency_s(self) -> float | None:
+        """It is the mean of the last ten heartbeats."""
+        return _mean(self._latencies)
+
+    @property
+    def interval_s(self) -> float | None:
+        """It is the mean time between the last ten heartbeats."""
+        return _mean(self._intervals)
+
+    def age_s(self, now: float) -> float | None:
+        return None if self.received_at is None else now - self.received_at
+
+    def online(self, now: float, at_least_s: float = 0.0) -> bool | None:
+        """None while there are too few heartbeats to decide; a silence of less than ``at_least_s`` is none."""
+        if self.reported_offline:
+            return False
+        interval, latency = self.interval_s, self.average_latency_s
+        if self.received_at is None or len(self._intervals) < 2 or interval is None or latency is None:
+            return None
+        age = now - self.received_at
+        return age <= max(2 * interval, 4 * latency) or age < at_least_s
+
+
+def _mean(values: deque[float]) -> float | None:
+    return sum(values) / len(values) if values else None
+
+
+class RobotView:
+    """One robot, by the messages it publishes."""
+
+    def __init__(self, base: str) -> None:
+        self.base = base
+        self.liveness = Liveness()
+        self.estop = RobotEstop(base)
+        self.reset_at = float("-inf")  # when its emergency stop ended, as far as it was seen
+        self.remembered: dict[str, Message] = {}  # by topic: what an emergency stop that begins later needs to know
+        self.capabilities: dict[str, Any] = {}
+        self.driveable: Driveable | None = None  # as its status says
+        self.autonomy: AutonomyStatus | None = None
+        self.volts: float | None = None
+        self.charging: bool | None = None
+        self.attitude: Orientation | None = None  # of the newest sample of its inertial sensor
+
+    @property
+    def name(self) -> str:
+        """The last level of its base topic."""
+        return self.base.rpartition("/")[2]
+
+    # -- what arrives
+
+    def receive(self, channel: Channel | None, message: Message, now: float, wall: float) -> None:
+        """Take a message of it that arrived at ``now`` (monotonic) and ``wall`` (epoch seconds).
+
+        What it says is known from ``channel``. A malformed one changes nothing: the last valid state stays.
+        """
+        if channel is ONLINE:
+            self.heartbeat(message, now, wall)
+        elif channel in (CAPABILITIES, ESTOP_STATE):
+            self.receive_stop(channel, message, now)
+        elif channel is STATUS:
+            self.driveable = driveable_of(message.payload)
+        elif channel in _TELEMETRY:
+            try:
+                self._receive_telemetry(channel, codec.decode(channel, message.payload))
+            except PayloadError:
+                return
+
+    def heartbeat(self, message: Message, now: float, wall: float) -> Heartbeat | None:
+        """Take a heartbeat; None if it is no sign of life: a retained or malformed one."""
+        if message.retain:
+            return None
+        try:
+            payload: Heartbeat = codec.decode(ONLINE, message.payload)
+        except PayloadError:
+            return None
+        self.liveness.heartbeat(now, wall - payload.t / 1000, online=payload.online is not False)
+        return payload
+
+    def receive_stop(self, channel: Channel | None, message: Message, now: float) -> bool:
+        """Take capabilities, or the state of a motor owner; whether they say something of its emergency stop."""
+        latched = self.latched
+        changed = self.estop.receive(message)
+        if latched and not self.latched:
+            self.reset_at = now
+        if channel is CAPABILITIES:
+            try:
+                self.capabilities = codec.decode(CAPABILITIES, message.payload).value
+            except PayloadError:
+                return changed
+        return changed
+
+    def remember(self, message: Message) -> None:
+        """Keep it for an emergency stop that begins later; invented owners keep no capabilities out."""
+        if len(self.remembered) < MAX_REMEMBERED or message.topic in (*self.remembered, CAPABILITIES.topic(self.base)):
+            self.remembered[message.topic] = message
+
+    def _receive_telemetry(self, channel: Channel, payload: Any) -> None:
+        if channel is CHARGING_LEVEL:
+            self.volts = payload.value
+        elif channel is CHARGING_STATUS:
+            self.charging = payload.value
+        elif channel is IMU:
+            self.attitude = payload.value.orientation_deg
+        else:
+            self.autonomy = payload
+
+    # -- what is known
+
+    @property
+    def transport(self) -> str:
+        return str(section_of(self.capabilities, "transport").get("kind", "?"))
+
+    @property
+    def latched(self) -> bool:
+        """Whether any of its motor owners is stopped by an emergency stop: it must not be driven."""
+        return bool(self.estop.latched)
+
+    @property
+    def stopped_by(self) -> EstopState | None:
+        """The state that holds the newest stop, if it is stopped."""
+        return self.estop.stopped_by
+
+    @property
+    def drives(self) -> bool:
+        """Whether it offers driving; without capabilities nothing is assumed (paper A.8.6)."""
+        drive = section_of(self.capabilities, "drive")
+        return drive.get("available") is True and drive.get("controls") is not False
+
+    @property
+    def arbitrates(self) -> bool:
+        """Whether it decides itself between a script and a person."""
+        return section_of(self.capabilities, "drive").get("arbitrates") is True
+
+    @property
+    def drive_topic(self) -> str | None:
+        """The topic of its drive commands; None until its capabilities have arrived."""
+        return self._topic("drive", "topic")
+
+    def lights_topic(self, *, flash: bool) -> str | None:
+        return self._topic("lights", "flash_topic" if flash else "solid_topic")
+
+    def offers(self, section: str) -> bool:
+        """Whether that section of its capabilities, for example ``video``, can be requested."""
+        return section_of(self.capabilities, section).get("controls") is True
+
+    def ready(self, now: float) -> bool:
+        """Whether it is online, with a known drive topic."""
+        return self.drive_topic is not None and self.liveness.online(now) is True
+
+    def online(self, now: float) -> bool | None:
+        """Whether people are told that it is there: as its heartbeats say, but not silent after less than 1.5 s."""
+        return self.liveness.online(now, SILENT_S)
+
+    def situation(self, now: float) -> Situation:
+        """What speaks for and against driving it, as far as it says so itself."""
+        script = self.autonomy
+        return Situation(
+            online=self.online(now),
+            latched=self.latched,
+            free_s=now - self.reset_at,
+            published=self.estop.has_capabilities,
+            drives=self.drives,
+            arbitrates=self.arbitrates,
+            script=script is not None and script.running,
+        )
+
+    def _topic(self, section: str, key: str) -> str | None:
+        topic = section_of(self.capabilities, section).get(key)
+        return topic if isinstance(topic, str) and not is_of_another(topic, self.base) else None
+
+
+_TELEMETRY = (CHARGING_LEVEL, CHARGING_STATUS, IMU, AUTONOMY_STATUS)
