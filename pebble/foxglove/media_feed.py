@@ -10,6 +10,8 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any, Final, NamedTuple
 
+from pebble.client.broker import Broker
+from pebble.client.media_request.picture_header import PictureHeader, follows, read_header
 from pebble.client.viewer import Medium
 from pebble.contract import AUDIO, CAMERA
 from pebble.contract.packets import PBAT
@@ -27,9 +29,7 @@ from pebble.recordings.exports.foxglove_messages import (
     stamped,
     time_of,
 )
-from pebble.web.broker import Broker
 from pebble.web.media_source import MediaSource, offered, refusal
-from pebble.web.picture_header import PictureHeader, follows, read_header
 
 log = logging.getLogger(__name__)
 

@@ -10,10 +10,10 @@ from weakref import WeakKeyDictionary
 
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from pebble.client.broker import Broker
+from pebble.client.media_request.encoding_choice import BEST_FIRST
 from pebble.contract import CAMERA
 from pebble.contract.identity import Direction
-from pebble.web.broker import Broker
-from pebble.web.encoding_choice import BEST_FIRST
 from pebble.web.media_stream import Streams
 from pebble.web.messages import PictureView
 from pebble.web.picture_stream import PageViewer, PictureStream, rest

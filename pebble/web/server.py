@@ -13,6 +13,7 @@ from typing import Any
 
 import msgspec
 
+from pebble.client.broker import Broker
 from pebble.client.estop import send
 from pebble.contract import CAPABILITIES, DRIVE, DRIVING, ONLINE, codec
 from pebble.contract.identity import Identity, parse_topic
@@ -28,7 +29,6 @@ from pebble.transports import Message
 from pebble.transports.clock import since_boot as clock
 from pebble.web import messages as m
 from pebble.web import robot_commands
-from pebble.web.broker import Broker
 from pebble.web.driving import Command, Driving
 from pebble.web.known_robots import KnownRobots
 from pebble.web.media import MediaHub

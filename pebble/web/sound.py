@@ -12,13 +12,13 @@ from typing import Final
 import msgspec
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from pebble.client.broker import Broker
 from pebble.contract import AUDIO, AUDIO_STREAM
 from pebble.contract.identity import Direction
 from pebble.contract.packets import Codec, Sound
 from pebble.errors import PayloadError
 from pebble.fleet.roles import Session, rights
 from pebble.transports import QoS
-from pebble.web.broker import Broker
 from pebble.web.media_source import offered, refusal
 from pebble.web.media_stream import MediaStream, Streams
 from pebble.web.messages import SoundView, TalkAnswer

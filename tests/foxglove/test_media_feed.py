@@ -9,6 +9,7 @@ from typing import cast
 import numpy as np
 import pytest
 
+from pebble.client.broker import Broker
 from pebble.contract.packets import PBAT
 from pebble.foxglove.media_feed import MAX_PAYLOAD, MAX_WAITING, MAX_WAITING_BYTES, MediaFeed
 from pebble.foxglove.server import MAX_BYTES, ChannelSpec, Server
@@ -16,7 +17,6 @@ from pebble.media.scene import Scene
 from pebble.media.video import make_encoder
 from pebble.recordings.exports.foxglove_messages import Schemas
 from pebble.transports.memory import MemoryHub
-from pebble.web.broker import Broker
 from tests.web.picture_robot import REF, VIDEO, FakeBroker
 from tests.web.sound_robot import AUDIO
 

@@ -14,11 +14,11 @@ from typing import Any, cast
 import numpy as np
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from pebble.client.broker import Broker
 from pebble.media.scene import Scene
 from pebble.media.video import make_encoder
 from pebble.transports import Message, QoS, Transport
 from pebble.transports.memory import MemoryHub, MemoryTransport
-from pebble.web.broker import Broker
 from pebble.web.media import MediaHub
 from pebble.web.robots import Robots
 

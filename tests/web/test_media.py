@@ -13,13 +13,13 @@ import cv2
 import numpy as np
 import pytest
 
+from pebble.client.media_request.picture_header import follows, read_header
+from pebble.client.media_request.queue import NO_FRAME
 from pebble.media.decode import VideoDecoder, encoding_of
 from pebble.media.scene import read_counter
 from pebble.media.video import make_encoder
 from pebble.transports import QoS
 from pebble.web import media_stream, rescue
-from pebble.web.media_queue import NO_FRAME
-from pebble.web.picture_header import follows, read_header
 from tests.web.picture_robot import (
     CAMERA,
     CAPABILITIES,
