@@ -31,12 +31,12 @@ from pebble.web import messages as m
 from pebble.web import robot_commands
 from pebble.web.driving import Command, Driving
 from pebble.web.known_robots import KnownRobots
-from pebble.web.media import MediaHub
+from pebble.web.media.pictures import MediaHub
+from pebble.web.media.robot_streams import OwnHosts, origin
+from pebble.web.media.sound import SoundHub
 from pebble.web.open_components import OpenComponents
-from pebble.web.robot_streams import OwnHosts, origin
 from pebble.web.robots import FLEET, SYNONYMS, Component, Robots, section_of
 from pebble.web.settings import WebSettings
-from pebble.web.sound import SoundHub
 from pebble.web.stops import Stops
 
 log = logging.getLogger(__name__)

@@ -20,8 +20,8 @@ from pebble.media.sound import make_sound_encoder
 from pebble.media.speech import Speech
 from pebble.transports import Message, QoS, Transport
 from pebble.transports.memory import MemoryHub, MemoryTransport
+from pebble.web.media.sound import SoundHub
 from pebble.web.robots import Robots
-from pebble.web.sound import SoundHub
 from tests.web.picture_robot import FakeBroker, until
 
 REF = "pebble/robots/goob"

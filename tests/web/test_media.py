@@ -19,7 +19,8 @@ from pebble.media.decode import VideoDecoder, encoding_of
 from pebble.media.scene import read_counter
 from pebble.media.video import make_encoder
 from pebble.transports import QoS
-from pebble.web import media_stream, rescue
+from pebble.web.media import rescue
+from pebble.web.media import stream as media_stream
 from tests.web.picture_robot import (
     CAMERA,
     CAPABILITIES,

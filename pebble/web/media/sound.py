@@ -19,12 +19,12 @@ from pebble.contract.packets import Codec, Sound
 from pebble.errors import PayloadError
 from pebble.fleet.roles import Session, rights
 from pebble.transports import QoS
+from pebble.web.media.stream import MediaStream, Streams
+from pebble.web.media.talk import PIECE_BYTES, SILENT_S, Talk, Voice
 from pebble.web.media_source import offered, refusal
-from pebble.web.media_stream import MediaStream, Streams
 from pebble.web.messages import SoundView, TalkAnswer
 from pebble.web.pace import Pace
 from pebble.web.robots import Robots, own_topic
-from pebble.web.talk import PIECE_BYTES, SILENT_S, Talk, Voice
 
 SOUND_METRIC: Final = "web/sound"
 ENCODINGS: Final = ("opus", "pcm")  # the best first
