@@ -10,11 +10,11 @@ from collections.abc import Callable
 from typing import Any, Final, NamedTuple, cast
 
 from pebble.client.broker import Broker
+from pebble.client.robot_topics import FLAGS, names
 from pebble.client.viewer import Medium, Viewer
 from pebble.contract import AUDIO, AUDIO_CONTROL, CAMERA, CAPABILITIES, INCOMING, VIDEO_CONTROL, Channel
 from pebble.errors import PebbleError, TransportError
 from pebble.transports import Handler, QoS, Subscription, Transport
-from pebble.web.robots import FLAGS, names
 
 log = logging.getLogger(__name__)
 

@@ -11,6 +11,7 @@ from typing import Any
 from msgspec.structs import replace
 
 from pebble.client.broker import Broker
+from pebble.client.robot_topics import FLAGS, WATCHED, names, section_of
 from pebble.contract import (
     AUTONOMY_FILES,
     AUTONOMY_STATUS,
@@ -33,7 +34,7 @@ from pebble.errors import PayloadError, PebbleError
 from pebble.transports import Message, Subscription
 from pebble.web.log_lines import LogLines
 from pebble.web.messages import FlagsView
-from pebble.web.robots import FLAGS, WATCHED, Robots, names, section_of
+from pebble.web.robots import Robots
 
 log = logging.getLogger(__name__)
 

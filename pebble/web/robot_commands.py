@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 import msgspec
 
 from pebble import contract as c
+from pebble.client.robot_topics import FLAGS, section_of
 from pebble.contract import Channel, codec
 from pebble.contract import payloads as p
 from pebble.transports import Message, QoS
 from pebble.web import messages as m
-from pebble.web.robots import FLAGS, section_of
 
 #: The topic of a channel of one component: its section and key of the capabilities, and the channel's own.
 TopicOf = Callable[[str, str, str, Channel], str]

@@ -16,34 +16,25 @@ import msgspec
 
 from pebble.client.discovery import Liveness
 from pebble.client.rank import Rank, RankedTable
+from pebble.client.robot_topics import FLEET, SYNONYMS, names, section_of
 from pebble.contract import (
-    AUTONOMY_STATUS,
     CAPABILITIES,
-    CHANNELS,
-    CHARGING_LEVEL,
-    CHARGING_STATUS,
     ESTOP_STATE,
     LOGS,
     MCU_DESCRIBE,
-    MEDIA_STATUS,
-    MQTT_AUDIO,
-    MQTT_VIDEO,
     ONLINE,
-    REMOTE_MIRROR,
     SOUNDBOARD_FILES,
     STATUS,
     VIDEO_OVERLAYS,
     Channel,
-    Kind,
     channel_of,
     codec,
     is_reserved,
 )
 from pebble.contract.identity import LEVEL, Direction, parse_topic
-from pebble.errors import PayloadError, TransportError
+from pebble.errors import PayloadError
 from pebble.runtime.robot_estop import RobotEstop
 from pebble.transports import Message
-from pebble.transports.topics import check_topic
 from pebble.web import messages as m
 from pebble.web.log_lines import LogLines
 from pebble.web.recent import Recent
@@ -60,23 +51,6 @@ _SILENT_S = 1.5  # a component is not called silent before
 _REFRESH_S = 1.0  # values that change with every heartbeat are sent this often
 _LONGEST_ALIAS = 200  # characters
 _STAMPS = 5  # heartbeats by which a clock of whole seconds is recognised
-
-#: What the page shows of every component, and what only of the one that is open.
-FLEET = (ONLINE, CAPABILITIES, STATUS, ESTOP_STATE, CHARGING_STATUS, CHARGING_LEVEL, AUTONOMY_STATUS, MEDIA_STATUS)
-SYNONYMS = tuple(channel for channel in CHANNELS if channel.synonym_of is not None)
-WATCHED = tuple(
-    channel
-    for channel in CHANNELS
-    if channel.direction == Direction.OUTGOING
-    and channel.payload is not bytes
-    and channel.remote
-    and channel not in FLEET
-    and channel not in SYNONYMS
-    and channel.kind is not Kind.EVENT
-)
-#: Flags, by the section of the capabilities whose ``flag_topic`` may name another topic for it.
-FLAGS = {"": REMOTE_MIRROR, "audio": MQTT_AUDIO, "video": MQTT_VIDEO}
-
 
 _is_level = re.compile(LEVEL).search
 
@@ -429,31 +403,6 @@ class Robots:
             if everybody or drawn or interest.watched == ref:
                 interest.dirty.add((ref, metric))
                 interest.notify()
-
-
-def section_of(capabilities: dict[str, Any], name: str) -> dict[str, Any]:
-    """A section of capabilities, or one of a section: ``system.reboot``. Empty if there is none."""
-    found: Any = capabilities
-    for level in name.split("."):
-        found = found.get(level) if isinstance(found, dict) else None
-    return found if isinstance(found, dict) else {}
-
-
-def own_topic(ref: str, topic: object, direction: str) -> bool:
-    """Whether this is a topic of ``ref`` in that direction. Capabilities may name others; they are not used."""
-    if not isinstance(topic, str) or not topic.startswith(f"{ref}/{direction}/") or parse_topic(topic) is None:
-        return False
-    try:
-        return check_topic(topic) == topic
-    except TransportError:
-        return False
-
-
-def names(ref: str, topic: object, channel: Channel) -> bool:
-    """Whether capabilities may name this topic for the channel: the component's own, and no other channel's."""
-    if not own_topic(ref, topic, channel.direction):
-        return False
-    return channel_of(str(topic)[len(ref) + 1 :]) in (None, channel)
 
 
 def _channel(metric: str) -> Channel | None:

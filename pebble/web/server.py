@@ -15,6 +15,7 @@ import msgspec
 
 from pebble.client.broker import Broker
 from pebble.client.estop import send
+from pebble.client.robot_topics import FLEET, SYNONYMS, section_of
 from pebble.contract import CAPABILITIES, DRIVE, DRIVING, ONLINE, codec
 from pebble.contract.identity import Identity, parse_topic
 from pebble.contract.payloads import Driver
@@ -35,7 +36,7 @@ from pebble.web.media.pictures import MediaHub
 from pebble.web.media.robot_streams import OwnHosts, origin
 from pebble.web.media.sound import SoundHub
 from pebble.web.open_components import OpenComponents
-from pebble.web.robots import FLEET, SYNONYMS, Component, Robots, section_of
+from pebble.web.robots import Component, Robots
 from pebble.web.settings import WebSettings
 from pebble.web.stops import Stops
 

@@ -13,6 +13,7 @@ import msgspec
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from pebble.client.broker import Broker
+from pebble.client.robot_topics import own_topic
 from pebble.contract import AUDIO, AUDIO_STREAM
 from pebble.contract.identity import Direction
 from pebble.contract.packets import Codec, Sound
@@ -24,7 +25,7 @@ from pebble.web.media.talk import PIECE_BYTES, SILENT_S, Talk, Voice
 from pebble.web.media_source import offered, refusal
 from pebble.web.messages import SoundView, TalkAnswer
 from pebble.web.pace import Pace
-from pebble.web.robots import Robots, own_topic
+from pebble.web.robots import Robots
 
 SOUND_METRIC: Final = "web/sound"
 ENCODINGS: Final = ("opus", "pcm")  # the best first
