@@ -12,6 +12,7 @@ from typing import Any, Final, NamedTuple
 
 from pebble.client.broker import Broker
 from pebble.client.media_request.picture_header import PictureHeader, follows, read_header
+from pebble.client.media_request.source import MediaSource, offered, refusal
 from pebble.client.viewer import Medium
 from pebble.contract import AUDIO, CAMERA
 from pebble.contract.packets import PBAT
@@ -29,7 +30,6 @@ from pebble.recordings.exports.foxglove_messages import (
     stamped,
     time_of,
 )
-from pebble.web.media_source import MediaSource, offered, refusal
 
 log = logging.getLogger(__name__)
 

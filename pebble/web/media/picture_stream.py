@@ -12,10 +12,10 @@ from pebble.client.broker import Broker
 from pebble.client.media_request.encoding_choice import BEST_FIRST, EncodingChoice
 from pebble.client.media_request.picture_header import PictureHeader, follows, read_header
 from pebble.client.media_request.queue import NO_FRAME, Frame, ViewerQueue, assess
+from pebble.client.media_request.source import offered, refusal
 from pebble.web.media import rescue
 from pebble.web.media.rescue import FULL, SMALL, Form, RescuedPicture, RescueStream
 from pebble.web.media.stream import MediaStream
-from pebble.web.media_source import offered, refusal
 from pebble.web.messages import PictureView
 from pebble.web.robots import Robots
 

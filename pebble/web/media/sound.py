@@ -13,6 +13,7 @@ import msgspec
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from pebble.client.broker import Broker
+from pebble.client.media_request.source import offered, refusal
 from pebble.client.robot_topics import own_topic
 from pebble.contract import AUDIO, AUDIO_STREAM
 from pebble.contract.identity import Direction
@@ -22,7 +23,6 @@ from pebble.fleet.roles import Session, rights
 from pebble.transports import QoS
 from pebble.web.media.stream import MediaStream, Streams
 from pebble.web.media.talk import PIECE_BYTES, SILENT_S, Talk, Voice
-from pebble.web.media_source import offered, refusal
 from pebble.web.messages import SoundView, TalkAnswer
 from pebble.web.pace import Pace
 from pebble.web.robots import Robots

@@ -13,10 +13,10 @@ from typing import Any, Final, Generic, TypeVar
 from starlette.websockets import WebSocket
 
 from pebble.client.broker import Broker
+from pebble.client.media_request.source import MediaSource
 from pebble.client.viewer import Medium
 from pebble.errors import PebbleError
 from pebble.media.rate_meter import RateMeter
-from pebble.web.media_source import MediaSource
 from pebble.web.robots import Robots
 
 log = logging.getLogger(__name__)
