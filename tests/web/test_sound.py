@@ -11,10 +11,10 @@ from typing import Any
 
 import pytest
 
+from pebble.client.media_request import request
 from pebble.contract.packets import Codec, Sound
 from pebble.fleet.roles import Role
 from pebble.transports import QoS
-from pebble.web.media import stream as media_stream
 from pebble.web.media.sound import MAX_PACKETS, WINDOW, SoundQueue, best
 from pebble.web.media.talk import LATE_S, PIECE_BYTES, PIECES_PER_S, SILENT_S, Talk, Voice
 from tests.web.sound_robot import (
@@ -43,7 +43,7 @@ def on_loop(test: Callable[..., Coroutine[Any, Any, None]]) -> Callable[..., Non
 
 @pytest.fixture(autouse=True)
 def _short_linger(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(media_stream, "LINGER_S", 0.4)
+    monkeypatch.setattr(request, "LINGER_S", 0.4)
 
 
 @pytest.fixture
