@@ -7,6 +7,7 @@ import logging
 import time
 from typing import Any, Final
 
+from pebble.client.broker import Broker
 from pebble.client.robot_topics import FLEET, SYNONYMS, WATCHED
 from pebble.client.viewer import Medium
 from pebble.contract import CAPABILITIES, Channel, codec
@@ -27,7 +28,6 @@ from pebble.recordings.exports.foxglove_messages import (
 from pebble.runtime.by_name import ByName
 from pebble.transports import Message
 from pebble.transports.topics import matches
-from pebble.web.broker import Broker
 
 log = logging.getLogger(__name__)
 

@@ -8,12 +8,12 @@ import signal
 from collections.abc import Callable, Iterator
 from typing import Final, NamedTuple
 
+from pebble.client.broker import Broker
 from pebble.errors import TransportError
 from pebble.foxglove.robots import Robots, filters
 from pebble.foxglove.server import Server
 from pebble.recordings.exports.foxglove_messages import Schemas
 from pebble.transports import MqttSettings
-from pebble.web.broker import Broker
 
 _SIGNALS: Final = ("SIGINT", "SIGTERM", "SIGHUP")  # the last one is unknown to Windows
 _WITHDRAW_S, _CLOSE_S = 1.0, 0.5

@@ -22,11 +22,13 @@ from starlette.websockets import WebSocket
 from pebble.fleet.audit import Audit
 from pebble.fleet.people import People
 from pebble.fleet.roles import Session
-from pebble.web import login, recordings, robot_streams
+from pebble.web.access import login
+from pebble.web.access.guard import CONTENT_SECURITY_POLICY, Guard
 from pebble.web.control import CHECK_S, Control
-from pebble.web.guard import CONTENT_SECURITY_POLICY, Guard
+from pebble.web.media import robot_streams
 from pebble.web.messages import EstopOp
-from pebble.web.recordings import Recordings
+from pebble.web.recordings import routes as recordings
+from pebble.web.recordings.routes import Recordings
 from pebble.web.server import Server
 from pebble.web.settings import WebSettings
 from pebble.web.static_files import FOREVER, NO_STORE, StaticFiles, root_of

@@ -20,8 +20,8 @@ from pebble.fleet.roles import Session, rights
 from pebble.transports.clock import since_boot as clock
 from pebble.web import messages as m
 from pebble.web import robot_commands
+from pebble.web.access.login import named, printable
 from pebble.web.driving import Tab
-from pebble.web.login import named, printable
 from pebble.web.pace import Pace
 from pebble.web.page_clock import PING_S, ClockJumpError
 from pebble.web.robots import Interest

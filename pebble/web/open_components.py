@@ -10,6 +10,7 @@ from typing import Any
 
 from msgspec.structs import replace
 
+from pebble.client.broker import Broker
 from pebble.client.robot_topics import FLAGS, WATCHED, names, section_of
 from pebble.contract import (
     AUTONOMY_FILES,
@@ -31,7 +32,6 @@ from pebble.contract.identity import Direction
 from pebble.contract.payloads import AnyObject
 from pebble.errors import PayloadError, PebbleError
 from pebble.transports import Message, Subscription
-from pebble.web.broker import Broker
 from pebble.web.log_lines import LogLines
 from pebble.web.messages import FlagsView
 from pebble.web.robots import Robots

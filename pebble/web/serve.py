@@ -15,8 +15,8 @@ from pebble.fleet import certificates
 from pebble.transports.renewed import Renewed
 from pebble.transports.socket_holders import why_not
 from pebble.transports.tls import make_server_context
+from pebble.web.access.connections import ACCEPT, HttpProtocol, Listener, Loop, WebSocketProtocol
 from pebble.web.app import create_app
-from pebble.web.connections import ACCEPT, HttpProtocol, Listener, Loop, WebSocketProtocol
 from pebble.web.settings import WebSettings
 
 _LARGEST_MESSAGE = 64 * 1024

@@ -13,6 +13,7 @@ from typing import Any
 
 import msgspec
 
+from pebble.client.broker import Broker
 from pebble.client.drive_reasons import SCRIPT_ORDER, SERVER_ORDER, Code, Situation, first_reason
 from pebble.client.estop import send
 from pebble.client.robot_topics import FLEET, SYNONYMS
@@ -31,15 +32,14 @@ from pebble.transports import Message
 from pebble.transports.clock import since_boot as clock
 from pebble.web import messages as m
 from pebble.web import robot_commands
-from pebble.web.broker import Broker
 from pebble.web.driving import Command, Driving
 from pebble.web.known_robots import KnownRobots
-from pebble.web.media import MediaHub
+from pebble.web.media.pictures import MediaHub
+from pebble.web.media.robot_streams import OwnHosts, origin
+from pebble.web.media.sound import SoundHub
 from pebble.web.open_components import OpenComponents
-from pebble.web.robot_streams import OwnHosts, origin
 from pebble.web.robots import Robots
 from pebble.web.settings import WebSettings
-from pebble.web.sound import SoundHub
 from pebble.web.stops import Stops
 
 log = logging.getLogger(__name__)

@@ -9,14 +9,15 @@ from typing import cast
 import numpy as np
 import pytest
 
+from pebble.client.broker import Broker
+from pebble.client.media_request.picture_header import MAX_PAYLOAD
 from pebble.contract.packets import PBAT
-from pebble.foxglove.media_feed import MAX_PAYLOAD, MAX_WAITING, MAX_WAITING_BYTES, MediaFeed
+from pebble.foxglove.media_feed import MAX_WAITING, MAX_WAITING_BYTES, MediaFeed
 from pebble.foxglove.server import MAX_BYTES, ChannelSpec, Server
 from pebble.media.scene import Scene
 from pebble.media.video import make_encoder
 from pebble.recordings.exports.foxglove_messages import Schemas
 from pebble.transports.memory import MemoryHub
-from pebble.web.broker import Broker
 from tests.web.picture_robot import REF, VIDEO, FakeBroker
 from tests.web.sound_robot import AUDIO
 
@@ -48,19 +49,19 @@ def feed(medium: str, payloads: list[bytes]) -> MediaFeed:
 def test_the_oldest_is_dropped_for_the_newest() -> None:
     found = feed("audio", [PBAT + bytes([number % 256]) for number in range(MAX_WAITING + 7)])
     assert found.dropped == 7
-    assert found._waiting[0].payload == PBAT + b"\x07"
+    assert found.waiting[0].payload == PBAT + b"\x07"
     large = bytes(PBAT) + bytes(MAX_PAYLOAD - 10)
     found = feed("audio", [large] * 5)
     assert found.dropped == 3
-    assert sum(len(one.payload) for one in found._waiting) <= MAX_WAITING_BYTES
+    assert sum(len(one.payload) for one in found.waiting) <= MAX_WAITING_BYTES
 
 
 def test_pictures_that_build_on_a_dropped_one_go_with_it() -> None:
     (first, *differences) = pictures(MAX_WAITING + 5, keyframe_interval=1000)
     found = feed("video", [first, *differences])
     assert found.dropped == MAX_WAITING + 1
-    assert [one.complete for one in found._waiting] == [False] * 4
-    assert found._wants_keyframe
+    assert [one.complete for one in found.waiting] == [False] * 4
+    assert found.wants_keyframe
 
 
 def test_without_pyav_nothing_is_requested_that_needs_it(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -68,9 +69,9 @@ def test_without_pyav_nothing_is_requested_that_needs_it(monkeypatch: pytest.Mon
     video, audio = feed("video", []), feed("audio", [])
     video.update(everything)
     audio.update(everything)
-    assert (video._encoding(), audio._encoding()) == (None, None)
+    assert (video.encoding(), audio.encoding()) == (None, None)
     monkeypatch.setitem(sys.modules, "av", None)
-    assert (video._encoding(), audio._encoding()) == ("pbvz", "pcm")
+    assert (video.encoding(), audio.encoding()) == ("pbvz", "pcm")
 
 
 def test_what_is_nothing_of_this_medium_or_too_large_is_refused() -> None:
@@ -81,7 +82,7 @@ def test_what_is_nothing_of_this_medium_or_too_large_is_refused() -> None:
 def test_after_a_missing_picture_none_is_passed_on_until_the_next_key_frame() -> None:
     sent = pictures(40)
     found = feed("video", [*sent[:3], *sent[4:]])
-    complete = [one.complete for one in found._waiting]
+    complete = [one.complete for one in found.waiting]
     assert complete[:4] == [True, True, True, False]
     assert complete[4:] == sorted(complete[4:])  # from the key frame on all of them
     assert complete[-1]

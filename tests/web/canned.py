@@ -34,9 +34,9 @@ from pebble.contract.packets import Codec, Picture, PictureKind, Sound
 from pebble.fleet.audit import Audit
 from pebble.media.speech import Speech
 from pebble.transports import MqttSettings
-from pebble.web import recordings
-from pebble.web.guard import CONTENT_SECURITY_POLICY
+from pebble.web.access.guard import CONTENT_SECURITY_POLICY
 from pebble.web.messages import FromPage
+from pebble.web.recordings import routes as recordings
 from pebble.web.settings import WebSettings
 from pebble.web.static_files import StaticFiles
 from tests.support import ROOT, free_port, until

@@ -14,12 +14,12 @@ from typing import Any, cast
 import numpy as np
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from pebble.client.broker import Broker
 from pebble.media.scene import Scene
 from pebble.media.video import make_encoder
 from pebble.transports import Message, QoS, Transport
 from pebble.transports.memory import MemoryHub, MemoryTransport
-from pebble.web.broker import Broker
-from pebble.web.media import MediaHub
+from pebble.web.media.pictures import MediaHub
 from pebble.web.robots import Robots
 
 REF = "pebble/robots/goob"
@@ -114,7 +114,7 @@ class PictureRobot:
 
 
 class FakeBroker:
-    """The server's connection: as pebble.web.broker.Broker, on the network inside the process."""
+    """The server's connection: as pebble.client.broker.Broker, on the network inside the process."""
 
     problem = ""
 

@@ -17,7 +17,7 @@ from websockets.sync.client import ClientConnection, connect
 from pebble.contract import CAPABILITIES, ESTOP_STATE, ONLINE, codec
 from pebble.contract.payloads import EstopState, Heartbeat
 from pebble.transports import Message, MqttSettings, QoS, create
-from pebble.web.connections import Loop
+from pebble.web.access.connections import Loop
 from pebble.web.serve import _config, _listen
 from pebble.web.settings import WebSettings
 from tests.support import until

@@ -13,15 +13,15 @@ from typing import Any, cast
 
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from pebble.client.broker import Broker
 from pebble.contract.packets import Sound
 from pebble.fleet.roles import Role, Session
 from pebble.media.sound import make_sound_encoder
 from pebble.media.speech import Speech
 from pebble.transports import Message, QoS, Transport
 from pebble.transports.memory import MemoryHub, MemoryTransport
-from pebble.web.broker import Broker
+from pebble.web.media.sound import SoundHub
 from pebble.web.robots import Robots
-from pebble.web.sound import SoundHub
 from tests.web.picture_robot import FakeBroker, until
 
 REF = "pebble/robots/goob"

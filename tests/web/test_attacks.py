@@ -20,8 +20,9 @@ from starlette.routing import Route, WebSocketRoute
 from websockets.exceptions import ConnectionClosed
 
 from pebble.fleet.roles import Role
-from pebble.web import connections, control
+from pebble.web import control
 from pebble.web import messages as m
+from pebble.web.access import connections
 from tests.support import Broker, beside, until
 from tests.web.attacker import PASSWORDS, Everything, Hall
 from tests.web.served import Page, RecordingRobot, Served, now_ms

@@ -15,8 +15,8 @@ import pytest
 import uvicorn
 
 from pebble.fleet import certificates
-from pebble.web import connections
-from pebble.web.connections import HttpProtocol, Listener, Loop, WebSocketProtocol
+from pebble.web.access import connections
+from pebble.web.access.connections import HttpProtocol, Listener, Loop, WebSocketProtocol
 from tests.support import until
 
 LARGE = 8_000_000  # more than sockets buffer

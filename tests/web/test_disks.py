@@ -12,7 +12,7 @@ import pytest
 
 from pebble.fleet.audit import Audit
 from pebble.runtime.rate_limit import RateLimitedLog
-from pebble.web import login
+from pebble.web.access import login
 from tests.small_disk import SmallDisk
 from tests.support import Broker, needs_root, until
 from tests.web.attacker import PASSWORDS, Hall

@@ -12,8 +12,8 @@ import pytest
 
 from pebble.fleet import certificates
 from pebble.transports import MqttSettings
-from pebble.web import guard as guard_module
-from pebble.web.guard import CONTENT_SECURITY_POLICY, MAX_BODY, Guard
+from pebble.web.access import guard as guard_module
+from pebble.web.access.guard import CONTENT_SECURITY_POLICY, MAX_BODY, Guard
 from pebble.web.settings import WebSettings
 
 HERE = ("127.0.0.1", 8080)

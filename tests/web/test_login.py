@@ -23,8 +23,8 @@ from pebble.fleet.audit import Audit
 from pebble.fleet.people import SESSION_S, People
 from pebble.fleet.roles import Role
 from pebble.transports import MqttSettings
-from pebble.web import login
-from pebble.web.guard import Guard
+from pebble.web.access import login
+from pebble.web.access.guard import Guard
 from pebble.web.settings import WebSettings
 from tests.support import until
 

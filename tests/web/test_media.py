@@ -13,13 +13,14 @@ import cv2
 import numpy as np
 import pytest
 
+from pebble.client.media_request import request
+from pebble.client.media_request.picture_header import follows, read_header
+from pebble.client.media_request.queue import NO_FRAME
 from pebble.media.decode import VideoDecoder, encoding_of
 from pebble.media.scene import read_counter
 from pebble.media.video import make_encoder
 from pebble.transports import QoS
-from pebble.web import media_stream, rescue
-from pebble.web.media_queue import NO_FRAME
-from pebble.web.picture_header import follows, read_header
+from pebble.web.media import rescue
 from tests.web.picture_robot import (
     CAMERA,
     CAPABILITIES,
@@ -48,7 +49,7 @@ def on_loop(test: Callable[..., Coroutine[Any, Any, None]]) -> Callable[..., Non
 
 @pytest.fixture(autouse=True)
 def _short_linger(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(media_stream, "LINGER_S", 0.4)
+    monkeypatch.setattr(request, "LINGER_S", 0.4)
 
 
 def jpeg(number: int = 0) -> bytes:

@@ -14,10 +14,10 @@ import httpx
 import pytest
 from websockets.sync.client import connect
 
+from pebble.client.broker import Broker as BrokerOfPages
 from pebble.errors import TransportError
 from pebble.transports import Message, MqttSettings, QoS, create
 from pebble.web import open_components
-from pebble.web.broker import Broker as BrokerOfPages
 from pebble.web.open_components import OpenComponents
 from pebble.web.robots import Interest, Robots
 from tests.support import Broker, until

@@ -25,8 +25,7 @@ from pebble.fleet.roles import Role
 from pebble.recordings.library import files
 from pebble.recordings.seek import questions
 from pebble.recordings.seek.segment import Flag, unpacked
-from pebble.web import archive_process
-from pebble.web import recordings as routes
+from pebble.web.recordings import archive_process, routes
 from tests.recordings.messages import START_NS
 from tests.recordings.others import DAMAGED
 from tests.recordings.playing import GOOB, js, ms

@@ -13,8 +13,8 @@ import msgspec
 import pytest
 
 from pebble.transports import MqttSettings
-from pebble.web.guard import CONTENT_SECURITY_POLICY
-from pebble.web.robot_streams import MAX_ORIGINS, OwnHosts, origin
+from pebble.web.access.guard import CONTENT_SECURITY_POLICY
+from pebble.web.media.robot_streams import MAX_ORIGINS, OwnHosts, origin
 from pebble.web.settings import WebSettings
 from tests.support import Broker, until
 from tests.web.in_node import evaluate

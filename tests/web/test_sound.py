@@ -11,12 +11,12 @@ from typing import Any
 
 import pytest
 
+from pebble.client.media_request import request
 from pebble.contract.packets import Codec, Sound
 from pebble.fleet.roles import Role
 from pebble.transports import QoS
-from pebble.web import media_stream
-from pebble.web.sound import MAX_PACKETS, WINDOW, SoundQueue, best
-from pebble.web.talk import LATE_S, PIECE_BYTES, PIECES_PER_S, SILENT_S, Talk, Voice
+from pebble.web.media.sound import MAX_PACKETS, WINDOW, SoundQueue, best
+from pebble.web.media.talk import LATE_S, PIECE_BYTES, PIECES_PER_S, SILENT_S, Talk, Voice
 from tests.web.sound_robot import (
     AUDIO,
     CAPABILITIES,
@@ -43,14 +43,14 @@ def on_loop(test: Callable[..., Coroutine[Any, Any, None]]) -> Callable[..., Non
 
 @pytest.fixture(autouse=True)
 def _short_linger(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(media_stream, "LINGER_S", 0.4)
+    monkeypatch.setattr(request, "LINGER_S", 0.4)
 
 
 @pytest.fixture
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing that this machine delays is too late; that has tests of its own."""
-    monkeypatch.setattr("pebble.web.talk.LATE_S", 60.0)
-    monkeypatch.setattr("pebble.web.talk.SILENT_S", 60.0)
+    monkeypatch.setattr("pebble.web.media.talk.LATE_S", 60.0)
+    monkeypatch.setattr("pebble.web.media.talk.SILENT_S", 60.0)
 
 
 # -- listening
@@ -316,7 +316,7 @@ async def test_a_talk_ends_with_its_socket_and_after_a_second_without_sound(monk
         await bob.speak(1, 3)
         await until(lambda: bob.talks[-1:] == [{"talk": 1, "on": False, "why": "No sound came in time for 1 s"}])
         await until(lambda: server.view.talker == "")
-        monkeypatch.setattr("pebble.web.talk.SILENT_S", 60.0)
+        monkeypatch.setattr("pebble.web.media.talk.SILENT_S", 60.0)
         bob.send_piece(1, 3, bytes(PIECE_BYTES))
         await bob.speak(2, 3)
         await until(lambda: server.view.talker == "bob")

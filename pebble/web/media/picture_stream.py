@@ -8,20 +8,19 @@ import time
 from collections.abc import Callable
 from typing import Final
 
-from pebble.web import rescue
-from pebble.web.broker import Broker
-from pebble.web.encoding_choice import BEST_FIRST, EncodingChoice
-from pebble.web.media_queue import NO_FRAME, Frame, ViewerQueue, assess
-from pebble.web.media_source import offered, refusal
-from pebble.web.media_stream import MediaStream
+from pebble.client.broker import Broker
+from pebble.client.media_request.encoding_choice import BEST_FIRST, EncodingChoice
+from pebble.client.media_request.picture_header import PictureHeader, PictureSequence
+from pebble.client.media_request.queue import NO_FRAME, Frame, ViewerQueue, assess
+from pebble.client.media_request.source import offered
+from pebble.web.media import rescue
+from pebble.web.media.rescue import FULL, SMALL, Form, RescuedPicture, RescueStream
+from pebble.web.media.stream import MediaStream
 from pebble.web.messages import PictureView
-from pebble.web.picture_header import PictureHeader, follows, read_header
-from pebble.web.rescue import FULL, SMALL, Form, RescuedPicture, RescueStream
 from pebble.web.robots import Robots
 
 Show = Callable[[str, PictureView], None]
 
-MAX_PAYLOAD: Final = 4 << 20
 _CHANGE_S: Final = 1.0  # a new encoding begins with a key frame within this time: viewers need no help meanwhile
 _MAX_CHAIN: Final = 240  # pictures since a key frame
 _MAX_CHAIN_BYTES: Final = 8 << 20
@@ -45,7 +44,7 @@ class PictureStream(MediaStream[PageViewer, PictureView]):
         self.choice = EncodingChoice()
         self.choice.pinned = pinned
         self._rescue = RescueStream(self._on_rescued)
-        self._last: PictureHeader | None = None  # of the newest picture, unless one is missing before it
+        self._sequence = PictureSequence()
         self._chain: list[bytes] = []  # the newest key frame and all pictures since; empty: it would be too long
         self._chain_bytes = 0
         self._seq = 0
@@ -54,7 +53,7 @@ class PictureStream(MediaStream[PageViewer, PictureView]):
 
     def pin(self, encoding: str) -> None:
         self.choice.pinned = encoding
-        self._wakeup.set()
+        self._request.wake()
 
     def acknowledge(self, viewer: PageViewer, seq: int, what: int) -> None:
         """Take a page's answer: 0 drawn, 1 a key frame is wanted, 2 this encoding cannot be decoded there."""
@@ -63,14 +62,14 @@ class PictureStream(MediaStream[PageViewer, PictureView]):
         if what == 1 and (frame is not None or seq == NO_FRAME):
             viewer.queue.refuse(now)
         elif what == 2 and (frame is not None or seq == NO_FRAME):
-            viewer.queue.cannot_decode(self._encoding if frame is None else frame.encoding)
+            viewer.queue.cannot_decode(self._arrivals.encoding if frame is None else frame.encoding)
         viewer.wakeup.set()
         if what:
-            self._wakeup.set()
+            self._request.wake()
 
     def chain(self) -> list[bytes]:
         """The newest key frame and the differences since, if pictures are flowing."""
-        return list(self._chain) if self._flowing(time.monotonic()) else []
+        return list(self._chain) if self._arrivals.flowing(time.monotonic()) else []
 
     @property
     def seq(self) -> int:
@@ -81,14 +80,11 @@ class PictureStream(MediaStream[PageViewer, PictureView]):
 
     def receive(self, payload: bytes) -> None:
         now = time.monotonic()
-        header = read_header(payload) if len(payload) <= MAX_PAYLOAD else None
+        header, fits = self._sequence.take(payload), self._sequence.complete
         if header is None:
             self.refused += 1
-            self._last = None
             return
         self._note(header.encoding, len(payload), now)
-        fits = follows(self._last, header)
-        self._last = header if fits else None
         self._extend_chain(payload, header, fits=fits)
         self._rescue.feed(payload, keyframe=header.keyframe)
         if fits:
@@ -117,13 +113,13 @@ class PictureStream(MediaStream[PageViewer, PictureView]):
                 viewer.wakeup.set()
             urgent = urgent or (queue.waiting and not queue.rescued)
         if urgent and header.encoding == "h264":
-            self._wakeup.set()
+            self._request.wake()
 
     def _skip(self, now: float) -> None:
         """A picture is missing before this one: it and what follows wait for a key frame."""
         for viewer in self.viewers:
             viewer.queue.lost(now)
-        self._wakeup.set()
+        self._request.wake()
 
     def _on_rescued(self, form: Form, picture: RescuedPicture) -> None:
         seq = self._next_seq()
@@ -140,16 +136,14 @@ class PictureStream(MediaStream[PageViewer, PictureView]):
 
     # -- requests, and key frames
 
-    async def _request(self) -> None:
+    async def _follow(self) -> None:
         capabilities = self._robots.capabilities(self.ref)
-        self._why = refusal(self.ref, capabilities, "video")
-        if self._why:
-            await self._source.withdraw()
-            return
-        encoding = self.choice.update(offered(capabilities, "video"), self._can(), time.monotonic())
-        if self.viewers:
-            await self._source.follow(capabilities, encoding)
-        await self._help_viewers()
+        await self._request.follow(capabilities, lambda: self._choose(offered(capabilities, "video")))
+        if not self._request.problem:
+            await self._help_viewers()
+
+    def _choose(self, encodings: tuple[str, ...]) -> str | None:
+        return self.choice.update(encodings, self._can(), time.monotonic())
 
     def _can(self) -> list[frozenset[str]]:
         """What each viewer decodes. For one that decodes nothing, what this server converts counts."""
@@ -159,12 +153,12 @@ class PictureStream(MediaStream[PageViewer, PictureView]):
     async def _help_viewers(self) -> None:
         """Request a key frame, or begin the rescue stream, if viewers need it."""
         now = time.monotonic()
-        if not self._encoding:
+        if not self._arrivals.encoding:
             return
-        changing = now - self._source.requested_at < _CHANGE_S
-        can_rescue = not changing and not rescue.unavailable(self._encoding)
+        changing = now - self._request.requested_at < _CHANGE_S
+        can_rescue = not changing and not rescue.unavailable(self._arrivals.encoding)
         queues = [viewer.queue for viewer in self.viewers]
-        wanted = assess(queues, self._encoding, now, can_rescue=can_rescue)
+        wanted = assess(queues, self._arrivals.encoding, now, can_rescue=can_rescue)
         small = {queue.small for queue in queues if queue.rescued}
         if can_rescue and small:
             self._rescue.forms = [SMALL if one else FULL for one in small]
@@ -175,7 +169,7 @@ class PictureStream(MediaStream[PageViewer, PictureView]):
         if wanted and not changing:
             for queue in queues:
                 queue.new = False
-            await self._source.request_keyframe(self._encoding)
+            await self._request.request_keyframe(self._arrivals.encoding)
 
     # -- what pages are shown
 
@@ -183,7 +177,7 @@ class PictureStream(MediaStream[PageViewer, PictureView]):
         return PictureView(
             state=state,
             why=why,
-            encoding=self._encoding,
+            encoding=self._arrivals.encoding,
             per_second=rate,
             kbits=kbits,
             viewers=len(self.viewers),
@@ -195,8 +189,8 @@ class PictureStream(MediaStream[PageViewer, PictureView]):
         self._show(self.ref, rest(self.choice.pinned))
 
     def _problem(self) -> str:
-        lacking = sum(not viewer.queue.decodes(self._encoding) for viewer in self.viewers)
-        problem = rescue.unavailable(self._encoding)
+        lacking = sum(not viewer.queue.decodes(self._arrivals.encoding) for viewer in self.viewers)
+        problem = rescue.unavailable(self._arrivals.encoding)
         return f"{lacking} of {len(self.viewers)} browsers cannot show it: {problem}" if problem and lacking else ""
 
 

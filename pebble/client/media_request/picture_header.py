@@ -9,6 +9,7 @@ import msgspec
 from pebble.contract.packets import KEY_FRAME, PBVD, SEQUENCE_LIMIT, Picture, PictureKind
 from pebble.errors import PayloadError
 
+MAX_PAYLOAD: Final = 4 << 20
 _HEADER_BYTES: Final = 19
 _SOI: Final = b"\xff\xd8"
 _LONGEST_STEP_MS: Final = 5000  # as pebble.media.decode: with more time in between, the number fits by chance
@@ -59,6 +60,25 @@ def follows(last: PictureHeader | None, header: PictureHeader) -> bool:
     if last.captured_ms is None or header.captured_ms is None:
         return last.captured_ms == header.captured_ms
     return 0 <= header.captured_ms - last.captured_ms <= _LONGEST_STEP_MS
+
+
+class PictureSequence:
+    """Notices that a picture is missing: those after it are of no use until the next key frame."""
+
+    def __init__(self) -> None:
+        self.complete = False  # none is missing before the newest
+        self._last: PictureHeader | None = None
+
+    def take(self, payload: bytes) -> PictureHeader | None:
+        """The header of the next payload; None if it is no picture, or too large."""
+        header = read_header(payload) if len(payload) <= MAX_PAYLOAD else None
+        self.complete = header is not None and follows(self._last, header)
+        self._last = header if self.complete else None
+        return header
+
+    def interrupt(self) -> None:
+        """Count the next picture as missing what is before it."""
+        self.complete, self._last = False, None
 
 
 def _after(last: PictureHeader) -> int | None:

@@ -12,6 +12,8 @@ from typing import Final
 import msgspec
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from pebble.client.broker import Broker
+from pebble.client.media_request.source import offered, refusal
 from pebble.client.robot_topics import own_topic
 from pebble.contract import AUDIO, AUDIO_STREAM
 from pebble.contract.identity import Direction
@@ -19,13 +21,11 @@ from pebble.contract.packets import Codec, Sound
 from pebble.errors import PayloadError
 from pebble.fleet.roles import Session, rights
 from pebble.transports import QoS
-from pebble.web.broker import Broker
-from pebble.web.media_source import offered, refusal
-from pebble.web.media_stream import MediaStream, Streams
+from pebble.web.media.stream import MediaStream, Streams
+from pebble.web.media.talk import PIECE_BYTES, SILENT_S, Talk, Voice
 from pebble.web.messages import SoundView, TalkAnswer
 from pebble.web.pace import Pace
 from pebble.web.robots import Robots
-from pebble.web.talk import PIECE_BYTES, SILENT_S, Talk, Voice
 
 SOUND_METRIC: Final = "web/sound"
 ENCODINGS: Final = ("opus", "pcm")  # the best first
@@ -148,7 +148,7 @@ class SoundStream(MediaStream[SoundPage, SoundView]):
         self._voice.begin(time.time())
         page.answer(talk, on=True)
         self._note_talk(self.ref, page.session, page.device, page.address)
-        self._wakeup.set()
+        self._request.wake()
 
     def _why_not(self, page: SoundPage) -> str:
         if "drive" not in rights(page.session.role):
@@ -181,20 +181,16 @@ class SoundStream(MediaStream[SoundPage, SoundView]):
         if page is self._talker and self._talk is not None:
             page.over = max(page.over, self._talk.number)
             self._talk = self._talker = None
-            self._wakeup.set()
+            self._request.wake()
 
     # -- requests, and what pages are shown
 
-    async def _request(self) -> None:
+    async def _follow(self) -> None:
         self._release(time.monotonic())
         capabilities = self._robots.capabilities(self.ref)
-        self._why = refusal(self.ref, capabilities, "audio")
-        if why := self._why or self._unheard():
+        if why := refusal(self.ref, capabilities, "audio") or self._unheard():
             self._interrupt(why)
-        if self._why:
-            await self._source.withdraw()
-        elif self.viewers:
-            await self._source.follow(capabilities, best(offered(capabilities, "audio"), self._listening()))
+        await self._request.follow(capabilities, lambda: best(offered(capabilities, "audio"), self._listening()))
 
     def _listening(self) -> list[frozenset[str]]:
         return [viewer.can for viewer in self.viewers if viewer.can]
@@ -203,15 +199,15 @@ class SoundStream(MediaStream[SoundPage, SoundView]):
         return SoundView(
             state=state,
             why=why,
-            encoding=self._encoding,
+            encoding=self._arrivals.encoding,
             listeners=len(self._listening()),
             talker="" if self._talker is None else self._talker.session.user,
         )
 
     def _problem(self) -> str:
         listening = self._listening()
-        lacking = sum(self._encoding not in can for can in listening)
-        return f"{lacking} of {len(listening)} browsers cannot play {self._encoding}" if lacking else ""
+        lacking = sum(self._arrivals.encoding not in can for can in listening)
+        return f"{lacking} of {len(listening)} browsers cannot play {self._arrivals.encoding}" if lacking else ""
 
     def _end(self) -> None:
         self._show(self.ref, rest())

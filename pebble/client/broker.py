@@ -9,11 +9,11 @@ import time
 from collections.abc import Callable
 from typing import Final
 
+from pebble.client.arrived import Arrived, Handler
 from pebble.client.driver_lease import ANSWER_S
 from pebble.errors import TransportError
 from pebble.runtime.by_name import EACH_S, ByName
 from pebble.transports import Message, MqttSettings, QoS, State, Subscription, Transport, create
-from pebble.web.arrived import Arrived, Handler
 
 log = logging.getLogger(__name__)
 

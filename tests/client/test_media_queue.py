@@ -6,8 +6,8 @@ import random
 
 import pytest
 
-from pebble.web.encoding_choice import EncodingChoice, best
-from pebble.web.media_queue import (
+from pebble.client.media_request.encoding_choice import EncodingChoice, best
+from pebble.client.media_request.queue import (
     MAX_FRAMES,
     MAX_QUEUED_BYTES,
     NO_FRAME,

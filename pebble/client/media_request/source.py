@@ -9,12 +9,12 @@ import time
 from collections.abc import Callable
 from typing import Any, Final, NamedTuple, cast
 
+from pebble.client.broker import Broker
 from pebble.client.robot_topics import FLAGS, names
 from pebble.client.viewer import Medium, Viewer
 from pebble.contract import AUDIO, AUDIO_CONTROL, CAMERA, CAPABILITIES, INCOMING, VIDEO_CONTROL, Channel
 from pebble.errors import PebbleError, TransportError
 from pebble.transports import Handler, QoS, Subscription, Transport
-from pebble.web.broker import Broker
 
 log = logging.getLogger(__name__)
 

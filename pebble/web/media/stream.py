@@ -12,23 +12,47 @@ from typing import Any, Final, Generic, TypeVar
 
 from starlette.websockets import WebSocket
 
+from pebble.client.broker import Broker
+from pebble.client.media_request.request import TICK_S, MediaRequest
 from pebble.client.viewer import Medium
-from pebble.errors import PebbleError
 from pebble.media.rate_meter import RateMeter
-from pebble.web.broker import Broker
-from pebble.web.media_source import MediaSource
 from pebble.web.robots import Robots
 
 log = logging.getLogger(__name__)
 
-LINGER_S: Final = 5.0  # without viewers, before the request is withdrawn: a page that reloads is back by then
-_TICK_S: Final = 0.5
+_WHAT: Final[dict[Medium, str]] = {"video": "picture", "audio": "sound"}
 _SILENT_S: Final = 2.0
 _SILENT_PERIODS: Final = 3.0
 _GONE: Final = 1001  # code of a closed socket
 
 ViewerT = TypeVar("ViewerT")
 ViewT = TypeVar("ViewT")
+
+
+class Arrivals:
+    """What arrives of one medium: in which encoding, how much, and whether it still does. Pure: times are passed in."""
+
+    def __init__(self) -> None:
+        self.encoding = ""  # of the newest payload
+        self.meter = RateMeter()
+        self._newest_at: float | None = None
+
+    def add(self, encoding: str, size: int, now: float) -> bool:
+        """Note a payload; return whether an encoding begins with it."""
+        begins = self._newest_at is None or encoding != self.encoding
+        self.meter.add(now, size)
+        self._newest_at, self.encoding = now, encoding
+        return begins
+
+    def quiet_s(self, now: float) -> float | None:
+        """How long nothing has come; None: nothing ever has."""
+        return None if self._newest_at is None else now - self._newest_at
+
+    def flowing(self, now: float) -> bool:
+        if self._newest_at is None:
+            return False
+        rate = self.meter.rate(self._newest_at)
+        return now - self._newest_at <= max(_SILENT_S, _SILENT_PERIODS / rate if rate else 0.0)
 
 
 class MediaStream(ABC, Generic[ViewerT, ViewT]):
@@ -45,32 +69,23 @@ class MediaStream(ABC, Generic[ViewerT, ViewT]):
         self.viewers: set[ViewerT] = set()
         self.refused = 0  # payloads that are nothing of this medium, or too large
         self.view = view  # as shown last
-        self._what = "picture" if medium == "video" else "sound"
-        self._broker, self._robots, self._show = broker, robots, show
-        self._source = MediaSource(broker, ref, medium, self.receive)
-        self._meter = RateMeter()
-        self._encoding = ""  # of the newest payload
-        self._arrived_at: float | None = None
         self._shown_at = float("-inf")
-        self._empty_since = time.monotonic()
-        self._why = ""  # it is not requested
-        self._wakeup = asyncio.Event()
-        self._closing = False
+        self._broker, self._robots, self._show = broker, robots, show
+        self._request = MediaRequest(broker, ref, medium, self.receive)
+        self._arrivals = Arrivals()
         self.task = asyncio.create_task(self._run())
 
     def join(self, viewer: ViewerT) -> None:
         self.viewers.add(viewer)
-        self._wakeup.set()
+        self._request.want(True)
 
     def leave(self, viewer: ViewerT) -> None:
         self.viewers.discard(viewer)
-        self._empty_since = time.monotonic()
-        self._wakeup.set()
+        self._request.want(bool(self.viewers))
 
     async def close(self) -> None:
         """Withdraw the request now."""
-        self._closing = True
-        self._wakeup.set()
+        self._request.close()
         await self.task
 
     # -- of each medium
@@ -80,8 +95,8 @@ class MediaStream(ABC, Generic[ViewerT, ViewT]):
         """Give a payload of the robot to all viewers. On the event loop."""
 
     @abstractmethod
-    async def _request(self) -> None:
-        """Request what the viewers need; called a few times a second. Raises PebbleError."""
+    async def _follow(self) -> None:
+        """Request what the viewers need; called a few times a second."""
 
     @abstractmethod
     def _make_view(self, state: str, why: str, rate: float, kbits: float) -> ViewT:
@@ -95,79 +110,46 @@ class MediaStream(ABC, Generic[ViewerT, ViewT]):
 
     async def _run(self) -> None:
         try:
-            while self.viewers or not self._closing:
-                while not self._over():
-                    await self._step()
-                await self._source.withdraw()
-                if self._closing or not self.viewers:  # else one has come meanwhile
-                    return
+            await self._request.run(self._step)
         finally:
-            await self._source.withdraw()
             self._end()
 
-    def _over(self) -> bool:
-        """A request is not withdrawn while there is no broker: the robot would go on sending afterwards."""
-        idle = not self.viewers and time.monotonic() - self._empty_since >= LINGER_S
-        return self._closing or (idle and (self._broker.connected or not self._source.started))
-
     async def _step(self) -> None:
-        started = time.monotonic()
         self._report()
-        try:
-            await self._request()
-        except PebbleError as error:
-            self._why = str(error)
+        await self._follow()
         self._report()
-        await self._pause(started)
-
-    async def _pause(self, started: float) -> None:
-        """A step each half second; one that is needed earlier, a tenth of a second after the last one."""
-        await asyncio.sleep(max(0.0, started + _TICK_S / 5 - time.monotonic()))
-        with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(self._wakeup.wait(), max(0.001, started + _TICK_S - time.monotonic()))
-        self._wakeup.clear()
-
-    # -- what arrives
 
     def _note(self, encoding: str, size: int, now: float) -> None:
-        starts = self._arrived_at is None or encoding != self._encoding
-        self._meter.add(now, size)
-        self._arrived_at, self._encoding = now, encoding
-        if starts:
-            self._wakeup.set()
-
-    def _flowing(self, now: float) -> bool:
-        if self._arrived_at is None:
-            return False
-        rate = self._meter.rate(self._arrived_at)
-        return now - self._arrived_at <= max(_SILENT_S, _SILENT_PERIODS / rate if rate else 0.0)
+        if self._arrivals.add(encoding, size, now):
+            self._request.wake()
 
     # -- what pages are shown
 
     def _report(self) -> None:
         """Show what has changed, at most twice a second."""
         now = time.monotonic()
-        if now - self._shown_at < _TICK_S:
+        if now - self._shown_at < TICK_S:
             return
         state, why = self._state(now)
         flowing = state == "flowing"
-        rate = round(self._meter.rate(now), 1) if flowing else 0.0
-        kbits = float(round(self._meter.bitrate(now) / 1000)) if flowing else 0.0
+        rate = round(self._arrivals.meter.rate(now), 1) if flowing else 0.0
+        kbits = float(round(self._arrivals.meter.bitrate(now) / 1000)) if flowing else 0.0
         view = self._make_view(state, why, rate, kbits)
         if view != self.view:
             self.view, self._shown_at = view, now
             self._show(self.ref, view)
 
     def _state(self, now: float) -> tuple[str, str]:
-        if self._why:
-            return "refused", self._why
-        if self._flowing(now):
+        if self._request.problem:
+            return "refused", self._request.problem
+        if self._arrivals.flowing(now):
             return "flowing", self._problem()
         if not self._broker.connected:
             return "silent", f"the server cannot reach the broker: {self._broker.problem}"
-        if self._arrived_at is None:
+        quiet_s = self._arrivals.quiet_s(now)
+        if quiet_s is None:
             return "starting", ""
-        return "silent", f"no {self._what} for {int(now - self._arrived_at)} s"
+        return "silent", f"no {_WHAT[self._request.medium]} for {int(quiet_s)} s"
 
     def _problem(self) -> str:
         """What is wrong although it flows."""

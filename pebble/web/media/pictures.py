@@ -10,15 +10,15 @@ from weakref import WeakKeyDictionary
 
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from pebble.client.broker import Broker
+from pebble.client.media_request.encoding_choice import BEST_FIRST
 from pebble.client.robot_topics import own_topic
 from pebble.contract import CAMERA
 from pebble.contract.identity import Direction
-from pebble.web.broker import Broker
-from pebble.web.encoding_choice import BEST_FIRST
-from pebble.web.media_stream import Streams
+from pebble.web.media.picture_stream import PageViewer, PictureStream, rest
+from pebble.web.media.rescue import RescuedPicture, newest_jpeg
+from pebble.web.media.stream import Streams
 from pebble.web.messages import PictureView
-from pebble.web.picture_stream import PageViewer, PictureStream, rest
-from pebble.web.rescue import RescuedPicture, newest_jpeg
 from pebble.web.robots import Robots
 
 PICTURE_METRIC: Final = "web/picture"

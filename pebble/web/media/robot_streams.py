@@ -13,7 +13,7 @@ from typing import Any, Final
 
 from pebble.contract import STATUS, codec
 from pebble.errors import PayloadError
-from pebble.web.guard import canonical, host_names, is_loopback
+from pebble.web.access.guard import canonical, host_names, is_loopback
 from pebble.web.robots import Robots
 from pebble.web.settings import WebSettings
 

@@ -24,8 +24,8 @@ from pebble.recordings.seek import questions
 from pebble.recordings.seek.segment import LONGEST_MS
 from pebble.recordings.seek.thumbnails import MOST, WIDEST
 from pebble.transports.clock import since_boot as clock
-from pebble.web import login
-from pebble.web.archive_process import ArchiveProcess, BusyError, Job
+from pebble.web.access import login
+from pebble.web.recordings.archive_process import ArchiveProcess, BusyError, Job
 
 _NONE: Final = "this server has no recordings: start it with --recordings DIR"
 _LONGEST_EXPORT_MS: Final = 3_600_000.0

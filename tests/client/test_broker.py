@@ -8,10 +8,10 @@ import time
 
 import pytest
 
+from pebble.client import arrived
+from pebble.client.arrived import Arrived
+from pebble.client.broker import Broker
 from pebble.transports import Message, MqttSettings
-from pebble.web import arrived
-from pebble.web.arrived import Arrived
-from pebble.web.broker import Broker
 
 
 def message(topic: str, size: int = 1) -> Message:

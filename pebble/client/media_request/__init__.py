@@ -1,0 +1,1 @@
+"""One request for pictures or sound of a robot, however many look and listen."""

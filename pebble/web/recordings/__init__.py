@@ -1,0 +1,1 @@
+"""Recordings for pages: the routes, and the process that reads the archive."""
