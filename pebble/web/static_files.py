@@ -30,6 +30,7 @@ _SCREENS = {"fleet.html": "ui/fleet.js", "robot.html": "ui/robot.js"}  # index.h
 _SHEETS = {"fleet.html": "fleet.css"}  # that the screen needs beside app.css
 _IMPORT = re.compile(rb'^(?:import|export|\}).*?"(\.\.?/[^"]+)";?$', re.MULTILINE)
 _COMMENTS = re.compile(r"^[ \t]*(?:/\*.*?\*/|//[^\n]*)[ \t]*$", re.MULTILINE | re.DOTALL)
+_CASTS = re.compile(r"/\*\* @[^\n]*?\*/ ")  # types within a line
 _LINE_ENDS = re.compile(r"(?<=\S)[ \t]+//[ ][^\"'`\n]*$", re.MULTILINE)  # one with quotes may be the end of a string
 _LOOSE = re.compile(r" (?=\{$)|(^[\w-]+:) ", re.MULTILINE)  # in style sheets
 _INDENTATION = re.compile(r"^\s+", re.MULTILINE)
@@ -113,6 +114,6 @@ def stripped(source: bytes, suffix: str) -> bytes:
     if suffix in ("css", "js", "mjs"):
         text = _COMMENTS.sub("", text)
     if suffix in ("js", "mjs"):
-        text = _LINE_ENDS.sub("", text)
+        text = _LINE_ENDS.sub("", _CASTS.sub("", text))
     text = _INDENTATION.sub("", text)
     return (_LOOSE.sub(r"\1", text) if suffix == "css" else text).encode()
