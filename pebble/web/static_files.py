@@ -26,7 +26,8 @@ _TYPES = {
 _VERSION = b"{version}"  # in the pages, replaced by that of the files
 _ROOT = b"{root}"  # replaced by root_of(): a proxy may show the server below a path that only browsers know
 _MODULES = b"{modules}"  # replaced by links to all that is imported: browsers need not discover them one by one
-_SCREENS = {"fleet.html": "ui/fleet.js", "robot.html": "ui/robot.js"}  # index.html, with what that screen needs
+#: index.html, with what that screen needs
+_SCREENS = {"fleet.html": "ui/fleet/fleet.js", "robot.html": "ui/robot/robot.js"}
 _SHEETS = {"fleet.html": "fleet.css"}  # that the screen needs beside app.css
 _IMPORT = re.compile(rb'^(?:import|export|\}).*?"(\.\.?/[^"]+)";?$', re.MULTILINE)
 _COMMENTS = re.compile(r"^[ \t]*(?:/\*.*?\*/|//[^\n]*)[ \t]*$", re.MULTILINE | re.DOTALL)

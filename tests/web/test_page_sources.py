@@ -96,7 +96,7 @@ def _imported(module: Path) -> set[Path]:
 def test_a_load_of_the_page_is_small(screen: str):
     """With the worker that decodes pictures."""
     served = StaticFiles(files("pebble.web") / "static").files
-    modules = [STATIC / name for name in ("main.js", f"ui/{screen}.js", "media/video-worker.js")]
+    modules = [STATIC / name for name in ("main.js", f"ui/{screen}/{screen}.js", "media/video-worker.js")]
     names = {str(path.relative_to(STATIC.resolve())) for one in modules for path in _imported(one.resolve())}
     names |= {f"{screen}.html", "app.css", "icons.svg", "manifest.webmanifest"}
     names |= {f"{screen}.css"} & set(served)

@@ -1,10 +1,10 @@
 // The header of every screen: which robot, whether it is there, and STOP.
 
 import * as browser from "../core/browser.js";
-import { Boundary, html, styled, useMetric, useModel, useOnline, usePage, usePart, useRefs, useTick, useValue } from "./hooks.js";
-import { Route } from "./models.js";
-import { Icon, Live, StopButton } from "./parts.js";
-import { battery, driverName, kindOf, nameOf, roughly, span, typeOf } from "./words.js";
+import { Boundary, html, styled, useMetric, useModel, useOnline, usePage, usePart, useRefs, useTick, useValue } from "./parts/hooks.js";
+import { Route } from "./parts/models.js";
+import { Icon, Live, StopButton } from "./parts/parts.js";
+import { battery, driverName, kindOf, nameOf, roughly, span, typeOf } from "./parts/words.js";
 
 export function Header({ at, layout, panel, onPanel, drawer, onDrawer }) {
   const { commands, driver, route } = usePage();
@@ -155,7 +155,7 @@ function ConnectionState() {
   return html`<span class=${`chip plain ${socket.roundTripMs > 300 ? "late" : ""}`}>connected${round}</span>`;
 }
 
-const BELL = styled(async () => (await import("./notices.js")).Bell, "notices.css", "panels.css");
+const BELL = styled(async () => (await import("./fleet/notices.js")).Bell, "notices.css", "panels.css");
 
 /** Fetched later. Where there is little room only their number is shown, with the settings. */
 function Notices(props) {
