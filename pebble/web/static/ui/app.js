@@ -56,7 +56,7 @@ export function App() {
         onDrawer=${() => setDrawer(!drawer)}
       />
     <//>
-    <${Boundary} vital what="The banner"><${Banners} at=${ref} layout=${layout} /><//>
+    <${Boundary} vital what="The banner"><${Banners} at=${ref} /><//>
     ${shown &&
     html`<${Boundary} key=${shown} what="This panel"
       ><${Part} part=${PARTS.panels} now shown=${shown} onClose=${() => panels.show("")}

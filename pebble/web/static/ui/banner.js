@@ -1,8 +1,7 @@
 // What must not be overlooked, below the header: stops, lost connections, and what was not done.
 
-import { RouteLink } from "./header.js";
 import { html, useEffect, useMetric, useModel, usePage, useRefs, useState, useTick, useValue } from "./parts/hooks.js";
-import { HoldButton, Icon, Why } from "./parts/parts.js";
+import { HoldButton, Icon, RouteLink, Why } from "./parts/parts.js";
 import { clockTime, nameOf, roughly } from "./parts/words.js";
 
 const NOTICE_MS = 6000;

@@ -10,8 +10,23 @@ import { styled } from "../parts/hooks.js";
  *   part: () => Promise<any>, right?: boolean, wide?: boolean, sends?: boolean}} CardKind
  */
 
+/** Which keys drive. */
+export const KEYS = styled(async () => (await import("../robot/key-hints.js")).KeyHints, "panels.css");
+
+/** How the inputs are scaled, and the extra axis. */
+export const DRIVE = styled(async () => (await import("../robot/drive-settings.js")).DriveSettings, "panels.css");
+
+/** How the picture comes, and where from. */
+export const PICTURE = styled(async () => (await import("../robot/picture-settings.js")).PictureSettings, "picture.css");
+
+/** Where else a picture may come from. */
+export const NO_CAMERA = styled(async () => (await import("../robot/picture-settings.js")).NoCamera, "picture.css");
+
 /** Listening and talking; a desktop has them below the picture. */
 export const VOICE = styled(async () => (await import("../robot/sound.js")).SoundControls, "sound.css");
+
+/** What belongs to a picture besides it. */
+export const EXTRAS = styled(() => import("../robot/picture-extras.js"), "picture.css");
 
 /** @type {CardKind[]} */
 export const CARDS = [

@@ -2,7 +2,7 @@
 
 import { ROOT } from "../../core/browser.js";
 import { doubtOf } from "./doubt.js";
-import { RouteLink, Liveness } from "../header.js";
+import { Liveness } from "../header.js";
 import {
   Boundary,
   html,
@@ -18,7 +18,7 @@ import {
 } from "../parts/hooks.js";
 import { Offers, Route, WATCHES } from "../parts/models.js";
 import { charging, plain, shortTime } from "../parts/more-words.js";
-import { Icon, Live, StopButton } from "../parts/parts.js";
+import { Icon, Live, RouteLink, StopButton } from "../parts/parts.js";
 import { RecordingsLink } from "./recordings-link.js";
 import { battery, clockTime, driverName, inner, isObject, kindOf, nameOf, roughly, typeOf, visible } from "../parts/words.js";
 

@@ -2,11 +2,10 @@
 
 import { Notices, Watcher } from "../../core/notices.js";
 import { DoubtMark } from "./doubt.js";
-import { RouteLink } from "../header.js";
 import { html, useCalm, useEffect, useModel, usePage, useRefs, useState, useValue } from "../parts/hooks.js";
 import { Model, read, write } from "../parts/models.js";
 import { Panel } from "../panels/panel.js";
-import { Icon } from "../parts/parts.js";
+import { Icon, RouteLink } from "../parts/parts.js";
 import { RecordingsLink } from "./recordings-link.js";
 import { shortTime } from "../parts/more-words.js";
 import { battery, inner, isObject, nameOf } from "../parts/words.js";

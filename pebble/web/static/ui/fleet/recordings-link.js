@@ -1,10 +1,9 @@
 // The way to what was recorded, where this server has recordings; fetched after the first picture.
 
 import { ROOT } from "../../core/browser.js";
-import { RouteLink } from "../header.js";
 import { html, useModel, usePage } from "../parts/hooks.js";
 import { Route, WATCHES } from "../parts/models.js";
-import { Icon } from "../parts/parts.js";
+import { Icon, RouteLink } from "../parts/parts.js";
 
 /** @param {string} ref "": all @returns {string} the address of its recordings */
 export const recordingsOf = (ref) => `${ROOT}replay${ref && Route.path(ref, false).slice(`${ROOT}r`.length)}`;

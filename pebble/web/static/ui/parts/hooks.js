@@ -28,19 +28,22 @@ const useRedraw = () => useReducer((n) => n + 1, 0)[1];
 
 /** @typedef {import("../../messages.js").Metrics} Metrics */
 
-/**
- * @template {string} M @param {string} ref @param {M} metric
- * @returns {import("../../core/store.js").Value<M extends keyof Metrics ? Metrics[M] : any> | undefined}
- */
-export function useMetric(ref, metric) {
+/** The store; draw again after its changes. @param {string | null} ref null: any @param {string | null} metric null: any */
+function useStore(ref, metric) {
   const { store } = usePage();
   const redraw = useRedraw();
   useEffect(() => {
     redraw(); // it may have changed since it was drawn
     return store.subscribe(ref, metric, redraw);
   }, [store, ref, metric]);
-  return store.get(ref, metric);
+  return store;
 }
+
+/**
+ * @template {string} M @param {string} ref @param {M} metric
+ * @returns {import("../../core/store.js").Value<M extends keyof Metrics ? Metrics[M] : any> | undefined}
+ */
+export const useMetric = (ref, metric) => useStore(ref, metric).get(ref, metric);
 
 /**
  * The payload; undefined until there is one.
@@ -50,26 +53,10 @@ export function useMetric(ref, metric) {
 export const useValue = (ref, metric) => useMetric(ref, metric)?.value;
 
 /** @returns {string[]} all components */
-export function useRefs() {
-  const { store } = usePage();
-  const redraw = useRedraw();
-  useEffect(() => {
-    redraw();
-    return store.subscribe(null, null, redraw);
-  }, [store]);
-  return store.refs();
-}
+export const useRefs = () => useStore(null, null).refs();
 
 /** @param {string} ref @returns {string[]} the metrics that were received of it */
-export function useMetrics(ref) {
-  const { store } = usePage();
-  const redraw = useRedraw();
-  useEffect(() => {
-    redraw();
-    return store.subscribe(ref, null, redraw);
-  }, [store, ref]);
-  return store.metrics(ref);
-}
+export const useMetrics = (ref) => useStore(ref, null).metrics(ref);
 
 /**
  * Draw again after each change of a model, or only after changes of what ``pick``, which never changes, returns.

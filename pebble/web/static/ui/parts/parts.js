@@ -1,8 +1,9 @@
 // Small parts of many widgets.
 
 import * as browser from "../../core/browser.js";
-import { html, useEffect, useLater, usePart, useRef, useState, useTick } from "./hooks.js";
-import { roughly } from "./words.js";
+import { Boundary, html, useEffect, useLater, usePage, usePart, useRef, useState, useTick, useValue } from "./hooks.js";
+import { Route } from "./models.js";
+import { reported, roughly } from "./words.js";
 
 const ICONS = new URL("../../icons.svg", import.meta.url).href;
 const GONE_MS = 10_000;
@@ -150,4 +151,55 @@ export function Part({ part, now = false, ...props }) {
     A part of this page could not be fetched.
     <button type="button" onClick=${() => location.reload()}>Reload</button>
   </p>`;
+}
+
+/**
+ * One of the components that ``of`` fetches: nothing until it is here, and it may fail without what it is beside.
+ * @param {any} props
+ */
+export function Extra({ of, part, what, source, ...props }) {
+  const { body } = usePart(of);
+  return body && html`<${Boundary} key=${source} what=${what}><${body[part]} source=${source} ...${props} /><//>`;
+}
+
+/** The address of its own stream: what was entered, else what it reports; "" none. @param {string} at */
+export function useStream(at) {
+  const own = reported(useValue(at, "status"));
+  return useValue(at, "web/stream-address")?.url || own;
+}
+
+/** Follow a link to a component, or the fleet, without loading the page again. @param {any} props */
+export function RouteLink({ to = "", path = Route.path(to), className, label, children }) {
+  const { route } = usePage();
+  const go = (event) => {
+    if (event.ctrlKey || event.metaKey || event.shiftKey || event.button) return;
+    event.preventDefault();
+    route.open(path);
+  };
+  return html`<a class=${className} href=${path} aria-label=${label} onClick=${go}>${children}</a>`;
+}
+
+/** Move one of the driver's sliders. */
+export function set(driver, name) {
+  return (event) => {
+    driver.sliders[name] = Number(event.currentTarget.value) / 100;
+    driver.changed();
+  };
+}
+
+export function Slider({ name, value, min, max = 100, text, onInput }) {
+  return html`<label class="slider">
+    <span>${name}</span>
+    <input
+      type="range"
+      data-test=${name.toLowerCase()}
+      min=${min}
+      max=${max}
+      step="5"
+      value=${Math.round(100 * value)}
+      aria-valuetext=${text}
+      onInput=${onInput}
+    />
+    <output>${text}</output>
+  </label>`;
 }

@@ -2,8 +2,7 @@
 
 import { Archive } from "../../core/replay/archive.js";
 import { html, useEffect, useModel, usePage, useState } from "../parts/hooks.js";
-import { RouteLink } from "../header.js";
-import { Icon, Why } from "../parts/parts.js";
+import { Icon, RouteLink, Why } from "../parts/parts.js";
 import { recordingsOf } from "../fleet/recordings-link.js";
 import { iconOf } from "../fleet/fleet.js";
 import { shortTime } from "../parts/more-words.js";

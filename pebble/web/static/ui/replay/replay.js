@@ -2,7 +2,6 @@
 
 import { startOf } from "../../core/replay/timeline.js";
 import { CARDS } from "../cards/cards.js";
-import { RouteLink } from "../header.js";
 import {
   Boundary,
   Page,
@@ -16,7 +15,7 @@ import {
   useValue,
 } from "../parts/hooks.js";
 import { CardView, Offers } from "../parts/models.js";
-import { Card, Icon, Part } from "../parts/parts.js";
+import { Card, Icon, Part, RouteLink } from "../parts/parts.js";
 import { nameOf } from "../parts/words.js";
 import { Choose, Elsewhere, timeWords } from "./choose.js";
 import { Download } from "./download.js";

@@ -1,9 +1,8 @@
 // How the inputs are scaled, and the extra axis.
 
 import * as browser from "../../core/browser.js";
-import { Slider, set } from "./drive.js";
 import { html, useEffect, useModel, usePage } from "../parts/hooks.js";
-import { Icon } from "../parts/parts.js";
+import { Icon, Slider, set } from "../parts/parts.js";
 
 export function DriveSettings() {
   const { driver } = usePage();

@@ -1,8 +1,9 @@
 // Driving: who may, why not, the stick, and how fast.
 
 import { ROOT } from "../../core/browser.js";
-import { html, styled, useCalm, useModel, usePage, useValue } from "../parts/hooks.js";
-import { Card, HoldButton, Icon, Part } from "../parts/parts.js";
+import { DRIVE, KEYS } from "../cards/cards.js";
+import { html, useCalm, useModel, usePage, useValue } from "../parts/hooks.js";
+import { Card, HoldButton, Icon, Part, Slider, set } from "../parts/parts.js";
 import { Stick } from "./stick.js";
 import { driverName, nameOf } from "../parts/words.js";
 
@@ -12,22 +13,14 @@ export function DriveCard({ at }) {
     <${DrivePad} />
     <${Hints} />
     <${Speed} />
-    <${DriveSettings} />
+    <${Part} part=${DRIVE} />
   <//>`;
 }
 
-const MORE = {
-  keyHints: styled(async () => (await import("./key-hints.js")).KeyHints, "panels.css"),
-  settings: styled(async () => (await import("./drive-settings.js")).DriveSettings, "panels.css"),
-};
-
 function Hints() {
   const { hints } = useModel(usePage().settings);
-  return hints ? html`<div style=${{ minHeight: "88px" }}><${Part} part=${MORE.keyHints} /></div>` : null;
+  return hints ? html`<div style=${{ minHeight: "88px" }}><${Part} part=${KEYS} /></div>` : null;
 }
-
-/** How the inputs are scaled, and the extra axis; fetched later. */
-export const DriveSettings = () => html`<${Part} part=${MORE.settings} />`;
 
 /** Why it cannot be driven now, and what can be done about it; or that it can. */
 export function WhyLine({ at }) {
@@ -98,33 +91,9 @@ export function DrivePad() {
   </div>`;
 }
 
-export function set(driver, name) {
-  return (event) => {
-    driver.sliders[name] = Number(event.currentTarget.value) / 100;
-    driver.changed();
-  };
-}
-
 export function Speed() {
   const { driver } = usePage();
   const { speed } = useModel(driver).sliders;
   const text = `${Math.round(100 * speed)} %`;
   return html`<${Slider} name="Speed" value=${speed} min=${5} text=${text} onInput=${set(driver, "speed")} />`;
-}
-
-export function Slider({ name, value, min, max = 100, text, onInput }) {
-  return html`<label class="slider">
-    <span>${name}</span>
-    <input
-      type="range"
-      data-test=${name.toLowerCase()}
-      min=${min}
-      max=${max}
-      step="5"
-      value=${Math.round(100 * value)}
-      aria-valuetext=${text}
-      onInput=${onInput}
-    />
-    <output>${text}</output>
-  </label>`;
 }

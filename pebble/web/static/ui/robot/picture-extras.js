@@ -4,8 +4,7 @@ import * as more from "../../core/browser-more.js";
 import { MIXED, refusal } from "../../core/stream.js";
 import { html, useEffect, useMetrics, useModel, usePage, useRef, useState, useValue } from "../parts/hooks.js";
 import { Model, read, write } from "../parts/models.js";
-import { Icon, Why } from "../parts/parts.js";
-import { useStream } from "./video.js";
+import { Icon, Why, useStream } from "../parts/parts.js";
 import { NewestOverlays, STALE_MS, contained, drawOverlays } from "../../media/overlays.js";
 import { nameOf, visible } from "../parts/words.js";
 

@@ -3,15 +3,17 @@
 import { refusal } from "../../core/stream.js";
 import { html, usePage, useRefs, useState, useTick, useValue } from "../parts/hooks.js";
 import { Offers } from "../parts/models.js";
-import { Why } from "../parts/parts.js";
-import { Extra } from "./video.js";
+import { Extra, Why } from "../parts/parts.js";
 import { useReasons, whyNotEnd } from "../parts/why-not.js";
 import { nameOf } from "../parts/words.js";
 
 const ENCODINGS = ["h264", "pbvz", "pbvd", "json", "jpeg"];
 
-/** Encoding and source; they count for everybody who looks at this component. */
-export function PictureSettings({ at, source, offers, video }) {
+/**
+ * Encoding and source; they count for everybody who looks at this component. With ``video`` it is started and stopped
+ * here, with what ``extras`` fetches.
+ */
+export function PictureSettings({ at, source, offers, video, extras }) {
   const page = useReasons(at);
   const view = useValue(source, "web/picture");
   const listed = offers.section("video").encodings;
@@ -23,7 +25,7 @@ export function PictureSettings({ at, source, offers, video }) {
     html`<button type="button" data-test="video" onClick=${video.toggle}>
         ${video.wanted ? "Stop video" : "Start video"}
       </button>
-      <${Extra} part="Tools" what="More of the picture" source=${source} wanted=${video.wanted} />`}
+      <${Extra} of=${extras} part="Tools" what="More of the picture" source=${source} wanted=${video.wanted} />`}
     <label class="field"
       ><span>Encoding</span>
       <select

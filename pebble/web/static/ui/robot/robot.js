@@ -1,12 +1,12 @@
 // One component: its picture, how to drive it, and its cards; on a desktop, a phone, and a phone that lies.
 
 import * as browser from "../../core/browser.js";
-import { CARDS, TABS, VOICE } from "../cards/cards.js";
-import { DriveCard, DrivePad, DriveSettings, Speed, WhyLine } from "./drive.js";
+import { CARDS, DRIVE, EXTRAS, NO_CAMERA, PICTURE, TABS, VOICE } from "../cards/cards.js";
+import { DriveCard, DrivePad, Speed, WhyLine } from "./drive.js";
 import { Boundary, fetchRest, html, useEffect, useMetric, useMetrics, useModel, usePage, useState, useValue } from "../parts/hooks.js";
 import { CardView, Offers, WATCHES } from "../parts/models.js";
-import { Card, Icon, Part } from "../parts/parts.js";
-import { NoCamera, PictureSettings, Stage, useStream, useVideo } from "./video.js";
+import { Card, Icon, Part, useStream } from "../parts/parts.js";
+import { Stage, useVideo } from "./video.js";
 import { nameOf, typeOf } from "../parts/words.js";
 
 export function Robot({ at, layout, drawer, onPanel }) {
@@ -56,7 +56,7 @@ function Desktop({ at, offers, view, video, source }) {
         html`<${Boundary} what="The picture"
           ><${Stage} at=${at} video=${video} source=${source} offers=${offers} wide
         /><//>`}
-        ${!video && offers.drives && html`<${NoCamera} at=${at} offers=${offers} />`}
+        ${!video && offers.drives && html`<${Part} part=${NO_CAMERA} at=${at} offers=${offers} />`}
         <div class="cards">
           ${columns(cards).map((column, index) => html`<div key=${index} class="column">${column.map(shown)}</div>`)}
         </div>
@@ -90,7 +90,7 @@ function Portrait({ at, offers, view, video, source, onPanel }) {
     html`<div class="phone-drive">
       ${video &&
       html`<${Boundary} what="The picture"><${Stage} at=${at} video=${video} source=${source} offers=${offers} /><//>`}
-      ${!video && offers.drives && html`<${NoCamera} at=${at} offers=${offers} />`}
+      ${!video && offers.drives && html`<${Part} part=${NO_CAMERA} at=${at} offers=${offers} />`}
       ${offers.drives &&
       html`<${Boundary} vital what="Driving">
         <section class="phone-pad" aria-label="Drive">
@@ -99,7 +99,7 @@ function Portrait({ at, offers, view, video, source, onPanel }) {
           <${Speed} />
           <details class="more-drive" open=${!video}>
             <summary data-test="more-drive">Turn, balance, extra axis</summary>
-            <${DriveSettings} />
+            <${Part} part=${DRIVE} />
           </details>
         </section>
       <//>`}
@@ -112,7 +112,7 @@ function Portrait({ at, offers, view, video, source, onPanel }) {
       ${tab === "more" &&
       html`${video &&
         html`<${Card} id="picture" title="Picture" icon="camera"
-          ><${PictureSettings} at=${at} source=${source} offers=${offers}
+          ><${Part} part=${PICTURE} at=${at} source=${source} offers=${offers}
         /><//>`}
         <${Missing} at=${at} offers=${offers} view=${view} hasVideo=${Boolean(video)} />
         <${MoreSettings} onPanel=${onPanel} />`}
@@ -151,10 +151,10 @@ function Immersive({ at, offers, view, video, source, drawer, onPanel }) {
     ${drawer &&
     html`<aside class="drawer" aria-label="Everything else">
       ${offers.drives &&
-      html`<${Card} id="drive-settings" title="Driving" icon="wheel"><${Speed} /><${DriveSettings} /><//>`}
+      html`<${Card} id="drive-settings" title="Driving" icon="wheel"><${Speed} /><${Part} part=${DRIVE} /><//>`}
       ${video &&
       html`<${Card} id="picture" title="Picture" icon="camera"
-        ><${PictureSettings} at=${at} source=${source} offers=${offers} video=${video}
+        ><${Part} part=${PICTURE} at=${at} source=${source} offers=${offers} video=${video} extras=${EXTRAS}
       /><//>`}
       ${cards.map((card) => html`<${CardOf} key=${card.id} card=${card} at=${at} offers=${offers} view=${view} />`)}
       <${MoreSettings} onPanel=${onPanel} />

@@ -1,36 +1,10 @@
 // The live picture: how old it is, how it comes, and where from.
 
 import * as browser from "../../core/browser.js";
-import { VOICE } from "../cards/cards.js";
-import {
-  Boundary,
-  html,
-  styled,
-  useEffect,
-  useModel,
-  usePage,
-  usePart,
-  useRef,
-  useState,
-  useTick,
-  useValue,
-} from "../parts/hooks.js";
-import { Icon, Part } from "../parts/parts.js";
-import { nameOf, reported, span } from "../parts/words.js";
-
-const EXTRAS = styled(() => import("./picture-extras.js"), "picture.css");
-
-/** What belongs to a picture besides it, as soon as it was fetched; it may fail without the picture. @param {any} props */
-export function Extra({ part, what, source, ...props }) {
-  const { body } = usePart(EXTRAS);
-  return body && html`<${Boundary} key=${source} what=${what}><${body[part]} source=${source} ...${props} /><//>`;
-}
-
-/** The address of its own stream: what was entered, else what it reports; "" none. @param {string} at */
-export function useStream(at) {
-  const own = reported(useValue(at, "status"));
-  return useValue(at, "web/stream-address")?.url || own;
-}
+import { EXTRAS, PICTURE, VOICE } from "../cards/cards.js";
+import { Boundary, html, useEffect, useModel, usePage, useRef, useState, useTick, useValue } from "../parts/hooks.js";
+import { Extra, Icon, Part } from "../parts/parts.js";
+import { nameOf, span } from "../parts/words.js";
 
 /** Show pictures of ``source`` as long as this is on the page. @param {string} at @param {string} source "": none */
 export function useVideo(at, source) {
@@ -72,7 +46,7 @@ export function Stage({ at, video: control, source, offers, wide = false, immers
   return html`<section class=${`stage ${stale ? "stale" : ""} ${video.info ? "" : "blank"}`} aria-label="Live picture">
     <div class="picture">
       <div class="canvas" ref=${place}></div>
-      <${Extra} part="Layer" what="What is drawn over it" source=${source} />
+      <${Extra} of=${EXTRAS} part="Layer" what="What is drawn over it" source=${source} />
       ${cover && html`<p class="cover" data-test="cover">${cover}</p>`}
       ${info && html`<span class="tag tag-how">${howWords(video, view)}</span>`}
       ${info && html`<span class=${`tag tag-age ${stale ? "bad" : ""}`}>${ageWords(video)}</span>`}
@@ -93,13 +67,12 @@ export function Stage({ at, video: control, source, offers, wide = false, immers
           ? "Leave full screen"
           : "Full screen"}
       </button>
-      <${Extra} part="Tools" what="More of the picture" source=${source} wanted=${control.wanted} />
-      ${wide && html`<${PictureSettings} at=${at} source=${source} offers=${offers} />`}
+      <${Extra} of=${EXTRAS} part="Tools" what="More of the picture" source=${source} wanted=${control.wanted} />
+      ${wide && html`<${Part} part=${PICTURE} at=${at} source=${source} offers=${offers} />`}
       ${wide && offers.has("audio") && html`<${Boundary} what="Sound"><${Part} part=${VOICE} at=${at} /><//>`}
     </div>`}
   </section>`;
 }
-
 
 /** Why there is no live picture; "" there is. */
 function useCover(control, source) {
@@ -132,13 +105,3 @@ function ageWords(video) {
   const { ms, since } = video.age();
   return since === "taken" ? `${span(ms)} old` : `arrived ${span(ms)} ago`;
 }
-
-const MORE = {
-  settings: styled(async () => (await import("./picture-settings.js")).PictureSettings, "picture.css"),
-  noCamera: styled(async () => (await import("./picture-settings.js")).NoCamera, "picture.css"),
-};
-
-/** How the picture comes, and where from; fetched later. */
-export const PictureSettings = (props) => html`<${Part} part=${MORE.settings} ...${props} />`;
-
-export const NoCamera = (props) => html`<${Part} part=${MORE.noCamera} ...${props} />`;
