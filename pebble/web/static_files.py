@@ -26,10 +26,12 @@ _TYPES = {
 _VERSION = b"{version}"  # in the pages, replaced by that of the files
 _ROOT = b"{root}"  # replaced by root_of(): a proxy may show the server below a path that only browsers know
 _MODULES = b"{modules}"  # replaced by links to all that is imported: browsers need not discover them one by one
-_SCREENS = {"fleet.html": "ui/fleet.js", "robot.html": "ui/robot.js"}  # index.html, with what that screen needs
+#: index.html, with what that screen needs
+_SCREENS = {"fleet.html": "ui/fleet/fleet.js", "robot.html": "ui/robot/robot.js"}
 _SHEETS = {"fleet.html": "fleet.css"}  # that the screen needs beside app.css
 _IMPORT = re.compile(rb'^(?:import|export|\}).*?"(\.\.?/[^"]+)";?$', re.MULTILINE)
 _COMMENTS = re.compile(r"^[ \t]*(?:/\*.*?\*/|//[^\n]*)[ \t]*$", re.MULTILINE | re.DOTALL)
+_CASTS = re.compile(r"/\*\* @[^\n]*?\*/ ")  # types within a line
 _LINE_ENDS = re.compile(r"(?<=\S)[ \t]+//[ ][^\"'`\n]*$", re.MULTILINE)  # one with quotes may be the end of a string
 _LOOSE = re.compile(r" (?=\{$)|(^[\w-]+:) ", re.MULTILINE)  # in style sheets
 _INDENTATION = re.compile(r"^\s+", re.MULTILINE)
@@ -113,6 +115,6 @@ def stripped(source: bytes, suffix: str) -> bytes:
     if suffix in ("css", "js", "mjs"):
         text = _COMMENTS.sub("", text)
     if suffix in ("js", "mjs"):
-        text = _LINE_ENDS.sub("", text)
+        text = _LINE_ENDS.sub("", _CASTS.sub("", text))
     text = _INDENTATION.sub("", text)
     return (_LOOSE.sub(r"\1", text) if suffix == "css" else text).encode()

@@ -48,7 +48,7 @@ def wire(stage: Stage) -> Iterator[Wire]:
 def _benjr_page(browser: Browser, stage: Stage) -> Iterator[Console]:
     with console(browser, stage, "benjr") as opened:
         for name, source in _MODULES.items():
-            opened.page.route(f"**/ui/{name}", _answer(source))
+            opened.page.route(f"**/ui/cards/{name}", _answer(source))
         opened.tab.until("!!window.pebble?.driver.actions")
         opened.page.evaluate(_SOUND)
         yield opened

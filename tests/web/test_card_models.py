@@ -47,7 +47,7 @@ BLACK = {"r": 0, "g": 0, "b": 0}
 
 def lights(steps: str) -> Any:
     names = "Lights, Pacer, command, lightsOf, supported, toggleFlash, whyNotLights"
-    return run("../ui/lights-model.js", names, _PAGE + steps)
+    return run("../ui/cards/lights-model.js", names, _PAGE + steps)
 
 
 _PACER = """
@@ -201,7 +201,7 @@ def test_lights_ignore_what_they_cannot_have_remembered(stored: str) -> None:
 
 
 def sounds(steps: str) -> Any:
-    return run("../ui/sounds-model.js", "clips, grouped, play, playing, repeatLast, soundsOf", _PAGE + steps)
+    return run("../ui/cards/sounds-model.js", "clips, grouped, play, playing, repeatLast, soundsOf", _PAGE + steps)
 
 
 def test_the_last_sound_is_repeated_as_it_was_played() -> None:
@@ -273,7 +273,7 @@ def test_what_plays(payload: Any, expected: list[str]) -> None:
 
 def forms(steps: str) -> Any:
     names = "filled, hint, lastScript, mistake, remember, remembered, scripts, whyNotSent"
-    return run("../ui/form-model.js", names, steps)
+    return run("../ui/cards/form-model.js", names, steps)
 
 
 def entry(key: str, kind: str = "string", **more: Any) -> dict[str, Any]:
@@ -513,7 +513,7 @@ MAINTAINER = "Log in as maintainer to use this"
 )
 def test_what_ends_something_may_be_asked_of_a_silent_robot(change: str, whys: list[str]) -> None:
     steps = f'{change}; result = [whyNotEnd(page), whyNot(page, ref), whyNot(page, ref, "", "system")];'
-    assert run("../ui/why-not.js", "whyNot, whyNotEnd", _PAGE + steps) == whys
+    assert run("../ui/parts/why-not.js", "whyNot, whyNotEnd", _PAGE + steps) == whys
 
 
 def test_the_newest_answers_are_remembered_by_the_number_of_the_command() -> None:
@@ -526,7 +526,7 @@ def test_the_newest_answers_are_remembered_by_the_number_of_the_command() -> Non
     for (let n = 3; n <= 500; n++) answer(n, "done");
     answer(0, "refused");
     result.push(connection.answers.size, connection.answers.has(500), connection.answers.has(300));"""
-    assert run("../ui/models.js", "Connection", steps) == ["refused", "done", 200, True, False]
+    assert run("../ui/parts/models.js", "Connection", steps) == ["refused", "done", 200, True, False]
 
 
 @pytest.mark.parametrize(
@@ -542,7 +542,7 @@ def test_the_newest_answers_are_remembered_by_the_number_of_the_command() -> Non
 )
 def test_a_value_is_gone(age: float, period: float, online: bool, gone: bool) -> None:
     steps = f"result = isGone({{ age: {1000 * age}, period: {1000 * period} }}, {json.dumps(online)});"
-    assert run("../ui/parts.js", "isGone", steps) is gone
+    assert run("../ui/parts/parts.js", "isGone", steps) is gone
 
 
 # -- scripts that run
@@ -550,7 +550,7 @@ def test_a_value_is_gone(age: float, period: float, online: bool, gone: bool) ->
 
 def autonomy(steps: str) -> Any:
     names = "Since, handDriven, statusOf, whyNotStarted"
-    return run("../ui/autonomy-model.js", names, _PAGE + steps)
+    return run("../ui/cards/autonomy-model.js", names, _PAGE + steps)
 
 
 @pytest.mark.parametrize(

@@ -194,7 +194,7 @@ def test_what_a_microcontroller_measures_is_shown(goob: Console) -> None:
 
 #: Every row that the page remembers of a metric.
 _ROWS = """async ([kind, metric]) => {
-  const { recorderOf } = await import(`/static/${pebble.connection.version}/ui/recorder.js`);
+  const { recorderOf } = await import(`/static/${pebble.connection.version}/ui/parts/recorder.js`);
   return recorderOf(pebble, pebble.route.ref).all.get(`${kind} ${metric}`)?.rows ?? [];
 }"""
 

@@ -11,11 +11,11 @@ from tests.web.in_node import evaluate
 from tests.web.states import LAMP_MCU, described
 
 _MODULES = {
-    "ui/manifest.js": "readManifest, command, unsendable, range, step, fieldOf",
-    "ui/lines.js": "Lines",
-    "ui/outlets.js": "outletsOf, obstacle",
-    "ui/models.js": "Offers",
-    "ui/spark.js": "lastMinute, remember, series",
+    "ui/cards/manifest.js": "readManifest, command, unsendable, range, step, fieldOf",
+    "ui/cards/lines.js": "Lines",
+    "ui/cards/outlets.js": "outletsOf, obstacle",
+    "ui/parts/models.js": "Offers",
+    "ui/cards/spark.js": "lastMinute, remember, series",
 }
 
 

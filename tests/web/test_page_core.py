@@ -363,4 +363,4 @@ def test_the_sound_socket_has_the_name_and_device_of_the_person() -> None:
 
 def test_what_rounds_to_zero_has_no_sign() -> None:
     steps = "result = [[-0.04, 1], [-0.06, 1], [0, 2], [-0.4, 0], [-10, 0], ['a', 1]].map((one) => number(...one));"
-    assert evaluate({"ui/words.js": "number"}, steps) == ["0.0", "-0.1", "0.00", "0", "-10", "–"]
+    assert evaluate({"ui/parts/words.js": "number"}, steps) == ["0.0", "-0.1", "0.00", "0", "-10", "–"]

@@ -78,7 +78,7 @@ def microphone(steps: str) -> Any:
 
 
 def sound(steps: str) -> Any:
-    imports = {"ui/sound-model.js": "Sound", "core/store.js": "Store"}
+    imports = {"ui/robot/sound-model.js": "Sound", "core/store.js": "Store"}
     return evaluate(imports, f"{_BROWSER}{_SOUND}{steps}\nsound.leave();")
 
 

@@ -13,7 +13,7 @@ from tests.web.states import GOOB, STATES
 
 pytestmark = pytest.mark.page
 
-SCREEN = "**/ui/robot.js"
+SCREEN = "**/ui/robot/robot.js"
 LATER = "fleet", "cards", "drive", "stick", "video", "settings"
 SHOWN = "document.querySelector('.vital .chip:last-child').innerText + document.querySelector('.pad-words').innerText"
 HERE = r"performance.getEntriesByType('resource').map((one) => one.name.match(/(\w+).js$/)?.[1])"
@@ -105,7 +105,7 @@ def test_the_picture_outlives_what_belongs_to_it(browser: Browser):
     with serving(STATES["driving"]) as canned, tab(browser, "about:blank") as opened:
         broken = "export const Layer = () => { throw new Error('broken'); }; export const Tools = Layer;"
         opened.context.route(
-            "**/ui/picture-extras.js", lambda route: route.fulfill(body=broken, content_type="text/javascript")
+            "**/ui/robot/picture-extras.js", lambda route: route.fulfill(body=broken, content_type="text/javascript")
         )
         opened.page.goto(canned.url + STATES["driving"].path)
         assert opened.until(lambda: opened.page.locator(".failed").count() == 2)

@@ -137,7 +137,7 @@ def test_the_page_refuses_the_same() -> None:
       reported: status.map(reported),
     };"""
     found = evaluate(
-        {"core/stream.js": "refusal", "ui/words.js": "reported"}, steps, {"addresses": addresses, "host": HOST}
+        {"core/stream.js": "refusal", "ui/parts/words.js": "reported"}, steps, {"addresses": addresses, "host": HOST}
     )
     assert found["shown"][: len(GOOD)] == list(GOOD)
     assert set(found["shown"][len(GOOD) :]) <= set(addresses[-3:])

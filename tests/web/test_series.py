@@ -269,5 +269,5 @@ def test_the_past_is_dropped_when_another_component_is_opened() -> None:
     result = [series.rows.map((row) => row.value)];
     recorderOf(page, lamp);
     result.push(store.metrics(goob));"""
-    modules = {"core/store.js": "Store", "ui/recorder.js": "recorderOf"}
+    modules = {"core/store.js": "Store", "ui/parts/recorder.js": "recorderOf"}
     assert evaluate(modules, steps) == [[1, 7], ["charge"]]

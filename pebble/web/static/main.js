@@ -6,9 +6,9 @@ import { Driver } from "./core/driver.js";
 import { Estop } from "./core/estop.js";
 import { Store } from "./core/store.js";
 import { App, PARTS } from "./ui/app.js";
-import { Boundary, Page, fetchPart, fetchRest, isHere, withRest } from "./ui/hooks.js";
-import { Connection, Panels, Route, Settings, WATCHES, read } from "./ui/models.js";
-import { Video } from "./ui/video-model.js";
+import { Boundary, Page, fetchPart, fetchRest, isHere, withRest } from "./ui/parts/hooks.js";
+import { Connection, Panels, Route, Settings, WATCHES, read } from "./ui/parts/models.js";
+import { Video } from "./ui/robot/video-model.js";
 import { Pictures } from "./media/pictures.js";
 
 const WATCHING = ["estop", "stop", "watch", "read-logs"]; // all that a screen sends that only watches

@@ -129,7 +129,7 @@ const commands = {
   },
 };
 
-/** As ui/stick.js does. */
+/** As ui/robot/stick.js does. */
 function holds(page, pointer) {
   return page.pointer === pointer && page.driver.inputs.pointer === pointer;
 }
@@ -149,7 +149,7 @@ function stickUp(page, pointer, end) {
   end();
 }
 
-/** As ui/drive.js does. */
+/** As ui/robot/drive.js does. */
 function holdButton(page, name, value, at) {
   if (!value || !page.driver.reason() || page.driver.gestureActive) page.driver.hold(name, value, at);
 }

@@ -3,15 +3,15 @@
 import * as browser from "../core/browser.js";
 import { Banners } from "./banner.js";
 import { Header } from "./header.js";
-import { Boundary, fetchRest, html, styled, useEffect, useMedia, useModel, usePage, useState } from "./hooks.js";
-import { Part } from "./parts.js";
-import { nameOf, visible } from "./words.js";
+import { Boundary, fetchRest, html, styled, useEffect, useMedia, useModel, usePage, useState } from "./parts/hooks.js";
+import { Part } from "./parts/parts.js";
+import { nameOf, visible } from "./parts/words.js";
 
 /** What is fetched when it is first shown, so that the first screen is there soon; main.js fetches the rest later. */
 export const PARTS = {
-  fleet: styled(async () => (await import("./fleet.js")).Fleet, "fleet.css"),
-  robot: async () => (await import("./robot.js")).Robot,
-  panels: styled(async () => (await fetchRest(), await import("./panels.js")).Panels, "panels.css", "notices.css"),
+  fleet: styled(async () => (await import("./fleet/fleet.js")).Fleet, "fleet.css"),
+  robot: async () => (await import("./robot/robot.js")).Robot,
+  panels: styled(async () => (await fetchRest(), await import("./panels/panels.js")).Panels, "panels.css", "notices.css"),
 };
 
 /** Not among them: few people look at recordings. */
@@ -56,7 +56,7 @@ export function App() {
         onDrawer=${() => setDrawer(!drawer)}
       />
     <//>
-    <${Boundary} vital what="The banner"><${Banners} at=${ref} layout=${layout} /><//>
+    <${Boundary} vital what="The banner"><${Banners} at=${ref} /><//>
     ${shown &&
     html`<${Boundary} key=${shown} what="This panel"
       ><${Part} part=${PARTS.panels} now shown=${shown} onClose=${() => panels.show("")}

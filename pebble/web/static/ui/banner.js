@@ -1,9 +1,8 @@
 // What must not be overlooked, below the header: stops, lost connections, and what was not done.
 
-import { RouteLink } from "./header.js";
-import { html, useEffect, useMetric, useModel, usePage, useRefs, useState, useTick, useValue } from "./hooks.js";
-import { HoldButton, Icon, Why } from "./parts.js";
-import { clockTime, nameOf, roughly } from "./words.js";
+import { html, useEffect, useMetric, useModel, usePage, useRefs, useState, useTick, useValue } from "./parts/hooks.js";
+import { HoldButton, Icon, RouteLink, Why } from "./parts/parts.js";
+import { clockTime, nameOf, roughly } from "./parts/words.js";
 
 const NOTICE_MS = 6000;
 const NO_ANSWER_MS = 1500;

@@ -44,7 +44,7 @@ export function install(page) {
 function sound(services) {
   let held = false;
   const use = async (act) => {
-    const { Sound } = await import("./sound-model.js");
+    const { Sound } = await import("./robot/sound-model.js");
     act((one.model ??= new Sound(services)));
   };
   const one = {

@@ -1,10 +1,9 @@
 // The header of every screen: which robot, whether it is there, and STOP.
 
 import * as browser from "../core/browser.js";
-import { Boundary, html, styled, useMetric, useModel, useOnline, usePage, usePart, useRefs, useTick, useValue } from "./hooks.js";
-import { Route } from "./models.js";
-import { Icon, Live, StopButton } from "./parts.js";
-import { battery, driverName, kindOf, nameOf, roughly, span, typeOf } from "./words.js";
+import { Boundary, html, styled, useMetric, useModel, useOnline, usePage, usePart, useRefs, useTick, useValue } from "./parts/hooks.js";
+import { Icon, Live, RouteLink, StopButton } from "./parts/parts.js";
+import { battery, driverName, kindOf, nameOf, roughly, span, typeOf } from "./parts/words.js";
 
 export function Header({ at, layout, panel, onPanel, drawer, onDrawer }) {
   const { commands, driver, route } = usePage();
@@ -61,17 +60,6 @@ export function Header({ at, layout, panel, onPanel, drawer, onDrawer }) {
 }
 
 const Brand = () => html`<span class="brand"><${Icon} name="logo" /><span>Pebble</span></span>`;
-
-/** Follow a link to a component, or the fleet, without loading the page again. @param {any} props */
-export function RouteLink({ to = "", path = Route.path(to), className, label, children }) {
-  const { route } = usePage();
-  const go = (event) => {
-    if (event.ctrlKey || event.metaKey || event.shiftKey || event.button) return;
-    event.preventDefault();
-    route.open(path);
-  };
-  return html`<a class=${className} href=${path} aria-label=${label} onClick=${go}>${children}</a>`;
-}
 
 const BackLink = () => html`<${RouteLink} to="" className="back" label="Fleet: all robots"
   ><${Icon} name="back" /><span>Fleet</span><//
@@ -155,7 +143,7 @@ function ConnectionState() {
   return html`<span class=${`chip plain ${socket.roundTripMs > 300 ? "late" : ""}`}>connected${round}</span>`;
 }
 
-const BELL = styled(async () => (await import("./notices.js")).Bell, "notices.css", "panels.css");
+const BELL = styled(async () => (await import("./fleet/notices.js")).Bell, "notices.css", "panels.css");
 
 /** Fetched later. Where there is little room only their number is shown, with the settings. */
 function Notices(props) {

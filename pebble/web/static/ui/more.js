@@ -6,9 +6,9 @@ import { Actions } from "../core/actions.js";
 import { Awake } from "../core/awake.js";
 import { PadInput } from "../core/pad-input.js";
 import { install as installCommands } from "./commands.js";
-import { lacks } from "./lacks.js";
-import { WATCHES } from "./models.js";
-import { pads } from "./pads.js";
+import { lacks } from "./parts/lacks.js";
+import { WATCHES } from "./parts/models.js";
+import { pads } from "./parts/pads.js";
 
 export { keepWhole } from "./mend.js";
 
@@ -62,9 +62,9 @@ class Doer {
       case "slower":
         return this.changeSpeed(-STEP);
       case "flash":
-        return this.say(import("./lights-model.js").then((lights) => lights.toggleFlash(page, ref)));
+        return this.say(import("./cards/lights-model.js").then((lights) => lights.toggleFlash(page, ref)));
       case "repeat":
-        return this.say(import("./sounds-model.js").then((sounds) => sounds.repeatLast(page, ref)));
+        return this.say(import("./cards/sounds-model.js").then((sounds) => sounds.repeatLast(page, ref)));
       case "mute":
         return page.sound?.toggleMute();
       case "talk":

@@ -1,8 +1,8 @@
 // Beside the recorded picture: what was sent to the robot, and the sessions of the day.
 
 import { holding } from "../../core/replay/timeline.js";
-import { html, useModel, useTick } from "../hooks.js";
-import { clockTime, number, span } from "../words.js";
+import { html, useModel, useTick } from "../parts/hooks.js";
+import { clockTime, number, span } from "../parts/words.js";
 
 const HELD_MS = 500; // a command to drive is over after that
 const SHOWN = 12; // lines

@@ -1,13 +1,12 @@
 // Which day and which robot.
 
 import { Archive } from "../../core/replay/archive.js";
-import { html, useEffect, useModel, usePage, useState } from "../hooks.js";
-import { RouteLink } from "../header.js";
-import { Icon, Why } from "../parts.js";
-import { recordingsOf } from "../recordings-link.js";
-import { iconOf } from "../fleet.js";
-import { shortTime } from "../more-words.js";
-import { clockTime, nameOf } from "../words.js";
+import { html, useEffect, useModel, usePage, useState } from "../parts/hooks.js";
+import { Icon, RouteLink, Why } from "../parts/parts.js";
+import { recordingsOf } from "../fleet/recordings-link.js";
+import { iconOf } from "../fleet/fleet.js";
+import { shortTime } from "../parts/more-words.js";
+import { clockTime, nameOf } from "../parts/words.js";
 
 const date = new Intl.DateTimeFormat("en-GB", { weekday: "short", day: "numeric", month: "short", year: "numeric" });
 const short = new Intl.DateTimeFormat("en-GB", { day: "numeric", month: "short" });

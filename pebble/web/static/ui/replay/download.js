@@ -1,9 +1,9 @@
 // A stretch of the recording as a film, or as it was recorded.
 
 import { Archive, delay } from "../../core/replay/archive.js";
-import { html, useEffect, useModel, useRef, useState, useTick } from "../hooks.js";
-import { Icon, Why } from "../parts.js";
-import { clockTime } from "../words.js";
+import { html, useEffect, useModel, useRef, useState, useTick } from "../parts/hooks.js";
+import { Icon, Why } from "../parts/parts.js";
+import { clockTime } from "../parts/words.js";
 import { sizeWords } from "./choose.js";
 import { long } from "./picture.js";
 

@@ -10,11 +10,11 @@ import { Store } from "../../core/store.js";
 import { ReplayPictures } from "../../media/replay-pictures.js";
 import { ReplaySound } from "../../media/replay-sound.js";
 import { LogBook } from "../../core/logs.js";
-import { logViewOf } from "../log-view.js";
-import { Model } from "../models.js";
-import { recordingsOf } from "../recordings-link.js";
-import { recorderOf } from "../recorder.js";
-import { Video } from "../video-model.js";
+import { logViewOf } from "../parts/log-view.js";
+import { Model } from "../parts/models.js";
+import { recordingsOf } from "../fleet/recordings-link.js";
+import { recorderOf } from "../parts/recorder.js";
+import { Video } from "../robot/video-model.js";
 
 const TICK_MS = 20;
 const LIVENESS_MS = 500;

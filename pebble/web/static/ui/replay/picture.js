@@ -3,10 +3,10 @@
 import * as browser from "../../core/browser.js";
 import { SPEEDS } from "../../core/replay/player.js";
 import { whyOf } from "../../core/replay/timeline.js";
-import { html, useEffect, useModel, useRef, useTick } from "../hooks.js";
-import { Icon, Why } from "../parts.js";
-import { Drawn, StillTools } from "../picture-extras.js";
-import { clockTime, nameOf, span } from "../words.js";
+import { html, useEffect, useModel, useRef, useTick } from "../parts/hooks.js";
+import { Icon, Why } from "../parts/parts.js";
+import { Drawn, StillTools } from "../robot/picture-extras.js";
+import { clockTime, nameOf, span } from "../parts/words.js";
 
 const WAIT_SHOWN_MS = 400;
 const OLD_MS = 2000; // as of a live picture

@@ -1,8 +1,7 @@
 // Recordings: which day and robot, or one robot at one time, with the same cards as live.
 
 import { startOf } from "../../core/replay/timeline.js";
-import { CARDS } from "../cards.js";
-import { RouteLink } from "../header.js";
+import { CARDS } from "../cards/cards.js";
 import {
   Boundary,
   Page,
@@ -14,10 +13,10 @@ import {
   useState,
   useTick,
   useValue,
-} from "../hooks.js";
-import { CardView, Offers } from "../models.js";
-import { Card, Icon, Part } from "../parts.js";
-import { nameOf } from "../words.js";
+} from "../parts/hooks.js";
+import { CardView, Offers } from "../parts/models.js";
+import { Card, Icon, Part, RouteLink } from "../parts/parts.js";
+import { nameOf } from "../parts/words.js";
 import { Choose, Elsewhere, timeWords } from "./choose.js";
 import { Download } from "./download.js";
 import { Replay as Model } from "./model.js";

@@ -3,9 +3,9 @@
 import * as browser from "../../core/browser.js";
 import { Archive } from "../../core/replay/archive.js";
 import { ROWS, columns, holding, mostKbits } from "../../core/replay/timeline.js";
-import { html, useEffect, useModel, useRef, useState, useTick } from "../hooks.js";
-import { shortTime } from "../more-words.js";
-import { clockTime } from "../words.js";
+import { html, useEffect, useModel, useRef, useState, useTick } from "../parts/hooks.js";
+import { shortTime } from "../parts/more-words.js";
+import { clockTime } from "../parts/words.js";
 import { dayWords } from "./choose.js";
 import { long } from "./picture.js";
 

@@ -1,0 +1,181 @@
+// The scripts of a robot: which one runs, and a form to start one.
+
+import { useAnswer } from "../parts/asking.js";
+import { Since, handDriven, statusOf, whyNotStarted } from "./autonomy-model.js";
+import { filled, lastScript, remember, remembered, scripts, whyNotSent } from "./form-model.js";
+import { Form } from "./form.js";
+import { html, useMetric, useOnline, useState, useTick, useValue } from "../parts/hooks.js";
+import { Icon, Why } from "../parts/parts.js";
+import { useReasons, whyNotEnd } from "../parts/why-not.js";
+import { plain } from "../parts/more-words.js";
+import { clockTime, nameOf } from "../parts/words.js";
+import { useMemo } from "../../vendor/hooks.mjs";
+
+const ASKED_MS = 10_000; // so long the page says that it has asked
+
+export function Autonomy({ at }) {
+  const page = useReasons(at);
+  useValue(at, "web/estop");
+  useValue(at, "web/driver");
+  const payload = useValue(at, "autonomy-files");
+  const listed = useMemo(() => scripts(payload), [payload]);
+  const entry = useMetric(at, "autonomy-status");
+  const status = statusOf(entry?.value);
+  const [chosen, choose] = useState(() => status.file || lastScript(at));
+  const find = (file) => listed?.find((one) => one.file === file);
+  const script = find(chosen);
+  const parts = { at, page, entry, status };
+  return html`<div class="autonomy">
+    <${Running} ...${parts} script=${find(status.file)} />
+    ${!listed && html`<p class="dim">No list of scripts was received yet: is autonomy_manager enabled in its config?</p>`}
+    ${listed?.length === 0 && html`<p class="dim">${nameOf(at)} has no scripts: put a folder with a run.py into its autonomy folder.</p>`}
+    ${Boolean(listed?.length) &&
+    html`<label class="field wide">
+        <span>script</span>
+        <select
+          data-test="script"
+          value=${script ? chosen : ""}
+          onChange=${(event) => choose(event.currentTarget.value)}
+        >
+          <option value="">choose…</option>
+          ${listed.map(({ file, label }) => html`<option key=${file} value=${file}>${plain(label)}</option>`)}
+        </select>
+      </label>
+      <${Starter} key=${`${chosen} ${Boolean(script)}`} ...${parts} script=${script} />`}
+  </div>`;
+}
+
+/** What runs, and the end of it. */
+function Running({ at, page, entry, status, script }) {
+  const why = whyNotEnd(page);
+  const label = (key) => script?.fields.find((one) => one.key === key)?.label ?? key;
+  const [seen] = useState(() => new Since()); // what runs while the card is closed may be another run
+  if (entry) seen.update(status, entry.at);
+  const past = !useOnline(at);
+  return html`<div class="ask-row ask-now">
+      <p role="status" data-test="script-state">
+        ${status.running
+          ? html`<b>${past ? "○" : "●"} ${plain(status.file)}</b>
+              ${status.waits ? " waits: a person drives" : past ? " ran when it was last seen" : " runs"},
+              ${" "}${since(seen)}`
+          : html`<span class="dim">No script runs.</span>`}
+      </p>
+      <button
+        type="button"
+        data-test="end-script"
+        disabled=${Boolean(why)}
+        aria-describedby=${why ? "why-end-script" : undefined}
+        onClick=${() => page.commands.stopScript(at)}
+      >
+        <${Icon} name="halt" />Stop script
+      </button>
+    </div>
+    ${why && html`<${Why} id="why-end-script">${why}<//>`}
+    ${status.error && html`<p class="bad" data-test="script-error">✖ ${plain(status.error)}</p>`}
+    ${status.dependencies.length > 0 &&
+    html`<ul class="dependencies" aria-label="Scripts that it needs">
+      ${status.dependencies.map(
+        ({ file, running }, index) => html`<li key=${index} class=${running ? "" : "bad"}>
+          ${running ? "●" : "✖"} ${plain(file)} ${running ? "runs" : "does not run"}
+        </li>`,
+      )}
+    </ul>`}
+    ${status.config.length > 0 &&
+    html`<details class="effective">
+      <summary data-test="effective">Its settings (${status.config.length})</summary>
+      <dl class="values">
+        ${status.config.map(
+          ([key, value]) => html`<div key=${key}>
+            <dt>${plain(label(key))}</dt>
+            <dd>${plain(value)}</dd>
+          </div>`,
+        )}
+      </dl>
+    </details>`}`;
+}
+
+const since = ({ at, isExact }) => `since ${clockTime(at)}${isExact ? "" : " or before"}`;
+
+/** The form of one script, and its start. */
+function Starter({ at, page, entry, status, script }) {
+  const [{ texts, version }, set] = useState(() => ({ texts: remembered(at, script?.file ?? ""), version: 0 }));
+  const form = filled(script?.fields ?? [], texts);
+  const why = whyNotStarted(page, at) || (script ? whyNotSent(form) : "Choose a script first");
+  const { by, waits } = handDriven(page, at);
+  const note = by && waits ? `${by} driving: the script will wait` : "";
+  const restore = (event) => {
+    event.currentTarget.closest(".card-body").querySelector("select").focus(); // the button vanishes
+    change(new Map(), version + 1);
+  };
+  const change = (next, drawn = version) => {
+    set({ texts: next, version: drawn });
+    remember(at, script.file, next);
+  };
+  const onText = (key, text) => {
+    const others = [...texts].filter(([one]) => one !== key);
+    change(new Map(text ? [...others, [key, text]] : others));
+  };
+  return html`${script &&
+    html`<${Form}
+      key=${version}
+      id="script-set"
+      fields=${script.fields}
+      texts=${texts}
+      mistakes=${form.mistakes}
+      onText=${onText}
+    />`}
+    ${script?.omitted > 0 && html`<p class="dim">… ${script.omitted} more settings cannot be shown.</p>`}
+    <div class="ask-row">
+      <${StartButton}
+        at=${at}
+        page=${page}
+        entry=${entry}
+        why=${why}
+        note=${note}
+        config=${form.config}
+        file=${script?.file}
+        >${startWords(status, script)}<//
+      >
+      ${texts.size > 0 &&
+      html`<button type="button" data-test="restore-all" onClick=${restore}>
+        All defaults
+      </button>`}
+    </div>
+    ${(why || note) && html`<${Why} id="why-start">${why || note}<//>`}`;
+}
+
+function StartButton({ at, page, entry, why, note, config, file, children }) {
+  const [asked, setAsked] = useState(/** @type {{at: number, of: number | undefined, n: number} | null} */ (null));
+  const answer = useAnswer(asked?.n);
+  const isAsked = asked !== null && Date.now() - asked.at < ASKED_MS && entry?.receivedAt === asked.of;
+  useTick(isAsked ? 1000 : 0);
+  const start = () => {
+    const n = page.commands.startScript(at, file, config);
+    if (n) remember(at, file, remembered(at, file)); // it is the last one now
+    setAsked({ at: Date.now(), of: entry?.receivedAt, n });
+  };
+  return html`<button
+      type="button"
+      class=${why ? "" : "primary"}
+      data-test="start-script"
+      disabled=${Boolean(why)}
+      aria-describedby=${why || note ? "why-start" : undefined}
+      onClick=${start}
+    >
+      <${Icon} name="play" />${children}
+    </button>
+    <span role="status" class=${answer.op === "refused" ? "bad" : "dim"} data-test="asked"
+      >${isAsked && startedWords(answer, nameOf(at))}</span
+    >`;
+}
+
+/** @param {import("../parts/asking.js").Progress} answer @param {string} name */
+function startedWords({ op, why }, name) {
+  if (op === "refused") return `not done: ${why}`;
+  return op === "done" ? `${name} was asked to start it` : "asking…";
+}
+
+function startWords({ running, file }, script) {
+  if (!running) return "Start";
+  return file === script?.file ? "Start again" : `Start instead of ${file.slice(0, 40)}`;
+}

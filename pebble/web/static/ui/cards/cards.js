@@ -1,0 +1,150 @@
+// Which cards there are, in their fixed order. A new one is a line here, and a module that is fetched when it is shown.
+
+import { styled } from "../parts/hooks.js";
+
+/**
+ * ``tab``: where it is on a phone. ``wants``: whether this component has it. ``part``: fetches what draws it; a
+ * component with ``at`` and ``offers``. ``right``: in the right one of a desktop's columns; ``wide``: below both.
+ * ``sends``: it is for commands only, so screens that only watch are without it.
+ * @typedef {{id: string, title: string, icon: string, tab: string, wants: (offers: any) => boolean,
+ *   part: () => Promise<any>, right?: boolean, wide?: boolean, sends?: boolean}} CardKind
+ */
+
+/** Which keys drive. */
+export const KEYS = styled(async () => (await import("../robot/key-hints.js")).KeyHints, "panels.css");
+
+/** How the inputs are scaled, and the extra axis. */
+export const DRIVE = styled(async () => (await import("../robot/drive-settings.js")).DriveSettings, "panels.css");
+
+/** How the picture comes, and where from. */
+export const PICTURE = styled(async () => (await import("../robot/picture-settings.js")).PictureSettings, "picture.css");
+
+/** Where else a picture may come from. */
+export const NO_CAMERA = styled(async () => (await import("../robot/picture-settings.js")).NoCamera, "picture.css");
+
+/** Listening and talking; a desktop has them below the picture. */
+export const VOICE = styled(async () => (await import("../robot/sound.js")).SoundControls, "sound.css");
+
+/** What belongs to a picture besides it. */
+export const EXTRAS = styled(() => import("../robot/picture-extras.js"), "picture.css");
+
+/** @type {CardKind[]} */
+export const CARDS = [
+  {
+    id: "telemetry",
+    title: "Telemetry",
+    icon: "gauge",
+    tab: "sensors",
+    wants: () => true,
+    part: async () => (await import("./telemetry.js")).Telemetry,
+  },
+  {
+    id: "lights",
+    sends: true,
+    right: true,
+    title: "Lights",
+    icon: "light",
+    tab: "more",
+    wants: (offers) => offers.hasLights,
+    part: styled(async () => (await import("./lights.js")).Lights, "commands.css"),
+  },
+  {
+    id: "voice",
+    title: "Listen and talk",
+    icon: "mic",
+    tab: "sound",
+    wants: (offers) => offers.has("audio"),
+    part: VOICE,
+  },
+  {
+    id: "sounds",
+    sends: true,
+    right: true,
+    title: "Sounds",
+    icon: "sound",
+    tab: "sound",
+    wants: (offers) => offers.has("soundboard"),
+    part: styled(async () => (await import("./sounds.js")).Sounds, "commands.css"),
+  },
+  {
+    id: "autonomy",
+    sends: true,
+    right: true,
+    title: "Autonomy",
+    icon: "script",
+    tab: "more",
+    wants: (offers) => offers.has("autonomy"),
+    part: styled(async () => (await import("./autonomy.js")).Autonomy, "commands.css"),
+  },
+  {
+    id: "outlets",
+    sends: true,
+    right: true,
+    title: "Outlets",
+    icon: "plug",
+    tab: "more",
+    wants: (offers) => offers.section("outlets").available === true || offers.received("outlets/"),
+    part: styled(async () => (await import("./outlets.js")).Outlets, "devices.css"),
+  },
+  {
+    id: "map",
+    title: "Map",
+    icon: "map",
+    tab: "sensors",
+    wants: (offers) => offers.received("wheel-odometry") || offers.received("localization-pose"),
+    part: styled(async () => (await import("./map.js")).Odometry, "map.css"),
+  },
+  {
+    id: "plots",
+    title: "Plots",
+    icon: "plot",
+    tab: "sensors",
+    wants: () => true,
+    part: styled(async () => (await import("./plots.js")).Plots, "plots.css", "vendor/uPlot.css"),
+  },
+  {
+    id: "mcus",
+    sends: true,
+    title: "Microcontrollers",
+    icon: "chip",
+    tab: "more",
+    wants: (offers) => offers.metrics.some((metric) => metric.endsWith("/describe")),
+    part: styled(async () => (await import("./mcus.js")).Mcus, "devices.css"),
+  },
+  {
+    id: "logs",
+    wide: true,
+    title: "Logs",
+    icon: "list",
+    tab: "more",
+    wants: (offers) => offers.isRobot,
+    part: styled(async () => (await import("./logs.js")).Logs, "system.css"),
+  },
+  {
+    id: "system",
+    sends: true,
+    right: true,
+    title: "System",
+    icon: "power",
+    tab: "more",
+    wants: (offers) => offers.has("system"),
+    part: styled(async () => (await import("./system.js")).System, "system.css", "panels.css"),
+  },
+  {
+    id: "values",
+    wide: true,
+    title: "All values",
+    icon: "list",
+    tab: "more",
+    wants: () => true,
+    part: styled(async () => (await import("./values.js")).Values, "devices.css"),
+  },
+];
+
+/** Tabs of a phone, in order; those without any card are left out. */
+export const TABS = [
+  { id: "drive", title: "Drive", icon: "wheel" },
+  { id: "sensors", title: "Sensors", icon: "gauge" },
+  { id: "sound", title: "Sound", icon: "sound" },
+  { id: "more", title: "More", icon: "list" },
+];

@@ -1,0 +1,111 @@
+// The lights of a robot: a colour, steady or flashing.
+
+import { html, useModel } from "../parts/hooks.js";
+import { LONGEST_S, SHORTEST_S, lightsOf, toggleFlash, whyNotLights } from "./lights-model.js";
+import { Why } from "../parts/parts.js";
+import { useReasons, whyNotEnd } from "../parts/why-not.js";
+import { nameOf } from "../parts/words.js";
+
+const COLOURS = {
+  red: "#ff0000",
+  orange: "#ff8800",
+  yellow: "#ffdd00",
+  green: "#00ff00",
+  cyan: "#00ffff",
+  blue: "#0000ff",
+  violet: "#aa00ff",
+  white: "#ffffff",
+};
+
+export function Lights({ at }) {
+  const page = useReasons(at);
+  const lights = useModel(lightsOf(at));
+  const noSolid = whyNotLights(page, at, "solid");
+  const noFlash = whyNotLights(page, at, "flash");
+  const off = Boolean(noSolid && noFlash);
+  const why = off ? noSolid : noSolid || noFlash;
+  const because = why ? "why-lights" : undefined;
+  const colour = (value) => lights.ask(page, { colour: value, mode: noSolid ? "flash" : undefined });
+  const mode = (value) => lights.ask(page, { mode: value });
+  return html`<div class="lights">
+    <div class="swatches" role="group" aria-label="Colour">
+      ${Object.entries(COLOURS).map(
+        ([name, value]) => html`<button
+          key=${name}
+          type="button"
+          class="swatch"
+          data-test=${`colour-${name}`}
+          aria-pressed=${lights.colour === value}
+          aria-describedby=${because}
+          disabled=${off}
+          onClick=${() => colour(value)}
+        >
+          <i aria-hidden="true" style=${{ background: value }}></i>${name}
+        </button>`,
+      )}
+      <label class=${`swatch other ${off ? "off" : ""}`}>
+        <input
+          type="color"
+          data-test="colour"
+          aria-describedby=${because}
+          disabled=${off}
+          value=${lights.colour}
+          onInput=${(event) => colour(event.currentTarget.value)}
+        />
+        <span>other</span>
+      </label>
+    </div>
+    <div class="ask-row">
+      <${ModeButton} lights=${lights} mode="solid" why=${noSolid} onPress=${() => mode("solid")}>Solid<//>
+      <${ModeButton} lights=${lights} mode="flash" why=${noFlash} onPress=${() => toggleFlash(page, at)}
+        >Flash <kbd aria-hidden="true">F</kbd><//
+      >
+      <${ModeButton} lights=${lights} mode="off" why=${whyNotEnd(page)} onPress=${() => mode("off")}>Off<//>
+      <${Period} page=${page} lights=${lights} why=${noFlash} />
+    </div>
+    ${why && html`<${Why} id="why-lights">${why}<//>`}
+    <p class="dim" data-test="lights-asked">${asked(lights)} ${nameOf(at)} does not report its lights.</p>
+  </div>`;
+}
+
+function ModeButton({ lights, mode, why, onPress, children }) {
+  return html`<button
+    type="button"
+    data-test=${`lights-${mode}`}
+    aria-pressed=${lights.mode === mode}
+    aria-describedby=${why ? "why-lights" : undefined}
+    disabled=${Boolean(why)}
+    onClick=${onPress}
+  >
+    ${children}
+  </button>`;
+}
+
+function Period({ page, lights, why }) {
+  const change = (event) => {
+    const seconds = event.currentTarget.valueAsNumber;
+    if (!(seconds >= SHORTEST_S && seconds <= LONGEST_S)) event.currentTarget.value = String(lights.period);
+    else if (lights.mode === "flash") lights.ask(page, { period: seconds });
+    else lights.setPeriod(seconds);
+  };
+  return html`<label class="field">
+    <span>period, s</span>
+    <input
+      type="number"
+      data-test="lights-period"
+      min=${SHORTEST_S}
+      max=${LONGEST_S}
+      step="0.05"
+      value=${lights.period}
+      disabled=${Boolean(why)}
+      aria-describedby=${why ? "why-lights" : undefined}
+      onChange=${change}
+    />
+  </label>`;
+}
+
+function asked({ mode, colour, period }) {
+  if (!mode) return "Nothing was asked from here yet.";
+  const what = { solid: `${colour}, solid`, flash: `${colour}, flashing every ${period} s`, off: "off" };
+  return `Asked from here last: ${what[mode]}.`;
+}

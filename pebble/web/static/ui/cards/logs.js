@@ -1,0 +1,168 @@
+// The log lines of a robot's services as they come, filtered.
+
+import * as more from "../../core/browser-more.js";
+import { LEVELS } from "../../core/logs.js";
+import { html, useEffect, useModel, usePage, useRef, useState, useValue } from "../parts/hooks.js";
+import { logViewOf } from "../parts/log-view.js";
+import { Why } from "../parts/parts.js";
+import { clockTime, inner, isObject } from "../parts/words.js";
+
+const SIGNS = { DEBUG: "·", INFO: "○", WARNING: "▲", ERROR: "✖", CRITICAL: "✖" };
+const END_PX = 24; // so near to the end the newest line is in sight
+const SAID_MS = 3000;
+const SERVICES = 64; // to choose from
+
+export function Logs({ at, view: cards }) {
+  const { commands, connection, store } = usePage();
+  const view = useModel(logViewOf(store, at));
+  const { you } = useModel(connection, (one) => one.you);
+  const card = useRef(/** @type {HTMLElement | null} */ (null));
+  useEffect(() => {
+    connection.onLogs = (message) => view.take(message);
+    commands.readLogs(at, true, view.book.origin, view.book.last);
+    return () => {
+      connection.onLogs = null;
+      commands.readLogs(at, false);
+    };
+  }, [view, you]); // each connection begins anew
+  useEffect(() => {
+    if (cards?.wanted !== "logs") return;
+    cards.wanted = "";
+    card.current?.scrollIntoView({ block: "nearest" });
+    card.current?.querySelector("select")?.focus({ preventScroll: true });
+  }, [cards?.wanted]);
+  const lines = view.book.filtered(view.filter);
+  return html`<div class="logs" ref=${card}>
+    <${Tools} at=${at} view=${view} lines=${lines} />
+    <${Lines} view=${view} lines=${lines} />
+    <${Foot} view=${view} lines=${lines} />
+  </div>`;
+}
+
+function Tools({ at, view, lines }) {
+  const { filter } = view;
+  const listed = inner(useValue(at, "status"))?.services;
+  const known = isObject(listed) ? Object.keys(listed).slice(0, SERVICES) : [];
+  const services = [...new Set([...known, ...view.book.services, filter.service])].filter(Boolean).sort();
+  const on = (name) => (event) => view.choose({ [name]: event.currentTarget.value });
+  return html`<div class="log-tools">
+    <select
+      data-test="log-level"
+      aria-label="Least level"
+      value=${String(filter.rank)}
+      onChange=${(event) => view.choose({ rank: Number(event.currentTarget.value) })}
+    >
+      ${LEVELS.map((level, rank) => html`<option key=${level} value=${rank}>${rank ? `${level} and above` : "All levels"}</option>`)}
+    </select>
+    <select data-test="log-service" aria-label="Service" value=${filter.service} onChange=${on("service")}>
+      <option value="">All services</option>
+      ${services.map((name) => html`<option key=${name} value=${name}>${name}</option>`)}
+    </select>
+    <input
+      type="search"
+      data-test="log-search"
+      placeholder="Search"
+      aria-label="Search in log lines"
+      value=${filter.search}
+      onInput=${on("search")}
+    />
+    <span class="log-buttons">
+      <${CopyButton} lines=${lines} />
+      <button type="button" data-test="log-clear" onClick=${() => view.clear()}>Clear</button>
+    </span>
+  </div>`;
+}
+
+function CopyButton({ lines }) {
+  const [done, show] = useState("");
+  useEffect(() => {
+    if (!done) return undefined;
+    const timer = setTimeout(() => show(""), SAID_MS);
+    return () => clearTimeout(timer);
+  }, [done]);
+  const copy = () =>
+    more.clipboard.copy(lines.map(textOf).join("\n")).then(
+      () => show(`${lines.length} lines copied`),
+      () => show("The browser refused it"),
+    );
+  const can = more.clipboard.possible;
+  return html`<button
+      type="button"
+      data-test="log-copy"
+      disabled=${!can}
+      aria-describedby=${can ? undefined : "log-copy-why"}
+      onClick=${copy}
+    >
+      Copy</button
+    >${!can && html`<${Why} id="log-copy-why">Copying needs https<//>`}
+    <span class="log-note" role="status">${done}</span>`;
+}
+
+const textOf = (line) =>
+  [line.t === null ? "" : new Date(line.t).toISOString(), line.level, line.service, line.text].filter(Boolean).join(" ");
+
+/** All of at most 500 are drawn, each once: the others are passed over. */
+function Lines({ view, lines }) {
+  const box = useRef(/** @type {HTMLElement | null} */ (null));
+  const nodes = useRef(new Map());
+  const old = nodes.current;
+  nodes.current = new Map(lines.map((line) => [line.number, old.get(line.number) ?? draw(line)]));
+  useEffect(() => {
+    if (view.follows && box.current) box.current.scrollTop = box.current.scrollHeight;
+  });
+  const scrolled = () => {
+    const { scrollTop, scrollHeight, clientHeight } = /** @type {HTMLElement} */ (box.current);
+    view.follow(scrollHeight - scrollTop - clientHeight < END_PX);
+  };
+  return html`<div
+    class="log-box"
+    data-test="log-lines"
+    role="log"
+    aria-live="off"
+    aria-label="Log lines"
+    tabindex="0"
+    data-arrows
+    ref=${box}
+    onScroll=${scrolled}
+  >
+    ${view.book.cut && html`<p class="log-gap">Older lines are not kept here</p>`}
+    ${lines.length ? html`<ol>${[...nodes.current.values()]}</ol>` : html`<${Empty} view=${view} />`}
+  </div>`;
+}
+
+function draw({ number, t, level, service, text, gap }) {
+  if (gap) return html`<li key=${number} class="log-gap">${text}</li>`;
+  const known = LEVELS.includes(level); // a robot must not choose a class
+  return html`<li key=${number} class=${`log-line ${known ? level.toLowerCase() : ""}`}>
+    <time title=${t === null ? "" : new Date(t).toLocaleString()}>${stamp(t)}</time>
+    <b class="log-level"><i aria-hidden="true">${SIGNS[level] ?? "○"}</i> ${level}</b>
+    <span class="log-service">${service}</span>
+    <span class="log-text">${text}</span>
+  </li>`;
+}
+
+const stamp = (t) => (t === null ? "no time" : `${clockTime(t)}.${String(Math.floor(t) % 1000).padStart(3, "0")}`);
+
+function Empty({ view }) {
+  const { connection } = usePage();
+  const count = view.book.lines.length;
+  const none = view.cleared ? "Cleared. New lines appear here." : "No log line has arrived yet.";
+  const why = connection.isOpen ? none : "No connection to the server";
+  return html`<p class="dim">${count ? `None of ${count} lines matches.` : why}</p>`;
+}
+
+function Foot({ view, lines }) {
+  const count = view.book.lines.length;
+  return html`<div class="log-foot">
+    <label class="check"
+      ><input
+        type="checkbox"
+        data-test="log-follow"
+        checked=${view.follows}
+        onChange=${(event) => view.follow(event.currentTarget.checked)}
+      /><span>Follow the newest line</span></label
+    >
+    <span class="dim" role="status">${view.follows ? "" : "Not following: you look at older lines"}</span>
+    <span class="dim log-count">${lines.length === count ? `${count}` : `${lines.length} of ${count}`} lines</span>
+  </div>`;
+}

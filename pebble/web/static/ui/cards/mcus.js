@@ -1,0 +1,167 @@
+// A section for each self-describing microcontroller: what it measures, and what it takes as commands.
+
+import { isLevel, useAnswer } from "../parts/asking.js";
+import { html, useMetric, useOnline, usePage, useRef, useState, useTick, useValue } from "../parts/hooks.js";
+import { command, fieldOf, range, readManifest, step, text, unsendable } from "./manifest.js";
+import { Icon, Why, isGone } from "../parts/parts.js";
+import { Spark, remember } from "./spark.js";
+import { useReasons, whyNotMoved } from "../parts/why-not.js";
+import { plain } from "../parts/more-words.js";
+import { clockTime, roughly } from "../parts/words.js";
+
+const MOST = 16;
+
+export function Mcus({ at, offers }) {
+  const why = whyNotMoved(useReasons(at), at);
+  const uids = offers.metrics
+    .map((metric) => /^mcu\/([^/]+)\/describe$/.exec(metric)?.[1])
+    .filter(Boolean)
+    .sort();
+  return html`${uids
+    .slice(0, MOST)
+    .map((uid, index) => html`<${Mcu} key=${uid} at=${at} uid=${uid} id=${`mcu-${index}`} whyNot=${why} />`)}
+  ${uids.length > MOST && html`<p class="dim">… ${uids.length - MOST} more</p>`}`;
+}
+
+function Mcu({ at, uid, id, whyNot }) {
+  const manifest = readManifest(useValue(at, `mcu/${uid}/describe`));
+  const rows = manifest?.interfaces.map((one, index) => {
+    const key = `${one.isOut} ${one.name} ${index}`; // a new manifest must not inherit what was entered
+    if (one.isOut) return html`<${Readings} key=${key} at=${at} uid=${uid} one=${one} />`;
+    return html`<${Form} key=${key} at=${at} uid=${uid} one=${one} id=${`${id}-${index}`} whyNot=${whyNot} />`;
+  });
+  return html`<section class="mcu" aria-labelledby=${id} data-test=${`mcu-${uid}`}>
+    <h3 id=${id}>${text(uid)}</h3>
+    ${!manifest && html`<p class="bad">What it says of itself cannot be read.</p>`}
+    ${manifest &&
+    html`<p class="dim">${manifest.model || "unknown model"} · firmware ${manifest.firmware || "unknown"}</p>
+      ${rows}
+      ${manifest.omitted > 0 && html`<p class="dim">… ${manifest.omitted} more</p>`}`}
+  </section>`;
+}
+
+/** The newest payload of an interface, under its own topic or under its alias. */
+function useReading(at, uid, one) {
+  const own = useMetric(at, `mcu/${uid}/${one.name}`);
+  const alias = useMetric(at, one.channel);
+  return own ?? alias;
+}
+
+function Readings({ at, uid, one }) {
+  useTick(1000);
+  const entry = useReading(at, uid, one);
+  const online = useOnline(at);
+  const history = useRef(/** @type {import("./spark.js").Point[]} */ ([]));
+  if (entry) remember(history.current, entry);
+  const { age = 0, period = 0 } = entry ?? {};
+  const repeats = one.kind === "sample" || one.rateHz > 0; // others are sent when they change
+  const gone = Boolean(entry) && isGone({ age, period: repeats ? period : 0 }, online);
+  const late = repeats && period > 0 && age > 2 * period + 250;
+  const rate = period > 0 && repeats && !gone ? `${plain(Number((1000 / period).toPrecision(2)))}/s` : "";
+  const since = entry ? `${roughly(age)} ago` : one.isPrivate ? "stays on the robot" : "nothing received yet";
+  return html`<div class="mcu-out" data-test=${`mcu-out-${one.name}`}>
+    <h4>
+      ${one.label}${" "}
+      <small class=${late ? "late" : ""}>${[one.profile, rate, since].filter(Boolean).join(" · ")}</small>
+    </h4>
+    <ul>
+      ${one.fields.map((field) => {
+        const value = entry && fieldOf(entry.value, field.name);
+        return html`<${Reading} key=${field.name} field=${field} value=${value} gone=${gone} history=${history} />`;
+      })}
+    </ul>
+    ${one.omitted > 0 && html`<p class="dim">… ${one.omitted} more</p>`}
+  </div>`;
+}
+
+/** One field; pressing it shows its last minute. */
+function Reading({ field, value, gone, history }) {
+  const [open, show] = useState(false);
+  const unit = field.unit && ` ${field.unit}`;
+  const words = value === undefined ? "–" : gone ? `– (was ${plain(value)}${unit})` : `${plain(value)}${unit}`;
+  const name = html`<span class="dim">${text(field.name)}</span>`;
+  const shown = html`<span class=${gone ? "dim" : ""}>${words}</span>`;
+  if (typeof value !== "number" && typeof value !== "boolean") return html`<li class="reading">${name}${shown}</li>`;
+  return html`<li>
+    <button
+      type="button"
+      class="reading quiet"
+      data-test=${`reading-${field.name}`}
+      aria-expanded=${String(open)}
+      onClick=${() => show(!open)}
+    >
+      ${name}${shown}<${Icon} name=${open ? "up" : "plot"} />
+    </button>
+    ${open && html`<${Spark} field=${field} history=${history} gone=${gone} />`}
+  </li>`;
+}
+
+function Form({ at, uid, one, id, whyNot }) {
+  const { commands } = usePage();
+  const [entered, enter] = useState(/** @type {Map<string, string | boolean>} */ (new Map()));
+  const [asked, ask] = useState(/** @type {{at: number, n: number} | null} */ (null));
+  const answer = useAnswer(asked?.n);
+  const names = isLevel(uid) && isLevel(one.name);
+  const own = unsendable(one) || (names ? "" : "its name cannot be part of a topic");
+  const { value, problems } = command(one, entered);
+  const why = own || whyNot || problems.join("; ");
+  const send = (event) => {
+    event.preventDefault();
+    if (why) return;
+    ask({ at: Date.now(), n: commands.commandMcu(at, uid, one.name, value) });
+  };
+  const change = (name, what) => enter(new Map(entered).set(name, what));
+  return html`<form class="mcu-in" data-test=${`mcu-in-${one.name}`} noValidate onSubmit=${send}>
+    <h4>${one.label} ${one.profile && html`<small>${one.profile}</small>`}</h4>
+    ${one.fields.map((field) => html`<${Entry} key=${field.name} field=${field} entered=${entered} change=${change} />`)}
+    ${one.omitted > 0 && html`<p class="dim">… ${one.omitted} more</p>`}
+    <button
+      type="submit"
+      data-test=${`send-${one.name}`}
+      aria-label=${`Send ${one.label}`}
+      aria-describedby=${why ? id : undefined}
+      disabled=${Boolean(why)}
+    >
+      Send
+    </button>
+    ${why && html`<${Why} id=${id}>${why}<//>`}
+    ${asked &&
+    html`<span class=${answer.op === "refused" ? "bad" : "dim"} role="status">${askedWords(answer, asked.at)}</span>`}
+  </form>`;
+}
+
+/** @param {import("../parts/asking.js").Progress} answer @param {number} at epoch ms */
+function askedWords({ op, why }, at) {
+  if (op === "refused") return `not done: ${why}`;
+  return `${op === "done" ? "sent" : "asked"} at ${clockTime(at)}`;
+}
+
+function Entry({ field, entered, change }) {
+  const value = entered.get(field.name);
+  const label = html`<span>${text(field.name)}${field.unit && html` <small>${field.unit}</small>`}</span>`;
+  const test = `field-${field.name}`;
+  if (field.type === "bool") {
+    return html`<label class="check"
+      ><input
+        type="checkbox"
+        role="switch"
+        data-test=${test}
+        checked=${value === true}
+        onChange=${(event) => change(field.name, event.currentTarget.checked)}
+      />${label}</label
+    >`;
+  }
+  const [least, most] = range(field) ?? [undefined, undefined];
+  return html`<label class="mcu-number"
+    >${label}<input
+      type="number"
+      data-test=${test}
+      min=${least}
+      max=${most}
+      step=${step(field)}
+      value=${value ?? ""}
+      onInput=${(event) => change(field.name, event.currentTarget.value)}
+    />
+    ${least !== undefined && html`<small>${least} to ${most}</small>`}</label
+  >`;
+}

@@ -1,0 +1,109 @@
+// Switched sockets: what their station reports of each, and what was asked of it.
+
+import { isLevel, useAnswer } from "../parts/asking.js";
+import { html, useEffect, useMetric, useOnline, useState, useTick } from "../parts/hooks.js";
+import { Why } from "../parts/parts.js";
+import { useReasons, whyNotEnd, whyNotMoved } from "../parts/why-not.js";
+import { inner, isObject } from "../parts/words.js";
+
+const MOST = 64;
+const LONG = 64; // characters of a name
+const CONFIRMED_MS = 3000;
+
+export function Outlets({ at, offers }) {
+  const page = useReasons(at);
+  const why = whyNotMoved(page, at);
+  const all = outletsOf(offers);
+  return html`${why && html`<${Why} id="why-outlets">${why}<//>`}
+    <ul class="outlets">
+      ${all
+        .slice(0, MOST)
+        .map((one, index) => html`<${Outlet} key=${one.name} ...${one} at=${at} id=${index} page=${page} />`)}
+    </ul>
+    ${!all.length && html`<p class="dim">No outlet is connected.</p>`}
+    ${all.length > MOST && html`<p class="dim">… ${all.length - MOST} more</p>`}`;
+}
+
+/**
+ * The outlets that the capabilities list, and those that have reported; of a component without such capabilities it is
+ * assumed that they can be switched.
+ * @param {import("../parts/models.js").Offers} offers @returns {{name: string, controls: boolean}[]}
+ */
+export function outletsOf(offers) {
+  const section = offers.section("outlets");
+  /** @type {Map<string, boolean>} */
+  const found = new Map();
+  for (const one of Array.isArray(section.outlets) ? section.outlets : []) {
+    if (isObject(one) && typeof one.name === "string" && one.name) found.set(one.name, one.controls !== false);
+  }
+  for (const metric of offers.metrics) {
+    const name = /^outlets\/([^/]+)\/status$/.exec(metric)?.[1];
+    if (name && !found.has(name)) found.set(name, section.available !== true);
+  }
+  return [...found].map(([name, controls]) => ({ name, controls }));
+}
+
+/**
+ * Why this one cannot be switched; "" it can. What is not reported is no obstacle; to switch off, no report is one.
+ * @param {string} name @param {boolean} controls @param {Record<string, unknown>} report @param {boolean} on
+ */
+export function obstacle(name, controls, report, on) {
+  if (!controls) return "this outlet cannot be switched from here: its robot lists no control";
+  if (!isLevel(name)) return "its name cannot be part of a topic";
+  if (!on) return "";
+  if (report.bound === false) return "no device is bound to this outlet";
+  if (report.reachable === false) return "outlet is unreachable";
+  return "";
+}
+
+function Outlet({ at, id, name, controls, page }) {
+  const payload = useMetric(at, `outlets/${name}/status`)?.value;
+  const online = useOnline(at);
+  const report = isObject(inner(payload)) ? inner(payload) : {};
+  const [asked, ask] = useState(/** @type {{on: boolean, at: number, n: number} | null} */ (null));
+  const answer = useAnswer(asked?.n);
+  const refused = answer.op === "refused";
+  const waits = asked !== null && report.on !== asked.on && !refused;
+  useEffect(() => {
+    if (asked && report.on === asked.on) ask(null);
+  }, [asked, report.on]);
+  useTick(waits ? 500 : 0);
+  const late = waits && performance.now() - asked.at > CONFIRMED_MS;
+  const words = report.on === true ? "on" : report.on === false ? "off" : "unknown";
+  const on = !(waits && !late ? asked.on : report.on === true); // what the next press asks
+  const own = obstacle(name, controls, report, on);
+  const common = on ? whyNotMoved(page, at) : whyNotEnd(page);
+  const press = () => ask({ on, at: performance.now(), n: page.commands.switchOutlet(at, name, on) });
+  const why = [common && "why-outlets", own && `why-outlet-${id}`].filter(Boolean).join(" ");
+  return html`<li class="outlet">
+    <span class="outlet-name">
+      <b id=${`outlet-${id}`}>${labelOf(payload, name)}</b>
+      <span data-test=${`outlet-state-${name}`}>${online ? words : `was ${words}`}</span>
+      ${waits &&
+      html`<span class=${late ? "bad" : "late"} role="status" data-test=${`outlet-asked-${name}`}
+        >asked: ${asked.on ? "on" : "off"}${late ? ", not confirmed" : ""}</span
+      >`}
+      ${refused && html`<span class="bad" role="status">not done: ${answer.why}</span>`}
+      ${own && html`<${Why} id=${`why-outlet-${id}`}>${own}<//>`}
+    </span>
+    <button
+      type="button"
+      role="switch"
+      class=${`switch ${waits ? "waits" : ""}`}
+      data-test=${`outlet-${name}`}
+      aria-checked=${String(report.on === true)}
+      aria-labelledby=${`outlet-${id}`}
+      aria-describedby=${why || undefined}
+      disabled=${Boolean(common || own)}
+      onClick=${press}
+    >
+      <span aria-hidden="true"></span>
+    </button>
+  </li>`;
+}
+
+function labelOf(payload, name) {
+  const label = isObject(payload) && typeof payload.label === "string" ? payload.label.trim() : "";
+  const text = label && label !== name ? `${label} (${name})` : name;
+  return text.length > LONG ? `${text.slice(0, LONG)}…` : text;
+}

@@ -1,0 +1,120 @@
+// The clips that a robot can play.
+
+import { html, useModel, useOnline, useValue } from "../parts/hooks.js";
+import { Icon, Why } from "../parts/parts.js";
+import { clips, grouped, play, playing, repeatLast, soundsOf } from "./sounds-model.js";
+import { useReasons, whyNot, whyNotEnd } from "../parts/why-not.js";
+import { plain } from "../parts/more-words.js";
+import { nameOf } from "../parts/words.js";
+import { useMemo } from "../../vendor/hooks.mjs";
+
+const MOST = 60; // clips that are listed at a time
+
+export function Sounds({ at }) {
+  const page = useReasons(at);
+  const sounds = useModel(soundsOf(at));
+  const why = whyNot(page, at, "soundboard");
+  const { last } = sounds;
+  const whyNotAgain = why || (last ? "" : "Play one sound first");
+  return html`<div class="sounds">
+    <${NowPlaying} at=${at} page=${page} />
+    <div class="ask-row">
+      <button
+        type="button"
+        data-test="repeat-last"
+        disabled=${Boolean(whyNotAgain)}
+        aria-describedby=${whyNotAgain ? "why-again" : undefined}
+        onClick=${() => repeatLast(page, at)}
+      >
+        <${Icon} name="play" />Again <kbd aria-hidden="true">P</kbd>
+      </button>
+      <label class="check"
+        ><input
+          type="checkbox"
+          data-test="repeat"
+          checked=${sounds.repeat}
+          onChange=${(event) => sounds.set({ repeat: event.currentTarget.checked })}
+        /><span>repeat until stopped</span></label
+      >
+    </div>
+    ${whyNotAgain && html`<${Why} id="why-again">${whyNotAgain}<//>`}
+    <${Clips} at=${at} page=${page} sounds=${sounds} why=${why} />
+  </div>`;
+}
+
+function NowPlaying({ at, page }) {
+  const { file, error } = playing(useValue(at, "soundboard-status"));
+  const why = whyNotEnd(page);
+  const was = useOnline(at) ? "plays" : "played when it was last seen";
+  return html`<div class="ask-row ask-now">
+      <p role="status" data-test="playing">
+        ${file ? html`<b>♪ ${plain(file)}</b> ${was}` : html`<span class="dim">Nothing ${was}.</span>`}
+      </p>
+      <button
+        type="button"
+        data-test="stop-sound"
+        disabled=${Boolean(why)}
+        aria-describedby=${why ? "why-stop-sound" : undefined}
+        onClick=${() => page.commands.stopSound(at)}
+      >
+        <${Icon} name="halt" />Stop sound
+      </button>
+    </div>
+    ${why && html`<${Why} id="why-stop-sound">${why}<//>`}
+    ${error && html`<p class="bad" data-test="sound-error">✖ ${plain(error)}</p>`}`;
+}
+
+function Clips({ at, page, sounds, why }) {
+  const payload = useValue(at, "soundboard-files");
+  const files = useMemo(() => clips(payload), [payload]);
+  const { filter } = sounds;
+  const shown = useMemo(() => grouped(files ?? [], filter, MOST), [files, filter]);
+  const now = playing(useValue(at, "soundboard-status")).file;
+  if (!files) return html`<p class="dim">No list of clips was received yet: is soundboard_handler enabled in its config?</p>`;
+  if (!files.length) return html`<p class="dim">No clips: put sound files into ${nameOf(at)}'s folder of sounds.</p>`;
+  return html`<input
+      type="search"
+      class="wide"
+      data-test="sound-filter"
+      aria-label="Filter the clips"
+      placeholder=${`filter ${files.length} clips`}
+      value=${filter}
+      onInput=${(event) => sounds.set({ filter: event.currentTarget.value })}
+    />
+    <div class="clips" data-test="clips" role="group" aria-label="Clips" tabindex="0" data-arrows>
+      ${shown.folders.map(
+        ([folder, names]) => html`<section key=${folder} aria-label=${folder ? plain(folder) : "clips"}>
+          ${folder && html`<h3>${plain(folder)}</h3>`}
+          <ul>
+            ${names.map(
+              (file) => html`<li key=${file}>
+                <${Clip} at=${at} page=${page} file=${file} folder=${folder} plays=${file === now} why=${why} />
+              </li>`,
+            )}
+          </ul>
+        </section>`,
+      )}
+      ${!shown.folders.length && html`<p class="dim">No clip matches “${filter}”.</p>`}
+      ${shown.more > 0 && html`<p class="dim" data-test="more-clips">… ${shown.more} more: use the filter.</p>`}
+    </div>`;
+}
+
+function Clip({ at, page, file, folder, plays, why: whyNotPlay }) {
+  const why = plays ? whyNotEnd(page) : whyNotPlay;
+  const press = () => {
+    const problem = why || (plays ? "" : play(page, at, file, soundsOf(at).repeat));
+    if (problem) page.connection.show(problem);
+    else if (plays) page.commands.stopSound(at);
+  };
+  return html`<button
+    type="button"
+    class=${`clip ${plays ? "on" : ""}`}
+    data-test="clip"
+    disabled=${Boolean(why)}
+    aria-describedby=${why ? (plays ? "why-stop-sound" : "why-again") : undefined}
+    aria-label=${`${plays ? "Stop" : "Play"} ${plain(file)}`}
+    onClick=${press}
+  >
+    <${Icon} name=${plays ? "halt" : "play"} /><span>${plain(file.slice(folder.length) || file)}</span>
+  </button>`;
+}

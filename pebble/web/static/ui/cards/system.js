@@ -1,0 +1,255 @@
+// What can be done to the whole robot: restart, reboot, update; and the flags that allow pictures and sound.
+
+import { Outcome, bootsOf, lacks } from "../../core/outcome.js";
+import { useAnswer } from "../parts/asking.js";
+import { html, useEffect, useModel, usePage, useState, useTick, useValue } from "../parts/hooks.js";
+import { logViewOf } from "../parts/log-view.js";
+import { Model } from "../parts/models.js";
+import { Panel } from "../panels/panel.js";
+import { HoldButton, Icon, Why } from "../parts/parts.js";
+import { useReasons, whyNot, whyNotEnd } from "../parts/why-not.js";
+import { plain } from "../parts/more-words.js";
+import { clockTime, driverName, nameOf } from "../parts/words.js";
+
+/** @typedef {import("../../core/outcome.js").Action} Action */
+
+/** @type {Record<Action, {title: string, effects: (name: string) => string[]}>} */
+const ACTIONS = {
+  "service-restart": {
+    title: "Restart Pebble",
+    effects: (name) => [
+      `All programs of ${name} end and start anew. It is away for some seconds.`,
+      "It stops driving; its script, pictures and sound end. A latched stop stays latched.",
+    ],
+  },
+  reboot: {
+    title: "Reboot",
+    effects: (name) => [
+      `The computer of ${name} restarts. It is away for a minute, or longer.`,
+      "If it does not come back, you have to go to it.",
+    ],
+  },
+  "git-pull": {
+    title: "Update",
+    effects: (name) => [
+      `${name} fetches new software. It runs after the next restart of Pebble.`,
+      "What comes of it is in its log lines.",
+    ],
+  },
+};
+
+export function System({ at, offers, view }) {
+  const page = useReasons(at);
+  const [asked, ask] = useState(/** @type {Action | ""} */ (""));
+  useEffect(() => ask(""), [at]);
+  return html`<div class="system">
+    <div class="system-actions">
+      ${Object.keys(ACTIONS).map((action) => {
+        const why = whyNotAct(page, at, offers, action);
+        const id = `why-${action}`;
+        return html`<div key=${action}>
+          <button
+            type="button"
+            data-test=${action}
+            disabled=${Boolean(why)}
+            aria-describedby=${why ? id : undefined}
+            onClick=${() => ask(/** @type {Action} */ (action))}
+          >
+            ${ACTIONS[action].title}…
+          </button>
+          ${why && html`<${Why} id=${id}>${why}<//>`}
+        </div>`;
+      })}
+    </div>
+    ${asked && html`<${Ask} at=${at} action=${asked} offers=${offers} onClose=${() => ask("")} />`}
+    <${LastOutcome} at=${at} view=${view} />
+    <${Flags} at=${at} offers=${offers} />
+  </div>`;
+}
+
+/** Why an action is off now; "" it is not. */
+const whyNotAct = (page, at, offers, action) =>
+  whyNot(page, at, "", "system") || lacks(action, offers.known ? offers.value : undefined);
+
+function Ask({ at, action, offers, onClose }) {
+  const page = useReasons(at);
+  const name = nameOf(at);
+  const { title, effects } = ACTIONS[action];
+  const why = whyNotAct(page, at, offers, action);
+  const held = () => {
+    begin(page, at, action);
+    onClose();
+  };
+  return html`<${Panel} id="ask" title=${`${title}: ${name}`} onClose=${onClose}>
+    <div class="system-ask">
+      <ul>
+        ${effects(name).map((text) => html`<li key=${text}>${text}</li>`)}
+        <${Now} at=${at} />
+      </ul>
+      <p class="dim">The robot does not acknowledge this. The page shows what is seen of it.</p>
+      <${HoldButton} test="ask-hold" disabled=${Boolean(why)} describedBy=${why ? "ask-why" : undefined} onHeld=${held}
+        >Hold 1 s: ${title}<//
+      >
+      ${why && html`<${Why} id="ask-why">${why}<//>`}
+      <button type="button" data-test="ask-leave" onClick=${onClose}>Leave it</button>
+    </div>
+  <//>`;
+}
+
+/** Who or what moves it at this moment. */
+function Now({ at }) {
+  const driver = useValue(at, "web/driver");
+  const script = useValue(at, "autonomy-status");
+  return html`${driver?.by && !driver.you && html`<li><b>${driverName(driver)} has control of it.</b></li>`}
+  ${script?.running === true && html`<li><b>The script ${plain(script.file)} is running.</b></li>`}`;
+}
+
+// -- what came of it
+
+/** Follows the states of one robot after an action was asked for, whatever is shown meanwhile. */
+class Watch extends Model {
+  /** @param {any} page @param {string} ref @param {Action} action */
+  constructor(page, ref, action) {
+    super();
+    this.page = page;
+    this.ref = ref;
+    this.outcome = new Outcome(action, page.store.now(), boots(page.store, ref));
+    this.n = 0; // of the command
+    const see = () => this.see();
+    this.ends = [
+      page.store.subscribe(ref, "web/liveness", see),
+      page.store.subscribe(ref, "web/estop", see),
+      page.connection.onChange(see),
+    ];
+    this.timer = setInterval(see, 1000);
+  }
+
+  see() {
+    const { store, connection } = this.page;
+    const answer = connection.answers.get(this.n);
+    if (answer?.op === "refused") this.outcome.refused = answer.why;
+    const entry = store.get(this.ref, "web/liveness");
+    const silent = entry?.value.silent_s;
+    this.outcome.see(
+      {
+        connected: connection.isOpen && !connection.socket.outdated,
+        online: entry?.value.online ?? null,
+        heartbeatAt: typeof silent === "number" ? store.now() - 1000 * silent - entry.age : null,
+        boots: boots(store, this.ref),
+      },
+      store.now(),
+    );
+    if (this.outcome.isOver(store.now())) this.end();
+    this.changed();
+  }
+
+  end() {
+    clearInterval(this.timer);
+    this.ends.splice(0).forEach((end) => end());
+  }
+}
+
+const boots = (store, ref) => bootsOf(store.get(ref, "web/estop")?.value?.owners);
+
+const NOTHING = new Model();
+/** @type {Map<string, Watch>} */
+const watches = new Map();
+const begun = new Model();
+
+function begin(page, ref, action) {
+  watches.get(ref)?.end();
+  const watch = new Watch(page, ref, action);
+  watches.set(ref, watch);
+  watch.n = page.commands.act(ref, action);
+  if (!watch.n) watch.outcome.refused = "no connection to the server";
+  begun.changed();
+}
+
+function LastOutcome({ at, view }) {
+  const { store } = usePage();
+  useModel(begun);
+  const watch = watches.get(at);
+  useModel(watch ?? NOTHING);
+  useTick(watch ? 1000 : 0);
+  const { seen, waits } = watch ? outcomeWords(watch.outcome, store.now()) : { seen: "", waits: "" };
+  const logs = () => {
+    logViewOf(store, at).choose({ service: "", rank: 0, search: watch?.outcome.action ?? "" });
+    view?.reveal("logs");
+  };
+  return html`<div class=${watch ? "system-outcome" : ""} data-test="outcome">
+    <p><span role="status">${seen}</span>${waits && `; ${waits}`}</p>
+    ${watch &&
+    html`<button type="button" data-test="outcome-logs" onClick=${logs}><${Icon} name="list" />Its log lines</button>`}
+  </div>`;
+}
+
+/** ``waits`` counts seconds: it is not read aloud. */
+function outcomeWords(outcome, now) {
+  const waits = outcome.refused ? "" : outcome.conclusion(now);
+  const words = outcome.words(now, clockTime).filter((one) => one !== waits);
+  return { seen: html`<b>${ACTIONS[outcome.action].title}:</b> ${words.join("; ")}`, waits };
+}
+
+// -- flags
+
+const FLAGS = /** @type {const} */ ([
+  ["mqtt-video", "mqtt_video", "Pictures", "The camera may run when a page wants its pictures"],
+  ["mqtt-audio", "mqtt_audio", "Sound", "Microphone and loudspeaker may run when a page wants them"],
+  ["remote-mirror", "remote_mirror", "Mirror", "Commands on the robot's own broker are copied to this one, to debug"],
+]);
+const ECHO_MS = 5000;
+
+function Flags({ at, offers }) {
+  const flags = useValue(at, "web/flags");
+  const has = { mqtt_video: offers.hasVideo, mqtt_audio: offers.has("audio"), remote_mirror: offers.transport !== "mcu" };
+  const shown = FLAGS.filter(([, field]) => has[field] || typeof flags?.[field] === "boolean");
+  if (!shown.length) return null;
+  return html`<section class="system" aria-labelledby="flags-title">
+    <h3 id="flags-title">Allowed, as the broker remembers it</h3>
+    ${shown.map(
+      ([name, field, title, meaning]) =>
+        html`<${Flag} key=${`${at} ${name}`} at=${at} name=${name} title=${title} meaning=${meaning} value=${flags?.[field]} known=${Boolean(flags)} />`,
+    )}
+  </section>`;
+}
+
+function Flag({ at, name, title, meaning, value, known }) {
+  const page = useReasons(at);
+  const [asked, ask] = useState(/** @type {{on: boolean, at: number, was: any, n: number} | null} */ (null));
+  useEffect(() => {
+    // another operator's change may arrive in place of the echo
+    if (asked && (value === asked.on || value !== asked.was)) ask(null);
+  }, [asked, value]);
+  useTick(asked ? 500 : 0);
+  const answer = useAnswer(asked?.n);
+  const isWaiting = asked && answer.op !== "refused" && performance.now() - asked.at < ECHO_MS;
+  const pending = isWaiting ? asked : null;
+  const why = whyNotEnd(page) || (known ? "" : "Not received yet");
+  const change = (event) => {
+    const on = event.currentTarget.checked;
+    ask({ on, at: performance.now(), was: value, n: page.commands.setFlag(at, name, on) });
+  };
+  const id = `flag-${name}`;
+  return html`<div class="flag">
+    <label class="check"
+      ><input
+        type="checkbox"
+        role="switch"
+        data-test=${id}
+        checked=${pending ? pending.on : value === true}
+        disabled=${Boolean(why)}
+        aria-describedby=${`${id}-why`}
+        onChange=${change}
+      /><span>${title}</span></label
+    >
+    <span class="flag-state" role="status">${flagWords(asked, pending, value, answer)}</span>
+    <${Why} id=${`${id}-why`}>${why || meaning}<//>
+  </div>`;
+}
+
+function flagWords(asked, pending, value, answer) {
+  const now = value === true ? "on" : value === false ? "off" : "never set";
+  if (pending) return `asked: ${pending.on ? "on" : "off"}…`;
+  if (answer.op === "refused") return `✖ ${now}; not done: ${answer.why}`;
+  return asked && asked.on !== value ? `✖ not confirmed: ${now}` : now;
+}

@@ -1,0 +1,113 @@
+// What the component reports of itself, in words and numbers.
+
+import { html, styled, useMetric, useOnline, useTick, useValue } from "../parts/hooks.js";
+import { Live, Part } from "../parts/parts.js";
+import { poseOf, poseWords } from "../../core/trail.js";
+import { charging, plain } from "../parts/more-words.js";
+import { battery, inner, isObject, number, roughly, span } from "../parts/words.js";
+
+const STREAM_MS = 1000;
+const SERVICES = styled(async () => (await import("./services.js")).Services, "system.css");
+
+export function Telemetry({ at, view }) {
+  const online = useOnline(at);
+  return html`<dl class="values">
+    <${Row} at=${at} metric="charging-level" name="Battery" online=${online}>${battery}<//>
+    <${Row} at=${at} metric="charging-status" name="Charger" online=${online}>${charging}<//>
+    <${Heartbeat} at=${at} />
+    <${Row} at=${at} metric="sensors/imu" name="Roll, pitch" online=${online} streams>${attitude}<//>
+    <${Row} at=${at} metric="sensors/imu" name="Turn rate" online=${online} streams>${rate}<//>
+    <${Row} at=${at} metric="sensors/imu" name="Acceleration" online=${online} streams>${acceleration}<//>
+    <${Row} at=${at} metric="touch-sensors" name="Touch" online=${online} streams>${touch}<//>
+    <${Row} at=${at} metric="wheel-odometry" name="Odometry" online=${online} streams>${odometry}<//>
+    <${Media} at=${at} online=${online} />
+    <${Services} at=${at} view=${view} />
+  </dl>`;
+}
+
+/** ``streams``: it comes several times a second, so a single one is old after ten seconds, too. */
+function Row({ at, metric, name, online, streams = false, children: words }) {
+  const received = useMetric(at, metric);
+  if (!received) return null;
+  const entry = streams ? { ...received, period: received.period || STREAM_MS } : received;
+  return html`<div>
+    <dt>${name}</dt>
+    <dd><${Live} entry=${entry} online=${online}>${words(entry.value)}<//></dd>
+  </div>`;
+}
+
+function Heartbeat({ at }) {
+  useTick(500);
+  const entry = useMetric(at, "web/liveness");
+  const view = entry?.value;
+  if (!view) return null;
+  const age = view.silent_s === null ? null : 1000 * view.silent_s + entry.age;
+  const ago = age < 1500 ? "within the last second" : `${roughly(age)} ago`;
+  const every = view.interval_ms ? `, every ${span(view.interval_ms)}` : "";
+  const seen = age === null ? "none since the server started" : `${ago}${every}`;
+  const average = view.average_latency_ms ?? null;
+  const late = view.whole_seconds
+    ? "unknown: its clock counts whole seconds"
+    : view.latency_ms === null
+      ? "–"
+      : `${span(view.latency_ms)}${average === null ? "" : `, on average ${span(average)}`}`;
+  return html`<div>
+      <dt>Heartbeat</dt>
+      <dd class=${view.online === false ? "bad" : ""}>${seen}</dd>
+    </div>
+    <div>
+      <dt>Latency</dt>
+      <dd>${late}</dd>
+    </div>`;
+}
+
+const degrees = (value) => `${number(value, 1)}°`;
+
+function attitude(payload) {
+  const angles = inner(payload)?.orientation_deg;
+  return `${degrees(angles?.roll)}, ${degrees(angles?.pitch)}`;
+}
+
+const rate = (payload) => `${number(inner(payload)?.gyro_dps?.z, 1)} °/s`;
+
+/** Where it is; all else of it is in the list of all values. */
+function odometry(payload) {
+  const pose = poseOf(payload);
+  return pose ? poseWords(pose) : plain(inner(payload));
+}
+
+const acceleration = (payload) => `${number(inner(payload)?.accel_norm_g, 2)} g`;
+
+function touch(payload) {
+  const value = inner(payload);
+  return isObject(value) ? Object.values(value).slice(0, 8).map(plain).join(" · ") : plain(value);
+}
+
+function Media({ at, online }) {
+  const entry = useMetric(at, "media-status");
+  const streams = inner(entry?.value);
+  if (!isObject(streams)) return null;
+  return Object.entries(streams)
+    .slice(0, 8)
+    .map(
+      ([name, report]) => html`<div key=${name}>
+        <dt>${name.replaceAll("_", " ")}</dt>
+        <dd class=${report?.last_error ? "bad" : ""}>
+          ${online ? "" : "was: "}${report?.last_error ? `✖ ${plain(report.last_error)}` : mediaWords(report)}
+        </dd>
+      </div>`,
+    );
+}
+
+function mediaWords(report) {
+  if (!isObject(report)) return plain(report);
+  return report.running ? plain(report.doing ?? "running") : "rests";
+}
+
+function Services({ at, view }) {
+  if (!isObject(inner(useValue(at, "status"))?.services)) return null;
+  return html`<div class="services">
+    <dt>Services</dt>
+    <dd><${Part} part=${SERVICES} at=${at} view=${view} /></dd>
+  </div>`;
+}

@@ -1,0 +1,45 @@
+// The frame of all panels: no modal dialogs, because STOP stays in reach. While one is open, nothing is driven.
+
+import { html, useEffect, usePage, useRef } from "../parts/hooks.js";
+import { Icon } from "../parts/parts.js";
+
+/** @param {{id: string, title: string, onClose: () => void, className?: string, children?: any}} props */
+export function Panel({ id, title, onClose, className = "", children }) {
+  const { driver } = usePage();
+  const element = useRef(null);
+  useEffect(() => {
+    const before = /** @type {HTMLElement | null} */ (document.activeElement);
+    driver.interrupt();
+    element.current.focus();
+    return () => {
+      driver.interrupt();
+      before?.focus?.();
+    };
+  }, []);
+  useEffect(() => {
+    if (document.activeElement === document.body) element.current.focus(); // what had it is gone
+  });
+  return html`<dialog
+    open
+    class=${`panel ${className}`}
+    ref=${element}
+    tabindex="-1"
+    data-test=${`panel-${id}`}
+    aria-labelledby=${`${id}-title`}
+    onKeyDown=${(event) => event.key === "Escape" && onClose()}
+  >
+    <div class="card-head">
+      <h2 id=${`${id}-title`}>${title}</h2>
+      <button
+        type="button"
+        class="quiet"
+        data-test=${`close-${id}`}
+        aria-label=${`Close ${title.toLowerCase()}`}
+        onClick=${onClose}
+      >
+        <${Icon} name="close" />
+      </button>
+    </div>
+    ${children}
+  </dialog>`;
+}

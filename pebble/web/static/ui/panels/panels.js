@@ -1,0 +1,12 @@
+// All panels: one of them can be open above each screen.
+
+import { GamepadPanel } from "./gamepad.js";
+import { HelpPanel } from "./help.js";
+import { html } from "../parts/hooks.js";
+import { PhonePanel } from "./phone.js";
+import { SettingsPanel } from "./settings.js";
+
+const PANELS = { settings: SettingsPanel, help: HelpPanel, gamepad: GamepadPanel, phone: PhonePanel };
+
+/** The panel that is shown. */
+export const Panels = ({ shown, onClose }) => html`<${PANELS[shown]} key=${shown} onClose=${onClose} />`;

@@ -1,0 +1,75 @@
+// The address of this screen as a QR code; or why a phone cannot open it.
+
+import { ROOT } from "../../core/browser.js";
+import { qrCode, pathOf } from "../../core/qr.js";
+import { html, useModel, usePage } from "../parts/hooks.js";
+import { Route } from "../parts/models.js";
+import { Panel } from "./panel.js";
+import { nameOf } from "../parts/words.js";
+
+const QUIET = 4; // modules around the code
+
+export function PhonePanel({ onClose }) {
+  const { ref } = useModel(usePage().route);
+  return html`<${Panel} id="phone" onClose=${onClose} title="Open on a phone">
+    ${isLoopback(location.hostname) ? html`<${OnlyHere} />` : html`<${Code} at=${ref} />`}
+  <//>`;
+}
+
+/** @param {string} host @returns {boolean} whether no other machine can reach it */
+export const isLoopback = (host) => /^(127\.[\d.]+|0\.0\.0\.0|\[::1?\]|localhost|.*\.localhost)$/.test(host);
+
+function Code({ at }) {
+  const whole = location.origin + Route.path(at, false);
+  const grid = qrCode(whole);
+  const address = grid ? whole : location.origin + ROOT;
+  return html`<div class="panel-text">
+    <${Drawn} grid=${grid ?? qrCode(address)} text=${address} />
+    <p class="address" data-test="address">${address}</p>
+    <p>
+      ${at && grid ? `Opens ${nameOf(at)}.` : "Opens the list of all robots."} The phone has to be in this network, and
+      its user logs in; there is no password in the code.
+    </p>
+    ${location.protocol === "https:" &&
+    html`<p class="dim">
+      If the phone does not trust the certificate: let it install <span class="address">${location.origin}${ROOT}ca.pem</span>
+    </p>`}
+  </div>`;
+}
+
+function Drawn({ grid, text }) {
+  if (!grid) return html`<p>This address is too long for a code.</p>`;
+  const size = grid.length + 2 * QUIET;
+  return html`<svg
+    class="qr"
+    role="img"
+    aria-label=${`QR code of ${text}`}
+    viewBox=${`${-QUIET} ${-QUIET} ${size} ${size}`}
+    shape-rendering="crispEdges"
+  >
+    <rect x=${-QUIET} y=${-QUIET} width=${size} height=${size} fill="#fff" />
+    <path d=${pathOf(grid)} fill="#000" />
+  </svg>`;
+}
+
+function OnlyHere() {
+  const { connection } = usePage();
+  const port = location.port ? `:${location.port}` : "";
+  const server = connection.you?.server ?? "";
+  const name = /^[\w-]{1,60}$/.test(server) ? `${server}.local` : "lab-pc.local";
+  return html`<div class="panel-text" data-test="only-here">
+    <p>
+      <b>A phone cannot open ${location.host}:</b> on every machine, this is the address of that machine itself.
+    </p>
+    ${location.protocol === "https:"
+      ? html`<p>Open this page by the name that is in its certificate, and come back here for the code.</p>`
+      : html`<p>For other machines, the page needs https and a login. On this computer, type once:</p>
+          <pre>
+pebble cert init ${name} 192.168.1.20
+pebble web user add ann --role driver</pre
+          >
+          <p>Use its own name and address. Then start the page for all machines:</p>
+          <pre>pebble web goob.json --host 0.0.0.0</pre>
+          <p>and open <span class="address">https://${name}${port}</span>, which has a code here.</p>`}
+  </div>`;
+}

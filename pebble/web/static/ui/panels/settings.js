@@ -1,0 +1,138 @@
+// Who I am, and how the page looks and is used in this browser.
+
+import { html, useModel, usePage } from "../parts/hooks.js";
+import { lacks } from "../parts/lacks.js";
+import { NoticeList } from "../fleet/notices.js";
+import { Panel } from "./panel.js";
+import { Icon } from "../parts/parts.js";
+import { RecordingsLink } from "../fleet/recordings-link.js";
+import { nameOf } from "../parts/words.js";
+
+const THEMES = { auto: "as the system", light: "light", dark: "dark" };
+const SIDES = { left: "on the left", right: "on the right" };
+const RIGHTS = { drive: "drive", reset: "reset stops", system: "restart and update robots", people: "manage users" };
+const MORE = [
+  { name: "help", icon: "help", text: "Keys, and how stopping works" },
+  { name: "gamepad", icon: "pad", text: "Set up a gamepad" },
+  { name: "phone", icon: "phone", text: "Open on a phone" },
+];
+
+export function SettingsPanel({ onClose }) {
+  const { settings, driver, panels } = usePage();
+  useModel(settings);
+  useModel(driver);
+  const narrow = !document.querySelector(".bell"); // else the list is behind a button of its own
+  return html`<${Panel} id="settings" title="Settings" onClose=${onClose}>
+    <${WhoAmI} />
+    ${lacks().map((one) => html`<p key=${one} class="panel-text why" data-test="lacks">${one}</p>`)}
+    ${narrow &&
+    html`<section class="panel-part" aria-labelledby="notices-heading">
+      <h3 id="notices-heading">Notices</h3>
+      <${NoticeList} onGo=${onClose} />
+    </section>`}
+    <${Choice} name="theme" title="Colours" choices=${THEMES} />
+    <${Choice} name="side" title="Stick, on a phone" choices=${SIDES} />
+    <fieldset>
+      <legend>Driving</legend>
+      <${Check} test="hints" checked=${settings.hints} onChange=${(checked) => settings.set("hints", checked)}>
+        Show which keys drive
+      <//>
+      ${driver.ref &&
+      html`<${Check}
+        test="in-sight"
+        checked=${driver.inSight}
+        onChange=${(checked) => {
+          driver.inSight = checked;
+          driver.changed();
+        }}
+      >
+        I can see ${nameOf(driver.ref)}: drive with an old picture, too. In this tab
+      <//>`}
+    </fieldset>
+    <div class="panel-links">
+      <div onClick=${onClose}><${RecordingsLink} at=${driver.ref} className="button wide" /></div>
+      ${MORE.map(
+        ({ name, icon, text }) => html`<button
+          key=${name}
+          type="button"
+          class="wide"
+          data-test=${`open-${name}`}
+          onClick=${() => panels.show(name)}
+        >
+          <${Icon} name=${icon} />${text}
+        </button>`,
+      )}
+    </div>
+  <//>`;
+}
+
+function Choice({ name, title, choices }) {
+  const { settings } = usePage();
+  return html`<fieldset>
+    <legend>${title}</legend>
+    <div class="choices">
+      ${Object.entries(choices).map(
+        ([value, text]) => html`<label key=${value} class="check"
+          ><input
+            type="radio"
+            data-test=${`${name}-${value}`}
+            name=${name}
+            checked=${settings[name] === value}
+            onChange=${() => settings.set(name, value)}
+          /><span>${text}</span></label
+        >`,
+      )}
+    </div>
+  </fieldset>`;
+}
+
+const Check = ({ test, checked, onChange, children }) => html`<label class="check"
+  ><input
+    type="checkbox"
+    data-test=${test}
+    checked=${checked}
+    onChange=${(event) => onChange(event.currentTarget.checked)}
+  /><span>${children}</span></label
+>`;
+
+function WhoAmI() {
+  const { connection, commands } = usePage();
+  useModel(connection);
+  const { you } = connection;
+  if (!you) return html`<p class="dim">Not connected yet.</p>`;
+  const rights = (you.rights ?? []).map((one) => RIGHTS[one] ?? one);
+  return html`<section class="who" aria-label="Who I am">
+    <span class="badge"><${Icon} name="person" /></span>
+    <p>
+      <b>${you.login ? you.user : "No login on this machine"}</b>
+      <span class="dim">${you.role} at ${you.server}. May ${["stop", ...rights].join(", ")}.</span>
+    </p>
+    ${you.login
+      ? html`<button type="button" onClick=${() => commands.logOut()}><${Icon} name="out" />Log out</button>`
+      : html`<${OwnName} you=${you} />`}
+  </section>`;
+}
+
+/** Without a login everybody would be called the same. */
+function OwnName({ you }) {
+  const { commands, settings } = usePage();
+  useModel(settings);
+  const change = (event) => {
+    const name = event.currentTarget.value.trim();
+    if (name !== settings.name) commands.setName(name);
+  };
+  return html`<div class="own-name">
+    <label
+      >Your name on this page
+      <input
+        type="text"
+        maxlength="32"
+        autocomplete="nickname"
+        data-test="own-name"
+        aria-describedby="own-name-why"
+        value=${settings.name}
+        onChange=${change}
+    /></label>
+    <span class="why" id="own-name-why">Others see “${you.user}”. Nobody checks it: here is no login.</span>
+  </div>`;
+}

@@ -1,0 +1,205 @@
+// Small parts of many widgets.
+
+import * as browser from "../../core/browser.js";
+import { Boundary, html, useEffect, useLater, usePage, usePart, useRef, useState, useTick, useValue } from "./hooks.js";
+import { Route } from "./models.js";
+import { reported, roughly } from "./words.js";
+
+const ICONS = new URL("../../icons.svg", import.meta.url).href;
+const GONE_MS = 10_000;
+const LATE_MS = 250; // beyond two periods
+
+/** @param {{name: string}} props */
+export const Icon = ({ name }) => html`<svg class="icon" aria-hidden="true"><use href=${`${ICONS}#${name}`} /></svg>`;
+
+/** A button that stops at the first touch, not when the finger is lifted, and with any finger. */
+export function StopButton({ onStop, label, children, className = "", describedBy, test }) {
+  const touchedAt = useRef(-Infinity);
+  return html`<span class="stop-area">
+    <button
+      type="button"
+      class=${`stop ${className}`}
+      data-test=${test}
+      aria-label=${label}
+      aria-describedby=${describedBy}
+      onPointerDown=${() => {
+        touchedAt.current = performance.now();
+        onStop();
+      }}
+      onClick=${(event) => (event.detail === 0 || performance.now() - touchedAt.current > 1500) && onStop()}
+      onContextMenu=${(event) => event.preventDefault()}
+    >
+      ${children}
+    </button>
+  </span>`;
+}
+
+const HOLD_MS = 1000;
+const HINT_MS = 2500;
+
+/** A button that has to be held for a second, by pointer or key. */
+export function HoldButton({ onHeld, disabled = false, children, className = "", describedBy, test }) {
+  const [held, hold] = useState(false);
+  const [tapped, setTapped] = useState(false);
+  const done = useRef(onHeld);
+  done.current = disabled ? () => {} : onHeld;
+  useEffect(() => {
+    if (disabled) hold(false); // the end of a press on a button that is off is not reported
+    if (!held || disabled) return undefined;
+    const timer = setTimeout(() => {
+      hold(false);
+      done.current();
+    }, HOLD_MS);
+    return () => clearTimeout(timer);
+  }, [held, disabled]);
+  useEffect(() => {
+    if (!tapped) return undefined;
+    const timer = setTimeout(() => setTapped(false), HINT_MS);
+    return () => clearTimeout(timer);
+  }, [tapped]);
+  const end = () => {
+    if (held) setTapped(true); // too early
+    hold(false);
+  };
+  const key = (event) => event.code === "Space" || event.code === "Enter";
+  return html`<button
+    type="button"
+    class=${`hold ${held ? "held" : ""} ${className}`}
+    data-test=${test}
+    disabled=${disabled}
+    aria-describedby=${describedBy}
+    onPointerDown=${(event) => {
+      if (event.button) return;
+      browser.capture(event);
+      setTapped(false);
+      hold(true);
+    }}
+    onPointerUp=${end}
+    onPointerCancel=${end}
+    onLostPointerCapture=${end}
+    onBlur=${end}
+    onKeyDown=${(event) => key(event) && !event.repeat && hold(true)}
+    onKeyUp=${end}
+    onContextMenu=${(event) => {
+      event.preventDefault();
+      end();
+    }}
+  >
+    <span class="hold-fill" aria-hidden="true"></span><span class="hold-text"
+      >${tapped && !held ? "Keep it pressed for 1 s" : children}</span
+    >
+  </button>`;
+}
+
+/** The reason under a control that is off. */
+export const Why = ({ id, children }) => html`<span class="why" id=${id}>${children}</span>`;
+
+/** What is no longer shown as a value. */
+export const Gone = ({ age, children }) => html`<span class="dim">– <small>(${roughly(age)} ago: ${children})</small></span>`;
+
+/** Whether it is too old to be shown as a value. @param {{age: number, period: number}} entry @param {boolean} online */
+export const isGone = ({ age, period }, online) => !online || (period > 0 && age > Math.max(GONE_MS, 3 * period));
+
+/**
+ * A value and how old it is: of another colour after two periods; after ten seconds, or three periods if these are
+ * longer, it is no longer shown as a value.
+ * @param {{entry?: import("../../core/store.js").Value, online?: boolean, children: any}} props
+ */
+export function Live({ entry, online = true, children }) {
+  const { age = 0, period = 0 } = entry ?? {};
+  const lateAt = period > 0 ? 2 * period + LATE_MS : Infinity;
+  const late = age > lateAt;
+  useTick(!online || late ? 1000 : 0); // its age is shown
+  useLater(online && !late ? lateAt - age + 1 : Infinity);
+  if (!entry) return html`<span class="dim">–</span>`;
+  if (isGone(entry, online)) return html`<${Gone} age=${age}>${children}<//>`;
+  return html`<span class=${late ? "late" : ""}>${children}${late && html` <small>${roughly(age)} old</small>`}</span>`;
+}
+
+/** @param {{title: string, id: string, icon?: string, aside?: any, view?: any, className?: string, children: any}} props */
+export function Card({ title, id, icon, aside, view, className = "", children }) {
+  const closed = view?.isClosed(id) ?? false;
+  return html`<section class=${`card ${className}`} aria-labelledby=${`${id}-title`} data-card=${id}>
+    <header class="card-head">
+      ${icon && html`<${Icon} name=${icon} />`}
+      <h2 id=${`${id}-title`}>${title}</h2>
+      ${aside}
+      ${view &&
+      html`<button
+          type="button"
+          class="quiet"
+          aria-expanded=${!closed}
+          aria-label=${`${closed ? "Open" : "Close"} ${title}`}
+          onClick=${() => view.toggle(id)}
+        >
+          <${Icon} name=${closed ? "down" : "up"} />
+        </button>
+        <button type="button" class="quiet" aria-label=${`Hide ${title}`} onClick=${() => view.hide(id)}>
+          <${Icon} name="close" />
+        </button>`}
+    </header>
+    ${!closed && html`<div class="card-body">${children}</div>`}
+  </section>`;
+}
+
+/** A part of the page that is fetched when it is first shown; ``now``: even before the first picture. */
+export function Part({ part, now = false, ...props }) {
+  const { body, failed } = usePart(part, now);
+  if (body) return html`<${body} ...${props} />`;
+  if (!failed) return html`<p class="loading" role="status">Loading…</p>`;
+  return html`<p class="failed" role="alert">
+    A part of this page could not be fetched.
+    <button type="button" onClick=${() => location.reload()}>Reload</button>
+  </p>`;
+}
+
+/**
+ * One of the components that ``of`` fetches: nothing until it is here, and it may fail without what it is beside.
+ * @param {any} props
+ */
+export function Extra({ of, part, what, source, ...props }) {
+  const { body } = usePart(of);
+  return body && html`<${Boundary} key=${source} what=${what}><${body[part]} source=${source} ...${props} /><//>`;
+}
+
+/** The address of its own stream: what was entered, else what it reports; "" none. @param {string} at */
+export function useStream(at) {
+  const own = reported(useValue(at, "status"));
+  return useValue(at, "web/stream-address")?.url || own;
+}
+
+/** Follow a link to a component, or the fleet, without loading the page again. @param {any} props */
+export function RouteLink({ to = "", path = Route.path(to), className, label, children }) {
+  const { route } = usePage();
+  const go = (event) => {
+    if (event.ctrlKey || event.metaKey || event.shiftKey || event.button) return;
+    event.preventDefault();
+    route.open(path);
+  };
+  return html`<a class=${className} href=${path} aria-label=${label} onClick=${go}>${children}</a>`;
+}
+
+/** Move one of the driver's sliders. */
+export function set(driver, name) {
+  return (event) => {
+    driver.sliders[name] = Number(event.currentTarget.value) / 100;
+    driver.changed();
+  };
+}
+
+export function Slider({ name, value, min, max = 100, text, onInput }) {
+  return html`<label class="slider">
+    <span>${name}</span>
+    <input
+      type="range"
+      data-test=${name.toLowerCase()}
+      min=${min}
+      max=${max}
+      step="5"
+      value=${Math.round(100 * value)}
+      aria-valuetext=${text}
+      onInput=${onInput}
+    />
+    <output>${text}</output>
+  </label>`;
+}

@@ -1,0 +1,45 @@
+// How the inputs are scaled, and the extra axis.
+
+import * as browser from "../../core/browser.js";
+import { html, useEffect, useModel, usePage } from "../parts/hooks.js";
+import { Icon, Slider, set } from "../parts/parts.js";
+
+export function DriveSettings() {
+  const { driver } = usePage();
+  const { turn, balance } = useModel(driver).sliders;
+  const part = `${Math.round(100 * turn)} %`;
+  const side = balance === 0 ? "centred" : `${Math.round(100 * Math.abs(balance))} % ${balance > 0 ? "right" : "left"}`;
+  return html`<div class="sliders">
+    <${Slider} name="Turn" value=${turn} min=${5} text=${part} onInput=${set(driver, "turn")} />
+    <${Slider} name="Balance" value=${balance} min=${-50} max=${50} text=${side} onInput=${set(driver, "balance")} />
+    <div class="aux">
+      <span>Extra axis <kbd>Q</kbd> <kbd>E</kbd></span>
+      <${AuxButton} driver=${driver} value=${1} label="Extra axis up">+<//>
+      <${AuxButton} driver=${driver} value=${-1} label="Extra axis down">−<//>
+    </div>
+    <p class="pad-name"><${Icon} name="pad" />${driver.pads?.pad?.id || "no gamepad: press one of its buttons"}</p>
+  </div>`;
+}
+
+function AuxButton({ driver, value, label, children }) {
+  const reason = driver.reason();
+  const end = () => driver.hold(`aux ${value}`, 0);
+  useEffect(() => end, []);
+  return html`<button
+    type="button"
+    data-test=${`aux${value > 0 ? "+" : "-"}`}
+    aria-label=${label}
+    disabled=${Boolean(reason) && !driver.gestureActive}
+    aria-describedby=${reason ? "why-drive" : undefined}
+    onPointerDown=${(event) => {
+      browser.capture(event);
+      driver.hold(`aux ${value}`, value, event.timeStamp);
+    }}
+    onPointerUp=${end}
+    onPointerCancel=${end}
+    onLostPointerCapture=${end}
+    onContextMenu=${(event) => event.preventDefault()}
+  >
+    ${children}
+  </button>`;
+}

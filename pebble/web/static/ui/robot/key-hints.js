@@ -1,0 +1,24 @@
+// Which keys drive; they light up while they are held.
+
+import { html, useModel, usePage } from "../parts/hooks.js";
+import { useKeyNames } from "../parts/keyboard.js";
+import { Icon } from "../parts/parts.js";
+
+const GRID = ["KeyQ", "KeyW", "KeyE", "KeyA", "KeyS", "KeyD"];
+
+export function KeyHints() {
+  const { driver, panels } = usePage();
+  useModel(driver);
+  const name = useKeyNames();
+  return html`<div class="keys">
+    <div class="key-grid" aria-hidden="true">
+      ${GRID.map(
+        (code) => html`<kbd key=${code} class=${driver.inputs.keys.has(code) ? "on" : ""}>${name(code)}</kbd>`,
+      )}
+    </div>
+    <p aria-hidden="true">or arrows drive,<br /><b>space</b> stops,<br /><b>Esc Esc</b> is STOP</p>
+    <button type="button" class="quiet" data-test="help" aria-label="All keys, and how stopping works" onClick=${() => panels.show("help")}>
+      <${Icon} name="help" />
+    </button>
+  </div>`;
+}

@@ -1,0 +1,201 @@
+// What belongs to a picture besides it: what robots draw over it, snapshots, and the robot's own stream.
+
+import * as more from "../../core/browser-more.js";
+import { MIXED, refusal } from "../../core/stream.js";
+import { html, useEffect, useMetrics, useModel, usePage, useRef, useState, useValue } from "../parts/hooks.js";
+import { Model, read, write } from "../parts/models.js";
+import { Icon, Why, useStream } from "../parts/parts.js";
+import { NewestOverlays, STALE_MS, contained, drawOverlays } from "../../media/overlays.js";
+import { nameOf, visible } from "../parts/words.js";
+
+const OVERLAYS = "video-overlays";
+
+/** Whether overlays are drawn over the pictures of a component; remembered in this browser. */
+class Switches extends Model {
+  isOn(ref) {
+    return read(`overlays ${ref}`, true) !== false;
+  }
+
+  set(ref, on) {
+    write(`overlays ${ref}`, on);
+    this.changed();
+  }
+}
+
+const switches = new Switches();
+
+/** What lies over the picture of ``source``. */
+export function Layer({ source }) {
+  const { video, driver } = usePage();
+  useModel(video);
+  const address = useStream(source);
+  const moved = video.stream !== "" && address !== "" && address !== video.stream;
+  useEffect(() => {
+    if (moved) show(video, driver, "");
+  }, [moved]);
+  return html`<${Drawn} source=${source} />
+  ${video.stream &&
+  html`<iframe
+    class="stream"
+    data-test="stream"
+    title=${`The own stream of ${nameOf(source)}`}
+    sandbox="allow-scripts allow-same-origin"
+    referrerpolicy="no-referrer"
+    src=${video.stream}
+  ></iframe>`}`;
+}
+
+/** Overlays, if they are switched on. */
+export function Drawn({ source }) {
+  useModel(switches);
+  return switches.isOn(source) && html`<${Overlays} source=${source} />`;
+}
+
+function Overlays({ source }) {
+  const { store, video } = usePage();
+  const canvas = useRef(null);
+  useEffect(() => {
+    const own = canvas.current;
+    if (!own) return undefined; // it was closed before it was shown
+    const newest = new NewestOverlays();
+    let timer = 0;
+    const draw = () => {
+      clearTimeout(timer);
+      const overlays = newest.current(store.clock());
+      paint(own, video.canvas, overlays);
+      if (overlays.shapes.length || overlays.labels.length) timer = setTimeout(draw, STALE_MS / 5);
+    };
+    const take = () => {
+      const entry = store.get(source, OVERLAYS);
+      if (entry) newest.receive(entry.value, entry.receivedAt);
+      draw();
+    };
+    const sizes = more.sizes(draw);
+    sizes.observe(video.canvas);
+    const unsubscribe = store.subscribe(source, OVERLAYS, take);
+    return () => {
+      unsubscribe();
+      sizes.disconnect();
+      clearTimeout(timer);
+    };
+  }, []);
+  return html`<canvas class="overlays" ref=${canvas} aria-hidden="true" data-test="overlays-canvas"></canvas>`;
+}
+
+/** Draw over the picture exactly where it is: its canvas shows all of it in the middle of its box. */
+function paint(canvas, picture, overlays) {
+  const box = picture.getBoundingClientRect();
+  const scale = devicePixelRatio || 1;
+  const width = Math.round(box.width * scale);
+  const height = Math.round(box.height * scale);
+  if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
+  const context = canvas.getContext("2d");
+  context.clearRect(0, 0, width, height);
+  const labels = overlays.labels.map((one) => ({ ...one, text: visible(one.text) }));
+  drawOverlays(context, { ...overlays, labels }, contained(picture.width, picture.height, width, height), scale);
+}
+
+/** Buttons below the picture of ``source``. ``wanted``: whether pictures are. */
+export const Tools = ({ source, wanted }) => html`<${StillTools} source=${source} />
+  <${Stream} source=${source} wanted=${wanted} />`;
+
+/** Snapshots, and whether overlays are drawn. */
+export function StillTools({ source }) {
+  const { connection, store, video } = usePage();
+  useModel(video);
+  useModel(switches);
+  const drawn = useMetrics(source).includes(OVERLAYS);
+  const save = () =>
+    snapshot(video, store, source).then(
+      (name) => connection.show(`Saved as ${name}`),
+      (error) => connection.show(`Not saved: ${error.message}`),
+    );
+  return html`${video.info &&
+  !video.stream &&
+  html`<button type="button" data-test="snapshot" onClick=${save}><${Icon} name="save" />Snapshot</button>`}
+  ${drawn &&
+  html`<label class="check overlay-switch"
+    ><input
+      type="checkbox"
+      data-test="overlays"
+      checked=${switches.isOn(source)}
+      onChange=${(event) => switches.set(source, event.currentTarget.checked)}
+    /><span>Overlays</span></label
+  >`}`;
+}
+
+/** Save what is on the canvas, under the time at which it was taken; returns the file's name. */
+async function snapshot(video, store, source) {
+  const name = fileName(source, store.now() - video.age().ms);
+  const blob = await new Promise((resolve) => video.canvas.toBlob(resolve, "image/png"));
+  if (!blob) throw new Error("this browser makes no PNG of it");
+  const link = document.createElement("a");
+  link.href = URL.createObjectURL(blob);
+  link.download = name;
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
+  return name;
+}
+
+/** @param {string} source @param {number} ms epoch @returns {string} goob-2026-05-01T12-03-41.png, in local time */
+export function fileName(source, ms) {
+  const at = new Date(ms);
+  const two = (number) => String(number).padStart(2, "0");
+  const day = [at.getFullYear(), two(at.getMonth() + 1), two(at.getDate())].join("-");
+  const time = [at.getHours(), at.getMinutes(), at.getSeconds()].map(two).join("-");
+  return `${nameOf(source).replace(/[^\w.-]/g, "_")}-${day}T${time}.png`;
+}
+
+/** Open the stream that the robot serves by itself, or that was entered for it, and what to know of it. */
+function Stream({ source, wanted }) {
+  const { video, driver } = usePage();
+  const [blocked, block] = useState(""); // the address that the page's policy refused
+  const address = useStream(source);
+  useEffect(() => {
+    const violated = (event) => {
+      if (event.effectiveDirective !== "frame-src") return;
+      block(video.stream);
+      show(video, driver, "");
+    };
+    document.addEventListener("securitypolicyviolation", violated);
+    return () => document.removeEventListener("securitypolicyviolation", violated);
+  }, []);
+  if (!address && !video.stream) return null;
+  if (video.stream) {
+    return html`<div class="stream-tools">
+      <button type="button" data-test="close-stream" onClick=${() => show(video, driver, "")}>
+        <${Icon} name="close" />Close the stream
+      </button>
+      <p class="why">
+        After a click on the stream, keys go to it: click beside it to drive. How old its picture is, is not known.
+      </p>
+    </div>`;
+  }
+  const refused = refusal(address, location);
+  const why = refused || (wanted ? "" : "Start video first: the robot streams while video is wanted");
+  return html`<div class="stream-tools">
+    <button
+      type="button"
+      data-test="open-stream"
+      disabled=${why !== ""}
+      aria-describedby=${why ? "why-stream" : undefined}
+      onClick=${() => show(video, driver, address)}
+    >
+      <${Icon} name="play" />Open the robot's own stream
+    </button>
+    ${why && html`<${Why} id="why-stream">${why}<//>`}
+    ${refused === MIXED &&
+    html`<a class="button" href=${address} target="_blank" rel="noopener noreferrer">Open it in another tab</a>`}
+    ${blocked === address &&
+    html`<p class="why" role="status">This address is known only since the page was loaded.</p>
+      <button type="button" data-test="reload-stream" onClick=${() => location.reload()}>Reload</button>`}
+  </div>`;
+}
+
+/** The gesture ends: from now on it is not known how old the picture is. */
+function show(video, driver, address) {
+  driver.interrupt();
+  video.stream = address;
+  video.changed();
+  driver.changed();
+}

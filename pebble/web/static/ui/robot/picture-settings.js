@@ -1,0 +1,126 @@
+// How the pictures of a component come, and where from.
+
+import { refusal } from "../../core/stream.js";
+import { html, usePage, useRefs, useState, useTick, useValue } from "../parts/hooks.js";
+import { Offers } from "../parts/models.js";
+import { Extra, Why } from "../parts/parts.js";
+import { useReasons, whyNotEnd } from "../parts/why-not.js";
+import { nameOf } from "../parts/words.js";
+
+const ENCODINGS = ["h264", "pbvz", "pbvd", "json", "jpeg"];
+
+/**
+ * Encoding and source; they count for everybody who looks at this component. With ``video`` it is started and stopped
+ * here, with what ``extras`` fetches.
+ */
+export function PictureSettings({ at, source, offers, video, extras }) {
+  const page = useReasons(at);
+  const view = useValue(source, "web/picture");
+  const listed = offers.section("video").encodings;
+  const encodings = ENCODINGS.filter((one) => !Array.isArray(listed) || listed.includes(one) || one === view?.pinned);
+  const why = whyNotEnd(page);
+  const more = { disabled: Boolean(why), "aria-describedby": why ? "why-picture" : undefined };
+  return html`<div class="picture-settings">
+    ${video &&
+    html`<button type="button" data-test="video" onClick=${video.toggle}>
+        ${video.wanted ? "Stop video" : "Start video"}
+      </button>
+      <${Extra} of=${extras} part="Tools" what="More of the picture" source=${source} wanted=${video.wanted} />`}
+    <label class="field"
+      ><span>Encoding</span>
+      <select
+        data-test="encoding"
+        value=${view?.pinned ?? ""}
+        ...${more}
+        onChange=${(event) => page.commands.setEncoding(source, event.currentTarget.value)}
+      >
+        <option value="">automatic</option>
+        ${encodings.map((one) => html`<option key=${one} value=${one}>${one}</option>`)}
+      </select></label
+    >
+    <${PictureFrom} at=${at} source=${source} offers=${offers} more=${more} />
+    ${why && html`<${Why} id="why-picture">${why}<//>`}
+    <${StreamAddress} key=${source} source=${source} />
+  </div>`;
+}
+
+/** For a component without a camera: another one may look at it, or a stream of any other program. */
+export function NoCamera({ at, offers }) {
+  const page = useReasons(at);
+  const why = whyNotEnd(page);
+  const more = { disabled: Boolean(why), "aria-describedby": why ? "why-picture" : undefined };
+  return html`<section class="no-camera picture-settings" aria-label="Picture">
+    <p>${nameOf(at)} has no camera.</p>
+    <${PictureFrom} at=${at} source=${at} offers=${offers} more=${more} />
+    ${why && html`<${Why} id="why-picture">${why}<//>`}
+    <${StreamAddress} source=${at} />
+  </section>`;
+}
+
+function PictureFrom({ at, source, offers, more }) {
+  const { commands } = usePage();
+  const cameras = useCameras(at);
+  if (!cameras.length) return null;
+  return html`<label class="field"
+    ><span>Picture from</span>
+    <select
+      data-test="picture-from"
+      value=${source === at ? "" : source}
+      ...${more}
+      onChange=${(event) => commands.setPictureFrom(at, event.currentTarget.value)}
+    >
+      <option value="">${offers.hasVideo ? "its own camera" : "nowhere"}</option>
+      ${cameras.map((ref) => html`<option key=${ref} value=${ref}>${nameOf(ref)}</option>`)}
+    </select></label
+  >`;
+}
+
+/** Enter the address of a stream, for everybody: of a camera that is beside the robot, for example. */
+function StreamAddress({ source }) {
+  const page = useReasons(source);
+  const current = useValue(source, "web/stream-address")?.url ?? "";
+  const [typed, type] = useState(/** @type {string | null} */ (null)); // null: as it is
+  const address = (typed ?? current).trim();
+  const why = whyNotEnd(page, "system") || (address && refusal(address, location));
+  const set = (url) => {
+    page.commands.setStreamAddress(source, url);
+    type(null);
+  };
+  return html`<details class="stream-address">
+    <summary data-test="stream-address">Stream from another address</summary>
+    <form
+      onSubmit=${(event) => {
+        event.preventDefault();
+        if (!why && address) set(address);
+      }}
+    >
+      <label class="field"
+        ><span>Address</span
+        ><input
+          type="text"
+          inputmode="url"
+          autocapitalize="off"
+          spellcheck="false"
+          placeholder="http://…"
+          data-test="stream-url"
+          value=${typed ?? current}
+          aria-describedby=${why ? "why-stream-address" : undefined}
+          onInput=${(event) => type(event.currentTarget.value)}
+      /></label>
+      <button data-test="set-stream" disabled=${Boolean(why) || !address || address === current}>Use it</button>
+      ${current &&
+      html`<button type="button" data-test="unset-stream" disabled=${whyNotEnd(page, "system") !== ""} onClick=${() => set("")}>
+        Use it no more
+      </button>`}
+      ${why && html`<${Why} id="why-stream-address">${why}<//>`}
+    </form>
+  </details>`;
+}
+
+function useCameras(at) {
+  const { store } = usePage();
+  useTick(2000);
+  return useRefs()
+    .filter((ref) => ref !== at && new Offers(ref, store.get(ref, "capabilities")?.value).hasVideo)
+    .sort();
+}
