@@ -131,7 +131,7 @@ def trace_commands(case: Case) -> Iterator[Cell]:
 
 
 def hops(sent: Mapping[Wheels, int], stations: Sequence[Mapping[Wheels, int]]) -> list[list[float]]:
-    """For each hop, and for all of them, the times of the commands that passed all stations, ms."""
+    """The times of the commands that passed all stations, ms, for each hop and for all of them."""
     way = [sent, *stations]
     known = [wheels for wheels in sent if all(wheels in station for station in stations)]
     return [[(b[one] - a[one]) / 1e6 for one in known] for a, b in [*pairwise(way), (way[0], way[-1])]]

@@ -74,7 +74,7 @@ class Option:
                 raise PebbleError(f"--{self.name} {one}: must be at least {self.least:g} and at most {self.most:g}")
 
     def words(self, value: Any, default: Any) -> list[str]:
-        """As on the command line; names only if they are not the default ones."""
+        """The variants as on the command line; names are given only if they are not the default ones."""
         if value is None or value is False or (self.many and list(value) == list(default or ())):
             return []
         shown = str(self.metavar) if self.private else self.as_word(value)
@@ -253,7 +253,7 @@ class Round:
     planted_us: Callable[[Params], float]
 
     def cases(self, conditions: Sequence[Params] | None = None, passes: int | None = None) -> Iterator[Case]:
-        """Of all conditions, or only of these; ``passes`` replaces that of the options.
+        """Measures all conditions, or only these; ``passes`` replaces that of the options.
 
         Roles of each condition run one after another, so that a temporary disturbance affects all of them.
         """

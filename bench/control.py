@@ -128,7 +128,7 @@ def _json(what: MqttSettings | ZenohSettings | SliceSpec) -> str:
 
 
 def conditions(run: Run) -> list[dict[str, Value]]:
-    """With a load only the first size and the first rates."""
+    """Only the first size and the first rates are measured with a load."""
     return [
         {**condition(size, rate), "load": load}
         for load in run["loads"]

@@ -45,7 +45,7 @@ def settings_of(url: str) -> MqttSettings:
 
 
 def opened(url: str, what: str, desk: Desk) -> ends.Connection:
-    """With a client id of its own: several runs may share one broker. Raises PebbleError."""
+    """Each run has a client id of its own: several may share one broker. Raises PebbleError."""
     return ends.opened(create("mqtt", f"bench-{what}-{secrets.token_hex(4)}", settings_of(url)), desk)
 
 

@@ -74,7 +74,7 @@ def _phase(case: Case, robot: Robot, subscriber: RobotSubscriber, phase: str) ->
 def cells_of(
     case: Case, phase: str, found: Mapping[str, Mapping[str, float]], pictures_per_s: float | None = None
 ) -> Iterator[Cell]:
-    """Of what was ``found`` by measure and process, and by picture the CPU time of the whole robot, with its sound."""
+    """Cells of what was ``found``, by measure and process; and the CPU time of the robot and its sound by picture."""
     params = {"phase": phase, "process": ALL}
     for name, values in found.items():
         for process, value in values.items():

@@ -76,7 +76,7 @@ def run(run: Run) -> int:
 
 
 def _print_whole(table: Table, console: Console) -> None:
-    """In a narrow terminal its lines are broken, but no figure is cut off."""
+    """A narrow terminal breaks its lines, but no figure is cut off."""
     width = console.width
     console.width = max(width, Measurement.get(console, console.options.update(max_width=_WIDEST), table).maximum)
     console.print(table)
@@ -163,7 +163,7 @@ class Collected:
                 cell.figures[name] = combine(self._figures[key, name])
 
     def cells(self) -> list[Cell]:
-        """In the order of the declared measures, if there is one."""
+        """The measures in the order in which they are declared, if they are."""
         order = {measure: at for at, measure in enumerate(self._about.measures)}
         return sorted(self._cells.values(), key=lambda cell: order.get(cell.measure, 0))
 

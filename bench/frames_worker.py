@@ -66,7 +66,7 @@ def write(writer: Writer, size: int, slower_us: float) -> None:
     stamps: list[int] = []  # of the frames, also of those that could not be sent
 
     def fill(frame: np.ndarray) -> None:
-        """As a camera does: pixels, then the time."""
+        """Pixels are written first, then the time, as a camera does."""
         np.copyto(frame, picture)
         for place in (8, len(frame) - 8):
             struct.pack_into("<q", frame.data, place, len(stamps))

@@ -219,7 +219,7 @@ def crowd(rig: Rig, scale: float) -> Samples:
     session.send("Performance.enable")
 
     def busy_s() -> float:
-        """Of script, style and layout so far."""
+        """The processor time of script, style and layout so far."""
         values = {one["name"]: one["value"] for one in session.send("Performance.getMetrics")["metrics"]}
         return float(sum(values[name] for name in ("ScriptDuration", "LayoutDuration", "RecalcStyleDuration")))
 

@@ -61,7 +61,7 @@ class Drawn:
 
 
 def ecdf(title: str, *, measures: Sequence[str] = ()) -> Declared:
-    """For each measure the share of messages within a time; one panel for each condition."""
+    """The share of messages within a time, for each measure; one panel for each condition."""
     caption = f"{title}: {{measure}}. Share of all messages, lost ones included, within the time"
     return _declared(_curves, caption, measures=measures, least=LEAST)
 

@@ -75,7 +75,7 @@ def styles(variants: Sequence[str]) -> dict[str, Style]:
 
 
 def unique(values: Sequence[str]) -> list[str]:
-    """In the order of their first appearance."""
+    """The values in the order of their first appearance."""
     return list(dict.fromkeys(values))
 
 

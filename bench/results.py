@@ -76,7 +76,7 @@ class Cell(msgspec.Struct, kw_only=True):
         return float(found) if isinstance(found, (int, float)) else math.nan
 
     def percentile(self, percent: float) -> float:
-        """Of all samples; NaN without samples."""
+        """The value over all samples; NaN without samples."""
         known = self.percentiles.get(f"{percent:g}")
         return percentile(self.samples, percent) if known is None else known
 

@@ -164,7 +164,7 @@ class Robot(SimulatedRobot):
         return self.launcher.tail()
 
     def pids(self) -> list[int]:
-        """Of the launcher, its children (including a hub), and the local broker, if there is one."""
+        """The process ids of the launcher, its children (including a hub), and the local broker, if there is one."""
         own = [pid for program in self._started for pid in (program.pid, *children(program.pid))]
         return own if self.local_broker is None else [*own, self.local_broker.pid]
 

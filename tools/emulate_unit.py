@@ -124,7 +124,7 @@ class Limits:
         return self._keys.get(key, [""])[-1:] == [value]
 
     def apply(self, readable: list[Path], writable: list[Path]) -> None:
-        """In systemd's order: file systems, resource limits, capabilities, and last of all system calls."""
+        """Restricts in systemd's order: file systems, resource limits, capabilities, and last of all system calls."""
         allowed = allowed_calls(self._keys.get("SystemCallFilter", ()))  # asks a program that soon cannot start
         self._mount(readable, writable)
         self._limit_resources()

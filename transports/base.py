@@ -69,7 +69,7 @@ class Message(msgspec.Struct, frozen=True):
 
     @property
     def waited_s(self) -> float:
-        """For how many seconds it has waited at most, until now; 0 where that is unknown."""
+        """Seconds for which it has waited at most, until now; 0 where that is unknown."""
         return 0.0 if self.waiting_since is None else max(0.0, clock.since_boot() - self.waiting_since)
 
 

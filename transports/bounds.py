@@ -71,7 +71,7 @@ class BoundedTable(MutableMapping[str, V]):
         self._put(topic, value, forget=True)
 
     def put_if_room(self, topic: str, value: V) -> bool:
-        """As ``table[topic] = value``, unless another topic would have to be forgotten; whether it is stored."""
+        """Stores the value unless another topic would have to be forgotten; returns whether it is stored."""
         return self._put(topic, value, forget=False)
 
     def __delitem__(self, topic: str) -> None:

@@ -198,7 +198,7 @@ def arrived(percent: float) -> _Value:
 
 
 def _column(head: str, measure: str, value: str | _Value) -> Column:
-    """Of a figure, or another value."""
+    """The text of a figure, or of another value."""
 
     def shown(cell: Cell) -> str:
         if isinstance(value, str):

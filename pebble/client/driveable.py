@@ -19,7 +19,7 @@ class Driveable(NamedTuple):
 
     @property
     def doubt(self) -> str:
-        """In words; empty if it can be driven."""
+        """The reason in words; empty if it can be driven."""
         if self.state == "yes":
             return ""
         what = "CANNOT BE DRIVEN OR STOPPED" if self.state == "no" else "not known whether its motors obey"
@@ -27,7 +27,7 @@ class Driveable(NamedTuple):
 
 
 def driveable_of(status: bytes) -> Driveable | None:
-    """As in the payload of ``outgoing/status``; None: it does not say so, as of an older robot, or without motors."""
+    """The value in an ``outgoing/status``; None: it is not there, as for an older robot, or one without motors."""
     if len(status) > _STATUS_BYTES:
         return None
     try:

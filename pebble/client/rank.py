@@ -65,7 +65,7 @@ class RankedTable(dict[str, R]):
         return len(self) >= self._most and rank <= self._floor
 
     def make_room(self, rank: Rank, remove: Callable[[str], object]) -> bool:
-        """For one of this rank, ``remove`` another one if necessary; False if none has a lower rank."""
+        """Makes room for one of this rank by ``remove``, if necessary; False if none has a lower rank."""
         if len(self) < self._most:
             return True
         lowest = self.lowest(rank)

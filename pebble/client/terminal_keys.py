@@ -49,7 +49,7 @@ class Terminal:
         self._write(_HIDE_CURSOR)
 
     def restore(self) -> None:
-        """As it was before; keys that were not read are forgotten, so that no shell gets them."""
+        """Restores the terminal; keys that were not read are forgotten, so that no shell gets them."""
         self._write(b"\r\n" + _SHOW_CURSOR)
         with suppress(self._termios.error, OSError):
             self._termios.tcsetattr(self._fd, self._termios.TCSAFLUSH, self._before)

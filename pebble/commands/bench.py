@@ -118,7 +118,7 @@ def _annotation(about: Comparison, option: Option) -> Any:
 
 
 def _parsed(option: Option, value: Any) -> Any:
-    """Of several values, each may be separated by commas. Raises PebbleError for text in place of numbers."""
+    """Values may be separated by commas, too. Raises PebbleError for text in place of numbers."""
     if not option.many:
         return value
     try:

@@ -216,7 +216,7 @@ def _assess(testbed: Testbed, operator: Operator, completed: CompletedStep | Com
 
 
 def _steps_not_done(testbed: Testbed, results: list[Result], left_alone: set[str]) -> list[str]:
-    """Of robots that nobody took from the operator."""
+    """The robots that no visitor took from the operator."""
     driven = {(result.robot, result.step) for result in results}
     steps = [*(step.name for step in SCRIPT), EMERGENCY_STOP]
     wanted = [(name, step) for name in ROBOTS for step in steps]

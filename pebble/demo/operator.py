@@ -230,7 +230,7 @@ class Operator:
                 return
 
     def _begin(self, step: str, robots: Sequence[RobotView]) -> None:
-        """With those that are free."""
+        """Chooses among those that are free."""
         self._doing, self._step_began = step, time.monotonic()
         self._robots = [robot for robot in robots if self._mine(robot)]
 

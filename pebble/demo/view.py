@@ -190,7 +190,7 @@ def _cell(step: str, name: str, results: Sequence[StepResult | StopResult]) -> s
 
 
 def _side_by_side(columns: Sequence[T], console: Console) -> Iterator[Sequence[T]]:
-    """As many columns at a time as the terminal is wide for; two fit into 80 characters."""
+    """The table has as many columns as the terminal is wide for; two fit into 80 characters."""
     fitting = max(1, (console.width - _LABEL_WIDTH) // (_COLUMN_WIDTH + _COLUMN_EDGE))
     for first in range(0, len(columns), fitting):
         yield columns[first : first + fitting]

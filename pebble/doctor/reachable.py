@@ -49,7 +49,7 @@ def own_addresses(proc: Path = Path("/proc")) -> list[str]:
 
 
 def _ipv6(words: list[str]) -> str:
-    """Of a line such as ``fe80…0001 04 40 20 80 eth0``; a link-local address needs the name of its link."""
+    """The address in a line such as ``fe80…0001 04 40 20 80 eth0``; a link-local address needs the name of its link."""
     address = socket.inet_ntop(socket.AF_INET6, bytes.fromhex(words[0]))
     return f"{address}%{words[5]}" if ipaddress.ip_address(address).is_link_local else address
 

@@ -90,7 +90,7 @@ def _missed(entries: list[Entry], now: float) -> Iterator[Finding]:
 
 
 def _room(folder: Path, entries: list[Entry], keep_bytes: int, free_bytes: int) -> Finding:
-    """For how long there is room at the rate of what was recorded in the last files."""
+    """Seconds for which there is room at the rate of what was recorded in the last files."""
     span_s, size = _rate(entries)
     room = max(0, shutil.disk_usage(folder).free - free_bytes)
     if span_s < _SHORTEST_S or not size:

@@ -106,14 +106,14 @@ def route(rules: Rules, side: Side, subject: Subject | None, message: Message, *
 
 
 def _qos(subject: Subject, message: Message) -> QoS:
-    """As received; messages *to* a robot get their channel's QoS at least: one QoS per topic keeps the order."""
+    """The QoS as received; *to* a robot at least that of the channel: one QoS per topic keeps the order."""
     if subject.kind.direction == INCOMING:
         return message.qos if message.qos >= subject.qos else QoS(subject.qos)
     return message.qos
 
 
 def _retain(subject: Subject, message: Message) -> bool:
-    """As published, if that is known; a flag is always retained on both sides."""
+    """Retained as published, if that is known; a flag is always retained on both sides."""
     if subject.one_shot:
         return False
     if subject.kind is Kind.FLAG and subject.retain:

@@ -52,7 +52,7 @@ class Subject:
 
     @cached_property
     def waits_s(self) -> float:
-        """For how long a message may wait before it is stale."""
+        """Seconds for which a message may wait before it is stale."""
         if not self.one_shot:
             return inf
         return WAITS_S if self.channel is None else self.channel.waits_s

@@ -24,7 +24,7 @@ class Mcu(NamedTuple):
 
     @property
     def shown(self) -> dict[str, Any]:
-        """As in the status."""
+        """The value is that of the status."""
         age = {} if self.silent_ms is None else {"heard_ms": self.silent_ms}
         return {"state": self.state, **age, **({"why": self.why} if self.why else {})}
 

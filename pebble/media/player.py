@@ -30,7 +30,7 @@ _DRAIN_S = 1.0  # for a program to play what is left in its buffer
 
 
 class Player:
-    """For one thread, apart from ``problem`` and ``stopping``. Writes wait for the program, but for 2 s at most."""
+    """One thread uses it, apart from ``problem`` and ``stopping``. Writes wait for the program, but for 2 s at most."""
 
     def __init__(self, command: Sequence[str], device: str, stopping: threading.Event) -> None:
         self.problem = ""  # why nothing is played; empty while sound is played

@@ -33,11 +33,11 @@ class SoundEncoder(Protocol):
     def name(self) -> str: ...
     @property
     def rate(self) -> int:
-        """Of what is sent."""
+        """The sample rate of what is sent, Hz."""
 
     @property
     def channels(self) -> int:
-        """Of what is sent."""
+        """The channels of what is sent."""
 
     @property
     def part_way(self) -> bool:

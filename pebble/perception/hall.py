@@ -114,7 +114,7 @@ class PhaseTracker:
         return self._move_to(self.phase, nearest, power)
 
     def update_pair(self, phase: float, power: float) -> float:
-        """As ``update``, from the phase itself, known but for whole waves."""
+        """Does what ``update`` does, from the phase itself, which is known but for whole waves."""
         if self.phase is None:
             self.phase = self._farthest = phase
             return 0.0
@@ -175,7 +175,7 @@ class HallWheel:
 
     @property
     def steps(self) -> float:
-        """In any direction."""
+        """The steps in any direction."""
         return self._counts.rad_in_any_direction / math.pi
 
     @property

@@ -38,13 +38,13 @@ class WheelGeometry(Struct, frozen=True, kw_only=True):
 
     @property
     def step_mm(self) -> tuple[float, float]:
-        """Of the left and the right wheel."""
+        """A step of the left and of the right wheel."""
         step = math.pi * self.diameter_mm / self.magnets
         return self.left_step_mm or step, self.right_step_mm or step
 
 
 class WheelPose(NamedTuple):
-    """In the frame of the start: x ahead, y to the left, heading −π..π, counter-clockwise positive."""
+    """The pose in the frame of the start: x ahead, y to the left, heading −π..π, counter-clockwise positive."""
 
     x_mm: float = 0.0
     y_mm: float = 0.0

@@ -46,7 +46,7 @@ class Tag(NamedTuple):
 
     @property
     def area(self) -> float:
-        """In square pixels."""
+        """The area in square pixels."""
         x, y = self.corners.T
         return abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1))) / 2
 

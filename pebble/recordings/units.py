@@ -18,7 +18,7 @@ def seconds(text: str) -> float:
 
 
 def size(text: str) -> int:
-    """In bytes. Raises PebbleError."""
+    """The size in bytes. Raises PebbleError."""
     return int(_value(text.removesuffix("B"), _BYTES, "a size: 64M, 2G or 1T"))
 
 

@@ -185,7 +185,7 @@ class Notifier:
 
 
 def _one_line(text: str) -> str:
-    """For an operator: on one line, without passwords, not too long."""
+    """The text for an operator: on one line, without passwords, not too long."""
     return "".join(one if one.isprintable() else " " for one in without_secrets(text))[:_WHY].strip()
 
 

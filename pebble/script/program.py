@@ -106,7 +106,7 @@ def _arguments(
 
 
 class _NoOptions(msgspec.Struct):
-    """Of a script without options."""
+    """The options of a script that has none."""
 
 
 class _Program:

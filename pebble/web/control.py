@@ -219,7 +219,7 @@ class Control:
         self._wake.set()
 
     def _stream_address(self, op: m.StreamAddressOp) -> None:
-        """For everybody, and of any host: hence only by those who look after robots."""
+        """Sets the value for all, and of any host: hence only those who look after robots may."""
         if not self._may("system", op):
             return
         if why := self._server.stream_address(op.ref, op.url):

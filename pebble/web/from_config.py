@@ -44,7 +44,7 @@ def settings_of(config: Config) -> WebSettings:
 
 
 def ready_settings_of(config: Config) -> WebSettings:
-    """As settings_of, of a page that people can use. Raises ConfigError with everything that is missing."""
+    """The settings of a page that people can use. Raises ConfigError with everything that is missing."""
     settings = settings_or_all_problems(config)
     if problems := _without_user(config):
         raise ConfigError(problems)
@@ -52,7 +52,7 @@ def ready_settings_of(config: Config) -> WebSettings:
 
 
 def settings_or_all_problems(config: Config) -> WebSettings:
-    """As settings_of; the error also says whether a user is missing, so that it is not found only after the rest."""
+    """Does what settings_of does; its error also says whether a user is missing: all is found at once."""
     try:
         return settings_of(config)
     except ConfigError as error:

@@ -38,7 +38,7 @@ LIMITS: Final = {
 
 
 class Recent:
-    """Of all components. Only the event loop calls it."""
+    """The newest values of all components. Only the event loop calls it."""
 
     def __init__(self) -> None:
         self.bytes = 0
@@ -78,7 +78,7 @@ class Recent:
         self.bytes += ring.bytes - before
 
     def metrics(self, ref: str) -> list[str]:
-        """Of which there is anything."""
+        """The metrics of which there is anything."""
         return [metric for metric in LIMITS if (ref, metric) in self._rings]
 
     def points(self, ref: str, metric: str, now: float) -> tuple[Point, ...]:

@@ -15,7 +15,7 @@ MAX_TIMES: Final = 16  # of the newest restarts of one service
 
 
 class Restarts:
-    """Of one component. The first status shows only how many there were before."""
+    """Counts the restarts of one component. The first status shows only how many there were before."""
 
     def __init__(self) -> None:
         self._counts: dict[str, int] = {}

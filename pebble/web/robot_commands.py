@@ -92,7 +92,7 @@ def _action_topic(op: m.ActionOp, channel: Channel, topic_of: TopicOf) -> str:
 
 
 def _sections(op: m.ActionOp) -> list[str]:
-    """Of the capabilities, in all spellings that the original page understands."""
+    """The commands in the capabilities, in all spellings that the original page understands."""
     names = (op.name.replace("-", "_"), op.name)
     return [f"system.{name}" for name in names] + list(names)
 

@@ -65,7 +65,7 @@ class RateController:
 
     @property
     def configured(self) -> Step:
-        """With nothing reduced."""
+        """The settings with nothing reduced."""
         return self._steps[0]
 
     def poll(self, now: float, encoding: str) -> Step | None:

@@ -156,7 +156,7 @@ def _content(file: IO[bytes]) -> bytes:
 
 
 def _parse(raw: bytes, source: str) -> Description:
-    """Of a script's output the last line counts: modules may print while they are imported."""
+    """The last line of a script's output counts: modules may print while they are imported."""
     if len(raw) > _LONGEST:
         raise DescribeError(f"{source} is longer than {_LONGEST} bytes")
     try:

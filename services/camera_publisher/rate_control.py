@@ -199,7 +199,7 @@ class LevelControl:
         return max(busy, 1.0 + lost) if lost > _LOST else busy
 
     def _go_down(self, load: float, now: float) -> bool:
-        """As far as it takes; what was just restored is reduced again, and restored later than the last time."""
+        """Reduces as far as necessary; what was just restored is reduced again, and restored later next time."""
         lower = range(self.level + 1, len(STEPS))
         affordable = self.step.cost * _AIM / load
         if self._rose_at is not None and now - self._rose_at < _PROBATION_S:

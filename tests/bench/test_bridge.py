@@ -130,7 +130,7 @@ def collected(rounds: Sequence[Sequence[Cell]]) -> list[Cell]:
 
 
 def turn_of(down: Sequence[float] = (), up: Sequence[float] = (), sent: int = 1, **known: Any) -> tuple[Turn, Arrived]:
-    """With latencies in ms."""
+    """A result with latencies in ms."""
     turn = Turn(
         **{"began": 0, "ended": MS, "sent": {wheels(number): 0 for number in range(sent)}, "cpu_s": {}, **known}
     )
@@ -167,7 +167,7 @@ def test_cpu_is_divided_by_what_was_forwarded_in_each_turn() -> None:
 
 
 class FakeRobot:
-    """In place of a robot: remembers when it was driven."""
+    """A stand-in for a robot that remembers when it was driven."""
 
     started: ClassVar[list[tuple[str, bool, bool]]] = []
     driven: ClassVar[list[str]] = []

@@ -74,7 +74,7 @@ def one_round(stop_ms: float, *, again: bool = False, lost: bool = False) -> Ite
 
 
 class FakeRobots:
-    """In place of robots: remembers in which way each was stopped."""
+    """A stand-in for robots that remembers in which way each was stopped."""
 
     def __init__(self) -> None:
         self.stopped: list[tuple[str, str]] = []

@@ -14,12 +14,12 @@ RUNS = 300
 
 @pytest.fixture(autouse=True)
 def fewer_resamples(monkeypatch: pytest.MonkeyPatch) -> None:
-    """For hundreds of intervals within a second or two."""
+    """A number of resamplings for hundreds of intervals within a second or two."""
     monkeypatch.setattr(ratios, "_RESAMPLES", 1000)
 
 
 def make(random: np.random.Generator, rounds: int, *, factor: float = 1.0, mood: float = 0.05) -> Rounds:
-    """As measured: each round has an offset of its own, and samples with a long tail."""
+    """The samples look as measured ones do: each round has an offset of its own, and a long tail."""
     moods = factor * np.exp(random.normal(0, mood, rounds))
     return [(100 * one * np.exp(random.normal(0, 0.1, 25))).tolist() for one in moods]
 

@@ -41,7 +41,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Traffic:
 
 
 def test_table_4_1_stands_beside_the_paper_s(recorded: Traffic) -> None:
-    """Of bytes that are summed here, second by second."""
+    """The rates from bytes that are summed here, second by second."""
     lines = [line.split() for line in printed(recorded).splitlines()]
     assert ["fred", "paper", *(f"{value:.2f}" for value in TABLE_4_1["fred"])] in lines
     seconds: dict[int, int] = {}

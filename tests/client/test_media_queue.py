@@ -165,7 +165,7 @@ def test_a_page_that_did_not_draw_waits_unless_a_key_frame_is_on_its_way() -> No
 
 
 def viewers(count: int, *, waiting: int = 0, now: float = 0.0) -> list[ViewerQueue]:
-    """Of which the last ``waiting`` are too slow."""
+    """A group of pages of which the last ``waiting`` are too slow."""
     made = [ViewerQueue(ALL, now) for _ in range(count)]
     for index, viewer in enumerate(made):
         viewer.offer_direct(frame(0, keyframe=True, encoding="h264"), now)

@@ -38,7 +38,7 @@ COMMANDS = [["check"], ["check", "--json"]]
 
 @pytest.fixture
 def config() -> Iterator[Path]:
-    """In a folder that every user may read."""
+    """A copy in a folder that every user may read."""
     folder = Path(tempfile.mkdtemp())
     folder.chmod(0o755)
     path = folder / "robot.json"

@@ -53,7 +53,7 @@ class LiveRobot:
         self._take(Message(f"{self.base}/incoming/estop", body))
 
     def set_flag(self, flag: str) -> None:
-        """As an operator."""
+        """Publishes as an operator."""
         self._transport.publish(f"{self.base}/incoming/flags/{flag}", b"true", retain=True)
 
     def publish_heartbeat(self) -> None:

@@ -185,7 +185,7 @@ TEXT = json.dumps(config(), indent=1).replace("rover", "röver")
 def test_a_file_in_another_encoding_is_understood_or_named(
     tmp_path: Path, encode: Callable[[str], bytes], expected: str
 ) -> None:
-    """In any locale; the same function reads password files and what else people write."""
+    """Text files are read in any locale; the same function reads password files and what else people write."""
     file = tmp_path / "c.json"
     file.write_bytes(encode(TEXT))
     env = os.environ | {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0", "PYTHONIOENCODING": "utf-8"}
@@ -204,7 +204,7 @@ def test_a_sentence_repeats_no_byte_of_the_file() -> None:
 
 
 def test_every_text_file_of_the_product_is_read_as_utf_8() -> None:
-    """In no other encoding, whatever the locale is."""
+    """No file is read in another encoding, whatever the locale is."""
     wrong = [
         f"{path.relative_to(ROOT)}:{call.lineno}"
         for folder in ("pebble", "transports", "services", "simulation")

@@ -48,7 +48,7 @@ LIBRARIES = (
 
 
 def _socketpair(*_: object) -> tuple[socket.socket, socket.socket]:
-    """As the standard library makes one on Windows."""
+    """A pair like the one that the standard library makes on Windows."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         first = socket.create_connection(server.getsockname())
         return first, server.accept()[0]

@@ -59,7 +59,7 @@ class Rules:
             self._waits_from = now
 
     def admits(self, drive: Drive, now: float) -> float | None:
-        """For how many seconds at most it may move anything; None: it must have no effect."""
+        """Seconds at most for which it may move anything; None: it must have no effect."""
         self.tick(now)
         run = drive.run if drive.signed and isinstance(drive.run, int) else 0
         if run > self._newest:

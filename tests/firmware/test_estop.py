@@ -25,7 +25,7 @@ def stop(drill: Drill, name: str = A, **more: str) -> None:
 
 
 def reset(drill: Drill, **changes: Any) -> None:
-    """With what the newest state says, unless changed."""
+    """A command with what the newest state says, unless changed."""
     newest = states(drill)[-1]
     order = {"boot": newest["boot"], "count": newest["count"], "by": "ann", **changes}
     drill.broker.publish(RESET, json.dumps(order).encode(), qos=1)
@@ -274,7 +274,7 @@ def _fail(number: int) -> Any:
 
 
 class PowerLostError(BaseException):
-    """In place of a power cut in the middle of a change."""
+    """A stand-in for a power cut in the middle of a change."""
 
 
 @pytest.mark.parametrize("at", ["write", "rename"])

@@ -51,7 +51,7 @@ def of(frames: list[Frame], kind: Type) -> list[Frame]:
 
 
 def states(frames: list[Frame]) -> dict[int, tuple[bool, ...]]:
-    """Of each outlet: bound, reachable, on."""
+    """The state of each outlet: bound, reachable, on."""
     return {frame.interface // 2: tuple(map(bool, frame.payload)) for frame in of(frames, Type.STATE)}
 
 

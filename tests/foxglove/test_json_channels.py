@@ -14,7 +14,7 @@ TELEMETRY = [channel for channel in CHANNELS if channel.direction == OUTGOING an
 
 
 def check(schema: dict[str, Any]) -> None:
-    """As foxglove/studio does it (packages/mcap-support/src/parseJsonSchema.ts), which refuses everything else."""
+    """Parses as foxglove/studio does (packages/mcap-support/src/parseJsonSchema.ts), which refuses everything else."""
     assert schema["type"] == "object"
     for field in schema["properties"].values():
         items = field["items"] if field["type"] == "array" else field

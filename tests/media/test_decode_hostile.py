@@ -41,7 +41,7 @@ def camera(sender: int, number: int) -> Pixels:
 
 
 def streams() -> dict[str, list[Stream]]:
-    """Of each form three senders, each with its own pictures, minutes apart."""
+    """Each form has three senders, each with its own pictures, minutes apart."""
     made: dict[str, list[Stream]] = {}
     for form in ("json", "pbvd", "pbvz", "h264"):
         made[form] = []

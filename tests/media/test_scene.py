@@ -56,7 +56,7 @@ def test_the_counter_survives_coarse_coding_and_shrinking(size: tuple[int, int],
 
 
 def test_the_counter_survives_being_sent_as_differences() -> None:
-    """As the paper's encoder does (8.8): differences are clipped at 128 and coded at quality 10."""
+    """Codes as the paper's encoder does (8.8): differences are clipped at 128 and coded at quality 10."""
     scene, now = Scene(320, 240), np.empty((240, 320, 3), np.uint8)
     scene.render(1000, now)
     shown = jpeg(now)

@@ -52,7 +52,7 @@ def wander(seed: int, *, noise: float = 0.0, geometry: WheelGeometry | None = No
 
 
 def worst(power: float, *, geometry: WheelGeometry | None = None, noise: float = 0.0) -> str:
-    """Of ten positions of the wheels at the start, forward and in reverse."""
+    """The errors of ten positions of the wheels at the start, forward and in reverse."""
     errors = [
         straight(way * power, geometry=geometry, noise=noise, start=start) for start in range(10) for way in (1, -1)
     ]

@@ -56,7 +56,7 @@ class Heartbeats:
         self.at[message.topic].append(time.monotonic())
 
     def intervals_ms(self, operator: Operator) -> list[float]:
-        """Of the next slice, all robots together."""
+        """The heartbeats of the next slice, all robots together."""
         self.at.clear()
         end = time.monotonic() + _SLICE_S
         while time.monotonic() < end:

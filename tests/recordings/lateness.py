@@ -22,7 +22,7 @@ SPEEDS = ((1.0, 20), (10.0, 120), (100.0, 300))  # and seconds of the recording
 
 
 def lateness(path: Path, port: int, speed: float) -> tuple[list[float], float]:
-    """In milliseconds for each message, against the pace since the first one; and the CPU time in seconds."""
+    """The lateness of each message against the pace since the first one, ms; and the CPU time, seconds."""
 
     def make(name: str, will: Message | None) -> Transport:
         return create("mqtt", name.replace("/", "-"), MqttSettings(host="127.0.0.1", port=port), will=will)

@@ -106,7 +106,7 @@ def test_only_what_is_named_is_deleted_of_it(tmp_path: Path, run: Run, name: str
 
 
 def exported(path: Path) -> list[tuple[Any, ...]]:
-    """As the package reads it: name, encoding and data of the schema, topic, payload."""
+    """The records as the package reads them: name, encoding and data of the schema, topic, payload."""
     with path.open("rb") as file:
         found = make_reader(file, validate_crcs=True).iter_messages()
         return [

@@ -121,7 +121,7 @@ def perform(case: Case) -> Outcome:
 
 
 def _drive(rig: Rig) -> float:
-    """For two seconds; returns when the operator stopped."""
+    """Drives for two seconds; returns when the operator stopped."""
     driver = Driver(rig.operator)
     time.sleep(_DRIVES_S)
     driver.stop()

@@ -58,7 +58,7 @@ def valid(channel: Channel, raw: bytes) -> bool:
 
 
 def _may_be_read(value: Any) -> bool:
-    """As a number, or as something else that counts as the default; NaN and infinity refuse a command."""
+    """A value is a number, or something else that counts as the default; NaN and infinity refuse a command."""
     text = str(value).lower()
     if not isinstance(value, (int, float, str)) or isinstance(value, bool):
         return True

@@ -157,7 +157,7 @@ class WorldRig(Rig):
         assert until(lambda: not self.script().get("running") and not self.mcu.turning(), 15)
 
     def timings(self) -> list[tuple[float, float]]:
-        """Of ``timed-follow``: when a picture was captured, and when the command that followed was published."""
+        """The times of ``timed-follow``: capture of a picture, and publication of the command that followed."""
         lines = (self.world.folder / "timing").read_text().splitlines()
         return [(int(captured) / 1e9, int(published) / 1e9) for captured, published in map(str.split, lines)]
 

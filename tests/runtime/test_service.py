@@ -434,7 +434,7 @@ def test_a_steering_command_that_waited_too_long_is_dropped(robot: Robot) -> Non
 def test_a_command_that_waited_while_the_machine_was_suspended_is_dropped(
     robot: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """In the inbox or before; the service's own clock may have stood still meanwhile."""
+    """A message waits in the inbox or before; the service's own clock may have stood still meanwhile."""
     now = clock.since_boot
     robot.start()
     robot.service.go_on.clear()

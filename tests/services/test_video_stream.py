@@ -52,7 +52,7 @@ class Stream:
         )  # fmt: skip
 
     def pids(self) -> list[int]:
-        """Of the program and of what it started."""
+        """The process ids of the program and of what it started."""
         assert until((self.folder / "pids").exists, 15)
         return [int(word) for word in (self.folder / "pids").read_text().split()]
 

@@ -25,7 +25,7 @@ def awake(clock: VirtualClock, motion: RobotMotion | None = None) -> Mpu6050:
 
 
 def mean(imu: Mpu6050, clock: VirtualClock, count: int = 200) -> list[float]:
-    """Of the seven words at the smallest ranges, in g, degrees Celsius and degrees per second."""
+    """The means of the seven words at the smallest ranges, in g, degrees Celsius and degrees per second."""
     rows = []
     for _ in range(count):
         clock.advance(0.01)

@@ -101,7 +101,7 @@ def test_two_boards_differ_by_their_uid() -> None:
 
 
 def test_a_host_that_was_away_for_a_while_misses_no_sample() -> None:
-    """As long as half a second, which is more than the scheduler of a busy machine takes away."""
+    """A wait of half a second, which is more than the scheduler of a busy machine takes away."""
     mcu = SimulatedMcu("goob_imu", 0.0)
     messages = b"".join(mcu.tick(now) for now in (0.0, 0.1, 0.55, 1.0))
     frames = [decode(stuffed) for stuffed in messages.split(END) if stuffed]

@@ -27,7 +27,7 @@ def _replaced(file: Path, text: str) -> None:
 
 
 def _linked(file: Path, text: str) -> None:
-    """As certbot does: the name stays, and leads to another file."""
+    """Renews as certbot does: the name stays, and leads to another file."""
     target = file.with_name(f"archive-{text}")
     target.write_text(text)
     file.unlink()

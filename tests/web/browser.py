@@ -109,11 +109,11 @@ class Tab:
         self._debugger = None
 
     def hide(self, *, hidden: bool = True) -> None:
-        """As if another tab were in front: Playwright's pages are always visible."""
+        """Hides the page as if another tab were in front: Playwright's pages are always visible."""
         self.page.evaluate(_HIDE, hidden)
 
     def blur(self) -> None:
-        """As if another window had the focus; Playwright's pages keep it."""
+        """Takes the focus away as if another window had it; Playwright's pages keep it."""
         self.page.evaluate("() => dispatchEvent(new Event('blur'))")
 
     def complaints(self) -> list[str]:

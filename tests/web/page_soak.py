@@ -61,7 +61,7 @@ def measure(stage: Stage, browser: CDPSession, opened: list[Console], samples: S
 
 
 def memory(tab: Tab) -> dict[str, float]:
-    """Of a tab without what nothing refers to: its script's heap in MB, and how many nodes and listeners it has."""
+    """The size of a tab without what nothing refers to: its script's heap in MB, its nodes and its listeners."""
     session = tab.cdp()
     session.send("HeapProfiler.enable")
     session.send("HeapProfiler.collectGarbage")
@@ -87,7 +87,7 @@ def _is_memory(what: str) -> bool:
 
 
 def change(values: list[float]) -> float:
-    """Of the median of the last quarter since the second one; 0: none."""
+    """The growth of the median of the last quarter since the second one; 0: none."""
     _, before, _, after = quarters(values)
     return after / before - 1
 

@@ -36,7 +36,7 @@ Values = Callable[[int], list[Value]]
 
 
 def capabilities(kind: str, *, video: bool = True, drive: bool = True) -> dict[str, Any]:
-    """Of a robot as the launcher announces them, without the topics."""
+    """The capabilities of a robot as the launcher announces them, without the topics."""
     return {
         "t": 0,
         "schema": "pebble-capabilities/v1",
@@ -127,7 +127,7 @@ def services(**more: Any) -> dict[str, Any]:
 
 
 def logs(now: int) -> list[Any]:
-    """Of goob: records, a wrapped one, plain text, and a line that is too long for one row."""
+    """The log of goob: records, a wrapped one, plain text, and a line that is too long for one row."""
     long = "the reader of the serial line was restarted after a checksum error in frame 0x1f3a; " * 3
     lines = [
         ("INFO", "mqtt_bridge", "connected to broker.example:8883"),

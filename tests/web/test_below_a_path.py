@@ -74,7 +74,7 @@ def console_behind(proxy: PrefixProxy, browser: Browser, stage: Stage) -> Iterat
 
 
 def test_a_robot_is_driven_and_stopped(browser: Browser) -> None:
-    """With its picture, and with all that the page fetches later."""
+    """The page shows its picture, and all that it fetches later."""
     with PrefixProxy(1, "/robots/") as proxy:
         names = ["127.0.0.1", f"127.0.0.1:{proxy.port}"]
         with Stage("minilamp", names=names) as stage, console_behind(proxy, browser, stage) as one:

@@ -50,7 +50,7 @@ result = given.map(({ options, arrivals }) => {
 
 
 def play(options: dict[str, int], arrivals: list[Arrival]) -> dict[str, Any]:
-    """As above, by pebble.media.jitter."""
+    """Does the same by pebble.media.jitter."""
     buffer = JitterBuffer(
         limit=options["limit"], concealment_ms=options["concealmentMs"], target_ms=options["targetMs"]
     )

@@ -149,7 +149,7 @@ def test_a_restart_is_asked_gone_and_back_and_moves_nothing(
 
 
 def test_troubles_of_another_robot_are_listed(at_goob: Console, robots: Stage, wire: Wire) -> None:
-    """In the browser all of it is about robots that are not open."""
+    """All of it is about robots that are not open, in the browser."""
     wire.publish("minilamp/incoming/estop", {"stop": "00112233445566cc", "by": "eve", "why": "test"})
     spoken = at_goob.page.locator("[data-test=announcement]")
     assert at_goob.tab.until(lambda: spoken.inner_text() == "minilamp was stopped by eve", 5), spoken.inner_text()

@@ -104,7 +104,7 @@ def test_modules_do_not_import_each_other_in_a_circle():
 
 @pytest.mark.parametrize("screen", ["fleet", "robot"])
 def test_a_load_of_the_page_is_small(screen: str):
-    """With the worker that decodes pictures."""
+    """The size includes the worker that decodes pictures."""
     served = StaticFiles(files("pebble.web") / "static").files
     modules = [STATIC / name for name in ("main.js", f"ui/{screen}/{screen}.js", "media/video-worker.js")]
     names = {str(path.relative_to(STATIC.resolve())) for one in modules for path in _imported(one.resolve())}

@@ -35,7 +35,7 @@ class Fingers:
         del self._places[finger]
 
     def cancel(self) -> None:
-        """As a call, a system gesture or too many fingers do."""
+        """Cancels a touch as a call, a system gesture or too many fingers do."""
         self._places.clear()
         self._send("touchCancel")
 

@@ -26,7 +26,7 @@ def message(value: Any, *, retain: bool = False) -> Message:
 
 
 def filled(metric: str, period_s: float, count: int, *, ref: str = REF, recent: Recent | None = None) -> Recent:
-    """With the numbers 0, 1, 2 … at their times; the component is open."""
+    """A history with the numbers 0, 1, 2 … at their times; the component is open."""
     recent = recent or Recent()
     recent.open(ref)
     for number in range(count):
@@ -55,7 +55,7 @@ def test_fast_ones_are_thinned_to_their_rate() -> None:
 
 @pytest.mark.parametrize("opened", [(), (GOOB,)], ids=["closed", "open"])
 def test_of_recorded_robots_what_is_plotted_is_remembered(opened: tuple[str, ...]) -> None:
-    """Of robots that no page has open the battery alone."""
+    """Robots that no page has open have their battery alone."""
     recent, sent = Recent(), received(DRIVE)
     for ref in opened:
         recent.open(ref)

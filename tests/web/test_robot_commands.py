@@ -29,7 +29,7 @@ _decoder = msgspec.json.Decoder(m.FromPage)
 
 
 def op(tag: str, **fields: Any) -> Any:
-    """As the server reads it."""
+    """The command as the server reads it."""
     return _decoder.decode(json.dumps({"op": tag, "ref": BASE, **fields}))
 
 

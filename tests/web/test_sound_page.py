@@ -89,7 +89,7 @@ Object.defineProperty(navigator, "mediaDevices", { get: () => undefined });"""
 def test_over_plain_http_sound_is_played_and_talking_needs_https(
     browser: Browser, served: Served, robot: SoundRobot
 ) -> None:
-    """As far as the page can tell; the worker still decodes Opus."""
+    """The browser lacks decoders as far as the page can tell; the worker still decodes Opus."""
     with page_of(browser, served, script=WITHOUT_WORKLET) as opened:
         assert opened.test("talk").is_disabled()
         why = opened.test("talk").get_attribute("aria-describedby")

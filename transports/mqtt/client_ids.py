@@ -18,7 +18,7 @@ def unique(name: str) -> str:
 
 
 def _escaped(name: str) -> str:
-    """Of names that differ in more than slashes the results differ, too: by a hash."""
+    """Names that differ in more than slashes give results that differ, too: by a hash."""
     text = _OTHER.sub("_", name)
     if text == name.replace("/", "_"):
         return text

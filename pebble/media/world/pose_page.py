@@ -106,7 +106,7 @@ class PoseReader:
         return int(self._words[0]) == _MAGIC and int(self._words[1]) == self._start
 
     def tracks(self) -> dict[str, Track]:
-        """Of every robot that has a sample."""
+        """The poses of every robot that has a sample."""
         tracks = {}
         for slot in self._words[_HEADER:].reshape(MOST_ROBOTS, _SLOT):
             name = slot[: LONGEST_NAME // 8].tobytes().rstrip(b"\0").decode()
@@ -127,7 +127,7 @@ def _samples(ring: _Words) -> list[Sample]:
 
 
 def _checksums(samples: _Words) -> _Words:
-    """Of each row; overflow is intended."""
+    """The hash of each row; overflow is intended."""
     return np.asarray((samples[:, :4] * _FACTORS).sum(axis=1, dtype=np.uint64) + _CHECK)
 
 

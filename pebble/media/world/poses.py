@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 
 class RobotPose(NamedTuple):
-    """In metres and radians, counter-clockwise."""
+    """A pose in metres and radians, counter-clockwise."""
 
     x: float
     y: float

@@ -115,7 +115,7 @@ def _pyav() -> Any:
 
 @contextmanager
 def _folder_beside(target: Path) -> Iterator[Path]:
-    """For files that may be as large as the film: a folder for temporary files is often in memory."""
+    """A folder for files that may be as large as the film: one for temporary files is often in memory."""
     with tempfile.TemporaryDirectory(dir=target.parent, prefix=f".{target.name}.") as name:
         yield Path(name)
 

@@ -216,7 +216,7 @@ def parameter_sets(unit: bytes) -> list[bytes]:
 
 
 def _fitted(picture: Pixels, shape: tuple[int, ...]) -> Pixels:
-    """As large as fits into ``shape``, in its middle, on black."""
+    """The picture becomes as large as fits into ``shape``, in its middle, on black."""
     import cv2
     import numpy as np
 

@@ -197,7 +197,7 @@ class Telemetry:
         return Converted(self._pose(f"{_id(topic)}/odom", x / per_metre, y / per_metre, 0.0, heading), "pose")
 
     def _localization(self, _topic: str, payload: bytes) -> Converted | None:
-        """Of a ROS robot: metres and radians in the frame that it names."""
+        """The pose of a ROS robot: metres and radians in the frame that it names."""
         pose = codec.plain(LOCALIZATION_POSE, payload)
         value = pose.get("value", pose) if isinstance(pose, dict) else None
         if not isinstance(value, dict):

@@ -46,7 +46,7 @@ class Imported(Struct, frozen=True):
 
     @property
     def metadata(self) -> dict[str, str]:
-        """As that of a recording's channel."""
+        """The form is that of a recording's channel."""
         flags = {"retained": self.retained, TRUNCATED: self.truncated}
         known = {"qos": str(self.qos), "retain": str(int(self.retain))}
         return known | {name: "1" for name, is_set in flags.items() if is_set}
@@ -187,7 +187,7 @@ def _imported(number: int, line: bytes) -> Imported | BadLine:
 
 
 def _stamp_ns(stamp: bytes) -> int:
-    """Of a number, or of a text in ISO 8601, which is UTC unless it names another zone. Raises ValueError."""
+    """The time of a number, or of a text in ISO 8601, which is UTC unless it names another zone. Raises ValueError."""
     if not stamp.startswith(b'"'):
         try:
             return epoch_ns(Decimal(stamp.decode()))

@@ -119,7 +119,7 @@ def _imported(bson: Any, document: dict[str, Any]) -> Imported:
 
 
 def _stamp_ns(bson: Any, stamp: Any) -> int:
-    """Of a date, or of a number of seconds or milliseconds. Raises ValueError."""
+    """The time of a date, or of a number of seconds or milliseconds. Raises ValueError."""
     if isinstance(stamp, bson.datetime_ms.DatetimeMS):
         return int(stamp) * 1_000_000
     if isinstance(stamp, int | float) and not isinstance(stamp, bool):

@@ -93,7 +93,7 @@ def copy_beside(data: Any, writer: McapWriter, without: Container[str] = (DAMAGE
 
 
 def _state(path: Path) -> tuple[int, ...]:
-    """Of a file: what differs if it is replaced or written to."""
+    """What differs if a file is replaced or written to."""
     about = path.stat()
     return about.st_dev, about.st_ino, about.st_size, about.st_mtime_ns
 

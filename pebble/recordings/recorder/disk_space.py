@@ -58,7 +58,7 @@ def outdated(entries: Iterable[Entry], limits: Limits, now: float) -> Entry | No
 
 
 def _deletable(entries: list[Entry]) -> list[Entry]:
-    """In the order in which they go."""
+    """The files in the order in which they go."""
     finished = sorted((entry for entry in entries if entry.is_finished), key=lambda entry: entry.number)
     media = [entry for entry in finished if entry.is_media]
     state = [entry for entry in finished if not entry.is_media]

@@ -30,7 +30,7 @@ class Due:
         return took - expected_s
 
     def suspended_s(self, awake_ns: int) -> float:
-        """For how long the machine was suspended since the last call."""
+        """Seconds for which the machine was suspended since the last call."""
         now = self._boot_ns()
         slept = 0 if self._awake is None else (now - self._awake_at) - (awake_ns - self._awake)
         self._awake, self._awake_at = awake_ns, now

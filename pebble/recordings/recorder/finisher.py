@@ -54,7 +54,7 @@ class Finisher:
         self._on_finished()
 
     def _mend(self, path: Path) -> None:
-        """In a process of its own: reading from a damaged disk may kill it (SIGBUS)."""
+        """Works in a process of its own: reading from a damaged disk may kill it (SIGBUS)."""
         self._unfinished.discard(path)
         if not path.exists():
             return

@@ -95,11 +95,11 @@ class RecordingFile:
 
     @property
     def chunks(self) -> list[Chunk]:
-        """In the order of time."""
+        """The messages in the order of time."""
         return self._scanned if self._statistics is None else self._chunks
 
     def size(self) -> int:
-        """Of the file itself, also where a copy is read."""
+        """The size of the file itself, also where a copy is read."""
         return self.path.stat().st_size if self._is_copied else os.fstat(self._descriptor).st_size
 
     def robots(self) -> set[str]:

@@ -60,7 +60,7 @@ def _numbers(numbers: Iterable[int]) -> str:
 
 
 def _percentile(value: str, share: float) -> str:
-    """Of rows with a ``place`` in their order, from 0 to ``last``; interpolates linearly.
+    """A quantile of rows with a ``place`` in their order, from 0 to ``last``; it interpolates linearly.
 
     The same as ``quantile_cont``, which would hold all values in memory: sorting uses files if need be.
     """

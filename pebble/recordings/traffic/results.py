@@ -154,7 +154,7 @@ class RobotTraffic(Struct, kw_only=True):
 
     @property
     def shared_share(self) -> float:
-        """Of outages, those that were not this robot's alone."""
+        """The outages that were not this robot's alone."""
         return sum(one.cause != "robot" for one in self.outages) / max(1, len(self.outages))
 
 

@@ -29,7 +29,7 @@ class Presence(Struct):
 
 
 def shared(robots: Sequence[Presence]) -> list[list[bool]]:
-    """For each robot and each of its outages, whether at least half of the robots online then, and two, had one."""
+    """Whether at least half of the robots online, and two, had an outage then; for each outage of each robot."""
     return [[_is_shared(moment, one, robots) for moment in one.outages] for one in robots]
 
 

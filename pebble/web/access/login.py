@@ -84,7 +84,7 @@ def session_of(connection: HTTPConnection) -> Session | None:
 
 
 def named(session: Session, name: str) -> Session:
-    """With the name that a person goes by; "" changes nothing. Only for where there is no login."""
+    """Takes the name that a person goes by; "" changes nothing. Used only where there is no login."""
     user = printable(name).strip()
     return dataclasses.replace(session, user=user) if user else session
 
@@ -95,7 +95,7 @@ def printable(text: str) -> str:
 
 
 def _cookie(settings: WebSettings) -> str:
-    """With the prefix, browsers take it only from this host, over https, for all paths."""
+    """The cookie's name; with the prefix, browsers take it only from this host, over https, for all paths."""
     return "__Host-pebble" if settings.certificate else "pebble"
 
 

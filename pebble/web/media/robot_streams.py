@@ -84,7 +84,7 @@ def origin(url: object, own: Container[str] = ()) -> str:
 
 
 def origins(robots: Robots, ref: str, own: Container[str]) -> list[str]:
-    """Of all that robots report now, or that were entered for them; those for the page of ``ref`` first."""
+    """The streams that robots report now, or that were entered for them; those for the page of ``ref`` first."""
     found: dict[str, None] = {}
     for one in (ref, robots.sources.get(ref, ref), *robots.components):
         if allowed := origin(robots.streams.get(one) or _reported(robots, one), own):

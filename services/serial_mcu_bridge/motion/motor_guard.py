@@ -111,7 +111,7 @@ class MotorGuard:
         self._changed(now)
 
     def judge(self, drive: Drive, now: float) -> float | None:
-        """For how many seconds from now this command moves the motors, 0: it stops them; None: it has no effect."""
+        """Seconds from now for which this command moves the motors, 0: it stops them; None: it has no effect."""
         valid_ms = drive.valid_ms if isinstance(drive.valid_ms, int) else -1
         run = run_of(drive)
         limit: int = self._arbiter.judge(drive.moves, run, valid_ms, _ms(now))

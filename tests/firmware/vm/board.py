@@ -152,7 +152,7 @@ class ADC:
 
 
 class I2C:
-    """With an MPU-6050 on it that lies still, and a motor shield that takes everything."""
+    """The bus has an MPU-6050 on it that lies still, and a motor shield that takes everything."""
 
     def __init__(self, *_, **__):
         pass
@@ -207,7 +207,7 @@ class Machine:
 
 
 class Poll:
-    """Of one stream; as in C, asking makes no garbage but the answer."""
+    """The poll of one stream; as in C, asking makes no garbage but the answer."""
 
     def register(self, stream, mask):
         self._stream = stream

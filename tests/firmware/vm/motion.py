@@ -17,7 +17,7 @@ def _subtract(later, earlier):
 
 
 def _plain(result):
-    """As it is after JSON: tuples are lists."""
+    """The value as it is after JSON: tuples are lists."""
     return list(result) if isinstance(result, tuple) else result
 
 

@@ -272,7 +272,7 @@ def test_sound_that_came_twice_is_played_once(tmp_path: Path) -> None:
 
 
 def delayed(messages: list[Recorded], delay_ms: Callable[[int], int]) -> list[Recorded]:
-    """As if they had been that long on their way; ``delay_ms`` takes the time of capture."""
+    """Messages arrive as if they had been that long on their way; ``delay_ms`` takes the time of capture."""
     return [
         Recorded(one.channel, 0, one.log_ns + delay_ms(offset_ms(one)) * 1_000_000, 0, one.payload) for one in messages
     ]

@@ -26,7 +26,7 @@ class Counted(NamedTuple):
 
 
 def by_mcap(path: Path) -> Counted:
-    """As the package ``mcap`` reads it."""
+    """The messages as the package ``mcap`` reads them."""
     with path.open("rb") as file:
         reader = make_reader(file, validate_crcs=True)
         summary = reader.get_summary()
@@ -39,7 +39,7 @@ def by_mcap(path: Path) -> Counted:
 
 
 def by_mcap_core(paths: list[Path]) -> list[Counted]:
-    """As npm's ``@mcap/core`` reads each."""
+    """The messages of each file as npm's ``@mcap/core`` reads them."""
     if shutil.which("node") is None or not _PACKAGE.exists():
         missing = pytest.fail if os.environ.get("CI") == "true" else pytest.skip
         missing("needs Node.js (apt install nodejs) and @mcap/core (python tools/fetch_npm.py .venv)")

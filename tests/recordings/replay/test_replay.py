@@ -57,7 +57,7 @@ class Operator:
         return [json.loads(payload).get("online", True) for payload in self.payloads(topic)]
 
     def publish_heartbeats(self) -> None:
-        """As a live robot does, for 1.5 s."""
+        """Publishes as a live robot does, for 1.5 s."""
         for _ in range(15):
             self.transport.publish(ONLINE, js(t=time.time_ns() // 10**6), qos=QoS.DELIVERED, retain=True)
             time.sleep(0.1)
@@ -102,7 +102,7 @@ def walk(folder: Path, seconds: int = 60) -> Path:
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In this process it listens more briefly."""
+    """The player of this process listens more briefly."""
     monkeypatch.setattr(replayed_robots, "LISTEN_S", 0.3)
     monkeypatch.setattr(replayed_robots, "_OPEN_S", 1.0)
 

@@ -48,7 +48,7 @@ def page(written) -> str:
 
 @pytest.fixture(scope="module")
 def lamp(tmp_path_factory) -> Traffic:
-    """Of one component without heartbeats, which has few drawings."""
+    """A report of one component without heartbeats, which has few drawings."""
     sent = [Sent(START_NS, "pebble/infrastructure/mast/outgoing/charging-level", b"{}")]
     return analysed(tmp_path_factory.mktemp("lamp"), sent)
 

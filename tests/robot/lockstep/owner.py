@@ -43,7 +43,7 @@ class Wheels:
 
     @property
     def speeds(self) -> tuple[int, int] | None:
-        """In thousandths; None: they do not turn."""
+        """The speeds in thousandths; None: they do not turn."""
         if self._line == _STOP or self._scheduler.now - self._at >= DEADMAN_S:
             return None
         _, left, right = self._line.split()

@@ -29,7 +29,7 @@ def by_script(wheels: tuple[float, float]) -> bool:
 
 
 def problems(history: History, lines: Lines, motors: Lines, overlaps: list[tuple[float, list[int]]]) -> list[str]:
-    """In words; empty if everything holds."""
+    """What does not hold, in words; empty if everything does."""
     faults = history.events("fault")
     return [
         *(f"{at:.3f}: two scripts are alive: {pids}" for at, pids in overlaps),

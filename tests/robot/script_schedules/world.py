@@ -43,7 +43,7 @@ run(main)
 
 
 class World:
-    """For many schedules; ``history`` is that of the present one."""
+    """A world for many schedules; ``history`` is that of the present one."""
 
     def __init__(self, transport: str) -> None:
         self.history = History()

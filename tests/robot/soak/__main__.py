@@ -36,7 +36,7 @@ _LOOKS = 640_000 // _NUMBERS
 
 @dataclass
 class Outcome:
-    """Of one attack. Seconds; ``back_s`` infinite: it could not be driven."""
+    """The times of one attack, in seconds; ``back_s`` infinite: it could not be driven."""
 
     name: str
     seconds: float = 0.0

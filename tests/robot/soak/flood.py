@@ -51,7 +51,7 @@ FLOODS = {
 
 @contextmanager
 def flooding(name: str, port: int, seconds: float, *options: str) -> Iterator[Child]:
-    """In a process of its own, which removes afterwards what was retained; waits for its end."""
+    """Floods from a process of its own, which removes afterwards what was retained; waits for its end."""
     words = [sys.executable, "-m", "tests.robot.soak.flood", name, "--port", str(port), "--seconds", str(seconds)]
     process = Child([*words, *options], cwd=ROOT)
     yield process

@@ -34,7 +34,7 @@ _MOST = {"heartbeats": 0.95, "mb": 30.0, "lines": 10.0}
 
 @dataclass
 class Figures:
-    """Of ten seconds: the share of heartbeats, commands obeyed, the process that took most more, lines per second."""
+    """Ten seconds: share of heartbeats, commands obeyed, the process that took most more, lines per second."""
 
     heartbeats: float
     obeyed: int

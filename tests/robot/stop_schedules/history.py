@@ -45,7 +45,7 @@ class History:
         return event.at
 
     def events(self, what: str = "", robot: str = "") -> list[Event]:
-        """In the order of their times."""
+        """The events in the order of their times."""
         with self._lock:
             found = [e for e in self._events if what in ("", e.what) and robot in ("", e.robot)]
         return sorted(found, key=lambda event: event.at)

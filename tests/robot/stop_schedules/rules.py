@@ -20,7 +20,7 @@ _NAMES = 4  # remembered by every owner
 
 
 def violations(history: History, world: World, until: float) -> list[str]:
-    """In words; empty if everything holds. ``until`` is when people began to end everything."""
+    """What does not hold, in words; empty if everything does. ``until`` is when people began to end everything."""
     return [f"{robot}: {problem}" for robot in ROBOTS for problem in _Rules(history, robot, world, until).problems()]
 
 

@@ -140,7 +140,7 @@ def _resets(chance: random.Random) -> list[Step]:
 
 
 def _reset(at: float, robot: str) -> list[Step]:
-    """With what a person does who wants to drive on: who holds the stick all the time is refused."""
+    """Adds what a person does who wants to drive on: who holds the stick all the time is refused."""
     return [Step(round(at + later, 3), what, robot) for later, what in ((0, "reset"), (0.1, "let go"), (0.2, "drive"))]
 
 

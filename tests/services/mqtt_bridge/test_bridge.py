@@ -53,7 +53,7 @@ def rig(monkeypatch: pytest.MonkeyPatch) -> Iterator[MemoryRig]:
 
 @pytest.fixture
 def goob(monkeypatch: pytest.MonkeyPatch) -> Iterator[MemoryRig]:
-    """For the robot of the recordings."""
+    """A bridge for the robot of the recordings."""
     rig = MemoryRig(monkeypatch, base=GOOB)
     yield rig
     rig.close()
@@ -550,7 +550,7 @@ class TestOneBroker:
         assert one.remote.payloads("outgoing/strange") == [b"1"]
 
     def test_a_heartbeat_seen_later_ends_the_mirroring(self, rig: MemoryRig) -> None:
-        """As if another bridge had begun to join the two brokers."""
+        """Publishes as if another bridge had begun to join the two brokers."""
         bridge = rig.bridge()
         joint = Client(MemoryTransport("joint", rig.remote_hub), listen=False)
         onto = Client(MemoryTransport("onto", rig.local_hub), listen=False)

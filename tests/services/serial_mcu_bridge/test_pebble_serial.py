@@ -213,7 +213,7 @@ def test_a_manifest_that_cannot_be_used_is_refused_and_asked_for_again(host: Hos
 
 
 def test_bad_text_in_a_hello_is_refused(host: Host) -> None:
-    """In the original Pebble it ends the reader thread."""
+    """The original Pebble's reader thread ends by it."""
     (refused,) = host.feed(wire.frame(wire.HELLO, M(b"\xff\xff").hello()))
     assert isinstance(refused, RefusedInput)
     assert "not UTF-8" in refused.reason

@@ -91,7 +91,7 @@ def test_booleans_are_booleans(raw: bytes, value: bool) -> None:
 
 @pytest.mark.parametrize("value", ["false", "true", 0, 1, 0.0, None, [], {}])
 def test_only_true_and_false_switch_anything(value: Any) -> None:
-    """In the original Pebble the text "false" switches on. Numbers are refused, too, as on every control."""
+    """The original Pebble switches on by the text "false". Numbers are refused, too, as on every control."""
     with pytest.raises(PayloadError, match="on is a boolean: true or false"):
         pack((Field("on", FieldType.BOOL),), {"on": value})
 

@@ -66,7 +66,7 @@ def test_the_configured_watchdog_stops_once(bench: Bench) -> None:
 
 
 def test_after_a_pause_of_the_process_the_stop_is_sent_before_the_next_command(bench: Bench) -> None:
-    """As after SIGSTOP and SIGCONT: the watchdog is overdue, and a command is handled first."""
+    """The order is that after SIGSTOP and SIGCONT: the watchdog is overdue, and a command is handled first."""
     bench.send("incoming/drive-values", {"z": 0.5})
     assert bench.line("M 0.500 0.500")
 

@@ -631,7 +631,7 @@ def test_nothing_listens_on_any_network(robot: Robot) -> None:
 
 
 def _inodes(_client: Transport) -> set[str]:
-    """Of all sockets of this network namespace that a packet could reach."""
+    """The addresses of all sockets of this network namespace that a packet could reach."""
     lines = [line.split() for table in ("udp", "udp6", "raw") for line in _table(table)]
     listening = [fields for table in ("tcp", "tcp6") for fields in map(str.split, _table(table)) if fields[3] == "0A"]
     return {fields[9] for fields in lines + listening}
@@ -872,7 +872,7 @@ def test_nonsense_does_not_disturb_the_hub(robot: Robot) -> None:
 
 
 def test_a_message_that_waited_in_a_socket_too_long_is_dropped(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As after a SIGSTOP of the receiver; retained messages are accepted all the same: they are not sent again."""
+    """The age is that after a SIGSTOP of the receiver; retained messages are accepted: they are not sent again."""
     sender, client = robot.client("sender"), robot.client("client")
     received: list[Message] = []
     client.subscribe("#", received.append)

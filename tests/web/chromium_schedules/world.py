@@ -44,7 +44,7 @@ _BUSY = "(ms) => { setTimeout(() => { const end = Date.now() + ms; while (Date.n
 
 
 class World:
-    """For many schedules; ``events`` are those of the present one. Tab 1 is the one behind the proxy."""
+    """A world for many schedules; ``events`` are those of the present one. Tab 1 is the one behind the proxy."""
 
     def __init__(self, robot: str) -> None:
         self.robot = robot

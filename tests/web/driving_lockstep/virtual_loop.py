@@ -8,7 +8,7 @@ from typing import Any
 
 
 class _NoFiles:
-    """In place of a selector."""
+    """A stand-in for a selector."""
 
     def select(self, _timeout: float | None) -> list[Any]:
         return []

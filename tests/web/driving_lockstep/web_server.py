@@ -28,7 +28,7 @@ BOOT_S = 0.2
 
 
 class _Time:
-    """In place of the module ``time``."""
+    """A stand-in for the module ``time``."""
 
     def __init__(self) -> None:
         self.clock: Callable[[], float] = lambda: 0.0
@@ -41,7 +41,7 @@ class _Time:
 
 
 class _Nothing:
-    """In place of what has nothing to do with driving: pictures, people, the audit log."""
+    """A stand-in for what has nothing to do with driving: pictures, people, the audit log."""
 
     def __init__(self, *_: Any) -> None:
         self._values: dict[str, str] = {}
