@@ -7,7 +7,9 @@ import re
 import shlex
 import subprocess
 import sys
+import tomllib
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -109,6 +111,21 @@ def test_a_command_line_is_one_that_exists(pebble: Any, line: str) -> None:
         command.make_context("pebble", words)
     except typer.BadParameter as error:
         assert "does not exist" in error.message  # noqa: PT017
+
+
+ALL_TEXT = "\n".join(path.read_text() for path in DOCUMENTS)
+
+
+def test_extras_targets_and_modules_are_ones_that_exist() -> None:
+    extras = set(tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"])
+    rules = re.findall(r"^([a-z][a-z -]*):", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    targets = {target for rule in rules for target in rule.split()}
+    example = "pebble.services.lamp"
+    modules = set(re.findall(r"python -m ((?:pebble|tests)\.[\w.-]*\w)", ALL_TEXT)) - {example}
+    named = {name for names in re.findall(r"'\.\[([\w,]+)\]'", ALL_TEXT) for name in names.split(",")}
+    assert named - extras == set()
+    assert set(re.findall(r"(?:^ {4}|`)make ([a-z][\w-]+)", ALL_TEXT, re.MULTILINE)) - targets == set()
+    assert [module for module in sorted(modules) if find_spec(module) is None] == []
 
 
 #: Names of constants that limit what others can add, and tokens of docs/bounds.md such as `web/stops.py:MAX_STOPS`.

@@ -54,7 +54,7 @@ def test_aims_of_all_comparisons_stand_in_one_table() -> None:
     ]
 
 
-def test_the_sentence_that_says_most_comes_first() -> None:
+def test_the_most_important_sentence_comes_first() -> None:
     document = text([section("control", synthetic.control(small=True))])
     first = "* [Service to service](#service-to-service): p50: zenoh-p2p takes 0.43× the time of mqtt-nodelay"
     assert document.index(first) < document.index("## Aims")
