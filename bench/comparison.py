@@ -145,13 +145,12 @@ class Comparison:
     words: Sequence[str] = ()  # what starts its command line after ``pebble``; by default ``bench NAME``
     reported: Sequence[str] | None = ()  # options in a report; None: it is not part of the report
     reported_full: Sequence[str] = ()  # more of them, of the full run
-    summary_lines: int = 0  # of the sentences in the report's summary; the most important come first
     root: bool = False  # needs root
 
     def null_test(self, what: str, **changes: Any) -> Comparison:
         """The mode of ``--null``: one variant against itself, as it is and slowed down. See pebble.bench.null."""
         own = {"name": f"{self.name}-null", "title": f"{self.title}: the null test", "is_null": True}
-        shown = {"assessment": (null.assessment,), "words": ("bench", self.name), "summary_lines": 0}
+        shown = {"assessment": (null.assessment,), "words": ("bench", self.name)}
         return replace(self, what=what, **{**own, **shown, "reported": ("--null",), **changes})
 
     def arguments(self, quick: bool) -> list[str]:

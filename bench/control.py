@@ -310,7 +310,6 @@ _CONTROL = Comparison(
     },
     tables=(TABLE, HOPS),
     assessment=(assessment,),
-    summary_lines=4,
     pictures=(ecdf("Service to service"), ratios("Service to service", "mqtt")),
 )
 CONTROL_NULL = _CONTROL.null_test(

@@ -121,5 +121,4 @@ COST = Comparison(
         ),
     ),
     pictures=(bars("What a robot costs", measures=(MEMORY, CPU), panel="phase", group="process"),),
-    summary_lines=12,
 )  # fmt: skip

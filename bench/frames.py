@@ -183,7 +183,6 @@ FRAMES = Comparison(
     ),
     assessment=(assessment, faults),
     complete=complete,
-    summary_lines=4,
     pictures=(tails("Frames between processes"), ecdf("Frames between processes")),
 )  # fmt: skip
 FRAMES_NULL = FRAMES.null_test(

@@ -29,6 +29,15 @@ _TIMEOUT_FACTOR = 4  # a comparison that takes this many times the expected time
 _TIMEOUT_EXTRA_S = 60.0  # and this in addition, is ended
 _END_S = 20.0  # for a comparison to end its processes
 _NOT_THE_TABLE = ("Written:", "No plots:")  # what a command prints about its files
+#: What a report begins with: pictures, and by comparison the sentence that says most.
+_PICTURES = ("bridge-down.png", "impair-audio-delivery.png")
+_SENTENCES = {
+    "control": r"p50: ",
+    "bridge": r"Median, down, load none: ",
+    "cost": r"idle, memory: ",
+    "frames": r"640x480, one reader: .* of mqtt ",
+    "impair": r"Sound that arrived within a second at 64k",
+}
 _LONG = 45  # lines of output: more are collapsed
 _TAIL = 12  # lines of a failed command's output
 
@@ -165,15 +174,20 @@ def _span(seconds: float) -> str:
 
 
 def _summary(sections: Sequence[Section]) -> Iterator[str]:
-    lines = []
-    for section in sections:
-        about, results = section.comparison, section.results
-        state = ": **failed**" if results is None else "" if results.complete else ": **incomplete**"
-        found = [f"\n  * {line}" for line in results.assessment[: about.summary_lines]] if results else []
-        lines += ["".join((section.link(about.title), state, *found))] if state or found else []
-    if lines:
-        yield "## In short"
+    """The pictures and sentences that say most, and which comparisons have failed."""
+    pictures = {file: caption for section in sections for file, caption in section.pictures}
+    yield from (f"![{pictures[file]}]({file})" for file in _PICTURES if file in pictures)
+    if lines := [line for section in sections for line in _found(section)]:
         yield _listed(lines)
+
+
+def _found(section: Section) -> Iterator[str]:
+    title, results = section.link(section.comparison.title), section.results
+    if results is None or not results.complete:
+        yield f"{title}: **{'failed' if results is None else 'incomplete'}**"
+    if results is not None and (pattern := _SENTENCES.get(section.comparison.name)):
+        most = next((line for line in results.assessment if re.match(pattern, line)), None)
+        yield from () if most is None else (f"{title}: {most}",)
 
 
 def _section(section: Section) -> Iterator[str]:
@@ -189,11 +203,12 @@ def _section(section: Section) -> Iterator[str]:
     yield f"Started {results.began[:10]} {results.began[11:16]} UTC, {_span(results.took_s)}{quickly}."
     if not results.complete:
         yield "**Something could not be measured.** See its output."
-    if lines := [*results.assessment, *map(str, results.aims)]:
-        yield _listed(lines)
+    if results.assessment:
+        yield _listed(results.assessment)
     yield from (f"![{caption}]({file})" for file, caption in section.pictures)
     printed = (line.rstrip() for line in section.output.splitlines() if not line.startswith(_NOT_THE_TABLE))
-    tables = "\n".join(line for line in printed if line.strip() not in lines).strip("\n").splitlines()
+    shown = {*results.assessment, *map(str, results.aims)}  # above, and in the table of all aims
+    tables = "\n".join(line for line in printed if line.strip() not in shown).strip("\n").splitlines()
     folded = [f"<details><summary>The tables, {len(tables)} lines</summary>", _fenced(tables), "</details>"]
     yield from folded if len(tables) > _LONG else folded[1:2] if tables else []
 

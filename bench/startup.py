@@ -195,5 +195,4 @@ STARTUP = Comparison(
     ),
     assessment=(Claims(judged=lambda cell: cell.measure not in PICTURES),),
     pictures=(dots("Start-up"),),
-    summary_lines=2,
 )  # fmt: skip

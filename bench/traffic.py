@@ -232,5 +232,4 @@ TRAFFIC = Comparison(
     assessment=(assessment,),
     complete=bool,  # a robot without outages is no failure
     pictures=(Drawn("pebble.bench.traffic:figures"),),
-    summary_lines=4,
 )

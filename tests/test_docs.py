@@ -7,7 +7,9 @@ import re
 import shlex
 import subprocess
 import sys
+import tomllib
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -43,12 +45,13 @@ DECISIONS = sorted((ROOT / "docs" / "decisions").glob("*.md"))
 #: The files that a decision named when it was written, and where they are now.
 NOW_AT = re.compile(r"^Now at: (.+)\.$", re.MULTILINE)
 MOVED = re.compile(r"`([^`]+)` → `[^`]+`")
+ROW = re.compile(r"^\| `([^`]+)` \|", re.MULTILINE)  # of docs/moved.md: the old path comes first
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
 def test_files_it_names_exist(document: Path) -> None:
     text = document.read_text()
-    moved = MOVED.findall("".join(NOW_AT.findall(text)))
+    moved = MOVED.findall("".join(NOW_AT.findall(text))) + ROW.findall(text) * (document.name == "moved.md")
     assert [name for name in CODE.findall(text) if name not in moved and not _exists(name)] == []
 
 
@@ -109,6 +112,21 @@ def test_a_command_line_is_one_that_exists(pebble: Any, line: str) -> None:
         command.make_context("pebble", words)
     except typer.BadParameter as error:
         assert "does not exist" in error.message  # noqa: PT017
+
+
+ALL_TEXT = "\n".join(path.read_text() for path in DOCUMENTS)
+
+
+def test_extras_targets_and_modules_are_ones_that_exist() -> None:
+    extras = set(tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"])
+    rules = re.findall(r"^([a-z][a-z -]*):", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    targets = {target for rule in rules for target in rule.split()}
+    example = "pebble.services.lamp"
+    modules = set(re.findall(r"python -m ((?:pebble|tests)\.[\w.-]*\w)", ALL_TEXT)) - {example}
+    named = {name for names in re.findall(r"'\.\[([\w,]+)\]'", ALL_TEXT) for name in names.split(",")}
+    assert named - extras == set()
+    assert set(re.findall(r"(?:^ {4}|`)make ([a-z][\w-]+)", ALL_TEXT, re.MULTILINE)) - targets == set()
+    assert [module for module in sorted(modules) if find_spec(module) is None] == []
 
 
 #: Names of constants that limit what others can add, and tokens of docs/bounds.md such as `web/stops.py:MAX_STOPS`.

@@ -380,7 +380,6 @@ IMPAIR = Comparison(
     assessment=(*AIMS, encodings, trips, transports),
     complete=lambda _cells: True,  # in the worst trials nothing may arrive
     pictures=(Drawn("pebble.bench.impair.pictures:over_trials"), Drawn("pebble.bench.impair.pictures:over_time")),
-    summary_lines=9,
     words=("impair",),
     root=True,
 )  # fmt: skip

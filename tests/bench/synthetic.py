@@ -83,7 +83,7 @@ def control(small: bool = False) -> Results:
         "control",
         cells,
         [
-            "zenoh-p2p takes 0.43× the time of mqtt-nodelay (99 % interval 0.41–0.45)",
+            "p50: zenoh-p2p takes 0.43× the time of mqtt-nodelay (99 % interval 0.41–0.45)",
             _aim("Zenoh peer to peer, p50 at most 0.70 of the better MQTT variant's", "met", "0.43, at most 0.45"),
             _aim("with media, p99 at 200 Hz at most 0.35 of it", "missed", "0.41, at most 0.52"),
         ],

@@ -319,7 +319,7 @@ def cell(
     return Cell(variant=variant, params=params, measure=measure, unit="ms", rounds=samples, figures=figures)
 
 
-def test_the_assessment_names_ratios_and_aims() -> None:
+def test_the_assessment_names_ratios() -> None:
     cells = [
         *(cell("mqtt", 0.6), cell("zenoh", 0.4), cell("mqtt", 0.5, UP), cell("zenoh", 0.5, UP)),
         *(cell("mqtt", 0.7, load=LOADED), cell("zenoh", 2.4, load=LOADED), cell(HOP, 0.1)),
@@ -328,23 +328,10 @@ def test_the_assessment_names_ratios_and_aims() -> None:
     assert "Median, down, load none: zenoh takes 0.67× the time of mqtt" in text
     assert "Median, down, load media: zenoh takes 3.43× the time of mqtt" in text
     assert "Median, up, load none: zenoh and mqtt are equal within noise" in text
-    assert "aim: mqtt, command to the wheels, p50 at most 0.7 ms: met (0.60 ms)" in text
 
 
-def test_a_missed_aim_is_shown_with_what_was_measured() -> None:
-    last = lines_of([cell("zenoh", 2.0)])[-1]
-    assert last == "aim: zenoh, command to the wheels, p99 at most 2 ms: missed (2.20 ms)"
-
-
-def test_lost_commands_count_as_infinitely_late() -> None:
-    *_, median, slowest = lines_of([cell("zenoh", 0.4, lost=9)])
-    assert median.endswith("p50 at most 0.7 ms: met (0.44 ms)")
-    assert slowest.endswith("p99 at most 2 ms: missed (not within 1 s)")
-
-
-def test_a_robot_that_received_nothing_missed_its_aims() -> None:
+def test_a_robot_that_received_nothing_is_shown_with_what_was_lost() -> None:
     nothing = [cell("mqtt", 0.4), cell("zenoh", 0.4, each=0, lost=800), cell(HOP, 0.1)]
-    assert "aim: zenoh, command to the wheels, p50 at most 0.7 ms: missed (not within 1 s)" in lines_of(nothing)
     assert any(row.split()[-4:] == ["–", "0", "800", "12.5"] for row in shown(nothing).splitlines() if "zenoh" in row)
 
 
@@ -352,13 +339,7 @@ def test_few_rounds_and_no_samples_are_assessed() -> None:
     few = [cell("mqtt", 0.6, rounds=7), cell("zenoh", 0.4, rounds=7), cell("zenoh", 0.4, load=LOADED, rounds=7)]
     lines = lines_of(few)
     assert any("7 rounds" in line for line in lines)
-    assert lines[-1] == "aim: zenoh, command to the wheels, p99 at most 2 ms: not judged (0.44 ms)"
     assert lines_of([]) == []
-
-
-def test_a_percentile_is_judged_only_where_something_lies_beyond_it() -> None:
-    lines = lines_of([cell("zenoh", 0.4, each=36), cell("zenoh", 2.4, load=LOADED, each=98)])
-    assert [line.partition(" ms: ")[2] for line in lines[-2:]] == ["met (0.40 ms)", "not judged (0.44 ms)"]
 
 
 def test_the_tables_have_the_robots_cost() -> None:
@@ -404,8 +385,6 @@ def test_commands_alone_are_judged_beside_the_stand_in() -> None:
         "missed: zenoh, command to the wheels, commands only, p99 at most 0.50 of paho's": "1.02 (1.02 to 1.02)",
     }
     assert "1.02 (1.02 to 1.02)" in shown([plain, ours])
-    text = "\n".join(lines_of([plain, ours]))
-    assert "aim: zenoh, command to the wheels, commands only, p50 at most 0.7 ms: missed (1.02 ms)" in text
 
 
 def test_cpu_is_judged_by_process_and_only_with_reports() -> None:
