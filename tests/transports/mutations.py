@@ -19,7 +19,7 @@ from typing import NamedTuple
 from tests.support import ROOT
 
 _FOLDERS = ("pebble", "transports", "services", "simulation", "firmware", "bench", "rig", "configs", "tests")
-_MQTT = "test_mqtt.py"
+_MQTT, _CONNECTION = "test_mqtt.py", "test_mqtt_connection.py"
 
 
 class Mutation(NamedTuple):
@@ -44,8 +44,8 @@ MUTATIONS = [
         "the socket counts as empty after the process has slept",
         "- began <= wait + OVERSLEPT_S:",
         "- began <= 1e9:",
-        _MQTT,
-        "burst_is_taken_out or fits_into_no_socket or never_arrives",
+        _CONNECTION,
+        "while_it_waits",
     ),
     Mutation(
         "what waited at the broker counts as fresh",
@@ -58,57 +58,57 @@ MUTATIONS = [
         "no ping follows a time without reading",
         "        if since != self._stalled_since:",
         "        if False:",
-        _MQTT,
-        "fits_into_no_socket",
+        _CONNECTION,
+        "ping_follows_at_once",
     ),
     Mutation(
         "a ping with every read after a time without reading",
         "        if since != self._stalled_since:",
         "        for _ in range(50):",
-        _MQTT,
-        "never_a_storm",
+        _CONNECTION,
+        "time_in_which_nothing_was_read",
     ),
     Mutation(
         "silence is not noticed",
         "if now - incoming.answered_at > incoming.silence_s:",
         "if now - incoming.answered_at > 1e9:",
-        _MQTT,
-        "silent_link",
+        _CONNECTION,
+        "is_silent or came_in_a_silence",
     ),
     Mutation(
         "pings are sent only in a silence",
         "if now >= self.pings.due_at:",
         "if now >= self.pings.due_at and now - incoming.answered_at > 0.4:",
-        _MQTT,
+        _CONNECTION,
         "while_other_answers_come",
     ),
     Mutation(
         "one late answer is a silence",
         "return max(self._silence_s, 4 * self._in_flight.round_trip_s)",
         "return self._silence_s / 4",
-        _MQTT,
-        "four_pings or slow_link or short_hole",
+        _CONNECTION,
+        "is_silent",
     ),
     Mutation(
         "retained messages do not show that the broker lives",
         "if age.has_retained or (size and self._packets == first):",
         "if size and self._packets == first:",
-        _MQTT,
-        "retained_messages_may_take",
+        _CONNECTION,
+        "signs_of_life",
     ),
     Mutation(
         "pieces of a long message do not show that the broker lives",
         "if age.has_retained or (size and self._packets == first):",
         "if age.has_retained:",
-        _MQTT,
-        "long_message or retained_messages_may_take",
+        _CONNECTION,
+        "signs_of_life",
     ),
     Mutation(
         "the time in which retained messages are handled counts as silence",
         "            incoming.age.note_handled()\n",
         "            incoming.age.has_retained = False\n",
-        _MQTT,
-        "handling_retained",
+        _CONNECTION,
+        "handled_is_no_silence",
     ),
     Mutation(
         "a lost connection sends what its socket still holds",
@@ -121,15 +121,15 @@ MUTATIONS = [
         "messages are acknowledged before they are handled",
         "            messages, incoming.messages = incoming.messages, []\n",
         "            client.acknowledge()\n            messages, incoming.messages = incoming.messages, []\n",
-        "test_mqtt_client.py",
+        _CONNECTION,
         "acknowledged_when_it_was_handled",
     ),
     Mutation(
         "a subscription is confirmed before its retained messages are delivered",
         "        try:\n            if messages:\n",
         "        self._in_flight.complete()\n        try:\n            if messages:\n",
-        _MQTT,
-        "subscribe_returns_after",
+        _CONNECTION,
+        "acknowledgement_is_complete",
     ),
     Mutation(
         "any number of messages may be unacknowledged",
@@ -191,14 +191,14 @@ MUTATIONS = [
         "older messages follow one that made them stale",
         '                    self._counters.add("dropped", self._backlog.supersede(message))',
         "                    pass",
-        "test_mqtt_connection.py",
+        _CONNECTION,
         "stale",
     ),
     Mutation(
         "a retained message is skipped although an older one of the batch may change that",
         "        if self.messages:\n            return False",
         "        if False:\n            return False",
-        "test_mqtt_connection.py",
+        _CONNECTION,
         "skip",
     ),
     Mutation(
@@ -224,7 +224,7 @@ def found(mutation: Mutation, folder: Path) -> bool:
         done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
     finally:
         files[0].write_text(text)
-    assert done.returncode in (0, 1), done.stdout + done.stderr
+    assert done.returncode in (0, 1), f"{mutation.bug}: {done.stdout}{done.stderr}"
     return done.returncode == 1
 
 

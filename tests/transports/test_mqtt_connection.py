@@ -5,6 +5,7 @@ from __future__ import annotations
 import select
 import socket
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import nullcontext
 
@@ -75,10 +76,12 @@ class Link:
             parts.append(self.other.recv(1 << 20))
         return b"".join(parts)
 
-    def answer_pings(self) -> None:
+    def answer_pings(self) -> int:
+        """Returns how many there were."""
         if asked := self.written().count(packets.PINGREQ):
             self.sends(PONG * asked)
             self.connection.pump(0.0, self.messages.extend)
+        return asked
 
     def close(self) -> None:
         self.connection.discard()
@@ -147,13 +150,37 @@ def test_a_message_is_as_old_as_the_time_in_which_nothing_was_read(
     link.sends(sent(b"old"))
     link.now += stopped_s
     link.pump()
-    link.answer_pings()
+    assert link.answer_pings() <= 2
     link.idle(0.1)
     link.sends(sent(b"fresh"))
     link.pump()
     old, fresh = (message.waited_s for message in link.messages)
     assert waited_s <= old < waited_s + 0.15
     assert fresh < 0.15
+
+
+def test_a_message_is_as_old_as_a_stop_of_the_process_while_it_waits_for_one(link: Link) -> None:
+    link.idle(0.2)
+
+    def stop() -> None:
+        time.sleep(0.05)
+        link.now += 1.5
+        link.other.sendall(sent(b"old"))
+
+    stopping = threading.Thread(target=stop)
+    stopping.start()
+    link.pump()
+    stopping.join()
+    assert 1.4 <= link.messages[0].waited_s <= 1.7
+
+
+def test_a_ping_follows_at_once_when_nothing_was_read_for_a_while(link: Link) -> None:
+    link.idle(0.6)
+    assert link.answer_pings() == 1
+    link.now += 0.2  # the next regular one is not due yet
+    link.sends(sent(b"1"), sent(b"2"))
+    link.pump(until_read=2)
+    assert link.answer_pings() == 1
 
 
 def test_a_ping_without_an_answer_makes_what_comes_before_that_as_old(link: Link) -> None:
