@@ -82,7 +82,7 @@ page-tests: .venv/.ready-dev
 	@sh tools/debian-packages.sh mosquitto=mosquitto chromium=chromium
 	@$(VENV) tools/run_tests.py -m page tests/web
 
-# Brokers of other makers; where they are installed, make test tests them as well.
+# Brokers of other makers; where they are installed, make thorough tests them as well.
 brokers: .venv/.ready-dev
 	@sh tools/debian-packages.sh mosquitto=mosquitto
 	@sh tools/brokers.sh

@@ -21,19 +21,18 @@ from pebble.errors import TransportError
 from pebble.transports import clock
 from pebble.transports.bounds import BoundedQueue, BoundedTable
 from pebble.transports.counters import Counters
-from pebble.transports.topics import REMEMBERED_LENGTH, check_filter, check_topic, matches
+from pebble.transports.own_retained import OwnRetained
+from pebble.transports.subscriptions import Subscriptions
+from pebble.transports.topics import check_filter, check_topic
 
 log = logging.getLogger(__name__)
 
 QUEUE_LIMIT = 1000  # messages waiting for a slow handler before the oldest is dropped
 QUEUE_BYTES = 16 << 20  # the same, for their topics and payloads
-_OWN_LIMIT = 10_000  # retained topics a transport can send again; the names of topics may come from other programs
-_OWN_BYTES = 16 << 20  # the same, with their payloads
 _DELIVERED_TOPICS_LIMIT = 65_536  # topics a subscription remembers as delivered, per connection
 _DELIVERED_TOPICS_BYTES = 4 << 20
 _HANDLER_END_S = 1.0  # how long closing waits for handlers that are running
 _TURN_S = 0.02  # how soon the end of a turn is noticed
-_MATCHED = 512  # topics whose subscriptions are remembered
 _WARNING_PERIOD_S = 5.0  # between two log lines about the same overflowing subscription
 
 
@@ -221,14 +220,9 @@ class Transport(ABC):
         self._state_lock = threading.RLock()
         self._connected = threading.Event()
         self._watchers: list[Watcher] = []
-        self._subscriptions: list[Subscription] = []
-        self._matched: dict[str, tuple[Subscription, ...]] = {}  # of these, by topic; empty after each change
-        self._lock = threading.RLock()  # guards the list of subscriptions
+        self._subscriptions = Subscriptions()
         self._publishing = threading.RLock()  # one publish at a time: the order of calls is the order per topic (T3)
-        # Our newest retained message, by topic; empty payloads included.
-        self._own = BoundedTable[Message](_OWN_LIMIT, _OWN_BYTES, lambda message: len(message.payload))
-        self._pending: dict[str, None] = {}  # topics in _own whose message is not sent yet, oldest first
-        self._shared: set[str] = set()  # topics in _own that others publish on, too
+        self._own = OwnRetained(self.counters)
         self._syncing = False  # guarded by _publishing
 
     # -- what services call
@@ -292,9 +286,7 @@ class Transport(ABC):
                 return
             connected = self._state is State.CONNECTED
             self._set_state(State.CLOSED)
-        with self._lock:
-            subscriptions, self._subscriptions = self._subscriptions, []
-            self._matched.clear()
+        subscriptions = self._subscriptions.remove_all()
         for subscription in subscriptions:
             subscription._stop()
         self._close(self.will if connected else None)
@@ -332,7 +324,7 @@ class Transport(ABC):
                 return False
             accepted = self._send(message, urgent)
             sent = accepted and self._state is State.CONNECTED
-            stored = retain and remember and self._remember(message, sent=sent, shared=shared)
+            stored = retain and remember and self._own.remember(message, sent=sent, shared=shared)
             if accepted:
                 self._count_sent()
             else:  # "parked" is the published name of the counter of pending messages
@@ -360,12 +352,11 @@ class Transport(ABC):
         if self.as_published and echo:
             raise TransportError(f"an as-published connection never echoes: subscribe {filter_} with echo=False")
         subscription = Subscription(self, filter_, handler, qos=QoS(qos), echo=echo, direct=direct, limit=limit)
-        with self._lock:
+        with self._subscriptions.lock:
             if self._state is State.CLOSED:
                 subscription._stop()
                 raise TransportError(f"transport {self.client_id} is closed")
-            self._subscriptions.append(subscription)
-            self._matched.clear()
+            self._subscriptions.add(subscription)
         self._declare(subscription)
         return subscription
 
@@ -383,18 +374,6 @@ class Transport(ABC):
         self.close()
 
     # -- for backends
-
-    def _matching(self, topic: str) -> tuple[Subscription, ...]:
-        """Remembered by topic: matching takes longer than everything else that happens to a message here."""
-        with self._lock:
-            found = self._matched.get(topic)
-            if found is None:
-                found = tuple(one for one in self._subscriptions if matches(one.filter, topic))
-                if len(self._matched) >= _MATCHED:
-                    self._matched.clear()
-                if len(topic) <= REMEMBERED_LENGTH:
-                    self._matched[topic] = found
-            return found
 
     def _set_state(self, state: State) -> None:
         """Notify the watchers, once per change. A closed transport stays closed unless it is opened again."""
@@ -417,40 +396,16 @@ class Transport(ABC):
 
     def _renew(self) -> None:
         """Backends call this when a new connection begins, before its first message is offered."""
-        with self._lock:
-            subscriptions = list(self._subscriptions)
-        for subscription in subscriptions:
+        for subscription in self._subscriptions:
             subscription.renew()
-
-    def _remember(self, message: Message, *, sent: bool, shared: bool | None = None) -> bool:
-        """Store a retained message, to send it again; False, and no older one is sent again, if there is no room.
-
-        ``shared`` None: as the older one.
-        """
-        shared = message.topic in self._shared if shared is None else shared
-        self._pending.pop(message.topic, None)
-        self._shared.discard(message.topic)
-        if sent and not message.payload:
-            self._own.pop(message.topic, None)
-            return True
-        if not self._own.put_if_room(message.topic, message):
-            self.counters.add("forgotten")
-            return False
-        if shared:
-            self._shared.add(message.topic)
-        if not sent:
-            self._pending[message.topic] = None
-        return True
 
     def _sync_retained(self, known: Collection[str]) -> None:
         """Send the pending retained messages, then our others that are not in ``known`` (T9)."""
         with self._publishing:
-            changed = [self._own[topic] for topic in self._pending]
-            missing = [m for topic, m in self._own.items() if topic not in self._pending and topic not in known]
             self._syncing = True
             try:
-                for message in changed + missing:
-                    self._remember(message, sent=self._send(message, False))
+                for message in self._own.to_send(known):
+                    self._own.remember(message, sent=self._send(message, False))
             finally:
                 self._syncing = False
 
@@ -465,12 +420,8 @@ class Transport(ABC):
         self._sync_retained(self._own.keys())
 
     def _forget(self, subscription: Subscription) -> None:
-        with self._lock:
-            if subscription not in self._subscriptions:
-                return
-            self._subscriptions.remove(subscription)
-            self._matched.clear()
-        self._undeclare(subscription)
+        if self._subscriptions.remove(subscription):
+            self._undeclare(subscription)
 
     @abstractmethod
     def _open(self, timeout: float) -> None:

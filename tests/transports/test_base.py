@@ -7,9 +7,9 @@ import tracemalloc
 
 import pytest
 
-from pebble.transports import Message, QoS, base
-from pebble.transports.base import _OWN_LIMIT
+from pebble.transports import Message, QoS, base, own_retained
 from pebble.transports.memory import MemoryHub, MemoryTransport
+from pebble.transports.subscriptions import Subscriptions
 from pebble.transports.topics import check_topic
 from pebble.transports.zenoh.keymap import key_to_topic, topic_to_key
 from tests.support import until
@@ -20,19 +20,19 @@ def test_retained_topics_are_bounded_in_number() -> None:
     hub = MemoryHub()
     with MemoryTransport("bridge", hub) as bridge, MemoryTransport("late", hub) as late:
         received: set[str] = set()
-        for number in range(_OWN_LIMIT + 50):
+        for number in range(own_retained.LIMIT + 50):
             assert bridge.publish(f"flag{number}", b"1", qos=QoS.DELIVERED, retain=True)
         assert bridge.counters["forgotten"] == 50
         hub.stop(forget=True)
-        late.subscribe("#", lambda message: received.add(message.topic), limit=2 * _OWN_LIMIT)
+        late.subscribe("#", lambda message: received.add(message.topic), limit=2 * own_retained.LIMIT)
         hub.start()
-        assert until(lambda: len(received) == _OWN_LIMIT)
+        assert until(lambda: len(received) == own_retained.LIMIT)
         assert "flag0" in received
 
 
 def test_retained_messages_are_bounded_in_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
     """An older value is not sent again in place of a newer one that is too large to be stored."""
-    monkeypatch.setattr(base, "_OWN_BYTES", 1000)
+    monkeypatch.setattr(own_retained, "BYTES", 1000)
     hub = MemoryHub()
     with MemoryTransport("bridge", hub) as bridge, MemoryTransport("late", hub) as late:
         for topic, size in (("a", 400), ("b", 400), ("c", 400), ("a", 900), ("d", 500)):
@@ -69,10 +69,11 @@ def test_a_slow_handlers_queue_is_bounded_in_bytes(monkeypatch: pytest.MonkeyPat
 
 def test_long_topics_of_strangers_are_not_remembered() -> None:
     with MemoryTransport("client", MemoryHub()) as client:
-        wanted = client.subscribe("a/#", lambda _: None)
+        subscriptions, wanted = Subscriptions(), client.subscribe("a/#", lambda _: None)
+        subscriptions.add(wanted)
         tracemalloc.start()
         for number in range(1000):
-            assert client._matching(f"a/{number:60000}") == (wanted,)
+            assert subscriptions.matching(f"a/{number:60000}") == (wanted,)
             assert key_to_topic(topic_to_key(check_topic(f"a/{number:1000}"))) == f"a/{number:1000}"
         left, _ = tracemalloc.get_traced_memory()
         tracemalloc.stop()

@@ -27,7 +27,7 @@ from tests.transports.brokers import MAKERS, ROBOT, Maker, sparing_aedes
 from tests.transports.net import ProcessPeer
 from tests.transports.received import Received
 
-pytestmark = pytest.mark.alone  # deadlines are checked
+pytestmark = [pytest.mark.alone, pytest.mark.thorough]  # deadlines are checked; make brokers runs it
 
 FLAG = "incoming/flags/mqtt-audio"
 STOPPED = {"latched": True, "boot": "b", "count": 1, "recent": [], "by": "ann", "why": "", "since": 1}

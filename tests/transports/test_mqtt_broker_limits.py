@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import product
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,7 @@ from pebble.transports import Message, MqttSettings, QoS, State
 from pebble.transports.mqtt.bridge_mode import Result
 from pebble.transports.mqtt.broker_limits import EVERYTHING, BrokerLimits, Limits
 from pebble.transports.mqtt.transport import MqttTransport
-from tests.support import Broker, until
+from tests.support import Broker, some, until
 from tests.transports.received import Received
 
 NONE = Limits(retain=False, qos=0)
@@ -73,27 +74,27 @@ def test_what_is_tried_next(events: list[str], limits: Limits) -> None:
     assert learning.limits == limits
 
 
-@pytest.mark.parametrize("protocol", ["3.1.1", "5"])
-@pytest.mark.parametrize("has_will", [True, False])
-@pytest.mark.parametrize("as_published", [True, False])
+LACKING = [
+    (["retain_available false"], "keeps no retained messages"),
+    (["max_qos 0"], "has no QoS 1"),
+    (["retain_available false", "max_qos 0"], "keeps no retained messages"),
+    ([], ""),
+]
+
+
 @pytest.mark.parametrize(
-    ("options", "lost"),
-    [
-        (["retain_available false"], "keeps no retained messages"),
-        (["max_qos 0"], "has no QoS 1"),
-        (["retain_available false", "max_qos 0"], "keeps no retained messages"),
-        ([], ""),
-    ],
+    ("lacking", "protocol", "has_will", "as_published"),
+    some(product(LACKING, ("3.1.1", "5"), (True, False), (True, False)), 5),
 )
 def test_messages_pass_both_ways_and_one_warning_names_what_is_lost(
     tmp_path: Path,
     caplog: pytest.LogCaptureFixture,
-    options: list[str],
-    lost: str,
+    lacking: tuple[list[str], str],
     protocol: str,
     has_will: bool,
     as_published: bool,
 ) -> None:
+    options, lost = lacking
     broker = Broker(tmp_path, *options)
     settings = MqttSettings(host="127.0.0.1", port=broker.port, protocol=protocol, as_published=as_published)
     will = Message("robot/online", b"gone", QoS.DELIVERED, retain=True)

@@ -4,22 +4,17 @@ from __future__ import annotations
 
 import select
 import socket
-import threading
 from collections.abc import Iterator
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack
 from typing import Any
 
 import pytest
 
 from pebble.transports import MqttSettings
-from pebble.transports.base import Message
-from pebble.transports.counters import Counters
 from pebble.transports.hosts import addresses_of
 from pebble.transports.mqtt import packets
 from pebble.transports.mqtt.client import Client, Opening
-from pebble.transports.mqtt.connection import Connection
 from pebble.transports.mqtt.packets import Filter
-from pebble.transports.mqtt.transport import MqttTransport
 from tests.support import until
 from tests.transports.test_mqtt_packets import Noted, packet
 
@@ -177,38 +172,3 @@ def test_a_client_that_leaves_closes_after_its_last_packet(pairs: Any) -> None:
     pair.other.setblocking(True)
     parts = list(iter(lambda: pair.other.recv(4096), b""))  # a reset would raise
     assert b"".join(parts).endswith(packets.DISCONNECT)
-
-
-@pytest.mark.parametrize("fails", [False, True])
-def test_a_message_is_acknowledged_when_it_was_handled_even_if_that_failed(fails: bool) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as server, ExitStack() as stack:
-        settings = MqttSettings(host="127.0.0.1", port=server.getsockname()[1])
-        connection = Connection(
-            opening(settings),
-            Counters(),
-            MqttTransport("client", settings),
-            where="broker",
-            as_published=False,
-        )
-        stack.callback(connection.discard)
-        connecting = threading.Thread(target=connection.connect, args=(threading.Event(),))
-        connecting.start()
-        other = stack.enter_context(server.accept()[0])
-        other.settimeout(5)
-        assert other.recv(4096).startswith(b"\x10")
-        other.sendall(b"\x20\2\0\0")
-        connecting.join(5)
-        handled: list[bytes] = []
-
-        def handle(messages: list[Message]) -> None:
-            handled.extend(message.payload for message in messages)
-            assert not select.select([other], [], [], 0.1)[0], "acknowledged before"
-            if fails:
-                raise RuntimeError("a handler failed")
-
-        other.sendall(b"".join(packet(0x32, b"\0\1a" + bytes((0, number)) + b"x") for number in (1, 2)))
-        with pytest.raises(RuntimeError) if fails else nullcontext():
-            while not handled:
-                connection.pump(1.0, handle)
-        assert handled == [b"x", b"x"]
-        assert other.recv(4096) == b"\x40\2\0\1\x40\2\0\2"

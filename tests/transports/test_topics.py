@@ -24,12 +24,12 @@ def random_topic(chosen: random.Random) -> str:
 
 def test_matches_agrees_with_paho_on_random_pairs() -> None:
     chosen, hits = random.Random(20), 0
-    for _ in range(50_000):
+    for _ in range(20_000):
         filter_, topic = random_filter(chosen), random_topic(chosen)
         wanted = topic_matches_sub(filter_, topic)
         assert matches(filter_, topic) is wanted, (filter_, topic)
         hits += wanted
-    assert 500 < hits < 49_500  # the pairs are neither all misses nor all hits
+    assert 500 < hits < 19_500  # the pairs are neither all misses nor all hits
 
 
 @pytest.mark.parametrize(

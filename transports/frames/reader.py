@@ -51,33 +51,26 @@ class FrameReader:
     def __init__(self, folder: Path, stream: str, *, views: bool = False, sharing: bool = True, depth: int = 1) -> None:
         if depth < 1:
             raise TransportError(f"a reader of {stream} with {depth} frames would never get one")
-        self._folder = folder
-        self._stream = stream
         self._names = StreamNames(folder, stream)
         self._views, self._sharing = views, sharing
         self.counters = Counters()
         self._count_received, self._count_shared = map(self.counters.adder, ("received", "shared"))
         self.problem = ""
-        self._latest: _LatestFrames[_Arrival] = _LatestFrames(depth)
-        self._writers: dict[int, WriterMemory] = {}  # the running ones, and their memory
-        self._seen_writer_ids: set[int] = set()  # that were counted
-        self._last: tuple[int, int] = (0, 0)  # writer and number of the newest frame that arrived
-        self._previous_writer = -1  # the writer before that
+        self._latest: _LatestFrames[_Arrival] = _LatestFrames(depth)  # closed while the reader is
+        self.running = RunningWriters()
+        self._order = _Order()
         self._sharing_ended = threading.Event()
         self._lacked_room = False  # in shared memory, when the session was opened
         self._changing = threading.Lock()
-        self._closed = True
         self._pid = 0
-        self._session: zenoh.Session | None = None
-        self._declared: list[Any] = []
+        self._session: tuple[zenoh.Session, list[Any]] | None = None  # and what is declared there
 
     # -- opening and closing
 
     def open(self) -> Self:
         """Raises TransportError in a folder that cannot contain a socket, or is not this user's."""
-        prepare_run_dir(self._folder)
+        prepare_run_dir(self._names.folder)
         with self._changing:
-            self._closed = False
             self._latest.reopen()
             lockable = not self._sharing or shared_memory.lockable(2 * METADATA)
             self.problem = "" if lockable else self._memlock_problem(2 * METADATA)
@@ -88,38 +81,38 @@ class FrameReader:
     def _start(self) -> None:
         if self.problem:
             log.warning("%s", self.problem)
-        session = self._session = self._open_session()
+        session = self._open_session()
         self._pid = os.getpid()
         if self.shared and self._views:
             # The self-test takes milliseconds: better now than at the first frame.
             views.why_unavailable()
         liveliness = session.liveliness()
-        self._declared = [  # called on Zenoh's receiving thread: these must be quick
+        declared = [  # called on Zenoh's receiving thread: these must be quick
             liveliness.declare_subscriber(self._names.writers, direct(self._on_writer), history=True),
             session.declare_subscriber(self._names.data, direct(self._on_frame)),
             liveliness.declare_token(self._names.reader(os.urandom(6).hex())),
         ]
+        self._session = session, declared
 
     def _open_session(self) -> zenoh.Session:
         if self.shared:
             try:
-                return open_reading(self._folder, self._names, shared=True)
+                return open_reading(self._names, shared=True)
             except SharingError as error:
                 self.problem = f"{error}; the frames are sent as bytes"
                 self._lacked_room = True
-        return open_reading(self._folder, self._names, shared=False)
+        return open_reading(self._names, shared=False)
 
     def _stop(self) -> None:
         if self._session is None or self._pid != os.getpid():  # a forked session cannot even be closed
             return
-        session, self._session = self._session, None
-        self._declared.clear()
-        self._writers.clear()
+        (session, declared), self._session = self._session, None
+        declared.clear()
+        self.running.clear()
         close_session(session)
 
     def close(self) -> None:
         with self._changing:
-            self._closed = True
             self._latest.close()
             self._stop()
 
@@ -133,7 +126,7 @@ class FrameReader:
 
     @property
     def closed(self) -> bool:
-        return self._closed
+        return self._latest.closed
 
     @property
     def shared(self) -> bool:
@@ -143,7 +136,7 @@ class FrameReader:
     @property
     def writers(self) -> int:
         """How many writers the stream has now: 0 or 1, and 2 for a moment when one replaces another."""
-        return len(self._writers)
+        return len(self.running)
 
     def read(self, timeout: float | None = None) -> Frame | None:
         """The newest frame not yet returned (with ``depth``: the oldest of those waiting).
@@ -151,7 +144,7 @@ class FrameReader:
         None after ``timeout`` seconds without one, and when the reader is closed.
         """
         end = None if timeout is None else time.monotonic() + timeout
-        while not self._closed:
+        while not self._latest.closed:
             check_process(self._pid)
             if self._sharing_ended.is_set():
                 self._reopen()
@@ -166,7 +159,7 @@ class FrameReader:
 
     def __iter__(self) -> Iterator[Frame]:
         """Until the reader is closed."""
-        while not self._closed:
+        while not self._latest.closed:
             frame = self.read()
             if frame is not None:
                 yield frame
@@ -178,7 +171,7 @@ class FrameReader:
             self.counters.add("copied")
             return Frame(info, _copy(bytes(payload)), shared=False)
         self._count_shared()
-        memory = memory or self._writers.get(info.writer)  # its first frame may come before its token
+        memory = memory or self.running.get(info.writer)  # its first frame may come before its token
         if memory is None or reclaim.is_reclaimed(memory):
             self.counters.add("torn")  # of a writer that has ended: its memory may have been reclaimed
             return None
@@ -199,19 +192,13 @@ class FrameReader:
         if info is None:
             self.counters.add("refused")
             return
-        writer, number = self._last
-        if info.writer == writer:
-            if info.sequence <= number:
-                return  # sent as bytes and overtaken by a shared frame: counted as missed then
-            if info.sequence > number + 1:
-                self.counters.add("missed", info.sequence - number - 1)
-        elif info.writer == self._previous_writer:
-            return  # a late frame of a writer that was replaced
-        else:
-            self._previous_writer = writer
-        self._last = (info.writer, info.sequence)
+        missed = self._order.missed(info)
+        if missed < 0:
+            return
+        if missed:
+            self.counters.add("missed", missed)
         self._count_received()
-        if skipped := self._latest.put((info, sample.payload, self._writers.get(info.writer))):
+        if skipped := self._latest.put((info, sample.payload, self.running.get(info.writer))):
             self.counters.add("skipped", skipped)
 
     def _on_writer(self, sample: zenoh.Sample) -> None:
@@ -221,13 +208,13 @@ class FrameReader:
             self.counters.add("refused")
             return
         if sample.kind != zenoh.SampleKind.PUT:
-            self._writers.pop(writer_id, None)
+            self.running.pop(writer_id, None)
             return
-        new = writer_id not in self._seen_writer_ids
+        new = writer_id not in self.running.seen
         if new:
-            self._seen_writer_ids.add(writer_id)
+            self.running.seen.add(writer_id)
             self.counters.add("writers")
-        self._writers[writer_id] = memory
+        self.running[writer_id] = memory
         if new and memory.size and self._lacked_room:  # it has found room: so may this reader
             self._lacked_room = False
             self._reopen_soon("")
@@ -236,14 +223,14 @@ class FrameReader:
 
     def _why_not_map(self, memory: WriterMemory) -> str:
         if reclaim.is_reclaimed(memory):
-            return f"the writer of {self._stream} was taken for dead: its frames come as bytes until a restart"
+            return f"the writer of {self._names.stream} was taken for dead: its frames come as bytes until a restart"
         if memory.file and any(file.endswith(memory.file) for _, _, file in segments.mappings()):
             return ""  # as before: only the connection was lost
         left = reclaim.unclaimed_bytes()
         if left > LEFT_MAPPED_LIMIT:
             return (
-                f"writers of {self._stream} were restarted so often that {left >> 20} MiB of their memory are lost "
-                "until this process is restarted: from now on it gets frames as bytes"
+                f"writers of {self._names.stream} were restarted so often that {left >> 20} MiB of their memory are "
+                "lost until this process is restarted: from now on it gets frames as bytes"
             )
         needed = memory.size + METADATA
         return "" if shared_memory.lockable(needed) else self._memlock_problem(needed)
@@ -257,17 +244,46 @@ class FrameReader:
     def _reopen(self) -> None:
         with self._changing:
             self._sharing_ended.clear()
-            if self._closed:
+            if self._latest.closed:
                 return
             self.counters.add("reopened")
             self._stop()
             self._start()
 
     def _memlock_problem(self, size: int) -> str:
-        return shared_memory.memlock_problem(size, f"a reader of {self._stream}")
+        return shared_memory.memlock_problem(size, f"a reader of {self._names.stream}")
 
 
 _Arrival = tuple[FrameInfo, zenoh.ZBytes, WriterMemory | None]
+
+
+class RunningWriters(dict[int, WriterMemory]):
+    """The memory of the writers that run, by their ids; ``seen``: those that were counted."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seen: set[int] = set()
+
+
+class _Order:
+    """The newest frame that has arrived: its writer and number, and the writer before that."""
+
+    def __init__(self) -> None:
+        self._writer, self._number, self._previous = 0, 0, -1
+
+    def missed(self, info: FrameInfo) -> int:
+        """How many frames were lost before this one; -1: it is not newer."""
+        missed = 0
+        if info.writer == self._writer:
+            if info.sequence <= self._number:
+                return -1  # sent as bytes and overtaken by a shared frame: counted as missed then
+            missed = info.sequence - self._number - 1
+        elif info.writer == self._previous:
+            return -1  # a late frame of a writer that was replaced
+        else:
+            self._previous = self._writer
+        self._writer, self._number = info.writer, info.sequence
+        return missed
 
 
 class _LatestFrames(Generic[_T]):
@@ -276,8 +292,10 @@ class _LatestFrames(Generic[_T]):
     def __init__(self, depth: int) -> None:
         self._depth = depth
         self.reopen()
+        self.closed = True
 
     def reopen(self) -> None:
+        self.closed = False
         self._items: deque[_T | None] = deque()
         self._wakeup = Wakeup()
 
@@ -310,6 +328,7 @@ class _LatestFrames(Generic[_T]):
 
     def close(self) -> None:
         """Drop waiting items: they pin the writer's memory."""
+        self.closed = True
         self._items.clear()
         self._items.append(None)
         self._wakeup.set()

@@ -38,8 +38,8 @@ class StreamNames:
         self.data = f"frames/{stream}/data"
         self.readers = f"frames/{stream}/reader/*"
         self.writers = f"frames/{stream}/writer/*/*/*"
+        self.folder, self.stream = folder, stream
         self._lock_name = f"frames-{stream}.{{}}.life"
-        self._folder = folder
 
     def reader(self, name: str) -> str:
         return self.readers.replace("*", name)
@@ -56,21 +56,21 @@ class StreamNames:
 
     def lock_path(self, writer_id: int) -> Path:
         """The file that this writer locks while it is open."""
-        return self._folder / self._lock_name.format(f"{writer_id:x}")
+        return self.folder / self._lock_name.format(f"{writer_id:x}")
 
     def lock_paths(self) -> list[Path]:
-        return list(self._folder.glob(self._lock_name.format("*")))
+        return list(self.folder.glob(self._lock_name.format("*")))
 
 
-def open_writing(folder: Path, names: StreamNames, *, shared: bool) -> zenoh.Session:
+def open_writing(names: StreamNames, *, shared: bool) -> zenoh.Session:
     """Open the writer's session. Raises TransportError if it cannot listen, for example because another writer does."""
     check_socket_path(names.socket)
-    return _open(folder, [names.socket], [], shared=shared)
+    return _open(names.folder, [names.socket], [], shared=shared)
 
 
-def open_reading(folder: Path, names: StreamNames, *, shared: bool) -> zenoh.Session:
+def open_reading(names: StreamNames, *, shared: bool) -> zenoh.Session:
     """Open a reader's session. The writer need not be running yet."""
-    return _open(folder, [], [names.socket], shared=shared)
+    return _open(names.folder, [], [names.socket], shared=shared)
 
 
 def _open(folder: Path, listen: list[Path], connect: list[Path], *, shared: bool) -> zenoh.Session:

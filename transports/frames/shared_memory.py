@@ -7,6 +7,7 @@ import ctypes
 import mmap
 import re
 import resource
+import time
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from pebble.transports.frames import views
 
 Bytes = np.ndarray[Any, np.dtype[np.uint8]]
 
+STARVED_S = 1.0  # after this long without a free slot, slots of dead or stopped readers are reclaimed
 MARGIN = 64 << 10  # bytes in addition to the frames: the allocator's own, and rounding
 _MLOCK_ONFAULT = 1  # checks the permission without touching the pages (Linux 4.4)
 _libc = ctypes.CDLL(None, use_errno=True)
@@ -31,6 +33,8 @@ class SharedPool:
         self.size = size
         self._provider = zenoh.shm.ShmProvider.default_backend(size)
         self._policy = zenoh.shm.GarbageCollect()
+        self._starved_since: float | None = None
+        self.reclaimed = 0  # how often slots were taken from readers that died or stopped
 
     def segment(self) -> str:
         """The name of its file in /dev/shm; "" if Zenoh does not report it."""
@@ -39,14 +43,30 @@ class SharedPool:
 
     def allocate(self, size: int) -> Chunk | None:
         """Memory for one frame of ``size`` bytes; None if no slot is free."""
+        chunk = self._allocate(size)
+        if chunk is None and self._starving():
+            self._provider.garbage_collect_unsafe()  # what no running reader has confirmed for 0.1 s
+            self.reclaimed += 1
+            chunk = self._allocate(size)
+        if chunk is not None:
+            self._starved_since = None
+        return chunk
+
+    def _allocate(self, size: int) -> Chunk | None:
         for _ in range(2):  # Zenoh fails if no single collected chunk is large enough; joined ones may be, next time
             with contextlib.suppress(zenoh.ZError):
                 return Chunk(self._provider.alloc(size, policy=self._policy), size, self._provider)
         return None
 
-    def reclaim(self) -> None:
-        """Free the chunks that no running reader has confirmed for a tenth of a second."""
-        self._provider.garbage_collect_unsafe()
+    def _starving(self) -> bool:
+        """Whether no slot was free for STARVED_S; then the time starts again."""
+        now = time.monotonic()
+        if self._starved_since is None:
+            self._starved_since = now
+        if now - self._starved_since < STARVED_S:
+            return False
+        self._starved_since = now
+        return True
 
 
 class Chunk:

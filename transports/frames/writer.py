@@ -32,7 +32,6 @@ Data = bytes | bytearray | memoryview | np.ndarray[Any, Any]
 
 SMALL = 16 << 10  # bytes: frames up to this size are sent as bytes, which is as fast and pins no memory
 RETRY_S = 30.0  # from the opening without room in shared memory until it is looked for again
-STARVED_S = 1.0  # after this long without a free slot, slots of dead or stopped readers are reclaimed
 #: What happens to a frame when a reader accepts nothing; neither blocks the writer. DROP: it is dropped after a
 #: millisecond, which is right for small messages: sound, and the reference to a picture in shared memory.
 #: A picture sent as bytes takes longer than that: BLOCK_FIRST lets one wait and drops those after it.
@@ -54,8 +53,6 @@ class FrameWriter:
     def __init__(self, folder: Path, stream: str, *, capacity: int, slots: int = 6) -> None:
         if capacity <= 0 or slots < 2:
             raise TransportError(f"frames of {stream}: {slots} slots of {capacity} bytes are no pool")
-        self._folder = folder
-        self._stream = stream
         self._names = StreamNames(folder, stream)
         self._pool_size = 0 if capacity <= SMALL else slots * capacity + MARGIN
         self.counters = Counters()
@@ -64,14 +61,12 @@ class FrameWriter:
         self._writer_id = 0
         self._pid = 0
         self._sequence = 0
-        self._starved_since: float | None = None
         self._closing = threading.Lock()
         self._session: zenoh.Session | None = None
-        self._publisher: zenoh.Publisher | None = None  # of small messages
-        self._bulk: zenoh.Publisher | None = None  # of pictures sent as bytes
+        #: For small messages, and for pictures sent as bytes.
+        self._publishers: tuple[zenoh.Publisher, zenoh.Publisher] | None = None
         self._pool: SharedPool | None = None
-        self._lock: FileLock | None = None
-        self._files: list[OwnFile] = []  # without which readers that start now get nothing
+        self._files: tuple[FileLock, list[OwnFile]] | None = None  # without which readers that start now get nothing
         self._tokens: list[Any] = []
         self._readers: set[str] = set()
 
@@ -79,14 +74,14 @@ class FrameWriter:
 
     def open(self) -> Self:
         """Raises TransportError if it cannot listen in that folder, for example because another writer does."""
-        prepare_run_dir(self._folder)
+        prepare_run_dir(self._names.folder)
         self._sweep()
         self.problem = self._why_not_shared()
         self._writer_id = random.SystemRandom().getrandbits(63) | 1
         self._sequence = 0
         session = self._session = self._open_session()
         self._pid = os.getpid()
-        self._lock = FileLock.wait(self._names.lock_path(self._writer_id))  # another writer may be checking it
+        lock = FileLock.wait(self._names.lock_path(self._writer_id))  # another writer may be checking it
         close_at_exit(self)
         self._pool = self._make_pool()
         self._retry_at = _NEVER
@@ -94,8 +89,8 @@ class FrameWriter:
             log.warning("%s", self.problem)
             if not self._has_room():
                 self._retry_at = time.monotonic() + RETRY_S
-        self._publisher = self._declare_publisher(session, _DROP)
-        self._bulk = self._declare_publisher(session, _BLOCK_FIRST) if self._pool_size else self._publisher
+        small = self._declare_publisher(session, _DROP)
+        self._publishers = small, self._declare_publisher(session, _BLOCK_FIRST) if self._pool_size else small
         follow = zenoh.handlers.Callback(self._on_reader, indirect=False)
         liveliness = session.liveliness()
         size, segment = (0, "") if self._pool is None else (self._pool.size, self._pool.segment())
@@ -103,8 +98,8 @@ class FrameWriter:
             liveliness.declare_subscriber(self._names.readers, follow, history=True),
             liveliness.declare_token(self._names.writer(self._writer_id, size, segment)),
         ]
-        needed = [self._names.socket, self._lock.path, *([segments.SHM / segment] if segment else [])]
-        self._files = [file for file in map(OwnFile, needed) if file.in_place]
+        needed = [self._names.socket, lock.path, *([segments.SHM / segment] if segment else [])]
+        self._files = lock, [file for file in map(OwnFile, needed) if file.in_place]
         return self
 
     @property
@@ -114,11 +109,11 @@ class FrameWriter:
         Its files may be removed: by a cleaner of old ones, or with a user's shared memory when the user logs out.
         """
         try:
-            if all(file.in_place for file in self._files):
+            if self._files is None or all(file.in_place for file in self._files[1]):
                 return True
-            prepare_run_dir(self._folder)
+            prepare_run_dir(self._names.folder)
         except (OSError, TransportError) as error:
-            log.debug("the frames of %s: %s", self._stream, error)
+            log.debug("the frames of %s: %s", self._names.stream, error)
             return True
         return False
 
@@ -138,10 +133,10 @@ class FrameWriter:
     def _open_session(self) -> zenoh.Session:
         if self._pool_size and not self.problem:
             try:
-                return open_writing(self._folder, self._names, shared=True)
+                return open_writing(self._names, shared=True)
             except SharingError as error:
                 self.problem = f"{error}; the frames are sent as bytes"
-        return open_writing(self._folder, self._names, shared=False)
+        return open_writing(self._names, shared=False)
 
     def _sweep(self) -> None:
         """Remove the segments and lock files of dead writers."""
@@ -153,7 +148,7 @@ class FrameWriter:
     def _why_not_shared(self) -> str:
         if self._pool_size == 0 or shared_memory.lockable(needed := self._pool_size + 2 * METADATA):
             return ""
-        return shared_memory.memlock_problem(needed, f"the writer of {self._stream}")
+        return shared_memory.memlock_problem(needed, f"the writer of {self._names.stream}")
 
     def _make_pool(self) -> SharedPool | None:
         if self._pool_size == 0 or self.problem:
@@ -162,7 +157,7 @@ class FrameWriter:
             views.why_unavailable()  # the self-test takes milliseconds: better now than at the first frame
             return SharedPool(self._pool_size)
         except zenoh.ZError as error:
-            self.problem = f"the writer of {self._stream} cannot share memory, frames are sent as bytes: {error}"
+            self.problem = f"the writer of {self._names.stream} cannot share memory, frames are sent as bytes: {error}"
             return None
 
     def close(self) -> None:
@@ -171,14 +166,13 @@ class FrameWriter:
             if self._session is None or self._pid != os.getpid():  # a forked session cannot even be closed
                 return
             session, self._session = self._session, None
-            self._publisher = self._bulk = self._pool = None
+            self._publishers = self._pool = None
             close_session(session)
             self._tokens.clear()
-            self._files.clear()
             self._readers.clear()
-            lock, self._lock = self._lock, None
-            if lock is not None:
-                lock.release()
+            files, self._files = self._files, None
+            if files is not None:
+                files[0].release()
 
     def __enter__(self) -> Self:
         return self.open()
@@ -233,7 +227,7 @@ class FrameWriter:
         return None if chunk is None else Slot(self, chunk)
 
     def _is_wanted(self) -> bool:
-        if self._publisher is None:
+        if self._publishers is None:
             return False
         check_process(self._pid)
         if not self._readers:
@@ -245,35 +239,22 @@ class FrameWriter:
         pool = self._pool
         if pool is None or size <= 0:
             return None
+        before = pool.reclaimed
         chunk = pool.allocate(size)
-        if chunk is None and self._starving():
-            pool.reclaim()
+        if pool.reclaimed != before:
             self.counters.add("reclaimed")
-            chunk = pool.allocate(size)
-        if chunk is not None:
-            self._starved_since = None
         return chunk
 
-    def _starving(self) -> bool:
-        """Whether no slot was free for STARVED_S; then the time starts again."""
-        now = time.monotonic()
-        if self._starved_since is None:
-            self._starved_since = now
-        if now - self._starved_since < STARVED_S:
-            return False
-        self._starved_since = now
-        return True
-
     def _put(self, payload: Any, info: FrameInfo, *, shared: bool = False) -> bool:
-        publisher = self._publisher if shared else self._bulk
-        if publisher is None:
+        publishers = self._publishers
+        if publishers is None:
             return False
         sequence = self._sequence + 1
         stamped = msgspec.structs.replace(info, sequence=sequence, writer=self._writer_id)
         try:
-            publisher.put(payload, attachment=encode(stamped))
+            publishers[0 if shared else 1].put(payload, attachment=encode(stamped))
         except zenoh.ZError as error:  # closed meanwhile
-            log.debug("a frame of %s was not sent: %s", self._stream, error)
+            log.debug("a frame of %s was not sent: %s", self._names.stream, error)
             return False
         self._sequence = sequence
         self.counters.add("written")

@@ -169,7 +169,7 @@ class MemoryTransport(Transport):
     def _send_retained(self, subscription: Subscription) -> None:
         for topic, message in list(self._hub.retained.items()):
             copy = replace(message, retain=True, retain_requested=True)
-            if subscription in self._matching(topic):
+            if subscription in self._subscriptions.matching(topic):
                 self.receive(_Delivery(copy, self._hub.publishers[topic], subscription))
 
     # -- the receiving thread
@@ -198,7 +198,7 @@ class MemoryTransport(Transport):
     def _deliver(self, delivery: _Delivery) -> None:
         self.count_received()
         message = delivery.message
-        targets = self._matching(message.topic) if delivery.only is None else [delivery.only]
+        targets = self._subscriptions.matching(message.topic) if delivery.only is None else [delivery.only]
         for subscription in targets:
             if subscription.echo or delivery.publisher is not self:
                 subscription.offer(message)
@@ -219,9 +219,7 @@ class MemoryTransport(Transport):
             self._attached = self._hub.era
             self._hub.attach(self)
             known = set(self._hub.retained)
-            with self._lock:
-                subscriptions = list(self._subscriptions)
-            for subscription in subscriptions:
+            for subscription in self._subscriptions:
                 self._send_retained(subscription)
         self._initial_sync(known)
 

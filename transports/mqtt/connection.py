@@ -319,6 +319,11 @@ class Connection:
         return self.incoming.ending.where
 
     @property
+    def socket(self) -> socket.socket | None:
+        """None once it is lost."""
+        return self._client.socket
+
+    @property
     def _lost(self) -> Lost:
         return self.incoming.ending.lost(accepted=self.incoming.accepted is not None)
 

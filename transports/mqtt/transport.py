@@ -157,16 +157,13 @@ class MqttTransport(Transport):
 
     def _undeclare(self, subscription: Subscription) -> None:  # noqa: ARG002  (the ones that stay decide)
         with self._filters.lock:
-            with self._lock:
-                wanted = [other.filter for other in self._subscriptions]
-            idle = self._filters.prune(wanted)
+            idle = self._filters.prune(other.filter for other in self._subscriptions)
             if self._connection is not None:
                 self._connection.unsubscribe(idle)
 
     def _no_local(self, filter_: str) -> bool:
         """Whether the broker may leave out our own messages for this filter (MQTT 5)."""
-        with self._lock:
-            echo_options = {other.echo for other in self._subscriptions if overlap(other.filter, filter_)}
+        echo_options = {other.echo for other in self._subscriptions if overlap(other.filter, filter_)}
         if len(echo_options) == 2 and self.exact_echo:
             self.exact_echo = False
             log.warning("%s: subscriptions with and without echo overlap in %s: both echo", self.client_id, filter_)
@@ -233,7 +230,7 @@ class MqttTransport(Transport):
                 connection.pump(_IDLE_S, receive)
                 if connection.limits is not self._dialler.reported and time.monotonic() > tried_at:
                     self._report_limits(connection)
-                if self._pending and connection.has_room:
+                if self._own.pending and connection.has_room:
                     self._sync_retained(self._own.keys())
                 if self._refused.withheld:
                     self._try_withheld(connection)
@@ -256,7 +253,7 @@ class MqttTransport(Transport):
         """See whether the broker accepts the message that is tried, and send the next one that is retained."""
         with self._publishing:
             for message in self._refused.to_try(connection, self._own):
-                self._remember(message, sent=self._send(message, False))
+                self._own.remember(message, sent=self._send(message, False))
 
     def _check_retention(self, connection: Connection) -> None:
         """Report which of our retained messages the broker does not have."""
@@ -284,7 +281,7 @@ class MqttTransport(Transport):
             return [
                 topic
                 for topic, message in self._own.items()
-                if message.payload and topic not in self._shared and self._accepts(connection, message)
+                if message.payload and topic not in self._own.shared and self._accepts(connection, message)
                 if connection.limits.retain
                 if topic not in self.not_taken and not any(overlap(topic, filter_) for filter_ in filters)
             ]
@@ -330,8 +327,10 @@ class MqttTransport(Transport):
         """
         self.went_back = False
         with self._publishing:
-            own = {topic: message for topic, message in self._own.items() if topic not in self._pending}
-            unsure = self._shared | {topic for topic, message in own.items() if not self._accepts(connection, message)}
+            own = {topic: message for topic, message in self._own.items() if topic not in self._own.pending}
+            unsure = self._own.shared | {
+                topic for topic, message in own.items() if not self._accepts(connection, message)
+            }
         topics = list(own)
         if not topics:
             return set()
@@ -377,6 +376,7 @@ class MqttTransport(Transport):
     def _deliver_all(self, messages: list[Message]) -> None:
         if self._refused.withheld:
             self._refused.arrived_at = time.monotonic()
+        subscriptions = self._subscriptions
         for message in messages:
             self.count_received()
             repeat = False
@@ -385,7 +385,7 @@ class MqttTransport(Transport):
                     self.counters.add("echoes")
                     continue
                 repeat = self._own_message_filter.is_repeat(message)
-            for subscription in self._matched.get(message.topic) or self._matching(message.topic):
+            for subscription in subscriptions.matched.get(message.topic) or subscriptions.matching(message.topic):
                 subscription.offer(message, repeat=repeat)
 
     def note_answers(self, refused: Mapping[str, bool]) -> None:
@@ -394,11 +394,11 @@ class MqttTransport(Transport):
         if self._retention.current is not None:
             for filter_ in [filter_ for filter_, is_refused in refused.items() if is_refused]:
                 self._retention.current.refused(filter_)
-        with self._lock:
-            for filter_, is_refused in refused.items():
-                for subscription in self._subscriptions:
-                    if overlap(subscription.filter, filter_):  # the filter that covers it: no other one overlaps
-                        subscription.refused = is_refused
+        subscriptions = list(self._subscriptions)
+        for filter_, is_refused in refused.items():
+            for subscription in subscriptions:
+                if overlap(subscription.filter, filter_):  # the filter that covers it: no other one overlaps
+                    subscription.refused = is_refused
 
     def note_refusal(self, topic: str, why: str) -> None:
         self._refused.report(self._dialler.where, topic, why)
@@ -418,8 +418,8 @@ class MqttTransport(Transport):
         self.counters.add("unconfirmed", connection.unacked)
         with self._publishing:
             for message in connection.unconfirmed_retained():
-                if message.topic not in self._pending:
-                    self._remember(message, sent=False)
+                if message.topic not in self._own.pending:
+                    self._own.remember(message, sent=False)
 
     def _log(self, level: int, line: str) -> None:
         now = time.monotonic()

@@ -29,7 +29,7 @@ class MessageAges:
     """Computes the ages of messages, on Zenoh's receiving threads; one older than ``late_s`` is late."""
 
     def __init__(self, boot: int, late_s: float) -> None:
-        self._boot, self._late_s = boot, late_s
+        self._boot, self.late_s = boot, late_s
         self._lock = threading.Lock()
         self._clocks: dict[int, _Clock] = {}
 
@@ -53,7 +53,7 @@ class MessageAges:
 
     def _assess(self, clock: _Clock, difference: float, now: float) -> float:
         """Messages queued while we were stopped come all at once; if messages stay late, the other clock is wrong."""
-        if difference - clock.least_difference <= self._late_s:
+        if difference - clock.least_difference <= self.late_s:
             clock.late_since = None
             return difference - clock.least_difference
         if clock.late_since is None or now - clock.late_at > _LATE_GAP_S:

@@ -6,12 +6,15 @@ import logging
 import threading
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import msgspec
 import zenoh
 
+from pebble.transports.peers import PeerRegistry, PresenceLock
+from pebble.transports.settings import ZenohSettings
 from pebble.transports.zenoh.callbacks import direct
-from pebble.transports.zenoh.wire import SYNC, UP, pack_number, unpack_number
+from pebble.transports.zenoh.wire import LIVE, SYNC, UP, pack_number, unpack_number
 
 log = logging.getLogger(__name__)
 
@@ -98,13 +101,14 @@ class Barrier:
 
     A query is answered only after the declarations sent before it on the same connection have been processed, in both
     directions. So a sibling that has answered ``@sync/<name>`` will send us what we subscribed to, and receive what we
-    publish. The answer carries ``number()``.
+    publish. The answer carries ``number()``. Siblings know this session by its token.
     """
 
     def __init__(self, session: zenoh.Session, name: str, number: Callable[[], int]) -> None:
         self._session, self._name, self._number = session, name, number
         self._silent: set[str] = set()  # hung or stopped: not waited for again until they answer
         session.declare_queryable(SYNC + name, direct(self._answer))
+        self._token = session.liveliness().declare_token(LIVE + name)
 
     def synchronize(self, expected: Callable[[], dict[str, str]], timeout: float) -> dict[str, int]:
         """Wait up to ``timeout`` seconds for all ``expected`` siblings (name to a description for logs).
@@ -152,3 +156,34 @@ class Barrier:
     def _answer(self, query: zenoh.Query) -> None:
         with query:
             query.reply(SYNC + self._name, pack_number(self._number()))
+
+
+class Siblings:
+    """The other processes of a run directory: found by the files that they lock, and waited for."""
+
+    def __init__(self, settings: ZenohSettings) -> None:
+        self._settings = settings
+        self._registry = PeerRegistry(settings.run_dir)
+        self._barrier: Barrier | None = None
+        self._expected: Callable[[], dict[str, str]] = dict
+
+    def register(self, owner: str) -> PresenceLock:
+        """Add this process."""
+        return self._registry.register(owner)
+
+    def sockets(self, *, but: str) -> list[Path]:
+        return self._registry.sockets(but=but)
+
+    def begin(self, session: zenoh.Session, name: str, hub: HubWatch, number: Callable[[], int]) -> None:
+        """There is a new session of this process, called ``name``, and with ``number()`` retained messages."""
+
+        def expected() -> dict[str, str]:
+            remote = self._settings.client and self._settings.connect
+            siblings = {} if remote else self._registry.ready(but=name)
+            return siblings | dict.fromkeys(hub.hubs, "the hub")
+
+        self._expected, self._barrier = expected, Barrier(session, name, number)
+
+    def synchronize(self, timeout: float) -> dict[str, int]:
+        """Wait until all that run surely know our declarations; returns the numbers they answered."""
+        return {} if self._barrier is None else self._barrier.synchronize(self._expected, timeout)

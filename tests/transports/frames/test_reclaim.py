@@ -70,8 +70,8 @@ def test_a_living_writers_pool_is_not_given_back_when_its_link_broke(net: Frames
     with FrameReader(net.folder, "camera") as reader:
         writer = net.writer(size=LARGE)
         _frame(reader)
-        for life, pool in list(reader._writers.items()):
-            del reader._writers[life], pool
+        for life, pool in list(reader.running.items()):
+            del reader.running[life], pool
         time.sleep(reclaim.GRACE_S + 0.1)
         reclaim.reclaim()
         assert _pools() == 1
@@ -84,7 +84,7 @@ def test_a_writer_that_was_taken_for_dead_sends_bytes(net: FramesNet) -> None:
     writer = net.writer(size=LARGE)
     with FrameReader(net.folder, "camera") as reader:
         assert _frame(reader).shared
-        (pool,) = reader._writers.values()
+        (pool,) = reader.running.values()
         reclaim._reclaimed.add(pool.file)
     with FrameReader(net.folder, "camera") as reader:
         assert until(lambda: not _frame(reader).shared)

@@ -26,9 +26,8 @@ from pebble.bench.usage import pss_mb
 from pebble.errors import TransportError
 from pebble.runtime.hub import run_hub
 from pebble.transports import Message, QoS, State, TlsSettings, Transport, ZenohSettings, create
+from pebble.transports.zenoh import publishers, wire
 from pebble.transports.zenoh import session as zenoh_session
-from pebble.transports.zenoh import transport as zenoh_transport
-from pebble.transports.zenoh import wire
 from pebble.transports.zenoh.hub import ZenohHub
 from pebble.transports.zenoh.hub import journal as hub_journal
 from pebble.transports.zenoh.hub import store as hub_store
@@ -408,7 +407,7 @@ def test_a_stopped_sibling_blocks_a_flood_once_and_for_a_bounded_time(robot: Rob
 
 
 def test_more_topics_than_publishers_are_received_in_order(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(zenoh_transport, "_PUBLISHERS", 3)
+    monkeypatch.setattr(publishers, "MOST", 3)
     received: dict[str, list[int]] = {}
     robot.client("receiver").subscribe("many/+", lambda m: received.setdefault(m.topic, []).append(int(m.payload)))
     sender = robot.client("sender")
@@ -429,7 +428,7 @@ def test_topics_that_strangers_invent_take_no_memory(robot: Robot) -> None:
         assert sender.publish(f"invented/{number}", b"%d" % number, qos=DELIVERED)
     assert until(lambda: len(numbers) == 6000)
     assert numbers == list(range(6000))
-    assert [topic for topic, _ in sender._publishers] == ["invented/0"]  # type: ignore[attr-defined]
+    assert [topic for topic, _ in sender.publishers] == ["invented/0"]  # type: ignore[attr-defined]
     assert pss_mb(hub) < before + 8.0
 
 
@@ -476,7 +475,7 @@ def test_retained_state_missed_while_one_connection_was_down_comes_with_it(robot
 
 
 def _links(transport: Any) -> int:
-    return len(transport._session.info.links())
+    return len(transport.session.info.links())
 
 
 # -- one topic, one order
@@ -859,7 +858,7 @@ def test_a_tool_waits_for_a_hub(robot: Robot) -> None:
 
 def test_nonsense_does_not_disturb_the_hub(robot: Robot) -> None:
     client = robot.client("client")
-    session: zenoh.Session = client._session  # type: ignore[attr-defined]
+    session: zenoh.Session = client.session  # type: ignore[attr-defined]
     for stamp in (None, b"", b"\xff" * 9, b"\x05" + bytes(8) + b"name"):
         session.put(wire.RETAINED + "nonsense", b"x", attachment=stamp)
     for what in (wire.HELLO, wire.BYE, wire.RETAINED + "**"):
@@ -882,7 +881,7 @@ def test_a_message_that_waited_in_a_socket_too_long_is_dropped(robot: Robot, mon
         stale, retained = (
             wire.pack_live(DELIVERED, retain_requested=retain_requested) for retain_requested in (False, True)
         )
-    session: zenoh.Session = sender._session  # type: ignore[attr-defined]
+    session: zenoh.Session = sender.session  # type: ignore[attr-defined]
     session.put("drive", b"stale", attachment=stale, **wire.BLOCK)
     session.put("state", b"old", attachment=retained, **wire.BLOCK)
     sender.publish("drive", b"fresh", qos=DELIVERED)

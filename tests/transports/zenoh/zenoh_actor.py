@@ -83,7 +83,7 @@ def listener(client: Transport) -> None:
 def killed(client: Transport) -> None:
     """Waits to be killed, with a will stored under the name of `client`."""
     client.close()
-    with_will = create("zenoh", "killed", client._settings, will=Message("will", b"dead", DELIVERED, True))  # type: ignore[attr-defined]
+    with_will = create("zenoh", "killed", client.settings, will=Message("will", b"dead", DELIVERED, True))  # type: ignore[attr-defined]
     with_will.open(5)
     report("up")
     sys.stdin.readline()
@@ -133,7 +133,7 @@ def _refusals(client: Transport) -> int:
     attempts = (
         lambda: client.publish("from/child", b""),
         lambda: client.subscribe("to/child", print),
-        lambda: create("zenoh", "child", client._settings).open(1),  # type: ignore[attr-defined]
+        lambda: create("zenoh", "child", client.settings).open(1),  # type: ignore[attr-defined]
     )
     return sum(_is_refused(attempt) for attempt in attempts)
 

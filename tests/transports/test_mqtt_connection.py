@@ -1,0 +1,252 @@
+"""A connection against the other end of its socket, which does what no broker does on demand; time is virtual."""
+
+from __future__ import annotations
+
+import select
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import nullcontext
+
+import pytest
+
+from pebble.transports import Message, MqttSettings, QoS, clock
+from pebble.transports.counters import Counters
+from pebble.transports.hosts import addresses_of
+from pebble.transports.mqtt import packets
+from pebble.transports.mqtt.client import Opening
+from pebble.transports.mqtt.connection import Connection
+from pebble.transports.mqtt.ending import Silent
+from pebble.transports.mqtt.transport import MqttTransport
+from tests.support import until
+from tests.transports.test_mqtt_packets import packet
+
+PONG = packet(0xD0, b"")
+
+
+def sent(payload: bytes, *, topic: bytes = b"a", retain: bool = False, mid: int = 0) -> bytes:
+    """A PUBLISH; of QoS 1 with an id."""
+    head = bytes((0, len(topic))) + topic + (bytes((0, mid)) if mid else b"")
+    return packet(0x30 | (2 if mid else 0) | int(retain), head + payload)
+
+
+class Link:
+    """A connection that is accepted, its messages, and the other end."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now = 1000.0
+        monkeypatch.setattr(clock, "since_boot", lambda: self.now)
+        self.messages: list[Message] = []
+        with socket.create_server(("127.0.0.1", 0)) as server:
+            settings = MqttSettings(host="127.0.0.1", port=server.getsockname()[1], silence_s=2.0)
+            self.owner = MqttTransport("client", settings)
+            opening = Opening("client", settings, None, None, addresses_of(settings.host, settings.port)[0])
+            self.counters = Counters()
+            self.connection = Connection(opening, self.counters, self.owner, where="broker", as_published=False)
+            connecting = threading.Thread(target=self.connection.connect, args=(threading.Event(),))
+            connecting.start()
+            self.other, _ = server.accept()
+        self.other.settimeout(5)
+        assert self.other.recv(4096).startswith(b"\x10")
+        self.other.sendall(b"\x20\2\0\0")
+        connecting.join(5)
+
+    def sends(self, *data: bytes) -> None:
+        """The other end does; all of it is in our socket when this returns."""
+        self.other.sendall(b"".join(data))
+        select.select([self.connection.socket], [], [], 5)
+
+    def pump(self, *, until_read: int = 1) -> None:
+        """Go on until so many messages are read."""
+        wanted = len(self.messages) + until_read
+        while len(self.messages) < wanted:
+            self.connection.pump(1.0, self.messages.extend)
+
+    def idle(self, seconds: float) -> None:
+        """Let so much time pass, in which `pump` is called and nothing comes."""
+        for _ in range(round(seconds / 0.05)):
+            self.now += 0.05
+            self.connection.pump(0.0, self.messages.extend)
+
+    def written(self) -> bytes:
+        """What the other end has received."""
+        parts = []
+        while select.select([self.other], [], [], 0.005)[0]:
+            parts.append(self.other.recv(1 << 20))
+        return b"".join(parts)
+
+    def answer_pings(self) -> int:
+        """Returns how many there were."""
+        if asked := self.written().count(packets.PINGREQ):
+            self.sends(PONG * asked)
+            self.connection.pump(0.0, self.messages.extend)
+        return asked
+
+    def close(self) -> None:
+        self.connection.discard()
+        self.other.close()
+
+
+@pytest.fixture
+def link(monkeypatch: pytest.MonkeyPatch) -> Iterator[Link]:
+    link = Link(monkeypatch)
+    yield link
+    link.close()
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_a_message_is_acknowledged_when_it_was_handled_even_if_that_failed(link: Link, fails: bool) -> None:
+    handled: list[bytes] = []
+
+    def handle(messages: list[Message]) -> None:
+        handled.extend(message.payload for message in messages)
+        assert not select.select([link.other], [], [], 0.1)[0], "acknowledged before"
+        if fails:
+            raise RuntimeError("a handler failed")
+
+    link.sends(sent(b"x", mid=1), sent(b"x", mid=2))
+    with pytest.raises(RuntimeError) if fails else nullcontext():
+        while not handled:
+            link.connection.pump(1.0, handle)
+    assert handled == [b"x", b"x"]
+    assert link.written() == b"\x40\2\0\1\x40\2\0\2"
+
+
+def test_a_retained_message_is_not_skipped_while_an_older_one_of_its_batch_may_change_that(link: Link) -> None:
+    link.owner.skips_retained = lambda topic: topic == b"b"  # type: ignore[method-assign]
+    link.sends(sent(b"1", topic=b"b", retain=True), sent(b"2"), sent(b"3", topic=b"b", retain=True))
+    link.pump(until_read=2)
+    assert [message.payload for message in link.messages] == [b"2", b"3"]
+
+
+@pytest.mark.parametrize("retain", [False, True])
+def test_what_waits_for_a_full_socket_is_stale_once_a_delivered_message_of_its_topic_follows(
+    link: Link, retain: bool
+) -> None:
+    for _ in range(200):
+        link.connection.publish(Message("full", bytes(100_000)))
+    dropped = link.counters["dropped"]
+    link.connection.publish(Message("a", b"stale", retain=retain))
+    assert link.connection.publish(Message("a", b"newest", QoS.DELIVERED, retain=retain))
+    assert link.counters["dropped"] == dropped + 1
+    received = bytearray()
+
+    def drained() -> bool:
+        received.extend(link.written())
+        link.connection.pump(0.0, link.messages.extend)
+        return b"newest" in received
+
+    assert until(drained, 20)
+    assert b"stale" not in received
+
+
+@pytest.mark.parametrize(("stopped_s", "waited_s"), [(0.0, 0.0), (0.04, 0.0), (0.7, 0.7), (1.6, 1.6)])
+def test_a_message_is_as_old_as_the_time_in_which_nothing_was_read(
+    link: Link, stopped_s: float, waited_s: float
+) -> None:
+    """It lay in the socket while the process was stopped; the one after it did not."""
+    link.idle(0.2)
+    link.sends(sent(b"old"))
+    link.now += stopped_s
+    link.pump()
+    assert link.answer_pings() <= 2
+    link.idle(0.1)
+    link.sends(sent(b"fresh"))
+    link.pump()
+    old, fresh = (message.waited_s for message in link.messages)
+    assert waited_s <= old < waited_s + 0.15
+    assert fresh < 0.15
+
+
+def test_a_message_is_as_old_as_a_stop_of_the_process_while_it_waits_for_one(link: Link) -> None:
+    link.idle(0.2)
+
+    def stop() -> None:
+        time.sleep(0.05)
+        link.now += 1.5
+        link.other.sendall(sent(b"old"))
+
+    stopping = threading.Thread(target=stop)
+    stopping.start()
+    link.pump()
+    stopping.join()
+    assert 1.4 <= link.messages[0].waited_s <= 1.7
+
+
+def test_a_ping_follows_at_once_when_nothing_was_read_for_a_while(link: Link) -> None:
+    link.idle(0.6)
+    assert link.answer_pings() == 1
+    link.now += 0.2  # the next regular one is not due yet
+    link.sends(sent(b"1"), sent(b"2"))
+    link.pump(until_read=2)
+    assert link.answer_pings() == 1
+
+
+def test_a_ping_without_an_answer_makes_what_comes_before_that_as_old(link: Link) -> None:
+    link.idle(1.0)
+    assert link.written().startswith(packets.PINGREQ)
+    link.sends(sent(b"old"))
+    link.pump()
+    assert 0.3 < link.messages[0].waited_s < 1.2
+
+
+def test_a_broker_that_answers_no_ping_is_silent(link: Link) -> None:
+    for _ in range(80):
+        link.idle(0.05)
+        link.answer_pings()
+    assert link.counters["silences"] == 0
+    link.idle(1.4)
+    with pytest.raises(Silent, match=r"broker has not answered for 2\.0 s"):
+        link.idle(0.7)
+    assert link.counters["silences"] == 1
+
+
+def test_what_came_in_a_silence_is_not_read(link: Link) -> None:
+    """Also if it is in the socket when the process goes on."""
+    link.idle(0.2)
+    link.sends(sent(b"old"))
+    link.now += 3.0
+    with pytest.raises(Silent):
+        link.pump()
+    assert link.messages == []
+
+
+def test_pings_are_sent_while_other_answers_come(link: Link) -> None:
+    for number in range(1, 41):
+        link.idle(0.05)
+        link.connection.publish(Message("a", b"", QoS.DELIVERED))
+        link.sends(packet(0x40, bytes((0, number))))
+    assert 3 <= link.written().count(packets.PINGREQ) <= 6
+
+
+def test_retained_messages_and_pieces_of_long_ones_are_signs_of_life(link: Link) -> None:
+    """The answers to pings are behind them."""
+    long = sent(bytes(100_000))
+    for number in range(20):
+        link.now += 0.5
+        link.sends(sent(b"x", retain=True) if number < 10 else long[(number - 10) * 1000 :][:1000])
+        link.connection.pump(0.0, link.messages.extend)
+    assert len(link.messages) == 10
+    assert link.counters["silences"] == 0
+
+
+def test_the_time_in_which_retained_messages_are_handled_is_no_silence(link: Link) -> None:
+    def handle(messages: list[Message]) -> None:
+        link.messages += messages
+        link.now += 1.5
+
+    for _ in range(5):
+        link.sends(sent(b"x", retain=True))
+        link.connection.pump(1.0, handle)
+    assert link.messages
+    assert link.counters["silences"] == 0
+
+
+def test_an_acknowledgement_is_complete_after_what_came_before_it_was_delivered(link: Link) -> None:
+    ack, seen = link.connection.subscribe([("a", False)]), list[bool]()
+    link.sends(packet(0x90, b"\0\1\1"), sent(b"x", retain=True))
+    while not seen:
+        link.connection.pump(1.0, lambda messages: seen.extend(ack.done for _ in messages))
+    assert seen == [False]
+    assert ack.done

@@ -1,0 +1,50 @@
+"""The retained messages that one transport has published, to be sent again to a broker or hub that lacks them."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import TYPE_CHECKING
+
+from pebble.transports.bounds import BoundedTable
+from pebble.transports.counters import Counters
+
+if TYPE_CHECKING:
+    from pebble.transports.base import Message
+
+LIMIT = 10_000  # retained topics a transport can send again; the names of topics may come from other programs
+BYTES = 16 << 20  # the same, with their payloads
+
+
+class OwnRetained(BoundedTable["Message"]):
+    """The newest one by topic; empty payloads included. The transport's lock of publishing guards the rest."""
+
+    def __init__(self, counters: Counters) -> None:
+        super().__init__(LIMIT, BYTES, lambda message: len(message.payload))
+        self.pending: dict[str, None] = {}  # topics whose message is not sent yet, oldest first
+        self.shared: set[str] = set()  # topics that others publish on, too
+        self._counters = counters
+
+    def remember(self, message: Message, *, sent: bool, shared: bool | None = None) -> bool:
+        """Store a message, to send it again; False, and no older one is sent again, if there is no room.
+
+        ``shared`` None: as the older one.
+        """
+        shared = message.topic in self.shared if shared is None else shared
+        self.pending.pop(message.topic, None)
+        self.shared.discard(message.topic)
+        if sent and not message.payload:
+            self.pop(message.topic, None)
+            return True
+        if not self.put_if_room(message.topic, message):
+            self._counters.add("forgotten")
+            return False
+        if shared:
+            self.shared.add(message.topic)
+        if not sent:
+            self.pending[message.topic] = None
+        return True
+
+    def to_send(self, known: Collection[str]) -> list[Message]:
+        """The pending ones, then the others that are not in ``known``."""
+        changed = [self[topic] for topic in self.pending]
+        return changed + [m for topic, m in self.items() if topic not in self.pending and topic not in known]

@@ -1,0 +1,138 @@
+"""What one client tells the hub and asks it: its will, its retained messages, and those of all."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterable
+
+import zenoh
+
+from pebble.transports.base import Message, QoS, Subscription
+from pebble.transports.own_retained import OwnRetained
+from pebble.transports.zenoh import wire
+from pebble.transports.zenoh.callbacks import direct
+from pebble.transports.zenoh.keymap import filter_to_key, key_to_topic, topic_to_key
+from pebble.transports.zenoh.presence import HubWatch
+from pebble.transports.zenoh.publishers import remember_first
+
+HUB_ANSWER_S = 1.0
+RETAINED_ANSWER_S = 3.0
+FETCH_S = 0.7  # the longest wait for the hub's retained messages, which it may delay for half a second
+GOODBYE_S = 0.3  # the longest wait for an answer when closing
+
+
+class HubConnection:
+    """A new connection begins every time a hub appears: `watch` says when. ``name`` is this client's in a session."""
+
+    def __init__(self, client_id: str, will: Message | None, own: OwnRetained, count: Callable[[], object]) -> None:
+        self._will = None if will is None else wire.Will.of(will, client_id)
+        self._own, self._count_received = own, count
+        # Retained topics we have removed, in case a hub that was ending did not receive the removal.
+        self._removed: dict[str, None] = {}
+        self.retained_count = 0  # of retained messages published so far
+        self.name = ""
+        self.watch = HubWatch()
+        self.lock = threading.Lock()  # no answer of a connection is offered after the next one began
+        self._number = 0
+
+    def open(self) -> None:
+        """The client opens, once more perhaps."""
+        self.name, self.watch = "", HubWatch()
+
+    def renew(self) -> None:
+        """A new connection begins: no answer to an older query is offered any more. The lock is held."""
+        self._number += 1
+
+    # -- sending
+
+    def put(self, session: zenoh.Session, message: Message, *, again: bool) -> None:
+        """Send a retained message to the hub, before the live one: a subscription made in between gets one of the two.
+
+        ``again``: it was published before, and siblings that run have it.
+        """
+        if not again:
+            self.retained_count += 1
+        if message.payload:
+            self._removed.pop(message.topic, None)
+        else:
+            remember_first(self._removed, message.topic, None)
+        self._put(session, message, 0 if again else self.retained_count)
+
+    def _put(self, session: zenoh.Session, message: Message, number: int) -> None:
+        stamp = wire.Stamp(message.qos, number, self.name)
+        session.put(wire.RETAINED + topic_to_key(message.topic), message.payload, attachment=stamp.pack(), **wire.BLOCK)
+
+    def put_removals(self, session: zenoh.Session, topics: Iterable[str]) -> None:
+        """Send once more which of ``topics`` we have removed."""
+        for topic in [topic for topic in topics if topic in self._removed]:
+            self._put(session, Message(topic, b"", QoS.DELIVERED, retain=True), self.retained_count)
+
+    # -- queries
+
+    def hello(self) -> bytes:
+        """Our will, and what we have published."""
+        gone: dict[str, int | None] = {topic_to_key(topic): None for topic in self._removed}
+        kept: dict[str, int | None] = {
+            topic_to_key(topic): wire.digest(own.payload) for topic, own in self._own.items() if own.payload
+        }
+        return wire.encode(wire.Hello(self.name, self.retained_count, self._will, gone | kept))
+
+    def greet(self, session: zenoh.Session, hello: bytes, timeout: float) -> set[str] | None:
+        """The topics that the hub lacks; None: no hub answers in time."""
+        answers = self._ask(session, wire.HELLO, hello, timeout)
+        return {key_to_topic(key) for answer in answers for key in wire.decode_keys(answer)} if answers else None
+
+    def leave(self, session: zenoh.Session) -> None:
+        """Have our will forgotten."""
+        self._ask(session, wire.BYE, wire.encode(self.name), GOODBYE_S)
+
+    def _ask(self, session: zenoh.Session, what: str, payload: bytes, timeout: float) -> list[bytes]:
+        replies = session.get(
+            what,
+            zenoh.handlers.FifoChannel(16),
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            timeout=timeout,
+            payload=payload,
+            **wire.BLOCK,
+        )
+        return [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]
+
+    def fetch(self, session: zenoh.Session, subscriptions: Iterable[Subscription], numbers: dict[str, int]) -> None:
+        """Query retained messages and wait for them, so that none comes among messages published after we returned.
+
+        ``numbers``: how many retained messages each sibling has sent; the hub answers once it has received those.
+        """
+        end = time.monotonic() + FETCH_S
+        for answered in [self._query(session, subscription, numbers) for subscription in subscriptions]:
+            answered.wait(max(0.0, end - time.monotonic()))
+
+    def _query(self, session: zenoh.Session, subscription: Subscription, numbers: dict[str, int]) -> threading.Event:
+        connection, answered = self._number, threading.Event()
+
+        def take(reply: zenoh.Reply) -> None:
+            sample = reply.ok
+            if sample is None or sample.attachment is None:
+                return
+            stamp = wire.Stamp.unpack(sample.attachment.to_bytes())
+            if stamp.origin == self.name and not subscription.echo:
+                return
+            self._count_received()
+            topic = key_to_topic(str(sample.key_expr).removeprefix(wire.RETAINED))
+            qos = min(stamp.qos, subscription.qos)
+            message = Message(topic, sample.payload.to_bytes(), qos, retain=True, retain_requested=True)
+            with self.lock:
+                if connection == self._number:
+                    subscription.offer(message)
+
+        session.get(
+            wire.RETAINED + filter_to_key(subscription.filter),
+            direct(take, answered.set),
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            timeout=RETAINED_ANSWER_S,
+            payload=wire.encode({name: number for name, number in numbers.items() if number}),
+            **wire.BLOCK,
+        )
+        return answered
