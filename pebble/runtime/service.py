@@ -12,10 +12,10 @@ from typing import Any, ClassVar, TypeVar
 
 from pebble.config import Config
 from pebble.contract import Channel, Kind, codec
-from pebble.errors import PayloadError
 from pebble.runtime.addresses import Addresses
 from pebble.runtime.inbox import Inbox
 from pebble.runtime.rate_limit import RateLimitedLog
+from pebble.runtime.receive import Refusals
 from pebble.runtime.timers import Timer, Timers
 from pebble.runtime.work_lock import WorkLock
 from pebble.transports import Message, QoS, State, Subscription, Transport
@@ -105,6 +105,7 @@ class Service:
         self.counters = Counters()
         self.timers = Timers()
         self._quiet_log = RateLimitedLog(self.log)
+        self.refusals = Refusals(self._quiet_log, self.counters)
         self._remarks = RateLimitedLog(self.log, period_s=60.0, most=_SENDERS)
         self._inbox = Inbox()
         self._work = WorkLock()
@@ -155,7 +156,11 @@ class Service:
     def listen(self, channel: Channel, method: Callable[..., None], *, direct: bool = False) -> Subscription:
         """Handle ``channel`` from now on, as ``@on`` does from the start; until the subscription is closed."""
 
-        receive = partial(self._receive, channel, method, direct=direct)
+        def deliver_direct(message: Message, value: Any, names: dict[str, str]) -> None:
+            method(value, self.clock() - message.waited_s, **names)
+
+        deliver = deliver_direct if direct else partial(self._deliver, channel, method)
+        receive = self.refusals.reader(channel, deliver, self._remark)
         topic = self.addresses[channel].topic
         return self.transport.subscribe(topic, receive, qos=QoS(channel.default_qos), direct=True)
 
@@ -314,32 +319,9 @@ class Service:
 
     # -- the transport's threads: decode and post, nothing else
 
-    def _receive(self, channel: Channel, method: Callable[..., None], message: Message, *, direct: bool) -> None:
-        """Refuse what is stale or malformed *before* it can replace a valid message in the inbox."""
-        if message.retain and channel.one_shot:
-            self.counters.add("stale")
-            self._quiet_log.warning(f"{channel.metric} retained", "refused a retained message on %s", channel.metric)
-            return
-        names = channel.names(message.topic) if channel.is_pattern else {}
-        if channel.is_pattern and not names:  # the filter's + also matches an empty level
-            self.counters.add("refused")
-            self._quiet_log.warning(
-                f"{channel.metric} unnamed", "refused a message with an empty level in its topic: %r", message.topic
-            )
-            return
-        try:
-            value = codec.decode(channel, message.payload, self._remark)
-        except PayloadError as error:
-            if codec.is_blank(message.payload):
-                self.counters.add("blank")
-                return
-            self.counters.add("refused")
-            self._quiet_log.warning(channel.metric, "refused a message: %s", error)
-            return
+    def _deliver(self, channel: Channel, method: Callable[..., None], message: Message, value: Any, names: Any) -> None:
+        """Post a message that is neither stale nor malformed: it may replace another in the inbox."""
         arrived = self.clock() - message.waited_s
-        if direct:
-            method(value, arrived, **names)
-            return
 
         def handle() -> None:
             # The service's clock may stand still while the machine is suspended; the message's does not.
