@@ -109,10 +109,6 @@ class MqttMirror(ForwardingService):
     def await_retained(self) -> None:
         barrier(self.remote, self._probe_topic)
 
-    def synchronized(self, side: Side) -> None:
-        if side is Side.REMOTE:
-            self.forwarder.probe_commands(*Side)
-
     def _request_probe(self) -> None:
         """Request a probe from the bridge, if the robot has one."""
         if self._watched:

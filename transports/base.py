@@ -250,8 +250,7 @@ class Transport(ABC):
         delivers_late: bool | None = None,
     ) -> None:
         """Set what the owner knows of topics and wants of retained messages, before :meth:`open`; None: as it was."""
-        self.is_stop = is_stop or self.is_stop
-        self.is_invented = is_invented or self.is_invented
+        self.is_stop, self.is_invented = is_stop or self.is_stop, is_invented or self.is_invented
         self.skips_retained = skips_retained or self.skips_retained
         self.delivers_late = self.delivers_late if delivers_late is None else delivers_late
 

@@ -115,35 +115,30 @@ class LightsFlash(LightsSolid, frozen=True, kw_only=True):
 STOP_WORDS = frozenset(("stop", "disable", "disabled", "off"))  # as the ``action`` of a command
 
 
-class SoundboardCommand(Payload, frozen=True, kw_only=True):
-    """Play or stop a clip (paper A.8.10); ``action`` wins over ``enabled``.
+class Switch(Payload, frozen=True, kw_only=True):
+    """A command that starts or stops one thing; ``action`` wins over ``enabled``."""
+
+    action: str | None = None
+    enabled: bool | None = None
+    file: str | None = None
+
+    def ends(self) -> bool:
+        return self.action.strip().lower() in STOP_WORDS if self.action else self.enabled is False
+
+
+class SoundboardCommand(Switch, frozen=True, kw_only=True):
+    """Play or stop a clip (paper A.8.10).
 
     ``repeat`` is how often to play it, or true: until it is stopped. It is not written where it says nothing.
     """
 
-    action: str | None = None
-    enabled: bool | None = None
-    file: str | None = None
     repeat: Annotated[int, Meta(ge=0)] | bool | UnsetType | None = UNSET  # 0, false and null: once
 
-    def ends(self) -> bool:
-        return _switches_off(self.action, self.enabled)
 
-
-class AutonomyCommand(Payload, frozen=True, kw_only=True, omit_defaults=True):
+class AutonomyCommand(Switch, frozen=True, kw_only=True, omit_defaults=True):
     """Start or stop one script (paper A.8.11)."""
 
-    action: str | None = None
-    enabled: bool | None = None
-    file: str | None = None
     config: dict[str, Any] | None = None
-
-    def ends(self) -> bool:
-        return _switches_off(self.action, self.enabled)
-
-
-def _switches_off(action: str | None, enabled: bool | None) -> bool:
-    return action.strip().lower() in STOP_WORDS if action else enabled is False
 
 
 class MediaRequest(Payload, frozen=True, kw_only=True, omit_defaults=True):

@@ -39,7 +39,7 @@ class Admission:
             return Drop.TOO_LARGE
         if subject.counted and (drop := self._count(side, subject, message)):
             return drop
-        if subject.one_shot and message.waited_s > subject.waits_s and not _ends_something(subject, message):
+        if subject.kind.one_shot and message.waited_s > subject.waits_s and not _ends_something(subject, message):
             return Drop.LATE
         return None
 

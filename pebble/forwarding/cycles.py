@@ -100,7 +100,7 @@ class Cycles:
         topic, payload = message.topic, message.payload
         if subject.is_stop:
             return Finding.CIRCULATES if self._repeats_stop(side, topic, payload) else Finding.PASS
-        once, after = subject.one_shot, _after(subject)
+        once, after = subject.kind.one_shot, _after(subject)
         number = _number_of(payload) if payload[-1:] in _DIGITS else None
         with self._lock:
             if number is not None:

@@ -29,7 +29,7 @@ from pebble.forwarding.side import Gate, Sides, SideState
 from pebble.forwarding.signatures import unsigned
 from pebble.forwarding.subjects import Subject, Subjects
 from pebble.runtime.rate_limit import RateLimitedLog
-from pebble.transports import Message, QoS, State, Transport
+from pebble.transports import Message, QoS, Transport
 from pebble.transports.counters import Counters, bounds_reached
 
 log = logging.getLogger(__name__)
@@ -46,18 +46,11 @@ class Routed(msgspec.Struct, frozen=True):
     outcome: Forward | Drop
 
 
-class Status(msgspec.Struct, frozen=True):
-    """What a forwarder does now, for tools and tests."""
-
-    gate: Gate
-    mirroring: bool
-    synchronized: frozenset[Side]  # whose retained messages have arrived
-    circulating: frozenset[tuple[Side, str]]  # topics that something else brings back to the side they came from
-
-
 class Forwarder:
-    """Forwards between two transports. Its owner subscribes, and calls :meth:`synchronize` after each subscription.
+    """Forwards between two transports.
 
+    Its owner passes on the state of each in :attr:`sides`, subscribes, and has :attr:`retained` synchronized
+    INITIAL_SYNC_S after each subscription.
     ``winner`` is the side whose retained messages count where they differ (see .reconciliation).
     ``on_value(subject, payload)`` is called, on any thread and with a lock held, with each new value of a two-way
     retained topic.
@@ -75,17 +68,17 @@ class Forwarder:
     ) -> None:
         self.counters = Counters()
         self._subjects, self._rules = subjects, rules
-        self._sides = Sides(
+        self.sides = Sides(
             (side, SideState(side, transport, self.counters, clock, wins=side is winner))
             for side, transport in transports.items()
         )
         #: What :func:`route` has returned. There are not many subjects, so it needs no bound.
         self._routes: dict[tuple[Side, Subject, QoS, bool, bool | None, bool], Forward | Drop] = {}
         self._admission = Admission(clock)
-        self._cycles = Cycles(clock, yields=not rules.leaves_robot)  # a mirror, to the bridge
+        self.cycles = Cycles(clock, yields=not rules.leaves_robot)  # a mirror, to the bridge
         both_ways = frozenset(kind for kind in Kind if rules.both_ways(kind))
-        self._publisher = Publisher(self._sides, self._cycles, subjects, self.counters, both_ways)
-        self._retained = RetainedTopics(self._sides, subjects, self._publisher, winner, both_ways, on_value)
+        self.publisher = Publisher(self.sides, self.cycles, subjects, self.counters, both_ways)
+        self.retained = RetainedTopics(self.sides, subjects, self.publisher, winner, both_ways, on_value)
         self._quiet_log = RateLimitedLog(log, period_s=60.0)
         self._mirroring = self._mirror_refused = False
         for transport in transports.values():
@@ -93,16 +86,7 @@ class Forwarder:
 
     @property
     def gate(self) -> Gate:
-        return self._sides.gate
-
-    @property
-    def status(self) -> Status:
-        synchronized = frozenset(side for side in Side if self._retained.synchronized(side))
-        return Status(self.gate, self._mirroring, synchronized, frozenset(self._cycles.closed_ways))
-
-    def value(self, topic: str) -> bytes | None:
-        """The newest value of a two-way retained topic."""
-        return self._retained.value(topic)
+        return self.sides.gate
 
     @property
     def mirroring(self) -> bool:
@@ -115,73 +99,37 @@ class Forwarder:
 
     def dropped(self) -> dict[str, int]:
         """How many messages did not pass, here or in a transport, because of a bound; by reason, like ``too_many``."""
-        found = Counter(bounds_reached(*(one.transport.counters for one in self._sides.values())))
+        found = Counter(bounds_reached(*(one.transport.counters for one in self.sides.values())))
         for one, side in itertools.product(_BOUNDS, Side):
             found[one.name.lower()] += self.counters[f"{side.value}: {one.value}"]
         return {**found, "events": self.counters["events_dropped"]}
 
     # -- connections
 
-    def subscribing(self, side: Side) -> None:
-        """The owner is about to subscribe to ``side``: its retained messages arrive from now on."""
-        self._sides[side].subscribing()
-
-    def watch(self, side: Side, state: State) -> None:
-        """Follow the state of ``side``; the owner calls this first in its own callback."""
-        self._sides[side].watch(state)
-
     def subscribed(self, side: Side) -> None:
         """``side`` is connected and subscribed to, and its retained messages have arrived."""
-        self._sides[side].window.subscribed()
+        self.sides[side].window.subscribed()
         if self.gate is Gate.OPEN:
-            self._sides[side].events.flush()
-
-    def is_arriving(self, side: Side) -> bool:
-        """Whether retained messages of ``side`` have come until just now."""
-        return self._sides[side].window.is_arriving
-
-    def synchronize(self, side: Side) -> None:
-        """Publish what retained messages have left open; to be called INITIAL_SYNC_S after :meth:`subscribed`."""
-        self._retained.synchronize(side)
-
-    @property
-    def synchronized(self) -> bool:
-        """Whether both sides are synchronized."""
-        return self._retained.synchronized(*Side)
+            self.sides[side].events.flush()
 
     def open(self) -> None:
         """Forward from now on; first what has waited."""
-        self._retained.open()
-        for one in self._sides.values():
+        self.retained.open()
+        for one in self.sides.values():
             one.events.flush()
 
     def shut(self) -> None:
         """Forward nothing from now on. Takes no lock: a loop of messages must end at once."""
-        self._retained.shut()
-        for one in self._sides.values():
+        self.retained.shut()
+        for one in self.sides.values():
             one.events.clear()
 
     def rearm(self) -> None:
         """After :meth:`shut`: messages wait for :meth:`open` again, and the remote side is synchronized anew."""
         if self.gate is Gate.SHUT:
-            self.subscribing(Side.REMOTE)
-            self._sides[Side.REMOTE].restarted = True
-            self._sides.gate = Gate.WAITING
-
-    def remove_retained(self, side: Side, topic: str, *, unless: Callable[[str], bool]) -> bool:
-        """Remove what ``side`` retains on ``topic``, unless there is a reason not to; return whether it was removed.
-
-        Until it is removed no retained message passes, so what is published meanwhile comes after it.
-        """
-        return self._retained.remove(side, topic, unless)
-
-    def probe_commands(self, *sides: Side) -> None:
-        """Find out whether commands and actions from ``sides`` would circulate; after each connection."""
-        self._publisher.probe_commands(*sides)
-
-    def probe_again(self, *sides: Side) -> None:
-        """Find out whether what circulated does so still, and commands from ``sides`` as well; once a second."""
-        self._publisher.probe_again(sides, self._retained.value)
+            self.sides[Side.REMOTE].subscribing()
+            self.sides[Side.REMOTE].restarted = True
+            self.sides.gate = Gate.WAITING
 
     # -- the receiving threads
 
@@ -191,14 +139,14 @@ class Forwarder:
         if kind is None or (kind is Kind.FLAG and not self._admission.refuses_flag(topic)):
             return False
         drop = Drop.TOO_MANY if kind is Kind.FLAG else Drop.STALE
-        self._sides[side].window.note()
+        self.sides[side].window.note()
         self.counters.add(f"{side.value}: {drop.value}")
         self._warn(drop, topic[:_LOGGED].decode(errors="replace"))
         return True
 
     def receive(self, side: Side, message: Message) -> Routed:
         """Forward ``message`` by the table."""
-        subject, here = self._subjects[message.topic], self._sides[side]
+        subject, here = self._subjects[message.topic], self.sides[side]
         outcome = self._receive(here, subject, message)
         if isinstance(outcome, Drop):
             self.counters.add(f"{side.value}: {outcome.value}")
@@ -227,12 +175,12 @@ class Forwarder:
             if refused in _WARNED:
                 self._warn(refused, message.topic[:_LOGGED])
             return refused
-        if (self._cycles.closed_ways or not here.transport.exact_echo) and self._publisher.is_echo(
+        if (self.cycles.closed_ways or not here.transport.exact_echo) and self.publisher.is_echo(
             here, subject, message
         ):
             return Drop.ECHO
-        if self._sides.gate is Gate.OPEN:
-            finding = self._cycles.examine(side, subject, message)
+        if self.sides.gate is Gate.OPEN:
+            finding = self.cycles.examine(side, subject, message)
             if finding is not Finding.PASS and (drop := self._act_on(finding, side, subject, message, forward)):
                 return drop
         if forward.unsigned:
@@ -244,16 +192,16 @@ class Forwarder:
                 message = Message(message.topic, passing, message.qos)
                 self.counters.add(f"{side.value}: zeros of a script, passed as a person's")
         if forward.retain:
-            return self._retained.receive(here, subject, message, forward)
-        there = self._sides[side.other]
+            return self.retained.receive(here, subject, message, forward)
+        there = self.sides[side.other]
         is_event = subject.kind is Kind.EVENT and message.qos is QoS.DELIVERED
-        if self._sides.gate is not Gate.OPEN:
+        if self.sides.gate is not Gate.OPEN:
             return self._hold_event(there, message) if is_event else Drop.CLOSED
         if is_event:
-            self._publisher.note_return(there, subject, message)
+            self.publisher.note_return(there, subject, message)
             there.events.send(message)
         else:
-            self._publisher.publish(there, subject, message, forward)
+            self.publisher.publish(there, subject, message, forward)
         return forward
 
     def _act_on(
@@ -264,11 +212,11 @@ class Forwarder:
             case Finding.CIRCULATES:
                 return Drop.CIRCULATES
             case Finding.SUSPECT:  # the probe goes first: it comes back before the message does
-                self._publisher.probe(side, message.topic, message.payload)
+                self.publisher.probe(side, message.topic, message.payload)
                 return None
             case Finding.RELAY:
                 relayed = Forward(forward.qos, False, forward.urgent)
-                self._publisher.publish(self._sides[side.other], subject, message, relayed)
+                self.publisher.publish(self.sides[side.other], subject, message, relayed)
         return Drop.PROBE
 
     def _hold_event(self, there: SideState, message: Message) -> Drop:
@@ -285,7 +233,7 @@ class Forwarder:
 
     def _may_mirror(self) -> bool:
         """A broker that sends our own commands back would repeat each one later: also after the stop."""
-        if all(one.transport.exact_echo for one in self._sides.values()):
+        if all(one.transport.exact_echo for one in self.sides.values()):
             return True
         if not self._mirror_refused:
             self._mirror_refused = True

@@ -51,7 +51,7 @@ class Publisher:
         What runs something is noted before it is known whether its topic circulates: its probe is still under way.
         """
         origin = to.side.other
-        if subject.runs or (not subject.one_shot and (origin, message.topic) in self._cycles.closed_ways):
+        if subject.runs or (not subject.kind.one_shot and (origin, message.topic) in self._cycles.closed_ways):
             self._sides[origin].returns.expect(message.topic, message.payload)
 
     def is_echo(self, here: SideState, subject: Subject, message: Message) -> bool:
@@ -88,8 +88,8 @@ class Publisher:
         subject, there = self._subjects[topic], self._sides[side.other]
         if subject is None or not there.connected:
             return
-        if subject.one_shot or _is_json(value):
-            probe = (b"" if subject.one_shot else value) + self._cycles.probe(side, topic)
+        if subject.kind.one_shot or _is_json(value):
+            probe = (b"" if subject.kind.one_shot else value) + self._cycles.probe(side, topic)
             there.transport.publish(topic, probe, qos=QoS.DELIVERED, urgent=subject.kind in URGENT)
 
 

@@ -90,7 +90,7 @@ class RetainedTopics:
         """The newest value of a two-way topic."""
         return self._reconciliation.value(topic)
 
-    def remove(self, side: Side, topic: str, unless: Callable[[str], bool]) -> bool:
+    def remove(self, side: Side, topic: str, *, unless: Callable[[str], bool]) -> bool:
         """Remove what ``side`` retains on ``topic``, unless there is a reason not to; return whether it was removed.
 
         Until it is removed no retained message passes, so what is published meanwhile comes after it.

@@ -94,7 +94,7 @@ def route(rules: Rules, side: Side, subject: Subject | None, message: Message, *
         return Drop.MEDIA
     if subject.stays and rules.leaves_robot:
         return Drop.STAYS
-    if subject.one_shot and (message.retain or message.retain_requested):
+    if subject.kind.one_shot and (message.retain or message.retain_requested):
         return Drop.STALE  # or was published to be retained: some brokers hide which
     if subject.kind not in rules.passes[side]:
         if subject.kind not in rules.mirrored.get(side, ()):
@@ -114,7 +114,7 @@ def _qos(subject: Subject, message: Message) -> QoS:
 
 def _retain(subject: Subject, message: Message) -> bool:
     """Retained as published, if that is known; a flag is always retained on both sides."""
-    if subject.one_shot:
+    if subject.kind.one_shot:
         return False
     if subject.kind is Kind.FLAG and subject.retain:
         return True

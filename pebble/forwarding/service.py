@@ -6,9 +6,11 @@ from abc import ABC, abstractmethod
 from functools import partial
 from typing import Any, ClassVar
 
+from msgspec import Struct
+
 from pebble.contract import BRIDGE_PROBE, INCOMING, OUTGOING
 from pebble.forwarding.cycles import PROBE_PERIOD_S
-from pebble.forwarding.forwarder import Forwarder, Status
+from pebble.forwarding.forwarder import Forwarder
 from pebble.forwarding.retained_window import INITIAL_SYNC_S, QUIET_S
 from pebble.forwarding.routing import Rules, Side
 from pebble.forwarding.side import Gate
@@ -19,9 +21,13 @@ from pebble.transports import Message, State, Subscription, Transport
 CHECK_AGAIN_S = 30.0  # while nothing is forwarded
 
 
-class ServiceStatus(Status, frozen=True):
+class Status(Struct, frozen=True):
     """What a forwarding service does now, for tools and tests."""
 
+    gate: Gate
+    mirroring: bool
+    synchronized: frozenset[Side]  # whose retained messages have arrived
+    circulating: frozenset[tuple[Side, str]]  # topics that something else brings back to the side they came from
     epoch: int  # lost connections of the remote side
     subscribed: frozenset[Side]
     counts: dict[str, int]  # messages, by side and what became of them
@@ -56,11 +62,17 @@ class ForwardingService(Service, ABC):
         self.subscriptions: dict[Side, list[Subscription]] = {side: [] for side in Side}
 
     @property
-    def status(self) -> ServiceStatus:
-        now = self.forwarder.status
-        subscribed = frozenset(side for side, subscriptions in self.subscriptions.items() if subscriptions)
-        counts = self.forwarder.counters.snapshot()
-        return ServiceStatus(now.gate, now.mirroring, now.synchronized, now.circulating, self.epoch, subscribed, counts)
+    def status(self) -> Status:
+        forwarder = self.forwarder
+        return Status(
+            gate=forwarder.gate,
+            mirroring=forwarder.mirroring,
+            synchronized=frozenset(filter(forwarder.retained.synchronized, Side)),
+            circulating=frozenset(forwarder.cycles.closed_ways),
+            epoch=self.epoch,
+            subscribed=frozenset(filter(self.subscriptions.get, Side)),
+            counts=forwarder.counters.snapshot(),
+        )
 
     # -- to implement
 
@@ -83,10 +95,6 @@ class ForwardingService(Service, ABC):
     @abstractmethod
     def await_retained(self) -> None:
         """Wait, bounded, until the retained messages of the remote side have arrived."""
-
-    @abstractmethod
-    def synchronized(self, side: Side) -> None:
-        """React to the values of ``side`` being known."""
 
     @abstractmethod
     def check_again(self, epoch: int) -> None:
@@ -129,7 +137,7 @@ class ForwardingService(Service, ABC):
         So a retained message of the remote side is never older than what the robot has changed.
         """
         self.unsubscribe(Side.REMOTE)
-        self.forwarder.subscribing(Side.REMOTE)
+        self.forwarder.sides[Side.REMOTE].subscribing()
         receive = partial(self.receive_remote, self.epoch)
         directions = (INCOMING,) if self.rules.leaves_robot else (INCOMING, OUTGOING)
         self.subscriptions[Side.REMOTE] = [
@@ -149,17 +157,18 @@ class ForwardingService(Service, ABC):
         epoch, end = self.epoch, self.clock() + self.arriving_s
 
         def synchronize() -> None:
-            if side is Side.REMOTE and self.forwarder.is_arriving(side) and self.clock() < end:
+            if side is Side.REMOTE and self.forwarder.sides[side].window.is_arriving and self.clock() < end:
                 self.call_at(self.clock() + QUIET_S, synchronize)
             elif side is Side.LOCAL or epoch == self.epoch:
-                self.forwarder.synchronize(side)
-                self.synchronized(side)
+                self.forwarder.retained.synchronize(side)
+                if side is Side.REMOTE or self.rules.leaves_robot:
+                    self.forwarder.publisher.probe_commands(*self.probed_sides)
 
         self.call_at(self.clock() + INITIAL_SYNC_S, synchronize)
 
     @every(PROBE_PERIOD_S)
     def _probe_again(self) -> None:
-        self.forwarder.probe_again(*self.probed_sides)
+        self.forwarder.publisher.probe_again(self.probed_sides, self.forwarder.retained.value)
 
     def disable(self) -> None:
         """Forward nothing until a check finds that the two sides are two brokers."""
@@ -177,7 +186,7 @@ class ForwardingService(Service, ABC):
     # -- the transports' threads
 
     def on_side_state(self, side: Side, state: State) -> None:
-        self.forwarder.watch(side, state)
+        self.forwarder.sides[side].watch(state)
         if state is State.CONNECTED:
             self.post(partial(self.connected, side, self.epoch))
             return

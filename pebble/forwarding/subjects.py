@@ -47,15 +47,10 @@ class Subject:
         return self.channel is None or self.channel.bridged
 
     @cached_property
-    def one_shot(self) -> bool:
-        return self.kind.one_shot
-
-    @cached_property
     def waits_s(self) -> float:
         """Seconds for which a message may wait before it is stale."""
-        if not self.one_shot:
-            return inf
-        return WAITS_S if self.channel is None else self.channel.waits_s
+        once = WAITS_S if self.channel is None else self.channel.waits_s
+        return once if self.kind.one_shot else inf
 
     @cached_property
     def is_stop(self) -> bool:

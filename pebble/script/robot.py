@@ -12,11 +12,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from pebble.config import Config
 from pebble.contract import AUTONOMY_COMMAND, DRIVE, ESTOP_RESET, ESTOP_STATE, Channel, Kind, codec
 from pebble.contract.payloads import Drive
-from pebble.errors import PayloadError, PebbleError
+from pebble.errors import PebbleError
 from pebble.runtime.addresses import Addresses
 from pebble.runtime.rate_limit import RateLimitedLog
+from pebble.runtime.receive import Refusals
 from pebble.script.wheels import Wheels
-from pebble.transports import Message, QoS, Transport
+from pebble.transports import QoS, Transport
+from pebble.transports.counters import Counters
 from pebble.transports.topics import matches
 
 if TYPE_CHECKING:
@@ -64,7 +66,7 @@ class Robot:
         """``transport`` is open. ``number`` gives the run's number, above the given one."""
         self.config = config
         self.log = logging.getLogger(f"pebble.script.{name}")
-        self._quiet_log = RateLimitedLog(self.log)
+        self._refusals = Refusals(RateLimitedLog(self.log), Counters())
         self._transport, self._addresses, self._clock = transport, Addresses(config), clock
         self._latest: dict[str, _Arrived] = {}
         self._subscribed: set[str] = set()
@@ -223,18 +225,7 @@ class Robot:
             return self._pictures
 
     def _subscribe(self, channel: Channel, handler: Callable[..., None]) -> None:
-        def receive(message: Message) -> None:
-            if message.retain and channel.one_shot:
-                return  # stale
-            names = channel.names(message.topic) if channel.is_pattern else {}
-            try:
-                value = codec.decode(channel, message.payload)
-            except PayloadError as error:
-                if not codec.is_blank(message.payload):
-                    self._quiet_log.warning(channel.metric, "refused a message: %s", error)
-                return
-            handler(value, **names)
-
+        receive = self._refusals.reader(channel, lambda _message, value, names: handler(value, **names))
         topic = self._addresses[channel].topic
         self._transport.subscribe(topic, receive, qos=QoS(channel.default_qos), limit=_WAITING)
 

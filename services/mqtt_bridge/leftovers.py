@@ -7,7 +7,6 @@ retained topics that nobody but the robot publishes.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol
 
 from pebble.contract import CHANNELS, MCU_DESCRIBE, MCU_VALUE, ONLINE, OUTGOING, Kind
 from pebble.forwarding.subjects import Subjects
@@ -15,12 +14,6 @@ from pebble.transports import Message, Subscription, Transport
 
 _TOPICS = 10_000  # noted of each side; with more nothing is removed
 _NOT_HERE = (ONLINE, MCU_DESCRIBE)  # the bridge's own, and what MCU_VALUE covers
-
-
-class Remove(Protocol):
-    """Removes what the broker retains on a topic, unless there is a reason not to; returns whether it was removed."""
-
-    def __call__(self, topic: str, *, unless: Callable[[str], bool]) -> bool: ...
 
 
 class Leftovers:
@@ -65,8 +58,11 @@ class Leftovers:
             self._next = len(self._filters)
         return True
 
-    def remove(self, remove: Remove) -> list[str]:
-        """Remove what only the broker retains, and return these topics; the last call."""
+    def remove(self, remove: Callable[..., bool]) -> list[str]:
+        """Remove what only the broker retains, and return these topics; the last call.
+
+        ``remove(topic, unless=…)`` removes one, unless there is a reason not to, and returns whether it did.
+        """
         self._close()
         gone = [topic for topic in sorted(self._there) if remove(topic, unless=self._stays)]
         self._here = None

@@ -117,7 +117,7 @@ class MqttBridge(ForwardingService):
         if self.forwarder.gate is not Gate.OPEN or not self._same_broker.both_connected:
             self._look_later()
             return
-        gone = self._leftovers.remove(partial(self.forwarder.remove_retained, Side.REMOTE))
+        gone = self._leftovers.remove(partial(self.forwarder.retained.remove, Side.REMOTE))
         if gone:
             self.log.info("removed %d retained topics that the robot no longer has: %s", len(gone), _few(gone))
 
@@ -143,9 +143,6 @@ class MqttBridge(ForwardingService):
     def await_retained(self) -> None:
         self.remote.ask(self.subjects.flags)
 
-    def synchronized(self, side: Side) -> None:  # noqa: ARG002  (also when the local side was away)
-        self.forwarder.probe_commands(Side.REMOTE)  # by now a mirror of the wrong broker has stopped
-
     def _check_brokers(self) -> None:
         """Open the gate if the two sides cannot be one broker, or begin a round of probing."""
         if not self._same_broker.possible:
@@ -170,7 +167,7 @@ class MqttBridge(ForwardingService):
         self.forwarder.open()
         if was_shut:  # what was received meanwhile was dropped: a new subscription brings the retained messages again
             self.unsubscribe(Side.LOCAL)
-            self.forwarder.subscribing(Side.LOCAL)
+            self.forwarder.sides[Side.LOCAL].subscribing()
             self.subscribe_local()
             self.forwarder.subscribed(Side.LOCAL)
         self.subscribe_remote()
@@ -182,7 +179,9 @@ class MqttBridge(ForwardingService):
             "the local and the remote side are one broker, or something else forwards outgoing/# to the local one: "
             "nothing is mirrored"
         )
-        self.forwarder.synchronize(Side.REMOTE)  # retained local flags wait for remote ones, which will not come
+        self.forwarder.retained.synchronize(
+            Side.REMOTE
+        )  # retained local flags wait for remote ones, which will not come
 
     def check_again(self, epoch: int) -> None:  # noqa: ARG002  (a round of probes notices a reconnect)
         self._check_brokers()
@@ -241,7 +240,7 @@ class MqttBridge(ForwardingService):
         local = side is Side.LOCAL
         if routed.outcome is Drop.STALE:
             if channel is None or not (local and self._actions.accepts_retained(channel)):
-                self._refuse_stale(channel)
+                self.refusals.stale("a command" if channel is None else channel.metric)
                 return
         elif not isinstance(routed.outcome, Forward) and (routed.outcome in _IGNORED or not local):
             return
@@ -264,7 +263,7 @@ class MqttBridge(ForwardingService):
         try:
             request: MediaRequest = codec.decode(channel, payload)
         except PayloadError as error:
-            self._refuse(channel, error)
+            self.refusals.malformed(channel, error)
         else:
             self.post_message(channel, partial(self._media.request, channel, request), newest_of=channel.metric)
 
@@ -277,17 +276,8 @@ class MqttBridge(ForwardingService):
         try:
             return bool(payload) and bool(codec.decode(channel, payload))
         except PayloadError as error:
-            self._refuse(channel, error)
+            self.refusals.malformed(channel, error)
             return False
-
-    def _refuse(self, channel: Channel, error: PayloadError) -> None:
-        self.counters.add("refused")
-        self._quiet_log.warning(channel.metric, "refused a message: %s", error)
-
-    def _refuse_stale(self, channel: Channel | None) -> None:
-        what = "a command" if channel is None else channel.metric
-        self.counters.add("stale")
-        self._quiet_log.warning(f"{what} retained", "refused a retained message on %s", what)
 
 
 def _few(topics: list[str]) -> str:

@@ -108,7 +108,7 @@ def bridge(local: Node, remote: Node, rules: Rules, *, mirroring: bool = False) 
         forwarder.subscribed(side)
     forwarder.open()
     for side in Side:
-        forwarder.synchronize(side)
+        forwarder.retained.synchronize(side)
     return forwarder
 
 

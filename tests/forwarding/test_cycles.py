@@ -37,7 +37,7 @@ class World:
         forwarder = bridge(*sides, TABLE_A1, mirroring=mirroring)
         self.bridges.append(forwarder)
         if probe:
-            forwarder.probe_commands(REMOTE)
+            forwarder.publisher.probe_commands(REMOTE)
         return forwarder
 
     def rests(self, deliveries: int = 500) -> bool:
@@ -51,7 +51,7 @@ class World:
         for _ in range(seconds):
             self.network.now += 1
             for forwarder in self.bridges:
-                forwarder.probe_again(REMOTE)
+                forwarder.publisher.probe_again((REMOTE,), forwarder.retained.value)
             assert self.rests()
 
     def arrives(self, client: Client, suffix: str, payload: bytes) -> bool:
@@ -258,7 +258,7 @@ class TestSeveralBridges:
         way = Way(mirrored, world.remote, "both", "incoming/#")
         world.bridge()
         world.bridges.append(bridge(world.local, mirrored, MIRROR))
-        world.bridges[-1].probe_commands(*Side)
+        world.bridges[-1].publisher.probe_commands(*Side)
         program = Client(mirrored).listen(f"{BASE}/#")
         for client in (world.operator, world.robot, program):
             world.send(client, DRIVE, MOVE, ZERO)

@@ -629,11 +629,11 @@ class TestStops:
         assert forwarder.receive(REMOTE, self.STOP).outcome is Drop.STALE
         forwarder.subscribed(REMOTE)
         assert self.first_pass(forwarder, clock) == pytest.approx(0.125)
-        forwarder.subscribing(REMOTE)
+        forwarder.sides[REMOTE].subscribing()
         assert forwarder.receive(REMOTE, self.STOP).outcome is Drop.STALE
         forwarder.subscribed(REMOTE)
         assert self.first_pass(forwarder, clock) == pytest.approx(0.125)
-        forwarder.watch(REMOTE, State.CONNECTING)
+        forwarder.sides[REMOTE].watch(State.CONNECTING)
         assert forwarder.receive(REMOTE, self.STOP).outcome is Drop.STALE
 
     def test_while_other_retained_messages_arrive(self, forwarder: Forwarder, clock: Clock) -> None:

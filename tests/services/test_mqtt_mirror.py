@@ -88,7 +88,7 @@ class Rig:
         return self.mirror
 
     def wait_ready(self) -> None:
-        assert until(lambda: self.gate is Gate.OPEN and self.mirror.forwarder.synchronized)
+        assert until(lambda: self.gate is Gate.OPEN and len(self.mirror.status.synchronized) == 2)
 
     def start_bridge(self) -> MqttBridge:
         bridge = MqttBridge(self._config(), MemoryTransport("local-bridge", self.hub))
@@ -174,7 +174,7 @@ class TestBothWays:
         for client in (rig.local, rig.program):
             client.publish("incoming/estop", b"old", retain=True)
         rig.start()
-        assert until(lambda: rig.mirror.forwarder.synchronized)
+        assert until(lambda: len(rig.mirror.status.synchronized) == 2)
         for side, client in (("local", rig.local), ("program", rig.program)):
             client.publish("incoming/estop", f"from {side}".encode(), retain=True)
             client.publish("incoming/estop-reset", b"retained", retain=True)

@@ -106,7 +106,7 @@ MUTATIONS = {
     ),
     # -- every service
     "retained commands are obeyed": Mutation(
-        _SERVICE, "if message.retain and channel.one_shot:", "if message.retain and not channel.kind:"
+        "pebble.runtime.receive", "if one_shot and message.retain:", "if one_shot and not channel.kind:"
     ),
     # -- the manager
     "final stops are not signed": Mutation(

@@ -228,7 +228,7 @@ class MqttRig:
         bridge = self.bridge
         assert until(lambda: gate_of(bridge) is not Gate.WAITING), "the bridge never made up its mind"
         if gate_of(bridge) is Gate.OPEN:
-            assert until(lambda: bridge.forwarder.synchronized)
+            assert until(lambda: len(bridge.status.synchronized) == 2)
 
     def retained(self, side: str) -> dict[str, bytes]:
         """What a late subscriber finds on that side."""

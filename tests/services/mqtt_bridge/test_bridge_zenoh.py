@@ -63,7 +63,7 @@ class TestZenohUplink:
         config = make_config(remote={"kind": "zenoh", "connect": [endpoint]})
         bridge = MqttBridge(config, MemoryTransport("local-bridge", hub))
         running = Running(bridge)
-        assert until(lambda: gate_of(bridge) is Gate.OPEN and bridge.forwarder.synchronized)
+        assert until(lambda: gate_of(bridge) is Gate.OPEN and len(bridge.status.synchronized) == 2)
         assert until(lambda: local.payloads(FLAG) == [FALSE])
         for number in range(200):
             operator.publish(DRIVE, b"%d" % number)

@@ -200,7 +200,7 @@ class Rig:
 
     @property
     def synchronized(self) -> bool:
-        return self._instance.forwarder.synchronized
+        return self._instance.status.synchronized == {LOCAL, REMOTE}
 
     def is_synchronized(self, side: Side) -> bool:
         return side in self._instance.status.synchronized

@@ -103,7 +103,7 @@ def test_a_microphone_that_was_switched_off_stays_off_when_the_robots_own_side_i
         def set_microphone(who: str, value: bytes) -> None:
             setter = {"operator": rig.remote, "program": rig.local, "once": once}[who]
             setter.publish(AUDIO_FLAG, value, retain=True, remember=setter is rig.local)
-            assert until(lambda: bridge.forwarder.value(f"{rig.base}/{AUDIO_FLAG}") == value)
+            assert until(lambda: bridge.forwarder.retained.value(f"{rig.base}/{AUDIO_FLAG}") == value)
             assert until(lambda: {rig.retained(name).get(AUDIO_FLAG) for name in ("local", "remote")} == {value})
 
         play(history, set_microphone, side.save)

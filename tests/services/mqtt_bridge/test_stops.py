@@ -80,7 +80,7 @@ def after_all(speaker: Client, listener: Client) -> None:
 
 def reconnected(rig: MqttRig, epoch: int) -> bool:
     """Whether the bridge has subscribed on a connection after ``epoch``."""
-    return rig.bridge.status.epoch > epoch and rig.bridge.forwarder.synchronized
+    return rig.bridge.status.epoch > epoch and len(rig.bridge.status.synchronized) == 2
 
 
 class TestUrgency:
@@ -113,7 +113,7 @@ class TestUrgency:
             held.set()
             return over.wait(10)
 
-        holding = partial(bridge.forwarder.remove_retained, Side.REMOTE, f"{BASE}/{STATE}", unless=hold)
+        holding = partial(bridge.forwarder.retained.remove, Side.REMOTE, f"{BASE}/{STATE}", unless=hold)
         threading.Thread(target=holding, daemon=True).start()
         assert held.wait(5)
         memory.remote.publish(STOP, PRESS, retain=retain)
