@@ -10,7 +10,19 @@ from dataclasses import replace
 from pathlib import Path
 
 from pebble.bench import null
-from pebble.bench.comparison import Budget, Case, Comparison, Option, Run, of_known, rounds, seconds, variants
+from pebble.bench.comparison import (
+    Budget,
+    Case,
+    Comparison,
+    Measuring,
+    Option,
+    Report,
+    Run,
+    of_known,
+    rounds,
+    seconds,
+    variants,
+)
 from pebble.bench.pictures import ecdf, null_ratios, tails
 from pebble.bench.ratios import LEAST_ROUNDS, paired
 from pebble.bench.results import Cell, Value
@@ -162,29 +174,33 @@ FRAMES = Comparison(
     quick=Budget(20, rounds=2, size=("640x480",), readers=(1,)),
     variants=VARIANTS,
     conditions=lambda run: [{"size": size, "readers": count} for size in run["size"] for count in run["readers"]],
-    prepare=prepare,
-    missing=missing,
-    measure=measure,
-    alone=True,
-    measures=("frame",),
-    figures={
-        **dict.fromkeys(("torn", "fallbacks"), sum),
-        **dict.fromkeys((*_CPU, *_MEMORY), of_known(statistics.median, 2)),
-    },
-    tables=(
-        Grid(
-            title="{size} BGR at 30 Hz, readers: {readers}", each=("size", "readers"), rows=("variant",),
-            columns=(
-                percentile_column(50, "p50 µs"), percentile_column(99, "p99 µs"), percentile_column(100, "max µs"),
-                _column("CPU %", *_CPU), _column("PSS MB", *_MEMORY), LOST, COUNT,
-            ),
-            caption="CPU: writer / each reader / broker; PSS: writer / each reader",
-        ),
+    measuring=Measuring(
+        prepare=prepare,
+        missing=missing,
+        measure=measure,
+        alone=True,
+        measures=("frame",),
+        figures={
+            **dict.fromkeys(("torn", "fallbacks"), sum),
+            **dict.fromkeys((*_CPU, *_MEMORY), of_known(statistics.median, 2)),
+        },
     ),
-    assessment=(assessment, faults),
-    complete=complete,
-    summary_lines=4,
-    pictures=(tails("Frames between processes"), ecdf("Frames between processes")),
+    report=Report(
+        tables=(
+            Grid(
+                title="{size} BGR at 30 Hz, readers: {readers}", each=("size", "readers"), rows=("variant",),
+                columns=(
+                    percentile_column(50, "p50 µs"), percentile_column(99, "p99 µs"), percentile_column(100, "max µs"),
+                    _column("CPU %", *_CPU), _column("PSS MB", *_MEMORY), LOST, COUNT,
+                ),
+                caption="CPU: writer / each reader / broker; PSS: writer / each reader",
+            ),
+        ),
+        assessment=(assessment, faults),
+        complete=complete,
+        summary_lines=4,
+        pictures=(tails("Frames between processes"), ecdf("Frames between processes")),
+    ),
 )  # fmt: skip
 FRAMES_NULL = FRAMES.null_test(
     "One frame transport against itself, and with a fifth of its usual latency planted by the writer. The "
@@ -192,8 +208,10 @@ FRAMES_NULL = FRAMES.null_test(
     full=Budget(130, seconds=0.4, rounds=30, size=("640x480",), readers=(1,), null=OURS),
     quick=Budget(8, rounds=2),
     variants=(),
-    assessment=(null.assessment, faults),
-    reported=("--null", OURS),
-    pictures=(null_ratios("Null test of frames"), ecdf("Null test of frames")),
+    report={
+        "assessment": (null.assessment, faults),
+        "reported": ("--null", OURS),
+        "pictures": (null_ratios("Null test of frames"), ecdf("Null test of frames")),
+    },
 )
 FRAMES = replace(FRAMES, modes={"null": FRAMES_NULL})

@@ -169,7 +169,7 @@ def _summary(sections: Sequence[Section]) -> Iterator[str]:
     for section in sections:
         about, results = section.comparison, section.results
         state = ": **failed**" if results is None else "" if results.complete else ": **incomplete**"
-        found = [f"\n  * {line}" for line in results.assessment[: about.summary_lines]] if results else []
+        found = [f"\n  * {line}" for line in results.assessment[: about.report.summary_lines]] if results else []
         lines += ["".join((section.link(about.title), state, *found))] if state or found else []
     if lines:
         yield "## In short"

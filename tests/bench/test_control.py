@@ -194,7 +194,7 @@ def far_cells(exchanges: Sequence[Exchange], monkeypatch: pytest.MonkeyPatch, of
 
 def shown(cells: Sequence[Cell]) -> str:
     printed = io.StringIO()
-    Console(file=printed, width=100).print(*CONTROL_FAR.shown(cells))
+    Console(file=printed, width=100).print(*CONTROL_FAR.report.shown(cells))
     return printed.getvalue()
 
 
