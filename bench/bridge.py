@@ -41,7 +41,7 @@ from pebble.rig.robot import KINDS
 
 UNLOADED, COMMANDS, LOADED = "none", "commands", "media"  # unloaded: 20 commands and 50 reports a second
 DOWN, UP, CPU = "down", "up", "CPU per message"
-_STARTUP_S = 1.0  # for start-up work to finish
+STARTUP_S = 1.0  # for start-up work to finish
 _LOADED_S = 2.0  # at most, of driving each robot while media flow
 _PILOT_S = 2.0
 
@@ -68,7 +68,7 @@ def running(kinds: Iterable[str], *, media: bool = False, reports: bool = True) 
         driven = {kind: stack.enter_context(driven_robot(kind, media=media, reports=reports)) for kind in kinds}
         for one in driven.values():
             one.wait_until_ready()
-        time.sleep(_STARTUP_S)
+        time.sleep(STARTUP_S)
         yield driven
 
 

@@ -38,7 +38,7 @@ INSTALL_GSTREAMER = (
     "apt-get install -y --no-install-recommends gstreamer1.0-plugins-base gstreamer1.0-plugins-bad"
     " gir1.2-gst-plugins-base-1.0 python3-gst-1.0 python3-numpy"
 )
-_SYSTEM_PYTHON = "/usr/bin/python3"  # the only one that Debian's gi and Gst can be imported into
+SYSTEM_PYTHON = "/usr/bin/python3"  # the only one that Debian's gi and Gst can be imported into
 _PLAIN_WORKER = str(Path(__file__).with_name("frames_worker.py"))
 _PROBE_S = 20.0
 _READY_S = 20.0
@@ -59,9 +59,9 @@ def missing(variant: str) -> str | None:
         return "mosquitto is not installed: apt-get install -y --no-install-recommends mosquitto"
     if variant == "gstreamer-shm":
         try:
-            subprocess.run([_SYSTEM_PYTHON, _PLAIN_WORKER], capture_output=True, timeout=_PROBE_S, check=True)
+            subprocess.run([SYSTEM_PYTHON, _PLAIN_WORKER], capture_output=True, timeout=_PROBE_S, check=True)
         except (OSError, subprocess.SubprocessError) as error:
-            return f"{_SYSTEM_PYTHON} has no GStreamer ({error}): {INSTALL_GSTREAMER}"
+            return f"{SYSTEM_PYTHON} has no GStreamer ({error}): {INSTALL_GSTREAMER}"
     return None
 
 
@@ -71,7 +71,7 @@ def measure(case: Case) -> Iterator[Cell]:
     CPU is in % of one core, memory (PSS) in MB; those of the readers are their mean.
     """
     is_gstreamer, seconds = case.variant == "gstreamer-shm", case.run["seconds"]
-    program = [_SYSTEM_PYTHON, _PLAIN_WORKER] if is_gstreamer else python("pebble.bench.frames_worker")
+    program = [SYSTEM_PYTHON, _PLAIN_WORKER] if is_gstreamer else python("pebble.bench.frames_worker")
     with Processes() as processes:
         broker = processes.broker() if case.variant == "mqtt" else None
         if broker is not None:

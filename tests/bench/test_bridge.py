@@ -205,7 +205,7 @@ def _fakes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(FakeRobot, "driven", [])
     monkeypatch.setattr(FakeRobot, "work", [])
     monkeypatch.setattr(bridge, "driven_robot", FakeRobot)
-    monkeypatch.setattr(bridge, "_STARTUP_S", 0.0)
+    monkeypatch.setattr(bridge, "STARTUP_S", 0.0)
     monkeypatch.setattr(engine, "find_spec", lambda _name: None)
 
 

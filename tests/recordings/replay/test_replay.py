@@ -105,7 +105,7 @@ def walk(folder: Path, seconds: int = 60) -> Path:
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """In this process it listens more briefly."""
     monkeypatch.setattr(live, "LISTEN_S", 0.3)
-    monkeypatch.setattr(replayed_robots, "_OPEN_S", 1.0)
+    monkeypatch.setattr(replayed_robots, "OPEN_S", 1.0)
 
 
 @contextmanager
@@ -332,7 +332,7 @@ def test_messages_are_not_late(tmp_path: Path, broker: Broker, quick: None) -> N
 def test_a_broker_that_delivers_nothing_ends_it(
     tmp_path: Path, run: Run, quick: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(live, "_RETURN_S", 0.5)
+    monkeypatch.setattr(live, "RETURN_S", 0.5)
     (tmp_path / "acl").write_text("topic write #\n")
     broker = Broker(tmp_path, f"acl_file {tmp_path / 'acl'}")
     assert run("replay", walk(tmp_path), "--url", f"mqtt://127.0.0.1:{broker.port}") == 1
