@@ -17,7 +17,20 @@ from typing import Any
 from pebble.bench.aims import RatioAim
 from pebble.bench.bridge_operator import ALL, HOP, STAND_IN, Arrived, DrivenRobot, Turn, Wheels, driven_robot, wheels_of
 from pebble.bench.clients import RATE_HZ
-from pebble.bench.comparison import Budget, Case, Comparison, Option, Round, Run, of_known, rounds, seconds, variants
+from pebble.bench.comparison import (
+    Budget,
+    Case,
+    Comparison,
+    Measuring,
+    Option,
+    Report,
+    Round,
+    Run,
+    of_known,
+    rounds,
+    seconds,
+    variants,
+)
 from pebble.bench.pictures import bars, ecdf, null_ratios, ratios
 from pebble.bench.results import Cell, grouped
 from pebble.bench.tables import COUNT, LOST, SPREAD, Claims, Grid, percentile_column, single_column
@@ -27,7 +40,7 @@ from pebble.rig.robot import KINDS
 
 UNLOADED, COMMANDS, LOADED = "none", "commands", "media"  # unloaded: 20 commands and 50 reports a second
 DOWN, UP, CPU = "down", "up", "CPU per message"
-_STARTUP_S = 1.0  # for start-up work to finish
+STARTUP_S = 1.0  # for start-up work to finish
 _LOADED_S = 2.0  # at most, of driving each robot while media flow
 _PILOT_S = 2.0
 
@@ -54,7 +67,7 @@ def running(kinds: Iterable[str], *, media: bool = False, reports: bool = True) 
         driven = {kind: stack.enter_context(driven_robot(kind, media=media, reports=reports)) for kind in kinds}
         for one in driven.values():
             one.wait_until_ready()
-        time.sleep(_STARTUP_S)
+        time.sleep(STARTUP_S)
         yield driven
 
 
@@ -208,18 +221,19 @@ BRIDGE_PROFILE = Comparison(
     full=Budget(60, profile=True, rounds=3, seconds=10.0, rate_hz=RATE_HZ),
     quick=Budget(12, rounds=1, seconds=2.0),
     variants=KINDS,
-    prepare=prepare,
-    measure=trace_commands,
-    tables=(
-        Grid(
-            title="Each hop of a command, ms", rows=("variant", "hop"),
-            columns=(*map(percentile_column, (50, 99, 100)), COUNT),
+    measuring=Measuring(prepare=prepare, measure=trace_commands),
+    report=Report(
+        tables=(
+            Grid(
+                title="Each hop of a command, ms", rows=("variant", "hop"),
+                columns=(*map(percentile_column, (50, 99, 100)), COUNT),
+            ),
         ),
+        reported=("--profile",),
+        pictures=(ecdf("Operator to wheels, hop by hop"),),
     ),
     root=True,
     words=("bench", "bridge"),
-    reported=("--profile",),
-    pictures=(ecdf("Operator to wheels, hop by hop"),),
 )  # fmt: skip
 _BRIDGE = Comparison(
     name="bridge",
@@ -235,23 +249,27 @@ _BRIDGE = Comparison(
     quick=Budget(22, rounds=2, seconds=0.5),
     variants=(STAND_IN, *KINDS),
     references=(HOP,),
-    prepare=prepare,
-    measure_round=measure,
-    measures=(DOWN, UP, CPU),
-    figures={"cpu_percent": of_known(fmean, 1)},
-    tables=(LATENCIES, CPU_TABLE),
-    assessment=(
-        Claims(
-            what="Median, {measure}, load {load}", judged=lambda cell: cell.params["load"] == UNLOADED,
-            of=lambda cell: cell.measure != CPU and cell.variant in KINDS,
-        ),
-        *_aims(),
+    measuring=Measuring(
+        prepare=prepare,
+        measure_round=measure,
+        measures=(DOWN, UP, CPU),
+        figures={"cpu_percent": of_known(fmean, 1)},
     ),
-    reported_full=("--with-media",),
-    pictures=(
-        ecdf("Operator to wheels and back", measures=(DOWN, UP)),
-        ratios("Operator to wheels and back", "mqtt", measures=(DOWN, UP)),
-        bars("Operator to wheels and back", measures=(CPU,), panel="load", group="process"),
+    report=Report(
+        tables=(LATENCIES, CPU_TABLE),
+        assessment=(
+            Claims(
+                what="Median, {measure}, load {load}", judged=lambda cell: cell.params["load"] == UNLOADED,
+                of=lambda cell: cell.measure != CPU and cell.variant in KINDS,
+            ),
+            *_aims(),
+        ),
+        reported_full=("--with-media",),
+        pictures=(
+            ecdf("Operator to wheels and back", measures=(DOWN, UP)),
+            ratios("Operator to wheels and back", "mqtt", measures=(DOWN, UP)),
+            bars("Operator to wheels and back", measures=(CPU,), panel="load", group="process"),
+        ),
     ),
 )  # fmt: skip
 BRIDGE_NULL = _BRIDGE.null_test(
@@ -264,11 +282,15 @@ BRIDGE_NULL = _BRIDGE.null_test(
     variants=KINDS[1:],
     references=(),
     conditions=lambda _run: [{"load": UNLOADED}],
-    environment=lambda run: running(run["variants"]),
-    measure=pilot,
-    measure_round=lambda round_: _in_turns(round_, UNLOADED, round_.env),
-    tables=(LATENCIES,),
-    reported_full=(),
-    pictures=(null_ratios("Null test of bridge"), ecdf("Null test of bridge")),
+    measuring={
+        "environment": lambda run: running(run["variants"]),
+        "measure": pilot,
+        "measure_round": lambda round_: _in_turns(round_, UNLOADED, round_.env),
+    },
+    report={
+        "tables": (LATENCIES,),
+        "reported_full": (),
+        "pictures": (null_ratios("Null test of bridge"), ecdf("Null test of bridge")),
+    },
 )
 BRIDGE = replace(_BRIDGE, modes={"null": BRIDGE_NULL, "profile": BRIDGE_PROFILE})

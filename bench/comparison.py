@@ -24,7 +24,8 @@ from pebble.bench.results import LONGEST_S, Cell, Judged, Results, Value
 from pebble.errors import PebbleError
 
 FOLDER: Final = Path("bench-results")
-_ELSEWHERE: Final = {"video": "wire", "sound": "wire", "impair": "impair.trials"}  # than in the module of their name
+#: Those that are not in the module of their name.
+_ELSEWHERE: Final = {"video": "wire.video", "sound": "wire.sound", "impair": "impair.trials"}
 _NAMES: Final = (
     "control", "bridge", "startup", "cost", "frames", "video", "sound", "estop", "fleet", "traffic", "page", "impair",
 )  # fmt: skip
@@ -105,64 +106,104 @@ class Budget(dict[str, Any]):
         self.takes_s = takes_s  # as expected
 
 
-@dataclass(frozen=True, kw_only=True)
-class Comparison:
+def unconditional(_run: Run) -> Sequence[Params]:
+    """One condition, which has no parameters."""
+    return ({},)
+
+
+def nothing_to_prepare(_run: Run) -> None:
+    """Any machine can run it."""
+
+
+def never_missing(_variant: str) -> str | None:
+    """Each variant can be measured."""
+    return None
+
+
+def without_environment(_run: Run) -> AbstractContextManager[Any]:
+    return nullcontext()
+
+
+def all_have_samples(cells: Sequence[Cell]) -> bool:
+    return all(cell.samples for cell in cells)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Measuring:
     """The engine calls ``measure`` for each case, or ``measure_round`` for each round, which calls :meth:`Round.cases`.
 
     Both return the cells of one round; cells of the same variant, conditions and measure are joined over the rounds.
     """
 
-    name: str
-    title: str
-    what: str  # what is measured, and how to read it: for the report
-    help: str = ""  # of the command line
-    full: Budget
-    quick: Budget
-    options: Sequence[Option] = ()
-    constants: Mapping[str, Value | list[Value]] = field(default_factory=dict)  # recorded with the options
-
-    variants: Sequence[str] = ()  # measured in turn; the option of this name chooses some
-    references: Sequence[str] = ()  # more of them, which are always measured
-    conditions: Callable[[Run], Sequence[Params]] = lambda _run: ({},)
-    prepare: Callable[[Run], None] = lambda _run: None  # checks what is needed, and notes; raises PebbleError
-    missing: Callable[[str], str | None] = lambda _variant: None  # why a variant is left out
-    environment: Callable[[Run], AbstractContextManager[Any]] = lambda _run: nullcontext()  # of ``fresh_every`` rounds
     measure: Callable[[Case], Iterable[Cell]] | None = None
     measure_round: Callable[[Round], Iterable[Cell]] | None = None
+    prepare: Callable[[Run], None] = nothing_to_prepare  # checks what is needed, and notes; raises PebbleError
+    missing: Callable[[str], str | None] = never_missing  # why a variant is left out
+    environment: Callable[[Run], AbstractContextManager[Any]] = without_environment  # of ``fresh_every`` rounds
     alone: bool = False  # a case that fails leaves an empty round of its own cells, not of all
     measures: Sequence[str] = ()  # the order of the cells; else as they were measured
     figures: Mapping[str, Combine] = field(default_factory=dict)  # how single values are joined; else the last one
 
-    derived: Callable[[list[Cell]], list[Cell]] = lambda cells: cells  # what all rounds together make of the cells
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Report:
+    """How the results are judged and shown, after a run and in the report."""
+
     tables: Sequence[Tables] = ()  # see pebble.bench.tables
     assessment: Sequence[Assess] = ()  # Claims, Aims and functions, the most important first
-    complete: Callable[[Sequence[Cell]], bool] = lambda cells: all(cell.samples for cell in cells)  # else exit code 1
+    complete: Callable[[Sequence[Cell]], bool] = all_have_samples  # else exit code 1
     pictures: Sequence[Callable[[Results], Iterable[Any]]] = ()  # see pebble.bench.pictures
-
-    folder: Path = FOLDER  # of the results, by default
-    is_null: bool = False  # one variant in three roles: see pebble.bench.null
-    modes: Mapping[str, Comparison] = field(default_factory=dict)  # what is run instead if this option is given
-    words: Sequence[str] = ()  # what starts its command line after ``pebble``; by default ``bench NAME``
-    reported: Sequence[str] | None = ()  # options in a report; None: it is not part of the report
+    reported: Sequence[str] | None = ()  # options in the report; None: it is not part of the report
     reported_full: Sequence[str] = ()  # more of them, of the full run
-    root: bool = False  # needs root
-
-    def null_test(self, what: str, **changes: Any) -> Comparison:
-        """The mode of ``--null``: one variant against itself, as it is and slowed down. See pebble.bench.null."""
-        own = {"name": f"{self.name}-null", "title": f"{self.title}: the null test", "is_null": True}
-        shown = {"assessment": (null.assessment,), "words": ("bench", self.name)}
-        return replace(self, what=what, **{**own, **shown, "reported": ("--null",), **changes})
-
-    def arguments(self, quick: bool) -> list[str]:
-        """The command line in a report, without ``pebble``."""
-        more = ["--quick"] if quick else self.reported_full
-        return [*(self.words or ("bench", self.name)), *(self.reported or ()), *more]
 
     def shown(self, cells: Sequence[Cell]) -> list[Table]:
         return [table for tables in self.tables for table in tables(cells)]
 
     def assessed(self, cells: Sequence[Cell]) -> list[str | Judged]:
         return [line for assess in self.assessment for line in assess(cells)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """A command with its options, what it measures, and what its results say."""
+
+    name: str
+    title: str
+    what: str  # what is measured, and how to read it: for the report
+    help: str = ""  # of the command line
+    words: Sequence[str] = ()  # what starts its command line after ``pebble``; by default ``bench NAME``
+    options: Sequence[Option] = ()
+    full: Budget
+    quick: Budget
+    constants: Mapping[str, Value | list[Value]] = field(default_factory=dict)  # recorded with the options
+    folder: Path = FOLDER  # of the results, by default
+    root: bool = False  # needs root
+
+    variants: Sequence[str] = ()  # measured in turn; the option of this name chooses some
+    references: Sequence[str] = ()  # more of them, which are always measured
+    conditions: Callable[[Run], Sequence[Params]] = unconditional
+    is_null: bool = False  # one variant in three roles: see pebble.bench.null
+    modes: Mapping[str, Comparison] = field(default_factory=dict)  # what is run instead if this option is given
+
+    measuring: Measuring = Measuring()
+    report: Report = Report()
+
+    def null_test(
+        self, what: str, *, report: dict[str, Any], measuring: dict[str, Any] | None = None, **changes: Any
+    ) -> Comparison:
+        """The mode of ``--null``: one variant against itself, as it is and slowed down. See pebble.bench.null.
+
+        ``report`` and ``measuring`` are what is different in these parts.
+        """
+        own = {"name": f"{self.name}-null", "title": f"{self.title}: the null test", "words": ("bench", self.name)}
+        shown = {"assessment": (null.assessment,), "reported": ("--null",), **report}
+        parts = {"measuring": replace(self.measuring, **(measuring or {})), "report": replace(self.report, **shown)}
+        return replace(self, what=what, is_null=True, **{**own, **parts, **changes})
+
+    def arguments(self, quick: bool) -> list[str]:
+        """The command line in a report, without ``pebble``."""
+        more = ["--quick"] if quick else self.report.reported_full
+        return [*(self.words or ("bench", self.name)), *(self.report.reported or ()), *more]
 
     def expected_s(self, quick: bool) -> int:
         return (self.quick if quick else self.full).takes_s
@@ -279,7 +320,7 @@ def find(name: str) -> Comparison:
 def reported() -> list[Comparison]:
     """The comparisons of the report, each followed by its modes."""
     every = [one for about in map(find, MODULES) for one in (about, *about.modes.values())]
-    return [one for one in every if one.reported is not None]
+    return [one for one in every if one.report.reported is not None]
 
 
 def chosen(names: Sequence[str]) -> list[Comparison]:

@@ -15,7 +15,19 @@ import msgspec
 from pebble.bench import control_far as far
 from pebble.bench import null
 from pebble.bench.aims import outcome, rounds_with_lost
-from pebble.bench.comparison import Budget, Case, Comparison, Option, Run, of_known, rounds, seconds, variants
+from pebble.bench.comparison import (
+    Budget,
+    Case,
+    Comparison,
+    Measuring,
+    Option,
+    Report,
+    Run,
+    of_known,
+    rounds,
+    seconds,
+    variants,
+)
 from pebble.bench.control_worker import ONE_WAY, ROUND_TRIP, SMALLEST, Slice, SliceSpec, condition
 from pebble.bench.engine import roles_of
 from pebble.bench.pictures import ecdf, null_ratios, ratios
@@ -268,15 +280,19 @@ CONTROL_FAR = Comparison(
     quick=Budget(5, **_ONE, seconds=1.0, rounds=4),
     variants=(far.VARIANT,),
     conditions=lambda run: [condition(size, rate) for size in run["sizes"] for rate in run["rates"]],
-    prepare=far.prepare,
-    environment=far.environment,
-    measure=far.measure,
-    figures={"late": sum, "clock_offset_ms": of_known(median, 6), "clock_error_ms": of_known(max, 6)},  # to ns
-    tables=(far.TABLE,),
-    complete=lambda cells: all(cell.samples for cell in cells if cell.measure == ROUND_TRIP),
+    measuring=Measuring(
+        prepare=far.prepare,
+        environment=far.environment,
+        measure=far.measure,
+        figures={"late": sum, "clock_offset_ms": of_known(median, 6), "clock_error_ms": of_known(max, 6)},  # to ns
+    ),
+    report=Report(
+        tables=(far.TABLE,),
+        complete=lambda cells: all(cell.samples for cell in cells if cell.measure == ROUND_TRIP),
+        reported=None,
+        pictures=(ecdf("Control far"),),
+    ),
     words=("bench", "control"),
-    reported=None,
-    pictures=(ecdf("Control far"),),
 )
 _CONTROL = Comparison(
     name="control",
@@ -300,17 +316,21 @@ _CONTROL = Comparison(
     quick=Budget(40, **_ONE, loads=[NONE, MEDIA], seconds=0.3, rounds=4, passes=1, fresh_every=2),
     variants=tuple(VARIANTS),
     conditions=conditions,
-    environment=lambda run: Participants(roles_of(run)),
-    measure=measure,
-    measures=(ONE_WAY, ROUND_TRIP),
-    figures={
-        "late": sum,
-        **dict.fromkeys(("call_us", "fabric_us", "inbox_us"), of_known(median, 1)),
-        **dict.fromkeys(("wake_ups", "broker_wake_ups", "pictures_hz"), of_known(fmean, 1)),
-    },
-    tables=(TABLE, HOPS),
-    assessment=(assessment,),
-    pictures=(ecdf("Service to service"), ratios("Service to service", "mqtt")),
+    measuring=Measuring(
+        environment=lambda run: Participants(roles_of(run)),
+        measure=measure,
+        measures=(ONE_WAY, ROUND_TRIP),
+        figures={
+            "late": sum,
+            **dict.fromkeys(("call_us", "fabric_us", "inbox_us"), of_known(median, 1)),
+            **dict.fromkeys(("wake_ups", "broker_wake_ups", "pictures_hz"), of_known(fmean, 1)),
+        },
+    ),
+    report=Report(
+        tables=(TABLE, HOPS),
+        assessment=(assessment,),
+        pictures=(ecdf("Service to service"), ratios("Service to service", "mqtt")),
+    ),
 )
 CONTROL_NULL = _CONTROL.null_test(
     "One variant against itself, and against itself with a fifth of its usual latency planted by the sender. "
@@ -319,7 +339,9 @@ CONTROL_NULL = _CONTROL.null_test(
     full=Budget(120, **_ONE, loads=[NONE], null=True, seconds=0.3, rounds=30, passes=2, fresh_every=1),
     quick=Budget(10, seconds=0.25, rounds=4, passes=1, fresh_every=2),
     variants=(P2P,),
-    tables=(replace(TABLE, baseline=""), HOPS),
-    pictures=(null_ratios("Null test of control"), ecdf("Null test of control")),
+    report={
+        "tables": (replace(TABLE, baseline=""), HOPS),
+        "pictures": (null_ratios("Null test of control"), ecdf("Null test of control")),
+    },
 )
 CONTROL = replace(_CONTROL, modes={"far": CONTROL_FAR, "null": CONTROL_NULL})

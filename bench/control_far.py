@@ -33,7 +33,7 @@ THERE, BACK = "one-way there", "one-way back"
 #: The largest relative drift: quartz is within 50 ppm on each side unless NTP slews it.
 DRIFT = 100e-6
 LEAST = 8  # exchanges, to compare two clocks
-_WARM_UP, _ANSWER_S = 10, 10.0  # messages
+_WARM_UP, ANSWER_S = 10, 10.0  # messages
 
 
 def settings_of(url: str) -> MqttSettings:
@@ -100,7 +100,7 @@ def environment(run: Run) -> Iterator[Sender]:
     with closing(opened(run["far"], "sender", desk)) as connection:
         sender = Sender(connection, secrets.token_hex(4), wall_clock(), desk)
         run.show("waiting for the echo")
-        if not sender.warm_up(_WARM_UP, _ANSWER_S):
+        if not sender.warm_up(_WARM_UP, ANSWER_S):
             raise PebbleError("no echo answers there: run `pebble bench echo URL` on the other machine")
         yield sender
 

@@ -14,7 +14,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from pebble.bench.clients import RATE_HZ, RobotSubscriber, driving, ready_robot
-from pebble.bench.comparison import Budget, Case, Comparison, rounds, seconds, variants
+from pebble.bench.comparison import Budget, Case, Comparison, Measuring, Report, rounds, seconds, variants
 from pebble.bench.pictures import bars
 from pebble.bench.results import Cell
 from pebble.bench.tables import Claims, Grid, median_column
@@ -102,23 +102,28 @@ COST = Comparison(
     quick=Budget(20, rounds=1, seconds=0.7),
     constants={"rate_hz": RATE_HZ},
     variants=KINDS,
-    prepare=lambda run: run.notes.extend([] if find_spec("av") else ["h264+opus is left out: there is no PyAV"]),
-    measure=measure,
-    tables=(
-        Grid(
-            title="memory (PSS), CPU (of one core), threads; medians", rows=("phase", "process"), last=ALL,
-            columns=(
-                median_column("MB", MEMORY), median_column("%", CPU), median_column("thr.", THREADS, "{:.0f}".format),
+    measuring=Measuring(
+        prepare=lambda run: run.notes.extend([] if find_spec("av") else ["h264+opus is left out: there is no PyAV"]),
+        measure=measure,
+    ),
+    report=Report(
+        tables=(
+            Grid(
+                title="memory (PSS), CPU (of one core), threads; medians", rows=("phase", "process"), last=ALL,
+                columns=(
+                    median_column("MB", MEMORY), median_column("%", CPU),
+                    median_column("thr.", THREADS, "{:.0f}".format),
+                ),
             ),
         ),
-    ),
-    assessment=(
-        Claims(
-            what="{phase}, {quantity}",
-            of=lambda cell: cell.params["process"] == ALL and cell.measure in _COMPARED,
-            quantity=_COMPARED,
-            judged=lambda cell: cell.params["process"] == ALL,
+        assessment=(
+            Claims(
+                what="{phase}, {quantity}",
+                of=lambda cell: cell.params["process"] == ALL and cell.measure in _COMPARED,
+                quantity=_COMPARED,
+                judged=lambda cell: cell.params["process"] == ALL,
+            ),
         ),
+        pictures=(bars("What a robot costs", measures=(MEMORY, CPU), panel="phase", group="process"),),
     ),
-    pictures=(bars("What a robot costs", measures=(MEMORY, CPU), panel="phase", group="process"),),
 )  # fmt: skip

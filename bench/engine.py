@@ -37,7 +37,7 @@ def run(run: Run) -> int:
     """Measures, prints and writes; returns 0 if everything has results of enough rounds. Raises PebbleError."""
     about, show = run.comparison, partial(run.console.print, highlight=False, soft_wrap=True)
     check_folder(run.output)
-    about.prepare(run)
+    about.measuring.prepare(run)
     collected = Collected(about, roles_of(run))
     results, since = begin(about.name, run.command, quick=run.quick), time.monotonic()
     with interrupted_by_signals():
@@ -45,19 +45,19 @@ def run(run: Run) -> int:
             failed = _measure(run, collected)
         finally:
             sweep()  # Zenoh leaves files behind even after a regular end
-    cells = about.derived(collected.cells())
+    cells = collected.cells()
     results.cells, results.options, results.took_s = cells, run.records(), round(time.monotonic() - since, 1)
     results.complete = False
     results.save(written := run.output / f"{about.name}.json")  # before anything that may fail
     notes = [str(run.problem).partition("\n")[0]] if run.problem else []
     lost = f"{len(failed)} of {run.rounds} rounds failed and were left out"
     notes += [f"{lost}; {why.splitlines()[0]}" for why in failed[:1]]
-    lines = [*(note[0].upper() + note[1:] for note in notes), *about.assessed(cells), *run.notes]
+    lines = [*(note[0].upper() + note[1:] for note in notes), *about.report.assessed(cells), *run.notes]
     results.assessment = [line for line in lines if isinstance(line, str)]
     results.aims = [line for line in lines if isinstance(line, Judged)]
     enough = run.rounds < LEAST_ROUNDS or run.rounds - len(failed) >= LEAST_ROUNDS
-    results.complete = run.problem is None and enough and about.complete(cells)
-    for table in about.shown(cells):
+    results.complete = run.problem is None and enough and about.report.complete(cells)
+    for table in about.report.shown(cells):
         _print_whole(table, run.console)
     for sentence in (*results.assessment, *results.aims):
         show(str(sentence))
@@ -87,7 +87,7 @@ def roles_of(run: Run) -> Sequence[str]:
     """The variants that this machine can measure, or the roles of the only one in a null test. Raises PebbleError."""
     about, null_of = run.comparison, run.options.get("null")
     asked = [null_of] if about.is_null and isinstance(null_of, str) else run.options.get("variants") or [""]
-    reasons = {name: why for name in asked if name and (why := about.missing(name)) is not None}
+    reasons = {name: why for name in asked if name and (why := about.measuring.missing(name)) is not None}
     for name, why in reasons.items():
         run.console.print(f"{name} is left out: {why}", style="yellow", highlight=False, soft_wrap=True)
     if len(reasons) == len(asked):
@@ -104,6 +104,7 @@ def _measure(run: Run, collected: Collected) -> list[str]:
     Rounds share an environment: a new one every ``fresh_every`` rounds, and after a round that failed.
     """
     about, env, failed, fresh = run.comparison, None, list[str](), True
+    measure = about.measuring.measure
     with run.console.status("", refresh_per_second=4) as status, ExitStack() as shared:
         for number in range(run.rounds):
             before = f"round {number + 1} of {run.rounds}: "
@@ -111,10 +112,10 @@ def _measure(run: Run, collected: Collected) -> list[str]:
             try:
                 if fresh or number % run.options.get("fresh_every", 1) == 0:
                     shared.close()
-                    env = shared.enter_context(about.environment(run))
+                    env = shared.enter_context(about.measuring.environment(run))
                 round_ = Round(run, number, env, roles=collected.roles, planted_us=collected.planted_us)
-                if about.is_null and about.measure is not None and not collected.pilot:
-                    collected.pilot = list(about.measure(next(one for one in round_.cases() if not one.slowed)))
+                if about.is_null and measure is not None and not collected.pilot:
+                    collected.pilot = list(measure(next(one for one in round_.cases() if not one.slowed)))
                 collected.add(_round(round_))
                 fresh = False
             except (PebbleError, OSError) as error:
@@ -127,7 +128,7 @@ def _measure(run: Run, collected: Collected) -> list[str]:
 
 
 def _round(round_: Round) -> Iterator[Cell]:
-    about = round_.run.comparison
+    about = round_.run.comparison.measuring
     if about.measure_round is not None:
         yield from about.measure_round(round_)
     elif about.measure is not None:
@@ -159,12 +160,12 @@ class Collected:
             cell.rounds += parts[0].rounds if cell.measure.endswith(OVER_TIME) else joined  # times, then values
             for name, value in (one for part in parts for one in part.figures.items()):
                 self._figures[key, name].append(value)
-                combine = {**_JOINED, **self._about.figures}.get(name, itemgetter(-1))
+                combine = {**_JOINED, **self._about.measuring.figures}.get(name, itemgetter(-1))
                 cell.figures[name] = combine(self._figures[key, name])
 
     def cells(self) -> list[Cell]:
         """The measures in the order in which they are declared, if they are."""
-        order = {measure: at for at, measure in enumerate(self._about.measures)}
+        order = {measure: at for at, measure in enumerate(self._about.measuring.measures)}
         return sorted(self._cells.values(), key=lambda cell: order.get(cell.measure, 0))
 
     def planted_us(self, condition: Mapping[str, Value]) -> float:

@@ -15,7 +15,7 @@ from typing import Any
 
 from pebble.bench import clients
 from pebble.bench.aims import Aim, single, with_lost
-from pebble.bench.comparison import Budget, Case, Comparison, Round, rounds
+from pebble.bench.comparison import Budget, Case, Comparison, Measuring, Report, Round, rounds
 from pebble.bench.fleet import read_moves
 from pebble.bench.pictures import ecdf
 from pebble.bench.results import Cell
@@ -233,31 +233,35 @@ ESTOP = Comparison(
     quick=Budget(90, rounds=2, stops=3, all_stops=2),
     constants={"rate_hz": clients.RATE_HZ},
     variants=(STOP, ZERO),
-    environment=lambda run: Robots(run["boards"]),
-    measure_round=measure,
-    measures=MEASURES,
-    figures={"again": sum},
-    tables=(
-        Grid(
-            title="From the stop, while driving goes on; ms", rows=("measure", "robot", "variant"),
-            heads=("", "robot", "by"), columns=(COUNT, *map(percentile_column, (50, 95, 100))),
-        ),
+    measuring=Measuring(
+        environment=lambda run: Robots(run["boards"]),
+        measure_round=measure,
+        measures=MEASURES,
+        figures={"again": sum},
     ),
-    assessment=(
-        Claims(
-            what="{measure}, {robot}", order=(ZERO, STOP), judged=lambda cell: cell.variant == STOP,
-            of=lambda cell: cell.measure == REST and cell.params["robot"] in KINDS,
+    report=Report(
+        tables=(
+            Grid(
+                title="From the stop, while driving goes on; ms", rows=("measure", "robot", "variant"),
+                heads=("", "robot", "by"), columns=(COUNT, *map(percentile_column, (50, 95, 100))),
+            ),
         ),
-        _aim(REST, 50.0, *KINDS),
-        _aim(REST, 250.0, ALL),
-        _aim(CONFIRMED, 500.0, *KINDS, ALL),
-        _aim(HOLD, 1000.0, *KINDS, BOARD),
-        Aim(
-            what="wheels stay at rest after a stop while driving goes on",
-            of=lambda cell: cell.measure == REST and cell.variant == STOP,
-            value=single("again"), at_most=0, worst=True, shown="{:g}".format, unit="times they turned again",
+        assessment=(
+            Claims(
+                what="{measure}, {robot}", order=(ZERO, STOP), judged=lambda cell: cell.variant == STOP,
+                of=lambda cell: cell.measure == REST and cell.params["robot"] in KINDS,
+            ),
+            _aim(REST, 50.0, *KINDS),
+            _aim(REST, 250.0, ALL),
+            _aim(CONFIRMED, 500.0, *KINDS, ALL),
+            _aim(HOLD, 1000.0, *KINDS, BOARD),
+            Aim(
+                what="wheels stay at rest after a stop while driving goes on",
+                of=lambda cell: cell.measure == REST and cell.variant == STOP,
+                value=single("again"), at_most=0, worst=True, shown="{:g}".format, unit="times they turned again",
+            ),
         ),
+        pictures=(ecdf("Estop"),),
+        reported=None,
     ),
-    pictures=(ecdf("Estop"),),
-    reported=None,
 )  # fmt: skip

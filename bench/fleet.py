@@ -21,7 +21,7 @@ import msgspec
 from paho.mqtt.client import MQTTMessage
 
 from pebble.bench.clients import MANY, StockClient, axes_of
-from pebble.bench.comparison import Budget, Case, Comparison, Option, seconds
+from pebble.bench.comparison import Budget, Case, Comparison, Measuring, Option, Report, seconds
 from pebble.bench.pictures import ecdf
 from pebble.bench.results import Cell, grouped, rounded
 from pebble.bench.tables import COUNT, LOST, Grid, percentile_column, single_column
@@ -152,19 +152,21 @@ FLEET = Comparison(
     full=Budget(35, robots=200, seconds=60.0),
     quick=Budget(12, robots=30, seconds=5.0),
     variants=("mqtt",),
-    measure=measure,
-    tables=(
-        Grid(
-            title="Command to pins, ms; longest gap between heartbeats; CPU, % of a core; memory of each robot",
-            rows=("robots", "rate"),
-            columns=(
-                *map(percentile_column, (50, 95, 99, 100)), COUNT, LOST,
-                *(single_column(head, name) for head, name in _COLUMNS.items()),
+    measuring=Measuring(measure=measure),
+    report=Report(
+        tables=(
+            Grid(
+                title="Command to pins, ms; longest gap between heartbeats; CPU, % of a core; memory of each robot",
+                rows=("robots", "rate"),
+                columns=(
+                    *map(percentile_column, (50, 95, 99, 100)), COUNT, LOST,
+                    *(single_column(head, name) for head, name in _COLUMNS.items()),
+                ),
             ),
         ),
+        pictures=(ecdf("Fleet"),),
+        reported_full=("--robots", "100", "--seconds", "20"),
     ),
-    pictures=(ecdf("Fleet"),),
-    reported_full=("--robots", "100", "--seconds", "20"),
 )  # fmt: skip
 
 if __name__ == "__main__":

@@ -10,7 +10,19 @@ from dataclasses import replace
 from pathlib import Path
 
 from pebble.bench import null
-from pebble.bench.comparison import Budget, Case, Comparison, Option, Run, of_known, rounds, seconds, variants
+from pebble.bench.comparison import (
+    Budget,
+    Case,
+    Comparison,
+    Measuring,
+    Option,
+    Report,
+    Run,
+    of_known,
+    rounds,
+    seconds,
+    variants,
+)
 from pebble.bench.pictures import ecdf, null_ratios, tails
 from pebble.bench.ratios import LEAST_ROUNDS, paired
 from pebble.bench.results import Cell, Value
@@ -26,7 +38,7 @@ INSTALL_GSTREAMER = (
     "apt-get install -y --no-install-recommends gstreamer1.0-plugins-base gstreamer1.0-plugins-bad"
     " gir1.2-gst-plugins-base-1.0 python3-gst-1.0 python3-numpy"
 )
-_SYSTEM_PYTHON = "/usr/bin/python3"  # the only one that Debian's gi and Gst can be imported into
+SYSTEM_PYTHON = "/usr/bin/python3"  # the only one that Debian's gi and Gst can be imported into
 _PLAIN_WORKER = str(Path(__file__).with_name("frames_worker.py"))
 _PROBE_S = 20.0
 _READY_S = 20.0
@@ -47,9 +59,9 @@ def missing(variant: str) -> str | None:
         return "mosquitto is not installed: apt-get install -y --no-install-recommends mosquitto"
     if variant == "gstreamer-shm":
         try:
-            subprocess.run([_SYSTEM_PYTHON, _PLAIN_WORKER], capture_output=True, timeout=_PROBE_S, check=True)
+            subprocess.run([SYSTEM_PYTHON, _PLAIN_WORKER], capture_output=True, timeout=_PROBE_S, check=True)
         except (OSError, subprocess.SubprocessError) as error:
-            return f"{_SYSTEM_PYTHON} has no GStreamer ({error}): {INSTALL_GSTREAMER}"
+            return f"{SYSTEM_PYTHON} has no GStreamer ({error}): {INSTALL_GSTREAMER}"
     return None
 
 
@@ -59,7 +71,7 @@ def measure(case: Case) -> Iterator[Cell]:
     CPU is in % of one core, memory (PSS) in MB; those of the readers are their mean.
     """
     is_gstreamer, seconds = case.variant == "gstreamer-shm", case.run["seconds"]
-    program = [_SYSTEM_PYTHON, _PLAIN_WORKER] if is_gstreamer else python("pebble.bench.frames_worker")
+    program = [SYSTEM_PYTHON, _PLAIN_WORKER] if is_gstreamer else python("pebble.bench.frames_worker")
     with Processes() as processes:
         broker = processes.broker() if case.variant == "mqtt" else None
         if broker is not None:
@@ -162,28 +174,32 @@ FRAMES = Comparison(
     quick=Budget(20, rounds=2, size=("640x480",), readers=(1,)),
     variants=VARIANTS,
     conditions=lambda run: [{"size": size, "readers": count} for size in run["size"] for count in run["readers"]],
-    prepare=prepare,
-    missing=missing,
-    measure=measure,
-    alone=True,
-    measures=("frame",),
-    figures={
-        **dict.fromkeys(("torn", "fallbacks"), sum),
-        **dict.fromkeys((*_CPU, *_MEMORY), of_known(statistics.median, 2)),
-    },
-    tables=(
-        Grid(
-            title="{size} BGR at 30 Hz, readers: {readers}", each=("size", "readers"), rows=("variant",),
-            columns=(
-                percentile_column(50, "p50 µs"), percentile_column(99, "p99 µs"), percentile_column(100, "max µs"),
-                _column("CPU %", *_CPU), _column("PSS MB", *_MEMORY), LOST, COUNT,
-            ),
-            caption="CPU: writer / each reader / broker; PSS: writer / each reader",
-        ),
+    measuring=Measuring(
+        prepare=prepare,
+        missing=missing,
+        measure=measure,
+        alone=True,
+        measures=("frame",),
+        figures={
+            **dict.fromkeys(("torn", "fallbacks"), sum),
+            **dict.fromkeys((*_CPU, *_MEMORY), of_known(statistics.median, 2)),
+        },
     ),
-    assessment=(assessment, faults),
-    complete=complete,
-    pictures=(tails("Frames between processes"), ecdf("Frames between processes")),
+    report=Report(
+        tables=(
+            Grid(
+                title="{size} BGR at 30 Hz, readers: {readers}", each=("size", "readers"), rows=("variant",),
+                columns=(
+                    percentile_column(50, "p50 µs"), percentile_column(99, "p99 µs"), percentile_column(100, "max µs"),
+                    _column("CPU %", *_CPU), _column("PSS MB", *_MEMORY), LOST, COUNT,
+                ),
+                caption="CPU: writer / each reader / broker; PSS: writer / each reader",
+            ),
+        ),
+        assessment=(assessment, faults),
+        complete=complete,
+        pictures=(tails("Frames between processes"), ecdf("Frames between processes")),
+    ),
 )  # fmt: skip
 FRAMES_NULL = FRAMES.null_test(
     "One frame transport against itself, and with a fifth of its usual latency planted by the writer. The "
@@ -191,8 +207,10 @@ FRAMES_NULL = FRAMES.null_test(
     full=Budget(130, seconds=0.4, rounds=30, size=("640x480",), readers=(1,), null=OURS),
     quick=Budget(8, rounds=2),
     variants=(),
-    assessment=(null.assessment, faults),
-    reported=("--null", OURS),
-    pictures=(null_ratios("Null test of frames"), ecdf("Null test of frames")),
+    report={
+        "assessment": (null.assessment, faults),
+        "reported": ("--null", OURS),
+        "pictures": (null_ratios("Null test of frames"), ecdf("Null test of frames")),
+    },
 )
 FRAMES = replace(FRAMES, modes={"null": FRAMES_NULL})

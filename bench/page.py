@@ -21,7 +21,7 @@ from urllib.parse import urlencode, urlsplit
 
 from pebble.bench.aims import outcome
 from pebble.bench.clients import driving as others_drive
-from pebble.bench.comparison import Budget, Case, Comparison, Option, rounds
+from pebble.bench.comparison import Budget, Case, Comparison, Measuring, Option, Report, rounds
 from pebble.bench.impair.conditions import Condition, Shape
 from pebble.bench.page_rig import HELD_S, KEY, ROBOT, Rig, linked, monotonic, rig
 from pebble.bench.results import Cell, Judged, percentile
@@ -352,7 +352,6 @@ PAGE = Comparison(
     folder=Path("build/page"),
     variants=("page",),
     conditions=lambda run: [{"case": name} for name in CASES if name in run["cases"]],
-    measure=measure,
-    assessment=(goals,),
-    reported=None,
+    measuring=Measuring(measure=measure),
+    report=Report(assessment=(goals,), reported=None),
 )  # fmt: skip

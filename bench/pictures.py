@@ -47,7 +47,7 @@ def draw(results: Results, folder: Path) -> dict[Path, Picture]:
 
 
 def pictures(results: Results) -> list[Picture]:
-    return [picture for one in find(results.bench).pictures for picture in one(results)]
+    return [picture for one in find(results.bench).report.pictures for picture in one(results)]
 
 
 @dataclass(frozen=True, slots=True)

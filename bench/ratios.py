@@ -15,7 +15,7 @@ from pebble.bench.results import percentile
 
 LEVEL = 0.99
 LEAST_ROUNDS = 8  # fewer do not support a 99 % interval: it is computed, but means little
-_RESAMPLES = 20_000
+RESAMPLES = 20_000
 _INFINITE = 1e15  # stands for infinity where resampling computes differences
 _LARGEST = 1e6  # ratio that is written as a number
 
@@ -84,7 +84,7 @@ def _interval(ours: Sequence[float], theirs: Sequence[float], level: float) -> I
 
     ratio = float(np.median(ours) - np.median(theirs))
     random = np.random.default_rng(1)  # the same samples give the same interval
-    a, b = (np.median(random.choice(logs, (_RESAMPLES, len(logs))), axis=1) for logs in (ours, theirs))
+    a, b = (np.median(random.choice(logs, (RESAMPLES, len(logs))), axis=1) for logs in (ours, theirs))
     tail, wider = (1 - level) / 2, student(level, rounds) / student(level, math.inf)
     low, high = (ratio + wider * (end - ratio) for end in np.quantile(a - b, [tail, 1 - tail]))
     return Interval(math.exp(ratio), math.exp(low), math.exp(high), level, rounds)

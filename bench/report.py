@@ -25,8 +25,8 @@ _HEADING = "# Results"  # the first line of every report
 #: Before a command: its tables are plain text of this width.
 _PLAIN = ("env", "-u", "FORCE_COLOR", "-u", "TTY_COMPATIBLE", "COLUMNS=120", "NO_COLOR=1", "PYTHONUNBUFFERED=1")
 _POLL_S = 0.2
-_TIMEOUT_FACTOR = 4  # a comparison that takes this many times the expected time,
-_TIMEOUT_EXTRA_S = 60.0  # and this in addition, is ended
+TIMEOUT_FACTOR = 4  # a comparison that takes this many times the expected time,
+TIMEOUT_EXTRA_S = 60.0  # and this in addition, is ended
 _END_S = 20.0  # for a comparison to end its processes
 _NOT_THE_TABLE = ("Written:", "No plots:")  # what a command prints about its files
 #: What a report begins with: pictures, and by comparison the sentence that says most.
@@ -71,7 +71,7 @@ def run(comparisons: Sequence[Comparison], folder: Path, *, quick: bool, console
             for number, one in enumerate(comparisons, 1):
                 began = time.monotonic()
                 with console.status(f"{number} of {len(comparisons)}: {one.name}, about {one.expected_s(quick)} s"):
-                    problem = _run(one, folder, quick)
+                    problem = run_one(one, folder, quick)
                 line = f"{one.name} {problem}: see {folder / one.name}.txt" if problem else one.name
                 console.print(f"{line}, {_span(time.monotonic() - began)}", soft_wrap=True)
                 failed += bool(problem)
@@ -81,13 +81,13 @@ def run(comparisons: Sequence[Comparison], folder: Path, *, quick: bool, console
     return 1 if failed else 0
 
 
-def _run(comparison: Comparison, folder: Path, quick: bool) -> str:
+def run_one(comparison: Comparison, folder: Path, quick: bool) -> str:
     """Runs a comparison's command line; returns why it failed. The process ends with this one."""
     results, output = _files(comparison, folder)
     for path in (results, output):  # of an earlier run: they would hide a failure
         path.unlink(missing_ok=True)
     words = python("pebble.cli", *comparison.arguments(quick), "--output", folder)
-    until = time.monotonic() + _TIMEOUT_FACTOR * comparison.expected_s(quick) + _TIMEOUT_EXTRA_S
+    until = time.monotonic() + TIMEOUT_FACTOR * comparison.expected_s(quick) + TIMEOUT_EXTRA_S
     program = Program(comparison.name, [*_PLAIN, *words], output)
     try:
         while (code := program.code) is None and time.monotonic() < until:

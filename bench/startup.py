@@ -10,7 +10,7 @@ from functools import partial
 from typing import Any
 
 from pebble.bench.clients import RATE_HZ, UP_S, RobotSubscriber, StockClient, driving, ready_robot
-from pebble.bench.comparison import Budget, Case, Comparison, rounds, variants
+from pebble.bench.comparison import Budget, Case, Comparison, Measuring, Report, rounds, variants
 from pebble.bench.pictures import dots
 from pebble.bench.results import Cell
 from pebble.bench.tables import SPREAD, Claims, Grid
@@ -184,15 +184,15 @@ STARTUP = Comparison(
     quick=Budget(23, rounds=3, joins=3),
     constants={"rate_hz": RATE_HZ},
     variants=KINDS,
-    measure=measure,
-    measures=MEASURES,
-    figures={"topics": max},
-    tables=(
-        Grid(
-            title="median (minimum to maximum) of the launches", rows=("measure", "unit"), heads=("", "unit"),
-            columns=(SPREAD,), ratio=True,
+    measuring=Measuring(measure=measure, measures=MEASURES, figures={"topics": max}),
+    report=Report(
+        tables=(
+            Grid(
+                title="median (minimum to maximum) of the launches", rows=("measure", "unit"), heads=("", "unit"),
+                columns=(SPREAD,), ratio=True,
+            ),
         ),
+        assessment=(Claims(judged=lambda cell: cell.measure not in PICTURES),),
+        pictures=(dots("Start-up"),),
     ),
-    assessment=(Claims(judged=lambda cell: cell.measure not in PICTURES),),
-    pictures=(dots("Start-up"),),
 )  # fmt: skip

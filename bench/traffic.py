@@ -20,7 +20,7 @@ from rich.table import Table
 
 from pebble.bench.aims import outcome
 from pebble.bench.clients import driving
-from pebble.bench.comparison import Budget, Case, Comparison, Run
+from pebble.bench.comparison import Budget, Case, Comparison, Measuring, Report, Run
 from pebble.bench.pictures import Drawn
 from pebble.bench.results import Cell, Judged, Results, Value
 from pebble.bench.tables import plain_table
@@ -226,10 +226,11 @@ TRAFFIC = Comparison(
     full=Budget(140, idle_s=40.0, session_s=80.0),
     quick=Budget(19, idle_s=7.0, session_s=6.0),
     constants={"robots": list(ROBOTS)},
-    prepare=prepare,
-    measure=measure,
-    tables=(tables,),
-    assessment=(assessment,),
-    complete=bool,  # a robot without outages is no failure
-    pictures=(Drawn("pebble.bench.traffic:figures"),),
+    measuring=Measuring(prepare=prepare, measure=measure),
+    report=Report(
+        tables=(tables,),
+        assessment=(assessment,),
+        complete=bool,  # a robot without outages is no failure
+        pictures=(Drawn("pebble.bench.traffic:figures"),),
+    ),
 )

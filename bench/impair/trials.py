@@ -14,7 +14,7 @@ from pathlib import Path
 import msgspec
 
 from pebble.bench.aims import Aim, outcome, single, with_lost
-from pebble.bench.comparison import Budget, Comparison, Option, Round, Run
+from pebble.bench.comparison import Budget, Comparison, Measuring, Option, Report, Round, Run
 from pebble.bench.impair import metrics
 from pebble.bench.impair.conditions import CONDITIONS, Condition
 from pebble.bench.impair.metrics import OperatorReport, Plan, Trial, cells_of, over_time
@@ -372,14 +372,18 @@ IMPAIR = Comparison(
         "soundboard": f"a wav file of {CLIP_S:g} s, played by a simulated loudspeaker",
     },
     variants=SUBJECTS,
-    prepare=lambda _run: require_namespaces(),
-    environment=robots,
-    measure_round=measure,
-    figures={"sent": lambda values: values[-1]},  # of the only round; None if nothing arrived
-    tables=TABLES,
-    assessment=(*AIMS, encodings, trips, transports),
-    complete=lambda _cells: True,  # in the worst trials nothing may arrive
-    pictures=(Drawn("pebble.bench.impair.pictures:over_trials"), Drawn("pebble.bench.impair.pictures:over_time")),
+    measuring=Measuring(
+        prepare=lambda _run: require_namespaces(),
+        environment=robots,
+        measure_round=measure,
+        figures={"sent": lambda values: values[-1]},  # of the only round; None if nothing arrived
+    ),
+    report=Report(
+        tables=TABLES,
+        assessment=(*AIMS, encodings, trips, transports),
+        complete=lambda _cells: True,  # in the worst trials nothing may arrive
+        pictures=(Drawn("pebble.bench.impair.pictures:over_trials"), Drawn("pebble.bench.impair.pictures:over_time")),
+    ),
     words=("impair",),
     root=True,
 )  # fmt: skip

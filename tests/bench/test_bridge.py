@@ -53,7 +53,7 @@ FORWARDER, SERIAL = PARTS = tuple(SERVICES)
 
 
 def lines_of(cells: list[Cell]) -> list[str]:
-    return [str(one) for one in BRIDGE.assessed(cells)]
+    return [str(one) for one in BRIDGE.report.assessed(cells)]
 
 
 def test_no_two_commands_are_alike_within_hours() -> None:
@@ -205,7 +205,7 @@ def _fakes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(FakeRobot, "driven", [])
     monkeypatch.setattr(FakeRobot, "work", [])
     monkeypatch.setattr(bridge, "driven_robot", FakeRobot)
-    monkeypatch.setattr(bridge, "_STARTUP_S", 0.0)
+    monkeypatch.setattr(bridge, "STARTUP_S", 0.0)
     monkeypatch.setattr(engine, "find_spec", lambda _name: None)
 
 
@@ -367,14 +367,16 @@ def cpu(kind: str, us: float, part: str = FORWARDER, load: str = UNLOADED, round
 
 def shown(cells: list[Cell]) -> str:
     printed = Console(file=io.StringIO(), width=120, record=True)
-    for table in BRIDGE.shown(cells):
+    for table in BRIDGE.report.shown(cells):
         printed.print(table)
     return printed.export_text()
 
 
 def aims(cells: list[Cell]) -> dict[str, str]:
     """Those that are ratios: what was measured, by outcome and aim."""
-    found = [line for line in BRIDGE.assessed(cells) if isinstance(line, Judged) and line.what.endswith("paho's")]
+    found = [
+        line for line in BRIDGE.report.assessed(cells) if isinstance(line, Judged) and line.what.endswith("paho's")
+    ]
     return {f"{line.outcome}: {line.what}": line.measured for line in found}
 
 
@@ -431,10 +433,10 @@ def test_the_table_of_a_profile_has_a_row_for_each_hop() -> None:
         Cell(variant="mqtt", params={"hop": name}, measure="hop", unit="ms", rounds=[9 * [ms] + [9.0]])
         for name, ms in zip(bridge.HOPS["mqtt"], (0.1, 0.2, 0.3, 0.4, 0.5, 1.5), strict=True)
     ]
-    (table,) = BRIDGE_PROFILE.shown(cells)
+    (table,) = BRIDGE_PROFILE.report.shown(cells)
     assert list(table.columns[1].cells) == [*bridge.HOPS["mqtt"]]
     assert [list(table.columns[at].cells)[-1] for at in (2, 3, 5)] == ["1.50", "9.00", "10"]
-    assert BRIDGE_PROFILE.assessed(cells) == []
+    assert BRIDGE_PROFILE.report.assessed(cells) == []
 
 
 def test_commands_are_found_in_the_packets_that_carry_them() -> None:

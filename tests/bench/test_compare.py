@@ -79,7 +79,7 @@ def test_a_faster_run_is_better_and_exits_with_0(tmp_path: Path) -> None:
 
 @pytest.mark.thorough
 def test_noise_rarely_shows_a_change(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ratios, "_RESAMPLES", 500)
+    monkeypatch.setattr(ratios, "RESAMPLES", 500)
     runs = [(results(2 * n, each=3), results(2 * n + 1, each=3)) for n in range(300)]
     false_alarms = sum(any(finding.changed for finding in compare(a, b, threshold=1.0)) for a, b in runs)
     assert false_alarms <= 6  # 3 are expected; with 5 % instead of 1 %, so few would occur in one of a hundred tests

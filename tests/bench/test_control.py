@@ -171,7 +171,7 @@ def test_a_clock_that_is_slewed_is_not_used(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_a_missing_far_echo_is_reported(url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(control_far, "_ANSWER_S", 0.3)
+    monkeypatch.setattr(control_far, "ANSWER_S", 0.3)
     with pytest.raises(PebbleError, match="run `pebble bench echo URL` on the other machine"):
         ran(CONTROL_FAR, tmp_path, far=url)
 
@@ -194,7 +194,7 @@ def far_cells(exchanges: Sequence[Exchange], monkeypatch: pytest.MonkeyPatch, of
 
 def shown(cells: Sequence[Cell]) -> str:
     printed = io.StringIO()
-    Console(file=printed, width=100).print(*CONTROL_FAR.shown(cells))
+    Console(file=printed, width=100).print(*CONTROL_FAR.report.shown(cells))
     return printed.getvalue()
 
 

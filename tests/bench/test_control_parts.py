@@ -61,7 +61,7 @@ def lines_of(cells: list[Cell]) -> list[str]:
 def shown(cells: list[Cell]) -> str:
     """The tables."""
     printed = io.StringIO()
-    Console(file=printed, width=100).print(*CONTROL.shown(cells))
+    Console(file=printed, width=100).print(*CONTROL.report.shown(cells))
     return printed.getvalue()
 
 

@@ -73,14 +73,14 @@ def test_without_pictures_there_is_no_cpu_per_picture() -> None:
 
 def test_the_table_has_the_processes_of_both_within_100_columns(cells: list[Cell]) -> None:
     out = io.StringIO()
-    Console(file=out, width=100).print(*COST.shown(cells))
+    Console(file=out, width=100).print(*COST.report.shown(cells))
     shown = out.getvalue()
     assert all(name in shown for name in ("idle", "json+pcm", "launcher", "mosquitto", "zenoh_hub", "all"))
     assert "…" not in shown
 
 
 def test_the_assessment_is_about_sums(cells: list[Cell]) -> None:
-    printed = "\n".join(map(str, COST.assessed(cells)))
+    printed = "\n".join(map(str, COST.report.assessed(cells)))
     assert "idle, memory: mqtt 31.5 (30.0 to 33.0) MB, zenoh 60.0 (60.0 to 60.0) MB\n" in printed
     assert "json+pcm, CPU per delivered picture: mqtt 4.20" in printed
     assert "json+pcm, pictures per second: mqtt 15.0 (15.0 to 15.0) 1/s" in printed

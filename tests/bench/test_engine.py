@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,9 @@ from pebble.bench.comparison import (
     Budget,
     Case,
     Comparison,
+    Measuring,
     Option,
+    Report,
     Round,
     Run,
     find,
@@ -52,7 +54,12 @@ def declared(**more: Any) -> Comparison:
         "conditions": lambda _run: SIZES,
         "measure": lambda case: [case.cell("way", "us", [100.0])],
     }
-    return Comparison(title="Waking up", what="", **{**given, **more})
+    given |= more
+    measuring, report = (
+        kind(**{one.name: given.pop(one.name) for one in fields(kind) if one.name in given})
+        for kind in (Measuring, Report)
+    )
+    return Comparison(title="Waking up", what="", measuring=measuring, report=report, **given)
 
 
 def measured(about: Comparison, folder: Path, **given: Any) -> Results:
@@ -168,7 +175,7 @@ def test_variants_that_cannot_be_measured_are_left_out(tmp_path: Path) -> None:
     about = declared(missing=lambda name: "no sockets here" if name == "socket" else None)
     assert {cell.variant for cell in measured(about, tmp_path).cells} == {"pipe"}
     with pytest.raises(PebbleError, match="no variant"):
-        engine.run(replace(about, missing=lambda _name: "nothing").run_of(output=tmp_path))
+        engine.run(replace(about, measuring=Measuring(missing=lambda _name: "nothing")).run_of(output=tmp_path))
 
 
 def test_what_ended_a_run_early_is_raised_when_results_are_written(tmp_path: Path) -> None:

@@ -4,7 +4,6 @@ import io
 import json
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +11,7 @@ import pytest
 from rich.console import Console
 
 from pebble.bench import engine
-from pebble.bench.comparison import Case, Round
+from pebble.bench.comparison import Case, Measuring, Round
 from pebble.bench.engine import Collected, run
 from pebble.bench.estop import (
     ALL,
@@ -120,7 +119,7 @@ def cells(*rounds: Iterator[Cell]) -> list[Cell]:
 
 
 def assessment(found: list[Cell]) -> list[str]:
-    return [str(line) for line in ESTOP.assessed(found)]
+    return [str(line) for line in ESTOP.report.assessed(found)]
 
 
 def test_a_cell_has_the_samples_of_each_round() -> None:
@@ -154,7 +153,7 @@ def test_a_stop_that_did_not_happen_misses_its_aim() -> None:
 
 def test_the_table_names_every_measure_within_130_columns() -> None:
     out = io.StringIO()
-    Console(file=out, width=130).print(*ESTOP.shown(cells(one_round(2.0))))
+    Console(file=out, width=130).print(*ESTOP.report.shown(cells(one_round(2.0))))
     assert all(measure in out.getvalue() for measure in (REST, CONFIRMED, HOLD))
     assert "…" not in out.getvalue()
 
@@ -176,7 +175,7 @@ def test_a_run_repeats_itself() -> None:
 
 def test_results_are_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     swept: list[bool] = []
-    measured = replace(ESTOP, environment=lambda _run: nullcontext(), measure_round=lambda _round: one_round(2.0))
+    measured = replace(ESTOP, measuring=Measuring(measure_round=lambda _round: one_round(2.0)))
     monkeypatch.setattr(engine, "sweep", lambda: swept.append(True))
     out = io.StringIO()
     assert run(measured.run_of(rounds=2, output=tmp_path, console=Console(file=out, width=130))) == 0

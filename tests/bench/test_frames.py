@@ -120,7 +120,7 @@ def test_workers_end_with_a_killed_bench(temporary: Path) -> None:
 def test_what_is_not_installed_is_left_out_with_the_command_that_installs_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(frames, "_SYSTEM_PYTHON", "/nowhere/python3")
+    monkeypatch.setattr(frames, "SYSTEM_PYTHON", "/nowhere/python3")
     printed = io.StringIO()
     run = FRAMES.run_of(variants=["zenoh-shm", "gstreamer-shm"], console=Console(file=printed, width=80))
     assert engine.roles_of(run) == ["zenoh-shm"]

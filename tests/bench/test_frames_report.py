@@ -37,7 +37,7 @@ def eight_rounds(variant: str, latency_us: float, **more: Any) -> Cell:
 
 
 def assessment(cells: Sequence[Cell]) -> list[str]:
-    return [str(line) for line in FRAMES.assessed(cells)]
+    return [str(line) for line in FRAMES.report.assessed(cells)]
 
 
 def test_every_round_keeps_its_place_and_its_samples() -> None:
@@ -65,7 +65,7 @@ def test_each_reader_is_to_read_each_frame() -> None:
 def test_a_case_that_never_ran_is_there_and_empty() -> None:
     cell = cell_of("mqtt", [FAILED] * 8)
     assert (cell.samples, cell.figures, cell.lost) == ([], {}, None)
-    [table] = FRAMES.shown([cell])
+    [table] = FRAMES.report.shown([cell])
     assert table.row_count == 1
     assert assessment([eight_rounds("zenoh-shm", 5.0), cell])[0].endswith("nothing was measured")
 
@@ -73,7 +73,7 @@ def test_a_case_that_never_ran_is_there_and_empty() -> None:
 def test_a_cell_has_the_name_of_its_role() -> None:
     cell = cell_of("mqtt again", [a_round(1)])
     assert cell.variant == "mqtt again"
-    assert len(FRAMES.shown([cell])) == 1
+    assert len(FRAMES.report.shown([cell])) == 1
 
 
 def test_words_compare_like_with_like() -> None:
@@ -120,7 +120,7 @@ def test_one_table_for_each_size_and_number_of_readers() -> None:
         for count in (1, 3)
         for name in VARIANTS
     ]
-    tables = FRAMES.shown(cells)
+    tables = FRAMES.report.shown(cells)
     assert [table.title for table in tables] == [
         f"{size} BGR at 30 Hz, readers: {count}" for size in (SMALL, HD) for count in (1, 3)
     ]

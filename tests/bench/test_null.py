@@ -97,7 +97,7 @@ class Processes:
 )
 def test_frames_against_themselves(tmp_path: Path, obedient: bool, quick: bool, code: int, outcome: str) -> None:
     printed = io.StringIO()
-    about = replace(FRAMES_NULL, measure=Processes(obedient=obedient))
+    about = replace(FRAMES_NULL, measuring=replace(FRAMES_NULL.measuring, measure=Processes(obedient=obedient)))
     assert engine.run(about.run_of(quick=quick, output=tmp_path, console=Console(file=printed, width=80))) == code
     results = load(tmp_path / "frames-null.json")
     assert [cell.variant for cell in results.cells] == list(null.roles("zenoh-shm"))

@@ -15,7 +15,7 @@ RUNS = 300
 @pytest.fixture(autouse=True)
 def fewer_resamples(monkeypatch: pytest.MonkeyPatch) -> None:
     """A number of resamplings for hundreds of intervals within a second or two."""
-    monkeypatch.setattr(ratios, "_RESAMPLES", 1000)
+    monkeypatch.setattr(ratios, "RESAMPLES", 1000)
 
 
 def make(random: np.random.Generator, rounds: int, *, factor: float = 1.0, mood: float = 0.05) -> Rounds:

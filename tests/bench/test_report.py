@@ -189,7 +189,7 @@ def test_an_interrupted_run_is_marked(tmp_path: Path, monkeypatch: pytest.Monkey
         put(folder, synthetic.sound(), "a table")
         return ""
 
-    monkeypatch.setattr(report, "_run", run)
+    monkeypatch.setattr(report, "run_one", run)
     with pytest.raises(KeyboardInterrupt):
         report.run(plan, tmp_path, quick=True, console=Console(quiet=True))
     assert ran == ["sound", "startup"]
@@ -199,8 +199,8 @@ def test_an_interrupted_run_is_marked(tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 def test_a_hanging_comparison_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(report, "_TIMEOUT_FACTOR", 0)
-    monkeypatch.setattr(report, "_TIMEOUT_EXTRA_S", 0.0)
+    monkeypatch.setattr(report, "TIMEOUT_FACTOR", 0)
+    monkeypatch.setattr(report, "TIMEOUT_EXTRA_S", 0.0)
     plan = [comparison("fleet", "bench", "fleet")]
     monkeypatch.setattr(report, "reported", lambda: plan)
     console = Console(record=True, width=100)

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from pebble.bench import startup
 from pebble.bench.bridge import BRIDGE
-from pebble.bench.comparison import Budget, Case, Comparison, Round
+from pebble.bench.comparison import Budget, Case, Comparison, Measuring, Round
 from pebble.bench.cost import COST, IDLE, MEMORY, cells_of
 from pebble.bench.engine import run
 from pebble.bench.results import Cell, Results, load
@@ -28,7 +28,14 @@ def attempted(outcomes: str, folder: Path, printed: io.StringIO | None = None) -
         yield case.cell("way", "us", [1.0])
 
     budget = Budget(1, rounds=len(outcomes))
-    about = Comparison(name="wake-up", title="Waking up", what="", full=budget, quick=budget, measure=measure)
+    about = Comparison(
+        name="wake-up",
+        title="Waking up",
+        what="",
+        full=budget,
+        quick=budget,
+        measuring=Measuring(measure=measure),
+    )
     code = run(about.run_of(output=folder, console=Console(file=printed or io.StringIO(), width=80)))
     results = load(folder / "wake-up.json")
     assert code == int(not results.complete)
@@ -101,7 +108,7 @@ def test_cost_goes_on(tmp_path: Path) -> None:
             raise PebbleError(f"{case.variant}: a process ended")
         yield from cells_of(case, IDLE, {MEMORY: {"launcher": mb}})
 
-    about = replace(COST, measure=measure)
+    about = replace(COST, measuring=Measuring(measure=measure))
     assert run(about.run_of(rounds=3, variants=["mqtt"], output=tmp_path, console=Console(file=io.StringIO()))) == 0
     results = load(tmp_path / "cost.json")
     assert results.cells[0].rounds == [[1.0], [3.0]]
@@ -115,7 +122,11 @@ def test_the_bridge_goes_on_and_counts_no_half_of_a_round(tmp_path: Path) -> Non
                 raise PebbleError("zenoh: the robot is not up after 30 s")
             yield case.cell("down", "ms", [1.0], sent=1)
 
-    about = replace(BRIDGE, measure_round=measure, conditions=lambda _run: [{"load": "none"}])
+    about = replace(
+        BRIDGE,
+        measuring=replace(BRIDGE.measuring, measure_round=measure),
+        conditions=lambda _run: [{"load": "none"}],
+    )
     assert run(about.run_of(rounds=3, output=tmp_path, console=Console(file=io.StringIO()))) == 0
     results = load(tmp_path / "bridge.json")
     assert {len(cell.rounds) for cell in results.cells} == {2}

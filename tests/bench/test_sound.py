@@ -11,7 +11,7 @@ from rich.console import Console
 
 from pebble.bench.engine import run
 from pebble.bench.results import load
-from pebble.bench.wire import AIM, SOUND, wire_bytes
+from pebble.bench.wire.sound import AIM, SOUND, wire_bytes
 
 
 @pytest.mark.parametrize(

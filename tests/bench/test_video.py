@@ -11,7 +11,9 @@ import pytest
 
 from pebble.bench.engine import run
 from pebble.bench.results import Cell, load
-from pebble.bench.wire import AIMS, SCENES, TOLERANCE, VIDEO, film, ratio_at_equal_quality, ssim
+from pebble.bench.wire.clips import SCENES, film
+from pebble.bench.wire.ssim import ssim
+from pebble.bench.wire.video import AIMS, TOLERANCE, VIDEO, ratio_at_equal_quality
 
 
 def test_similarity_of_known_pictures() -> None:

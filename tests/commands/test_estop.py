@@ -30,8 +30,8 @@ _numbers = itertools.count(1)
 class LiveRobot:
     """A robot on a broker: answers stops and resets, and records every command."""
 
-    def __init__(self, port: int, *owners: str, persisted: bool | None = True, **more: Any) -> None:
-        self.id = f"robot{next(_numbers)}"
+    def __init__(self, port: int, *owners: str, id_: str = "", persisted: bool | None = True, **more: Any) -> None:
+        self.id = id_ or f"robot{next(_numbers)}"
         self.base = f"pebble/robots/{self.id}"
         self.robot = Robot(self.base, *owners, persisted=persisted, **more)
         self.commands: list[Message] = []
@@ -402,9 +402,12 @@ def test_wrong_command_lines(run: Run, arguments: tuple[str, ...], code: int, na
     assert "geheim" not in run.err
 
 
-def test_a_robot_called_reset_can_be_stopped() -> None:
-    assert estop._parse(["pebble/robots/reset"]) == ("", "pebble/robots/reset")
-    assert estop._parse(["reset", "pebble/robots/status"]) == ("reset", "pebble/robots/status")
+def test_a_robot_called_reset_can_be_stopped(run: Run, robot_on: Make, url: str) -> None:
+    robot = robot_on("serial", id_="reset")
+    assert run("estop", robot.base, url) == 0
+    assert robot.latched
+    assert run("estop", "reset", robot.base, url) == 0
+    assert not robot.latched
 
 
 # -- reset and status

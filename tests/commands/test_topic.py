@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import json
-import os
 import signal
 import subprocess
 from collections.abc import Iterator
@@ -12,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.commands.command_line import config_file, program
+from tests.commands.command_line import Run, config_file, program
 from tests.support import Broker
 from tests.transports.zenoh_net import HubProcess
 
@@ -52,12 +51,11 @@ def test_what_is_published_is_echoed_on_either_transport(at: tuple[str, str, str
     assert (pub.returncode, pub_output) == (130, ("", ""))
 
 
-def test_retained_topics_are_listed_with_their_synonym_and_echoed_raw(at: tuple[str, str, str]) -> None:
-    assert program("topic", "pub", "flags/mqtt-video", "true", *at).wait(60) == 0
-    assert program("topic", "pub", "heartbeat", '{"t": 1710969600123}', *at).wait(60) == 0
-    out, err = program("topic", "list", "--seconds", "1", *at).communicate(timeout=60)
-    assert err == ""
-    rows = {line.split()[0]: line.split()[1:] for line in out.splitlines()}
+def test_retained_topics_are_listed_with_their_synonym_and_echoed_raw(at: tuple[str, str, str], run: Run) -> None:
+    assert run("topic", "pub", "flags/mqtt-video", "true", *at) == 0
+    assert run("topic", "pub", "heartbeat", '{"t": 1710969600123}', *at) == 0
+    assert (run("topic", "list", "--seconds", "1", *at), run.err) == (0, "")
+    rows = {line.split()[0]: line.split()[1:] for line in run.out.splitlines()}
     assert rows["incoming/flags/mqtt-video"] == ["yes", "4", "B", "?", "flag"]
     assert rows["outgoing/heartbeat"][0] == "yes"
     assert rows["outgoing/heartbeat"][-3:] == ["state", "(like", "online)"]
@@ -65,8 +63,8 @@ def test_retained_topics_are_listed_with_their_synonym_and_echoed_raw(at: tuple[
     assert out == '{"t": 1710969600123}\n'
 
 
-def test_rates_are_measured_and_retained_messages_do_not_count(at: tuple[str, str, str]) -> None:
-    assert program("topic", "pub", "charging-level", '{"value": 7.4}', *at).wait(60) == 0
+def test_rates_are_measured_and_retained_messages_do_not_count(at: tuple[str, str, str], run: Run) -> None:
+    assert run("topic", "pub", "charging-level", '{"value": 7.4}', *at) == 0
     silent = program("topic", "hz", "charging-level", "--seconds", "1.5", *at)
     pub = program("topic", "pub", "drive-values", "{}", "--rate", "40", *at)
     hz = program("topic", "hz", "drive-values", "--seconds", "3", *at)
@@ -81,8 +79,8 @@ def test_rates_are_measured_and_retained_messages_do_not_count(at: tuple[str, st
     assert (hz.returncode, bw.returncode, silent.returncode) == (0, 0, 1)
 
 
-def test_ctrl_c_ends_an_echo_quietly(at: tuple[str, str, str]) -> None:
-    assert program("topic", "pub", "flags/mqtt-audio", "true", *at).wait(60) == 0
+def test_ctrl_c_ends_an_echo_quietly(at: tuple[str, str, str], run: Run) -> None:
+    assert run("topic", "pub", "flags/mqtt-audio", "true", *at) == 0
     process = program("topic", "echo", "flags/mqtt-audio", *at)
     try:
         assert process.stdout is not None
@@ -94,7 +92,9 @@ def test_ctrl_c_ends_an_echo_quietly(at: tuple[str, str, str]) -> None:
     assert (process.returncode, err) == (130, "")
 
 
-def test_a_config_leads_to_its_own_side_and_to_the_remote_one(tmp_path: Path, local_transports: dict[str, str]) -> None:
+def test_a_config_leads_to_its_own_side_and_to_the_remote_one(
+    tmp_path: Path, run: Run, local_transports: dict[str, str]
+) -> None:
     port = int(local_transports["mqtt"].rpartition(":")[2])
     path = config_file(
         tmp_path,
@@ -104,13 +104,15 @@ def test_a_config_leads_to_its_own_side_and_to_the_remote_one(tmp_path: Path, lo
     )
     sides = {"robot": ("--config", path), "operators": ("--config", path, "--remote")}
     for side, where in sides.items():
-        assert program("topic", "pub", "status", json.dumps({"value": {"side": side}}), *where).wait(60) == 0
+        assert run("topic", "pub", "status", json.dumps({"value": {"side": side}}), *where) == 0
     for side, where in sides.items():
-        out, _ = program("topic", "echo", "status", "-n", "1", "-s", "30", "--raw", *where).communicate(timeout=60)
-        assert json.loads(out)["value"]["side"] == side
+        raw = program("topic", "echo", "status", "-n", "1", "-s", "30", "--raw", *where).communicate(timeout=60)[0]
+        assert json.loads(raw)["value"]["side"] == side
 
 
-def test_a_password_comes_from_a_file_or_the_environment(tmp_path: Path) -> None:
+def test_a_password_comes_from_a_file_or_the_environment(
+    tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
     passwords = tmp_path / "passwords"
     subprocess.run(["mosquitto_passwd", "-b", "-c", str(passwords), "ann", "geheim"], check=True, capture_output=True)
     passwords.chmod(0o644)
@@ -119,12 +121,10 @@ def test_a_password_comes_from_a_file_or_the_environment(tmp_path: Path) -> None
     url = f"mqtt://ann@127.0.0.1:{broker.port}"
     pub = ("topic", "pub", "status", "{}", "--robot", "goob", "--url", url)
     try:
-        assert program(*pub, "--password-file", tmp_path / "right").wait(60) == 0
-        assert program(*pub, env={**os.environ, "PEBBLE_PASSWORD": "geheim"}).wait(60) == 0
-        refused = program(*pub)
-        _, err = refused.communicate(timeout=60)
+        assert run(*pub, "--password-file", tmp_path / "right") == 0
+        assert (run(*pub), run.err.count("\n")) == (1, 1)
+        assert "cannot connect" in run.err
+        monkeypatch.setenv("PEBBLE_PASSWORD", "geheim")
+        assert run(*pub) == 0
     finally:
         broker.stop()
-    assert refused.returncode == 1
-    assert err.count("\n") == 1
-    assert "cannot connect" in err

@@ -17,7 +17,7 @@ from rich.console import Console
 
 from pebble import cli
 from pebble.bench import engine
-from pebble.bench.comparison import Case
+from pebble.bench.comparison import Case, Measuring
 from pebble.bench.fleet import FLEET, STEPS, cell_of, latencies_ms, longest_gap_s, measure
 from pebble.bench.results import load
 from pebble.errors import ConfigError, PebbleError
@@ -123,7 +123,8 @@ def test_figures_are_shown_and_written(tmp_path: Path) -> None:
     sent = {"minilamp-001": [0, second], "benjr-001": [0]}
     answer = {"sent": sent, "late": 0, "heartbeats": heartbeats}
     moves = {name: [Moved(ms * 1_000_000, name, (1.0, 1.0))] for name, ms in (("minilamp-001", 1), ("benjr-001", 9))}
-    measured = replace(FLEET, measure=lambda case: [cell_of(case, answer, moves, {"fleet": 1.0, "mb": 8.0})])
+    measure = Measuring(measure=lambda case: [cell_of(case, answer, moves, {"fleet": 1.0, "mb": 8.0})])
+    measured = replace(FLEET, measuring=measure)
     out = StringIO()
     assert engine.run(measured.run_of(robots=2, output=tmp_path, console=Console(file=out, width=120))) == 0
     # p50 … max, n, lost, sent, late

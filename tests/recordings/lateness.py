@@ -36,8 +36,7 @@ def lateness(path: Path, port: int, speed: float) -> tuple[list[float], float]:
         def publish(message: Message) -> bool:
             accepted = robots.publish(message)
             if accepted:
-                due_s = (player._next.log_ns - player._from_ns) / 1e9 / speed if player._next else 0.0
-                late.append(1000 * (time.monotonic() - player._from - due_s))
+                late.append(1000 * player.late_s)
             return accepted
 
         player = Player(source, rules, publish, wall_ns=time.time_ns, speed=speed, **clocks)  # type: ignore[arg-type]

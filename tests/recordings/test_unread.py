@@ -55,11 +55,6 @@ pytest.importorskip("matplotlib")
 NAME = "20261122T100030Z-000001.state.mcap"
 
 
-@pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
-    return Run(monkeypatch, capsys)
-
-
 def stored(folder: Path, data: bytes, name: str = NAME) -> Path:
     path = folder / "rec" / "2026" / "11" / "22" / name
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -39,7 +39,7 @@ from pebble.recordings.files.writer import Contents
 _TORN, _DAMAGED = "torn_bytes", "damaged_bytes"
 CANNOT_BE_READ: Final = 3  # exit code
 _LIBRARY: Final = "pebble"
-_READERS_S: Final = 5.0  # that finishing waits for readers
+READERS_S: Final = 5.0  # that finishing waits for readers
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +103,7 @@ def _finish(file: BinaryIO, path: Path) -> Finished:
     finished = Finished(contents.messages, contents.missing, damaged, torn)
     if damage.finished and not covers:
         return finished
-    own(file, path, _READERS_S)
+    own(file, path, READERS_S)
     rest = contents.mend_indexes(file, covers)
     _cover(file, covers, contents)
     file.truncate(contents.end_at)

@@ -42,7 +42,7 @@ class OpenFile:
         self.last_ns = 0  # of its messages
         self.pending: list[Item] = []  # what the file has not taken yet
         try:
-            self.writer = McapWriter(_Raw(self.file), library=LIBRARY, packer=packer)
+            self.writer = McapWriter(RawFile(self.file), library=LIBRARY, packer=packer)
             self.writer.metadata("pebble.recording", {**about, "lane": lane})
         except OSError:
             self.discard()
@@ -115,7 +115,7 @@ def lane_of(topic: str, *, is_media: bool) -> str:
     return f"{MEDIA}{'.'.join(levels)}" if plain else OTHER_MEDIA
 
 
-class _Raw:
+class RawFile:
     """A file whose ``write`` is one call."""
 
     def __init__(self, file: BinaryIO) -> None:

@@ -14,7 +14,7 @@ from pebble.recordings.replay.rules import ReplayError
 from pebble.transports import Message, QoS, Transport
 
 LISTEN_S: Final = 2.0  # eight heartbeats of a robot
-_RETURN_S: Final = 5.0  # for the first own message
+RETURN_S: Final = 5.0  # for the first own message
 _TICK_S: Final = 0.05
 _OWN: Final = 4096  # own messages that may still come back
 #: What a robot publishes that is running, wherever its connection leads.
@@ -57,7 +57,7 @@ class LiveRobots:
         if self.found:
             raise ReplayError(f"{self.found} is live: the replay has ended, so that it is not mistaken for the robot")
         for base, since in list(self._awaited.items()):
-            if self._now() - since > _RETURN_S and base not in self._returned:
+            if self._now() - since > RETURN_S and base not in self._returned:
                 raise ReplayError(
                     f"the broker does not deliver {base}/{OUTGOING}/# to this login, or not from it: a live robot "
                     "would not be noticed"

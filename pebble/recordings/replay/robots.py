@@ -13,7 +13,7 @@ from pebble.recordings.replay.live import LiveRobots, base_of_topic
 from pebble.recordings.replay.rules import ReplayError, is_zero
 from pebble.transports import Message, QoS, State, Transport
 
-_OPEN_S: Final = 3.0
+OPEN_S: Final = 3.0
 CLEAR_S: Final = 5.0  # for a connection that is lost at the end, while topics are still retained
 _TICK_S: Final = 0.05
 _MORE: Final = 3  # topics named in an error
@@ -112,18 +112,18 @@ class ReplayedRobots:
     def _opened(self, name: str, will: Message | None) -> Transport:
         transport = self._make(f"{name}-replay", will)
         transport.on_state(self._on_state)
-        transport.open(_OPEN_S)
+        transport.open(OPEN_S)
         self._robots[name] = transport  # so that it is closed in any case
         if transport.state is not State.CONNECTED:
-            raise TransportError(f"cannot connect: {transport.problem or f'no answer within {_OPEN_S:g} s'}")
+            raise TransportError(f"cannot connect: {transport.problem or f'no answer within {OPEN_S:g} s'}")
         return transport
 
     def _listen(self) -> None:
         listener = self._listener = self._make("replay-listener", None)
         listener.on_state(self._on_state)
-        listener.open(_OPEN_S)
+        listener.open(OPEN_S)
         if listener.state is not State.CONNECTED:
-            raise TransportError(f"cannot connect: {listener.problem or f'no answer within {_OPEN_S:g} s'}")
+            raise TransportError(f"cannot connect: {listener.problem or f'no answer within {OPEN_S:g} s'}")
         self._live.listen(listener, self._wait)
 
     def _clear(self) -> list[str]:

@@ -35,7 +35,7 @@ WINDOW = Window(10 * S, 20 * S)
 
 
 def lines_of(cells: list[Cell]) -> list[str]:
-    return [str(one) for one in IMPAIR.assessed(cells)]
+    return [str(one) for one in IMPAIR.report.assessed(cells)]
 
 
 def packet(number: int, late_ms: float = 50, at_ms: float | None = None) -> Sound:
@@ -307,7 +307,7 @@ def test_transports_are_compared_where_both_were_tried() -> None:
 def test_the_tables_fit_a_terminal() -> None:
     tried = [trial(name, condition) for condition in ("wifi-power-save", "64k+5%") for name in SUBJECTS]
     console = Console(file=io.StringIO(), width=80)
-    shown = IMPAIR.shown(cells_of(tried))
+    shown = IMPAIR.report.shown(cells_of(tried))
     assert len(shown) == 4
     for table in shown:
         assert console.measure(table).maximum <= 80

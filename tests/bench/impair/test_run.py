@@ -86,7 +86,7 @@ def go(monkeypatch: pytest.MonkeyPatch, folder: Path, trials: int) -> tuple[list
     printed = io.StringIO()
     monkeypatch.setattr("pebble.bench.engine.find_spec", lambda _name: None)  # no plots
     monkeypatch.setattr("pebble.bench.impair.network.why_no_namespaces", lambda: None)
-    run = replace(IMPAIR, environment=fake_robots(log, trials)).run_of(
+    run = replace(IMPAIR, measuring=replace(IMPAIR.measuring, environment=fake_robots(log, trials))).run_of(
         trials=["1024k", "5%"],
         variants=["mqtt original", "zenoh original", "mqtt h264 opus"],
         output=folder,

@@ -183,8 +183,8 @@ def test_bad_lines_are_reported_and_the_others_read(line: bytes) -> None:
 
 
 def test_a_line_that_is_too_long_is_skipped_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lines, "_LONGEST", 1000)
-    monkeypatch.setattr(lines, "_SKIPPED_AT_ONCE", 300)
+    monkeypatch.setattr(lines, "LONGEST", 1000)
+    monkeypatch.setattr(lines, "SKIPPED_AT_ONCE", 300)
     good = json.dumps(LINE).encode()
     file = _Watched(b"\n".join([good, b"x" * 5000, good, good + b" " * (999 - len(good)), b"x" * 1000]))
     found = list(read_lines(file))

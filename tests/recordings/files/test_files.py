@@ -293,7 +293,7 @@ def test_a_file_is_not_cut_while_it_is_read(tmp_path: Path, monkeypatch: pytest.
     )
     assert reader.stdout is not None
     assert reader.stdout.readline() == "mapped\n"
-    monkeypatch.setattr("pebble.recordings.files.finish._READERS_S", 0.3)
+    monkeypatch.setattr("pebble.recordings.files.finish.READERS_S", 0.3)
     with pytest.raises(OSError, match="is being read: try again later"):
         finish(path)
     reader.communicate("\n", 10)

@@ -19,6 +19,7 @@ from pebble.recordings import library
 from pebble.recordings.files.mcap import Recorded
 from pebble.recordings.recorder.intake import EVENTS
 from pebble.transports import Message, MqttSettings, QoS, Transport, create
+from tests.commands.command_line import Run
 from tests.support import AmqttBroker, Broker, until
 
 GOOB = "pebble/robots/goob"
@@ -55,6 +56,12 @@ def recorded(root: Path) -> list[Recorded]:
 
 def of(messages: list[Recorded], topic: str) -> list[bytes]:
     return [message.payload for message in messages if message.channel.topic == topic]
+
+
+def old_topics(root: Path) -> set[str]:
+    """Those of the many values that were retained before."""
+    old = (one.channel.topic for one in recorded(root) if one.channel.metadata.get("retained") == "1")
+    return {topic for topic in old if "/many/" in topic}
 
 
 def events(messages: list[Recorded], name: str) -> list[dict[str, Any]]:
@@ -94,9 +101,10 @@ def test_what_a_subscriber_sees_is_recorded_byte_for_byte_with_its_flags(tmp_pat
     with recording(tmp_path / "rec", broker.port, "--protocol", protocol):
         publish_all(robot, reference)
         robot.publish(STATUS, b"{}", qos=QoS.DELIVERED, retain=True)
-        robot.publish("pebble/infrastructure", b"1")
         robot.publish("replay/robots/goob/outgoing/online", b"{}", retain=True)
-        time.sleep(2.5)  # the retained messages are fetched beside
+        robot.publish("pebble/infrastructure", b"1")
+        assert until(lambda: of(recorded(tmp_path / "rec"), "pebble/infrastructure"), step=0.2)
+        assert until(lambda: len(old_topics(tmp_path / "rec")) == 1500, step=0.2)  # they are fetched beside
     found = recorded(tmp_path / "rec")
     for topic in (AUDIO, DRIVE):
         assert of(found, topic) == reference.of(topic)
@@ -110,7 +118,7 @@ def test_what_a_subscriber_sees_is_recorded_byte_for_byte_with_its_flags(tmp_pat
     assert flags["pebble/infrastructure"]["qos"] == "0"
     old = [message for message in found if message.channel.metadata.get("retained") == "1"]
     assert of(old, FLAG) == [b"true"]
-    assert len({message.channel.topic for message in old if "/many/" in message.channel.topic}) == 1500
+    assert len(old_topics(tmp_path / "rec")) == 1500
     robot.close()
     reference.transport.close()
     broker.stop()
@@ -123,7 +131,7 @@ def test_a_broker_that_knows_only_mqtt_3(tmp_path: Path) -> None:
         reference = Reference(broker.port)
         with recording(tmp_path / "rec", broker.port, "--protocol", "3.1.1"):
             publish_all(robot, reference, 50)
-            time.sleep(1.0)
+            assert until(lambda: len(of(recorded(tmp_path / "rec"), DRIVE)) == 50, step=0.2)
         assert of(recorded(tmp_path / "rec"), DRIVE) == reference.of(DRIVE)
         robot.close()
         reference.transport.close()
@@ -136,7 +144,7 @@ def test_a_killed_recorder_is_continued_by_the_next(tmp_path: Path) -> None:
     robot, reference = client(broker.port), Reference(broker.port)
     with recording(root, broker.port) as process:
         publish_all(robot, reference, 200)
-        time.sleep(1.5)
+        assert until(lambda: len(of(recorded(root), DRIVE)) == 200, step=0.2)
         process.kill()
     active = [path for path in library.files([root]) if path.name.endswith(".active")]
     assert len(active) == 2
@@ -144,7 +152,7 @@ def test_a_killed_recorder_is_continued_by_the_next(tmp_path: Path) -> None:
     with recording(root, broker.port):
         assert until(lambda: not any(path.exists() for path in active), 10)
         publish_all(robot, Reference(broker.port), 20)
-        time.sleep(1.0)
+        assert until(lambda: len(of(recorded(root), DRIVE)) == 220, step=0.2)
     found = recorded(root)
     assert len(of(found, DRIVE)) == 220
     assert [event["missing"] for event in events(found, "recovered")] == [0, 0]
@@ -160,14 +168,14 @@ def test_an_outage_is_a_gap(tmp_path: Path, how: str) -> None:
         began = time.time()
         if how == "killed":
             broker.kill()
-            time.sleep(3.0)
+            time.sleep(1.0)
             broker.start()
         else:
             os.kill(broker.pid, signal.SIGSTOP)
-            time.sleep(4.0)
+            time.sleep(3.0)
             os.kill(broker.pid, signal.SIGCONT)
         ended = time.time()
-        time.sleep(4.0)
+        assert until(lambda: events(recorded(root), "gap"), 10, step=0.2)
     (gap,) = events(recorded(root), "gap")
     assert gap["why"] == "no connection"
     assert gap["since"] / 1e3 == pytest.approx(began, abs=3.0)  # a silence is noticed after two seconds
@@ -197,27 +205,19 @@ class TestErrors:
             (("--settings", "{tmp}/none.json"), "No such file"),
         ],
     )
-    def test_one_line(self, tmp_path: Path, arguments: tuple[str, ...], problem: str) -> None:
-        filled = [argument.replace("{tmp}", str(tmp_path)) for argument in arguments]
-        done = subprocess.run(
-            [sys.executable, "-m", "pebble", "record", *filled],
-            capture_output=True,
-            text=True,
-            cwd=tmp_path,
-            timeout=60,
-        )
-        assert done.returncode != 0
-        assert problem in done.stderr
-        assert len(done.stderr.strip().splitlines()) == 1
+    def test_one_line(
+        self, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], problem: str
+    ) -> None:
+        monkeypatch.chdir(tmp_path)
+        assert run("record", *(argument.replace("{tmp}", str(tmp_path)) for argument in arguments)) != 0
+        assert problem in run.err
+        assert len(run.err.strip().splitlines()) == 1
 
-    def test_a_key_in_its_file(self, tmp_path: Path) -> None:
+    def test_a_key_in_its_file(self, tmp_path: Path, run: Run) -> None:
         path = tmp_path / "record.json"
         path.write_text('{"connections": [{"url": "mqtt://127.0.0.1"}], "rotate": 5}')
-        done = subprocess.run(
-            [sys.executable, "-m", "pebble", "record", "--settings", path], capture_output=True, text=True, timeout=60
-        )
-        assert done.returncode == 1
-        assert "`rotate`" in done.stderr
+        assert run("record", "--settings", path) == 1
+        assert "`rotate`" in run.err
 
 
 def test_a_file_of_its_own(tmp_path: Path) -> None:

@@ -22,13 +22,13 @@ from pebble.recordings import library
 from pebble.recordings.files.finish import finish
 from pebble.recordings.files.mcap import Recorded, RecordingError
 from pebble.recordings.files.reader import mapped, metadata_of, read
-from pebble.recordings.recorder import lane as lane_module
 from pebble.recordings.recorder.folder import Folder
 from pebble.recordings.recorder.intake import EVENTS, Clocks
+from pebble.recordings.recorder.lane import RawFile
 from pebble.recordings.recorder.recorder import Recorder
 from pebble.recordings.recorder.settings import Options
 from tests.small_disk import SmallDisk
-from tests.support import beside, needs_root, until
+from tests.support import beside, cases, needs_root, until
 
 BASE = "pebble/robots/goob"
 ONLINE, CAMERA = f"{BASE}/outgoing/online", f"{BASE}/outgoing/front-camera"
@@ -116,7 +116,7 @@ class TestFiles:
 
     def test_times_are_those_of_reception(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         """However long the disk holds up the writer, and whatever happens to the recording meanwhile."""
-        monkeypatch.setattr(lane_module._Raw, "write", _slowly(lane_module._Raw.write, 0.4))
+        monkeypatch.setattr(RawFile, "write", _slowly(RawFile.write, 0.4))
         running = Running(tmp_path / "rec")
         for _ in range(60):
             running.send(payload=b'{"t":%d}' % (time.time_ns() // 10**6))
@@ -231,7 +231,7 @@ class TestDisk:
     def test_a_slow_disk_blocks_no_sender_and_costs_pictures_first(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr(lane_module._Raw, "write", _slowly(lane_module._Raw.write, 0.7))
+        monkeypatch.setattr(RawFile, "write", _slowly(RawFile.write, 0.7))
         running = Running(tmp_path / "rec", Options(free_bytes=0, queue_bytes=600_000, flush_seconds=0.2))
         running.send()
         assert until(lambda: running.recorder.waiting == 0, 10)
@@ -249,7 +249,7 @@ class TestDisk:
     def test_a_full_disk_loses_only_what_comes_meanwhile_and_the_count_is_written_down(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        full, write = threading.Event(), lane_module._Raw.write
+        full, write = threading.Event(), RawFile.write
 
         def raw_write(self: Any, data: memoryview) -> int | None:
             if full.is_set():
@@ -258,7 +258,7 @@ class TestDisk:
                 return write(self, data[:40])  # a part of it still fits
             return write(self, data)
 
-        monkeypatch.setattr(lane_module._Raw, "write", raw_write)
+        monkeypatch.setattr(RawFile, "write", raw_write)
         running = Running(tmp_path / "rec")
         running.send(100)
         assert running.written(100)
@@ -371,7 +371,7 @@ class TestDisk:
         running = Running(tmp_path / "rec")
         running.send(20)
         assert running.written(20)
-        monkeypatch.setattr(lane_module._Raw, "write", full)
+        monkeypatch.setattr(RawFile, "write", full)
         running.send(30)
         assert until(lambda: bool(running.recorder.blocked), 10)
         running.send(40)
@@ -455,7 +455,7 @@ class TestEnds:
     def test_killed_at_any_moment_it_loses_a_second_at_most(self, tmp_path: Path) -> None:
         """What a killed recorder leaves is finished by the next one."""
         root, rng, lost = tmp_path / "rec", random.Random(4), []
-        for _ in range(6):
+        for _ in range(cases(2, 6)):
             with subprocess.Popen([sys.executable, "-c", _CHILD, root], stdout=subprocess.PIPE, text=True) as child:
                 assert child.stdout is not None
                 child.stdout.readline()
@@ -484,9 +484,9 @@ class TestEnds:
     def test_power_is_lost(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         """Images of the disk: what was synced, and random pages of the rest. Each opens, and says what is missing."""
         disk = _Disk(monkeypatch)
-        running = Running(tmp_path / "rec", Options(free_bytes=0, flush_seconds=0.05, sync_seconds=2.0, level=1))
+        running = Running(tmp_path / "rec", Options(free_bytes=0, flush_seconds=0.05, sync_seconds=1.0, level=1))
         rng = random.Random(9)
-        ends = time.monotonic() + 5.0
+        ends = time.monotonic() + cases(3, 5)
         while time.monotonic() < ends:
             running.send(20, payload=b'{"t": %d, "x": "' + rng.randbytes(150).hex().encode() + b'"}')
             time.sleep(0.01)
@@ -494,7 +494,7 @@ class TestEnds:
         running.stop()
         path = tmp_path / "image.mcap"
         complete = {message.sequence: message.payload for message in recorded(running.root)}
-        missing, images = 0, int(os.environ.get("PEBBLE_POWER_LOSSES", "100"))
+        missing, images = 0, cases(20, 100)
         for _ in range(images):
             image, synced = disk.image(log, rng)
             path.write_bytes(image)
@@ -519,7 +519,7 @@ class _Disk:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.log: list[bytes | None] = []  # None: synced
-        write, fdatasync = lane_module._Raw.write, os.fdatasync
+        write, fdatasync = RawFile.write, os.fdatasync
 
         def raw_write(raw: Any, data: memoryview) -> int | None:
             self.log.append(bytes(data))
@@ -529,7 +529,7 @@ class _Disk:
             fdatasync(descriptor)
             self.log.append(None)
 
-        monkeypatch.setattr(lane_module._Raw, "write", raw_write)
+        monkeypatch.setattr(RawFile, "write", raw_write)
         monkeypatch.setattr(os, "fdatasync", sync)
 
     @staticmethod

@@ -17,6 +17,7 @@ import pytest
 
 from pebble.bench.results import percentile
 from pebble.recordings.files.finish import finish
+from pebble.recordings.replay import live
 from pebble.recordings.replay import robots as replayed_robots
 from pebble.transports import Message, MqttSettings, QoS, create
 from tests.commands.command_line import Run, program
@@ -103,8 +104,8 @@ def walk(folder: Path, seconds: int = 60) -> Path:
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """The player of this process listens more briefly."""
-    monkeypatch.setattr(replayed_robots, "LISTEN_S", 0.3)
-    monkeypatch.setattr(replayed_robots, "_OPEN_S", 1.0)
+    monkeypatch.setattr(live, "LISTEN_S", 0.3)
+    monkeypatch.setattr(replayed_robots, "OPEN_S", 1.0)
 
 
 @contextmanager
@@ -331,7 +332,7 @@ def test_messages_are_not_late(tmp_path: Path, broker: Broker, quick: None) -> N
 def test_a_broker_that_delivers_nothing_ends_it(
     tmp_path: Path, run: Run, quick: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(replayed_robots, "_RETURN_S", 0.5)
+    monkeypatch.setattr(live, "RETURN_S", 0.5)
     (tmp_path / "acl").write_text("topic write #\n")
     broker = Broker(tmp_path, f"acl_file {tmp_path / 'acl'}")
     assert run("replay", walk(tmp_path), "--url", f"mqtt://127.0.0.1:{broker.port}") == 1

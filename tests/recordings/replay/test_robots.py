@@ -181,7 +181,7 @@ def test_a_refused_subscription_ends_it(network: Network, monkeypatch: pytest.Mo
 
 
 def test_without_a_broker_there_is_one_error(network: Network, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(replayed_robots, "_OPEN_S", 0.05)
+    monkeypatch.setattr(replayed_robots, "OPEN_S", 0.05)
     network.hub.stop()
     with pytest.raises(TransportError, match="cannot connect: the hub is away"), network.robots():
         pass

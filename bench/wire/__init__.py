@@ -1,0 +1,1 @@
+"""Bytes on the wire: what the encoders of pictures and sound make, without sending it."""
