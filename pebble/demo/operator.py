@@ -18,16 +18,16 @@ from typing import NamedTuple
 
 from pebble import contract
 from pebble.client.discovery import ALL_OUTGOING, Discovery
-from pebble.client.driver_lease import FILTER, VALID_S
+from pebble.client.driver_lease import FILTER
 from pebble.client.estop import StopSender, new_name
 from pebble.client.estop_states import Reset
 from pebble.client.robot_view import RobotView
-from pebble.contract import APRILTAG_DATA, AUTONOMY_COMMAND, DRIVE, DRIVING, SOUNDBOARD_COMMAND, codec
+from pebble.contract import APRILTAG_DATA, AUTONOMY_COMMAND, DRIVE, SOUNDBOARD_COMMAND, codec
 from pebble.contract.payloads import AutonomyCommand, Drive, LightsFlash, LightsSolid, SoundboardCommand, TagData
+from pebble.demo.visitors import Visitors
 from pebble.errors import PayloadError
 from pebble.motion.arbiter import HOLD_MS
 from pebble.rig.testbed import CLIP, TAG_ID
-from pebble.services.serial_mcu_bridge.text.goob_base import mix
 from pebble.transports import Message, MqttSettings, QoS, create
 
 COMMAND_PERIOD_S = 0.05  # how often a held stick is repeated
@@ -39,6 +39,11 @@ _MOST_WAITING = 1000  # events and completed steps; beyond them the oldest is dr
 _ASSESSED_S = 5.0  # until what was completed is assessed, on the smallest machine
 
 Wheels = tuple[float, float]  # left and right, -1..1
+
+
+def wheels_of(drive: Drive) -> Wheels:
+    """How fast a command turns the wheels; none of the demo's asks for more than full speed."""
+    return drive.z + drive.x, drive.z - drive.x
 
 
 class Step(NamedTuple):
@@ -129,16 +134,15 @@ class Operator:
 
     def __init__(self, port: int, name: str = "pebble-demo-operator") -> None:
         self.discovery = Discovery()
-        self.left_alone: set[str] = set()
         self.again: frozenset[str] = frozenset()
         self.rounds = 0
         self.commands: dict[str, tuple[Drive, float]] = {}  # by base topic: the last one sent, and when
         self.events: deque[tuple[float, str]] = deque(maxlen=_MOST_WAITING)
         self.completed: deque[CompletedStep | CompletedStop | CompletedFollow] = deque(maxlen=_MOST_WAITING)
-        self._doing, self._step_began = "discovering robots", 0.0
+        self._doing = "discovering robots"
+        self._visitors = Visitors(NAME)
         self._robots: list[RobotView] = []  # that take part in the present step
         self._scripted: RobotView | None = None  # if a person takes it, the present step ends
-        self._visits: dict[str, tuple[str, float]] = {}  # by base topic: who drives it from the page, announced when
         self._transport = create("mqtt", name, MqttSettings(host="127.0.0.1", port=port))
         self._stopping = threading.Event()
         self._thread = threading.Thread()
@@ -147,7 +151,7 @@ class Operator:
         """Connect and subscribe; returns at once."""
         self._transport.open(timeout=0.0)
         self._transport.subscribe(ALL_OUTGOING, lambda one: self.discovery.receive(one, time.monotonic(), time.time()))
-        self._transport.subscribe(FILTER, self._note_visits)
+        self._transport.subscribe(FILTER, lambda one: self._visitors.receive(one, time.monotonic()))
 
     def ready(self, wanted: int) -> bool:
         """Are that many robots online, with a drive topic?"""
@@ -161,8 +165,14 @@ class Operator:
     @property
     def activity(self) -> str:
         """What it does, and which robots it leaves alone."""
-        others = [f"{robot.name} {why}" for robot in self.discovery.all_robots() if (why := self._taken(robot))]
+        robots, now = self.discovery.all_robots(), time.monotonic()
+        others = [f"{robot.name} {why}" for robot in robots if (why := self._visitors.taken(robot, now))]
         return "; ".join([self._doing, *others])
+
+    @property
+    def left_alone(self) -> set[str]:
+        """Names of robots of which people had the control meanwhile."""
+        return self._visitors.left_alone
 
     def begin(self, yours: str = "") -> None:
         """Start driving all robots discovered so far, round after round; with ``yours`` only once, and then show it."""
@@ -176,32 +186,8 @@ class Operator:
             self._thread.join(1.0)
         self._transport.close()
 
-    # -- people at the page
-
-    def _note_visits(self, message: Message) -> None:
-        """A server announces once a second which robots are driven; what the broker retained is older."""
-        if message.retain:
-            return
-        with suppress(PayloadError):
-            for base, driver in codec.decode(DRIVING, message.payload).robots.items():
-                who = f"{driver.by} on {driver.device}" if driver.device else driver.by
-                self._visits[base] = who, time.monotonic()
-
-    def _taken(self, robot: RobotView) -> str:
-        """Why people have the control of it now; empty: they have not."""
-        who, at = self._visits.get(robot.base, ("", -math.inf))
-        if time.monotonic() - at < VALID_S:
-            return f"is driven by {who}"
-        stop = robot.stopped_by
-        return "" if stop is None or stop.by == NAME else f"is stopped by {stop.by or 'unknown'}"
-
     def _mine(self, robot: RobotView) -> bool:
-        """Whether it may be driven in the present step, in which no person has had it so far."""
-        _, at = self._visits.get(robot.base, ("", -math.inf))
-        if at < self._step_began and not self._taken(robot):
-            return True
-        self.left_alone.add(robot.name)
-        return False
+        return self._visitors.free(robot, time.monotonic())
 
     # -- the operator's thread
 
@@ -213,15 +199,15 @@ class Operator:
                     self._begin(step.name, robots)
                     self._perform(step)
                 if not self.rounds:
-                    self._until_right(EMERGENCY_STOP, partial(self._stop_all, robots))
-                    self._until_right(BY_ITSELF, partial(self._take_over, robots))
+                    self.until_right(EMERGENCY_STOP, partial(self._stop_all, robots))
+                    self.until_right(BY_ITSELF, partial(self._take_over, robots))
                 self.rounds += 1
             self._doing = yours
             self._stopping.wait()
         self._begin("disconnecting", robots)
         self._drive(STOP)
 
-    def _until_right(self, name: str, act: Callable[[], None]) -> None:
+    def until_right(self, name: str, act: Callable[[], None]) -> None:
         """Once, and again while its assessment leaves ``name`` in ``again``."""
         for _ in range(_MOST_TIMES):
             act()
@@ -231,7 +217,8 @@ class Operator:
 
     def _begin(self, step: str, robots: Sequence[RobotView]) -> None:
         """Chooses among those that are free."""
-        self._doing, self._step_began = step, time.monotonic()
+        self._doing = step
+        self._visitors.begin_step(time.monotonic())
         self._robots = [robot for robot in robots if self._mine(robot)]
 
     def _complete(self, *completed: CompletedStep | CompletedStop | CompletedFollow) -> None:
@@ -375,4 +362,4 @@ class Operator:
             self.show(f"ENDS: {FOLLOW}, {robot.name} sees tag {TAG_ID} at {distance_m():.2f} m")
             ended = time.monotonic()
         self._wait(_FOLLOWED_REST_S)
-        return CompletedFollow(robot.name, began, took_over, mix(_BACK.x, _BACK.z), released, ended, CLIP)
+        return CompletedFollow(robot.name, began, took_over, wheels_of(_BACK), released, ended, CLIP)

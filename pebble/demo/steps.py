@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
-from pebble.demo.operator import CompletedStep
+from pebble.demo.operator import CompletedStep, wheels_of
 from pebble.simulation.mcu import Snapshot
 from pebble.simulation.motion import FULL_SPEED_MM_S, TRACK_MM
 from pebble.simulation.trace import Entry
@@ -73,7 +73,7 @@ def assess(
 
 def _reaction(completed: CompletedStep, reports: Sequence[Snapshot]) -> float:
     """Seconds until both wheels turned as commanded; infinite for never."""
-    wanted = (completed.step.drive.z + completed.step.drive.x, completed.step.drive.z - completed.step.drive.x)
+    wanted = wheels_of(completed.step.drive)
     for report in reports:
         speeds = (report.board.left_mm_s, report.board.right_mm_s)
         if all(speed * math.copysign(1, want) > _TURNING_MM_S for speed, want in zip(speeds, wanted, strict=True)):

@@ -22,6 +22,7 @@ from pebble.web import messages as m
 from pebble.web import robot_commands
 from pebble.web.access.login import named, printable
 from pebble.web.driving import Tab
+from pebble.web.log_lines import LogReader
 from pebble.web.pace import Pace
 from pebble.web.page_clock import PING_S, ClockJumpError
 from pebble.web.robots import Interest
@@ -61,12 +62,9 @@ class Control:
         self._wake = asyncio.Event()
         self._pace = Pace(time.monotonic())
         self._waiting: deque[m.ToPage] = deque(maxlen=_WAITING)
-        self._drives = True
         self._why_not = ""  # why this page may not drive at all
-        self._reads_logs = False
-        self._logs_sent = "", 0  # the origin and number of the last line
-        self._logs_due = False  # whether the page has received the part before
-        self._large_due = False  # and the last large value
+        self._logs = LogReader()
+        self._large_due = False  # whether the page has received the last large value
         self._series: deque[str] = deque()  # metrics of the watched component whose past is still to be sent
         self._moved: set[str] = set()  # robots that this lease has moved, for the audit
 
@@ -111,15 +109,15 @@ class Control:
         if not settings.login:
             self._session = named(self._session, hello.name)
             self._tab.user = self._session.user
-        self._drives = settings.plain_http_drive or self._is_secure()
+        drives = settings.plain_http_drive or self._is_secure()
         version = self._websocket.app.state.version
-        if not self._drives:
+        if not drives:
             self._why_not = "This connection is not encrypted: driving is switched off"
         elif hello.version != version:
             self._why_not = _RELOAD
         self._post(
             m.Welcome(
-                server=server.name,
+                server=settings.name,
                 version=version,
                 user=self._session.user,
                 role=self._session.role,
@@ -127,7 +125,7 @@ class Control:
                 login=settings.login,
                 token=self._tab.token,
                 now=1000 * time.time(),
-                drives=self._drives,
+                drives=drives,
                 recordings=settings.recordings is not None,
             )
         )
@@ -184,7 +182,8 @@ class Control:
         match op:
             case m.Echo():
                 self._tab.clock.echo(op.n, op.t, clock())
-                self._logs_due = self._large_due = True
+                self._logs.echoed()
+                self._large_due = True
                 self._post_series()
             case m.DriveOp():
                 self._drive(op)
@@ -293,7 +292,7 @@ class Control:
         if ref == before:
             return
         self._server.robots.watch(self._interest, ref)
-        self._reads_logs = False
+        self._logs.end()
         self._series.clear()
         if ref:
             self._server.watch(ref)
@@ -302,7 +301,7 @@ class Control:
 
     def _read_logs(self, op: m.ReadLogs) -> None:
         if op.ref == self._interest.watched:
-            self._reads_logs, self._logs_sent, self._logs_due = op.on, (op.origin, op.after), True
+            self._logs.begin(op.origin, op.after, on=op.on)
 
     def _lease(self, op: m.Lease) -> None:
         server = self._server
@@ -387,13 +386,8 @@ class Control:
     async def _send_logs(self) -> None:
         """One part at each echo, as _post_series."""
         ref = self._interest.watched
-        lines = self._server.robots.logs.get(ref) if self._reads_logs and self._logs_due else None
-        if lines is None:
-            return
-        origin, number = self._logs_sent
-        run = lines.after(number if origin == lines.origin else 0)
-        if run is not None:
-            self._logs_sent, self._logs_due = (lines.origin, run.first + len(run.lines) - 1), False
+        lines = self._server.robots.logs.get(ref)
+        if lines is not None and (run := self._logs.take(lines)) is not None:
             await self._websocket.send_text(
                 encode(m.Logs(ref=ref, origin=lines.origin, first=run.first, lines=run.lines))
             )

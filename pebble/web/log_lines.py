@@ -63,6 +63,34 @@ class LogLines:
         return Run(first, tuple(run)) if run else None
 
 
+class LogReader:
+    """How far one page has read the lines of the component that it watches: one part at each echo."""
+
+    def __init__(self) -> None:
+        self._on = self._due = False  # due: the page has received the part before
+        self._sent = "", 0  # the origin and number of the last line
+
+    def begin(self, origin: str, number: int, *, on: bool) -> None:
+        """The page has lines until this one; ``on`` False: it wants no more."""
+        self._on, self._sent, self._due = on, (origin, number), True
+
+    def end(self) -> None:
+        self._on = False
+
+    def echoed(self) -> None:
+        self._due = True
+
+    def take(self, lines: LogLines) -> Run | None:
+        """What to send now; it counts as received from now on."""
+        if not (self._on and self._due):
+            return None
+        origin, number = self._sent
+        run = lines.after(number if origin == lines.origin else 0)
+        if run is not None:
+            self._sent, self._due = (lines.origin, run.first + len(run.lines) - 1), False
+        return run
+
+
 def line_of(payload: bytes) -> msgspec.Raw | None:
     """The line as JSON: some robots send plain text. None if it is too long, or nested too deep."""
     if len(payload) > MAX_LINE_BYTES or codec.too_deep(payload):

@@ -81,7 +81,7 @@ class Component:
         """It falls once the component is silent: what was there long ago must not keep out what is there now."""
         self.rank = Rank.of(self.robot.estop, known=known, live=self.live and self.sent_online is not False)
 
-    def heartbeat(self, message: Message, now: float, wall: float) -> bool:
+    def take_heartbeat(self, message: Message, now: float, wall: float) -> bool:
         """Take a heartbeat; whether the component ends with it."""
         payload = self.robot.heartbeat(message, now, wall)
         if payload is None:
@@ -356,7 +356,7 @@ class Robots:
             component.aliases[metric] = _aliases(message.payload)
         elif channel is ONLINE or channel in SYNONYMS:
             arrived = time.time() - (time.monotonic() - now)
-            if component.heartbeat(message, now, arrived) and component.sent_online is not False:
+            if component.take_heartbeat(message, now, arrived) and component.sent_online is not False:
                 self._refresh(component, now)  # it may be back before the next round
         elif channel is STATUS and component.restarts.receive(
             message.payload, int(1000 * time.time()), dated=not message.retain

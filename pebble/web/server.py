@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import logging
 import secrets
-import socket
 import time
 from collections.abc import Coroutine
 from contextlib import suppress
@@ -20,9 +19,7 @@ from pebble.client.robot_topics import FLEET, SYNONYMS
 from pebble.client.robot_view import RobotView
 from pebble.contract import CAPABILITIES, DRIVE, DRIVING, ONLINE, codec
 from pebble.contract.identity import Identity, parse_topic
-from pebble.contract.payloads import Driver
-from pebble.contract.payloads import Driving as DrivingPayload
-from pebble.errors import ConfigError, PayloadError
+from pebble.errors import ConfigError
 from pebble.fleet.audit import Audit
 from pebble.fleet.database import DatabaseError
 from pebble.fleet.people import People
@@ -32,13 +29,14 @@ from pebble.transports import Message
 from pebble.transports.clock import since_boot as clock
 from pebble.web import messages as m
 from pebble.web import robot_commands
+from pebble.web.driven_here import DrivenHere
 from pebble.web.driving import Command, Driving
-from pebble.web.known_robots import KnownRobots
 from pebble.web.media.pictures import MediaHub
 from pebble.web.media.robot_streams import OwnHosts, origin
 from pebble.web.media.sound import SoundHub
 from pebble.web.open_components import OpenComponents
 from pebble.web.robots import Robots
+from pebble.web.saved_robots import SavedRobots
 from pebble.web.settings import WebSettings
 from pebble.web.stops import Stops
 
@@ -46,11 +44,8 @@ log = logging.getLogger(__name__)
 
 TICK_S = 0.05
 _REFRESH_S = 0.25
-_ANNOUNCE_S = 1.0
-_ANNOUNCED = 64  # robots in one announcement
 _ESTOP_METRIC = "web/estop"
 _STREAM_ADDRESS = "stream-address "  # what a setting of the server begins with; then the component
-_KNOWN = "known "  # the same
 _DAY_S = 24 * 3600
 
 
@@ -59,24 +54,20 @@ class Server:
 
     def __init__(self, settings: WebSettings, people: People, audit: Audit) -> None:
         self.settings, self.people, self.audit = settings, people, audit
-        self.name = settings.server or socket.gethostname().partition(".")[0] or "server"
-        self.id = f"{self.name}-{secrets.token_hex(2)}"
+        server = f"{settings.name}-{secrets.token_hex(2)}"
         self.broker = Broker(settings.broker)
-        self.robots, self.stops, self.driving = Robots(), Stops(), Driving(self.id)
-        self.known = KnownRobots(people.all(_KNOWN))
-        self.robots.before = self.known
+        self.robots, self.stops, self.driving = Robots(), Stops(), Driving(server)
+        self.saved = SavedRobots(people)
+        known = self.robots.before = self.saved.robots
         self.own_hosts = OwnHosts(settings)
-        self.broker.is_known = lambda topic: "/".join(topic.split("/", 3)[:3]) in self.known
+        self.broker.is_known = lambda topic: "/".join(topic.split("/", 3)[:3]) in known
         self.robots.streams.update(people.all(_STREAM_ADDRESS))
         self.media = MediaHub(self.broker, self.robots)
         self.sound = SoundHub(self.broker, self.robots, self._note_talk)
         self.open_components = OpenComponents(self.broker, self.robots, self.spawn)
-        self.by_name = ByName(FLEET, lambda ref: ref in self.known or ref in self.open_components)
-        self.drive_changed: set[str] = set()
+        self.by_name = ByName(FLEET, lambda ref: ref in known or ref in self.open_components)
+        self.driven_here = DrivenHere(server)
         self._tasks: set[asyncio.Task[None]] = set()
-        self._saving = False
-        self._announced_at = float("-inf")
-        self._announcing: set[str] = set()  # systems of the robots in the last announcement
 
     async def open(self) -> None:
         """Connect to the broker and subscribe. Raises TransportError for settings that can never work."""
@@ -85,7 +76,7 @@ class Server:
         self._show_broker()
         for channel in (*FLEET, *SYNONYMS):
             deferred = channel is ONLINE or channel in SYNONYMS
-            await self.broker.subscribe(channel.filter("+/+/+"), self._receive, deferred=deferred)
+            await self.broker.subscribe(channel.filter("+/+/+"), self.receive, deferred=deferred)
         await self.broker.subscribe(DRIVING.filter("+/+/+"), self._announced)
         self.spawn(self._tick())
         self.spawn(self.broker.ask(self.by_name))
@@ -110,7 +101,8 @@ class Server:
 
     # -- from the broker
 
-    def _receive(self, message: Message, now: float) -> None:
+    def receive(self, message: Message, now: float) -> None:
+        """Take a message of a component."""
         address = parse_topic(message.topic)
         if address is None:
             return
@@ -128,15 +120,9 @@ class Server:
 
     def _announced(self, message: Message, _now: float) -> None:
         """Another server drives robots."""
-        address = parse_topic(message.topic)
-        if address is None or message.retain or address.identity.id == self.id:
-            return
-        try:
-            payload = codec.decode(DRIVING, message.payload)
-        except PayloadError:
-            return
-        robots = {ref: (one.by, one.device, one.since) for ref, one in payload.robots.items()}
-        self.publish(self.driving.announced(address.identity.id, robots, clock()))
+        announced = self.driven_here.receive(message)
+        if announced is not None:
+            self.publish(self.driving.announced(*announced, clock()))
 
     def _show_broker(self) -> None:
         view = m.BrokerView(
@@ -163,11 +149,11 @@ class Server:
         by = f"{session.user} on {device}" if device else session.user
         if ref and not _is_base(ref):
             return
-        known, before = [one.robot for one in self.robots.components.values()], tuple(self.known)
+        known, before = [one.robot for one in self.robots.components.values()], tuple(self.saved.robots)
         self._send(
             self.stops.press(ref, name, by=by, why=why, now=clock(), known=known, before=before, user=session.user)
         )
-        self._show_stops()
+        self.show_stops()
         self.audit.write("stop", ref=ref or "all", user=session.user, device=device, address=address, detail=why)
 
     def blocked(self, ref: str) -> str:
@@ -285,7 +271,7 @@ class Server:
                 now = clock()
                 self.publish(self.driving.tick(now))
                 self._send(self.stops.tick(now))
-                self._show_stops()
+                self.show_stops()
                 if now >= refresh_at:
                     refresh_at = now + _REFRESH_S
                     self.robots.refresh(time.monotonic())
@@ -295,43 +281,20 @@ class Server:
 
     def operated(self, ref: str) -> None:
         """A person drives this robot from here."""
-        self.known.operated(ref, int(time.time() // _DAY_S))
+        self.saved.robots.operated(ref, int(time.time() // _DAY_S))
 
     def _remember_robots(self) -> None:
         for component in self.robots.components.values():
-            self.known.seen(component.robot, component.rank, int(time.time() // _DAY_S))
-        if not self._saving and (changes := self.known.changes()):
-            self._saving = True
-            self.spawn(self._save(changes))
-
-    async def _save(self, changes: dict[str, str | None]) -> None:
-        """On a thread: another process may be writing to the file."""
-        try:
-            for ref, value in changes.items():
-                await asyncio.to_thread(self.people.set, _KNOWN + ref, value)
-        except DatabaseError as error:
-            log.warning("which robots are known is not saved: %s", error)
-        finally:
-            self._saving = False
+            self.saved.robots.seen(component.robot, component.rank, int(time.time() // _DAY_S))
+        if (saving := self.saved.save()) is not None:
+            self.spawn(saving)
 
     def _announce(self, now: float) -> None:
-        """Tell other servers once a second, and when a lease changes, which robots are driven from here."""
-        if now - self._announced_at < _ANNOUNCE_S and not self.drive_changed:
-            return
-        self.drive_changed.clear()
-        self._announced_at = now
-        systems: dict[str, dict[str, Driver]] = {system: {} for system in self._announcing}
-        for ref, lease in list(self.driving.leases.items())[:_ANNOUNCED]:
-            one = Driver(by=lease.tab.user, device=lease.tab.device, since=lease.since_ms)
-            systems.setdefault(ref.partition("/")[0], {})[ref] = one
-        self._announcing = {system for system, robots in systems.items() if robots}  # the others: once more, empty
-        for system, robots in systems.items():
-            payload = DrivingPayload(t=int(1000 * time.time()), robots=robots)
-            self.broker.publish(
-                DRIVING.topic(Identity(system, "servers", self.id).base), codec.encode(DRIVING, payload)
-            )
+        for message in self.driven_here.tick(self.driving.leases, now, int(1000 * time.time())):
+            self.broker.publish(message.topic, message.payload)
 
-    def _show_stops(self) -> None:
+    def show_stops(self) -> None:
+        """Let pages see what has changed of emergency stops."""
         changed, self.stops.changed = self.stops.changed, set()
         for ref in changed:
             component = self.robots.components.get(ref)
@@ -340,7 +303,7 @@ class Server:
 
     def _show_drivers(self) -> None:
         changed, self.driving.changed = self.driving.changed, set()
-        self.drive_changed |= changed
+        self.driven_here.changed |= changed
         for interest in self.robots.interests if changed else ():
             interest.dirty |= {(ref, "web/driver") for ref in changed}
             interest.notify()

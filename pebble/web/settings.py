@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,7 +19,7 @@ class WebSettings:
     host: str = "127.0.0.1"
     port: int = DEFAULT_PORT  # 0: a free one
     names: tuple[str, ...] = ()  # further host names by which browsers may address it
-    server: str = ""  # what it is called on pages and for other servers; "": this machine's name
+    server: str = ""  # its name; "": this machine's
     login: bool = False
     people: Path | None = None  # the database of users, sessions and settings; None: in memory
     certificate: Path | None = None
@@ -26,3 +27,8 @@ class WebSettings:
     recordings: Path | None = None  # the folder of a recorder, to look at; None: none
     authority: Path | None = None  # offered for download, so that phones can trust it
     plain_http_drive: bool = True  # False: over plain http from another machine nothing drives
+
+    @property
+    def name(self) -> str:
+        """What it is called on pages and for other servers."""
+        return self.server or socket.gethostname().partition(".")[0] or "server"

@@ -104,17 +104,17 @@ def test_a_robot_that_a_person_has_taken_is_left_alone_until_the_step_after(robo
 
 def test_what_may_be_due_to_the_machine_is_repeated_but_not_for_ever(broker: Broker) -> None:
     operator, times = Operator(broker.port), []
-    operator._until_right("x", lambda: times.append(1))
+    operator.until_right("x", lambda: times.append(1))
     assert len(times) == 1
     operator.again = frozenset({"x"})
-    operator._until_right("x", lambda: times.append(2))
+    operator.until_right("x", lambda: times.append(2))
     assert times == [1, 2, 2, 2]
 
     def is_right() -> None:
         times.append(3)
         operator.again = frozenset()
 
-    operator._until_right("x", is_right)
+    operator.until_right("x", is_right)
     assert times == [1, 2, 2, 2, 3]
     operator.close()
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import pytest
 
-from pebble.demo.operator import COMMAND_PERIOD_S, SCRIPT, CompletedStep, Step
+from pebble.demo.operator import COMMAND_PERIOD_S, SCRIPT, CompletedStep, Step, wheels_of
 from pebble.demo.steps import StepResult, assess
-from pebble.services.serial_mcu_bridge.text.goob_base import STOP, drive_line, lights_line, mix
+from pebble.services.serial_mcu_bridge.text.goob_base import STOP, drive_line, lights_line
 from pebble.simulation.board import SimulatedMcu
 from pebble.simulation.mcu import Snapshot
 from pebble.simulation.trace import Entry
@@ -58,7 +58,7 @@ class Performance:
         if self.deaf:
             return lines
         sign = -1 if self.mirrored else 1
-        drive = drive_line(*mix(sign * step.drive.x, sign * step.drive.z))
+        drive = drive_line(*(sign * wheel for wheel in wheels_of(step.drive)))
         count = round((step.drive_s - self.late_start_s) / COMMAND_PERIOD_S)
         lines += [(BEGAN + self.late_start_s + index * COMMAND_PERIOD_S, drive) for index in range(count)]
         if self.stop_after_s is not None:

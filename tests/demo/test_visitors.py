@@ -1,9 +1,6 @@
-"""Which robots people drive, by what servers announce."""
+"""Which robots people have, by what servers announce."""
 
 from __future__ import annotations
-
-import time
-from collections.abc import Callable, Iterator
 
 import pytest
 
@@ -11,59 +8,46 @@ from pebble.client.driver_lease import VALID_S
 from pebble.client.robot_view import RobotView
 from pebble.contract import DRIVING, codec
 from pebble.contract.payloads import Driver, Driving
-from pebble.demo.operator import Operator
+from pebble.demo.visitors import Visitors
 from pebble.transports import Message
 
 GOOB, FRED = (RobotView(f"pebble/robots/{name}") for name in ("goob", "fred"))
 
 
-def announcement(server: str, *robots: RobotView, device: str = "phone") -> Message:
+def announcement(server: str, *robots: RobotView, device: str = "phone", retain: bool = False) -> Message:
     driven = {robot.base: Driver(by="anna", device=device, since=1) for robot in robots}
-    return Message(DRIVING.topic(f"pebble/servers/{server}"), codec.encode(DRIVING, Driving(t=1, robots=driven)))
+    payload = codec.encode(DRIVING, Driving(t=1, robots=driven))
+    return Message(DRIVING.topic(f"pebble/servers/{server}"), payload, retain=retain)
 
 
-@pytest.fixture
-def operator() -> Iterator[Operator]:
-    made = Operator(1)
-    yield made
-    made.close()
+def test_a_robot_is_driven_while_a_server_announces_it() -> None:
+    visitors = Visitors("me")
+
+    def taken(now: float) -> tuple[str, str]:
+        return visitors.taken(GOOB, now), visitors.taken(FRED, now)
+
+    assert taken(10.0) == ("", "")
+    visitors.receive(announcement("hall", GOOB), 10.0)
+    assert taken(11.0) == ("is driven by anna on phone", "")
+    visitors.receive(announcement("lab", FRED, device=""), 11.0)  # its silence about the other means nothing
+    assert taken(11.0) == ("is driven by anna on phone", "is driven by anna")
+    assert taken(10.0 + VALID_S) == ("", "is driven by anna")
 
 
-@pytest.fixture
-def at(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
-    """Sets the time."""
-    return lambda now: monkeypatch.setattr(time, "monotonic", lambda: now)
+def test_a_robot_that_was_driven_is_left_alone_until_the_step_after() -> None:
+    visitors = Visitors("me")
+    visitors.begin_step(9.0)
+    visitors.receive(announcement("hall", GOOB), 10.0)
+    assert [visitors.free(robot, 20.0) for robot in (GOOB, FRED)] == [False, True]
+    assert visitors.left_alone == {"goob"}
+    visitors.begin_step(20.0)
+    assert visitors.free(GOOB, 20.0)
 
 
-def test_a_robot_is_driven_while_a_server_announces_it(operator: Operator, at: Callable[[float], None]) -> None:
-    at(10.0)
-    assert operator._taken(GOOB) == ""
-    operator._note_visits(announcement("hall", GOOB))
-    at(11.0)
-    assert operator._taken(GOOB) == "is driven by anna on phone"
-    assert operator._taken(FRED) == ""
-    operator._note_visits(announcement("lab", FRED, device=""))  # its silence about the other means nothing
-    assert operator._taken(GOOB) == "is driven by anna on phone"
-    assert operator._taken(FRED) == "is driven by anna"
-    at(10.0 + VALID_S)
-    assert operator._taken(GOOB) == ""
-    assert operator._taken(FRED) == "is driven by anna"
-
-
-def test_a_robot_that_was_driven_is_left_alone_until_the_step_after(
-    operator: Operator, at: Callable[[float], None]
-) -> None:
-    at(9.0)
-    operator._begin("a step", [GOOB, FRED])
-    at(10.0)
-    operator._note_visits(announcement("hall", GOOB))
-    at(20.0)
-    assert [operator._mine(robot) for robot in (GOOB, FRED)] == [False, True]
-    assert operator.left_alone == {"goob"}
-    operator._begin("the step after", [GOOB, FRED])
-    assert operator._mine(GOOB)
-
-
-def test_what_is_no_announcement_is_ignored(operator: Operator) -> None:
-    operator._note_visits(Message(DRIVING.topic("pebble/servers/hall"), b"{"))
-    assert operator._taken(GOOB) == ""
+@pytest.mark.parametrize(
+    "message", [Message(DRIVING.topic("pebble/servers/hall"), b"{"), announcement("hall", GOOB, retain=True)]
+)
+def test_what_is_no_announcement_of_now_is_ignored(message: Message) -> None:
+    visitors = Visitors("me")
+    visitors.receive(message, 1.0)
+    assert visitors.taken(GOOB, 1.0) == ""

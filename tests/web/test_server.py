@@ -31,7 +31,7 @@ def test_what_is_drawn_over_a_picture_of_another_component_follows_its_capabilit
     monkeypatch.setattr(server.open_components, "update", updated.append)
     server.robots.sources[GOOB] = TOWER
     payload = json.dumps({"schema": "pebble-capabilities/v1", "t": 1, "value": {}}).encode()
-    server._receive(Message(f"{TOWER}/outgoing/capabilities", payload), 1.0)
+    server.receive(Message(f"{TOWER}/outgoing/capabilities", payload), 1.0)
     assert updated == [TOWER, GOOB]
 
 

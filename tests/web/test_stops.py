@@ -83,8 +83,8 @@ def test_a_component_that_was_forgotten_is_shown_again_by_its_heartbeat() -> Non
     server = Server(WebSettings(broker=MqttSettings(host="127.0.0.1")), People(None), Audit(None))
     heartbeat = Message(ONLINE.topic(A), codec.encode(ONLINE, Heartbeat(t=int(1000 * time.time()))))
     for _ in range(2):
-        server._receive(heartbeat, time.monotonic())
-        server._show_stops()
+        server.receive(heartbeat, time.monotonic())
+        server.show_stops()
         assert server.robots.value(A, "web/estop") is not None
         server.robots.forget(A)
         assert server.robots.value(A, "web/estop") is None
