@@ -15,6 +15,7 @@ import msgspec
 
 from pebble.client.broker import Broker
 from pebble.client.estop import send
+from pebble.client.page_settings import WebSettings
 from pebble.client.robot_topics import FLEET, SYNONYMS, section_of
 from pebble.contract import CAPABILITIES, DRIVE, DRIVING, ONLINE, codec
 from pebble.contract.identity import Identity, parse_topic
@@ -37,7 +38,6 @@ from pebble.web.media.robot_streams import OwnHosts, origin
 from pebble.web.media.sound import SoundHub
 from pebble.web.open_components import OpenComponents
 from pebble.web.robots import Component, Robots
-from pebble.web.settings import WebSettings
 from pebble.web.stops import Stops
 
 log = logging.getLogger(__name__)
