@@ -15,6 +15,7 @@ from urllib.parse import urlsplit
 import msgspec
 
 from pebble.client.discovery import ALL_OUTGOING, Discovery
+from pebble.client.page_packages import require_packages
 from pebble.config.raw import deep_merge
 from pebble.contract.identity import Identity
 from pebble.errors import PebbleError
@@ -25,7 +26,6 @@ from pebble.simulation.mcu import Snapshot
 from pebble.simulation.world.program import Snapshot as WorldSnapshot
 from pebble.simulation.world.program import port_path, trace_path
 from pebble.transports import MqttSettings, create
-from pebble.web.extra import require_packages
 from pebble.web.program import Ready
 
 ROBOTS = ("goob", "fred", "minilamp", "benjr")

@@ -13,7 +13,7 @@ from pebble.contract import AUDIO_CONTROL, CAPABILITIES, MQTT_AUDIO, MQTT_VIDEO,
 from pebble.contract.identity import is_of_another
 from pebble.contract.payloads import MediaRequest
 from pebble.errors import PayloadError, PebbleError
-from pebble.transports import Message, QoS, Transport
+from pebble.transports import Message, QoS, Subscription, Transport
 
 log = logging.getLogger(__name__)
 
@@ -36,9 +36,16 @@ class Viewer:
     :meth:`note_received`, so that they are transmitted once.
     """
 
-    def __init__(self, transport: Transport, base: str, on_payload: Callable[[Medium, bytes], None] | None) -> None:
+    def __init__(
+        self,
+        transport: Transport,
+        base: str,
+        on_payload: Callable[[Medium, bytes], None] | None,
+        capabilities: dict[str, Any] | None = None,
+    ) -> None:
+        """``capabilities``: those to go by; None: what the robot publishes."""
         self.base = base
-        self.capabilities: dict[str, Any] = {}
+        self.capabilities = capabilities or {}
         self.sent: deque[bytes] = deque(maxlen=_SENT)  # own requests: what else arrives on their topic is from others
         self._transport, self._on_payload = transport, on_payload
         self._has_capabilities = threading.Event()
@@ -50,7 +57,9 @@ class Viewer:
         self._requested_at: dict[Medium, float] = {}
         self._received_at: dict[Medium, float] = {}
         self._keyframe_at = float("-inf")
-        self._subscriptions = [transport.subscribe(CAPABILITIES.topic(base), self._on_capabilities)]
+        self._subscriptions: list[Subscription] = []
+        if capabilities is None:
+            self._subscriptions.append(transport.subscribe(CAPABILITIES.topic(base), self._on_capabilities))
 
     def wait_for_capabilities(self, timeout: float) -> None:
         """Wait for the robot's capabilities; raises PebbleError on timeout."""
@@ -132,13 +141,15 @@ class Viewer:
     def _set_flag(self, medium: Medium, *, up: bool) -> None:
         topic = self.topic(medium, "flag_topic", _FLAGS[medium])
         self._flags[topic] = up
-        self._transport.publish(topic, codec.encode(_FLAGS[medium], up), qos=QoS.DELIVERED, retain=True, shared=True)
+        self._transport.publish(
+            topic, codec.encode(_FLAGS[medium], up), qos=QoS.DELIVERED, retain=True, shared=True, urgent=True
+        )
 
     def _send(self, medium: Medium, request: MediaRequest) -> None:
         topic = self.topic(medium, "command_topic", _CONTROLS[medium])
         payload = codec.encode(_CONTROLS[medium], request)
         self.sent.append(payload)
-        self._transport.publish(topic, payload, qos=QoS.DELIVERED)
+        self._transport.publish(topic, payload, qos=QoS.DELIVERED, urgent=True)
 
     def topic(self, medium: Medium, key: str, channel: Channel) -> str:
         """The effective topic that capabilities list under ``key``, else the channel's own."""

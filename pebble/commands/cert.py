@@ -7,10 +7,10 @@ from typing import Annotated
 
 import typer
 
+from pebble.client.page_packages import require_packages
 from pebble.commands.web_people import TLS, default_folder
 from pebble.errors import PebbleError
 from pebble.fleet import certificates
-from pebble.web.extra import require_packages
 
 _HELP = """Certificates of one's own, for the operator page by https.
 

@@ -15,6 +15,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from pebble.client.connection import password as broker_password
+from pebble.client.page_packages import require_packages
 from pebble.client.url import settings_of as settings_of_url
 from pebble.commands import web_people
 from pebble.commands.options import CaCert, PasswordFile, host_of
@@ -27,10 +28,9 @@ from pebble.fleet.certificates import CA_CERT, SERVER_CERT, SERVER_KEY
 from pebble.fleet.people import NAME
 from pebble.runtime.connections import REMOTE_RECONNECT_S
 from pebble.transports import MqttSettings
-from pebble.web.extra import require_packages
 
 if TYPE_CHECKING:
-    from pebble.web.settings import WebSettings
+    from pebble.client.page_settings import WebSettings
 
 Host = Annotated[
     str | None,
@@ -133,7 +133,7 @@ def _broker(url: str, password_file: Path | None, ca_cert: Path | None) -> MqttS
 
 
 def _of_url(broker: MqttSettings, options: dict[str, Any], folder: Path | None) -> WebSettings:
-    from pebble.web.settings import WebSettings
+    from pebble.client.page_settings import WebSettings
 
     given = {key: value for key, value in options.items() if value is not None}
     settings = WebSettings(**{"broker": broker, "people": default_folder() / PEOPLE, **given})
@@ -147,7 +147,7 @@ def _of_url(broker: MqttSettings, options: dict[str, Any], folder: Path | None) 
 
 def _of_config(file: Path, options: dict[str, Any], folder: Path | None) -> tuple[WebSettings, bool]:
     """The settings, and whether the config allows plain http."""
-    from pebble.web.from_config import settings_or_all_problems
+    from pebble.web.ready_settings import settings_or_all_problems
 
     config = load(file)
     web = config.web_interface

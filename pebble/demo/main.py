@@ -14,6 +14,8 @@ from typing import NamedTuple, cast
 
 from rich.console import Console
 
+from pebble.client.page_packages import require_packages
+from pebble.client.page_settings import DEFAULT_PORT
 from pebble.contract.encodings import ALL_VIDEO
 from pebble.demo import emergency, following
 from pebble.demo.brokers import BrokerKind, best_kind
@@ -38,8 +40,6 @@ from pebble.demo.steps import assess
 from pebble.demo.view import View, show_media_results, show_results
 from pebble.errors import PebbleError
 from pebble.rig.testbed import ROBOTS, PageServer, RoomRobot, Testbed
-from pebble.web.extra import require_packages
-from pebble.web.settings import DEFAULT_PORT
 
 SHORTEST_S = ROUND_S + EMERGENCY_S + TAKEOVER_S
 _DISCOVERY_S = 30.0  # until all robots can be driven, on the smallest machine

@@ -17,6 +17,8 @@ from collections.abc import Callable, Iterator
 from importlib import metadata
 from pathlib import Path
 
+from pebble.client.page_from_config import settings_of
+from pebble.client.page_packages import require_packages
 from pebble.config import Config, Mqtt
 from pebble.config.secret_text import shown_user
 from pebble.doctor import Finding, Level, device_names
@@ -31,8 +33,6 @@ from pebble.errors import PebbleError
 from pebble.runtime.connections import REMOTE_RECONNECT_S, mqtt_settings
 from pebble.transports.settings import MqttSettings
 from pebble.transports.socket_paths import FRAMES_SOCKET, fits_socket
-from pebble.web.extra import require_packages
-from pebble.web.from_config import settings_of
 
 _ENOUGH_LOCKED = 64 * 1024 * 1024  # a camera's pool of frames at 1080p
 _BUILT = 1735689600  # 2025: a clock before this has not been set

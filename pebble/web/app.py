@@ -19,6 +19,7 @@ from starlette.routing import Route, WebSocketRoute
 from starlette.types import Lifespan
 from starlette.websockets import WebSocket
 
+from pebble.client.page_settings import WebSettings
 from pebble.fleet.audit import Audit
 from pebble.fleet.people import People
 from pebble.fleet.roles import Session
@@ -30,7 +31,6 @@ from pebble.web.messages import EstopOp
 from pebble.web.recordings import routes as recordings
 from pebble.web.recordings.routes import Recordings
 from pebble.web.server import Server
-from pebble.web.settings import WebSettings
 from pebble.web.static_files import FOREVER, NO_STORE, StaticFiles, root_of
 
 _ENCODINGS = frozenset({"json", "pbvd", "pbvz", "h264", "jpeg"})

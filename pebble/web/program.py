@@ -12,10 +12,10 @@ from typing import Any
 
 import msgspec
 
+from pebble.client.page_packages import require_packages
+from pebble.client.page_settings import WebSettings
 from pebble.errors import PebbleError
 from pebble.runtime.parent import set_up_logging
-from pebble.web.extra import require_packages
-from pebble.web.settings import WebSettings
 
 log = logging.getLogger(__name__)
 

@@ -7,13 +7,13 @@ import logging
 import signal
 import sys
 
+from pebble.client.page_packages import require_packages
+from pebble.client.page_settings import WebSettings
 from pebble.config import config_of_process
 from pebble.errors import PebbleError
 from pebble.runtime.parent import ALIVE_PERIOD_S, Notifier, set_log_level, set_up_logging
 from pebble.runtime.process import exit_at_the_latest
-from pebble.web.extra import require_packages
-from pebble.web.from_config import ready_settings_of
-from pebble.web.settings import WebSettings
+from pebble.web.ready_settings import ready_settings_of
 
 log = logging.getLogger(__name__)
 

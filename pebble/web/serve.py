@@ -10,6 +10,7 @@ from pathlib import Path
 
 import uvicorn
 
+from pebble.client.page_settings import WebSettings
 from pebble.errors import PebbleError
 from pebble.fleet import certificates
 from pebble.transports.renewed import Renewed
@@ -17,7 +18,6 @@ from pebble.transports.socket_holders import why_not
 from pebble.transports.tls import make_server_context
 from pebble.web.access.connections import ACCEPT, HttpProtocol, Listener, Loop, WebSocketProtocol
 from pebble.web.app import create_app
-from pebble.web.settings import WebSettings
 
 _LARGEST_MESSAGE = 64 * 1024
 _END_S = 1

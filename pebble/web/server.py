@@ -15,6 +15,7 @@ import msgspec
 from pebble.client.broker import Broker
 from pebble.client.drive_reasons import SCRIPT_ORDER, SERVER_ORDER, Code, Situation, first_reason
 from pebble.client.estop import send
+from pebble.client.page_settings import WebSettings
 from pebble.client.robot_topics import FLEET, SYNONYMS
 from pebble.client.robot_view import RobotView
 from pebble.contract import CAPABILITIES, DRIVE, DRIVING, ONLINE, codec
@@ -37,7 +38,6 @@ from pebble.web.media.sound import SoundHub
 from pebble.web.open_components import OpenComponents
 from pebble.web.robots import Robots
 from pebble.web.saved_robots import SavedRobots
-from pebble.web.settings import WebSettings
 from pebble.web.stops import Stops
 
 log = logging.getLogger(__name__)

@@ -5,13 +5,17 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 
 import pytest
 
 from pebble.client import arrived
 from pebble.client.arrived import Arrived
 from pebble.client.broker import Broker
-from pebble.transports import Message, MqttSettings
+from pebble.transports import Message, QoS
+from pebble.transports.memory import MemoryHub, MemoryTransport
+from tests.web.media.robots import broker_on, until
 
 
 def message(topic: str, size: int = 1) -> Message:
@@ -52,20 +56,21 @@ def test_bytes_are_bounded_and_given_back() -> None:
     assert waiting.put(ignore, message("c"), 0.0)
 
 
-class Fed(Broker):
-    """A broker whose messages come from a test."""
-
-    def __init__(self) -> None:
-        super().__init__(MqttSettings(host="127.0.0.1"))
-        self._loop = asyncio.get_running_loop()
-
-    def feed(self, handler: arrived.Handler, topic: str) -> None:
-        self._arrived.put(handler, message(topic), 0.0)
-        self._wake()
+@asynccontextmanager
+async def receiving(handler: arrived.Handler) -> AsyncIterator[tuple[Broker, MemoryTransport]]:
+    """A connection that receives everything, and another one that publishes."""
+    hub = MemoryHub()
+    broker = broker_on(hub)
+    await broker.open()
+    await broker.subscribe("#", handler)
+    with MemoryTransport("operator", hub) as operator:
+        yield broker, operator
+    await broker.close()
 
 
 async def _flood() -> tuple[list[str], int, int]:
-    broker, taken, turns = Fed(), [], 0
+    taken: list[str] = []
+    turns = 0
 
     def slow(one: Message, _at: float) -> None:
         end = time.monotonic() + 0.001
@@ -73,36 +78,38 @@ async def _flood() -> tuple[list[str], int, int]:
             pass
         taken.append(one.topic)
 
-    for number in range(200):
-        broker.feed(slow, str(number))
-    while len(taken) < 200:
-        await asyncio.sleep(0)
-        turns += 1
-    return taken, turns, broker._arrived.dropped
+    async with receiving(slow) as (broker, operator):
+        for number in range(200):
+            operator.publish(f"a/{number}", b"1", qos=QoS.DELIVERED)
+        while len(taken) < 200:
+            await asyncio.sleep(0)
+            turns += 1
+    return taken, turns, broker.dropped
 
 
 def test_a_flood_leaves_the_loop_its_turns() -> None:
     taken, turns, dropped = asyncio.run(_flood())
-    assert taken == [str(number) for number in range(200)]
+    assert taken == [f"a/{number}" for number in range(200)]
     assert turns >= 5  # 200 ms of work, in parts of 10 ms
     assert dropped == 0
 
 
 async def _failing() -> list[str]:
-    broker, taken = Fed(), []
+    taken: list[str] = []
 
     def take(one: Message, _at: float) -> None:
-        if one.topic == "bad":
+        if one.topic == "a/bad":
             raise ValueError(one.topic)
         taken.append(one.topic)
 
-    for topic in ("a", "bad", "b"):
-        broker.feed(take, topic)
-    await asyncio.sleep(0.01)
+    async with receiving(take) as (_, operator):
+        for topic in ("a/1", "a/bad", "a/2"):
+            operator.publish(topic, b"1", qos=QoS.DELIVERED)
+        await until(lambda: len(taken) == 2)
     return taken
 
 
 def test_a_handler_that_fails_holds_back_nothing(caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.ERROR):
-        assert asyncio.run(_failing()) == ["a", "b"]
-    assert "a message on bad" in caplog.text
+        assert asyncio.run(_failing()) == ["a/1", "a/2"]
+    assert "a message on a/bad" in caplog.text

@@ -58,11 +58,11 @@ def test_two_are_under_way_and_one_when_acknowledgements_are_late() -> None:
 
 
 def test_more_are_under_way_if_they_are_small() -> None:
-    queue = MediaQueue()
+    queue, taken = MediaQueue(), 0
     for seq in range(20):
         queue.offer(frame(seq, keyframe=True, size=500))
-        queue.take(0.0)
-    assert len(queue._under_way) == 8
+        taken += queue.take(0.0) is not None
+    assert taken == 8
     queue.acknowledge(0, 1.0)
     queue.offer(frame(20, keyframe=True, size=2000))
     assert queue.window == 1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
+from unittest.mock import MagicMock
 
 import pytest
 
@@ -50,12 +51,16 @@ def robot() -> Iterator[Robot]:
 
 
 @pytest.fixture
-def viewer(robot: Robot) -> Iterator[Viewer]:
-    transport = MemoryTransport("viewer", robot.hub).open()
+def transport(robot: Robot) -> Iterator[MemoryTransport]:
+    with MemoryTransport("viewer", robot.hub) as one:
+        yield one
+
+
+@pytest.fixture
+def viewer(transport: MemoryTransport) -> Viewer:
     viewer = Viewer(transport, BASE, lambda _medium, _payload: None)
     viewer.wait_for_capabilities(5)
-    yield viewer
-    transport.close()
+    return viewer
 
 
 def test_it_raises_the_flag_and_requests_and_undoes_both(robot: Robot, viewer: Viewer) -> None:
@@ -76,13 +81,15 @@ def test_a_flag_that_was_up_stays_up(robot: Robot, viewer: Viewer) -> None:
 
 
 def test_a_flag_lowered_by_another_operator_stays_down(
-    robot: Robot, viewer: Viewer, monkeypatch: pytest.MonkeyPatch
+    robot: Robot, viewer: Viewer, transport: MemoryTransport, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("pebble.client.viewer._REPEAT_S", 0.0)
     viewer.request("video")
     assert until(lambda: robot.flags == [b'{"value":true}'])
+    seen: list[bytes] = []
+    transport.subscribe(FLAG, lambda message: seen.append(message.payload), direct=True)  # after the viewer's
     robot.publish(FLAG, b"false", retain=True)
-    assert until(lambda: not viewer._flags[FLAG])
+    assert until(lambda: seen[-1:] == [b"false"])
     viewer.repeat_requests()
     viewer.close()
     assert until(lambda: robot.requests[-1:] == [b'{"enabled":false}'])
@@ -141,13 +148,15 @@ def test_requests_go_to_no_other_robot() -> None:
         assert viewer.topic("video", "command_topic", VIDEO_CONTROL) == REQUEST
 
 
-def test_without_a_receiver_it_receives_no_media_but_learns_of_them(robot: Robot) -> None:
-    transport = MemoryTransport("viewer", robot.hub).open()
+def test_without_a_receiver_it_receives_no_media_but_learns_of_them(
+    robot: Robot, transport: MemoryTransport, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    subscribe = MagicMock(wraps=transport.subscribe)
+    monkeypatch.setattr(transport, "subscribe", subscribe)
     viewer = Viewer(transport, BASE, None)
     viewer.wait_for_capabilities(5)
     viewer.note_received("video")
     viewer.request("video")  # another viewer's pictures arrive already
-    assert CAMERA not in {subscription.filter for subscription in viewer._subscriptions}
+    assert [call.args[0] for call in subscribe.call_args_list] == [f"{BASE}/outgoing/capabilities", FLAG]
     viewer.close()
     assert robot.requests == []
-    transport.close()

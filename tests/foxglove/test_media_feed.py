@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import sys
-from typing import cast
 
 import numpy as np
 import pytest
 
-from pebble.client.broker import Broker
 from pebble.client.media_request.picture_header import MAX_PAYLOAD
 from pebble.contract.packets import PBAT
 from pebble.foxglove.media_feed import MAX_WAITING, MAX_WAITING_BYTES, MediaFeed
@@ -18,8 +16,7 @@ from pebble.media.scene import Scene
 from pebble.media.video import make_encoder
 from pebble.recordings.exports.foxglove_messages import Schemas
 from pebble.transports.memory import MemoryHub
-from tests.web.picture_robot import REF, VIDEO, FakeBroker
-from tests.web.sound_robot import AUDIO
+from tests.web.media.robots import AUDIO, REF, VIDEO, broker_on
 
 
 def pictures(count: int, keyframe_interval: int = 10) -> list[bytes]:
@@ -34,11 +31,10 @@ def pictures(count: int, keyframe_interval: int = 10) -> list[bytes]:
 
 async def _feed(medium: str, payloads: list[bytes]) -> MediaFeed:
     """Payloads that come while the conversion does not get on."""
-    broker = FakeBroker(MemoryHub())
-    feed = MediaFeed(cast(Broker, broker), Server("test", lambda _topic, _on: None), Schemas(), REF, medium)  # type: ignore[arg-type]
+    broker = broker_on(MemoryHub())
+    feed = MediaFeed(broker, Server("test", lambda _topic, _on: None), Schemas(), REF, medium)  # type: ignore[arg-type]
     for payload in payloads:
         feed.receive(payload)
-    broker.transport.close()
     return feed
 
 

@@ -22,8 +22,7 @@ from pebble.media.scene import read_counter
 from tests.foxglove.live import client, live
 from tests.foxglove.watcher import SUBPROTOCOL, Watcher, parser
 from tests.support import Broker, until
-from tests.web.picture_robot import CAMERA, CAPABILITIES, VIDEO, PictureRobot, capabilities
-from tests.web.sound_robot import AUDIO, SOUND, SoundRobot
+from tests.web.media.robots import AUDIO, CAMERA, CAPABILITIES, SOUND, VIDEO, PictureRobot, SoundRobot, capabilities
 
 H264, JPEG, SAMPLES = f"{CAMERA}/video", f"{CAMERA}/image", f"{SOUND}/sound"
 REQUESTED, WITHDRAWN = {"enabled": True, "encoding": "h264"}, {"enabled": False}
@@ -222,14 +221,14 @@ def test_a_client_that_does_not_read_delays_no_other_and_loses_the_oldest(broker
         assert follow_each_other(counters(list(map(decoded, images))))
         robot.mute = True
         waited = counters(list(map(decoded, pictures_of(stopped, parser(watcher.channels[JPEG])))))
-        assert waited[-1] == robot.frames - 1
+        assert waited[-1] == len(robot.sent) - 1
         assert BACKLOG <= len(waited) < len(images) - 50
         stopped.close()
 
 
 @pytest.mark.parametrize("encoding", ["pcm", "opus"])
 def test_sound_becomes_samples(broker: Broker, encoding: str) -> None:
-    robot = SoundRobot({**AUDIO, "encoding": encoding}, client(broker))
+    robot = SoundRobot({**AUDIO, "encoding": encoding}, transport=client(broker))
     try:
         with live(broker) as server:
             watcher = Watcher(server.address)

@@ -12,12 +12,12 @@ from typing import Any
 import pytest
 
 from pebble.client.connection import Target, resolve
+from pebble.client.page_from_config import settings_of
 from pebble.config import Config, load
 from pebble.doctor.broker_probe import probe
 from pebble.runtime.connections import local_transport, mirror_transport, remote_transport
 from pebble.transports import MqttSettings, State, create
 from pebble.transports.mqtt.client_ids import unique
-from pebble.web.from_config import settings_of
 from tests.support import Broker, until
 from tests.transports.brokers import MAKERS
 

@@ -30,6 +30,7 @@ from starlette.responses import HTMLResponse, JSONResponse, Response
 from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
+from pebble.client.page_settings import WebSettings
 from pebble.contract.packets import Codec, Picture, PictureKind, Sound
 from pebble.fleet.audit import Audit
 from pebble.media.speech import Speech
@@ -37,7 +38,6 @@ from pebble.transports import MqttSettings
 from pebble.web.access.guard import CONTENT_SECURITY_POLICY
 from pebble.web.messages import FromPage
 from pebble.web.recordings import routes as recordings
-from pebble.web.settings import WebSettings
 from pebble.web.static_files import StaticFiles
 from tests.support import ROOT, free_port, until
 from tests.web import recorded

@@ -24,7 +24,7 @@ from pebble.media.speech import PERIOD_S, Speech
 from pebble.rig.testbed import LinuxRobot
 from pebble.simulation.loudspeaker import playbacks
 from tests.web.browser import Tab
-from tests.web.sound_robot import REF
+from tests.web.media.robots import REF
 from tests.web.stage import Stage
 
 RATE = 16_000

@@ -14,12 +14,12 @@ import uvicorn
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
+from pebble.client.page_settings import WebSettings
 from pebble.contract import CAPABILITIES, ESTOP_STATE, ONLINE, codec
 from pebble.contract.payloads import EstopState, Heartbeat
 from pebble.transports import Message, MqttSettings, QoS, create
 from pebble.web.access.connections import Loop
 from pebble.web.serve import _config, _listen
-from pebble.web.settings import WebSettings
 from tests.support import until
 
 HEARTBEAT_S = 0.25

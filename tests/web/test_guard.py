@@ -10,11 +10,11 @@ from typing import Any
 import httpx
 import pytest
 
+from pebble.client.page_settings import WebSettings
 from pebble.fleet import certificates
 from pebble.transports import MqttSettings
 from pebble.web.access import guard as guard_module
 from pebble.web.access.guard import CONTENT_SECURITY_POLICY, MAX_BODY, Guard
-from pebble.web.settings import WebSettings
 
 HERE = ("127.0.0.1", 8080)
 OWN = "127.0.0.1:8080"

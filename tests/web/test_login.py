@@ -19,13 +19,13 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse
 from starlette.routing import Route
 
+from pebble.client.page_settings import WebSettings
 from pebble.fleet.audit import Audit
 from pebble.fleet.people import SESSION_S, People
 from pebble.fleet.roles import Role
 from pebble.transports import MqttSettings
 from pebble.web.access import login
 from pebble.web.access.guard import Guard
-from pebble.web.settings import WebSettings
 from tests.support import until
 
 PASSWORD = "correct horse"

@@ -13,7 +13,7 @@ from playwright.sync_api import Browser
 from pebble.transports import MqttSettings, create
 from tests.support import Broker
 from tests.web.browser import Tab, tab
-from tests.web.picture_robot import REF, VIDEO, PictureRobot, capabilities
+from tests.web.media.robots import REF, VIDEO, PictureRobot, capabilities
 from tests.web.served import Served
 
 pytestmark = pytest.mark.page

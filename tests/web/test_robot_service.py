@@ -15,7 +15,8 @@ from typing import Any
 
 import pytest
 
-from pebble.web import extra, robot_service
+from pebble.client import page_packages as extra
+from pebble.web import robot_service
 from tests.support import ROOT, Broker, Child, free_port, until
 
 

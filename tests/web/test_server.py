@@ -7,11 +7,11 @@ from collections.abc import Iterator
 
 import pytest
 
+from pebble.client.page_settings import WebSettings
 from pebble.fleet.audit import Audit
 from pebble.fleet.people import People
 from pebble.transports import Message, MqttSettings
 from pebble.web.server import Server
-from pebble.web.settings import WebSettings
 
 GOOB, TOWER = "pebble/robots/goob", "pebble/robots/tower"
 

@@ -26,8 +26,8 @@ from tests.web.ears import (
     talks,
     write_voice,
 )
+from tests.web.media.robots import REF, SoundRobot
 from tests.web.served import Served
-from tests.web.sound_robot import REF, SoundRobot
 
 pytestmark = pytest.mark.page
 

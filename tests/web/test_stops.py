@@ -7,6 +7,7 @@ import time
 import pytest
 
 from pebble.client.estop import new_name
+from pebble.client.page_settings import WebSettings
 from pebble.contract import CAPABILITIES, ESTOP, ONLINE, codec
 from pebble.contract.payloads import Capabilities, Heartbeat
 from pebble.fleet.audit import Audit
@@ -14,7 +15,6 @@ from pebble.fleet.people import People
 from pebble.runtime.robot_estop import RobotEstop
 from pebble.transports import Message, MqttSettings
 from pebble.web.server import Server
-from pebble.web.settings import WebSettings
 from pebble.web.stops import MAX_EACH, MAX_STOPS, Stops
 
 A, B = "pebble/robots/a", "pebble/robots/b"

@@ -7,19 +7,17 @@ import logging
 import threading
 import time
 from collections.abc import Callable
-from typing import Any, Final, NamedTuple, cast
+from typing import Any, Final, NamedTuple
 
 from pebble.client.broker import Broker
 from pebble.client.robot_topics import FLAGS, names
 from pebble.client.viewer import Medium, Viewer
-from pebble.contract import AUDIO, AUDIO_CONTROL, CAMERA, CAPABILITIES, INCOMING, VIDEO_CONTROL, Channel
-from pebble.errors import PebbleError, TransportError
-from pebble.transports import Handler, QoS, Subscription, Transport
+from pebble.contract import AUDIO, AUDIO_CONTROL, CAMERA, VIDEO_CONTROL, Channel
+from pebble.errors import PebbleError
 
 log = logging.getLogger(__name__)
 
 _MAX_PENDING, _MAX_PENDING_BYTES = 2000, 16 << 20  # received, and not yet taken by the event loop
-_CAPABILITIES_S: Final = 2.0
 #: The channels whose topics capabilities may name, by its key in the medium's section.
 _NAMED: Final[dict[Medium, dict[str, Channel]]] = {
     "video": {"topic": CAMERA, "command_topic": VIDEO_CONTROL, "flag_topic": FLAGS["video"]},
@@ -75,7 +73,7 @@ class MediaSource:
         self.requested_at = float("-inf")
         self._broker, self._receive = broker, receive
         self._viewer: Viewer | None = None
-        self._topics: tuple[object, ...] = ()  # that the capabilities listed at the request
+        self._topics: list[object] = []  # that the capabilities listed at the request
         self._pending = self._pending_bytes = 0
         self._lock = threading.Lock()  # guards the last two
 
@@ -84,15 +82,19 @@ class MediaSource:
         return self._viewer is not None
 
     async def follow(self, capabilities: dict[str, Any], encoding: str | None) -> None:
-        """Request it, as these capabilities allow it; call it again and again. Raises PebbleError."""
-        topics = tuple(capabilities[self.medium].get(key) for key in _NAMED[self.medium])
-        if self._viewer is not None and topics != self._topics:
+        """Request it as these capabilities, which :func:`refusal` allows, offer it; call it again and again.
+
+        Raises PebbleError.
+        """
+        topics = [capabilities[self.medium].get(key) for key in _NAMED[self.medium]]
+        if self._viewer is None or topics != self._topics:
             await self.withdraw()
-        if self._viewer is None:
-            self._viewer = await asyncio.to_thread(self._open)
+            self._viewer = Viewer(self._broker.transport, self.ref, self._on_payload, capabilities)
             self._topics = topics
             await self._request(encoding)
-        elif encoding != self.encoding:
+            return
+        self._viewer.capabilities = capabilities
+        if encoding != self.encoding:
             await self._request(encoding)
         else:
             await asyncio.to_thread(self._viewer.repeat_requests)
@@ -126,19 +128,6 @@ class MediaSource:
         except PebbleError as error:
             log.warning("the %s of %s: %s", _WORDS[self.medium].name, self.ref, error)
 
-    def _open(self) -> Viewer:
-        """On a thread: it waits for the broker."""
-        transport = cast(Transport, _OwnTopics(self._broker.transport, self.ref, self.medium))
-        viewer = Viewer(transport, self.ref, self._on_payload)
-        try:
-            viewer.wait_for_capabilities(_CAPABILITIES_S)
-            if reason := refusal(self.ref, viewer.capabilities, self.medium):
-                raise PebbleError(reason)
-        except PebbleError:
-            viewer.close()
-            raise
-        return viewer
-
     # -- a thread of the transport
 
     def _on_payload(self, _medium: Medium, payload: bytes) -> None:
@@ -159,28 +148,3 @@ class MediaSource:
             self._pending_bytes -= len(payload)
         if self._viewer is not None:
             self._receive(payload)
-
-
-class _OwnTopics:
-    """The part of a transport that a Viewer uses, limited to the topics of one component's medium.
-
-    A robot's capabilities may change between being checked and being used.
-    """
-
-    def __init__(self, transport: Transport, ref: str, medium: Medium) -> None:
-        self._transport, self._ref = transport, ref
-        self._channels = (CAPABILITIES, *_NAMED[medium].values())
-
-    def publish(self, topic: str, payload: bytes, **options: Any) -> bool:
-        self._check(topic, *(channel for channel in self._channels if channel.direction == INCOMING))
-        return self._transport.publish(topic, payload, urgent=True, **options)
-
-    def subscribe(
-        self, filter_: str, handler: Handler, *, qos: QoS = QoS.DELIVERED, echo: bool = True, direct: bool = False
-    ) -> Subscription:
-        self._check(filter_, *self._channels)
-        return self._transport.subscribe(filter_, handler, qos=qos, echo=echo, direct=direct)
-
-    def _check(self, topic: str, *channels: Channel) -> None:
-        if not any(names(self._ref, topic, channel) for channel in channels):
-            raise TransportError(f"{topic} is no topic of {self._ref} for this")

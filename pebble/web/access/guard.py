@@ -10,8 +10,8 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from pebble.client.page_settings import WebSettings
 from pebble.fleet import certificates
-from pebble.web.settings import WebSettings
 
 MAX_BODY = 16 * 1024
 BODY_S = 10.0  # for a body to arrive

@@ -16,11 +16,11 @@ from starlette.requests import HTTPConnection, Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
+from pebble.client.page_settings import WebSettings
 from pebble.fleet.database import DatabaseError
 from pebble.fleet.people import SESSION_S, TooManyTriesError, User
 from pebble.fleet.roles import LOCAL, Session
 from pebble.runtime.rate_limit import RateLimitedLog
-from pebble.web.settings import WebSettings
 from pebble.web.static_files import root_of
 
 _WAITING = 32  # logins that wait for the thread; each takes some 20 ms

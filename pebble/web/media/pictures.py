@@ -12,9 +12,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from pebble.client.broker import Broker
 from pebble.client.media_request.encoding_choice import BEST_FIRST
-from pebble.client.robot_topics import own_topic
 from pebble.contract import CAMERA
-from pebble.contract.identity import Direction
 from pebble.web.media.picture_stream import PageViewer, PictureStream, rest
 from pebble.web.media.rescue import RescuedPicture, newest_jpeg
 from pebble.web.media.stream import Streams
@@ -23,7 +21,6 @@ from pebble.web.robots import Robots
 
 PICTURE_METRIC: Final = "web/picture"
 _ANSWER: Final = struct.Struct(">IB")  # number of a frame, and what became of it
-_BAD_REQUEST: Final = 4400  # code of a closed socket
 _SNAPSHOT_S: Final = 0.5  # a snapshot this recent is used again
 
 
@@ -32,15 +29,12 @@ class MediaHub:
 
     def __init__(self, broker: Broker, robots: Robots) -> None:
         self._broker, self._robots = broker, robots
-        self._streams = Streams(self._make)
+        self._streams = Streams(CAMERA, self._make)
         self._snapshots: WeakKeyDictionary[PictureStream, _Snapshot] = WeakKeyDictionary()
         self._pinned: dict[str, str] = {}
 
     async def serve(self, websocket: WebSocket, ref: str, can: frozenset[str]) -> None:
         """Send the pictures of ``ref`` to a page that decodes ``can``, until either end closes the socket."""
-        if self._streams.closed or not own_topic(ref, CAMERA.topic(ref), Direction.OUTGOING):
-            await websocket.close(_BAD_REQUEST, "no such component")
-            return
         viewer = PageViewer(can)
         await self._streams.serve(
             websocket,

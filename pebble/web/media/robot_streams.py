@@ -11,11 +11,11 @@ import socket
 from collections.abc import Container
 from typing import Any, Final
 
+from pebble.client.page_settings import WebSettings
 from pebble.contract import STATUS, codec
 from pebble.errors import PayloadError
 from pebble.web.access.guard import canonical, host_names, is_loopback
 from pebble.web.robots import Robots
-from pebble.web.settings import WebSettings
 
 KEYS: Final = ("webrtc_url", "webrtcUrl", "url")  # of the status; robots of the original use all of them
 MAX_ORIGINS: Final = 16  # in one header

@@ -14,9 +14,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from pebble.client.broker import Broker
 from pebble.client.media_request.source import offered, refusal
-from pebble.client.robot_topics import own_topic
 from pebble.contract import AUDIO, AUDIO_STREAM
-from pebble.contract.identity import Direction
 from pebble.contract.packets import Codec, Sound
 from pebble.errors import PayloadError
 from pebble.fleet.roles import Session, rights
@@ -37,7 +35,6 @@ _MAX_ANSWERS: Final = 8
 _HEAD: Final = struct.Struct(">BI")
 _PIECE: Final = struct.Struct(">BII")
 _RECEIVED, _VOICE, _END = range(3)  # what a page sends
-_BAD_REQUEST: Final = 4400  # code of a closed socket
 
 NoteTalk = Callable[[str, Session, str, str], None]  # component, session, device and address, for the audit log
 
@@ -218,7 +215,7 @@ class SoundHub:
 
     def __init__(self, broker: Broker, robots: Robots, note: NoteTalk) -> None:
         self._robots = robots
-        self._streams = Streams(lambda ref: SoundStream(broker, robots, ref, self._show, note))
+        self._streams = Streams(AUDIO, lambda ref: SoundStream(broker, robots, ref, self._show, note))
 
     async def serve(
         self,
@@ -230,9 +227,6 @@ class SoundHub:
         address: str = "",
     ) -> None:
         """Serve a page that plays ``can`` and may talk, until either end closes the socket."""
-        if self._streams.closed or not own_topic(ref, AUDIO.topic(ref), Direction.OUTGOING):
-            await websocket.close(_BAD_REQUEST, "no such component")
-            return
         page = SoundPage(can & frozenset(ENCODINGS), session, device, address)
         await self._streams.serve(
             websocket, ref, page, lambda _: _send(websocket, page), lambda stream: _receive(websocket, stream, page)

@@ -14,7 +14,10 @@ from starlette.websockets import WebSocket
 
 from pebble.client.broker import Broker
 from pebble.client.media_request.request import TICK_S, MediaRequest
+from pebble.client.robot_topics import own_topic
 from pebble.client.viewer import Medium
+from pebble.contract import Channel
+from pebble.contract.identity import Direction
 from pebble.media.rate_meter import RateMeter
 from pebble.web.robots import Robots
 
@@ -23,7 +26,7 @@ log = logging.getLogger(__name__)
 _WHAT: Final[dict[Medium, str]] = {"video": "picture", "audio": "sound"}
 _SILENT_S: Final = 2.0
 _SILENT_PERIODS: Final = 3.0
-_GONE: Final = 1001  # code of a closed socket
+_GONE, _BAD_REQUEST = 1001, 4400  # codes of a closed socket
 
 ViewerT = TypeVar("ViewerT")
 ViewT = TypeVar("ViewT")
@@ -162,9 +165,9 @@ StreamT = TypeVar("StreamT", bound=MediaStream[Any, Any])
 class Streams(Generic[StreamT]):
     """The streams of one medium, by robot; one that has ended is forgotten."""
 
-    def __init__(self, make: Callable[[str], StreamT]) -> None:
-        self.closed = False
-        self._make = make
+    def __init__(self, channel: Channel, make: Callable[[str], StreamT]) -> None:
+        self._channel, self._make = channel, make
+        self._closed = False
         self._streams: dict[str, StreamT] = {}
 
     def get(self, ref: str) -> StreamT | None:
@@ -179,6 +182,9 @@ class Streams(Generic[StreamT]):
         *work: Callable[[StreamT], Coroutine[Any, Any, None]],
     ) -> None:
         """Let the page view that robot until one part of the ``work`` for its socket ends; close the socket."""
+        if self._closed or not own_topic(ref, self._channel.topic(ref), Direction.OUTGOING):
+            await websocket.close(_BAD_REQUEST, "no such component")
+            return
         stream = self._open(ref)
         stream.join(viewer)
         tasks = {asyncio.create_task(one(stream)) for one in work}
@@ -192,7 +198,7 @@ class Streams(Generic[StreamT]):
 
     async def close(self) -> None:
         """Withdraw all requests; for good."""
-        self.closed = True
+        self._closed = True
         await asyncio.gather(*(stream.close() for stream in self._streams.values()), return_exceptions=True)
 
     def _open(self, ref: str) -> StreamT:

@@ -13,11 +13,11 @@ from unittest.mock import patch
 from starlette.websockets import WebSocketDisconnect, WebSocketState
 
 from pebble.client import broker
+from pebble.client.page_settings import WebSettings
 from pebble.contract import DRIVE, codec
 from pebble.fleet.roles import Role, Session
 from pebble.transports import clock as message_clock
 from pebble.web import control, robots, server
-from pebble.web.settings import WebSettings
 from tests.robot.lockstep.network import Connection, Network
 from tests.robot.lockstep.processes import Process
 from tests.web.driving_lockstep.pages import EPOCH

@@ -12,10 +12,10 @@ import httpx
 import msgspec
 import pytest
 
+from pebble.client.page_settings import WebSettings
 from pebble.transports import MqttSettings
 from pebble.web.access.guard import CONTENT_SECURITY_POLICY
 from pebble.web.media.robot_streams import MAX_ORIGINS, OwnHosts, origin
-from pebble.web.settings import WebSettings
 from tests.support import Broker, until
 from tests.web.in_node import evaluate
 from tests.web.served import RecordingRobot, Served

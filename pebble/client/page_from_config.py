@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from pebble.client.page_settings import WebSettings
 from pebble.config import Config, Mqtt
 from pebble.config.web import WebInterface
-from pebble.errors import ConfigError, PebbleError
-from pebble.fleet.people import People
+from pebble.errors import ConfigError
 from pebble.runtime.connections import REMOTE_RECONNECT_S, mqtt_settings
-from pebble.web.settings import WebSettings
 
 PEOPLE = "people.sqlite"  # in the state directory
 
@@ -17,7 +16,7 @@ PEOPLE = "people.sqlite"  # in the state directory
 def settings_of(config: Config) -> WebSettings:
     """How ``config`` sets up the operator page. Raises ConfigError with the key and what to do.
 
-    Whether there is a user, where ``login`` is true, is seen only in a database: :func:`ready_settings_of`.
+    Whether there is a user, where ``login`` is true, is seen only in a database: ``pebble.web.ready_settings``.
     """
     web = config.web_interface
     if not web.local and web.tls.certificate is None and not web.plain_http:
@@ -33,8 +32,8 @@ def settings_of(config: Config) -> WebSettings:
         port=web.port,
         names=web.names,
         server=web.server or "",
-        login=_has_login(web),
-        people=_people(config),
+        login=has_login(web),
+        people=people_of(config),
         certificate=web.tls.certificate,
         key=web.tls.key,
         authority=web.tls.ca,
@@ -43,47 +42,11 @@ def settings_of(config: Config) -> WebSettings:
     )
 
 
-def ready_settings_of(config: Config) -> WebSettings:
-    """The settings of a page that people can use. Raises ConfigError with everything that is missing."""
-    settings = settings_or_all_problems(config)
-    if problems := _without_user(config):
-        raise ConfigError(problems)
-    return settings
-
-
-def settings_or_all_problems(config: Config) -> WebSettings:
-    """Does what settings_of does; its error also says whether a user is missing: all is found at once."""
-    try:
-        return settings_of(config)
-    except ConfigError as error:
-        try:
-            more = _without_user(config)
-        except PebbleError as other:
-            more = [str(other)]
-        raise ConfigError([*error.problems, *more]) from None
-
-
-def _without_user(config: Config) -> list[str]:
-    """The problem that a login is needed and there is no user; empty if all is well."""
-    if not _has_login(config.web_interface):
-        return []
-    people = People(_people(config))
-    try:
-        if people.list():
-            return []
-    finally:
-        people.close()
-    return [
-        f"web_interface.people: {_people(config)} has no user: run "
-        f"`pebble web user add NAME --people {_people(config)}` as the user who runs the robot"
-    ]
-
-
-def _has_login(web: WebInterface) -> bool:
+def has_login(web: WebInterface) -> bool:
     return not web.local or web.tls.certificate is not None
 
 
-def _people(config: Config) -> Path:
+def people_of(config: Config) -> Path:
     return config.web_interface.people or config.state_dir() / PEOPLE
 
 

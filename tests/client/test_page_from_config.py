@@ -7,10 +7,11 @@ from typing import Any
 
 import pytest
 
+from pebble.client.page_from_config import settings_of
+from pebble.client.page_settings import WebSettings
 from pebble.config import load, parse
 from pebble.errors import ConfigError
-from pebble.web.from_config import settings_of, settings_or_all_problems
-from pebble.web.settings import WebSettings
+from pebble.web.ready_settings import settings_or_all_problems
 
 ROOT = Path(__file__).resolve().parents[2]
 REMOTE: dict[str, Any] = {
