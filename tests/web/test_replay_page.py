@@ -162,7 +162,8 @@ def test_the_cards_show_that_time_and_none_of_them_sends(replay: Tab):
 def test_plots_and_the_trail_grow_while_it_plays_and_begin_anew_with_a_seek(replay: Tab):
     replay.page.evaluate("pebble.replay.player.setSpeed(8)")
     replay.test("play").click()
-    trail = """async () => { const { recorderOf } = await import(`/static/${pebble.connection.version}/ui/parts/recorder.js`);
+    trail = """async () => {
+      const { recorderOf } = await import(`/static/${pebble.connection.version}/ui/parts/recorder.js`);
       return recorderOf(pebble.replay.page, 'pebble/robots/goob').all.get('poses wheel-odometry')?.times ?? []; }"""
     assert replay.until(lambda: len(replay.page.evaluate(trail)) > 8)
     replay.test("play").click()
