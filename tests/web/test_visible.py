@@ -53,9 +53,7 @@ def characters() -> list[str]:
     return [chr(code) for code in range(sys.maxunicode + 1) if unicodedata.category(chr(code)) not in ("Cn", "Co")]
 
 
-@pytest.mark.parametrize(
-    ("around", "together"), [("a{}b", 100), ("\u00e9{}\u00e9", 100), ("{}", 1), ("\u00e9{}", 1)]
-)
+@pytest.mark.parametrize(("around", "together"), [("a{}b", 100), ("\u00e9{}\u00e9", 100), ("{}", 1), ("\u00e9{}", 1)])
 def test_the_rule_is_the_same_for_every_character(around: str, together: int) -> None:
     """Those with a letter on each side are many in one text: no character sees further than that."""
     each = [around.format(one) for one in characters()]
