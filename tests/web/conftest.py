@@ -12,6 +12,7 @@ from playwright.sync_api import Browser
 
 from tests.support import Broker
 from tests.web.browser import chromium
+from tests.web.console import Console, Wire, console, used
 from tests.web.served import Served
 from tests.web.stage import Stage
 
@@ -36,14 +37,33 @@ def browser() -> Iterator[Browser]:
 
 
 @pytest.fixture(scope="module")
-def stage() -> Iterator[Stage]:
-    """The demo's four robots."""
-    with Stage() as running:
+def robot_names() -> tuple[str, ...]:
+    """The robots of ``stage``; none: the demo's four. A module that needs fewer has a fixture of its own."""
+    return ()
+
+
+@pytest.fixture(scope="module")
+def stage(robot_names: tuple[str, ...]) -> Iterator[Stage]:
+    """Whole robots: MiniLAMP alone is ready in a second."""
+    with Stage(*robot_names) as running:
         yield running
 
 
 @pytest.fixture(scope="module")
-def lamp() -> Iterator[Stage]:
-    """MiniLAMP alone: ready in a second."""
-    with Stage("minilamp") as running:
-        yield running
+def wire(stage: Stage) -> Iterator[Wire]:
+    running = Wire(stage)
+    yield running
+    running.close()
+
+
+@pytest.fixture(scope="module")
+def lamp_page(browser: Browser, stage: Stage) -> Iterator[Console]:
+    with console(browser, stage, "minilamp") as opened:
+        yield opened
+
+
+@pytest.fixture
+def at_lamp(lamp_page: Console) -> Iterator[Console]:
+    """Minilamp's page: it has no camera, so it is ready at once."""
+    with used(lamp_page) as ready:
+        yield ready

@@ -1,4 +1,4 @@
-"""Keys and buttons besides driving, mappings of gamepads, and screens that only watch; asserted at robot and broker."""
+"""Keys and buttons besides driving, gamepads, and screens that only watch; asserted at robot and broker."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from playwright.sync_api import Browser, Route
 
 from tests.web.browser import Tab, tab
 from tests.web.canned import serving
-from tests.web.console import FORWARD, RIGHT, Console, Wire, console, pad, used
+from tests.web.console import BACK, FORWARD, LEFT, RIGHT, Console, Wheels, Wire, console, pad, used
 from tests.web.stage import Stage
 from tests.web.states import STATES
 
@@ -31,17 +31,9 @@ _SOUND = """() => {
 
 
 @pytest.fixture(scope="module")
-def stage() -> Iterator[Stage]:
+def robot_names() -> tuple[str, ...]:
     """BenJr alone: its motors have more speeds than on and off."""
-    with Stage("benjr") as running:
-        yield running
-
-
-@pytest.fixture(scope="module")
-def wire(stage: Stage) -> Iterator[Wire]:
-    running = Wire(stage)
-    yield running
-    running.close()
+    return ("benjr",)
 
 
 @pytest.fixture(scope="module")
@@ -155,6 +147,73 @@ def test_keys_in_text_and_shortcuts_do_nothing(at_benjr: Console) -> None:
 
 
 # -- gamepads
+
+
+def _drives(at_benjr: Console, *pads: dict[str, Any], wheels: Wheels = FORWARD) -> bool:
+    """Show the first gamepad in neutral, then as it is."""
+
+    def neutral() -> None:
+        at_benjr.pads({**pads[0], "axes": [0, 0]}, *pads[1:])
+        at_benjr.page.wait_for_timeout(120)
+
+    neutral()
+    return at_benjr.persists(lambda: at_benjr.pads(*pads), lambda: at_benjr.wheels == wheels, neutral)
+
+
+def test_a_gamepad_drives_once_it_was_seen_in_neutral(at_benjr: Console) -> None:
+    at_benjr.pads(pad(z=1))
+    assert at_benjr.stays_at_rest()
+    assert _drives(at_benjr, pad(z=1))
+    assert _drives(at_benjr, pad(x=-1), wheels=LEFT)
+    at_benjr.pads(pad(0.05, -0.05))
+    assert at_benjr.rests()
+
+
+def test_a_gamepad_that_is_disconnected_while_it_is_deflected_stops(at_benjr: Console) -> None:
+    assert _drives(at_benjr, pad(z=1))
+    at_benjr.pads(None)
+    assert at_benjr.rests()
+    at_benjr.pads(None, pad(z=1))
+    assert at_benjr.stays_at_rest()
+    assert _drives(at_benjr, pad(z=1))
+
+
+def test_a_deflected_gamepad_whose_time_stands_still_is_given_up(at_benjr: Console) -> None:
+    assert _drives(at_benjr, pad(z=1))
+    began = time.monotonic()
+    assert at_benjr.rests(6)
+    assert time.monotonic() - began > 2.5
+    assert at_benjr.reason in ("pad", "release")
+    at_benjr.pads(pad(z=1))
+    assert at_benjr.stays_at_rest()
+    assert _drives(at_benjr, pad(z=1))
+
+
+def test_of_two_gamepads_the_one_that_was_touched_last_drives(at_benjr: Console) -> None:
+    second = pad(name="Logitech Attack 3")
+    assert _drives(at_benjr, pad(z=1), second)
+    at_benjr.page.wait_for_timeout(200)  # what two do at once is one device, listed twice
+    at_benjr.pads(pad(z=1), {**second, "axes": [0, 1]})
+    assert at_benjr.rests()  # it is let go first
+    at_benjr.pads(pad(), second)
+    at_benjr.page.wait_for_timeout(120)
+    at_benjr.pads(pad(), {**second, "axes": [0, 1]})
+    assert at_benjr.turns(BACK)
+
+
+def test_the_buttons_of_a_gamepad_stop(at_benjr: Console, wire: Wire) -> None:
+    assert _drives(at_benjr, pad(z=1))
+    at_benjr.pads(pad(0, 1, 0))
+    assert at_benjr.rests()
+    assert at_benjr.stays_at_rest()
+    assert not wire.latched("benjr")
+    assert _drives(at_benjr, pad(z=1))
+    at_benjr.pads(pad(0, 1, 8, 9))
+    assert at_benjr.tab.until(lambda: wire.latched("benjr"), 2)
+    assert at_benjr.rests()
+
+
+# -- mappings of gamepads
 
 _SWAPPED = {
     "x": {"axis": 3, "invert": True},

@@ -20,26 +20,6 @@ pytestmark = pytest.mark.alone  # deadlines are checked
 
 
 @pytest.fixture(scope="module")
-def wire(stage: Stage) -> Iterator[Wire]:
-    running = Wire(stage)
-    yield running
-    running.close()
-
-
-@pytest.fixture(scope="module")
-def _lamp_page(browser: Browser, stage: Stage) -> Iterator[Console]:
-    with console(browser, stage, "minilamp") as opened:
-        yield opened
-
-
-@pytest.fixture
-def at_lamp(_lamp_page: Console) -> Iterator[Console]:
-    """Minilamp's page: it has no camera, so it is ready at once."""
-    with used(_lamp_page) as ready:
-        yield ready
-
-
-@pytest.fixture(scope="module")
 def _benjr_page(browser: Browser, stage: Stage) -> Iterator[Console]:
     with console(browser, stage, "benjr", theme="dark") as opened:
         yield opened

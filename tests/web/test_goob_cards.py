@@ -50,21 +50,13 @@ class Reports:
 
 
 @pytest.fixture(scope="module")
-def stage() -> Iterator[Stage]:
-    with Stage("goob") as running:
-        yield running
+def robot_names() -> tuple[str, ...]:
+    return ("goob",)
 
 
 @pytest.fixture(scope="module")
 def reports(stage: Stage) -> Iterator[Reports]:
     running = Reports(stage)
-    yield running
-    running.close()
-
-
-@pytest.fixture(scope="module")
-def wire(stage: Stage) -> Iterator[Wire]:
-    running = Wire(stage)
     yield running
     running.close()
 

@@ -91,21 +91,15 @@ def proxy() -> Iterator[TcpProxy]:
 
 
 @pytest.fixture(scope="module")
-def lamp(proxy: TcpProxy) -> Iterator[Stage]:
+def stage(proxy: TcpProxy) -> Iterator[Stage]:
     with Stage("minilamp", names=["127.0.0.1", f"127.0.0.1:{proxy.port}"]) as running:
         proxy.lead_to(int(running.url.rpartition(":")[2].rstrip("/")))
         yield running
 
 
-@pytest.fixture(scope="module")
-def _lamp_page(browser: Browser, lamp: Stage) -> Iterator[Console]:
-    with console(browser, lamp, "minilamp") as opened:
-        yield opened
-
-
 @pytest.fixture
-def at_lamp(_lamp_page: Console) -> Iterator[Console]:
-    with used(_lamp_page, complaints=False) as ready:
+def at_lamp(lamp_page: Console) -> Iterator[Console]:
+    with used(lamp_page, complaints=False) as ready:
         yield ready
 
 
@@ -128,9 +122,9 @@ def test_the_wheels_stop_and_wait_for_a_new_press(at_lamp: Console, what: str) -
     assert at_lamp.press_anew()
 
 
-def test_a_tab_that_is_closed_stops(browser: Browser, lamp: Stage, at_lamp: Console) -> None:
+def test_a_tab_that_is_closed_stops(browser: Browser, stage: Stage, at_lamp: Console) -> None:
     at_lamp.test("release").click()
-    with console(browser, lamp, "minilamp") as second:
+    with console(browser, stage, "minilamp") as second:
         second.take()
         assert second.drive()
         second.page.close()
@@ -148,9 +142,9 @@ STALLS: dict[str, Callable[[TcpProxy], object]] = {
 @pytest.mark.parametrize("how", STALLS)
 @pytest.mark.parametrize("seconds", [0.8, 2.5])
 def test_a_connection_that_fails_stops(
-    browser: Browser, lamp: Stage, proxy: TcpProxy, how: str, seconds: float
+    browser: Browser, stage: Stage, proxy: TcpProxy, how: str, seconds: float
 ) -> None:
-    with console(browser, lamp, "minilamp", "phone", "dark", url=f"http://127.0.0.1:{proxy.port}/") as robot:
+    with console(browser, stage, "minilamp", "phone", "dark", url=f"http://127.0.0.1:{proxy.port}/") as robot:
         robot.take()
         assert robot.drive()
         began = time.monotonic()
@@ -161,7 +155,7 @@ def test_a_connection_that_fails_stops(
         proxy.resume()
         assert robot.because("", "free", "release")
         robot.page.wait_for_timeout(1000 * QUIET_S)
-        assert not lamp.wheels_turning("minilamp", since_ns=rested)
+        assert not stage.wheels_turning("minilamp", since_ns=rested)
         robot.take()
         assert robot.press_anew()
         robot.test("release").click()

@@ -120,7 +120,10 @@ def test_state_is_shown_whatever_others_do_to_the_page(driving: Tab, change: str
 
 @pytest.mark.parametrize(
     "change",
-    ["document.documentElement.replaceWith(document.createElement('html'))", "document.write('<p>to be read</p>')"],
+    [
+        "document.documentElement.replaceWith(document.createElement('html'))",
+        pytest.param("document.write('<p>to be read</p>')", marks=_RARE),
+    ],
 )
 def test_a_page_whose_whole_document_was_replaced_is_loaded_again(browser: Browser, change: str) -> None:
     """What listened to keys and buttons may have gone with it."""
@@ -140,7 +143,12 @@ def _is_new(page: Page) -> bool:
 
 
 @pytest.mark.parametrize(
-    "how", [_THROWS, _GONE, "value: function () { throw new DOMException('denied', 'SecurityError'); }"]
+    "how",
+    [
+        pytest.param(_THROWS, marks=_RARE),
+        pytest.param(_GONE, marks=_RARE),
+        "value: function () { throw new DOMException('denied', 'SecurityError'); }",
+    ],
 )
 def test_without_sockets_the_page_reports_no_connection_and_stops_by_a_request(browser: Browser, how: str) -> None:
     script = _DENY % ("[window, 'WebSocket']", how)

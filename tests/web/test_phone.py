@@ -82,22 +82,22 @@ def phone(browser: Browser, stage: Stage, size: Size = "phone", theme: Theme = "
         held.fingers.lift()
 
 
+@pytest.fixture(scope="module")
+def robot_names() -> tuple[str, ...]:
+    return ("minilamp",)
+
+
 @pytest.fixture
-def at_lamp(browser: Browser, lamp: Stage) -> Iterator[Phone]:
-    with phone(browser, lamp) as opened:
+def at_lamp(browser: Browser, stage: Stage) -> Iterator[Phone]:
+    with phone(browser, stage) as opened:
         yield opened
 
 
-@pytest.fixture(scope="module")
-def wire(lamp: Stage) -> Iterator[Wire]:
-    running = Wire(lamp)
-    yield running
-    running.close()
-
-
 @pytest.mark.parametrize(("size", "theme"), [("phone", "light"), ("landscape", "dark"), ("small", "dark")])
-def test_the_stick_follows_a_finger_until_it_is_lifted(browser: Browser, lamp: Stage, size: Size, theme: Theme) -> None:
-    with phone(browser, lamp, size, theme) as robot:
+def test_the_stick_follows_a_finger_until_it_is_lifted(
+    browser: Browser, stage: Stage, size: Size, theme: Theme
+) -> None:
+    with phone(browser, stage, size, theme) as robot:
         for x, y, wheels in [(0, -1, FORWARD), (0, 1, BACK), (-1, 0, LEFT), (1, 0, RIGHT)]:
             assert robot.drive_by_stick(x, y, wheels)
             robot.fingers.up(1)
@@ -202,8 +202,8 @@ def test_what_takes_the_finger_away_stops(at_lamp: Phone, what: str) -> None:
 # -- buttons
 
 
-def test_control_and_reset_by_finger(browser: Browser, lamp: Stage, wire: Wire) -> None:
-    with phone(browser, lamp, theme="dark") as robot:
+def test_control_and_reset_by_finger(browser: Browser, stage: Stage, wire: Wire) -> None:
+    with phone(browser, stage, theme="dark") as robot:
         robot.test("release").tap()
         assert robot.because("free", within=3)
         robot.stick()
@@ -238,8 +238,8 @@ def test_the_extra_axis_is_held_by_a_finger(at_lamp: Phone, wire: Wire) -> None:
     assert at_lamp.wheels == REST
 
 
-def test_the_fleet_is_stopped_and_a_robot_opened_by_finger(browser: Browser, lamp: Stage, wire: Wire) -> None:
-    with phone(browser, lamp) as robot:
+def test_the_fleet_is_stopped_and_a_robot_opened_by_finger(browser: Browser, stage: Stage, wire: Wire) -> None:
+    with phone(browser, stage) as robot:
         robot.page.get_by_label("All robots").tap()
         assert robot.tab.until("window.pebble.driver.ref === ''", 2)
         robot.test("stop-all").tap()

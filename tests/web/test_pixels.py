@@ -94,16 +94,18 @@ def stream(
     return made
 
 
+@pytest.mark.parametrize("size", [(112, 80), pytest.param((640, 480), marks=pytest.mark.thorough)], ids=str)
 @pytest.mark.parametrize("quality", [10, 60, 95])
 @pytest.mark.parametrize("name", EXACT)
-def test_every_pixel_is_the_same(check: Any, name: str, quality: int) -> None:
-    shown = check(stream(name, 12, size=(640, 480), quality=quality))
+def test_every_pixel_is_the_same(check: Any, name: str, quality: int, size: tuple[int, int]) -> None:
+    shown = check(stream(name, 12, size=size, quality=quality))
     assert [one["frame"] for one in shown] == list(range(12))
 
 
+@pytest.mark.parametrize("size", [(64, 48), pytest.param((320, 180), marks=pytest.mark.thorough)], ids=str)
 @pytest.mark.parametrize("name", EXACT)
-def test_a_long_row_of_differences_does_not_drift(check: Any, name: str) -> None:
-    assert None not in check(stream(name, 90, size=(320, 180), interval=90))
+def test_a_long_row_of_differences_does_not_drift(check: Any, name: str, size: tuple[int, int]) -> None:
+    assert None not in check(stream(name, 90, size=size, interval=90))
 
 
 @pytest.mark.parametrize("name", EXACT)

@@ -22,42 +22,49 @@ def status(url: str) -> int:
         return int(answer.status)
 
 
-def test_the_traces_show_what_a_robot_is_commanded(lamp: Stage) -> None:
-    transport = create("mqtt", "driver", MqttSettings(host="127.0.0.1", port=lamp.broker_port))
+@pytest.fixture(scope="module")
+def robot_names() -> tuple[str, ...]:
+    return ("minilamp",)
+
+
+def test_the_traces_show_what_a_robot_is_commanded(stage: Stage) -> None:
+    transport = create("mqtt", "driver", MqttSettings(host="127.0.0.1", port=stage.broker_port))
     transport.open()
     began = time.monotonic_ns()
-    assert not lamp.wheels_turning("minilamp", since_ns=began)
-    assert lamp.last_motion_ns("minilamp") == 0
+    assert not stage.wheels_turning("minilamp", since_ns=began)
+    assert stage.last_motion_ns("minilamp") == 0
 
     def drive(axes: Drive) -> None:
-        transport.publish(f"{lamp.ref('minilamp')}/incoming/drive-values", codec.encode(DRIVE, axes), qos=QoS.DELIVERED)
+        transport.publish(
+            f"{stage.ref('minilamp')}/incoming/drive-values", codec.encode(DRIVE, axes), qos=QoS.DELIVERED
+        )
 
     drive(Drive(z=0.5))
-    assert until(lambda: lamp.wheels_turning("minilamp"))
+    assert until(lambda: stage.wheels_turning("minilamp"))
     drive(Drive())
-    assert until(lambda: not lamp.wheels_turning("minilamp"))
+    assert until(lambda: not stage.wheels_turning("minilamp"))
     transport.close()
-    assert lamp.wheels_turning("minilamp", since_ns=began)
-    assert began < lamp.last_motion_ns("minilamp") < time.monotonic_ns()
-    assert not lamp.wheels_turning("minilamp", since_ns=lamp.last_motion_ns("minilamp"))
+    assert stage.wheels_turning("minilamp", since_ns=began)
+    assert began < stage.last_motion_ns("minilamp") < time.monotonic_ns()
+    assert not stage.wheels_turning("minilamp", since_ns=stage.last_motion_ns("minilamp"))
 
 
-def test_the_server_can_be_frozen_killed_and_started_again_at_its_address(lamp: Stage) -> None:
-    url = lamp.url
-    lamp.server.freeze()
+def test_the_server_can_be_frozen_killed_and_started_again_at_its_address(stage: Stage) -> None:
+    url = stage.url
+    stage.server.freeze()
     with pytest.raises(TimeoutError):
         urllib.request.urlopen(url, timeout=0.3)
-    lamp.server.thaw()
+    stage.server.thaw()
     assert status(url) == 200
-    lamp.server.kill()
-    lamp.restart_server()
-    assert lamp.url == url
+    stage.server.kill()
+    stage.restart_server()
+    assert stage.url == url
     assert status(url) == 200
 
 
 @pytest.mark.parametrize("size", ["desktop", "phone"])
-def test_a_browser_opens_the_page_and_keeps_its_complaints(lamp: Stage, browser: Browser, size: str) -> None:
-    with tab(browser, lamp.url, size, "dark") as opened:  # type: ignore[arg-type]
+def test_a_browser_opens_the_page_and_keeps_its_complaints(stage: Stage, browser: Browser, size: str) -> None:
+    with tab(browser, stage.url, size, "dark") as opened:  # type: ignore[arg-type]
         assert opened.page.title() == "Pebble"
         assert opened.page.evaluate("matchMedia('(pointer: coarse)').matches") is (size == "phone")
         assert opened.page.evaluate("matchMedia('(prefers-color-scheme: dark)').matches")
