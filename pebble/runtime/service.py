@@ -105,15 +105,14 @@ class Service:
         self.log = logging.getLogger(f"pebble.{self.name}")
         self.counters = Counters()
         self.timers = Timers()
-        self._quiet_log = RateLimitedLog(self.log)
+        self.log_limited = RateLimitedLog(self.log)
         self._remarks = RateLimitedLog(self.log, period_s=60.0, most=_SENDERS)
         self._inbox = Inbox()
         self._work = WorkLock()
-        self._wakes_at = -inf  # when the service's thread looks at its timers, on `clock`; guarded by `_work`
         self._states: dict[str, tuple[Channel, bytes]] = {}
         self._handled: dict[Channel, Subscription] = {}  # of the methods marked with @on
         self._on_stop = ExitStack()
-        self._running = True
+        self.running = True
 
     # -- to override
 
@@ -153,6 +152,15 @@ class Service:
         if self._states.pop(topic, None) is not None:
             self._send(channel, topic, b"")
 
+    def clear(self, channel: Channel, **names: str) -> None:
+        """Clear the retained message on ``channel``, whichever process published it."""
+        self._send(channel, self._topic(channel, names), b"")
+
+    def republish(self) -> None:
+        """Publish all states again."""
+        for topic, (channel, raw) in self._states.items():
+            self._send(channel, topic, raw)
+
     def listen(self, channel: Channel, method: Callable[..., None], *, direct: bool = False) -> Subscription:
         """Handle ``channel`` from now on, as ``@on`` does from the start; until the subscription is closed."""
 
@@ -186,18 +194,19 @@ class Service:
         nothing waits; if its thread hangs, it is not. ``job`` must neither block nor take long. A failure ends the
         service, as that of a posted job.
         """
-        if not self._work.try_enter():
+        work = self._work
+        if not work.try_enter():
             return False
         try:
             if self._inbox:
                 return False
             job()
-            if self.timers.next_due < self._wakes_at:
+            if self.timers.next_due < work.wakes_at:
                 self._inbox.wake()
         except Exception as failure:  # noqa: BLE001 - it is raised again where it ends the service
             self.post_first(partial(_fail, failure))
         finally:
-            self._work.leave()
+            work.leave()
         return True
 
     def call_at(self, due: float, job: Callable[[], None]) -> Timer:
@@ -206,17 +215,17 @@ class Service:
 
     def quit(self) -> None:
         """End :meth:`run` soon. Safe from any thread and from signal handlers."""
-        self._running = False
+        self.running = False
         self._inbox.post_internal(lambda: None)
 
     def run(self, ready: Callable[[], None] = lambda: None) -> None:
         """Run until :meth:`quit`. ``ready`` is called once the service has subscribed."""
         try:
             with self._work:
-                self._set_up()
+                self.set_up()
             ready()
-            while self._running:
-                self._turn(None if self._wakes_at == inf else max(0.0, self._wakes_at - self.clock()))
+            while self.running:
+                self.turn(None if self._work.wakes_at == inf else max(0.0, self._work.wakes_at - self.clock()))
         finally:
             self._tear_down()
 
@@ -227,7 +236,8 @@ class Service:
 
     # -- the service's thread
 
-    def _set_up(self) -> None:
+    def set_up(self) -> None:
+        """Start and subscribe; :meth:`run` does it first."""
         self.start()
         self.transport.on_state(self._on_state)
         self.transport.open(timeout=0.0)
@@ -236,7 +246,7 @@ class Service:
             self._handled[method.channel] = self.listen(method.channel, method, direct=method.direct)
         self._set_timers()
 
-    def _turn(self, timeout: float | None) -> bool:
+    def turn(self, timeout: float | None) -> bool:
         """Do one job, if there is one within ``timeout`` seconds, and what is due; return whether there was one."""
         self._inbox.wait(timeout)
         with self._work:
@@ -244,7 +254,7 @@ class Service:
             if job is not None:
                 job()
             self.timers.run_due(self.clock())
-            self._wakes_at = self.timers.next_due
+            self._work.wakes_at = self.timers.next_due
         return job is not None
 
     def _tear_down(self) -> None:
@@ -263,7 +273,7 @@ class Service:
             self.timers.add(now, method, period=method.period)
         interval = self.republish_interval_s
         if interval > 0:
-            self.timers.add(now + interval, self._republish, period=interval)
+            self.timers.add(now + interval, self.republish, period=interval)
 
     @property
     def republish_interval_s(self) -> float:
@@ -272,11 +282,7 @@ class Service:
 
     def _begin_connection(self) -> None:
         self.on_connected()
-        self._republish()
-
-    def _republish(self) -> None:
-        for topic, (channel, raw) in self._states.items():
-            self._send(channel, topic, raw)
+        self.republish()
 
     def _topic(self, channel: Channel, names: dict[str, str]) -> str:
         return self.addresses[channel].topic if not names else channel.topic(self.config.base, **names)
@@ -286,7 +292,7 @@ class Service:
         return self.transport.publish(topic, raw, qos=_QOS[address.qos], retain=address.retain)
 
     def _log_totals(self) -> None:
-        totals = self._quiet_log.totals()
+        totals = self.log_limited.totals()
         if totals or self._inbox.dropped:
             self.log.info("refused in all: %s; dropped from the inbox: %d", totals or "nothing", self._inbox.dropped)
 
@@ -304,14 +310,14 @@ class Service:
         """What fails on a message is counted, and the service goes on: a retained one would end it again and again."""
         try:
             method()
-        except Exception:  # noqa: BLE001 - a message comes from another process, and must not end this one
+        except Exception:  # a message comes from another process, and must not end this one
             self.counters.add("handler_errors")
-            self._quiet_log.exception(f"{channel.metric} failed", "failed on a message on %s", channel.metric)
+            self.log_limited.exception(f"{channel.metric} failed", "failed on a message on %s", channel.metric)
 
     def count_late(self, channel: Channel) -> None:
         """Count and log a command that waited longer than WAIT_LIMIT_S, and that the caller drops."""
         self.counters.add("late")
-        self._quiet_log.warning(f"{channel.metric} late", "dropped a late %s", channel.metric)
+        self.log_limited.warning(f"{channel.metric} late", "dropped a late %s", channel.metric)
 
     # -- the transport's threads: decode and post, nothing else
 
@@ -319,12 +325,12 @@ class Service:
         """Refuse what is stale or malformed *before* it can replace a valid message in the inbox."""
         if message.retain and channel.kind in _ONE_SHOT:
             self.counters.add("stale")
-            self._quiet_log.warning(f"{channel.metric} retained", "refused a retained message on %s", channel.metric)
+            self.log_limited.warning(f"{channel.metric} retained", "refused a retained message on %s", channel.metric)
             return
         names = channel.names(message.topic) if channel.is_pattern else {}
         if channel.is_pattern and not names:  # the filter's + also matches an empty level
             self.counters.add("refused")
-            self._quiet_log.warning(
+            self.log_limited.warning(
                 f"{channel.metric} unnamed", "refused a message with an empty level in its topic: %r", message.topic
             )
             return
@@ -335,7 +341,7 @@ class Service:
                 self.counters.add("blank")
                 return
             self.counters.add("refused")
-            self._quiet_log.warning(channel.metric, "refused a message: %s", error)
+            self.log_limited.warning(channel.metric, "refused a message: %s", error)
             return
         arrived = self.clock() - message.waited_s
         if direct:

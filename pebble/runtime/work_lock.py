@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from math import inf
 from types import TracebackType
 
 
@@ -13,6 +14,7 @@ class WorkLock:
     """
 
     def __init__(self) -> None:
+        self.wakes_at = -inf  # when the own thread looks at its timers, on the service's clock; guarded by this lock
         self._lock = threading.Lock()
         self._awaited = False  # by the own thread
 

@@ -107,7 +107,7 @@ class AutonomyManager(Service):
         word = (command.action or "").strip().lower()
         begin = True if word in _START else False if word in STOP_WORDS else command.enabled
         if begin is None:
-            self._quiet_log.warning("command", "ignored a command that neither starts nor stops a script")
+            self.log_limited.warning("command", "ignored a command that neither starts nor stops a script")
         elif begin:
             self._start_script((command.file or "").strip(), command.config or {})
         else:
@@ -122,7 +122,7 @@ class AutonomyManager(Service):
             wanted = plan(self._scripts, file, config)
             self._check(wanted)
         except StartError as error:
-            self._quiet_log.log("refused", logging.WARNING, "%s", error)
+            self.log_limited.log("refused", logging.WARNING, "%s", error)
             self._runner.refuse(str(error))
         else:
             self._runner.start(wanted)

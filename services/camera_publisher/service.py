@@ -56,14 +56,14 @@ class CameraPublisher(Service):
         )
 
     def start(self) -> None:
-        self.on_stop(self._log_totals)
+        self.on_stop(self._log_counters)
         self._remote.on_state(lambda _state: self.post(self._on_remote))
         self._remote.open(timeout=0.0)
         self.on_stop(self._remote.close)
         self._reader.open()
         self.on_stop(self._reader.close)
 
-    def _log_totals(self) -> None:
+    def _log_counters(self) -> None:
         self.log.info("pictures: %s", self.counters.snapshot())
 
     # -- what operators request
@@ -186,7 +186,7 @@ class CameraPublisher(Service):
     def _fail(self, error: PebbleError) -> None:
         self._throw_away("failed")
         self._problem = str(error)
-        self._quiet_log.warning("a frame", "a frame of the camera cannot be sent: %s", error)
+        self.log_limited.warning("a frame", "a frame of the camera cannot be sent: %s", error)
 
     # -- the report
 

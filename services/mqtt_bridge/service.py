@@ -356,12 +356,12 @@ class MqttBridge(Service):
 
     def _refuse(self, channel: Channel, error: PayloadError) -> None:
         self.counters.add("refused")
-        self._quiet_log.warning(channel.metric, "refused a message: %s", error)
+        self.log_limited.warning(channel.metric, "refused a message: %s", error)
 
     def _refuse_stale(self, channel: Channel | None) -> None:
         what = "a command" if channel is None else channel.metric
         self.counters.add("stale")
-        self._quiet_log.warning(f"{what} retained", "refused a retained message on %s", what)
+        self.log_limited.warning(f"{what} retained", "refused a retained message on %s", what)
 
 
 def _few(topics: list[str]) -> str:

@@ -115,7 +115,7 @@ class DescribedBridge(SerialService):
         self._handle_events(self._session.tick(self.clock(), _now_ms()))
         for uid in self._peers.left_over(self.clock()):
             self.log.info("%s: its retained manifest is stale; cleared", uid)
-            self._send(MCU_DESCRIBE, MCU_DESCRIBE.topic(self.config.base, uid=uid), b"")
+            self.clear(MCU_DESCRIBE, uid=uid)
             self._aliases.update()
         self._perform(self._uid.tick(self.clock()))
         self._arm()
@@ -176,7 +176,7 @@ class DescribedBridge(SerialService):
             self.log.debug("%s: command %d accepted", answer.command, answer.sequence)
         elif answer.accepted is None:
             self.counters.add("unanswered")
-            self._quiet_log.warning("unanswered", "%s: no answer to command %d", answer.command, answer.sequence)
+            self.log_limited.warning("unanswered", "%s: no answer to command %d", answer.command, answer.sequence)
         else:
             self.counters.add("nack")
             reason = answer.reason or "no reason given"
@@ -273,13 +273,13 @@ class DescribedBridge(SerialService):
         name = route.interface.name
         if device is not self._device:
             self.counters.add("no_device")
-            self._quiet_log.warning("no device", "%s: dropped a command, the device is not there", name)
+            self.log_limited.warning("no device", "%s: dropped a command, the device is not there", name)
             return
         try:
             send = self._session.command(route.interface, values, self.clock(), _now_ms())
         except PayloadError as error:
             self.counters.add("refused")
-            self._quiet_log.warning("command", "refused a command: %s", error)
+            self.log_limited.warning("command", "refused a command: %s", error)
             return
         if not self.line.send(send.kind, send.data):
             self.counters.add("no_device")
@@ -298,11 +298,10 @@ class DescribedBridge(SerialService):
 
     def _end_alias(self, alias: Alias) -> None:
         self._features.names -= outlet_feature(alias.claim)
-        address = self.addresses[alias.channel]
         if alias.channel.kind is Kind.STATE:
             self.retract(alias.channel)
-        elif address.retain:  # the config retains a stream
-            self._send(alias.channel, address.topic, b"")
+        elif self.addresses[alias.channel].retain:  # the config retains a stream
+            self.clear(alias.channel)
 
     # -- the other devices of this robot
 
@@ -329,7 +328,7 @@ class DescribedBridge(SerialService):
         now = self.clock()
         if self._device is not None and uid == self._device.uid:
             if manifest is None:
-                self._republish()  # another process removed it, for example one that has yielded the uid
+                self.republish()  # another process removed it, for example one that has yielded the uid
             else:
                 self._perform(self._uid.on_manifest(uid, now))
             return

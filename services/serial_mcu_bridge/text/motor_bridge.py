@@ -126,7 +126,7 @@ class MotorBridge(SerialService):
             if latches:
                 self._guard.stop(stop, self.clock())
             else:
-                self._quiet_log.warning("unlatched", "a stop only halts: it could not be reset")
+                self.log_limited.warning("unlatched", "a stop only halts: it could not be reset")
                 self._guard.judge(_FINAL_ZERO, self.clock())
         for waiting in batch.resets:
             self._guard.reset(waiting.reset, self.clock() - waiting.at, self.clock())
@@ -142,7 +142,7 @@ class MotorBridge(SerialService):
         if dropped:
             self.counters.add("motion_dropped", dropped)
             text = "dropped commands of many senders or stops that waited"
-            self._quiet_log.warning("motion_dropped", text, times=dropped)
+            self.log_limited.warning("motion_dropped", text, times=dropped)
 
     def _drive(self, received: ReceivedDrive) -> None:
         now, drive = self.clock(), received.drive
@@ -243,7 +243,7 @@ class MotorBridge(SerialService):
         if self._latches:
             self.publish(ESTOP_STATE, state, owner=self._owner)
         else:
-            self._send(ESTOP_STATE, ESTOP_STATE.topic(self.config.base, owner=self._owner), b"")
+            self.clear(ESTOP_STATE, owner=self._owner)
 
     def _on_saved(self, number: int, succeeded: bool) -> None:
         """On the file's thread."""

@@ -101,7 +101,7 @@ class ServiceProcess(Process):
         self.service = self._make(self)
         # Here all work waits for a turn of the process: a frozen one gets messages, and does nothing.
         self.service.run_if_idle = lambda _job: False  # type: ignore[method-assign]
-        self.service._set_up()
+        self.service.set_up()
         self.wake()
 
     def kill(self, restart_s: float | None) -> None:
@@ -116,8 +116,8 @@ class ServiceProcess(Process):
     def turn(self) -> None:
         service = self.service
         assert service is not None
-        while service._turn(0):
-            if not service._running:
+        while service.turn(0):
+            if not service.running:
                 raise AssertionError(f"{self.name} ends by itself")
         wait = service.timers.wait(self.scheduler.now)
         if wait is not None:
