@@ -76,9 +76,9 @@ class SimulatedMcu:
         self.body.on_relay = on_relay or self.body.on_relay
         self.motion, self.battery = self.body.motion, self.body.battery
         self.battery.charging = charging
-        self._boot_output = self._line = self._last = self._drive_line = b""
-        self._commands = self._trips = 0
+        self._boot_output = b""
         self._firmware: Any = None  # its robot object, since the last boot
+        self._obeyed = _ObeyedLines(None)
         self._runner = Runner(self.board, kind, settings, on_boot=self._on_boot)
         self._start()
 
@@ -103,15 +103,14 @@ class SimulatedMcu:
         if not self.profile.is_text:
             return output + self._write_input(data, now)
         if not self._firmware.lines.length:  # the firmware has dropped half a line
-            self._line = b""
+            self._obeyed.half = b""
         *lines, rest = data.split(b"\n")
         for line in lines:
             answer = self._write_input(line + b"\n", now)
-            self._count_command(self._line + line, answer)
-            self._line = b""
+            self._obeyed.add(line, answer)
             output += answer
         if rest:
-            self._line = (self._line + rest)[:_LONGEST_LINE]
+            self._obeyed.half = (self._obeyed.half + rest)[:_LONGEST_LINE]
             output += self._write_input(rest, now)
         return output
 
@@ -121,7 +120,8 @@ class SimulatedMcu:
         return first + self._advance(now, self.profile.turn_s) + self._turn(now)
 
     def state(self) -> BoardState:
-        return self.body.state(self._drive(), self._commands, self._last.decode("ascii", "replace"))
+        drive = self._obeyed.drive(self.board) if self.profile.is_text else None
+        return self.body.state(drive, self._obeyed.count, self._obeyed.last.decode("ascii", "replace"))
 
     # -- time
 
@@ -161,31 +161,39 @@ class SimulatedMcu:
         self._runner.step()
         self._boot_output = self.board.take_output()
 
-    # -- commands
-
     def _on_boot(self, robot: Any) -> None:
         if self.failsafe_s is not None:
             robot.deadman.limit_ms = round(self.failsafe_s * 1000)
         self._firmware = robot
-        self._line = self._last = self._drive_line = b""
-        self._commands = self._trips = 0
+        self._obeyed = _ObeyedLines(robot)
 
-    def _count_command(self, line: bytes, answer: bytes) -> None:
-        """Count ``line`` if the firmware answered OK."""
+
+class _ObeyedLines:
+    """The lines that a text board's firmware has answered with OK since it booted."""
+
+    def __init__(self, firmware: Any) -> None:
+        self.half = b""  # of the line that is being typed
+        self.last = b""
+        self.count = 0
+        self._firmware = firmware
+        self._drive = b""
+        self._trips = 0  # of the failsafe, before that drive command
+
+    def add(self, rest: bytes, answer: bytes) -> None:
+        """Count the line that ``rest`` ends, if the answer is OK."""
+        line, self.half = self.half + rest, b""
         at = answer.find(b"OK ")
         if at < 0:
             return
-        self._commands += 1
-        self._last = b" ".join(line.split()[:_TOKENS])
+        self.count += 1
+        self.last = b" ".join(line.split()[:_TOKENS])
         if answer[at + 3 : at + 4] == b"M":
-            self._drive_line, self._trips = self._last, self._firmware.deadman.trips
+            self._drive, self._trips = self.last, self._firmware.deadman.trips
 
-    def _drive(self) -> Pair | None:
+    def drive(self, board: Board) -> Pair:
         """The wheel speeds of the last drive command as the firmware parses them; 0 after its failsafe tripped."""
-        if not self.profile.is_text:
-            return None
-        if not self._drive_line or self._firmware.deadman.trips != self._trips:
+        if not self._drive or self._firmware.deadman.trips != self._trips:
             return 0.0, 0.0
-        read = self.board.firmware.module("common.lines")
-        left, right = (read.clamp(read.number(token, 0, len(token)), -1.0) for token in self._drive_line.split()[1:3])
+        read = board.firmware.module("common.lines")
+        left, right = (read.clamp(read.number(token, 0, len(token)), -1.0) for token in self._drive.split()[1:3])
         return left, right

@@ -19,6 +19,7 @@ from typing import Any, Self, TypeVar
 
 from pebble.errors import ConfigError, DeviceError
 from pebble.runtime.lines import LineSplitter
+from pebble.runtime.wakeup_pipe import WakeupPipe
 from pebble.simulation.board import BoardState, SimulatedMcu
 from pebble.simulation.bodies import Outlets, Pair
 from pebble.simulation.micropython.board import UID
@@ -83,8 +84,7 @@ class PtyMcu:
         self._host = False
         self._stopping = False
         self._requests: queue.SimpleQueue[tuple[Future[Any], Callable[[], Any]]] = queue.SimpleQueue()
-        self._wakeup_reader, self._wakeup_writer = os.pipe()
-        os.set_blocking(self._wakeup_reader, False)
+        self._wakeup = WakeupPipe()
         self._thread = threading.Thread(target=self._run, name=f"pebble-sim {kind}", daemon=True)
 
     def open(self) -> Self:
@@ -105,8 +105,7 @@ class PtyMcu:
         self._call(self._stop)
         self._thread.join(_ANSWER_S)
         self.trace.close()
-        os.close(self._wakeup_reader)
-        os.close(self._wakeup_writer)
+        self._wakeup.close()
 
     def __enter__(self) -> Self:
         return self.open()
@@ -168,7 +167,7 @@ class PtyMcu:
             raise DeviceError(f"the simulated MCU at {self.symlink} is not running")
         answer: Future[T] = Future()
         self._requests.put((answer, job))
-        os.write(self._wakeup_writer, b"!")
+        self._wakeup.set()
         return answer.result(_ANSWER_S)
 
     # -- the MCU's thread
@@ -183,14 +182,13 @@ class PtyMcu:
 
     def _wait(self) -> None:
         """Wait for data from the host, for a request, or for the next tick."""
-        watched = [self._wakeup_reader]
+        watched = [self._wakeup.fileno()]
         if self._host and self._master is not None:
             watched.append(self._master)
         unasked = self._master is not None and not self._host
         ready, _, _ = select.select(watched, [], [], min(self._tick_s, _NO_HOST_S) if unasked else self._tick_s)
-        if self._wakeup_reader in ready:
-            with suppress(BlockingIOError):
-                os.read(self._wakeup_reader, _CHUNK)
+        if self._wakeup.fileno() in ready:
+            self._wakeup.clear()
 
     def _poll_host(self, master: int) -> None:
         poller = select.poll()

@@ -3,27 +3,27 @@
 from __future__ import annotations
 
 import logging
-import os
 import select
 import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
 from enum import Enum
+from typing import NamedTuple
 
 from pebble.errors import DeviceError
+from pebble.runtime.wakeup_pipe import WakeupPipe
+from pebble.services.serial_mcu_bridge.line.hearing import UNREAD_S, Hearing
 from pebble.services.serial_mcu_bridge.line.outbox import Outbox
+from pebble.services.serial_mcu_bridge.line.output import Output
 from pebble.services.serial_mcu_bridge.line.port import Port
 
 log = logging.getLogger(__name__)
 
 _FIRST_RETRY_S, _LAST_RETRY_S = 0.1, 1.0
 _RETRY_WRITE_S = 0.002  # while bytes are being sent; a drive line takes 1.4 ms at 115200 baud
-_UNREAD_S = 1.0  # without a report, from a board that reports at rest
-_STALL_S = 1.0  # a device that accepts nothing for so long is closed and opened again
 _DRAIN_S = 0.3  # for the last stop line to be sent
 _PATH_CHECK_S = 1.0
-_BITS_PER_BYTE = 10  # 8N1
 
 
 class LineState(Enum):
@@ -31,6 +31,16 @@ class LineState(Enum):
     ABSENT = "absent"  # no such device, or it has gone; opened again and again until closed
     BOOTING = "booting"  # open, stop line sent; boards that reset on opening have time to boot
     READY = "ready"
+
+
+class _Opening(NamedTuple):
+    """The device, and how it is opened."""
+
+    path: str
+    baud: int
+    boot_s: float
+    read_timeout_s: float
+    retry_s: float
 
 
 class SerialLine:
@@ -65,32 +75,20 @@ class SerialLine:
         retry_s: float = _LAST_RETRY_S,
         end: bytes = b"\n",
     ) -> None:
-        self.path, self.baud = path, baud
         self.opened = 0  # how often the device was opened
         self.refused = 0  # lines refused because there was no device
-        self.unread = 0  # drive lines that were not sent, because earlier ones were probably not read
-        self.reports_at_rest = False  # set by the owner, who knows the protocol
-        self.received = 0  # chunks of bytes from the device since it was opened and has booted
-        self.outbox = Outbox(stop, drive_timeout_s)
-        self._stop, self._boot_s, self._read_timeout = stop, boot_s, read_timeout_s
-        self._retry, self._end = retry_s, end
+        self.hearing = Hearing()
+        self._opening = _Opening(path, baud, boot_s, read_timeout_s, retry_s)
         self._on_bytes, self._on_state = on_bytes, on_state
-        self._byte_s = _BITS_PER_BYTE / baud
         self._thread = threading.Thread(target=self._run, name=f"pebble-serial {path}", daemon=True)
+        self._wakeup = WakeupPipe()
         self._lock = threading.Lock()  # guards everything below
+        self.output = Output(Outbox(stop, drive_timeout_s), stop, end, baud)
         self._state = LineState.CLOSED
         self._problem = ""
         self._closing = False
         self._port: Port | None = None
         self._failure: DeviceError | None = None  # raised while writing on a caller's thread
-        self._received_at = 0.0
-        self._stopped_unread = False
-        self._sending = b""  # lines, or the rest of one, not yet written to the kernel
-        self._busy_until = 0.0  # when all written bytes have had time to be sent
-        self._blocked_since: float | None = None
-        self._wakeup_read, self._wakeup_write = os.pipe()
-        os.set_blocking(self._wakeup_read, False)
-        os.set_blocking(self._wakeup_write, False)
 
     @property
     def state(self) -> LineState:
@@ -100,11 +98,6 @@ class SerialLine:
     def problem(self) -> str:
         """The reason why there is no device; empty while there is one."""
         return self._problem
-
-    @property
-    def sent_until(self) -> float:
-        """When all that was written to the device has had time to be sent, in monotonic seconds."""
-        return self._busy_until
 
     def open(self) -> None:
         """Start the thread that opens the device. Returns at once."""
@@ -116,17 +109,18 @@ class SerialLine:
         One that could not be sent for ``valid_s``, or for ``drive_timeout_s``, becomes a stop.
         """
         if self._may_be_unread():
-            self.unread += 1
+            self.hearing.unread += 1
             return self._stop_unread()
-        return self._hand_over(lambda now: self.outbox.drive(line, now, valid_s), line if valid_s > 0 else b"")
+        outbox = self.output.outbox
+        return self._hand_over(lambda now: outbox.drive(line, now, valid_s), line if valid_s > 0 else b"")
 
     def halt(self) -> bool:
         """Send the stop in place of any waiting drive line. False: no device; opening it begins with the stop."""
-        return self._hand_over(lambda _now: self.outbox.halt(), self._stop)
+        return self._hand_over(lambda _now: self.output.outbox.halt(), self.output.stop)
 
     def send(self, kind: str, line: bytes) -> bool:
         """Send a line that drives nothing; a waiting one of the same ``kind`` is replaced. False: no device."""
-        return self._hand_over(lambda _now: self.outbox.put(kind, line), line)
+        return self._hand_over(lambda _now: self.output.outbox.put(kind, line), line)
 
     def close(self, timeout: float = 0.8) -> None:
         """Send the stop as the last line, wait up to 0.3 s until it is sent, and close the device permanently."""
@@ -134,79 +128,58 @@ class SerialLine:
             if self._closing:
                 return
             self._closing = True
-            self.outbox.clear()
-            self._sending += self._stop if self._port is not None else b""
-            with suppress(DeviceError):  # the reading thread will meet it, too
-                self._pump(time.monotonic())
-            self._wake()
+            output = self.output
+            output.outbox.clear()
+            if self._port is not None:
+                output.sending += output.stop
+                with suppress(DeviceError):  # the reading thread will meet it, too
+                    output.write(self._port, time.monotonic(), ready=self._state is LineState.READY)
+            self._wakeup.set()
         if self._thread.ident is not None:
             self._thread.join(timeout)
         if self._thread.is_alive():
-            log.warning("%s does not close in time; it closes when the process ends", self.path)
+            log.warning("%s does not close in time; it closes when the process ends", self._opening.path)
             return
-        os.close(self._wakeup_read)
-        os.close(self._wakeup_write)
+        self._wakeup.close()
 
     # -- any thread
 
     def _may_be_unread(self) -> bool:
         port = self._port
-        hidden = port is not None and port.hides_queue and self.reports_at_rest and self._state is LineState.READY
-        return hidden and time.monotonic() - self._received_at > _UNREAD_S
+        hidden = port is not None and port.hides_queue and self.hearing.reports_at_rest
+        return hidden and self._state is LineState.READY and time.monotonic() - self.hearing.at > UNREAD_S
 
     def _stop_unread(self) -> bool:
         """Send one stop in place of all drive lines until the device is heard again."""
-        if self._stopped_unread:
+        if self.hearing.stopped:
             return True
-        self._stopped_unread = True
-        log.warning("%s: silent for %g s, and perhaps not read: stopped until it reports again", self.path, _UNREAD_S)
+        self.hearing.stopped = True
+        text = "%s: silent for %g s, and perhaps not read: stopped until it reports again"
+        log.warning(text, self._opening.path, UNREAD_S)
         return self.halt()
 
     def _hand_over(self, place: Callable[[float], None], line: bytes) -> bool:
         """Write ``line`` at once, on the caller's thread, or ``place`` it in the outbox if it has to wait."""
         now = time.monotonic()
         with self._lock:
-            if self._port is None or self._closing:
+            port, output = self._port, self.output
+            if port is None or self._closing:
                 self.refused += 1
                 return False
-            was_idle = not self._sending and not self.outbox.waiting
+            was_idle = not output.sending and not output.outbox.waiting
+            ready = self._state is LineState.READY
             try:
-                if was_idle and line and self._is_free(self._port, now):
-                    self._sending = line
+                if was_idle and line and ready and output.is_free(port, now):
+                    output.sending = line
                 else:
                     place(now)
-                self._pump(now)
+                output.write(port, now, ready=ready)
             except DeviceError as error:
                 self._failure = error
-                self._wake()
-            if was_idle and (self._sending or self.outbox.waiting):
-                self._wake()  # so that the reading thread sends the rest
+                self._wakeup.set()
+            if was_idle and (output.sending or output.outbox.waiting):
+                self._wakeup.set()  # so that the reading thread sends the rest
             return True
-
-    def _pump(self, now: float) -> None:
-        """Write lines until the kernel accepts no more. Lock held."""
-        while self._port is not None and (self._sending or (self.outbox.waiting and self._next_line(self._port, now))):
-            sent = self._port.write(self._sending)
-            if not sent:
-                return
-            self._sending = self._sending[sent:]
-            self._busy_until = max(now, self._busy_until) + sent * self._byte_s
-            self._blocked_since = None
-
-    def _next_line(self, port: Port, now: float) -> bool:
-        """Take a line from the outbox if it can be sent at once: a line in the kernel cannot be replaced."""
-        if not self._is_free(port, now):
-            return False
-        self._sending = self.outbox.take(now) or b""
-        return bool(self._sending)
-
-    def _is_free(self, port: Port, now: float) -> bool:
-        """Whether the device has sent all that was written to it. Lock held."""
-        return self._state is LineState.READY and now >= self._busy_until and not port.queued()
-
-    def _wake(self) -> None:
-        with suppress(BlockingIOError):  # full: it wakes up anyway
-            os.write(self._wakeup_write, b"!")
 
     # -- the reading thread
 
@@ -215,13 +188,13 @@ class SerialLine:
             retry_s = _FIRST_RETRY_S
             while not self._closing:
                 try:
-                    self._serve_opening(Port(self.path, self.baud))
+                    self._serve_opening(Port(self._opening.path, self._opening.baud))
                 except DeviceError as error:
                     if self._state is LineState.READY:
                         retry_s = _FIRST_RETRY_S
                     self._set_state(LineState.ABSENT, str(error))
                     self._pause(retry_s)
-                    retry_s = min(2 * retry_s, self._retry)
+                    retry_s = min(2 * retry_s, self._opening.retry_s)
         finally:
             self._set_state(LineState.CLOSED)
 
@@ -239,89 +212,74 @@ class SerialLine:
     def _attach(self, port: Port) -> None:
         with self._lock:
             self.opened += 1
-            self.received = 0
-            port.discard_output()  # an earlier process may have left old commands in the kernel
-            self._port, self._failure, self._blocked_since = port, None, None
-            self.outbox.clear()
-            self._sending = self._end + self._stop
-            self._pump(time.monotonic())
+            self.hearing.received = 0
+            self._port, self._failure = port, None
+            self.output.begin(port)
+            self.output.write(port, time.monotonic(), ready=False)
         self._set_state(LineState.BOOTING)
 
     def _serve(self, port: Port) -> None:
-        poller = select.poll()
-        poller.register(port, select.POLLIN)
-        poller.register(self._wakeup_read, select.POLLIN)
-        now = time.monotonic()
-        ready_at, path_check_at = now + self._boot_s, now + _PATH_CHECK_S
-        if self._boot_s <= 0:
-            self._become_ready()  # before the first byte is read: it must not be discarded
+        poller, device, wakeup = select.poll(), port.fileno(), self._wakeup.fileno()
+        poller.register(device, select.POLLIN)
+        poller.register(wakeup, select.POLLIN)
+        now, boot_s = time.monotonic(), self._opening.boot_s
+        ready_at, path_check_at = now + boot_s, now + _PATH_CHECK_S
+        if boot_s <= 0:
+            self._become_ready(port)  # before the first byte is read: it must not be discarded
         while not self._closing:
             ready = {fd for fd, _ in poller.poll(1000 * self._poll_timeout(ready_at - now))}
-            if self._wakeup_read in ready:
-                self._clear_wakeups()
-            if port.fileno() in ready:
+            if wakeup in ready:
+                self._wakeup.clear()
+            if device in ready:
                 self._receive(port.read())
             now = time.monotonic()
             if self._state is LineState.BOOTING and now >= ready_at:
-                self._become_ready()
-            with self._lock:
-                self._write_waiting(now)
+                self._become_ready(port)
+            self._write_waiting(port, now)
             if now >= path_check_at:
                 path_check_at = now + _PATH_CHECK_S
                 if port.is_replaced():
-                    raise DeviceError(f"{self.path} is another device now")
+                    raise DeviceError(f"{port.path} is another device now")
 
     def _poll_timeout(self, until_ready: float) -> float:
         """Return how long to wait for input before writing again, in seconds."""
         if self._state is LineState.BOOTING:
-            return max(_RETRY_WRITE_S, min(self._read_timeout, until_ready))
-        return _RETRY_WRITE_S if self._sending or self.outbox.waiting else self._read_timeout
+            return max(_RETRY_WRITE_S, min(self._opening.read_timeout_s, until_ready))
+        return _RETRY_WRITE_S if self.output.sending or self.output.outbox.waiting else self._opening.read_timeout_s
 
     def _receive(self, chunk: bytes) -> None:
         if chunk and self._state is LineState.READY:
-            self.received += 1
-            self._received_at, self._stopped_unread = time.monotonic(), False
+            self.hearing.heard(time.monotonic())
             self._on_bytes(chunk)
 
-    def _become_ready(self) -> None:
+    def _become_ready(self, port: Port) -> None:
         with self._lock:
-            self._sending += self._stop
-            self._received_at, self._stopped_unread = time.monotonic(), False
-            hidden = self._port is not None and self._port.hides_queue
+            self.output.sending += self.output.stop
+            self.hearing.begin(time.monotonic())
         self._set_state(LineState.READY)
-        if hidden and self._stop:
-            log.info("%s is a pseudo-terminal: a reader that stands still may obey drive lines late", self.path)
+        if port.hides_queue and self.output.stop:
+            log.info("%s is a pseudo-terminal: a reader that stands still may obey drive lines late", port.path)
 
-    def _write_waiting(self, now: float) -> None:
-        """Write what waits; raise DeviceError for a device that accepts nothing. Lock held."""
-        if self._failure is not None:
-            raise self._failure
-        self._pump(now)
-        if not self._sending and not self.outbox.waiting:
-            self._blocked_since = None
-        elif self._state is LineState.READY:
-            if self._blocked_since is None:
-                self._blocked_since = now
-            elif now - self._blocked_since > _STALL_S:
-                self._discard_output()
-                raise DeviceError(f"{self.path} has accepted nothing for {_STALL_S} s")
-
-    def _discard_output(self) -> None:
-        """Discard the old commands that a stuck device would execute later. Lock held."""
-        if self._port is not None:
-            self._port.discard_output()
+    def _write_waiting(self, port: Port, now: float) -> None:
+        """Write what waits; raise DeviceError for a device that has gone or accepts nothing."""
+        with self._lock:
+            if self._failure is not None:
+                raise self._failure
+            ready = self._state is LineState.READY
+            self.output.write(port, now, ready=ready)
+            if ready and (self.output.sending or self.output.outbox.waiting):
+                self.output.check_stall(port, now)
 
     def _finish(self, port: Port) -> None:
         """Wait up to 0.3 s until the last stop is sent; for a stuck device it replaces all earlier output."""
         end = time.monotonic() + _DRAIN_S
         while time.monotonic() < end:
             with self._lock:
-                self._pump(time.monotonic())
-                if not self._sending and not port.queued():
+                self.output.write(port, time.monotonic(), ready=self._state is LineState.READY)
+                if not self.output.sending and not port.queued():
                     return
             time.sleep(_RETRY_WRITE_S)
-        port.discard_output()
-        port.write(self._end + self._stop)
+        self.output.replace_by_stop(port)
 
     def _set_state(self, state: LineState, problem: str = "") -> None:
         with self._lock:
@@ -331,17 +289,13 @@ class SerialLine:
         if problem:
             log.warning("%s", problem)
         else:
-            log.info("%s: %s", self.path, state.value)
+            log.info("%s: %s", self._opening.path, state.value)
         self._on_state(state, problem)
 
     def _pause(self, seconds: float) -> None:
         end = time.monotonic() + seconds
         poller = select.poll()
-        poller.register(self._wakeup_read, select.POLLIN)
+        poller.register(self._wakeup, select.POLLIN)
         while not self._closing and (left := end - time.monotonic()) > 0:
             if poller.poll(1000 * left):
-                self._clear_wakeups()
-
-    def _clear_wakeups(self) -> None:
-        with suppress(BlockingIOError):
-            os.read(self._wakeup_read, 4096)
+                self._wakeup.clear()

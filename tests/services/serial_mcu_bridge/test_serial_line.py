@@ -121,7 +121,7 @@ def test_a_command_too_old_after_the_boot_is_a_stop(mcu: PtyMcu, connect: Connec
     assert until(host.is_ready)
     assert until(lambda: len(mcu.trace.lines()) == 3)
     assert mcu.trace.lines() == [STOPPED] * 3
-    assert host.line.outbox.expired == 1
+    assert host.line.output.outbox.expired == 1
 
 
 def test_lines_go_down_and_answers_come_up(mcu: PtyMcu, host: Host) -> None:
@@ -141,7 +141,7 @@ def test_of_a_burst_the_last_command_is_sent_and_few_before_it(mcu: PtyMcu, host
     assert sent[-1] == "M 0.999 0.500"
     assert sent == sorted(sent)
     assert len(sent) < 500
-    assert host.line.outbox.superseded == 1000 - len(sent)
+    assert host.line.output.outbox.superseded == 1000 - len(sent)
 
 
 def test_a_burst_that_ends_in_a_stop_ends_stopped(mcu: PtyMcu, host: Host) -> None:
@@ -270,7 +270,7 @@ def stuck() -> Iterator[StuckDevice]:
 def fill(host: Host) -> float:
     """Send drive lines until the kernel's buffer is full; return the duration of the longest call in seconds."""
     longest = 0.0
-    while until(lambda: not host.line.outbox.waiting, 0.2, step=0.0002):
+    while until(lambda: not host.line.output.outbox.waiting, 0.2, step=0.0002):
         before = time.monotonic()
         host.line.drive(drive_line(0.3, 0.3))
         longest = max(longest, time.monotonic() - before)
@@ -297,16 +297,16 @@ def test_a_reader_that_stands_still_finds_at_most_a_second_of_drive_lines(
     caplog.set_level(logging.INFO)
     host, driven = connect(stuck.path, boot_s=0.05), drive_line(0.4, 0.4)
     assert until(host.is_ready)
-    host.line.reports_at_rest = reports  # of a board that does not, nothing can be known
+    host.line.hearing.reports_at_rest = reports  # of a board that does not, nothing can be known
     os.write(stuck.master, b"T 1 2 3\n")
-    assert until(lambda: host.line.received > 0)
+    assert until(lambda: host.line.hearing.received > 0)
     stuck.seen()
     end = time.monotonic() + 1.6
     while time.monotonic() < end:
         assert host.line.drive(driven)
         time.sleep(0.05)
     unread = stuck.seen().split(STOP)[-2 if reports else -1]
-    assert (host.line.unread > 0) == reports
+    assert (host.line.hearing.unread > 0) == reports
     assert stuck.seen().endswith(STOP if reports else driven)
     assert 5 <= unread.count(driven) < (24 if reports else 99)
     assert [text for text in caplog.messages if "perhaps not read" in text] == [

@@ -1,0 +1,63 @@
+"""What is sent to an open serial device: the bytes being written, and after them the lines that wait."""
+
+from __future__ import annotations
+
+from pebble.errors import DeviceError
+from pebble.services.serial_mcu_bridge.line.outbox import Outbox
+from pebble.services.serial_mcu_bridge.line.port import Port
+
+_BITS_PER_BYTE = 10  # 8N1
+_STALL_S = 1.0  # a device that accepts nothing for so long is closed and opened again
+
+
+class Output:
+    """It writes without blocking. Its owner passes the port and the monotonic clock, and calls it under one lock.
+
+    A line leaves the outbox only once it can be sent at once, because one in the kernel cannot be replaced.
+    """
+
+    def __init__(self, outbox: Outbox, stop: bytes, end: bytes, baud: int) -> None:
+        self.outbox, self.stop = outbox, stop
+        self.sending = b""  # lines, or the rest of one, not yet written to the kernel
+        self.sent_until = 0.0  # when all that was written has had time to be sent
+        self._end, self._byte_s = end, _BITS_PER_BYTE / baud
+        self._blocked_since: float | None = None
+
+    def begin(self, port: Port) -> None:
+        """Forget all that waited for an earlier opening; a line end and the stop come first."""
+        port.discard_output()  # an earlier process may have left old commands in the kernel
+        self.outbox.clear()
+        self.sending, self._blocked_since = self._end + self.stop, None
+
+    def is_free(self, port: Port, now: float) -> bool:
+        """Whether the device has sent all that was written to it."""
+        return now >= self.sent_until and not port.queued()
+
+    def write(self, port: Port, now: float, *, ready: bool) -> None:
+        """Write until the kernel accepts no more; lines from the outbox only to a ``ready`` device."""
+        while self.sending or (ready and self.outbox.waiting and self._next_line(port, now)):
+            sent = port.write(self.sending)
+            if not sent:
+                return
+            self.sending = self.sending[sent:]
+            self.sent_until = max(now, self.sent_until) + sent * self._byte_s
+            self._blocked_since = None
+
+    def check_stall(self, port: Port, now: float) -> None:
+        """Raise DeviceError if the device has accepted nothing of what waits; what it has not sent is discarded."""
+        if self._blocked_since is None:
+            self._blocked_since = now
+        elif now - self._blocked_since > _STALL_S:
+            port.discard_output()  # else a stuck device would execute old commands later
+            raise DeviceError(f"{port.path} has accepted nothing for {_STALL_S} s")
+
+    def replace_by_stop(self, port: Port) -> None:
+        """Discard what is unsent, and send the stop instead."""
+        port.discard_output()
+        port.write(self._end + self.stop)
+
+    def _next_line(self, port: Port, now: float) -> bool:
+        if not self.is_free(port, now):
+            return False
+        self.sending, self._blocked_since = self.outbox.take(now) or b"", None
+        return bool(self.sending)
