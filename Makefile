@@ -5,12 +5,13 @@ VENV := .venv/bin/python
 
 .DEFAULT_GOAL := help
 unexport PYTHONDONTWRITEBYTECODE  # every test starts programs: compiling them each time would cost a third of the time
-.PHONY: help demo test thorough stops soak floods schedules script-schedules page-schedules page-tests brokers check firmware report clean lock audit sbom check-types check-names check-collection test-running test-robots test-pages test-computing
+.PHONY: help demo test quick thorough stops soak floods schedules script-schedules page-schedules page-tests brokers check firmware report clean lock audit sbom check-types check-names check-collection test-running test-robots test-pages test-computing
 
 help:
 	@echo "make demo             four simulated robots, on Zenoh, on MQTT and on MCUs, driven through a broker; Ctrl-C ends it"
 	@echo "make demo SECONDS=30  ends by itself; succeeds only if every robot moved, stopped and obeyed as it should"
 	@echo "make test             all checks and tests, a quarter of an hour"
+	@echo "make quick            what to run before each commit: lint, types, contract, memory transport, one robot; a minute"
 	@echo "make thorough         the same, with all cases of the random tests, and the tests that take longest"
 	@echo "make stops            400 random schedules of emergency stops and faults with whole robots, 40 minutes"
 	@echo "make soak             floods, kills, freezes, full disks and more while an operator drives; MINUTES=30 for each transport"
@@ -48,12 +49,29 @@ ALONE = $(shell grep --recursive --files-with-matches --include=test_*.py 'mark\
 	tests/services tests/robot/test_faults.py tests | grep --invert-match tests/test_demo.py | awk '!seen[$$0]++')
 PAGES = $(filter tests/web/%,$(ALONE))
 
+# Each run of pytest appends what its tests took; without it, for parts that are called alone.
+TIMES := .venv/test-times.tsv
+export PEBBLE_TEST_TIMES := $(abspath $(TIMES))
+SHOW_TIMES = $(VENV) tools/test_times.py $(TIMES)
+
+quick: .venv/.ready-dev
+	@sh tools/debian-packages.sh mosquitto=mosquitto
+	@rm -f $(TIMES)
+	@$(MAKE) --no-print-directory --jobs=2 check-types check-names
+	@$(VENV) tools/run_tests.py --numprocesses 2 tests/contract tests/forwarding
+	@$(VENV) tools/run_tests.py -k memory tests/transports/test_contract.py
+	@$(VENV) tools/run_tests.py -k "drive_forms or silence" tests/robot/test_robot.py
+	@$(SHOW_TIMES)
+
 # What only computes, as little as possible in the way, uses what the others leave, from the beginning to the end.
 test: check
 	@sh tools/debian-packages.sh mosquitto=mosquitto mosquitto_pub=mosquitto-clients chromium=chromium node=nodejs ip=iproute2 tc=iproute2 nft=nftables systemd-analyze=systemd
+	@rm -f $(TIMES)
 	@$(MAKE) --no-print-directory --jobs=2 test-computing test-running
 	@echo "pebble: the demo, whose robots need all processors"
 	@$(VENV) tools/run_tests.py $(if $(PEBBLE_THOROUGH),,-m "not thorough") tests/test_demo.py
+	@$(SHOW_TIMES)
+	@$(VENV) tools/tree_growth.py
 
 test-running:
 	@echo "pebble: tests"
