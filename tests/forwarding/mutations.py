@@ -203,13 +203,6 @@ MUTATIONS = (
         "",
         f"{_ALL}TestOneBroker",
     ),
-    Mutation(
-        "what the robot still has is removed",
-        "services/mqtt_bridge/leftovers.py",
-        "return topic in here or",
-        "return",
-        f"{_ALL}TestLeftovers",
-    ),
 )
 
 
