@@ -9,11 +9,8 @@ from pathlib import Path
 import pytest
 
 from pebble.forwarding import cycles
-from pebble.forwarding import service as service_module
-from pebble.forwarding.side import Gate
-from pebble.transports.memory import MemoryTransport
 from tests.services.mqtt_bridge import bridge_rig
-from tests.services.mqtt_bridge.bridge_rig import BASE, Client, MemoryRig, MqttRig, Quiet, gate_of
+from tests.services.mqtt_bridge.bridge_rig import Client, MemoryRig, MqttRig, Quiet
 from tests.support import Broker, until
 from tests.tcp_proxy import TcpProxy
 
@@ -127,36 +124,3 @@ def rig(monkeypatch: pytest.MonkeyPatch) -> Iterator[MemoryRig]:
     rig = MemoryRig(monkeypatch)
     yield rig
     rig.close()
-
-
-def test_at_each_connection_the_robots_own_side_receives_probes(rig: MemoryRig) -> None:
-    rig.bridge()
-    assert until(lambda: len(rig.local.probes) >= 4)
-    rig.cut()
-    before = len(rig.local.probes)
-    rig.uplink.mend()
-    assert until(lambda: len(rig.local.probes) >= before + 4)
-    assert all(probe.payload.isspace() for probe in rig.local.probes)
-    assert not rig.remote.probes
-
-
-def test_a_probe_of_a_media_request_requests_nothing(rig: MemoryRig) -> None:
-    bridge = rig.bridge()
-    for client in (rig.local, rig.remote):
-        client.publish("incoming/front-camera", b" \t\n" * 8)
-        client.publish("incoming/front-camera", b"  ")
-    assert until(lambda: rig.local.payloads("incoming/front-camera") == [b"  "])
-    assert bridge.counters["refused"] == 0
-
-
-def test_one_broker_that_becomes_two(rig: MemoryRig, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without a reconnect: something else forwarded outgoing/# and does so no more."""
-    monkeypatch.setattr(service_module, "CHECK_AGAIN_S", 0.2)
-    joint = Client(MemoryTransport("joint", rig.remote_hub), listen=False)
-    onto = Client(MemoryTransport("onto", rig.local_hub), listen=False)
-    joint.transport.subscribe(f"{BASE}/outgoing/#", lambda m: onto.transport.publish(m.topic, m.payload), echo=False)
-    bridge = rig.bridge()
-    assert gate_of(bridge) is Gate.SHUT
-    joint.transport.close()
-    assert until(lambda: gate_of(bridge) is Gate.OPEN, 5)
-    onto.transport.close()

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from pebble.forwarding import side as side_module
-from pebble.services.mqtt_bridge import service as bridge_module
 from pebble.services.mqtt_bridge.media import Media
 from pebble.transports import State
-from tests.services.mqtt_bridge.bridge_rig import BASE, MemoryRig, MqttRig, Quiet
+from tests.services.mqtt_bridge.bridge_rig import MqttRig, Quiet
 from tests.services.mqtt_bridge.restoring import FALSE, HISTORIES, TRUE, OwnBroker, OwnHub, play
 from tests.sparing_broker import SparingBroker
 from tests.support import Broker, some, until
@@ -189,45 +187,3 @@ def test_an_operators_flag_counts_however_late_the_broker_sends_it(
     finally:
         rig.close()
         front.close()
-
-
-class TestLeftovers:
-    @pytest.fixture
-    def memory(self, monkeypatch: pytest.MonkeyPatch) -> Iterator[MemoryRig]:
-        monkeypatch.setattr(bridge_module, "LEFTOVERS_AFTER_S", 0.3)
-        monkeypatch.setattr(bridge_module, "ASK_S", 0.0)
-        rig = MemoryRig(monkeypatch)
-        yield rig
-        rig.close()
-
-    def test_what_was_taken_back_while_no_bridge_ran_is_removed_there(
-        self, memory: MemoryRig, caplog: pytest.LogCaptureFixture
-    ) -> None:
-        caplog.set_level(logging.INFO)
-        gone = ["mcu/m1/describe", "mcu/m1/range", "outlets/1/status", "autonomy-status"]
-        stays = ["mcu/m2/describe", "estop/serial", "status"]
-        foreign = ["incoming/flags/foreign", "outgoing/video", "outgoing/unknown", "outgoing/online"]
-        memory.bridge()
-        for name in (*gone, *stays):
-            memory.local.publish(f"outgoing/{name}", b'{"interfaces": [{"name": "range"}]}', retain=True)
-        there = {f"{BASE}/outgoing/{name}" for name in (*gone, *stays)}
-        assert until(lambda: there <= memory.remote_hub.retained.keys())
-        memory.stop_bridges()
-        for topic in foreign:
-            memory.remote.publish(topic, b"1", retain=True)
-        for name in gone:
-            memory.local.publish(f"outgoing/{name}", b"", retain=True)
-        memory.bridge()
-        assert until(lambda: "removed 4 retained topics" in caplog.text)
-        left = {f"{BASE}/{topic}" for topic in (*foreign, *(f"outgoing/{name}" for name in stays))}
-        assert until(lambda: {*memory.remote_hub.retained} == left), memory.remote_hub.retained.keys()
-
-    def test_nothing_is_removed_while_the_robot_has_no_connection(self, memory: MemoryRig) -> None:
-        memory.bridge()
-        memory.local.publish("outgoing/status", b"1", retain=True)
-        assert until(lambda: f"{BASE}/outgoing/status" in memory.remote_hub.retained)
-        memory.stop_bridges()
-        memory.local_hub.stop(forget=True)
-        memory.bridge(ready=False)
-        Quiet(memory.remote).wait(1.0)
-        assert f"{BASE}/outgoing/status" in memory.remote_hub.retained

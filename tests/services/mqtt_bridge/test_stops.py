@@ -123,58 +123,9 @@ class TestUrgency:
         over.set()
         assert until(lambda: memory.local.on(MIRROR_FLAG))
 
-    def test_one_that_comes_before_anything_is_forwarded_is_not_delivered_later(self, memory: MemoryRig) -> None:
-        """Its sender repeats it. A stop from before an outage must not stop the robot after it."""
-        memory.uplink.cut()
-        bridge = memory.bridge(ready=False)
-        memory.local.publish(MIRROR_FLAG, TRUE, retain=True)
-        for retain in (False, True):
-            memory.local.publish(STOP, PRESS, retain=retain)
-        assert until(lambda: memory.taken() == 3)
-        assert gate_of(bridge) is Gate.WAITING
-        memory.uplink.mend()
-        memory.wait_ready(bridge)
-        memory.local.publish(STOP, b"now")
-        assert until(lambda: memory.remote.on(STOP))
-        Quiet(memory.local, memory.remote).wait(0.7)
-        assert memory.remote.payloads(STOP) == [b"now"]
-
-    @pytest.mark.parametrize("side", ["transport", "remote"])
-    def test_it_is_taken_where_too_many_messages_wait(self, memory: MemoryRig, side: str) -> None:
-        is_stop = getattr(memory.bridge(), side).is_stop
-        found = {suffix: is_stop(f"{BASE}/{suffix}") for suffix in (STOP, RESET, STATE, DRIVE, "incoming/estop/x")}
-        assert found == {suffix: suffix == STOP for suffix in found}
-
-    def test_an_mcus_private_alias_does_not_hold_it_back(self, memory: MemoryRig) -> None:
-        memory.bridge()
-        interfaces = [
-            {"name": "a", "channel": channel, "dir": direction, "local_only": True}
-            for direction, channel in (("in", "estop"), ("in", "estop-reset"), ("out", "estop/mcu"))
-        ]
-        manifest = (
-            b'{"device_uid": "spy", "interfaces": %s}'
-            % str(interfaces).replace("'", '"').replace("True", "true").encode()
-        )
-        memory.local.publish("outgoing/mcu/spy/describe", manifest, retain=True)
-        assert until(lambda: memory.remote.on("outgoing/mcu/spy/describe"))
-        memory.remote.publish(STOP, PRESS)
-        memory.remote.publish(RESET, b"{}")
-        memory.local.publish(STATE, b"{}", retain=True)
-        assert until(lambda: memory.local.on(STOP) and memory.local.on(RESET) and memory.remote.on(STATE))
-
 
 class TestRetain:
     """What asks to be retained, on connections that show it for live messages, too, and on those that do not."""
-
-    def test_a_live_stop_passes_where_live_and_retained_are_distinguished(self, memory: MemoryRig) -> None:
-        memory.remote.publish(STOP, OLD, retain=True)
-        memory.bridge()
-        memory.remote.publish(STOP, PRESS, retain=True)
-        memory.remote.publish(RESET, b"{}", retain=True)
-        after_all(memory.remote, memory.local)
-        assert [(m.payload, m.retain_requested) for m in memory.local.on(STOP)] == [(PRESS, False)]
-        assert not memory.local.on(RESET)
-        assert STOP not in {topic.removeprefix("pebble/robots/rover/") for topic in memory.local_hub.retained}
 
     @pytest.mark.parametrize("protocol", ["3.1.1", "5"])
     def test_a_live_stop_passes_unmarked_and_a_reset_does_not(

@@ -1,0 +1,459 @@
+"""Bridge and mirror between two networks in virtual time: rows of what happens, and what both sides have afterwards."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from itertools import groupby
+from typing import Any
+
+import pytest
+
+from pebble.forwarding.event_buffer import LIMIT
+from pebble.forwarding.routing import Side
+from pebble.forwarding.side import Gate
+from pebble.services.mqtt_bridge.actions import SystemActions
+from tests.forwarding.virtual import World
+from tests.services.mqtt_bridge.bridge_rig import BASE, Client
+
+DRIVE, STOP, RESET = "incoming/drive-values", "incoming/estop", "incoming/estop-reset"
+LIGHTS, EVENT = "incoming/lights-solid", "outgoing/somebody/happened"
+FLAG, MIRROR_FLAG = "incoming/flags/mqtt-video", "incoming/flags/remote-mirror"
+REBOOT, GIT_PULL = "incoming/flags/reboot", "incoming/flags/git-pull"
+ONE_SHOTS = (
+    *(DRIVE, REBOOT, GIT_PULL, "incoming/flags/service-restart", RESET),
+    *("incoming/soundboard-command", "incoming/autonomy-command", "incoming/something-new"),
+)
+TRUE, FALSE = b"true", b"false"
+Make = Callable[..., World]
+
+
+@pytest.fixture
+def make(monkeypatch: pytest.MonkeyPatch) -> Make:
+    return lambda service="bridge", **options: World(service, monkeypatch, **options)
+
+
+@pytest.fixture(params=["bridge", "mirror"])
+def world(request: pytest.FixtureRequest, make: Make) -> World:
+    return make(request.param)
+
+
+@pytest.fixture
+def bridge(make: Make) -> World:
+    return make()
+
+
+@pytest.fixture
+def ran(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The actions that would have run."""
+    ran: list[str] = []
+    monkeypatch.setattr(SystemActions, "request", lambda _actions, channel: bool(ran.append(channel.metric)) or True)
+    return ran
+
+
+def sides(world: World) -> tuple[tuple[Client, Client], tuple[Client, Client]]:
+    """Who publishes, and who listens."""
+    return (world.local, world.remote), (world.remote, world.local)
+
+
+def do(world: World, history: str) -> None:
+    """Words: ``L:x`` and ``R:x``, who sets the flag (``Lonce:x``: does not repeat it), and what the service meets."""
+    world.run()
+    words: dict[str, Callable[[], object]] = {
+        "start": world.start,
+        "alone": lambda: (world.start(), world.uplink.cut()),
+        "stop": world.stop,
+        "cut": lambda: world.uplink.cut(),
+        "mend": lambda: world.uplink.mend(),
+        "away": lambda: world.here.cut(),
+        "back": lambda: world.here.mend(),
+        "local-forgets": lambda: (world.local_hub.stop(forget=True), world.run(1), world.local_hub.start()),
+        "remote-forgets": lambda: (world.remote_hub.stop(forget=True), world.run(1), world.remote_hub.start()),
+    }
+    for word in history.split():
+        who, colon, value = word.partition(":")
+        if colon:
+            client = world.local if who[0] == "L" else world.remote
+            client.publish(FLAG, value.encode(), retain=True, remember="once" not in who)
+        else:
+            words[word]()
+        world.run()
+
+
+class TestFlags:
+    """Which value both sides have afterwards, and which changes each side's clients have received."""
+
+    @pytest.mark.parametrize(
+        ("service", "history", "value", "local", "remote"),
+        [
+            ("bridge", "L:1 R:0 start", "0", "0", ""),  # the winner's counts, once: no flapping
+            ("mirror", "L:1 R:0 start", "1", "", "1"),
+            *((each, "L:1 start", "1", "", "1") for each in ("bridge", "mirror")),
+            *((each, "R:1 start", "1", "1", "") for each in ("bridge", "mirror")),
+            ("bridge", "L:1 R:0 alone mend", "0", "0", ""),
+            ("mirror", "L:1 R:0 alone mend", "1", "", "1"),
+            *((each, "R:0 alone L:1 mend", "1", "", "1") for each in ("bridge", "mirror")),
+            *((each, "start R:0 L:1", "1", "0", "1") for each in ("bridge", "mirror")),
+            *((each, "start R:0 cut L:1 mend", "1", "0", "1") for each in ("bridge", "mirror")),
+            ("bridge", "start L:1 cut R:0 mend", "0", "0", "1"),
+            ("mirror", "start L:1 cut R:0 mend", "1", "", "1"),
+            *((each, "start L:0 away R:1 back", "1", "1", "0") for each in ("bridge", "mirror")),
+            ("bridge", "start R:1 stop start", "1", "1", ""),
+            ("mirror", "start R:1 stop start", "1", "1", "1"),
+            *((each, "start L:1 R:", "", "", "1") for each in ("bridge", "mirror")),
+        ],
+    )
+    def test_histories(self, make: Make, service: str, history: str, value: str, local: str, remote: str) -> None:
+        world = make(service)
+        do(world, history)
+        expected = value.encode() or None
+        assert world.retained(FLAG) == (expected, expected)
+        seen = [[one for one, _ in groupby(client.payloads(FLAG)) if one] for client in (world.local, world.remote)]
+        assert seen == [one.encode().split() for one in (local, remote)], "no flapping"
+
+    @pytest.mark.parametrize("history", ["Lonce:0 Ronce:1", "Ronce:0 Lonce:1"])
+    @pytest.mark.parametrize("forgetful", ["local", "remote"])
+    def test_a_side_that_lost_a_value_receives_the_newest(self, world: World, history: str, forgetful: str) -> None:
+        """Also if the last value that was sent there is older."""
+        do(world, f"start {history} {forgetful}-forgets")
+        assert world.retained(FLAG) == (b"1", b"1")
+
+    def test_are_retained_although_their_publisher_did_not_ask_for_it(self, world: World) -> None:
+        do(world, "start")
+        for client, other in sides(world):
+            client.publish(FLAG, TRUE)
+            world.run()
+            assert other.payloads(FLAG)[-1] == TRUE
+        assert world.retained(FLAG) == (TRUE, TRUE)
+
+    @pytest.mark.parametrize("mirroring", [False, True])
+    def test_alternating_ones_arrive_once_each_in_order(self, world: World, mirroring: bool) -> None:
+        do(world, "start")
+        world.local.publish(MIRROR_FLAG, TRUE if mirroring else FALSE, retain=True)
+        for client, other in sides(world):
+            before = len(client.on(FLAG)), len(other.on(FLAG))
+            for number in range(200):
+                client.publish(FLAG, FALSE if number % 2 else TRUE, retain=True)
+                world.run(0.002)
+            assert other.payloads(FLAG)[before[1] :] == [TRUE, FALSE] * 100
+            assert len(client.on(FLAG)) == before[0]
+
+
+class TestOneShots:
+    @pytest.mark.parametrize("when", ["before", "live"])
+    @pytest.mark.parametrize("retainer", [0, 1], ids=["local", "remote"])
+    def test_retained_ones_neither_cross_nor_run(self, world: World, ran: list[str], retainer: int, when: str) -> None:
+        """Nor those that ask to be retained, nor after a reconnect."""
+        client, other = sides(world)[retainer]
+        if when == "live":
+            do(world, "start")
+            world.local.publish(MIRROR_FLAG, TRUE, retain=True)
+            world.run()
+        for suffix in ONE_SHOTS:
+            client.publish(suffix, TRUE, retain=True)
+        if when == "before":
+            do(world, "start")
+        do(world, "cut mend")
+        assert not [message for message in other.seen if message.topic.removeprefix(f"{BASE}/") in ONE_SHOTS]
+        assert not ran
+
+    def test_local_commands_reach_the_remote_side_only_while_mirroring(self, bridge: World) -> None:
+        do(bridge, "start")
+        for mirror, payload in ((None, b"1"), (TRUE, b"2"), (b'{"enabled": false}', b"3"), (b'"true"', b"4")):
+            if mirror is not None:
+                bridge.local.publish(MIRROR_FLAG, mirror, retain=True)
+            bridge.local.publish(DRIVE, payload)
+            bridge.run()
+        assert bridge.remote.payloads(DRIVE) == [b"2"]
+        assert bridge.service is not None
+        assert bridge.service.counters["refused"] == 1
+
+    @pytest.mark.parametrize("true", [b"true", b'{"value": true}', b'{"enabled": true}'])
+    def test_the_mirror_flag_may_come_from_the_remote_side(self, bridge: World, true: bytes) -> None:
+        do(bridge, "start")
+        for flag, payload in ((true, b"2"), (b"", b"3")):  # removed: back to the default
+            bridge.remote.publish(MIRROR_FLAG, flag, retain=True)
+            bridge.run()
+            bridge.local.publish(DRIVE, payload)
+            bridge.run()
+        assert bridge.remote.payloads(DRIVE) == [b"2"]
+
+    @pytest.mark.parametrize("side", [0, 1], ids=["local", "remote"])
+    @pytest.mark.parametrize("true", [b"true", b'{"value": true}', b'{"enabled": true}'])
+    def test_actions_run_once_from_either_side(self, bridge: World, ran: list[str], side: int, true: bytes) -> None:
+        do(bridge, "start")
+        client, other = sides(bridge)[side]
+        for payload in (b"false", b"1", b'"true"', b"null", b"", b"[true]", b"\xff", true):
+            client.publish(GIT_PULL, payload)
+        bridge.run()
+        assert ran == ["flags/git-pull"]
+        assert other.payloads(GIT_PULL)[-1:] == [true]
+
+    def test_actions_from_the_local_side_run_without_uplink(self, bridge: World, ran: list[str]) -> None:
+        do(bridge, "alone")
+        bridge.local.publish(REBOOT, TRUE)
+        bridge.run()
+        assert ran == ["flags/reboot"]
+
+    def test_retained_actions_run_if_the_config_allows_it(self, bridge: World, ran: list[str]) -> None:
+        bridge.local.publish(REBOOT, TRUE, retain=True)
+        bridge.start(reboot_control={"command": [sys.executable], "ignore_retained": False})
+        bridge.run()
+        assert ran == ["flags/reboot"]
+
+    def test_renamed_actions(self, bridge: World, ran: list[str]) -> None:
+        bridge.start(topics={"reboot": "site/reboot"})
+        bridge.run()
+        bridge.remote.transport.publish("site/reboot", TRUE)
+        bridge.run()
+        assert ran == ["flags/reboot"]
+
+
+class TestStops:
+    def test_a_live_one_passes_although_it_asks_to_be_retained_and_a_retained_one_does_not(self, world: World) -> None:
+        for client, _ in sides(world):
+            client.publish(STOP, b"old", retain=True)
+        do(world, "start")
+        world.local.publish(MIRROR_FLAG, TRUE, retain=True)
+        world.run()
+        for name, (client, _) in zip(("local", "remote"), sides(world), strict=True):
+            client.publish(STOP, name.encode(), retain=True)
+        do(world, "cut mend away back")
+        assert world.remote.payloads(STOP) == [b"local"]
+        assert world.local.payloads(STOP) == [b"remote"]
+        assert world.retained(STOP) == (b"local", b"remote")  # each its publisher's own
+
+    def test_one_from_before_anything_is_forwarded_is_not_delivered_later(self, world: World) -> None:
+        """Its sender repeats it. A stop from before an outage must not stop the robot after it."""
+        do(world, "alone")
+        world.local.publish(MIRROR_FLAG, TRUE, retain=True)
+        for retain in (False, True):
+            world.local.publish(STOP, b"{}", retain=retain)
+        do(world, "mend")
+        world.local.publish(STOP, b"now")
+        world.run()
+        assert world.remote.payloads(STOP) == [b"now"]
+
+
+class TestOutage:
+    def test_the_remote_side_has_the_current_state_afterwards(self, world: World) -> None:
+        world.local.publish("outgoing/autonomy-files", b"start-up", retain=True)
+        do(world, "start cut")
+        world.remote_hub.retained.clear()
+        world.local.publish("outgoing/autonomy-files", b"newer", retain=True)
+        world.local.publish("outgoing/soundboard-files", b"new", retain=True)
+        do(world, "mend")
+        assert world.remote.payloads("outgoing/autonomy-files") == [b"start-up", b"newer"]
+        assert world.remote.payloads("outgoing/soundboard-files") == [b"new"]
+        world.local.publish("outgoing/soundboard-files", b"", retain=True)
+        world.run()
+        assert world.retained("outgoing/soundboard-files") == (None, None)
+
+    def test_what_waits_for_the_first_uplink(self, world: World) -> None:
+        world.local.publish("outgoing/capabilities", b"old", retain=True)
+        do(world, "alone")
+        world.local.publish("outgoing/capabilities", b"new", retain=True)
+        world.local.publish(EVENT, b"1")
+        do(world, "mend")
+        assert world.remote.payloads("outgoing/capabilities") == [b"new"]
+        assert world.remote.payloads(EVENT) == [b"1"]
+
+    def test_events_wait_streams_and_commands_do_not(self, world: World) -> None:
+        do(world, "start")
+        world.local.publish(MIRROR_FLAG, TRUE, retain=True)
+        do(world, "cut")
+        lost = (("outgoing/touch-sensors", 1), ("outgoing/somebody/stream", 0), (DRIVE, 1), (REBOOT, 1))
+        world.local.publish(EVENT, b"event")
+        for suffix, qos in lost:
+            world.local.publish(suffix, b"1", qos=qos)
+        world.local.publish(EVENT, b"later")
+        do(world, "mend")
+        assert world.remote.payloads(EVENT) == [b"event", b"later"]
+        assert not [suffix for suffix, _ in lost if world.remote.on(suffix)]
+
+    def test_waiting_events_are_bounded_and_the_oldest_go(self, world: World) -> None:
+        do(world, "start cut")
+        for number in range(LIMIT + 100):
+            world.local.publish(EVENT, b"%d" % number)
+        do(world, "mend")
+        assert world.remote.payloads(EVENT) == [b"%d" % number for number in range(100, LIMIT + 100)]
+        assert world.service is not None
+        assert world.service.dropped()["events"] == 100
+
+
+class TestProbes:
+    def test_at_each_connection_commands_are_probed(self, world: World) -> None:
+        """Those of the robot's own side only by the mirror."""
+        do(world, "start")
+        expected = (4, 4 * (world.name == "mirror"))
+        clients = world.local, world.remote
+        assert min(len(client.probes) >= number for client, number in zip(clients, expected, strict=True))
+        assert (not world.remote.probes) == (world.name == "bridge")
+        assert all(probe.payload.isspace() for client in clients for probe in client.probes)
+        before = len(world.local.probes)
+        do(world, "cut mend")
+        assert len(world.local.probes) >= before + 4
+
+    def test_one_of_a_media_request_requests_nothing(self, bridge: World) -> None:
+        do(bridge, "start")
+        for client, _ in sides(bridge):
+            client.publish("incoming/front-camera", b" \t\n" * 8)
+            client.publish("incoming/front-camera", b"  ")
+        bridge.run()
+        assert bridge.local.payloads("incoming/front-camera") == [b"  "]
+        assert bridge.service is not None
+        assert bridge.service.counters["refused"] == 0
+
+
+class TestOneBroker:
+    """Both sides of the bridge are one network, or become two."""
+
+    @pytest.fixture
+    def one(self, make: Make) -> World:
+        return make(one=True)
+
+    @staticmethod
+    def gate(world: World) -> Gate:
+        assert world.service is not None
+        return world.service.status.gate
+
+    @pytest.mark.parametrize("enabled", [True, False], ids=["with a heartbeat", "without"])
+    def test_nothing_is_forwarded_and_the_heartbeat_is_published(self, one: World, enabled: bool) -> None:
+        one.local.publish("outgoing/status", b"before", retain=True)
+        one.start(heartbeat={"enabled": enabled})
+        one.run()
+        for history in ("", "cut mend", "away back", "local-forgets"):  # still so after an outage
+            do(one, history)
+            assert self.gate(one) is Gate.SHUT
+            for suffix in (MIRROR_FLAG, FLAG, "outgoing/status", DRIVE, "outgoing/strange"):
+                before = len(one.remote.on(suffix))
+                one.local.publish(suffix, TRUE)
+                one.run()
+                assert one.remote.payloads(suffix)[before:] == [TRUE]
+        assert (len(one.remote.on("outgoing/online")) > 40) == enabled
+
+    def test_actions_run_once(self, one: World, ran: list[str]) -> None:
+        one.local.publish(REBOOT, TRUE, retain=True)
+        do(one, "start")
+        one.remote.publish(GIT_PULL, TRUE)
+        one.run()
+        assert ran == ["flags/git-pull"]
+
+    def test_a_way_that_comes_later_and_goes_again(self, bridge: World) -> None:
+        """As if another bridge had begun to join the two brokers; without a reconnect."""
+        do(bridge, "start")
+        assert self.gate(bridge) is Gate.OPEN
+        joint = bridge.remote.transport.subscribe(
+            f"{BASE}/outgoing/#", lambda m: bridge.local.transport.publish(m.topic, m.payload, qos=m.qos), echo=False,
+            direct=True,
+        )  # fmt: skip
+        bridge.run()
+        assert self.gate(bridge) is Gate.SHUT
+        joint.close()
+        bridge.run(40)
+        assert self.gate(bridge) is Gate.OPEN
+
+    def test_a_heartbeat_of_another_program_of_the_same_millisecond_is_no_proof(self, bridge: World) -> None:
+        do(bridge, "start")
+        for heartbeat in bridge.remote.payloads("outgoing/online"):
+            bridge.local.publish("outgoing/online", heartbeat)
+        bridge.run()
+        assert self.gate(bridge) is Gate.OPEN
+
+
+class TestLeftovers:
+    GONE = ("mcu/m1/describe", "mcu/m1/range", "outlets/1/status", "autonomy-status")
+    STAYS = ("mcu/m2/describe", "estop/serial", "status")
+    FOREIGN = ("incoming/flags/foreign", "outgoing/video", "outgoing/unknown", "outgoing/online")
+
+    @pytest.mark.parametrize("forgets", [False, True], ids=["the robot has taken it back", "the robot is not there"])
+    def test_what_was_taken_back_while_no_bridge_ran_is_removed_there(self, bridge: World, forgets: bool) -> None:
+        do(bridge, "start")
+        for name in (*self.GONE, *self.STAYS):
+            bridge.local.publish(f"outgoing/{name}", b'{"interfaces": [{"name": "range"}]}', retain=True)
+        bridge.run()
+        there = {f"{BASE}/outgoing/{name}" for name in (*self.GONE, *self.STAYS)}
+        assert there <= bridge.remote_hub.retained.keys()
+        bridge.stop()
+        for topic in self.FOREIGN:
+            bridge.remote.publish(topic, b"1", retain=True)
+        for name in self.GONE:
+            bridge.local.publish(f"outgoing/{name}", b"", retain=True)
+        if forgets:
+            bridge.local_hub.stop(forget=True)
+        do(bridge, "start")
+        bridge.run(60)
+        left = {f"{BASE}/{topic}" for topic in (*self.FOREIGN, *(f"outgoing/{name}" for name in self.STAYS))}
+        assert {*bridge.remote_hub.retained} == (there | left if forgets else left)
+
+
+class TestPrivate:
+    def test_what_an_mcu_wants_private_stays_private(self, bridge: World) -> None:
+        do(bridge, "start")
+        interfaces: list[dict[str, Any]] = [
+            {"name": "fast", "channel": "sensors/extra", "local_only": True}, {"name": "slow"},
+            {"name": "a", "channel": "estop", "dir": "in", "local_only": True},  # an alias never holds a stop back
+            {"name": "b", "channel": "estop-reset", "dir": "in", "local_only": True},
+            {"name": "c", "channel": "estop/mcu", "dir": "out", "local_only": True},
+        ]  # fmt: skip
+        manifest = json.dumps({"device_uid": "imu-1", "interfaces": interfaces}).encode()
+        bridge.local.publish("outgoing/mcu/imu-1/describe", manifest, retain=True)
+        passes = ("outgoing/mcu/imu-1/slow", "outgoing/estop/mcu")
+        private = ("outgoing/mcu/imu-1/fast", "outgoing/sensors/extra")
+        for suffix in (*passes, *private):
+            bridge.local.publish(suffix, b"{}")
+        for suffix in (STOP, RESET):
+            bridge.remote.publish(suffix, b"{}")
+        bridge.remote.publish("outgoing/status", b"no", retain=True)
+        bridge.run()
+        assert all(bridge.remote.on(suffix) for suffix in ("outgoing/mcu/imu-1/describe", *passes))
+        assert not [suffix for suffix in private if bridge.remote.on(suffix)]
+        assert all(bridge.local.on(suffix) for suffix in (STOP, RESET))
+        assert not bridge.local.on("outgoing/status"), "what is published at the operators' broker stays there"
+
+
+class TestHeartbeat:
+    def test_at_once_then_at_its_interval_to_the_remote_side_only(self, bridge: World) -> None:
+        do(bridge, "start")
+        heartbeats = bridge.remote.on("outgoing/online")
+        assert 13 <= len(heartbeats) <= 14
+        stamps = [json.loads(one.payload) for one in heartbeats]
+        assert all(set(stamp) == {"t"} and type(stamp["t"]) is int for stamp in stamps)
+        assert all(one.qos == 1 and one.retain_requested for one in heartbeats)
+        assert not bridge.local.on("outgoing/online")
+
+    def test_again_at_once_after_an_outage(self, bridge: World) -> None:
+        bridge.start(heartbeat={"interval_seconds": 300})
+        bridge.run()
+        before = len(bridge.remote.on("outgoing/online"))
+        do(bridge, "cut mend")
+        assert len(bridge.remote.on("outgoing/online")) == before + 1
+
+    def test_the_will_is_published_after_a_polite_end(self, bridge: World) -> None:
+        do(bridge, "start stop")
+        last = bridge.remote.on("outgoing/online")[-1]
+        assert json.loads(last.payload)["online"] is False
+        assert last.retain_requested
+
+    def test_it_can_be_off_and_then_belongs_to_others(self, bridge: World) -> None:
+        bridge.start(heartbeat={"enabled": False})
+        bridge.local.publish("outgoing/online", b'{"t": 1}', retain=True)
+        bridge.run()
+        assert bridge.remote.payloads("outgoing/online") == [b'{"t": 1}']
+
+    def test_renamed(self, bridge: World) -> None:
+        bridge.start(heartbeat={"topic": f"{BASE}/outgoing/alive", "qos": 0, "retain": False})
+        bridge.run()
+        bridge.local.publish("outgoing/online", b"mine")
+        bridge.run()
+        assert bridge.remote.on("outgoing/alive")[0].retain_requested is False
+        assert bridge.remote.payloads("outgoing/online") == [b"mine"]
+
+
+@pytest.mark.parametrize("side", list(Side))
+def test_a_stop_is_taken_where_too_many_messages_wait(world: World, side: Side) -> None:
+    do(world, "start")
+    is_stop = {Side.LOCAL: world.here, Side.REMOTE: world.uplink}[side].is_stop
+    found = {suffix: is_stop(f"{BASE}/{suffix}") for suffix in (STOP, RESET, "outgoing/estop/mcu", DRIVE, f"{STOP}/x")}
+    assert found == {suffix: suffix == STOP for suffix in found}
