@@ -26,7 +26,7 @@ _ALL_ADDRESSES = ("0.0.0.0", "::")  # noqa: S104 - compared, not listened on
 
 def run(settings: WebSettings, *, on_ready: Callable[[str], None] | None = None) -> int:
     """Serve until SIGINT or SIGTERM; ``on_ready`` gets the address once it can be opened. Raises PebbleError."""
-    listener = _listen(settings)
+    listener = listen(settings)
     try:
         with asyncio.Runner(loop_factory=Loop) as runner:
             runner.run(_serve(settings, listener, on_ready))
@@ -36,7 +36,7 @@ def run(settings: WebSettings, *, on_ready: Callable[[str], None] | None = None)
 
 
 async def _serve(settings: WebSettings, listener: Listener, on_ready: Callable[[str], None] | None) -> None:
-    config = _config(settings, listener)
+    config = server_config(settings, listener)
     config.load()
     if config.ssl is not None and settings.certificate is not None:
         renew_certificate(config.ssl, settings.certificate, settings.key)
@@ -68,7 +68,7 @@ def renew_certificate(listening: ssl.SSLContext, certificate: Path, key: Path | 
     listening.sni_callback = choose
 
 
-def _config(settings: WebSettings, listener: Listener) -> uvicorn.Config:
+def server_config(settings: WebSettings, listener: Listener) -> uvicorn.Config:
     app = create_app(settings)
     app.state.recognise = listener.recognise
     return uvicorn.Config(
@@ -92,7 +92,7 @@ def _config(settings: WebSettings, listener: Listener) -> uvicorn.Config:
     )
 
 
-def _listen(settings: WebSettings) -> Listener:
+def listen(settings: WebSettings) -> Listener:
     family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
     listener = Listener(family)
     try:

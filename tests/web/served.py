@@ -19,7 +19,7 @@ from pebble.contract import CAPABILITIES, ESTOP_STATE, ONLINE, codec
 from pebble.contract.payloads import EstopState, Heartbeat
 from pebble.transports import Message, MqttSettings, QoS, create
 from pebble.web.access.connections import Loop
-from pebble.web.serve import _config, _listen
+from pebble.web.serve import listen, server_config
 from tests.support import until
 
 HEARTBEAT_S = 0.25
@@ -31,9 +31,9 @@ class Served:
     def __init__(self, broker_port: int, **settings: Any) -> None:
         broker = MqttSettings(host="127.0.0.1", port=broker_port)
         self.settings = WebSettings(**{"broker": broker, "port": 0, "server": "hall", **settings})
-        self._listener = _listen(self.settings)
-        self.port = int(self._listener.getsockname()[1])
-        self._uvicorn = uvicorn.Server(_config(self.settings, self._listener))
+        self.listener = listen(self.settings)
+        self.port = int(self.listener.getsockname()[1])
+        self._uvicorn = uvicorn.Server(server_config(self.settings, self.listener))
         self._thread = threading.Thread(target=self._run, name="served", daemon=True)
 
     @property
@@ -56,7 +56,7 @@ class Served:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
         self._uvicorn.should_exit = True
         self._thread.join(10)
-        self._listener.close()
+        self.listener.close()
         assert not self._thread.is_alive(), "the server did not end"
 
     def page(self, **options: Any) -> Page:
@@ -64,7 +64,7 @@ class Served:
 
     def _run(self) -> None:
         with asyncio.Runner(loop_factory=Loop) as runner:
-            runner.run(self._uvicorn.serve(sockets=[self._listener]))
+            runner.run(self._uvicorn.serve(sockets=[self.listener]))
 
 
 class Page:

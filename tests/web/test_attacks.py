@@ -531,7 +531,7 @@ def test_slow_requests_do_not_keep_others_out(hall: Hall, driver: Page, monkeypa
         client.sendall(b"GET /ws/control HTTP/1.1\r\nX: y\r\n" if number % 2 else b"G")
         slow.append(client)
     assert hall.works()
-    listener: Any = hall.served._listener
+    listener: Any = hall.served.listener
     end = time.monotonic() + 4
     while time.monotonic() < end and listener.connections > 20:
         for client in slow:
@@ -545,7 +545,7 @@ def test_slow_requests_do_not_keep_others_out(hall: Hall, driver: Page, monkeypa
 
 
 def test_connections_are_bounded(hall: Hall, driver: Page) -> None:
-    listener: Any = hall.served._listener
+    listener: Any = hall.served.listener
     clients = [socket.create_connection(("127.0.0.1", hall.served.port), 5) for _ in range(300)]
     assert until(lambda: listener.ended >= 100)
     assert listener.connections <= 200

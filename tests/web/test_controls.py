@@ -35,10 +35,11 @@ def at_benjr(_benjr_page: Console) -> Iterator[Console]:
 # -- keys
 
 
-@pytest.mark.parametrize("name", ["goob", "fred", "minilamp", "benjr"])
-def test_each_key_turns_the_wheels_while_it_is_held(browser: Browser, stage: Stage, name: str) -> None:
+@pytest.mark.parametrize(("name", "keys"), [("goob", 4), ("fred", 4), ("minilamp", 8), ("benjr", 8)])
+def test_each_key_turns_the_wheels_while_it_is_held(browser: Browser, stage: Stage, name: str, keys: int) -> None:
+    """Letters at every robot, and arrows where no picture takes the processors."""
     with console(browser, stage, name) as opened, used(opened) as robot:
-        for key, wheels in KEYS.items():
+        for key, wheels in list(KEYS.items())[:keys]:
             assert robot.drive(key, wheels=wheels), (key, robot.wheels, robot.reason)
             robot.let_go()
             assert robot.rests(), key

@@ -296,6 +296,7 @@ def test_one_finger_scrolls_the_page_and_two_zoom_the_map(server: CannedServer, 
     with showing(server, browser, SENSORS, "phone") as opened:
         opened.test("tab-sensors").click()
         opened.test("map").wait_for()
+        assert opened.until(lambda: opened.page.locator(".loading").count() == 0)  # a card above it would move it
         see(opened, "map")
         box = opened.test("map").bounding_box()
         assert box is not None
@@ -307,17 +308,18 @@ def test_one_finger_scrolls_the_page_and_two_zoom_the_map(server: CannedServer, 
                 "type": kind, "touchPoints": [{"x": x, "y": y, "id": number} for number, (x, y) in enumerate(points)],
             })  # fmt: skip
 
-        words = "document.querySelector('.map canvas').dataset.scale"
-        scale = float(opened.page.evaluate(words))
+        scale = lambda: float(opened.page.evaluate("document.querySelector('.map canvas').dataset.scale ?? NaN"))
+        assert opened.until(lambda: scale() > 0)
+        before = scale()
         fingers("touchStart", (x - 30, y), (x + 30, y))
         for apart in (40, 50, 60):
             fingers("touchMove", (x - apart, y), (x + apart, y))
         fingers("touchEnd")
-        assert opened.until(lambda: float(opened.page.evaluate(words)) == pytest.approx(2 * scale, rel=0.01))
+        assert opened.until(lambda: scale() == pytest.approx(2 * before, rel=0.01))
         assert opened.page.evaluate("visualViewport.scale") == 1
-        before = opened.page.evaluate("scrollY")
-        cdp.send("Input.synthesizeScrollGesture", {"x": x, "y": y, "yDistance": 150 if before > 150 else -150})
-        assert opened.until(lambda: abs(opened.page.evaluate("scrollY") - before) > 60)
+        top = opened.page.evaluate("scrollY")
+        cdp.send("Input.synthesizeScrollGesture", {"x": x, "y": y, "yDistance": 150 if top > 150 else -150})
+        assert opened.until(lambda: abs(opened.page.evaluate("scrollY") - top) > 60)
 
 
 # -- over the picture

@@ -29,9 +29,9 @@ def rest(world: World) -> None:
 def _mend(world: World) -> None:
     """The faults end."""
     if world.network.era is None:
-        world._find_broker()
+        world.find_broker()
     if world.server.frozen:
-        world._thaw()
+        world.thaw()
     world.server.delay = 0.0
     world.silent_until = 0.0
     world.scheduler.run(_SLEEP_S if any(human.asleep for human in world.humans) else 0.01)
@@ -43,21 +43,21 @@ def _mend(world: World) -> None:
         travels_s = max(travels_s, wire.up.wait, wire.down.wait)
         wire.delay(0.003, 0.003)
         if human.blocked_from is not None:
-            world._unblock(slot, human.page, ("input", "network", "timers"))
+            world.unblock(slot, human.page, ("input", "network", "timers"))
         if world.server.roles.get(slot) is Role.VIEWER or world.ask(slot)["reason"] in ("role",):
             world.server.roles[slot] = Role.DRIVER
         if human.meta:
             world.do_meta(slot, 0)
         if human.has_pad:
             human.pad_frozen = False
-            world._pad(slot, (0.0, 0.0, 0.0))
+            world.show_pad(slot, (0.0, 0.0, 0.0))
         world.do_dialog(slot, 1)
         world.pages.do(human.page, "sliders", {"speed": 0.6, "turn": 0.6, "balance": 0})
         human.acted, human.balance = world.now, 0.0
     world.scheduler.run(travels_s)
     for _ in range(30):  # what is frozen, dead or away for some time is back soon
         world.scheduler.run(0.1)
-        if world._reachable() and world._other is None and not world.rules.stopping():
+        if world.reaches() and world.other_server is None and not world.rules.stopping():
             break
     world.scheduler.run(_HEARTBEAT_S)  # one that was lost is no silence any more
     world.rules.faults += 1
@@ -70,7 +70,7 @@ def _connected(world: World, slot: int) -> None:
         if state["open"] and state["reason"] != "role":
             return
         if state["ended"]:  # the session has ended: the human logs in again
-            world._leave(slot, vanish=False)
+            world.leave(slot, vanish=False)
             world.load(slot, "")
         world.scheduler.run(0.1)
     world.scheduler.check(False, "a page does not connect again")
@@ -117,7 +117,7 @@ def _drives(world: World, slot: int) -> None:
         elif reason == "stopped":
             world.pages.do(human.page, "reset")
         elif reason == "pad":
-            world._pad(slot, (0.0, 0.0, 0.0))
+            world.show_pad(slot, (0.0, 0.0, 0.0))
     world.scheduler.check(
         False, f"a human who does what the page says cannot drive: {state['reason'] or 'it gives no reason'}"
     )

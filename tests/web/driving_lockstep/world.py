@@ -100,7 +100,7 @@ class World:
         self.rules.stopping = lambda: any(not one.finished for one, _ in self.server.server.stops._senders.values())
         self.server.lease_moved = self.rules.lease_moved
         self.rules.driving = lambda: self.server.server.driving
-        self.rules.reachable = self._reachable
+        self.rules.reachable = self.reaches
         self.rules.owner_up = self._owner_up
         self.rules.path_s = lambda: 0.003 + self.server.delay + self.owner.delay
         self.humans: list[Human] = []
@@ -110,7 +110,7 @@ class World:
         self.states: dict[int, dict[str, Any]] = {}
         self._loads = 0
         self._lease: Any = None
-        self._other: tuple[int, float] | None = None  # another server drives: since, and until
+        self.other_server: tuple[int, float] | None = None  # another server drives: since, and until
         self.owner.start()
         self.server.start()
         self._announce()
@@ -208,7 +208,7 @@ class World:
     def _void(self, slot: int, why: str) -> None:
         self.humans[slot].interrupt(self.now, why)
 
-    def _reachable(self) -> bool:
+    def reaches(self) -> bool:
         """Whether commands get from the server to the wheels."""
         server = self.server
         return self._owner_up() and server.alive and not server.frozen and bool(server.server.broker.connected)
@@ -270,7 +270,7 @@ class World:
             human.let_go(name, self.now)
             self.pages.do(human.page, "hold", "up", 0)
         else:
-            self._pad(slot, (0.0, 0.0, 0.0))
+            self.show_pad(slot, (0.0, 0.0, 0.0))
         if not human.held and not human.pad_frozen and not (human.mac and human.meta):
             self._at_rest(slot, "everything is released", late=0.06 if name == "pad" else 0.0)
 
@@ -327,13 +327,13 @@ class World:
         slot, human = self._human(a)
         if b % 8 == 7:
             if not human.pad_frozen:
-                self._pad(slot, None)
+                self.show_pad(slot, None)
         elif b % 8 == 6:
             human.pad_frozen = "pad" in human.held
         elif b % 8 == 5:
-            self._pad(slot, (0.0, 0.0, 0.0))
+            self.show_pad(slot, (0.0, 0.0, 0.0))
         else:
-            self._pad(
+            self.show_pad(
                 slot, ((0.0, 0.8, 0.0), (0.9, 0.2, 0.0), (-0.5, 0.0, 0.0), (0.0, 0.0, 0.8), (0.0, -1.0, 0.0))[b % 5]
             )
 
@@ -342,15 +342,15 @@ class World:
         slot, human = self._human(a)
         if "pad" in human.held or human.pad_frozen:
             return
-        self._pad(slot, (0.0, 0.0, 0.0))
+        self.show_pad(slot, (0.0, 0.0, 0.0))
         self.scheduler.run(0.06)
-        self._pad(slot, (0.0, 0.8, 0.0))
+        self.show_pad(slot, (0.0, 0.8, 0.0))
         self.scheduler.run(0.1)
         human.pad_frozen = True
         human.let_go("pad", self.now)
         self.scheduler.run((0.3, 3.2)[b % 2])
 
-    def _pad(self, slot: int, axes: tuple[float, float, float] | None) -> None:
+    def show_pad(self, slot: int, axes: tuple[float, float, float] | None) -> None:
         human = self.humans[slot]
         x, z, y = axes or (0.0, 0.0, 0.0)
         human.has_pad = axes is not None
@@ -447,7 +447,7 @@ class World:
         if human.blocked_from is None:
             self._block(slot)
             page, order = human.page, _ORDERS[b % len(_ORDERS)]
-            self.scheduler.after(_BLOCKS_S[b % len(_BLOCKS_S)], lambda: self._unblock(slot, page, order))
+            self.scheduler.after(_BLOCKS_S[b % len(_BLOCKS_S)], lambda: self.unblock(slot, page, order))
 
     def _block(self, slot: int) -> None:
         human = self.humans[slot]
@@ -455,7 +455,7 @@ class World:
         self.pages.do(human.page, "block")
         self.rules.page_stands_still(human.page, self.wires[slot].up.wait)
 
-    def _unblock(self, slot: int, page: int, order: tuple[str, ...]) -> None:
+    def unblock(self, slot: int, page: int, order: tuple[str, ...]) -> None:
         human = self.humans[slot]
         if human.page == page:
             human.unblock(self.now)
@@ -478,7 +478,7 @@ class World:
                 human.asleep = False
                 self.pages.do(page, "awake", self.now - began if stands else 0.0)
                 wire.release()
-                self._unblock(slot, page, _ORDERS[b // 8 % len(_ORDERS)])
+                self.unblock(slot, page, _ORDERS[b // 8 % len(_ORDERS)])
 
         self.wake[slot] = wake
         self.scheduler.after(sleeps_s, wake)
@@ -493,10 +493,10 @@ class World:
         """The page is loaded again: by the same tab, by a copy of it, or by another one; the old one may hang on."""
         slot, _human = self._human(a)
         token = "" if b % 4 == 3 else self.ask(slot)["token"]
-        self._leave(slot, vanish=b % 4 == 2)
+        self.leave(slot, vanish=b % 4 == 2)
         self.load(slot, token)
 
-    def _leave(self, slot: int, *, vanish: bool) -> None:
+    def leave(self, slot: int, *, vanish: bool) -> None:
         page = self.humans[slot].page
         self.pages.do(page, "gone")
         self.rules.page_stands_still(page, self.wires[slot].up.wait)
@@ -535,7 +535,7 @@ class World:
     def do_other(self, a: int, b: int) -> None:
         """Another server drives the robot."""
         since = int(1000 * (EPOCH + self.now)) + (0, -3_600_000, 0)[b % 3]
-        self._other = (since, self.now + (0.1, 0.9, 2.5)[a % 3])
+        self.other_server = (since, self.now + (0.1, 0.9, 2.5)[a % 3])
         self._announce_other()
 
     def do_role(self, a: int, b: int) -> None:
@@ -577,9 +577,9 @@ class World:
         if self.server.alive and not self.server.frozen:
             self.rules.server_stands_still()
             self.server.freeze()
-            self.scheduler.after((0.1, 0.2, 0.28, 0.5, 1.0, 2.5)[b % 6], self._thaw)
+            self.scheduler.after((0.1, 0.2, 0.28, 0.5, 1.0, 2.5)[b % 6], self.thaw)
 
-    def _thaw(self) -> None:
+    def thaw(self) -> None:
         self.rules.faults += 1
         self.server.thaw()
 
@@ -599,9 +599,9 @@ class World:
             return
         self.rules.server_stands_still()
         self.network.stop(forget=a % 4 == 3)
-        self.scheduler.after(_OUTAGES_S[b % len(_OUTAGES_S)], self._find_broker)
+        self.scheduler.after(_OUTAGES_S[b % len(_OUTAGES_S)], self.find_broker)
 
-    def _find_broker(self) -> None:
+    def find_broker(self) -> None:
         self.rules.faults += 1
         if self.network.era is None:
             self.network.start()
@@ -638,7 +638,7 @@ class World:
         links = [link for link in self.links.values() if link.page == human.page and link.open]
         if human.gesture is None:
             return
-        if human.blocked_from is None and not wire.up.stalled and links and self._reachable():
+        if human.blocked_from is None and not wire.up.stalled and links and self.reaches():
             link = links[-1]
             changed = lambda: (wire.changed, human.blocked_from, human.page, link.open, human.sent)
             self.rules.let_go(human.page, link.first, wire.up.wait + late, why, changed)
@@ -656,15 +656,15 @@ class World:
         self.scheduler.after(_HEARTBEAT_S, self._heartbeat)
 
     def _announce_other(self) -> None:
-        if self._other is None:
+        if self.other_server is None:
             return
-        since, until = self._other
+        since, until = self.other_server
         ends = self.now >= until
         robots = {} if ends else {BASE: Driver(by="eve", device="desk", since=since)}
         payload = codec.encode(DRIVING, DrivingPayload(t=int(1000 * (EPOCH + self.now)), robots=robots))
         self._send(Message(DRIVING.topic(Identity("pebble", "servers", "other-1").base), payload, QoS.LATEST))
         if ends:
-            self._other = None
+            self.other_server = None
         else:
             self.scheduler.after(min(1.0, until - self.now), self._announce_other)
 
