@@ -234,7 +234,7 @@ def test_retained_messages_and_pieces_of_long_ones_are_signs_of_life(link: Link)
 def test_the_time_in_which_retained_messages_are_handled_is_no_silence(link: Link) -> None:
     def handle(messages: list[Message]) -> None:
         link.messages += messages
-        link.now += 1.5
+        link.now += 2.5
 
     for _ in range(5):
         link.sends(sent(b"x", retain=True))
