@@ -6,6 +6,7 @@ import importlib
 import multiprocessing
 import os
 import sys
+import tempfile
 from multiprocessing.reduction import DupFd
 from typing import Any
 
@@ -13,19 +14,19 @@ from pebble.runtime.parent import end_with_parent
 
 _context = multiprocessing.get_context("forkserver")
 _context.set_forkserver_preload(
-    ["__main__", "tests.transports.frames.frames_peer", "tests.transports.zenoh.zenoh_actor", "pebble.runtime.hub"]
+    ["__main__", "tests.transports.frames.frames_peer", "tests.transports.peer", "pebble.runtime.hub"]
 )
 
 
 class Forked:
-    """Runs ``main(*arguments)`` of a module; its standard input and output are pipes, as those of a `Popen`."""
+    """Runs ``main(*arguments)`` of a module; its standard input and output are pipes, as a `Popen` has."""
 
-    def __init__(self, module: str, *arguments: str) -> None:
+    def __init__(self, module: str, *arguments: Any) -> None:
         their_input, our_output = os.pipe()
         our_input, their_output = os.pipe()
-        self._process = _context.Process(
-            target=_run, args=(module, arguments, DupFd(their_input), DupFd(their_output)), daemon=True
-        )
+        self._errors = tempfile.TemporaryFile("w+")  # noqa: SIM115  (as long as the process)
+        pipes = [DupFd(one) for one in (their_input, their_output, self._errors.fileno())]
+        self._process = _context.Process(target=_run, args=(module, arguments, pipes), daemon=True)
         self._process.start()
         os.close(their_input)
         os.close(their_output)
@@ -35,6 +36,12 @@ class Forked:
     def pid(self) -> int:
         assert self._process.pid is not None
         return self._process.pid
+
+    @property
+    def printed(self) -> str:
+        """What it has written to its standard error."""
+        self._errors.seek(0)
+        return self._errors.read()
 
     def poll(self) -> int | None:
         return self._process.exitcode
@@ -47,9 +54,9 @@ class Forked:
         return self._process.exitcode
 
 
-def _run(module: str, arguments: tuple[str, ...], standard_input: Any, standard_output: Any) -> None:
+def _run(module: str, arguments: tuple[Any, ...], pipes: list[Any]) -> None:
     end_with_parent()
-    for number, pipe in enumerate((standard_input, standard_output)):
+    for number, pipe in enumerate(pipes):
         os.dup2(pipe.detach(), number)
     sys.stdin, sys.stdout = os.fdopen(0, closefd=False), os.fdopen(1, "w", closefd=False)
-    importlib.import_module(module).main(*arguments)
+    sys.exit(importlib.import_module(module).main(*arguments))
