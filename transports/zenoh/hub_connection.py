@@ -73,10 +73,10 @@ class HubConnection:
     def hello(self) -> bytes:
         """Our will, and what we have published."""
         gone: dict[str, int | None] = {topic_to_key(topic): None for topic in self._removed}
-        kept: dict[str, int | None] = {
+        stored: dict[str, int | None] = {
             topic_to_key(topic): wire.digest(own.payload) for topic, own in self._own.items() if own.payload
         }
-        return wire.encode(wire.Hello(self.name, self.retained_count, self._will, gone | kept))
+        return wire.encode(wire.Hello(self.name, self.retained_count, self._will, gone | stored))
 
     def greet(self, session: zenoh.Session, hello: bytes, timeout: float) -> set[str] | None:
         """The topics that the hub lacks; None: no hub answers in time."""

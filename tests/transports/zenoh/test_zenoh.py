@@ -410,7 +410,7 @@ def test_a_stopped_sibling_blocks_a_flood_once_and_for_a_bounded_time(robot: Rob
 
 
 def test_more_topics_than_publishers_are_received_in_order(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(publishers, "MOST", 3)
+    monkeypatch.setattr(publishers, "PUBLISHERS", 3)
     received: dict[str, list[int]] = {}
     robot.client("receiver").subscribe("many/+", lambda m: received.setdefault(m.topic, []).append(int(m.payload)))
     sender = robot.client("sender")
