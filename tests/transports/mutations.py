@@ -91,8 +91,8 @@ MUTATIONS = [
     ),
     Mutation(
         "retained messages do not show that the broker lives",
-        "if age.has_retained or (size and self._packets == first):",
-        "if size and self._packets == first:",
+        "            age.has_retained = True\n",
+        "            pass\n",
         _CONNECTION,
         "signs_of_life",
     ),
@@ -114,8 +114,8 @@ MUTATIONS = [
         "a lost connection sends what its socket still holds",
         "sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _ABORT)",
         "pass",
-        _MQTT,
-        "typed_into_a_silent_link",
+        _CONNECTION,
+        "discarded_connection",
     ),
     Mutation(
         "messages are acknowledged before they are handled",
@@ -149,8 +149,8 @@ MUTATIONS = [
         "no ping follows a message that may be at fault",
         "if (doubtful := self.pings.doubtful) and message.topic in doubtful:",
         "if (doubtful := self.pings.doubtful) and not doubtful:",
-        _MQTT,
-        "hangs_up_costs_that_topic",
+        _CONNECTION,
+        "may_be_at_fault",
     ),
     Mutation(
         "a broker that hangs up on a message is taken for a broken link",

@@ -9,13 +9,11 @@ from __future__ import annotations
 import base64
 import json
 import pickle
-import subprocess
-import sys
 from abc import ABC, abstractmethod
 from typing import Any, Protocol
 
 from pebble.transports import Message, QoS, State, Transport, create
-from tests.support import ROOT, Child
+from tests.transports.forked import Forked
 
 
 class Peer(Protocol):
@@ -120,13 +118,7 @@ class ProcessPeer:
 
     def __init__(self, kind: str, name: str, settings: Any, will: Message | None) -> None:
         recipe = base64.b64encode(pickle.dumps((kind, name, settings, will))).decode()
-        self._process = Child(
-            [sys.executable, "-m", "tests.transports.peer", recipe],
-            cwd=ROOT,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
+        self._process = Forked("tests.transports.peer", recipe)
         assert self._answer() is True, "the peer did not connect"
 
     def publish(self, topic: str, payload: bytes, *, qos: QoS = QoS.DELIVERED, retain: bool = False) -> bool:
@@ -143,18 +135,15 @@ class ProcessPeer:
         self._release()
 
     def _ask(self, request: dict[str, Any]) -> Any:
-        assert self._process.stdin is not None
         self._process.stdin.write(json.dumps(request) + "\n")
         self._process.stdin.flush()
         return self._answer()
 
     def _answer(self) -> Any:
-        assert self._process.stdout is not None
         line = self._process.stdout.readline()
         assert line, f"the peer died with exit code {self._process.wait(10)}"
         return json.loads(line)
 
     def _release(self) -> None:
         for pipe in (self._process.stdin, self._process.stdout):
-            assert pipe is not None
             pipe.close()

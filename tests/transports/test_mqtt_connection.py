@@ -234,7 +234,7 @@ def test_retained_messages_and_pieces_of_long_ones_are_signs_of_life(link: Link)
 def test_the_time_in_which_retained_messages_are_handled_is_no_silence(link: Link) -> None:
     def handle(messages: list[Message]) -> None:
         link.messages += messages
-        link.now += 1.5
+        link.now += 2.5
 
     for _ in range(5):
         link.sends(sent(b"x", retain=True))
@@ -250,3 +250,20 @@ def test_an_acknowledgement_is_complete_after_what_came_before_it_was_delivered(
         link.connection.pump(1.0, lambda messages: seen.extend(ack.done for _ in messages))
     assert seen == [False]
     assert ack.done
+
+
+def test_a_discarded_connection_sends_nothing_more(link: Link) -> None:
+    """What waits in the socket would arrive late, as if it were fresh."""
+    for _ in range(200):
+        link.connection.publish(Message("full", bytes(100_000)))
+    link.connection.discard()
+    with pytest.raises(ConnectionResetError):
+        list(iter(lambda: link.other.recv(1 << 20), b""))
+
+
+def test_a_ping_follows_the_next_message_of_a_topic_that_may_be_at_fault(link: Link) -> None:
+    link.connection.pings.doubtful.add("a")
+    for topic in ("b", "a", "a"):
+        link.connection.publish(Message(topic, b""))
+    message = b"\x30\3\0\1"
+    assert link.written() == message + b"b" + message + b"a" + packets.PINGREQ + message + b"a"

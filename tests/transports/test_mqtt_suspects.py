@@ -153,7 +153,7 @@ def test_what_a_broker_hangs_up_on_costs_that_topic(link: tuple[float, float, bo
         assert world.arrived[topic] - before[topic] >= 0.95 * 120 / ROBOT[topic][0] - 1
 
 
-@pytest.mark.parametrize("driven", [False, True], ids=["idle", "driven"])
+@pytest.mark.parametrize("driven", some([False, True], 2))
 def test_a_topic_that_is_allowed_again_is_used_again(driven: bool) -> None:
     def refuses(topic: str, _size: int, now: float) -> bool:
         return topic == "r/touch" and now < 100

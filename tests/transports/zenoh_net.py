@@ -5,15 +5,14 @@ from __future__ import annotations
 import dataclasses
 import os
 import signal
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from pebble.transports import Message, QoS, State, ZenohSettings, create
-from tests.support import ROOT, until
+from tests.support import until
+from tests.transports.forked import Forked
 from tests.transports.net import Net
 
 
@@ -22,12 +21,11 @@ class HubProcess:
 
     def __init__(self, run_dir: Path, journal: Path | None = None) -> None:
         self.settings = ZenohSettings(run_dir=run_dir, journal=journal)
-        self._process: subprocess.Popen[str] | None = None
+        self._process: Forked | None = None
 
     def start(self) -> HubProcess:
         settings = msgspec.json.encode(self.settings, enc_hook=str).decode()
-        command = [sys.executable, "-m", "pebble.runtime.hub", settings]
-        self._process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
+        self._process = Forked("pebble.runtime.hub", [settings])
         probe = create("zenoh", "probe", dataclasses.replace(self.settings, client=True)).open(10)
         assert probe.state is State.CONNECTED, probe.problem
         probe.close()
@@ -36,14 +34,13 @@ class HubProcess:
     def kill(self) -> None:
         self.end(signal.SIGKILL)
 
-    def end(self, number: int = signal.SIGTERM) -> tuple[int, str]:
+    def end(self, number: int = signal.SIGTERM) -> tuple[int | None, str]:
         """Returns the exit code and what it wrote to stderr."""
         process, self._process = self._process, None
         assert process is not None
-        process.send_signal(signal.SIGCONT)
-        process.send_signal(number)
-        _, printed = process.communicate(timeout=10)
-        return process.returncode, printed
+        os.kill(process.pid, signal.SIGCONT)
+        os.kill(process.pid, number)
+        return process.wait(10), process.printed
 
     def signal(self, number: int) -> None:
         os.kill(self.pid, number)

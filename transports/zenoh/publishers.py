@@ -12,7 +12,7 @@ from pebble.transports.base import Message, QoS
 from pebble.transports.zenoh import wire
 from pebble.transports.zenoh.keymap import topic_to_key
 
-MOST = 1000  # topics for which a publisher is declared
+PUBLISHERS = 1000  # topics for which a publisher is declared
 _TOPIC_LIMIT = 10_000  # topics whose priority, or removal, is remembered
 
 _V = TypeVar("_V")
@@ -50,7 +50,7 @@ class Publishers:
         have invented gets one, and only the first of the others.
         """
         urgent = remember_first(self._urgent, message.topic, urgent)
-        if len(self.declared) >= MOST or self._is_invented(message.topic):
+        if len(self.declared) >= PUBLISHERS or self._is_invented(message.topic):
             return None
         treatment = wire.TREATMENTS[message.qos, urgent]
         publisher = session.declare_publisher(topic_to_key(message.topic), **treatment)

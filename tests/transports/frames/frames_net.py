@@ -6,8 +6,6 @@ import contextlib
 import json
 import os
 import signal
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,7 +13,8 @@ from typing import Any
 import msgspec
 
 from pebble.transports.segments import SHM
-from tests.support import ROOT, Child, until
+from tests.support import until
+from tests.transports.forked import Forked
 from tests.transports.frames.frames_peer import Options
 
 
@@ -23,25 +22,11 @@ class Peer:
     """One process; `ask` for its numbers."""
 
     def __init__(self, role: str, folder: Path, options: Options) -> None:
-        self._process = Child(
-            [
-                sys.executable,
-                "-m",
-                "tests.transports.frames.frames_peer",
-                role,
-                str(folder),
-                msgspec.json.encode(options),
-            ],
-            cwd=ROOT,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            text=True,
-        )
+        arguments = (role, str(folder), msgspec.json.encode(options).decode())
+        self._process = Forked("tests.transports.frames.frames_peer", *arguments)
         assert self._line() == "up"
 
     def ask(self) -> dict[str, Any]:
-        assert self._process.stdin is not None
         self._process.stdin.write("?\n")
         self._process.stdin.flush()
         answer: dict[str, Any] = json.loads(self._line())
@@ -69,9 +54,8 @@ class Peer:
     def pid(self) -> int:
         return self._process.pid
 
-    def close(self) -> int:
+    def close(self) -> int | None:
         """Its exit code after a polite end."""
-        assert self._process.stdin is not None
         self._process.stdin.close()
         return self._end()
 
@@ -79,17 +63,15 @@ class Peer:
         self._process.kill()
         self._end()
 
-    def _end(self) -> int:
+    def _end(self) -> int | None:
         try:
             return self._process.wait(10)
         finally:
             for pipe in (self._process.stdin, self._process.stdout):
-                if pipe is not None:
-                    with contextlib.suppress(BrokenPipeError):
-                        pipe.close()
+                with contextlib.suppress(BrokenPipeError):
+                    pipe.close()
 
     def _line(self) -> str:
-        assert self._process.stdout is not None
         return self._process.stdout.readline().strip()
 
     @property

@@ -32,7 +32,7 @@ from pebble.transports.zenoh.hub import ZenohHub
 from pebble.transports.zenoh.hub import journal as hub_journal
 from pebble.transports.zenoh.hub import store as hub_store
 from pebble.transports.zenoh.hub.store import HubStore, Retained, StoredWill
-from tests.support import ROOT, free_port, until
+from tests.support import ROOT, free_port, some, until
 from tests.transports.zenoh_net import HubProcess
 
 DELIVERED = QoS.DELIVERED
@@ -174,15 +174,18 @@ def test_retained_messages_published_without_a_hub_arrive_live_and_reach_it_late
 
 @pytest.mark.parametrize(
     "remove",
-    [
-        lambda run: shutil.rmtree(run),
-        lambda run: run.rename(run.with_name("moved")),
-        lambda run: (run.rename(run.with_name("moved")), run.mkdir(0o700)),
-        lambda run: [path.unlink() for path in run.glob("*.sock")],
-        lambda run: [path.unlink() for path in run.glob("*.seat")],
-        lambda run: [path.unlink() for path in run.iterdir() if path.suffix != ".sock"],
-        lambda run: (run / "hub.sock").unlink(),
-    ],
+    some(
+        [
+            lambda run: shutil.rmtree(run),
+            lambda run: run.rename(run.with_name("moved")),
+            lambda run: (run.rename(run.with_name("moved")), run.mkdir(0o700)),
+            lambda run: [path.unlink() for path in run.glob("*.sock")],
+            lambda run: [path.unlink() for path in run.glob("*.seat")],
+            lambda run: [path.unlink() for path in run.iterdir() if path.suffix != ".sock"],
+            lambda run: (run / "hub.sock").unlink(),
+        ],
+        3,
+    ),
 )
 def test_what_was_removed_from_the_run_directory_is_made_again(robot: Robot, remove: Callable[[Path], object]) -> None:
     """Those that run go on with each other, and those that start now reach them, and what the hub has stored."""
@@ -407,7 +410,7 @@ def test_a_stopped_sibling_blocks_a_flood_once_and_for_a_bounded_time(robot: Rob
 
 
 def test_more_topics_than_publishers_are_received_in_order(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(publishers, "MOST", 3)
+    monkeypatch.setattr(publishers, "PUBLISHERS", 3)
     received: dict[str, list[int]] = {}
     robot.client("receiver").subscribe("many/+", lambda m: received.setdefault(m.topic, []).append(int(m.payload)))
     sender = robot.client("sender")
@@ -824,7 +827,7 @@ def test_a_second_hub_is_refused(robot: Robot) -> None:
     assert robot.client("client").state is State.CONNECTED
 
 
-@pytest.mark.parametrize("arguments", [[], ["a", "b"], ["{"], ["{}"], ['{"run_dir": 1}']])
+@pytest.mark.parametrize("arguments", some([[], ["a", "b"], ["{"], ["{}"], ['{"run_dir": 1}']], 4))
 def test_the_hub_explains_its_arguments(arguments: list[str]) -> None:
     program = [sys.executable, "-m", "pebble.runtime.hub", *arguments]
     done = subprocess.run(program, cwd=ROOT, capture_output=True, text=True, timeout=20, check=False)
