@@ -141,7 +141,7 @@ def test_the_launcher_is_notified_however_busy_it_is(
     filled = os.write(end, b"." * 1_000_000)
     broker.refuse(ESTOP)
     bench = start()
-    assert until(lambda: not bench.service._announced)
+    assert until(lambda: not bench.service.announced)
     assert os.read(notes, filled) == b"." * filled
     assert until(lambda: readable(notes) == b"LACKS estop\n")
     refuse(broker, bench)

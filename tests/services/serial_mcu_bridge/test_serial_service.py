@@ -73,7 +73,7 @@ def test_after_a_pause_of_the_process_the_stop_is_sent_before_the_next_command(b
     def pause() -> None:
         time.sleep(0.9)
         bench.service.receive_drive(Drive(x=0.0, z=0.25), bench.service.clock())
-        bench.service._judge()
+        bench.service.judge()
 
     bench.service.post(pause)
     assert bench.line("M 0.250 0.250")
@@ -303,6 +303,6 @@ def test_robots_with_one_state_directory_do_not_share_a_stop(tmp_path: Path) -> 
         return MotorBridge(parse(raw, folder=tmp_path, env={}), MemoryTransport(robot, MemoryHub()))
 
     stopped, other = bridge("rover"), bridge("other")
-    stopped._file.save({"latched": True})
-    stopped._file.close()
-    assert (stopped._file.load(), other._file.load()) == ({"latched": True}, None)
+    stopped.state_file.save({"latched": True})
+    stopped.state_file.close()
+    assert (stopped.state_file.load(), other.state_file.load()) == ({"latched": True}, None)
