@@ -241,6 +241,16 @@ def test_a_stop_does_not_wait_behind_a_full_inbox(bench: Bench) -> None:
     assert state(bench)["count"] == 1
 
 
+def test_a_command_that_waited_for_too_long_moves_nothing(bench: Bench) -> None:
+    with bench.occupied():
+        bench.send("incoming/drive-values", {"z": 0.5})
+        time.sleep(0.6)
+    bench.send("incoming/lights-solid", {"r": 1})
+    assert bench.line("L 0.000 0.000 1.000")
+    assert bench.service.counters["late"] == 1
+    assert set(bench.mcu.trace.lines()) == {"M 0.000 0.000", "L 0.000 0.000 1.000"}
+
+
 def test_a_command_is_valid_for_its_valid_ms(bench: Bench) -> None:
     bench.send("incoming/drive-values", {"z": 0.5, "valid_ms": 100})
     assert bench.line("M 0.500 0.500")
