@@ -77,7 +77,7 @@ class SimulatedMcu:
         self.motion, self.battery = self.body.motion, self.body.battery
         self.battery.charging = charging
         self._boot_output = b""
-        self._firmware: Any = None  # its robot object, since the last boot
+        self.robot: Any = None  # the firmware's, since the last boot
         self._obeyed = _ObeyedLines(None)
         self._runner = Runner(self.board, kind, settings, on_boot=self._on_boot)
         self._start()
@@ -102,7 +102,7 @@ class SimulatedMcu:
         output = self._advance(now, self.profile.tick_s)
         if not self.profile.is_text:
             return output + self._write_input(data, now)
-        if not self._firmware.lines.length:  # the firmware has dropped half a line
+        if not self.robot.lines.length:  # the firmware has dropped half a line
             self._obeyed.half = b""
         *lines, rest = data.split(b"\n")
         for line in lines:
@@ -164,18 +164,18 @@ class SimulatedMcu:
     def _on_boot(self, robot: Any) -> None:
         if self.failsafe_s is not None:
             robot.deadman.limit_ms = round(self.failsafe_s * 1000)
-        self._firmware = robot
+        self.robot = robot
         self._obeyed = _ObeyedLines(robot)
 
 
 class _ObeyedLines:
     """The lines that a text board's firmware has answered with OK since it booted."""
 
-    def __init__(self, firmware: Any) -> None:
+    def __init__(self, robot: Any) -> None:
         self.half = b""  # of the line that is being typed
         self.last = b""
         self.count = 0
-        self._firmware = firmware
+        self._robot = robot
         self._drive = b""
         self._trips = 0  # of the failsafe, before that drive command
 
@@ -188,11 +188,11 @@ class _ObeyedLines:
         self.count += 1
         self.last = b" ".join(line.split()[:_TOKENS])
         if answer[at + 3 : at + 4] == b"M":
-            self._drive, self._trips = self.last, self._firmware.deadman.trips
+            self._drive, self._trips = self.last, self._robot.deadman.trips
 
     def drive(self, board: Board) -> Pair:
         """The wheel speeds of the last drive command as the firmware parses them; 0 after its failsafe tripped."""
-        if not self._drive or self._firmware.deadman.trips != self._trips:
+        if not self._drive or self._robot.deadman.trips != self._trips:
             return 0.0, 0.0
         read = board.firmware.module("common.lines")
         left, right = (read.clamp(read.number(token, 0, len(token)), -1.0) for token in self._drive.split()[1:3])

@@ -55,7 +55,7 @@ class SoundboardHandler(Service):
         return self._section.retained_publish_interval_seconds
 
     def start(self) -> None:
-        self.timers.add(self.clock(), self._scan, period=self._section.playback.scan_interval)
+        self.timers.add(self.clock(), self.scan, period=self._section.playback.scan_interval)
         self._publish_status()
 
     def stop(self) -> None:
@@ -102,7 +102,7 @@ class SoundboardHandler(Service):
         repeat = command.repeat
         return _Request(clip, math.inf if repeat is True else max(1, repeat or 1))
 
-    def _scan(self) -> None:
+    def scan(self) -> None:
         files = self._clips.scan()
         if self._clips.problem != self._scan_problem:
             self._scan_problem = self._clips.problem

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.services.serial_mcu_bridge.mcu_rig import Rig
+from tests.services.serial_mcu_bridge.mcu_rig import LocalNetwork, Rig
 from tests.support import Broker
 
 
@@ -27,10 +27,18 @@ def remote(tmp_path: Path) -> Iterator[Broker]:
     broker.stop()
 
 
-@pytest.fixture(params=["memory", "mqtt", "zenoh"])
-def rig(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Rig]:
+@pytest.fixture(scope="session", params=["memory", "mqtt", "zenoh"])
+def network(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[LocalNetwork]:
+    """One broker, and one hub, for all robots of a run."""
+    network = LocalNetwork(request.param, tmp_path_factory.mktemp("network"))
+    yield network
+    network.close()
+
+
+@pytest.fixture
+def rig(network: LocalNetwork, tmp_path: Path) -> Iterator[Rig]:
     """MCUs and their bridges, on each transport."""
-    rig = Rig(request.param, tmp_path)
+    rig = Rig(network.kind, tmp_path, network)
     yield rig
     rig.close()
 

@@ -207,7 +207,7 @@ def test_commands_that_arrive_together_are_obeyed_in_turn() -> None:
 def test_an_error_in_the_firmware_stops_the_motors_and_starts_it_anew(monkeypatch: pytest.MonkeyPatch) -> None:
     mcu = SimulatedMcu("goob", 0.0)
     mcu.receive(b"M 1 1\n", 0.0)
-    monkeypatch.setattr(mcu._firmware.port, "read", lambda: 1 / 0)
+    monkeypatch.setattr(mcu.robot.port, "read", lambda: 1 / 0)
     assert mcu.tick(0.1).startswith(b"Starting setup...")
     assert mcu.state().motors == (0.0, 0.0)
     assert mcu.resets == 1
@@ -218,10 +218,10 @@ def test_an_error_in_the_firmware_stops_the_motors_and_starts_it_anew(monkeypatc
 
 def test_firmware_that_fails_at_every_turn_keeps_starting(monkeypatch: pytest.MonkeyPatch) -> None:
     mcu = SimulatedMcu("goob", 0.0)
-    monkeypatch.setattr(type(mcu._firmware), "step", lambda _robot: 1 / 0)
+    monkeypatch.setattr(type(mcu.robot), "step", lambda _robot: 1 / 0)
     for turn in range(5):
         mcu.tick(turn * 0.001)
-        monkeypatch.setattr(type(mcu._firmware), "step", lambda _robot: 1 / 0)  # each boot has classes of its own
+        monkeypatch.setattr(type(mcu.robot), "step", lambda _robot: 1 / 0)  # each boot has classes of its own
     assert mcu.resets == 5
     assert mcu.state().motors == (0.0, 0.0)
 

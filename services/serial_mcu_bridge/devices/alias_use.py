@@ -23,11 +23,11 @@ class AliasUse:
         self._log, self._peers, self._begin, self._end = log, peers, begin, end
         self.permitted = False  # other devices have had time to object
         self._device: Device | None = None
-        self._used: dict[str, tuple[Alias, Subscription | None]] = {}  # by claim
+        self.used: dict[str, tuple[Alias, Subscription | None]] = {}  # by claim
         self._rivals: dict[str, list[str]] = {}  # by claim, as last logged
 
     def __contains__(self, alias: Alias) -> bool:
-        return alias.claim in self._used
+        return alias.claim in self.used
 
     def announce(self, device: Device) -> None:
         """Set a device whose manifest was just published; no alias is in use yet."""
@@ -49,7 +49,7 @@ class AliasUse:
 
     def withdraw(self) -> None:
         """Release all aliases, because the device has gone."""
-        for claim in list(self._used):
+        for claim in list(self.used):
             self._release(claim)
         self._device, self.permitted = None, False
         self._rivals.clear()
@@ -59,13 +59,13 @@ class AliasUse:
         self._log_conflict(device, alias.claim, rivals)
         if rivals:
             self._release(alias.claim)
-        elif self.permitted and alias.claim not in self._used:
-            self._used[alias.claim] = alias, None  # counts as used already, so that begin can publish on it
-            self._used[alias.claim] = alias, self._begin(device, route, alias)
+        elif self.permitted and alias.claim not in self.used:
+            self.used[alias.claim] = alias, None  # counts as used already, so that begin can publish on it
+            self.used[alias.claim] = alias, self._begin(device, route, alias)
 
     def _release(self, claim: str) -> None:
-        if claim in self._used:
-            alias, subscription = self._used.pop(claim)
+        if claim in self.used:
+            alias, subscription = self.used.pop(claim)
             if subscription is not None:
                 subscription.close()
             self._end(alias)

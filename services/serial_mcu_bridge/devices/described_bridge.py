@@ -43,7 +43,7 @@ from pebble.services.serial_mcu_bridge.serial_service import SerialService
 from pebble.services.serial_mcu_bridge.text.device_log import DeviceLogLine
 from pebble.transports import Message, Subscription
 
-_CLAIM_S = 0.25  # between publishing claims and using them: another device has objected by then
+CLAIM_S = 0.25  # between publishing claims and using them: another device has objected by then
 _WATCH_S = 0.5
 
 #: Published to request a uid or to check a retained manifest; the process that has the device publishes its manifest.
@@ -66,15 +66,15 @@ class DescribedBridge(SerialService):
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
         self._session = Session(self.config.base)
-        self._watchdog = ImuWatchdog(self.options, self.instance)
+        self.watchdog = ImuWatchdog(self.options, self.instance)
         self._peers = PeerDevices()
         self._uid = UidClaim(secrets.token_hex(8))
         self._candidate: Manifest | None = None  # described, possibly under a uid that another device holds
         self._conflict_logged = False
-        self._device: Device | None = None
+        self.device: Device | None = None
         self._published_states: dict[int, tuple[Reading, int]] = {}  # newest of each state interface, its epoch ms
         self._generic: list[Subscription] = []  # of the device that was described last, connected or not
-        self._aliases = AliasUse(self.log, self._peers, self._begin_alias, self._end_alias)
+        self.aliases = AliasUse(self.log, self._peers, self._begin_alias, self._end_alias)
         self._features = ProvidedFeatures(Notifier())
         self._timer: Timer | None = None
 
@@ -91,9 +91,9 @@ class DescribedBridge(SerialService):
         now = self.clock()
         if state is LineState.READY:
             self._session.opened(now)
-            self._watchdog.begin(now)
+            self.watchdog.begin(now)
         elif state is LineState.ABSENT:
-            self._watchdog.end()
+            self.watchdog.end()
             self._handle_events(self._session.closed())
             self.exit_if_configured()
         self._arm()
@@ -107,8 +107,8 @@ class DescribedBridge(SerialService):
     @every(_WATCH_S)
     def watch(self) -> None:
         self._features.report()
-        if self._watchdog.expired(self.clock()):
-            raise DeviceError(f"no sample for {self._watchdog.timeout_s:g} s")
+        if self.watchdog.expired(self.clock()):
+            raise DeviceError(f"no sample for {self.watchdog.timeout_s:g} s")
 
     def _tick(self) -> None:
         self._timer = None
@@ -116,7 +116,7 @@ class DescribedBridge(SerialService):
         for uid in self._peers.left_over(self.clock()):
             self.log.info("%s: its retained manifest is stale; cleared", uid)
             self.clear(MCU_DESCRIBE, uid=uid)
-            self._aliases.update()
+            self.aliases.update()
         self._perform(self._uid.tick(self.clock()))
         self._arm()
 
@@ -154,9 +154,9 @@ class DescribedBridge(SerialService):
                         self.device_log.log(subject, level, "%s", reason)
 
     def _report(self, reading: Reading) -> None:
-        device, now_ms = self._device, _now_ms()
+        device, now_ms = self.device, _now_ms()
         if device is None or not device.has_motion or reading.interface.profile == MOTION:
-            self._watchdog.sample(self.clock())
+            self.watchdog.sample(self.clock())
         if reading.interface.kind is InterfaceKind.STATE:
             self._published_states[reading.interface.id] = reading, now_ms
         if device is not None:
@@ -168,7 +168,7 @@ class DescribedBridge(SerialService):
 
     def _publish_alias(self, device: Device, route: Route, sample: McuSample, alias: Alias) -> None:
         body = device.alias_body(route, sample)  # also while unused, as a summary needs the newest motion
-        if alias in self._aliases and body is not None:
+        if alias in self.aliases and body is not None:
             self.publish(alias.channel, body)
 
     def _log_answer(self, answer: Answer) -> None:
@@ -186,7 +186,7 @@ class DescribedBridge(SerialService):
     # -- the device appears and leaves
 
     def _perform(self, move: Move) -> None:
-        candidate, device = self._candidate, self._device
+        candidate, device = self._candidate, self.device
         match move:
             case Move.ASK if candidate is not None:
                 self._ask(candidate.uid, self._uid.token)
@@ -219,14 +219,14 @@ class DescribedBridge(SerialService):
     def _publish_device(self, manifest: Manifest) -> None:
         port = str(self.options.serial.port)
         reports = ImuReports(device=port, protocol=self.options.protocol, instance=self.instance)
-        device = self._device = Device(manifest, self.addresses, reports)
+        device = self.device = Device(manifest, self.addresses, reports)
         hello = device.hello
         self.log.info("%s: %r, firmware %r, %d interfaces", device.uid, hello.model, hello.firmware_version,
                       len(device.routes))  # fmt: skip
         for name, reason in device.claims.refused.items():
             self.log.warning("%s: no alias for %s: %s", device.uid, name, reason)
         if any(route.interface.profile.startswith(FAMILY) for route in device.routes.values()):
-            self._watchdog.found_imu()
+            self.watchdog.found_imu()
         self._peers.forget(device.uid)
         self._close_generic()
         self._listen_generic(device, private=False)  # a reader of the manifest may send commands at once
@@ -234,8 +234,8 @@ class DescribedBridge(SerialService):
         self._listen_generic(device, private=True)
         for reading, received_ms in self._published_states.values():  # received before we held the uid
             self.publish(device.routes[reading.interface.id].generic, device.sample(reading, received_ms))
-        self._aliases.announce(device)
-        self.call_at(self.clock() + _CLAIM_S, partial(self._aliases.permit, device))
+        self.aliases.announce(device)
+        self.call_at(self.clock() + CLAIM_S, partial(self.aliases.permit, device))
 
     def _device_gone(self, why: str) -> None:
         """Remove the device's retained messages. Its commands are still received, counted and dropped."""
@@ -245,11 +245,11 @@ class DescribedBridge(SerialService):
         self._withdraw(why)
 
     def _withdraw(self, why: str) -> None:
-        device, self._device = self._device, None
+        device, self.device = self.device, None
         if device is None:
             return
         self.log.info("%s: %s", device.uid, why)
-        self._aliases.withdraw()
+        self.aliases.withdraw()
         for route in device.routes.values():
             if route.generic.kind is Kind.STATE:
                 self.retract(route.generic)
@@ -271,7 +271,7 @@ class DescribedBridge(SerialService):
 
     def _command(self, device: Device, route: Route, values: dict[str, Any]) -> None:
         name = route.interface.name
-        if device is not self._device:
+        if device is not self.device:
             self.counters.add("no_device")
             self.log_limited.warning("no device", "%s: dropped a command, the device is not there", name)
             return
@@ -326,7 +326,7 @@ class DescribedBridge(SerialService):
 
     def _receive_manifest(self, uid: str, manifest: McuManifest | None, retained: bool) -> None:
         now = self.clock()
-        if self._device is not None and uid == self._device.uid:
+        if self.device is not None and uid == self.device.uid:
             if manifest is None:
                 self.republish()  # another process removed it, for example one that has yielded the uid
             else:
@@ -341,7 +341,7 @@ class DescribedBridge(SerialService):
                 self._ask(uid)  # unless its bridge publishes it again in time, _tick removes it
             else:
                 self._perform(self._uid.on_manifest(uid, now))
-        self._aliases.update()
+        self.aliases.update()
         self._arm()
 
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from pebble.errors import DeviceError
 from pebble.runtime.wakeup_pipe import WakeupPipe
-from pebble.services.serial_mcu_bridge.line.hearing import UNREAD_S, Hearing
+from pebble.services.serial_mcu_bridge.line.input import UNREAD_S, Input
 from pebble.services.serial_mcu_bridge.line.outbox import Outbox
 from pebble.services.serial_mcu_bridge.line.output import Output
 from pebble.services.serial_mcu_bridge.line.port import Port
@@ -77,7 +77,7 @@ class SerialLine:
     ) -> None:
         self.opened = 0  # how often the device was opened
         self.refused = 0  # lines refused because there was no device
-        self.hearing = Hearing()
+        self.input = Input()
         self._opening = _Opening(path, baud, boot_s, read_timeout_s, retry_s)
         self._on_bytes, self._on_state = on_bytes, on_state
         self._thread = threading.Thread(target=self._run, name=f"pebble-serial {path}", daemon=True)
@@ -109,7 +109,7 @@ class SerialLine:
         One that could not be sent for ``valid_s``, or for ``drive_timeout_s``, becomes a stop.
         """
         if self._may_be_unread():
-            self.hearing.unread += 1
+            self.input.unread += 1
             return self._stop_unread()
         outbox = self.output.outbox
         return self._hand_over(lambda now: outbox.drive(line, now, valid_s), line if valid_s > 0 else b"")
@@ -146,14 +146,14 @@ class SerialLine:
 
     def _may_be_unread(self) -> bool:
         port = self._port
-        hidden = port is not None and port.hides_queue and self.hearing.reports_at_rest
-        return hidden and self._state is LineState.READY and time.monotonic() - self.hearing.at > UNREAD_S
+        hidden = port is not None and port.hides_queue and self.input.reports_at_rest
+        return hidden and self._state is LineState.READY and time.monotonic() - self.input.at > UNREAD_S
 
     def _stop_unread(self) -> bool:
         """Send one stop in place of all drive lines until the device is heard again."""
-        if self.hearing.stopped:
+        if self.input.stopped:
             return True
-        self.hearing.stopped = True
+        self.input.stopped = True
         text = "%s: silent for %g s, and perhaps not read: stopped until it reports again"
         log.warning(text, self._opening.path, UNREAD_S)
         return self.halt()
@@ -212,7 +212,7 @@ class SerialLine:
     def _attach(self, port: Port) -> None:
         with self._lock:
             self.opened += 1
-            self.hearing.received = 0
+            self.input.received = 0
             self._port, self._failure = port, None
             self.output.begin(port)
             self.output.write(port, time.monotonic(), ready=False)
@@ -249,13 +249,13 @@ class SerialLine:
 
     def _receive(self, chunk: bytes) -> None:
         if chunk and self._state is LineState.READY:
-            self.hearing.heard(time.monotonic())
+            self.input.receive(time.monotonic())
             self._on_bytes(chunk)
 
     def _become_ready(self, port: Port) -> None:
         with self._lock:
             self.output.sending += self.output.stop
-            self.hearing.begin(time.monotonic())
+            self.input.begin(time.monotonic())
         self._set_state(LineState.READY)
         if port.hides_queue and self.output.stop:
             log.info("%s is a pseudo-terminal: a reader that stands still may obey drive lines late", port.path)

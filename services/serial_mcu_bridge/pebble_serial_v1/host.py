@@ -123,7 +123,7 @@ class Session:
         self._splitter = LineSplitter(FRAME_LIMIT, END)
         self._too_long = 0
         self._by_id: dict[int, Interface] = {}
-        self._known: OrderedDict[Hello, Manifest] = OrderedDict()
+        self.known: OrderedDict[Hello, Manifest] = OrderedDict()
         self._commands: OrderedDict[int, _Command] = OrderedDict()
         self._slots: dict[int, int] = {}  # of the newest command, by interface
         self._sequence = 0
@@ -222,18 +222,18 @@ class Session:
         if self.manifest is not None and self.manifest.hello == hello:
             return  # it has restarted, and its manifest is the same
         yield from self._forget("its HELLO differs")
-        known = self._known.get(hello)
+        known = self.known.get(hello)
         if known is not None:
-            self._known.move_to_end(hello)
+            self.known.move_to_end(hello)
             yield from self._begin(Described(known, remembered=True))
         else:  # a repeated HELLO does not delay the request
             self._ask_at = min(now + ASK_AFTER_HELLO_S, self._ask_at or float("inf"))
 
     def _describe(self, manifest: Manifest) -> Iterator[Event]:
-        self._known[manifest.hello] = manifest
-        self._known.move_to_end(manifest.hello)
-        if len(self._known) > _REMEMBERED:
-            self._known.popitem(last=False)
+        self.known[manifest.hello] = manifest
+        self.known.move_to_end(manifest.hello)
+        if len(self.known) > _REMEMBERED:
+            self.known.popitem(last=False)
         if manifest == self.manifest:
             self._ask_at = None
             return

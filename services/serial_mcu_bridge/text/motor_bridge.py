@@ -75,10 +75,10 @@ class MotorBridge(SerialService):
         self._publishes_touch = self.options.telemetry.publish_touch_sensors
         self._owner = self.config.motor_owner(self.instance)
         self._waiting = MotionInbox()
-        self._file = StateFile(self.config.state_file(f"estop-{self._owner}"), self._on_saved)
+        self.state_file = StateFile(self.config.state_file(f"estop-{self._owner}"), self._on_saved)
         self._barred_file = StateFile(self.config.run_dir() / f"barred-{self._owner}.json")
         self._guard = MotorGuard(
-            self._file,
+            self.state_file,
             self._barred_file,
             self._publish_state,
             self.counters,
@@ -87,12 +87,12 @@ class MotorBridge(SerialService):
         )
         self._deadline: Timer | None = None  # stops the motors unless a command arrives; None: they are stopped
         self._guard_timer: Timer | None = None
-        self._announced = self._notified = True  # that it latches: to operators, and to the launcher
+        self.announced = self._notified = True  # that it latches: to operators, and to the launcher
         self._charging: ChargingStatus | None = None
         self._splitter = LineSplitter()
 
     def start(self) -> None:
-        self.on_stop(self._file.close)
+        self.on_stop(self.state_file.close)
         self.on_stop(self._barred_file.close)
         self._guard.begin(self.clock())
         super().start()
@@ -112,12 +112,12 @@ class MotorBridge(SerialService):
         self._judge_soon(self._waiting.put_drive(drive, arrived))
 
     def _judge_soon(self, was_empty: bool) -> None:
-        if was_empty and not self.run_if_idle(self._judge):
-            self.post_first(self._judge)
+        if was_empty and not self.run_if_idle(self.judge):
+            self.post_first(self.judge)
 
     # -- commands
 
-    def _judge(self) -> None:
+    def judge(self) -> None:
         """Stops first: they void every drive command that waits with them."""
         batch = self._waiting.take()
         latches = not batch.stops or self._latches  # without a stop nothing here depends on it
@@ -188,14 +188,14 @@ class MotorBridge(SerialService):
                 f"the broker refuses the subscription to {self.addresses[DRIVE].topic}: nothing can drive this robot."
                 " Permit the user in local_mqtt to subscribe to it"
             )
-        if self._latches is not self._announced:
-            self._announced = self._latches
+        if self._latches is not self.announced:
+            self.announced = self._latches
             self._announce()
-        if self._notified is not self._announced and self.notifier.lacks("estop", not self._announced):
-            self._notified = self._announced
+        if self._notified is not self.announced and self.notifier.lacks("estop", not self.announced):
+            self._notified = self.announced
 
     def _announce(self) -> None:
-        if self._announced:
+        if self.announced:
             self.log.warning("the subscriptions to the emergency stop are granted again: a stop latches")
             self.repeat_state()
             return

@@ -11,6 +11,7 @@ import time
 import tty
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from itertools import count
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -32,6 +33,7 @@ from tests.transports.zenoh_net import HubProcess
 
 ROBOT = "rover"
 BASE = f"pebble/robots/{ROBOT}"
+_numbers = count()
 STEP_S = 0.002
 BOOT_S = 0.05  # before the HELLO: a host discards the input from before it opened the port
 
@@ -58,7 +60,7 @@ class ScriptedMcu:
         self._master = -1
         self._host = self._hello_sent = False
         self._boots_until = 0.0
-        self._rest = b""
+        self.rest = b""
         self._lock = threading.Lock()
         self._ending = False
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -72,7 +74,7 @@ class ScriptedMcu:
             new = self.link.with_suffix(".new")
             new.symlink_to(os.ttyname(slave))
             os.close(slave)
-            self._rest, self._host, self._hello_sent, self.samples_sent = self.half, False, False, 0
+            self.rest, self._host, self._hello_sent, self.samples_sent = self.half, False, False, 0
             self.plugged_at = time.monotonic()
             new.replace(self.link)
 
@@ -138,7 +140,7 @@ class ScriptedMcu:
                 self._hello_sent = True
                 self._write(wire.frame(wire.HELLO, self.manifest.hello()))
         if events and events[0][1] & select.POLLIN:
-            *frames, self._rest = (self._rest + os.read(self._master, 65536)).split(b"\0")
+            *frames, self.rest = (self.rest + os.read(self._master, 65536)).split(b"\0")
             for stuffed in frames:
                 if stuffed not in (b"", self.half):
                     self._receive(wire.received(stuffed))
@@ -185,9 +187,9 @@ class LocalNetwork:
             self._ends.callback(hub.kill)
             self.transport = {"kind": "zenoh", "run_dir": str(self._run_dir)}
 
-    def config(self, folder: Path, serial: dict[str, Any], **services: Any) -> Config:
+    def config(self, folder: Path, serial: dict[str, Any], *, robot: str = ROBOT, **services: Any) -> Config:
         raw = {
-            "robot": {"id": ROBOT},
+            "robot": {"id": robot},
             "transport": {"kind": "mqtt", **self.transport, "state_dir": str(folder / "state")},
             "local_mqtt": self.local_mqtt,
             "services": {"serial_mcu_bridge": serial, **services},
@@ -221,19 +223,20 @@ class LocalNetwork:
 class Listener:
     """A client that subscribes to all outgoing topics of the robot and can send commands."""
 
-    def __init__(self, transport: Transport) -> None:
+    def __init__(self, transport: Transport, base: str = BASE) -> None:
         self.received: list[Message] = []
         self.at: list[float] = []
+        self.base = base
         self.transport = transport.open(10)
         assert transport.state is State.CONNECTED, transport.problem
-        transport.subscribe(f"{BASE}/outgoing/#", self._receive, direct=True)
+        transport.subscribe(f"{base}/outgoing/#", self._receive, direct=True)
 
     def _receive(self, message: Message) -> None:
         self.at.append(time.monotonic())
         self.received.append(message)
 
     def on(self, metric: str) -> list[Message]:
-        return [message for message in list(self.received) if message.topic == f"{BASE}/outgoing/{metric}"]
+        return [message for message in list(self.received) if message.topic == f"{self.base}/outgoing/{metric}"]
 
     def payloads(self, metric: str) -> list[Any]:
         return [msgspec.json.decode(message.payload) for message in self.on(metric) if message.payload]
@@ -241,7 +244,7 @@ class Listener:
     def first(self, metric: str) -> float:
         """Return when the first message on this topic was received."""
         pairs = zip(list(self.received), list(self.at), strict=False)
-        return next(at for message, at in pairs if message.topic == f"{BASE}/outgoing/{metric}")
+        return next(at for message, at in pairs if message.topic == f"{self.base}/outgoing/{metric}")
 
     def retained(self, metric: str) -> list[bytes]:
         """Return the payload of the newest message on a topic; an empty list if that message cleared the topic."""
@@ -249,7 +252,7 @@ class Listener:
 
     def command(self, metric: str, body: Any, *, retain: bool = False) -> None:
         raw = body if isinstance(body, bytes) else json.dumps(body).encode()
-        assert self.transport.publish(f"{BASE}/incoming/{metric}", raw, qos=QoS.DELIVERED, retain=retain)
+        assert self.transport.publish(f"{self.base}/incoming/{metric}", raw, qos=QoS.DELIVERED, retain=retain)
 
 
 class Running:
@@ -278,23 +281,31 @@ class Running:
 
 
 class Rig:
-    """A local transport, a subscriber, and any number of serial lines with one MCU each, by instance name."""
+    """A local transport, a subscriber, and any number of serial lines with one MCU each, by instance name.
 
-    def __init__(self, kind: str, folder: Path) -> None:
+    On a ``network`` that it shares with others its robot has a name of its own.
+    """
+
+    def __init__(self, kind: str, folder: Path, network: LocalNetwork | None = None) -> None:
         self.folder, self._ends = folder, ExitStack()
-        self.network = LocalNetwork(kind, folder)
-        self._ends.callback(self.network.close)
+        self._robot = ROBOT if network is None else f"{ROBOT}-{next(_numbers)}"
+        self.base = f"pebble/robots/{self._robot}"
+        if network is None:
+            network = LocalNetwork(kind, folder)
+            self._ends.callback(network.close)
+        self.network = network
         self.world = self.listener("world")
         self._config: Config | None = None
         self.lines: dict[str, Running] = {}
         self.mcus: dict[str, ScriptedMcu] = {}
 
     def listener(self, name: str) -> Listener:
-        listener = Listener(self.network.client(name))
+        listener = Listener(self.network.client(name), self.base)
         self._ends.callback(listener.transport.close)
         return listener
 
-    def mcu(self, manifest: M, name: str = "one", *, plugged: bool = True, sends_hello: bool = False) -> ScriptedMcu:
+    def mcu(self, manifest: M, name: str = "one", *, plugged: bool = True, sends_hello: bool = True) -> ScriptedMcu:
+        """Without its hello, a bridge asks an MCU for its manifest only a while after the port was opened."""
         mcu = self.mcus[name] = ScriptedMcu(self.folder / name, manifest, sends_hello=sends_hello)
         self._ends.callback(mcu.close)
         if plugged:
@@ -304,7 +315,7 @@ class Rig:
     def bridge(self, name: str = "one", protocol: str = "pebble_serial_v1", **section: Any) -> Running:
         """Start the service for the MCU of that name; ``section`` is the rest of its config."""
         line = {"enabled": True, "protocol": protocol, "serial": {"port": str(self.folder / name)}, **section}
-        config = view_of(self.network.config(self.folder, {"instances": {name: line}}), name)
+        config = view_of(self.network.config(self.folder, {"instances": {name: line}}, robot=self._robot), name)
         transport = self.network.robots_transport(config, f"serial-{name}")
         running = self.lines[name] = Running(bridge_of(config)(config, transport, instance=name))
         self._ends.callback(running.stop)
@@ -313,7 +324,7 @@ class Rig:
     def claimed(self, name: str = "one") -> bool:
         """Wait until other devices have had time to object to the aliases, and those of commands are subscribed to."""
         service, done = self.lines[name].service, threading.Event()
-        if not until(lambda: service._aliases.permitted, 5):  # type: ignore[attr-defined]
+        if not until(lambda: service.aliases.permitted, 5):  # type: ignore[attr-defined]
             return False
         service.post(done.set)  # the subscriptions are made by the job that permits
         return done.wait(5)

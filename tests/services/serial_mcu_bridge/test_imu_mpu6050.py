@@ -133,4 +133,4 @@ def test_malformed_lines_are_logged_and_nothing_is_ever_sent(rig: Rig, caplog: p
     assert until(received)  # what is sent while the port is being opened may be cut short
     assert running.service.counters["lines_discarded"] >= 1
     running.stop()
-    assert (mcu.received, mcu._rest) == ([], b"")
+    assert (mcu.received, mcu.rest) == ([], b"")

@@ -12,14 +12,15 @@ from typing import Any
 import pytest
 
 from pebble.runtime.parent import NOTIFY_FD
+from pebble.services.serial_mcu_bridge.devices import peers
 from pebble.services.serial_mcu_bridge.pebble_serial_v1 import host
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.host import SILENCE_S
 from pebble.transports import QoS
 from tests.services.serial_mcu_bridge import mcu_wire as wire
-from tests.services.serial_mcu_bridge.mcu_rig import BASE, Rig, motion, summary, wait_for_payload
+from tests.services.serial_mcu_bridge.mcu_rig import Rig, motion, summary, wait_for_payload
 from tests.services.serial_mcu_bridge.mcu_wire import IMU, LAMP, STATION, F, I, M
 from tests.services.serial_mcu_bridge.test_pebble_serial_hostile import ATTACKS
-from tests.support import until
+from tests.support import cases, until
 
 STATE = b"\1\0\1"
 
@@ -51,9 +52,9 @@ def test_the_launcher_is_notified_of_outlets_while_they_are_in_use(
 
 @pytest.mark.alone
 def test_it_is_found_within_two_seconds_and_publishes_its_manifest(rig: Rig) -> None:
-    mcu = rig.mcu(IMU, plugged=False)
+    mcu = rig.mcu(IMU, plugged=False, sends_hello=False)
     rig.bridge()
-    time.sleep(1)  # the port is absent at first
+    time.sleep(0.5)  # the port is absent at first
     mcu.stream(100, motion())
     mcu.plug()
     assert wait_for_payload(rig.world, "mcu/goob-imu-nano/describe")
@@ -63,7 +64,7 @@ def test_it_is_found_within_two_seconds_and_publishes_its_manifest(rig: Rig) -> 
     assert rig.world.first("sensors/imu-fast") - mcu.plugged_at < 2
     (described,) = rig.world.payloads("mcu/goob-imu-nano/describe")
     assert described["schema_hash"] == "goob-imu-v2"
-    assert rig.world.received[0].topic == f"{BASE}/outgoing/mcu/goob-imu-nano/describe"
+    assert rig.world.received[0].topic == f"{rig.base}/outgoing/mcu/goob-imu-nano/describe"
     late = rig.listener("late")
     assert until(lambda: late.on("mcu/goob-imu-nano/describe"))
     assert late.on("mcu/goob-imu-nano/describe")[0].retain
@@ -76,10 +77,11 @@ def test_a_hundred_samples_a_second_without_loss(rig: Rig) -> None:
     assert wait_for_payload(rig.world, "mcu/goob-imu-nano/describe")
     assert rig.claimed()
     mcu.stream(100, motion())
-    time.sleep(5)
+    seconds = cases(2, 5)
+    time.sleep(seconds)
     mcu.silent = True
     assert until(lambda: len(rig.world.on("sensors/imu-fast")) == mcu.samples_sent)
-    assert mcu.samples_sent >= 450
+    assert mcu.samples_sent >= 90 * seconds
     for metric in ("mcu/goob-imu-nano/imu_fast", "sensors/imu-fast"):
         assert [body["seq"] for body in rig.world.payloads(metric)] == list(range(1, mcu.samples_sent + 1))
 
@@ -125,7 +127,8 @@ def test_the_bodies_of_an_inertial_sensor(memory: Rig) -> None:
         "goob-imu-nano", "imu_fast", "imu.motion.v1",
     )  # fmt: skip
     assert generic["value"]["ax"] == 9.807
-    qos = {m.topic.removeprefix(f"{BASE}/outgoing/"): (int(m.qos), m.retain_requested) for m in memory.world.received}
+    out = f"{memory.base}/outgoing/"
+    qos = {m.topic.removeprefix(out): (int(m.qos), m.retain_requested) for m in memory.world.received}
     assert qos["mcu/goob-imu-nano/imu_fast"] == qos["sensors/imu-fast"] == (0, False)
     assert qos["mcu/goob-imu-nano/imu"] == qos["sensors/imu"] == (1, False)
     assert qos["mcu/goob-imu-nano/describe"] == (1, True)
@@ -142,7 +145,7 @@ def test_qos_and_retain_follow_the_interface(rig: Rig) -> None:
     late = rig.listener("late")
     assert until(lambda: len(late.received) >= 3)
     time.sleep(0.2)
-    assert sorted(m.topic.removeprefix(f"{BASE}/outgoing/") for m in late.received) == [
+    assert sorted(m.topic.removeprefix(f"{rig.base}/outgoing/") for m in late.received) == [
         "lights/lamp", "mcu/lamp-1/describe", "mcu/lamp-1/lamp",
     ]  # fmt: skip
     assert {int(m.qos) for m in rig.world.on("mcu/lamp-1/button") + rig.world.on("lights/lamp")} == {1}
@@ -239,7 +242,7 @@ def test_many_commands_at_once_all_arrive_unless_they_are_far_too_many(memory: R
 
 @pytest.mark.alone
 def test_an_unplugged_device_is_cleared_and_a_replugged_one_is_requested_again(rig: Rig) -> None:
-    mcu = rig.mcu(LAMP)
+    mcu = rig.mcu(LAMP, sends_hello=False)
     running = rig.bridge()
     assert wait_for_payload(rig.world, "mcu/lamp-1/describe")
     assert rig.claimed()
@@ -266,7 +269,7 @@ def test_an_unplugged_device_is_cleared_and_a_replugged_one_is_requested_again(r
 
 def test_a_known_device_is_usable_after_its_hello(memory: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(host, "ASK_AFTER_OPENING_S", 60.0)  # until then only a HELLO causes a request
-    mcu = memory.mcu(LAMP, sends_hello=True)
+    mcu = memory.mcu(LAMP)
     memory.bridge()
     assert wait_for_payload(memory.world, "mcu/lamp-1/describe")
     asked = mcu.asked()
@@ -280,7 +283,7 @@ def test_a_known_device_is_usable_after_its_hello(memory: Rig, monkeypatch: pyte
 def test_a_partial_frame_of_an_earlier_host_does_not_damage_the_first_command(
     memory: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    mcu = memory.mcu(LAMP, sends_hello=True)
+    mcu = memory.mcu(LAMP)
     running = memory.bridge()
     assert until(lambda: memory.world.retained("mcu/lamp-1/describe"), 5)
     mcu.unplug()
@@ -356,12 +359,13 @@ def test_a_stopping_bridge_clears_its_retained_messages(rig: Rig) -> None:
     assert until(lambda: rig.world.retained("mcu/lamp-1/lamp") == [])
 
 
-def test_a_stale_manifest_of_a_killed_bridge_is_cleared_by_the_next(rig: Rig) -> None:
+def test_a_stale_manifest_of_a_killed_bridge_is_cleared_by_the_next(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     """The device was removed while no bridge was running."""
+    monkeypatch.setattr(peers, "CONFIRM_S", 1.5)
     left = rig.network.client("killed").open(10)
     manifest = b'{"protocol":"pebble_serial_v1","schema_version":1,"interface_count":0,"schema_hash":"h",' \
                b'"device_uid":"ghost","firmware_version":"1","model":"m","interfaces":[]}'  # fmt: skip
-    left.publish(f"{BASE}/outgoing/mcu/ghost/describe", manifest, qos=1, retain=True)  # type: ignore[arg-type]
+    left.publish(f"{rig.base}/outgoing/mcu/ghost/describe", manifest, qos=1, retain=True)  # type: ignore[arg-type]
     assert wait_for_payload(rig.world, "mcu/ghost/describe")
     left.close()
     rig.mcu(LAMP)
@@ -377,14 +381,14 @@ def test_invalid_messages_about_other_devices_do_not_stop_the_bridge(rig: Rig) -
     odd = b'{"protocol":"pebble_serial_v1","schema_version":1,"interface_count":1,"schema_hash":"h",' \
           b'"device_uid":"odd","firmware_version":"1","model":"m","interfaces":[{"name":"a","channel":"sensors/imu",' \
           b'"profile":"imu.summary.v1","encoding":{"fields":5}}]}'  # fmt: skip
-    stranger.publish(f"{BASE}/outgoing/mcu/odd/describe", odd, qos=QoS.DELIVERED, retain=True)
-    stranger.publish(f"{BASE}/outgoing/mcu//describe", odd, qos=QoS.DELIVERED, retain=True)
+    stranger.publish(f"{rig.base}/outgoing/mcu/odd/describe", odd, qos=QoS.DELIVERED, retain=True)
+    stranger.publish(f"{rig.base}/outgoing/mcu//describe", odd, qos=QoS.DELIVERED, retain=True)
     assert wait_for_payload(rig.world, "mcu/odd/describe")
     rig.mcu(LAMP)
     running = rig.bridge()
     assert wait_for_payload(rig.world, "mcu/lamp-1/describe")
-    stranger.publish(f"{BASE}/incoming/mcu//describe", b'{"from": "x"}', qos=QoS.DELIVERED)
-    stranger.publish(f"{BASE}/incoming/mcu/lamp-1/describe", b'{"from": {"x": [1]}, "has": 3}', qos=QoS.DELIVERED)
+    stranger.publish(f"{rig.base}/incoming/mcu//describe", b'{"from": "x"}', qos=QoS.DELIVERED)
+    stranger.publish(f"{rig.base}/incoming/mcu/lamp-1/describe", b'{"from": {"x": [1]}, "has": 3}', qos=QoS.DELIVERED)
     rig.world.command("mcu/lamp-1/lamp", {"level": 40, "on": True})
     assert until(rig.mcus["one"].commands)
     assert running.alive
@@ -406,12 +410,12 @@ def test_garbage_on_the_line_does_not_stop_the_bridge(memory: Rig) -> None:
     assert counters["stuffing"] + counters["crc"] >= 1
 
 
-def test_twenty_thousand_hostile_frames_do_not_stop_the_bridge(memory: Rig) -> None:
+def test_thousands_of_hostile_frames_do_not_stop_the_bridge(memory: Rig) -> None:
     mcu = memory.mcu(STATION)
     running = memory.bridge()
     assert wait_for_payload(memory.world, "mcu/hs105-sta/describe")
     chance = random.Random(8)
-    for _ in range(200):
+    for _ in range(cases(40, 200)):
         mcu.pour(b"".join(chance.choice(ATTACKS)(chance) for _ in range(100)))
     before = len(memory.world.on("mcu/hs105-sta/o1_state"))
 
@@ -433,7 +437,7 @@ def test_a_silent_inertial_sensor_ends_the_process(memory: Rig) -> None:
     running = memory.bridge(health={"imu_sample_timeout_seconds": 1.0}, log_level="INFO")
     mcu.stream(100, motion())
     assert wait_for_payload(memory.world, "sensors/imu-fast")
-    time.sleep(1.5)
+    time.sleep(1.2)
     assert running.alive
     mcu.silent = True
     stopped = time.monotonic()
@@ -447,7 +451,7 @@ def test_other_devices_may_be_silent(memory: Rig) -> None:
     memory.mcu(STATION)
     running = memory.bridge()
     assert wait_for_payload(memory.world, "mcu/hs105-sta/describe")
-    watchdog = running.service._watchdog  # type: ignore[attr-defined]
+    watchdog = running.service.watchdog  # type: ignore[attr-defined]
     assert watchdog.timeout_s == 0
     assert SILENCE_S > 5
 
@@ -456,7 +460,7 @@ def test_an_inertial_sensor_has_five_seconds_unless_the_config_sets_another_time
     memory.mcu(IMU)
     running = memory.bridge()
     assert wait_for_payload(memory.world, "mcu/goob-imu-nano/describe")
-    assert running.service._watchdog.timeout_s == 5  # type: ignore[attr-defined]
+    assert running.service.watchdog.timeout_s == 5  # type: ignore[attr-defined]
 
 
 def test_an_absent_sensor_is_waited_for(memory: Rig) -> None:
@@ -465,7 +469,7 @@ def test_an_absent_sensor_is_waited_for(memory: Rig) -> None:
     mcu.stream(100, motion())
     assert wait_for_payload(memory.world, "sensors/imu-fast")
     mcu.unplug()
-    time.sleep(1.5)
+    time.sleep(1.0)
     assert running.alive
     mcu.plug()
     assert until(lambda: memory.world.retained("mcu/goob-imu-nano/describe"), 3)

@@ -39,10 +39,10 @@ def test_the_numbers_agree_with_the_code() -> None:
         (host.ANSWER_S, "no answer within {:g} s"),
         (host._WAITING, "Up to {} commands per interface"),
         (peers.CONFIRM_S, "counts as a claim for {:g} s"),
-        (described_bridge._CLAIM_S, "only {:g} s after it has published"),
+        (described_bridge.CLAIM_S, "only {:g} s after it has published"),
         (manifest._MOST_INTERFACES, "fields of an interface; levels of a channel | {}; 64; 8"),
     ):
         assert sentence.format(number) in sentences, sentence
-    assert uid_claim.ASK_S + described_bridge._CLAIM_S + described_bridge.DescribedBridge.retry_s < 1, (
+    assert uid_claim.ASK_S + described_bridge.CLAIM_S + described_bridge.DescribedBridge.retry_s < 1, (
         "the topics exist within two seconds"
     )

@@ -96,4 +96,4 @@ def test_devices_that_change_all_the_time_leave_nothing_behind() -> None:
         events += session.feed(wire.frame(wire.DESCRIBE, manifest.describe()), 1.0)
     assert sum(isinstance(event, Described) for event in events) == 500
     assert sum(isinstance(event, Gone) for event in events) == 499
-    assert len(session._known) == 16
+    assert len(session.known) == 16

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from pebble.runtime.parent import NOTIFY_FD
-from pebble.transports import Message, MqttSettings, State, create
+from pebble.transports import Message, MqttSettings, QoS, State, create
 from tests.services.serial_mcu_bridge.motor_rig import BASE, STOP, Bench, reset, state, stopped
 from tests.support import RefusingBroker, until
 
@@ -53,7 +53,7 @@ def retained(broker: RefusingBroker) -> list[Any]:
     found: list[Message] = []
     with create("mqtt", "observer", MqttSettings(host="127.0.0.1", port=broker.port)) as client:
         client.subscribe(f"{BASE}/outgoing/estop/+", found.append, direct=True)
-    return [json.loads(message.payload) for message in found]
+    return [json.loads(message.payload) for message in found if message.payload]
 
 
 def errors(caplog: pytest.LogCaptureFixture) -> list[str]:
@@ -67,6 +67,11 @@ def test_without_both_subscriptions_there_is_no_emergency_stop(
     broker.refuse(*refused)
     bench = start()
     assert until(lambda: errors(caplog))
+    assert until(lambda: retained(broker) == [])
+    old = f"{BASE}/outgoing/estop/serial"  # as a broker has it that was restored from an older save
+    assert bench.operator.publish(old, b'{"latched": false}', qos=QoS.DELIVERED, retain=True)
+    assert until(lambda: b'{"latched": false}' in [message.payload for message in bench.received])
+    bench.service.post(bench.service.repeat_state)
     assert until(lambda: retained(broker) == [])
     assert f"refuses the subscription to {' and '.join(refused)}: this robot has no emergency stop" in errors(caplog)[0]
     assert f"to subscribe to both {ESTOP} and {ESTOP_RESET}" in errors(caplog)[0]
@@ -141,7 +146,7 @@ def test_the_launcher_is_notified_however_busy_it_is(
     filled = os.write(end, b"." * 1_000_000)
     broker.refuse(ESTOP)
     bench = start()
-    assert until(lambda: not bench.service._announced)
+    assert until(lambda: not bench.service.announced)
     assert os.read(notes, filled) == b"." * filled
     assert until(lambda: readable(notes) == b"LACKS estop\n")
     refuse(broker, bench)

@@ -297,16 +297,16 @@ def test_a_reader_that_stands_still_finds_at_most_a_second_of_drive_lines(
     caplog.set_level(logging.INFO)
     host, driven = connect(stuck.path, boot_s=0.05), drive_line(0.4, 0.4)
     assert until(host.is_ready)
-    host.line.hearing.reports_at_rest = reports  # of a board that does not, nothing can be known
+    host.line.input.reports_at_rest = reports  # of a board that does not, nothing can be known
     os.write(stuck.master, b"T 1 2 3\n")
-    assert until(lambda: host.line.hearing.received > 0)
+    assert until(lambda: host.line.input.received > 0)
     stuck.seen()
     end = time.monotonic() + 1.6
     while time.monotonic() < end:
         assert host.line.drive(driven)
         time.sleep(0.05)
     unread = stuck.seen().split(STOP)[-2 if reports else -1]
-    assert (host.line.hearing.unread > 0) == reports
+    assert (host.line.input.unread > 0) == reports
     assert stuck.seen().endswith(STOP if reports else driven)
     assert 5 <= unread.count(driven) < (24 if reports else 99)
     assert [text for text in caplog.messages if "perhaps not read" in text] == [

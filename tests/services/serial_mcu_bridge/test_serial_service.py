@@ -73,7 +73,7 @@ def test_after_a_pause_of_the_process_the_stop_is_sent_before_the_next_command(b
     def pause() -> None:
         time.sleep(0.9)
         bench.service.receive_drive(Drive(x=0.0, z=0.25), bench.service.clock())
-        bench.service._judge()
+        bench.service.judge()
 
     bench.service.post(pause)
     assert bench.line("M 0.250 0.250")
@@ -241,6 +241,16 @@ def test_a_stop_does_not_wait_behind_a_full_inbox(bench: Bench) -> None:
     assert state(bench)["count"] == 1
 
 
+def test_a_command_that_waited_for_too_long_moves_nothing(bench: Bench) -> None:
+    with bench.occupied():
+        bench.send("incoming/drive-values", {"z": 0.5})
+        time.sleep(0.6)
+    bench.send("incoming/lights-solid", {"r": 1})
+    assert bench.line("L 0.000 0.000 1.000")
+    assert bench.service.counters["late"] == 1
+    assert set(bench.mcu.trace.lines()) == {"M 0.000 0.000", "L 0.000 0.000 1.000"}
+
+
 def test_a_command_is_valid_for_its_valid_ms(bench: Bench) -> None:
     bench.send("incoming/drive-values", {"z": 0.5, "valid_ms": 100})
     assert bench.line("M 0.500 0.500")
@@ -303,6 +313,6 @@ def test_robots_with_one_state_directory_do_not_share_a_stop(tmp_path: Path) -> 
         return MotorBridge(parse(raw, folder=tmp_path, env={}), MemoryTransport(robot, MemoryHub()))
 
     stopped, other = bridge("rover"), bridge("other")
-    stopped._file.save({"latched": True})
-    stopped._file.close()
-    assert (stopped._file.load(), other._file.load()) == ({"latched": True}, None)
+    stopped.state_file.save({"latched": True})
+    stopped.state_file.close()
+    assert (stopped.state_file.load(), other.state_file.load()) == ({"latched": True}, None)

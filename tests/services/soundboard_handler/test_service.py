@@ -315,8 +315,8 @@ def test_an_unchanged_list_is_not_published_again(board: Soundboard, monkeypatch
     published: list[Any] = []
     service = SoundboardHandler(board.config, board.local)
     monkeypatch.setattr(service, "publish", lambda _channel, value: published.append(value))
-    service._scan()
-    service._scan()
+    service.scan()
+    service.scan()
     assert [one.files for one in published] == [["a.wav"]]
 
 
