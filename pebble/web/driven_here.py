@@ -13,7 +13,7 @@ from pebble.transports import Message
 from pebble.web.driving import Lease
 
 _EVERY_S = 1.0
-_MAX_ROBOTS = 64  # in one announcement
+_ANNOUNCED = 64  # in one announcement
 
 
 class DrivenHere:
@@ -43,7 +43,7 @@ class DrivenHere:
         self.changed.clear()
         self._announced_at = now
         systems: dict[str, dict[str, Driver]] = {system: {} for system in self._systems}
-        for ref, lease in list(leases.items())[:_MAX_ROBOTS]:
+        for ref, lease in list(leases.items())[:_ANNOUNCED]:
             one = Driver(by=lease.tab.user, device=lease.tab.device, since=lease.since_ms)
             systems.setdefault(ref.partition("/")[0], {})[ref] = one
         self._systems = {system for system, robots in systems.items() if robots}  # the others: once more, empty
