@@ -10,9 +10,9 @@ from collections.abc import Callable
 from typing import Any, Final, NamedTuple
 
 from pebble.client.broker import Broker
+from pebble.client.media_request.offer import offered, refusal
 from pebble.client.media_request.picture_header import MAX_PAYLOAD, PictureSequence
 from pebble.client.media_request.request import MediaRequest
-from pebble.client.media_request.source import offered, refusal
 from pebble.client.viewer import Medium
 from pebble.contract import AUDIO, CAMERA
 from pebble.contract.packets import PBAT

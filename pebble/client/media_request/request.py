@@ -4,41 +4,40 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
+import threading
 import time
 from collections.abc import Awaitable, Callable
 from typing import Any, Final
 
 from pebble.client.broker import Broker
-from pebble.client.media_request.source import MediaSource, refusal
-from pebble.client.viewer import Medium
+from pebble.client.media_request.offer import NAMED, WORDS, offered, refusal
+from pebble.client.viewer import Medium, Viewer
 from pebble.errors import PebbleError
+
+log = logging.getLogger(__name__)
 
 LINGER_S: Final = 5.0  # unwanted, before the request is withdrawn: a page that reloads is back by then
 TICK_S: Final = 0.5
+_MAX_PENDING, _MAX_PENDING_BYTES = 2000, 16 << 20  # received, and not yet taken by the event loop
 
 
 class MediaRequest:
-    """The request for one medium of one robot. Only the event loop calls it."""
+    """The request for one medium of one robot. Only the event loop calls it, its coroutines only in :meth:`run`."""
 
     def __init__(self, broker: Broker, ref: str, medium: Medium, receive: Callable[[bytes], None]) -> None:
         """``receive`` gets each payload."""
         self.ref, self.medium = ref, medium
         self.problem = ""  # why it is not requested
+        self.encoding: str | None = None  # as requested; None: as configured, or nothing is requested
+        self.requested_at = float("-inf")
         self._broker = broker
-        self._source = MediaSource(broker, ref, medium, receive)
+        self._inbox = _Inbox(broker, lambda payload: None if self._viewer is None else receive(payload))
+        self._viewer: Viewer | None = None
+        self._topics: list[object] = []  # that the capabilities listed at the request
         self._wanted = self._closing = False
         self._wanted_at = float("-inf")  # the last time
         self._wakeup = asyncio.Event()
-
-    @property
-    def encoding(self) -> str | None:
-        """The encoding that was requested; None: as configured, or nothing is requested."""
-        return self._source.encoding
-
-    @property
-    def requested_at(self) -> float:
-        """When that was (monotonic)."""
-        return self._source.requested_at
 
     def want(self, wanted: bool) -> None:
         """Say whether anything shows or plays it now."""
@@ -73,34 +72,64 @@ class MediaRequest:
                     await step()
                     await self._pause(began)
                     continue
-                await self._source.withdraw()
+                await self._withdraw()
                 if self._is_over():  # else something has come to want it meanwhile
                     return
         finally:
-            await self._source.withdraw()
+            await self._withdraw()
 
     async def follow(self, capabilities: dict[str, Any], encoding: Callable[[], str | None]) -> None:
         """Request it if it is wanted, as these capabilities allow it, in ``encoding()``; call it with each step."""
         self.problem = refusal(self.ref, capabilities, self.medium)
         if self.problem:
-            await self._source.withdraw()
+            await self._withdraw()
             return
         chosen = encoding()
         if not self._wanted:
             return
         try:
-            await self._source.follow(capabilities, chosen)
+            await self._follow(capabilities, chosen)
         except PebbleError as error:
             self.problem = str(error)
 
     async def request_keyframe(self, encoding: str) -> None:
-        """Request a key frame in the encoding that arrives; one passes each second."""
-        await self._source.request_keyframe(encoding)
+        """Request a key frame in the encoding that arrives; the viewer lets one pass each second."""
+        if self._viewer is not None:
+            known = encoding if encoding in offered(self._viewer.capabilities, self.medium) else None
+            await asyncio.to_thread(self._viewer.request_keyframe, known)
+
+    async def _follow(self, capabilities: dict[str, Any], encoding: str | None) -> None:
+        topics = [capabilities[self.medium].get(key) for key in NAMED[self.medium]]
+        viewer = self._viewer
+        if viewer is None or topics != self._topics:
+            await self._withdraw()
+            viewer = Viewer(self._broker.transport, self.ref, lambda _, payload: self._inbox.put(payload), capabilities)
+            self._viewer, self._topics = viewer, topics
+        elif encoding == self.encoding:
+            viewer.capabilities = capabilities
+            await asyncio.to_thread(viewer.repeat_requests)
+            return
+        viewer.capabilities = capabilities
+        self.encoding, self.requested_at = encoding, time.monotonic()
+        try:
+            await asyncio.to_thread(viewer.request, self.medium, encoding)
+        except PebbleError:
+            await self._withdraw()
+            raise
+
+    async def _withdraw(self) -> None:
+        viewer, self._viewer = self._viewer, None
+        self.encoding, self.requested_at = None, float("-inf")
+        if viewer is not None:
+            try:
+                await asyncio.to_thread(viewer.close)
+            except PebbleError as error:
+                log.warning("the %s of %s: %s", WORDS[self.medium].name, self.ref, error)
 
     def _is_over(self) -> bool:
         """A request is not withdrawn while there is no broker: the robot would go on sending afterwards."""
         idle = not self._wanted and time.monotonic() - self._wanted_at >= LINGER_S
-        return idle and (self._broker.connected or not self._source.started)
+        return idle and (self._broker.connected or self._viewer is None)
 
     async def _pause(self, began: float) -> None:
         """A step that is needed earlier comes a tenth of a second after the last one."""
@@ -109,3 +138,28 @@ class MediaRequest:
             async with asyncio.timeout(max(0.001, began + TICK_S - time.monotonic())):
                 await self._wakeup.wait()
         self._wakeup.clear()
+
+
+class _Inbox:
+    """Payloads on their way from a thread of the transport to the event loop."""
+
+    def __init__(self, broker: Broker, receive: Callable[[bytes], None]) -> None:
+        self._broker, self._receive = broker, receive
+        self._pending = self._pending_bytes = 0
+        self._lock = threading.Lock()  # guards these two
+
+    def put(self, payload: bytes) -> None:
+        size = len(payload)
+        with self._lock:
+            if self._pending >= _MAX_PENDING or self._pending_bytes + size > _MAX_PENDING_BYTES:
+                return  # the event loop is far behind; what is missing is noticed by the numbers
+            self._pending += 1
+            self._pending_bytes += size
+        with contextlib.suppress(RuntimeError):  # the loop has ended
+            self._broker.loop.call_soon_threadsafe(self._take, payload)
+
+    def _take(self, payload: bytes) -> None:
+        with self._lock:
+            self._pending -= 1
+            self._pending_bytes -= len(payload)
+        self._receive(payload)

@@ -13,7 +13,7 @@ import msgspec
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from pebble.client.broker import Broker
-from pebble.client.media_request.source import offered, refusal
+from pebble.client.media_request.offer import offered, refusal
 from pebble.contract import AUDIO, AUDIO_STREAM
 from pebble.contract.packets import Codec, Sound
 from pebble.errors import PayloadError

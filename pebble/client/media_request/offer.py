@@ -1,0 +1,54 @@
+"""What of a robot's pictures and sound may be requested, by its capabilities. Pure."""
+
+from __future__ import annotations
+
+from typing import Any, Final, NamedTuple
+
+from pebble.client.robot_topics import FLAGS, names
+from pebble.client.viewer import Medium
+from pebble.contract import AUDIO, AUDIO_CONTROL, CAMERA, VIDEO_CONTROL, Channel
+
+#: The channels whose topics capabilities may name, by its key in the medium's section.
+NAMED: Final[dict[Medium, dict[str, Channel]]] = {
+    "video": {"topic": CAMERA, "command_topic": VIDEO_CONTROL, "flag_topic": FLAGS["video"]},
+    "audio": {"topic": AUDIO, "command_topic": AUDIO_CONTROL, "flag_topic": FLAGS["audio"]},
+}
+
+
+class Words(NamedTuple):
+    """How people are told of a medium."""
+
+    lacking: str
+    fixed: str
+    name: str
+
+
+WORDS: Final[dict[Medium, Words]] = {
+    "video": Words("it has no camera", "its camera cannot be switched on from here", "pictures"),
+    "audio": Words("it has no sound", "its sound cannot be switched on from here", "sound"),
+}
+
+
+def offered(capabilities: dict[str, Any], medium: Medium) -> tuple[str, ...]:
+    """The encodings that may be requested; empty for robots that do not list any, whose requests name none."""
+    section = capabilities.get(medium)
+    listed = section.get("encodings") if isinstance(section, dict) else None
+    return tuple(name for name in listed if isinstance(name, str)) if isinstance(listed, list) else ()
+
+
+def refusal(ref: str, capabilities: dict[str, Any], medium: Medium) -> str:
+    """Why this robot's pictures, or its sound, are not requested; empty if they may be.
+
+    Capabilities come from the network: one that names topics of another component, or channel, is not believed at all.
+    """
+    if not capabilities:
+        return "it has published no capabilities yet"
+    section, words = capabilities.get(medium), WORDS[medium]
+    if not isinstance(section, dict) or section.get("available") is not True:
+        return words.lacking
+    if section.get("controls") is not True:
+        return words.fixed
+    for key, channel in NAMED[medium].items():
+        if section.get(key) is not None and not names(ref, section[key], channel):
+            return f"its capabilities name a topic for {words.name} that is not its own ({key})"
+    return ""
