@@ -341,7 +341,7 @@ class TestOneBroker:
         assert ran == ["flags/git-pull"]
 
     def test_a_way_that_comes_later_and_goes_again(self, bridge: World) -> None:
-        """As if another bridge had begun to join the two brokers; without a reconnect."""
+        """Probes find it as if another bridge had begun to join the two brokers, without a reconnect."""
         do(bridge, "start")
         assert self.gate(bridge) is Gate.OPEN
         joint = bridge.remote.transport.subscribe(
