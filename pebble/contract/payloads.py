@@ -127,7 +127,7 @@ class Switch(Payload, frozen=True, kw_only=True):
 
 
 class SoundboardCommand(Switch, frozen=True, kw_only=True):
-    """Play or stop a clip (paper A.8.10).
+    """Play or stop a clip (paper A.8.10); ``action`` wins over ``enabled``.
 
     ``repeat`` is how often to play it, or true: until it is stopped. It is not written where it says nothing.
     """
