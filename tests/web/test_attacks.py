@@ -300,24 +300,24 @@ def test_a_viewer_may_stop(hall: Hall, broker: Broker) -> None:
 
 
 TRAVERSALS = [
-    "../settings.py",
-    "..%2fsettings.py",
-    "%2e%2e/settings.py",
-    "%2e%2e%2fsettings.py",
-    "..%252fsettings.py",
-    "%252e%252e%252fsettings.py",
-    "..\\settings.py",
-    "..%5csettings.py",
-    "....//settings.py",
-    "core/../../settings.py",
+    "../server.py",
+    "..%2fserver.py",
+    "%2e%2e/server.py",
+    "%2e%2e%2fserver.py",
+    "..%252fserver.py",
+    "%252e%252e%252fserver.py",
+    "..\\server.py",
+    "..%5cserver.py",
+    "....//server.py",
+    "core/../../server.py",
     "/etc/passwd",
     "%2fetc%2fpasswd",
     "//etc/passwd",
-    "..%00/settings.py",
+    "..%00/server.py",
     "main.js%00.py",
-    "..;/settings.py",
-    "..%c0%afsettings.py",
-    "..%ef%bc%8fsettings.py",
+    "..;/server.py",
+    "..%c0%afserver.py",
+    "..%ef%bc%8fserver.py",
     "core",
     "core/",
     "",
@@ -330,7 +330,7 @@ TRAVERSALS = [
 
 @pytest.mark.parametrize("path", TRAVERSALS)
 def test_nothing_but_the_pages_files_is_served(hall: Hall, path: str) -> None:
-    secret = (HERE / "settings.py").read_bytes()[:60]
+    secret = (HERE / "server.py").read_bytes()[:60]
     versions = (hall.served.version, "..", "%2e%2e", "x")
     for place in [f"/static/{version}/{path}" for version in versions] + [f"/static/{path}", f"/r/{path}", f"/{path}"]:
         request = f"GET {place} HTTP/1.1\r\nHost: 127.0.0.1:{hall.served.port}\r\nConnection: close\r\n\r\n"
