@@ -63,7 +63,8 @@ a folder, 409 too much at once, 422 what recordings cannot answer.
 
 | request | answer |
 |---|---|
-| `GET /archive/days` | JSON, the newest first: `day` (of UTC), `robots`, `bytes`, `first`, `last`, `gaps` |
+| `GET /archive/days` | JSON, the newest first: `day` (of UTC), `robots`, `bytes`, `first`, `last`, `gaps`, `unread` \
+(lines about files that cannot be read completely, on the day when each was written last) |
 | `GET /archive/timeline?day=&robot=` | JSON: `from`, `step`, for each step `activity`, `video`, `audio`, \
 `rest` (kbit/s); \
 `gaps`, `outages`, `sessions` with `since` and `until`. 202 with `indexing`, a share, while the day is indexed: \
@@ -78,8 +79,8 @@ seconds old or less |
 | `POST /archive/exports` | body `{"robot", "since", "until", "as"}`, `as`: mkv, mp4 or mcap; 202 with `id`. \
 One at a time, \
 of at most an hour |
-| `GET /archive/exports/ID` | `state` (running, ready, failed), `done`, `why`, `name`, `bytes`; `…/file` is the \
-file |
+| `GET /archive/exports/ID` | `state` (running, ready, failed), `done`, `why` (it failed, or what could not be \
+read), `name`, `bytes`; `…/file` is the file |
 | `POST /archive/exports/ID/end` | ends or removes it |
 
 `activity` is a sum: 1 online, 2 driven, 4 lights, 8 a sound was played, 16 a script was started, 32 a warning \
