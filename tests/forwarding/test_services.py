@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import logging
 import sys
+import time
 from collections.abc import Callable
 from itertools import groupby
 from typing import Any
@@ -11,14 +13,17 @@ from typing import Any
 import pytest
 
 from pebble.forwarding.event_buffer import LIMIT
+from pebble.forwarding.probes import PROBE_REQUEST
 from pebble.forwarding.routing import Side
+from pebble.forwarding.service import CHECK_AGAIN_S
 from pebble.forwarding.side import Gate
 from pebble.services.mqtt_bridge.actions import SystemActions
-from tests.forwarding.virtual import World
+from tests.forwarding.virtual import Hub, World
 from tests.services.mqtt_bridge.bridge_rig import BASE, Client
 
 DRIVE, STOP, RESET = "incoming/drive-values", "incoming/estop", "incoming/estop-reset"
 LIGHTS, EVENT = "incoming/lights-solid", "outgoing/somebody/happened"
+STATUS, READING, ONLINE = "outgoing/status", "outgoing/programs/reading", "outgoing/online"
 FLAG, MIRROR_FLAG = "incoming/flags/mqtt-video", "incoming/flags/remote-mirror"
 REBOOT, GIT_PULL = "incoming/flags/reboot", "incoming/flags/git-pull"
 ONE_SHOTS = (
@@ -81,6 +86,10 @@ def do(world: World, history: str) -> None:
         world.run()
 
 
+def errors(caplog: pytest.LogCaptureFixture) -> list[str]:
+    return [record.getMessage() for record in caplog.records if record.levelno >= logging.ERROR]
+
+
 class TestFlags:
     """Which value both sides have afterwards, and which changes each side's clients have received."""
 
@@ -111,6 +120,20 @@ class TestFlags:
         assert world.retained(FLAG) == (expected, expected)
         seen = [[one for one, _ in groupby(client.payloads(FLAG)) if one] for client in (world.local, world.remote)]
         assert seen == [one.encode().split() for one in (local, remote)], "no flapping"
+
+    def test_the_mirrors_local_side_wins_and_its_broker_fills_the_rest(self, make: Make) -> None:
+        mirror = make("mirror")
+        for suffix, payload in ((STATUS, b"yesterday"), (READING, b"mine"), (DRIVE, b"stale"), (REBOOT, TRUE)):
+            mirror.remote.publish(suffix, payload, retain=True)
+        for suffix, payload in ((STATUS, b"today"), (LIGHTS, b"stale")):
+            mirror.local.publish(suffix, payload, retain=True)
+        do(mirror, "start")
+        assert mirror.retained(STATUS) == (b"today", b"today")
+        assert mirror.retained(READING) == (b"mine", b"mine")
+        assert mirror.retained(DRIVE) == (None, b"stale"), "not ours to remove"
+        assert (mirror.retained(REBOOT), mirror.retained(LIGHTS)) == ((None, TRUE), (b"stale", None))
+        assert {message.topic for message in mirror.local.seen} == {f"{BASE}/{READING}"}
+        assert not mirror.remote.on(LIGHTS)
 
     @pytest.mark.parametrize("history", ["Lonce:0 Ronce:1", "Ronce:0 Lonce:1"])
     @pytest.mark.parametrize("forgetful", ["local", "remote"])
@@ -166,7 +189,6 @@ class TestOneShots:
             bridge.local.publish(DRIVE, payload)
             bridge.run()
         assert bridge.remote.payloads(DRIVE) == [b"2"]
-        assert bridge.service is not None
         assert bridge.service.counters["refused"] == 1
 
     @pytest.mark.parametrize("true", [b"true", b'{"value": true}', b'{"enabled": true}'])
@@ -201,6 +223,15 @@ class TestOneShots:
         bridge.start(reboot_control={"command": [sys.executable], "ignore_retained": False})
         bridge.run()
         assert ran == ["flags/reboot"]
+
+    def test_one_that_fails_in_the_bridge_ends_nothing(self, bridge: World, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(SystemActions, "request", lambda _actions, _channel: 1 / 0)
+        do(bridge, "start")
+        bridge.remote.publish(GIT_PULL, TRUE)
+        bridge.remote.publish(DRIVE, b"1")
+        bridge.run()
+        assert bridge.service.counters["handler_errors"] == 1
+        assert bridge.local.payloads(DRIVE) == [b"1"]
 
     def test_renamed_actions(self, bridge: World, ran: list[str]) -> None:
         bridge.start(topics={"reboot": "site/reboot"})
@@ -278,7 +309,6 @@ class TestOutage:
             world.local.publish(EVENT, b"%d" % number)
         do(world, "mend")
         assert world.remote.payloads(EVENT) == [b"%d" % number for number in range(100, LIMIT + 100)]
-        assert world.service is not None
         assert world.service.dropped()["events"] == 100
 
 
@@ -302,7 +332,6 @@ class TestProbes:
             client.publish("incoming/front-camera", b"  ")
         bridge.run()
         assert bridge.local.payloads("incoming/front-camera") == [b"  "]
-        assert bridge.service is not None
         assert bridge.service.counters["refused"] == 0
 
 
@@ -313,25 +342,20 @@ class TestOneBroker:
     def one(self, make: Make) -> World:
         return make(one=True)
 
-    @staticmethod
-    def gate(world: World) -> Gate:
-        assert world.service is not None
-        return world.service.status.gate
-
     @pytest.mark.parametrize("enabled", [True, False], ids=["with a heartbeat", "without"])
     def test_nothing_is_forwarded_and_the_heartbeat_is_published(self, one: World, enabled: bool) -> None:
-        one.local.publish("outgoing/status", b"before", retain=True)
+        one.local.publish(STATUS, b"before", retain=True)
         one.start(heartbeat={"enabled": enabled})
         one.run()
         for history in ("", "cut mend", "away back", "local-forgets"):  # still so after an outage
             do(one, history)
-            assert self.gate(one) is Gate.SHUT
-            for suffix in (MIRROR_FLAG, FLAG, "outgoing/status", DRIVE, "outgoing/strange"):
+            assert one.running[0].gate is Gate.SHUT
+            for suffix in (MIRROR_FLAG, FLAG, STATUS, DRIVE, "outgoing/strange"):
                 before = len(one.remote.on(suffix))
                 one.local.publish(suffix, TRUE)
                 one.run()
                 assert one.remote.payloads(suffix)[before:] == [TRUE]
-        assert (len(one.remote.on("outgoing/online")) > 40) == enabled
+        assert (len(one.remote.on(ONLINE)) > 40) == enabled
 
     def test_actions_run_once(self, one: World, ran: list[str]) -> None:
         one.local.publish(REBOOT, TRUE, retain=True)
@@ -343,29 +367,147 @@ class TestOneBroker:
     def test_a_way_that_comes_later_and_goes_again(self, bridge: World) -> None:
         """Probes find it as if another bridge had begun to join the two brokers, without a reconnect."""
         do(bridge, "start")
-        assert self.gate(bridge) is Gate.OPEN
+        assert bridge.running[0].gate is Gate.OPEN
         joint = bridge.remote.transport.subscribe(
             f"{BASE}/outgoing/#", lambda m: bridge.local.transport.publish(m.topic, m.payload, qos=m.qos), echo=False,
             direct=True,
         )  # fmt: skip
         bridge.run()
-        assert self.gate(bridge) is Gate.SHUT
+        assert bridge.running[0].gate is Gate.SHUT
         joint.close()
         bridge.run(40)
-        assert self.gate(bridge) is Gate.OPEN
+        assert bridge.running[0].gate is Gate.OPEN
 
     def test_a_heartbeat_of_another_program_of_the_same_millisecond_is_no_proof(self, bridge: World) -> None:
         do(bridge, "start")
-        for heartbeat in bridge.remote.payloads("outgoing/online"):
-            bridge.local.publish("outgoing/online", heartbeat)
+        for heartbeat in bridge.remote.payloads(ONLINE):
+            bridge.local.publish(ONLINE, heartbeat)
         bridge.run()
-        assert self.gate(bridge) is Gate.OPEN
+        assert bridge.running[0].gate is Gate.OPEN
+
+
+def heartbeat(age_s: float = 0.0, **more: Any) -> bytes:
+    return json.dumps({"t": int((time.time() - age_s) * 1000), **more}).encode()
+
+
+class TestWrongBroker:
+    """The mirror's broker is, or seems to be, the remote one, which a bridge on the same robot serves."""
+
+    @pytest.fixture
+    def mirror(self, make: Make) -> World:
+        return make("mirror")
+
+    @pytest.fixture
+    def apart(self, mirror: World) -> World:
+        """Bridge and mirror, each with a broker of its own."""
+        for service, broker in (("bridge", Hub()), ("mirror", mirror.remote_hub)):
+            mirror.start(service, broker=broker, enabled=True)
+        mirror.run()
+        return mirror
+
+    @staticmethod
+    def is_mirrored(world: World) -> bool:
+        """Whether a command at the mirror's broker arrives, by the mirror or the bridge, and what only it forwards."""
+        before = len(world.local.on(DRIVE)), len(world.local.on(READING))
+        world.remote.publish(DRIVE, b"1")
+        world.remote.publish(READING, b"1")
+        world.run(1)
+        assert len(world.local.on(DRIVE)) == before[0] + 1
+        return len(world.local.on(READING)) > before[1]
+
+    @pytest.mark.parametrize("enabled", [True, False], ids=["with a heartbeat", "without"])
+    @pytest.mark.parametrize("order", [("mirror", "bridge"), ("bridge", "mirror")], ids=" ".join)
+    def test_the_remote_one_is_refused(
+        self, mirror: World, caplog: pytest.LogCaptureFixture, order: tuple[str, str], enabled: bool
+    ) -> None:
+        for service in order:
+            mirror.start(service, enabled=True, heartbeat={"enabled": enabled})
+            mirror.run()
+        assert not self.is_mirrored(mirror)
+        (error,) = errors(caplog)
+        assert "127.0.0.1:1883 is the remote one" in error
+
+    def test_one_that_later_turns_out_to_be_the_remote_one_too(self, apart: World) -> None:
+        """Its address may lead elsewhere after a reconnect."""
+        assert apart.running[1].gate is Gate.OPEN
+        apart.uplink.lead_to(apart.remote_hub)
+        apart.run()
+        assert not self.is_mirrored(apart)
+
+    @pytest.mark.parametrize("retain", [False, True])
+    @pytest.mark.parametrize("topic", ["outgoing/bridge-probe", ONLINE])
+    def test_no_client_of_it_can_stop_the_mirror(self, apart: World, topic: str, retain: bool) -> None:
+        nonce = heartbeat(nonce="0123456789abcdef")
+        for payload in (b"x", b"", b"x" * 100_000, heartbeat(), nonce, PROBE_REQUEST, *map(heartbeat, range(-9, 1))):
+            apart.remote.publish(topic, payload, retain=retain)
+            apart.run(0.1)
+        apart.run()
+        assert apart.running[1].gate is Gate.OPEN
+        apart.remote.publish(DRIVE, b"after")
+        apart.run()
+        assert apart.local.payloads(DRIVE) == [b"after"]
+
+    def test_a_client_of_it_never_sees_what_would_stop_the_mirror(self, apart: World) -> None:
+        apart.remote.publish(ONLINE, heartbeat())
+        apart.run()
+        assert len(apart.local.on("outgoing/bridge-probe")) >= 3  # questions of the mirror, and answers
+        assert not apart.remote.on("outgoing/bridge-probe")
+
+    @pytest.mark.parametrize("history", ["", "cut mend"], ids=["after a while", "at a reconnect"])
+    def test_it_is_checked_again(self, mirror: World, history: str) -> None:
+        mirror.start()
+        for suffix, payload in ((READING, b"gone"), (STATUS, b"old")):
+            mirror.local.publish(suffix, payload, retain=True)
+        mirror.run()
+        mirror.stop()
+        for service in ("mirror", "bridge"):
+            mirror.start(service, enabled=True)
+            mirror.run()
+        assert mirror.running[0].gate is Gate.SHUT
+        mirror.running[1].uplink.lead_to(Hub())  # the bridge serves another broker from now on
+        mirror.local.publish(READING, b"", retain=True)
+        mirror.local.publish(STATUS, b"new", retain=True)
+        mirror.run()
+        do(mirror, history)
+        mirror.run(0 if history else CHECK_AGAIN_S)
+        assert self.is_mirrored(mirror)
+        assert mirror.retained(STATUS) == (b"new", b"new")
+        assert mirror.retained(READING) == (None, None)
+
+    @pytest.mark.parametrize("bridge_lives", [True, False])
+    def test_it_stays_shut_while_the_broker_is_the_remote_one(
+        self, mirror: World, caplog: pytest.LogCaptureFixture, bridge_lives: bool
+    ) -> None:
+        """Also if the bridge cannot be asked: the earlier proof still counts."""
+        for service in ("mirror", "bridge"):
+            mirror.start(service, enabled=True)
+            mirror.run()
+        {True: lambda: None, False: mirror.running[1].uplink.cut}[bridge_lives]()
+        for _ in range(int(20 * CHECK_AGAIN_S)):
+            mirror.run(0.25)
+            assert mirror.running[0].gate is not Gate.OPEN
+        assert len(errors(caplog)) == 1
+
+    @pytest.mark.parametrize(
+        "left_over", [heartbeat(3600), heartbeat(online=False), b"{}", b"\xff"], ids=["old", "will", "empty", "garbage"]
+    )
+    def test_what_is_left_over_from_other_days_does_not_count(self, mirror: World, left_over: bytes) -> None:
+        mirror.remote.publish(ONLINE, left_over, retain=True)
+        mirror.start(enabled=True)
+        mirror.run()
+        assert self.is_mirrored(mirror)
+
+    def test_without_a_bridge_the_heartbeat_is_anybodys(self, mirror: World) -> None:
+        do(mirror, "start")
+        mirror.remote.publish(ONLINE, heartbeat(), retain=True)
+        mirror.run()
+        assert mirror.local.on(ONLINE)
 
 
 class TestLeftovers:
     GONE = ("mcu/m1/describe", "mcu/m1/range", "outlets/1/status", "autonomy-status")
     STAYS = ("mcu/m2/describe", "estop/serial", "status")
-    FOREIGN = ("incoming/flags/foreign", "outgoing/video", "outgoing/unknown", "outgoing/online")
+    FOREIGN = ("incoming/flags/foreign", "outgoing/video", "outgoing/unknown", ONLINE)
 
     @pytest.mark.parametrize("forgets", [False, True], ids=["the robot has taken it back", "the robot is not there"])
     def test_what_was_taken_back_while_no_bridge_ran_is_removed_there(self, bridge: World, forgets: bool) -> None:
@@ -405,50 +547,53 @@ class TestPrivate:
             bridge.local.publish(suffix, b"{}")
         for suffix in (STOP, RESET):
             bridge.remote.publish(suffix, b"{}")
-        bridge.remote.publish("outgoing/status", b"no", retain=True)
+        bridge.remote.publish(STATUS, b"no", retain=True)
         bridge.run()
         assert all(bridge.remote.on(suffix) for suffix in ("outgoing/mcu/imu-1/describe", *passes))
         assert not [suffix for suffix in private if bridge.remote.on(suffix)]
         assert all(bridge.local.on(suffix) for suffix in (STOP, RESET))
-        assert not bridge.local.on("outgoing/status"), "what is published at the operators' broker stays there"
+        assert not bridge.local.on(STATUS), "what is published at the operators' broker stays there"
 
 
 class TestHeartbeat:
     def test_at_once_then_at_its_interval_to_the_remote_side_only(self, bridge: World) -> None:
         do(bridge, "start")
-        heartbeats = bridge.remote.on("outgoing/online")
+        heartbeats = bridge.remote.on(ONLINE)
         assert 13 <= len(heartbeats) <= 14
         stamps = [json.loads(one.payload) for one in heartbeats]
         assert all(set(stamp) == {"t"} and type(stamp["t"]) is int for stamp in stamps)
         assert all(one.qos == 1 and one.retain_requested for one in heartbeats)
-        assert not bridge.local.on("outgoing/online")
+        assert not bridge.local.on(ONLINE)
 
     def test_again_at_once_after_an_outage(self, bridge: World) -> None:
         bridge.start(heartbeat={"interval_seconds": 300})
         bridge.run()
-        before = len(bridge.remote.on("outgoing/online"))
+        before = len(bridge.remote.on(ONLINE))
         do(bridge, "cut mend")
-        assert len(bridge.remote.on("outgoing/online")) == before + 1
+        assert len(bridge.remote.on(ONLINE)) == before + 1
 
-    def test_the_will_is_published_after_a_polite_end(self, bridge: World) -> None:
-        do(bridge, "start stop")
-        last = bridge.remote.on("outgoing/online")[-1]
+    @pytest.mark.parametrize("end", ["politely", "in a crash"])
+    def test_the_will_is_published_at_its_end(self, bridge: World, end: str) -> None:
+        do(bridge, "start")
+        {"politely": bridge.stop, "in a crash": lambda: bridge.remote_hub.crash(bridge.uplink)}[end]()
+        bridge.run(0)
+        last = bridge.remote.on(ONLINE)[-1]
         assert json.loads(last.payload)["online"] is False
         assert last.retain_requested
 
     def test_it_can_be_off_and_then_belongs_to_others(self, bridge: World) -> None:
         bridge.start(heartbeat={"enabled": False})
-        bridge.local.publish("outgoing/online", b'{"t": 1}', retain=True)
+        bridge.local.publish(ONLINE, b'{"t": 1}', retain=True)
         bridge.run()
-        assert bridge.remote.payloads("outgoing/online") == [b'{"t": 1}']
+        assert bridge.remote.payloads(ONLINE) == [b'{"t": 1}']
 
     def test_renamed(self, bridge: World) -> None:
         bridge.start(heartbeat={"topic": f"{BASE}/outgoing/alive", "qos": 0, "retain": False})
         bridge.run()
-        bridge.local.publish("outgoing/online", b"mine")
+        bridge.local.publish(ONLINE, b"mine")
         bridge.run()
         assert bridge.remote.on("outgoing/alive")[0].retain_requested is False
-        assert bridge.remote.payloads("outgoing/online") == [b"mine"]
+        assert bridge.remote.payloads(ONLINE) == [b"mine"]
 
 
 @pytest.mark.parametrize("side", list(Side))

@@ -1,15 +1,18 @@
-"""Bridge or mirror in virtual time, between two networks in memory: nothing runs but by :meth:`World.run`."""
+"""Bridge and mirror in virtual time, between networks in memory: nothing runs but by :meth:`World.run`."""
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Iterator
 from math import inf
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 
-from pebble.config import parse
+from pebble.config import Config, parse
 from pebble.forwarding.service import ForwardingService
+from pebble.forwarding.side import Gate
 from pebble.services import mqtt_mirror as mirror_module
 from pebble.services.mqtt_bridge import service as bridge_module
 from pebble.services.mqtt_bridge.service import MqttBridge
@@ -40,6 +43,13 @@ class Connection(MemoryTransport):
     def mend(self) -> None:
         self._away = False
 
+    def lead_to(self, hub: Hub) -> None:
+        """The connection is lost, and the address leads to another broker from now on."""
+        self._on_hub_stopped()
+        self._hub.leave(self)
+        self._hub, self._changed = hub, threading.Condition(hub.lock)
+        hub.enter(self)
+
     def work(self) -> bool:
         """Do one thing, if there is one to do."""
         if self._stopping or not (self._inbox or self._attached != self._reachable):
@@ -56,7 +66,7 @@ class Connection(MemoryTransport):
 
     @property
     def _present(self) -> bool:
-        return not self._away and super()._present
+        return self._attached is not None and self._attached == self._reachable
 
     def _open(self, timeout: float) -> None:
         self._stopping = False
@@ -65,8 +75,20 @@ class Connection(MemoryTransport):
             pass
 
 
+class Running(NamedTuple):
+    """A service and its two connections."""
+
+    service: ForwardingService
+    here: Connection  # on the robot's side
+    uplink: Connection
+
+    @property
+    def gate(self) -> Gate:
+        return self.service.status.gate
+
+
 class World:
-    """Two sides with a client on each, and a service between them that can be restarted."""
+    """Two sides with a client on each, and a service between them that can be restarted; others may run beside it."""
 
     def __init__(self, service: str, monkeypatch: pytest.MonkeyPatch, *, one: bool = False) -> None:
         self.name = service
@@ -76,26 +98,34 @@ class World:
         self.remote_hub = self.local_hub if one else Hub()
         self.local = Client(Connection("someone-local", self.local_hub, self))
         self.remote = Client(Connection("operator", self.remote_hub, self))
-        self.here: Connection  # the service's own, on the robot's side
-        self.uplink: Connection
-        self.service: ForwardingService | None = None
-        monkeypatch.setattr(bridge_module, "remote_transport", self._uplink)
-        monkeypatch.setattr(mirror_module, "mirror_transport", self._uplink)
+        self.running: list[Running] = []
+        for module, name in ((bridge_module, "remote_transport"), (mirror_module, "mirror_transport")):
+            monkeypatch.setattr(module, name, self._uplink)
 
-    def start(self, **section: Any) -> None:
-        """Start the service; its sides may be away."""
-        self.here = Connection("here", self.local_hub, self)
-        config = make_config(**section)
-        if self.name == "mirror":
-            raw = {"robot": {"id": "rover"}, "transport": {"kind": "zenoh", "mqtt_mirror": {"host": "127.0.0.1"}}}
-            config = parse(raw, folder=Path.cwd(), env={})
-        self.service = SERVICES[self.name](config, self.here, clock=lambda: self.now)
-        self.service.set_up()
+    @property
+    def service(self) -> ForwardingService:
+        return self.running[0].service
+
+    @property
+    def here(self) -> Connection:
+        return self.running[0].here
+
+    @property
+    def uplink(self) -> Connection:
+        return self.running[0].uplink
+
+    def start(self, service: str = "", *, broker: Hub | None = None, **section: Any) -> Running:
+        """Start a service; its sides may be away. ``broker``: on its remote side, if that is another one."""
+        self._broker = broker or self.remote_hub
+        here = Connection("here", self.local_hub, self)
+        made = SERVICES[service or self.name](self._config(section), here, clock=lambda: self.now)
+        self.running.append(Running(made, here, self.connections[-1]))
+        made.set_up()
+        return self.running[-1]
 
     def stop(self) -> None:
-        assert self.service is not None
-        self.service = None
-        for connection in (self.here, self.uplink):
+        _, *connections = self.running.pop()
+        for connection in connections:
             connection.close()
             self.connections.remove(connection)
 
@@ -104,7 +134,7 @@ class World:
         end = self.now + seconds
         while True:
             self._rest()
-            due = inf if self.service is None else self.service.timers.next_due
+            due = min((one.timers.next_due for one in self._services()), default=inf)
             if due > end:
                 break
             self.now = max(self.now, due)
@@ -116,16 +146,26 @@ class World:
         local, remote = self.local_hub.retained.get(topic), self.remote_hub.retained.get(topic)
         return local and local.payload, remote and remote.payload
 
+    def _services(self) -> Iterator[ForwardingService]:
+        return (one.service for one in self.running)
+
     def _rest(self) -> None:
         for _ in range(100_000):
             worked = [connection.work() for connection in self.connections]
-            if self.service is not None:
-                due = self.service.timers.next_due <= self.now
-                worked += [self.service.turn(0) or due]
+            for service in self._services():
+                due = service.timers.next_due <= self.now
+                worked.append(service.turn(0) or due)
             if not any(worked):
                 return
         raise AssertionError("messages do not come to rest")
 
+    def _config(self, section: dict[str, Any]) -> Config:
+        if self.name == "bridge":
+            return make_config(**section)
+        services = {"mqtt_bridge": {"remote_mqtt": {"host": "127.0.0.1"}, **section}}
+        transport = {"kind": "zenoh", "mqtt_mirror": {"host": "127.0.0.1"}}
+        raw = {"robot": {"id": "rover"}, "transport": transport, "services": services}
+        return parse(raw, folder=Path.cwd(), env={})
+
     def _uplink(self, *_arguments: Any, will: Message | None = None) -> Connection:
-        self.uplink = Connection("uplink", self.remote_hub, self, will=will)
-        return self.uplink
+        return Connection("uplink", self._broker, self, will=will)

@@ -18,9 +18,11 @@ from pebble.runtime.by_name import ByName, ask_beside
 from pebble.transports import Message, MqttSettings, QoS, State
 from pebble.transports.mqtt import suspects
 from pebble.transports.mqtt.transport import MqttTransport
+from tests.forwarding.links import MqttEnd, Rig, Side
 from tests.robot.operator import Operator
-from tests.robot.rig import BASE, STOP, Rig
-from tests.services.mqtt_bridge.bridge_rig import MqttRig, Quiet
+from tests.robot.rig import BASE, STOP
+from tests.robot.rig import Rig as RobotRig
+from tests.services.mqtt_bridge.bridge_rig import Quiet
 from tests.sparing_broker import SparingBroker
 from tests.support import Broker, beside, until
 from tests.transports.brokers import MAKERS, ROBOT, Maker, sparing_aedes
@@ -144,22 +146,22 @@ def test_what_an_account_may_not_publish_costs_it_that_and_is_reported(
 
 
 def test_an_operators_flag_is_not_overwritten_by_a_robot_that_starts(broker: Broker, tmp_path: Path) -> None:
-    own = Broker(tmp_path)
-    rig = MqttRig(*({"host": "127.0.0.1", "port": one.port} for one in (own, broker)))
+    own = MqttEnd(tmp_path)
+    rig = Rig("bridge", own, MqttEnd(tmp_path, broker=broker))
     try:
         rig.local.publish(FLAG, TRUE, retain=True)
         rig.remote.publish(FLAG, FALSE, retain=True)
         for client in (rig.local, rig.remote):
             client.transport.close()
         rig.start()
-        Quiet(rig.client("local")).wait(0.5)
-        assert rig.retained("local")[FLAG] == FALSE
-        operator = rig.client("remote")
+        Quiet(rig.client(Side.LOCAL)).wait(0.5)
+        assert rig.retained(Side.LOCAL)[FLAG] == FALSE
+        operator = rig.client(Side.REMOTE)
         operator.transport.ask([f"{rig.base}/{FLAG}"])
         assert until(lambda: {*operator.payloads(FLAG)} == {FALSE}), operator.payloads(FLAG)
     finally:
         rig.close()
-        own.stop()
+        own.close()
 
 
 def test_an_operators_tool_finds_the_states_of_an_idle_robot(broker: Broker, base: str) -> None:
@@ -199,7 +201,7 @@ def test_an_operators_tool_finds_the_states_of_an_idle_robot(broker: Broker, bas
 
 def test_a_whole_robot_is_driven_and_stopped_although_it_may_not_publish_a_stream(maker: Maker, broker: Broker) -> None:
     uplink = {"host": "127.0.0.1", "port": broker.port, **ROBOT}
-    with Rig("zenoh", remote=broker, mqtt_bridge={"remote_mqtt": uplink}) as rig:
+    with RobotRig("zenoh", remote=broker, mqtt_bridge={"remote_mqtt": uplink}) as rig:
         assert not maker.closes or until(lambda: "outgoing/touch-sensors" in rig.log.read_text())
         ending = threading.Event()
 

@@ -26,7 +26,7 @@ class HubProcess:
     def start(self) -> HubProcess:
         settings = msgspec.json.encode(self.settings, enc_hook=str).decode()
         self._process = Forked("pebble.runtime.hub", [settings])
-        probe = create("zenoh", "probe", dataclasses.replace(self.settings, client=True)).open(10)
+        probe = create("zenoh", "probe", dataclasses.replace(self.settings, client=True, listen=())).open(10)
         assert probe.state is State.CONNECTED, probe.problem
         probe.close()
         return self

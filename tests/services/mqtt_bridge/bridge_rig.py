@@ -2,28 +2,25 @@
 
 from __future__ import annotations
 
-import itertools
 import os
 import threading
 import time
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import pytest
 
 from pebble.config import Config, parse
 from pebble.forwarding.routing import Side
 from pebble.forwarding.side import Gate
-from pebble.runtime.connections import local_transport
 from pebble.service import Service
 from pebble.services.mqtt_bridge import service as bridge_module
 from pebble.services.mqtt_bridge.service import MqttBridge
-from pebble.transports import Message, MqttSettings, QoS, State, Transport, ZenohSettings, create
+from pebble.transports import Message, QoS, State, Transport
 from pebble.transports.memory import MemoryHub, MemoryTransport
 from tests.support import until
 
 BASE = "pebble/robots/rover"
-_numbers = itertools.count(1)
 
 
 def make_config(
@@ -101,152 +98,33 @@ class Running:
         assert not self._thread.is_alive(), "the service does not end"
 
 
-class Uplink:
-    """A hub as one client sees it through a connection that can be cut; the connections of others stay."""
-
-    def __init__(self, hub: MemoryHub) -> None:
-        self._hub = hub
-        self._cuts, self._whole = 0, True
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._hub, name)
-
-    @property
-    def era(self) -> tuple[int, int] | None:
-        return (self._hub.era, self._cuts) if self._whole and self._hub.era is not None else None
-
-    def cut(self) -> None:
-        self._turn(whole=False)
-
-    def mend(self) -> None:
-        self._turn(whole=True)
-
-    def _turn(self, *, whole: bool) -> None:
-        with self._hub.lock:
-            self._whole, self._cuts = whole, self._cuts + 1
-            self._hub._wake_all()
-
-
 class MemoryRig:
-    """Two hubs (or twice the same one), a client on each, and any number of bridges one after another."""
+    """Two hubs, a client on each, and a bridge, each with threads of its own as in a robot."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, *, one: bool = False, base: str = BASE) -> None:
-        self.local_hub = MemoryHub()
-        self.remote_hub = self.local_hub if one else MemoryHub()
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, *, base: str = BASE) -> None:
+        self.local_hub, self.remote_hub = MemoryHub(), MemoryHub()
         self.local = Client(MemoryTransport("someone-local", self.local_hub), base)
         self.remote = Client(MemoryTransport("operator", self.remote_hub), base)
-        self.uplink = Uplink(self.remote_hub)
         self.robot_side: MemoryTransport
-        self.operator_side: MemoryTransport
         self._running: list[Running] = []
         monkeypatch.setattr(bridge_module, "remote_transport", self._remote_transport)
 
-    def bridge(self, *, ready: bool = True, **section: Any) -> MqttBridge:
-        """Start a bridge that listens; ``ready`` waits until it forwards, or has found out that it must not."""
+    def bridge(self, **section: Any) -> MqttBridge:
+        """Start a bridge, and wait until it forwards."""
         self.robot_side = MemoryTransport("local-bridge", self.local_hub)
         bridge = MqttBridge(make_config(**section), self.robot_side)
         self._running.append(Running(bridge))
-        assert until(lambda: Side.LOCAL in bridge.status.subscribed), "the bridge does not listen"
-        if ready:
-            self.wait_ready(bridge)
+        assert until(lambda: gate_of(bridge) is Gate.OPEN and bridge.status.subscribed == {*Side})
         return bridge
 
-    def cut(self) -> None:
-        """The bridge loses its uplink, and has noticed."""
-        self.uplink.cut()
-        assert until(lambda: self.operator_side.state is State.CONNECTING)
-
-    def taken(self) -> int:
-        """How many messages of the local side the bridge has dealt with."""
-        return self.robot_side.counters["delivered"]
-
-    def wait_ready(self, bridge: MqttBridge) -> None:
-        assert until(lambda: gate_of(bridge) is not Gate.WAITING), "the bridge never made up its mind"
-        if gate_of(bridge) is Gate.OPEN:
-            assert until(lambda: Side.REMOTE in bridge.status.subscribed)
-
-    def stop_bridges(self) -> None:
+    def close(self) -> None:
         while self._running:
             self._running.pop().stop()
-
-    def close(self) -> None:
-        self.stop_bridges()
         self.local.transport.close()
         self.remote.transport.close()
 
     def _remote_transport(self, _config: Config, name: str, *, will: Message | None = None) -> MemoryTransport:
-        self.operator_side = MemoryTransport(name, cast(MemoryHub, self.uplink), will=will)
-        return self.operator_side
-
-
-class MqttRig:
-    """The same over real brokers: the bridge as its process would make it, clients that are no clients of ours."""
-
-    def __init__(
-        self,
-        local: dict[str, Any] | ZenohSettings,
-        remote: dict[str, Any],
-        *,
-        uplink: int | None = None,
-        **section: Any,
-    ) -> None:
-        """``local``: where the robot's broker is, or its hub; ``uplink``: a port of the remote one, for the bridge."""
-        robot = f"r{next(_numbers)}"
-        self.base = f"pebble/robots/{robot}"
-        remote_mqtt = {**remote, "port": uplink or remote["port"]}
-        if isinstance(local, ZenohSettings):
-            section["transport"] = {"kind": "zenoh", "run_dir": str(local.run_dir)}
-        self._config = make_config(
-            robot, None if isinstance(local, ZenohSettings) else local, remote_mqtt=remote_mqtt, **section
-        )
-        self._where: tuple[dict[str, Any] | ZenohSettings, dict[str, Any]] = (local, remote)
-        self._clients: list[Client] = []
-        self._running: Running | None = None
-        self.bridge: MqttBridge
-        self.local, self.remote = self.client("local"), self.client("remote")
-
-    def client(self, side: str, *, listen: bool = True) -> Client:
-        """A client on that side. It does not receive its own messages."""
-        where = self._where[side == "remote"]
-        name = f"{self.base}-{side}-{len(self._clients)}"
-        if isinstance(where, ZenohSettings):
-            transport = create("zenoh", name.rpartition("/")[2], where)
-        else:
-            transport = create("mqtt", name, MqttSettings(**{**where, "as_published": True}))
-        client = Client(transport, self.base, listen=listen)
-        self._clients.append(client)
-        return client
-
-    def start(self, *, ready: bool = True) -> MqttBridge:
-        self.bridge = MqttBridge(self._config, local_transport(self._config, "local-bridge", as_published=True))
-        self._running = Running(self.bridge)
-        if ready:
-            self.wait_ready()
-        return self.bridge
-
-    def wait_ready(self) -> None:
-        bridge = self.bridge
-        assert until(lambda: gate_of(bridge) is not Gate.WAITING), "the bridge never made up its mind"
-        if gate_of(bridge) is Gate.OPEN:
-            assert until(lambda: len(bridge.status.synchronized) == 2)
-
-    def retained(self, side: str) -> dict[str, bytes]:
-        """What a late subscriber finds on that side."""
-        late = self.client(side)
-        Quiet(late).wait(0.2)
-        late.transport.close()
-        retained = {m.topic.removeprefix(f"{self.base}/"): m.payload for m in late.seen if m.retain}
-        return {suffix: payload for suffix, payload in retained.items() if suffix != "outgoing/online"}
-
-    def stop(self) -> None:
-        if self._running is not None:
-            self._running.stop()
-            self._running = None
-
-    def close(self) -> None:
-        self.stop()
-        for client in self._clients:
-            client.transport.close()
+        return MemoryTransport(name, self.remote_hub, will=will)
 
 
 def gate_of(bridge: MqttBridge) -> Gate:

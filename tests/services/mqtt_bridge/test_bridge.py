@@ -1,27 +1,29 @@
-"""The bridge between two transports in memory, with their threads: recordings, bursts, crashes, real actions."""
+"""The bridge between two transports in memory, with their threads: recordings, bursts, urgent stops."""
 
 from __future__ import annotations
 
-import json
 import logging
-import sys
+import threading
 import time
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 import pytest
 
-from pebble.services.mqtt_bridge.actions import SystemActions
+from pebble.forwarding.routing import Side
+from pebble.transports import QoS
 from pebble.transports.memory import MemoryTransport
 from tests.recordings.demo_robots import DRIVE as RECORDED_DRIVE
 from tests.recordings.demo_robots import GOOB, messages, recorded
 from tests.recordings.replayed import AS_RECORDED, Plays
-from tests.services.mqtt_bridge.bridge_rig import Client, MemoryRig, Quiet
+from tests.services.mqtt_bridge.bridge_rig import BASE, Client, MemoryRig, Quiet
 from tests.support import until
 
-DRIVE = "incoming/drive-values"
+DRIVE, STOP, STATE = "incoming/drive-values", "incoming/estop", "outgoing/estop/mcu"
+MIRROR_FLAG = "incoming/flags/remote-mirror"
+PRESS, TRUE = b'{"stop": "00000000000000a1", "by": "test"}', b"true"
 #: Of the recording, without what is a device's own: that waits for the device's description, which no replay publishes.
 RECORDED = (
     "logs", "status", "charging-level", "charging-status", "media-status", "autonomy-files", "autonomy-status",
@@ -42,24 +44,6 @@ def goob(monkeypatch: pytest.MonkeyPatch) -> Iterator[MemoryRig]:
     rig = MemoryRig(monkeypatch, base=GOOB)
     yield rig
     rig.close()
-
-
-def recorders(folder: Path, **more: Any) -> dict[str, Any]:
-    """Actions that write down their own name instead of what they should do."""
-    record = folder / "ran"
-    return {
-        f"{name}_control": {
-            "command": [sys.executable, "-c", f"open({str(record)!r}, 'a').write('{name}\\n')"],
-            "cooldown_seconds": 0,
-            **more,
-        }
-        for name in ("reboot", "service_restart", "git_pull")
-    }
-
-
-def ran(folder: Path) -> list[str]:
-    record = folder / "ran"
-    return record.read_text().split() if record.exists() else []
 
 
 def after_all(speaker: Client, listener: Client, suffix: str = "outgoing/after") -> None:
@@ -107,35 +91,46 @@ class TestHeartbeat:
         assert until(lambda: rig.remote.on("outgoing/status")[-1].payload == b"%d" % (sent - 1))
         heartbeats = len(rig.remote.on("outgoing/online")) - before
         assert heartbeats >= (time.monotonic() - began) / 0.05 / 3
-        rig.stop_bridges()
+        rig.close()
         assert not [message for message in caplog.messages if "dropped from the inbox" in message]
 
-    def test_the_will_is_published_after_a_crash(self, rig: MemoryRig) -> None:
-        rig.bridge()
-        rig.remote_hub.crash(rig.operator_side)
-        assert until(lambda: json.loads(rig.remote.payloads("outgoing/online")[-1]).get("online") is False)
-        assert rig.remote.on("outgoing/online")[-1].retain_requested
 
-
-class TestOutage:
-    def test_local_traffic_does_not_notice(self, rig: MemoryRig) -> None:
-        rig.bridge()
-        other = Client(MemoryTransport("somebody-else", rig.local_hub))
-        rig.cut()
-        for number in range(200):
-            rig.local.publish("outgoing/status", b"%d" % number)
-        assert until(lambda: len(other.on("outgoing/status")) == 200, 2)
-        other.transport.close()
-
-
-class TestActions:
-    def test_one_that_fails_in_the_bridge_ends_nothing(
-        self, rig: MemoryRig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+class TestUrgency:
+    def test_a_stop_is_published_by_the_thread_that_received_it(
+        self, rig: MemoryRig, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        bridge = rig.bridge(**recorders(tmp_path))
-        with monkeypatch.context() as broken:
-            broken.setattr(SystemActions, "request", lambda _actions, _channel: 1 / 0)
-            rig.remote.publish("incoming/flags/reboot", b"true")
-            assert until(lambda: bridge.counters["handler_errors"] == 1)
-        rig.remote.publish("incoming/flags/git-pull", b"true")
-        assert until(lambda: ran(tmp_path) == ["git_pull"])
+        """No queue and no other thread is in between, so nothing can delay it or take its place."""
+        rig.bridge()
+        threads: list[str] = []
+        publish = MemoryTransport.publish
+
+        def record(transport: MemoryTransport, topic: str, *arguments: Any, **options: Any) -> bool:
+            if topic.endswith(STOP) and transport is rig.robot_side:
+                threads.append(threading.current_thread().name)
+                assert options["urgent"]
+                assert options["qos"] is QoS.DELIVERED
+            return publish(transport, topic, *arguments, **options)
+
+        monkeypatch.setattr(MemoryTransport, "publish", record)
+        rig.remote.publish(STOP, PRESS, qos=0)
+        assert until(lambda: rig.local.on(STOP))
+        assert threads == ["pebble-memory remote-bridge"]
+
+    @pytest.mark.parametrize("retain", [False, True])
+    def test_it_waits_for_no_lock_of_retained_messages(self, rig: MemoryRig, *, retain: bool) -> None:
+        bridge = rig.bridge()
+        held, over = threading.Event(), threading.Event()
+
+        def hold(_topic: str) -> bool:
+            held.set()
+            return over.wait(10)
+
+        holding = partial(bridge.forwarder.retained.remove, Side.REMOTE, f"{BASE}/{STATE}", unless=hold)
+        threading.Thread(target=holding, daemon=True).start()
+        assert held.wait(5)
+        rig.remote.publish(STOP, PRESS, retain=retain)
+        rig.remote.publish(MIRROR_FLAG, TRUE, retain=True)
+        assert until(lambda: rig.local.payloads(STOP) == [PRESS], 5)
+        assert not rig.local.on(MIRROR_FLAG)
+        over.set()
+        assert until(lambda: rig.local.on(MIRROR_FLAG))

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
@@ -22,7 +23,8 @@ from pebble.launcher.programs import Stage
 from pebble.runtime.parent import NOTIFY_FD, WANTED, ProgramRequest
 from pebble.services.mqtt_bridge.media import MEDIA, Media
 from pebble.transports import Message, MqttSettings, create
-from tests.services.mqtt_bridge.bridge_rig import BASE, Client, MemoryRig, Quiet
+from tests.forwarding.virtual import World
+from tests.services.mqtt_bridge.bridge_rig import BASE, Client
 from tests.support import ROOT, Broker, process_name, until
 
 TRUE, FALSE = b'{"value": true}', b'{"value": false}'
@@ -96,210 +98,184 @@ class TestDecision:
         assert media.requests()[CAMERA] == NO
 
 
-class Launcher:
-    """The other end of the bridge's notify pipe."""
+RENAMED = {
+    "video_publisher": "outgoing/eye",
+    "audio_publisher": "outgoing/ear",
+    "audio_receiver": "incoming/mouth",
+}
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+
+class AskingBridge(World):
+    """A bridge in virtual time whose notify pipe ends here, where a launcher's would."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, *, one: bool) -> None:
+        super().__init__("bridge", monkeypatch, one=one)
         self._read, self.write = os.pipe()
         os.set_blocking(self._read, False)
         monkeypatch.setenv(NOTIFY_FD, str(self.write))
-        self.received: list[str] = []
+        self.asked: list[str] = []
 
-    def drain(self) -> bytes:
-        try:
-            return os.read(self._read, 1_000_000)
-        except BlockingIOError:
-            return b""
+    def begin(self, **section: Any) -> None:
+        self.start(av_daemon=DEVICES, **section)
+        self.run()
 
-    def receives(self, program: str, wanted: int, encoding: str = "") -> bool:
-        """Whether this becomes the last line about it."""
-        return until(lambda: self._last(program) == f"{wanted} {encoding}".strip())
-
-    def _last(self, program: str) -> str:
-        self.received += self.drain().decode().splitlines()
+    def wanted(self, program: str) -> str:
+        """What the launcher was told about a program last."""
+        self.run()
+        with suppress(BlockingIOError):
+            self.asked += os.read(self._read, 1_000_000).decode().splitlines()
         start = f"WANT {program} "
-        earlier = [line.removeprefix(start) for line in self.received if line.startswith(start)]
-        return earlier[-1] if earlier else ""
+        reported = [line.removeprefix(start) for line in self.asked if line.startswith(start)]
+        return reported[-1] if reported else ""
+
+    def fill(self) -> None:
+        """The launcher is busy: there is no room for a further request."""
+        os.set_blocking(self.write, False)
+        for line in (b"ALIVE\n" * 100, b"ALIVE\n"):
+            with suppress(BlockingIOError):
+                while True:
+                    os.write(self.write, line)
 
     def close(self) -> None:
         os.close(self._read)
         os.close(self.write)
 
 
-@pytest.fixture
-def launcher(monkeypatch: pytest.MonkeyPatch) -> Iterator[Launcher]:
-    launcher = Launcher(monkeypatch)
-    yield launcher
-    launcher.close()
-
-
 @pytest.fixture(params=[False, True], ids=["two sides", "one broker"])
-def either(request: pytest.FixtureRequest, launcher: Launcher, monkeypatch: pytest.MonkeyPatch) -> Iterator[MemoryRig]:
-    rig = MemoryRig(monkeypatch, one=request.param)
-    yield rig
-    rig.close()
+def either(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[AskingBridge]:
+    bridge = AskingBridge(monkeypatch, one=request.param)
+    yield bridge
+    bridge.close()
 
 
 @pytest.fixture
-def rig(launcher: Launcher, monkeypatch: pytest.MonkeyPatch) -> Iterator[MemoryRig]:
-    rig = MemoryRig(monkeypatch)
-    yield rig
-    rig.close()
+def bridge(monkeypatch: pytest.MonkeyPatch) -> Iterator[AskingBridge]:
+    bridge = AskingBridge(monkeypatch, one=False)
+    yield bridge
+    bridge.close()
+
+
+each_side = pytest.mark.parametrize("side", ["local", "remote"])
 
 
 class TestBridge:
-    def test_flags_gate_and_requests_start(self, either: MemoryRig, launcher: Launcher) -> None:
-        either.bridge(av_daemon=DEVICES)
+    def test_flags_gate_and_requests_start(self, either: AskingBridge) -> None:
+        either.begin()
         either.remote.publish(VIDEO, ON)
-        either.remote.publish(VIDEO_FLAG, TRUE, retain=True)
-        assert launcher.receives(CAMERA, 1)
-        either.remote.publish(VIDEO, OFF)
-        assert launcher.receives(CAMERA, 0)
-        either.remote.publish(VIDEO, ON)
-        assert launcher.receives(CAMERA, 1)
-        either.remote.publish(VIDEO_FLAG, FALSE, retain=True)
-        assert launcher.receives(CAMERA, 0)
-        either.remote.publish(VIDEO_FLAG, TRUE, retain=True)
-        assert launcher.receives(CAMERA, 1)
-        either.remote.publish(VIDEO_FLAG, b"", retain=True)
-        assert launcher.receives(CAMERA, 0)
-        assert not any("audio" in line and line.endswith("1") for line in launcher.received)
+        changes = [(TRUE, None, "1"), (None, OFF, "0"), (None, ON, "1"), (FALSE, None, "0"), (TRUE, None, "1")]
+        for flag, request, wanted in [*changes, (b"", None, "0")]:
+            if flag is not None:
+                either.remote.publish(VIDEO_FLAG, flag, retain=True)
+            if request is not None:
+                either.remote.publish(VIDEO, request)
+            assert either.wanted(CAMERA) == wanted
+        assert not any("audio" in line and line.endswith("1") for line in either.asked)
 
-    @pytest.mark.parametrize("side", ["local", "remote"])
-    def test_either_side_may_set_the_flag_and_ask(self, either: MemoryRig, launcher: Launcher, side: str) -> None:
-        either.bridge(av_daemon=DEVICES)
+    @each_side
+    def test_either_side_may_set_the_flag_and_ask(self, either: AskingBridge, side: str) -> None:
+        either.begin()
         client: Client = getattr(either, side)
         client.publish(AUDIO_FLAG, TRUE, retain=True)
-        client.publish(AUDIO, ON)
-        assert launcher.receives(MICROPHONE, 1)
-        assert launcher.receives(SPEAKER, 1)
-        client.publish(AUDIO, OFF)
-        assert launcher.receives(MICROPHONE, 0)
-        assert launcher.receives(SPEAKER, 0)
+        for request, wanted in ((ON, "1"), (OFF, "0")):
+            client.publish(AUDIO, request)
+            assert [either.wanted(MICROPHONE), either.wanted(SPEAKER)] == [wanted] * 2
 
-    @pytest.mark.parametrize("side", ["local", "remote"])
-    def test_a_retained_flag_counts(self, either: MemoryRig, launcher: Launcher, side: str) -> None:
+    @each_side
+    def test_a_retained_flag_counts(self, either: AskingBridge, side: str) -> None:
         getattr(either, side).publish(VIDEO_FLAG, TRUE, retain=True)
-        either.bridge(av_daemon=DEVICES)
+        either.begin()
         either.remote.publish(VIDEO, ON)
-        assert launcher.receives(CAMERA, 1)
+        assert either.wanted(CAMERA) == "1"
 
-    @pytest.mark.parametrize("side", ["local", "remote"])
-    def test_a_retained_request_never_does(self, either: MemoryRig, launcher: Launcher, side: str) -> None:
+    @each_side
+    def test_a_retained_request_never_does(self, either: AskingBridge, side: str) -> None:
         client: Client = getattr(either, side)
         client.publish(VIDEO, ON, retain=True)
-        bridge = either.bridge(av_daemon=DEVICES)
-        client.publish(VIDEO_FLAG, TRUE, retain=True)
-        client.publish(AUDIO_FLAG, TRUE, retain=True)
+        either.begin()
+        for flag in (VIDEO_FLAG, AUDIO_FLAG):
+            client.publish(flag, TRUE, retain=True)
         client.publish(AUDIO, ON)
-        assert launcher.receives(SPEAKER, 1), "and by now the retained one has arrived"
-        assert bridge.counters["stale"]
-        assert launcher.receives(CAMERA, 0)
+        assert (either.wanted(SPEAKER), either.wanted(CAMERA)) == ("1", "0")
+        assert either.service.counters["stale"]
 
     @pytest.mark.parametrize(
-        ("asked", "encoding"),
+        ("asked", "wanted"),
         [
-            (b"true", ""),
-            (TRUE, ""),
-            (b'{"enabled": true, "encoding": "h264", "keyframe": true}', "h264"),
-            (b'{"value": {"enabled": true, "encoding": "pbvz"}}', "pbvz"),
+            (b"true", "1"),
+            (TRUE, "1"),
+            (b'{"enabled": true, "encoding": "h264", "keyframe": true}', "1 h264"),
+            (b'{"value": {"enabled": true, "encoding": "pbvz"}}', "1 pbvz"),
         ],
     )
-    def test_forms_of_a_request(self, rig: MemoryRig, launcher: Launcher, asked: bytes, encoding: str) -> None:
-        rig.bridge(av_daemon=DEVICES)
-        rig.remote.publish(VIDEO_FLAG, TRUE, retain=True)
-        rig.remote.publish(VIDEO, asked)
-        assert launcher.receives(CAMERA, 1, encoding)
-        assert until(lambda: rig.local.payloads(VIDEO) == [asked]), "the publisher reads it, too"
+    def test_forms_of_a_request(self, bridge: AskingBridge, asked: bytes, wanted: str) -> None:
+        bridge.begin()
+        bridge.remote.publish(VIDEO_FLAG, TRUE, retain=True)
+        bridge.remote.publish(VIDEO, asked)
+        assert bridge.wanted(CAMERA) == wanted
+        assert bridge.local.payloads(VIDEO) == [asked], "the publisher reads it, too"
 
     @pytest.mark.parametrize("nonsense", [b"", b"1", b'"true"', b"{", b"\xff", b"[true]", b'{"enabled": NaN}'])
-    def test_nonsense_starts_and_stops_nothing(self, rig: MemoryRig, launcher: Launcher, nonsense: bytes) -> None:
-        bridge = rig.bridge(av_daemon=DEVICES)
-        rig.remote.publish(VIDEO_FLAG, TRUE, retain=True)
-        rig.remote.publish(VIDEO, nonsense)
-        assert until(lambda: bridge.counters["refused"])
-        assert launcher.receives(CAMERA, 0)
-        rig.remote.publish(VIDEO, ON)
-        assert launcher.receives(CAMERA, 1)
-        rig.remote.publish(VIDEO, nonsense)
-        assert until(lambda: bridge.counters["refused"] == 2)
-        assert launcher.receives(CAMERA, 1)
+    def test_nonsense_starts_and_stops_nothing(self, bridge: AskingBridge, nonsense: bytes) -> None:
+        bridge.begin()
+        bridge.remote.publish(VIDEO_FLAG, TRUE, retain=True)
+        for payload, wanted in ((nonsense, "0"), (ON, "1"), (nonsense, "1")):
+            bridge.remote.publish(VIDEO, payload)
+            assert bridge.wanted(CAMERA) == wanted
+        assert bridge.service.counters["refused"] == 2
 
-    def test_a_robot_without_camera_and_microphone_asks_for_nothing(self, rig: MemoryRig, launcher: Launcher) -> None:
-        rig.bridge()
+    def test_a_robot_without_camera_and_microphone_asks_for_nothing(self, bridge: AskingBridge) -> None:
+        bridge.start()
+        bridge.run()
         for flag, request in ((VIDEO_FLAG, VIDEO), (AUDIO_FLAG, AUDIO)):
-            rig.remote.publish(flag, TRUE, retain=True)
-            rig.remote.publish(request, ON)
-        assert until(lambda: rig.local.on(AUDIO))
-        Quiet(rig.local).wait(0.1)
-        assert not launcher.drain()
+            bridge.remote.publish(flag, TRUE, retain=True)
+            bridge.remote.publish(request, ON)
+        assert [bridge.wanted(program) for program in ALL] == [""] * 3
+        assert bridge.local.on(AUDIO)
 
     def test_what_a_bridge_before_it_wanted_runs_on(
-        self, either: MemoryRig, launcher: Launcher, monkeypatch: pytest.MonkeyPatch
+        self, either: AskingBridge, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setenv(WANTED, f"{CAMERA}=h264")
         either.remote.publish(VIDEO_FLAG, TRUE, retain=True)
-        either.bridge(av_daemon=DEVICES)
-        assert launcher.receives(CAMERA, 1, "h264")
-        assert f"WANT {CAMERA} 0" not in launcher.received
+        either.begin()
+        assert either.wanted(CAMERA) == "1 h264"
+        assert f"WANT {CAMERA} 0" not in either.asked
 
-    def test_a_request_is_sent_again_to_a_busy_launcher(self, rig: MemoryRig, launcher: Launcher) -> None:
-        rig.bridge(av_daemon=DEVICES)
-        assert launcher.receives(CAMERA, 0)
-        while True:
-            try:
-                os.write(launcher.write, b"ALIVE\n" * 100)
-            except BlockingIOError:
-                break
-        rig.remote.publish(VIDEO_FLAG, TRUE, retain=True)
-        rig.remote.publish(VIDEO, ON)
-        assert until(lambda: rig.local.on(VIDEO))
-        assert launcher.receives(CAMERA, 1)
+    def test_a_request_is_sent_again_to_a_busy_launcher(self, bridge: AskingBridge) -> None:
+        bridge.begin()
+        assert bridge.wanted(CAMERA) == "0"
+        bridge.fill()
+        bridge.remote.publish(VIDEO_FLAG, TRUE, retain=True)
+        bridge.remote.publish(VIDEO, ON)
+        assert bridge.wanted(CAMERA) == "0"
+        assert bridge.local.on(VIDEO)
+        assert bridge.wanted(CAMERA) == "1"
 
     def test_without_a_launcher_it_logs_that_once(
-        self, rig: MemoryRig, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+        self, bridge: AskingBridge, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
     ) -> None:
         caplog.set_level(logging.INFO)
         monkeypatch.delenv(NOTIFY_FD)
-        rig.bridge(av_daemon=DEVICES)
-        rig.remote.publish(VIDEO_FLAG, TRUE, retain=True)
-        rig.remote.publish(VIDEO, ON)
-        rig.remote.publish(DRIVE, b"1")
-        assert until(lambda: rig.local.on(DRIVE))
+        bridge.begin()
+        bridge.remote.publish(VIDEO_FLAG, TRUE, retain=True)
+        bridge.remote.publish(VIDEO, ON)
+        bridge.run()
         assert sum("there is no launcher" in message for message in caplog.messages) == 1
 
-    def test_pictures_and_sound_never_pass(self, rig: MemoryRig) -> None:
-        bridge = rig.bridge(av_daemon=DEVICES)
-        rig.remote.publish("incoming/flags/remote-mirror", TRUE, retain=True)
-        assert until(lambda: bridge.forwarder.mirroring)
-        for client in (rig.local, rig.remote):
-            for suffix in ("outgoing/front-camera", "outgoing/audio", "incoming/audio-stream"):
+    @pytest.mark.parametrize("names", [{}, RENAMED], ids=["as usual", "renamed"])
+    def test_pictures_and_sound_never_pass(self, bridge: AskingBridge, names: dict[str, str]) -> None:
+        bridge.begin(media={name: {"topic": f"{BASE}/{topic}"} for name, topic in names.items()})
+        bridge.remote.publish("incoming/flags/remote-mirror", TRUE, retain=True)
+        bridge.run()
+        media = tuple(names.values()) or ("outgoing/front-camera", "outgoing/audio", "incoming/audio-stream")
+        for client in (bridge.local, bridge.remote):
+            for suffix in media:
                 client.publish(suffix, b"\xff\xd8", qos=0)
-        rig.local.publish("outgoing/online-elsewhere", b"after")
-        rig.remote.publish(DRIVE, b"after")
-        assert until(lambda: rig.remote.on("outgoing/online-elsewhere") and rig.local.on(DRIVE))
-        media = ("front-camera", "audio", "audio-stream")
-        seen = [m.topic for m in [*rig.local.seen, *rig.remote.seen] if m.topic.endswith(media)]
+        bridge.run()
+        assert bridge.service.status.mirroring
+        seen = [one.topic for one in [*bridge.local.seen, *bridge.remote.seen] if one.topic.endswith(media)]
         assert seen == [], "no client receives its own messages, and the other side must not"
-        assert not bridge.counters["refused"], "nor are they taken for requests, whose names are alike"
-
-    def test_they_do_not_pass_under_other_names_either(self, rig: MemoryRig) -> None:
-        names = {name: {"topic": f"{BASE}/{topic}"} for name, topic in RENAMED.items()}
-        rig.bridge(av_daemon=DEVICES, media=names)
-        for suffix in RENAMED.values():
-            rig.local.publish(suffix, b"\xff\xd8", qos=0)
-            rig.remote.publish(suffix, b"\xff\xd8", qos=0)
-        rig.local.publish("outgoing/strange", b"after")
-        rig.remote.publish(DRIVE, b"after")
-        assert until(lambda: rig.remote.on("outgoing/strange") and rig.local.on(DRIVE))
-        assert not [m for m in [*rig.local.seen, *rig.remote.seen] if m.topic.endswith(tuple(RENAMED.values()))]
-
-
-RENAMED = {
-    "video_publisher": "outgoing/eye",
-    "audio_publisher": "outgoing/ear",
-    "audio_receiver": "incoming/mouth",
-}
+        assert not bridge.service.counters["refused"], "nor are they taken for requests, whose names are alike"
 
 
 SILENCE_S = 5.0  # a machine that does too much at once is not a broker that stopped answering

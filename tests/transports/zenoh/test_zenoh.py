@@ -632,9 +632,9 @@ def test_nothing_listens_on_any_network(robot: Robot) -> None:
     talking.ask("a")
     assert until(lambda: listening.ask() == "1 x")
     assert _reachable(robot.hub.pid, talking.process.pid, listening.process.pid) == set()
-    with socket.create_server(("127.0.0.1", 0)) as server, socket.socket(type=socket.SOCK_DGRAM) as heard:
-        heard.bind(("127.0.0.1", 0))
-        assert {str(os.fstat(one.fileno()).st_ino) for one in (server, heard)} <= _reachable(os.getpid())
+    with socket.create_server(("127.0.0.1", 0)) as server, socket.socket(type=socket.SOCK_DGRAM) as datagrams:
+        datagrams.bind(("127.0.0.1", 0))
+        assert {str(os.fstat(one.fileno()).st_ino) for one in (server, datagrams)} <= _reachable(os.getpid())
 
 
 def _reachable(*pids: int) -> set[str]:

@@ -1,0 +1,493 @@
+"""What crosses a bridge or a mirror between real brokers and hubs: one table of messages, in every situation.
+
+The same rules hold in virtual time (test_services.py). Each situation publishes the whole table from both sides: QoS,
+retained or not, direction, known topic or not.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from itertools import product
+from pathlib import Path
+from typing import Any, Final
+
+import pytest
+
+from pebble.contract import Kind
+from pebble.forwarding.admission import MAX_UNKNOWN_FLAGS
+from pebble.forwarding.side import Gate
+from pebble.services.mqtt_bridge import service as bridge_module
+from pebble.transports import Message, State
+from tests.forwarding.links import LOCAL, REMOTE, End, MqttEnd, Rig, Side, ZenohEnd
+from tests.services.mqtt_bridge.bridge_rig import Client, Quiet
+from tests.support import Broker, until
+from tests.tcp_proxy import TcpProxy
+
+STOP, RESET, DRIVE = "incoming/estop", "incoming/estop-reset", "incoming/drive-values"
+VIDEO_FLAG, AUDIO_FLAG = "incoming/flags/mqtt-video", "incoming/flags/mqtt-audio"
+MIRROR_FLAG = "incoming/flags/remote-mirror"
+TRUE, FALSE, PRESS = b'{"value": true}', b'{"value": false}', b'{"stop": "00000000000000a1", "by": "test"}'
+
+#: Topics of the contract by the side that publishes on them, and their kinds.
+KNOWN: Final[dict[Side, dict[str, Kind]]] = {
+    LOCAL: {
+        "outgoing/navigation-goal": Kind.STATE,
+        "outgoing/wheel-odometry": Kind.STREAM,
+        "outgoing/sensors/imu-fast": Kind.STREAM,
+        "outgoing/media-report/one": Kind.EVENT,
+        DRIVE: Kind.COMMAND,
+        VIDEO_FLAG: Kind.FLAG,
+        "incoming/flags/reboot": Kind.ACTION,
+    },
+    REMOTE: {
+        "outgoing/diagnostics": Kind.STATE,
+        "outgoing/apriltag-data": Kind.STREAM,
+        "outgoing/media-report/two": Kind.EVENT,
+        "incoming/lights-solid": Kind.COMMAND,
+        STOP: Kind.COMMAND,
+        RESET: Kind.COMMAND,
+        AUDIO_FLAG: Kind.FLAG,
+        "incoming/flags/git-pull": Kind.ACTION,
+    },
+}
+#: Topics outside of the contract.
+UNKNOWN: Final[dict[Side, dict[str, Kind]]] = {
+    side: {
+        f"outgoing/weather/{side.value}": Kind.EVENT,
+        f"incoming/dance/{side.value}": Kind.COMMAND,
+        f"incoming/flags/party-{side.value}": Kind.FLAG,
+    }
+    for side in Side
+}
+PASSES: Final = {
+    "mirror": dict.fromkeys(Side, frozenset(Kind)),
+    "bridge": {
+        LOCAL: {Kind.STATE, Kind.EVENT, Kind.STREAM, Kind.FLAG, Kind.ACTION},
+        REMOTE: {Kind.COMMAND, Kind.FLAG, Kind.ACTION},
+    },
+}
+STAYS: Final = {"mirror": (), "bridge": ("outgoing/sensors/imu-fast", "outgoing/media-report/one")}
+LINKS: dict[str, tuple[str, Callable[[Path], End], Callable[[Path], End]]] = {
+    "bridge on 3.1.1": ("bridge", MqttEnd, MqttEnd),
+    "mirror on 5": ("mirror", ZenohEnd, partial(MqttEnd, protocol="5")),
+    "bridge on zenoh": ("bridge", ZenohEnd, partial(MqttEnd, protocol="5")),
+    "bridge on 5": ("bridge", partial(MqttEnd, protocol="5"), partial(MqttEnd, protocol="5")),
+    "mirror on 3.1.1": ("mirror", ZenohEnd, MqttEnd),
+    "bridge to zenoh": ("bridge", MqttEnd, partial(ZenohEnd, uplink=True)),
+}
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One cell of the table: a message on ``topic``, published by ``side``."""
+
+    side: Side
+    topic: str
+    kind: Kind
+    retain: bool
+    qos: int
+
+    @property
+    def known(self) -> bool:
+        return self.topic in KNOWN[self.side]
+
+    def passes(self, service: str) -> bool:
+        """Commands and actions that ask to be retained are stale, but a live stop is one."""
+        once = self.kind in (Kind.COMMAND, Kind.ACTION) and self.topic != STOP
+        return (
+            self.kind in PASSES[service][self.side] and self.topic not in STAYS[service] and not (once and self.retain)
+        )
+
+    @property
+    def survives(self) -> bool:
+        """Passes although the other side is away: the newest retained message of a topic, and events."""
+        return self.qos == 1 and self.topic != STOP and (self.retain or self.kind is Kind.EVENT)
+
+    def payload(self, situation: str) -> bytes:
+        return f"{situation}: QoS {self.qos}, {'retained' if self.retain else 'live'}".encode()
+
+    def arrives(self, situation: str) -> tuple[bytes, int, bool]:
+        """Same bytes; flags of the contract are always retained; to the robot with the channel's QoS at least."""
+        to_robot = self.known and self.topic.startswith("incoming/")
+        retained = (self.retain and self.topic != STOP) or (self.known and self.kind is Kind.FLAG)
+        return self.payload(situation), 1 if to_robot else self.qos, retained
+
+
+TABLE: Final = [
+    Cell(side, topic, kind, retain, qos)
+    for side in Side
+    for (topic, kind), retain, qos in product((KNOWN[side] | UNKNOWN[side]).items(), (False, True), (0, 1))
+]
+Arrived = dict[str, list[tuple[bytes, int, bool]]]
+
+
+class TableRig(Rig):
+    """Publishes the table, and knows what of it is due."""
+
+    def publish_table(self, situation: str) -> None:
+        for cell in TABLE:
+            self.clients[cell.side].publish(cell.topic, cell.payload(situation), qos=cell.qos, retain=cell.retain)
+
+    def arrived(self, situation: str) -> Arrived:
+        """What came across, by topic."""
+        came: Arrived = {}
+        for message in (message for client in self.clients.values() for message in list(client.seen)):
+            if message.payload.startswith(f"{situation}:".encode()):
+                came.setdefault(message.topic.removeprefix(f"{self.base}/"), []).append(_shape(message))
+        return came
+
+    def expected(self, situation: str, away: End | None = None) -> Arrived:
+        """The whole table, or what of it survives that ``away`` is away."""
+        due: Arrived = {}
+        for cell in TABLE:
+            whole = away is None or away.survives
+            # of what the clients of the absent side publish, the service finds retained copies
+            lost = away is self.ends[cell.side] and not cell.retain
+            if cell.passes(self.name) and (whole or (cell.survives and not lost)):
+                due.setdefault(cell.topic, []).append(cell.arrives(situation))
+        return due
+
+    def crosses_once(self, situation: str) -> None:
+        """The whole table passes as published, each quality in order, once each, and what is retained can be found."""
+        assert until(lambda: self.synchronized)
+        self.publish_table(situation)
+        due = self.expected(situation)
+        until(lambda: sum(map(len, self.arrived(situation).values())) >= sum(map(len, due.values())), 5)
+        Quiet(*self.clients.values()).wait(0.1)
+        assert _by_quality(self.arrived(situation)) == _by_quality(due)
+        for side in Side:
+            cells = [cell for cell in TABLE if cell.side is side.other and cell.passes(self.name)]
+            newest = {cell.topic: cell.payload(situation) for cell in cells if cell.arrives(situation)[2]}
+            found = partial(self.retained_of_others, side)
+            assert until(lambda found=found, newest=newest: found() == newest, 3), found()  # type: ignore[misc]
+
+    def crosses_later(self, situation: str, away: Side) -> None:
+        """What survives an outage has arrived (events of its beginning perhaps twice), and nothing else."""
+        due = {topic: set(messages) for topic, messages in self.expected(situation, self.ends[away]).items()}
+
+        def came() -> dict[str, set[tuple[bytes, int, bool]]]:
+            return {topic: set(messages) for topic, messages in self.arrived(situation).items()}
+
+        until(lambda: came() == due, 5)
+        assert until(lambda: self.synchronized)
+        Quiet(*self.clients.values()).wait(0.1)
+        assert came() == due
+
+    def retained_of_others(self, side: Side) -> dict[str, bytes]:
+        """What a late subscriber finds on ``side`` of what the other side has published."""
+        others = KNOWN[side.other] | UNKNOWN[side.other]
+        return {topic: payload for topic, payload in self.retained(side).items() if topic in others}
+
+
+def _shape(message: Message) -> tuple[bytes, int, bool]:
+    return message.payload, int(message.qos), message.retain or bool(message.retain_requested)
+
+
+def _by_quality(messages: Arrived) -> Arrived:
+    """Each topic's messages of QoS 0, then those of QoS 1: between the two there is no order (T8)."""
+    return {topic: sorted(each, key=lambda message: message[1]) for topic, each in messages.items()}
+
+
+@pytest.fixture(scope="module")
+def ends(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, End, End]]:
+    """A link: the service's name, and both ends, which the tests of this file share."""
+    service, *kinds = LINKS[request.param]
+    local, remote = (kind(tmp_path_factory.mktemp("end")) for kind in kinds)
+    yield service, local, remote
+    for end in (local, remote):
+        end.close()
+
+
+@pytest.fixture
+def make(ends: tuple[str, End, End]) -> Iterator[Callable[..., TableRig]]:
+    """Makes rigs on the link, each with a robot of its own."""
+    made: list[TableRig] = []
+
+    def make(**section: Any) -> TableRig:
+        made.append(TableRig(*ends, **section))
+        return made[-1]
+
+    yield make
+    for rig in made:
+        rig.close()
+
+
+@pytest.fixture
+def rig(make: Callable[..., TableRig]) -> TableRig:
+    return make()
+
+
+def over(*names: Any) -> pytest.MarkDecorator:
+    return pytest.mark.parametrize("ends", names, indirect=True)
+
+
+FIRST, SECOND, THIRD, *FURTHER = LINKS
+MARKS = {name: [pytest.mark.thorough] for name in FURTHER}
+each_link = over(*(pytest.param(name, marks=MARKS.get(name, ())) for name in LINKS))
+AWAY = [
+    pytest.param(name, side, marks=MARKS.get(name, ()))
+    for name, side in product(LINKS, Side)
+    if (name, side) != ("bridge to zenoh", REMOTE)
+]
+
+
+@each_link
+def test_both_sides_are_there(rig: TableRig) -> None:
+    rig.publish_table("before")
+    rig.start()
+    rig.crosses_once("then")
+    before = {topic: [message for message in messages if message[2]][-1:]
+              for topic, messages in rig.expected("before").items()}  # fmt: skip
+    assert {topic: messages[-1:] for topic, messages in rig.arrived("before").items()} == {
+        topic: messages for topic, messages in before.items() if messages
+    }
+
+
+@pytest.mark.parametrize(("ends", "away"), AWAY, indirect=["ends"])
+def test_one_side_is_away(rig: TableRig, away: Side) -> None:
+    end = rig.ends[away]
+    end.leave()
+    rig.start(ready=False)
+    # a bridge between two brokers subscribes only once it has seen both
+    assert until(
+        lambda: (
+            away.other in rig.service.status.synchronized
+            or (not end.survives and rig.transport(away.other).state is State.CONNECTED)
+        )
+    )
+    rig.publish_table("at the start")
+    end.come_back()
+    rig.crosses_later("at the start", away)
+    rig.crosses_once("between")
+    end.leave()
+    assert until(lambda: rig.transport(away).state is State.CONNECTING)
+    rig.publish_table("outage")
+    end.come_back()
+    rig.crosses_later("outage", away)
+    rig.crosses_once("after")
+
+
+@pytest.mark.thorough
+@pytest.mark.xfail(strict=True, reason="it sends the hub alone what changed meanwhile, and operators read it at a hub")
+@over("bridge to zenoh")
+def test_what_changed_while_an_uplink_over_zenoh_was_away_reaches_operators_who_stayed(rig: TableRig) -> None:
+    rig.start()
+    rig.ends[REMOTE].leave()
+    assert until(lambda: rig.transport(REMOTE).state is State.CONNECTING)
+    rig.local.publish("outgoing/navigation-goal", b"new", retain=True)
+    rig.ends[REMOTE].come_back()
+    assert until(lambda: rig.retained(REMOTE) == {"outgoing/navigation-goal": b"new"})
+    assert until(lambda: rig.remote.payloads("outgoing/navigation-goal") == [b"new"], 1)
+
+
+@over(FIRST, SECOND)
+@pytest.mark.parametrize("forgetful", [LOCAL, REMOTE], ids=lambda side: f"{side.value} forgets")
+def test_a_side_that_forgot_everything_gets_the_current_state(rig: TableRig, forgetful: Side) -> None:
+    """Also what changed meanwhile, and what its own clients had set, who are gone."""
+    state, other = "outgoing/capabilities", forgetful.other
+    rig.local.publish(state, b"old", retain=True, remember=forgetful is REMOTE)
+    rig.start()
+    rig.clients[other].publish(VIDEO_FLAG, TRUE, retain=True)
+    assert until(lambda: rig.clients[forgetful].on(VIDEO_FLAG) and rig.remote.on(state))
+    rig.clients[forgetful].publish(VIDEO_FLAG, FALSE, retain=True)
+    assert until(lambda: rig.clients[other].on(VIDEO_FLAG))
+    rig.clients[forgetful].transport.close()  # it would publish its own retained messages again
+    rig.ends[forgetful].stop()
+    rig.clients[other].publish(AUDIO_FLAG, TRUE, retain=True)
+    expected = {VIDEO_FLAG: FALSE, AUDIO_FLAG: TRUE}
+    if forgetful is REMOTE:
+        rig.local.publish(state, b"new", retain=True)
+        expected[state] = b"new"
+    rig.ends[forgetful].restore()
+    assert until(lambda: rig.retained(forgetful).items() >= expected.items(), 10, step=0.3), rig.retained(forgetful)
+    assert rig.retained(other).items() >= expected.items()
+
+
+def storm(*voices: tuple[Client, str, list[bytes]], seconds: float, retain: bool = False) -> None:
+    """Every client publishes all of it, evenly spread and in turns."""
+    began = time.monotonic()
+    rounds = list(zip(*(payloads for _, _, payloads in voices), strict=True))
+    for number, payloads in enumerate(rounds, 1):
+        for (client, suffix, _), payload in zip(voices, payloads, strict=True):
+            client.publish(suffix, payload, retain=retain and "/flags/" in suffix)
+        time.sleep(max(0.0, began + number * seconds / len(rounds) - time.monotonic()))
+
+
+@each_link
+def test_a_storm_from_both_sides_comes_through_once_each_in_order_and_nothing_circulates(rig: TableRig) -> None:
+    rig.start()
+    rig.local.publish(MIRROR_FLAG, TRUE, retain=True)
+    assert until(lambda: rig.remote.on(MIRROR_FLAG))
+    flags = [TRUE, FALSE] * 150
+    drives = [b'{"x": 0, "z": 0, "valid_ms": 0}', b'{"x": 0, "z": 0}'] * 150
+    presses = [b'{"stop": "%016x"}' % (number // 2) for number in range(300)]
+    voices = {
+        LOCAL: {VIDEO_FLAG: flags, DRIVE: drives, STOP: presses, "incoming/flags/party": [TRUE] * 300},
+        REMOTE: {AUDIO_FLAG: flags, DRIVE: drives, STOP: presses, "incoming/flags/party": [FALSE] * 300},
+    }
+    every = [(rig.clients[side], suffix, sent) for side in Side for suffix, sent in voices[side].items()]
+    storm(*every, seconds=1.0, retain=True)
+    for side, sent in voices.items():
+        listener = rig.clients[side.other]
+        for suffix, payloads in sent.items():
+            assert until(lambda: len(listener.on(suffix)) >= len(payloads))  # noqa: B023
+    Quiet(rig.local, rig.remote).wait(0.3)
+    for side, sent in voices.items():
+        assert {suffix: rig.clients[side.other].payloads(suffix) for suffix in sent} == sent
+        assert not any(message.retain for message in rig.clients[side].on(STOP))
+    assert not rig.local.on(VIDEO_FLAG)
+    assert not rig.remote.on(AUDIO_FLAG)
+
+
+@contextmanager
+def slow(rig: Rig, delay_s: float, piece: int = 65536) -> Iterator[None]:
+    """The way to the operators' broker is so meanwhile."""
+    link = link_of(rig)
+    as_usual = link.delay_s, link.piece
+    link.delay_s, link.piece = delay_s, piece
+    yield
+    link.delay_s, link.piece = as_usual
+
+
+def link_of(rig: Rig) -> TcpProxy:
+    end = rig.ends[REMOTE]
+    assert isinstance(end, MqttEnd)
+    return end.link
+
+
+def broker_of(rig: Rig) -> Broker:
+    end = rig.ends[REMOTE]
+    assert isinstance(end, MqttEnd)
+    assert isinstance(end.broker, Broker)
+    return end.broker
+
+
+@over(FIRST)
+class TestBridge:
+    def test_what_the_robot_took_back_while_no_bridge_ran_is_removed_and_what_it_still_has_stays(
+        self, make: Callable[..., TableRig], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(bridge_module, "LEFTOVERS_AFTER_S", 0.5)
+        rig, gone, stays = make(), ("mcu/m1/describe", "outlets/1/status"), ("mcu/m2/describe", "autonomy-status")
+        rig.start()
+        for name in (*gone, *stays):
+            rig.local.publish(f"outgoing/{name}", b'{"interfaces": []}', retain=True)
+        assert until(lambda: all(rig.remote.on(f"outgoing/{name}") for name in (*gone, *stays)))
+        rig.stop()
+        for name in gone:
+            rig.local.publish(f"outgoing/{name}", b"", retain=True)
+        rig.start()
+        assert until(lambda: {*rig.retained(REMOTE)} == {f"outgoing/{name}" for name in stays}), rig.retained(REMOTE)
+        Quiet(rig.remote).wait(0.5)
+        assert {*rig.retained(REMOTE)} == {f"outgoing/{name}" for name in stays}
+
+    def test_retained_flags_of_strangers_cost_the_robot_neither_memory_nor_its_commands(self, rig: TableRig) -> None:
+        for number in range(3000):
+            rig.remote.publish(f"incoming/flags/f{number}", b"x" * 100, qos=0, retain=True)
+        rig.remote.publish(VIDEO_FLAG, TRUE, retain=True)
+        rig.start()
+        assert until(lambda: rig.local.payloads(VIDEO_FLAG) == [TRUE])
+        rig.remote.publish(DRIVE, b'{"x": 0, "z": 0.5}')
+        assert until(lambda: rig.local.on(DRIVE))
+        assert len({one.topic for one in rig.local.seen if "/flags/f" in one.topic}) == MAX_UNKNOWN_FLAGS
+        assert rig.service.dropped()["too_many"] == 3000 - MAX_UNKNOWN_FLAGS
+
+    @pytest.mark.parametrize(("delay_s", "piece"), [(0.15, 65536), (0.02, 8)])
+    def test_flags_that_differ_at_the_start_of_a_slow_link(self, rig: TableRig, delay_s: float, piece: int) -> None:
+        with slow(rig, delay_s, piece):
+            rig.local.publish(VIDEO_FLAG, TRUE, retain=True)
+            rig.remote.publish(VIDEO_FLAG, FALSE, retain=True)
+            rig.local.publish(AUDIO_FLAG, TRUE, retain=True)
+            rig.start()
+            assert until(lambda: rig.local.payloads(VIDEO_FLAG) == [FALSE])
+            assert until(lambda: rig.remote.payloads(AUDIO_FLAG) == [TRUE])
+            rig.after_all(REMOTE)
+            assert rig.retained(LOCAL) == rig.retained(REMOTE) == {VIDEO_FLAG: FALSE, AUDIO_FLAG: TRUE}
+            assert (rig.local.payloads(VIDEO_FLAG), rig.remote.on(VIDEO_FLAG)) == ([FALSE], [])
+
+    def test_a_retained_stop_passes_on_no_slow_link(self, rig: TableRig) -> None:
+        """A broker sends few retained messages at a time: the last ones arrive many round trips after the first."""
+        others = 300
+        for number in range(others):
+            rig.remote.publish(f"incoming/flags/f{number}", TRUE, retain=True)
+        rig.remote.publish(STOP, b"old", retain=True)
+        with slow(rig, 0.1):
+            rig.start(ready=False)
+
+            def arrived() -> int:
+                return sum(number for name, number in rig.service.status.counts.items() if name.startswith("remote: "))
+
+            assert until(lambda: arrived() >= others, 30)
+            rig.wait_ready()
+            rig.after_all(REMOTE)
+            assert not rig.local.on(STOP)
+            rig.remote.publish(STOP, PRESS)
+            assert until(lambda: rig.local.payloads(STOP) == [PRESS])
+
+    def test_a_stop_that_a_new_subscription_brings_does_not_pass(self, rig: TableRig) -> None:
+        """After the gate was shut the bridge subscribes anew, on connections that have been up for long."""
+        bridge = rig.start()
+        for client in (rig.local, rig.remote):
+            client.publish(STOP, b"old", retain=True)
+        rig.local.publish(MIRROR_FLAG, TRUE, retain=True)
+        assert until(lambda: rig.local.on(STOP) and bridge.status.mirroring)
+        bridge.forwarder.shut()
+        bridge.post(bridge.disable)
+        bridge.post(partial(bridge.check_again, bridge.status.epoch))
+        assert until(lambda: rig.gate is Gate.OPEN and REMOTE in bridge.status.subscribed)
+        rig.after_all(REMOTE)
+        rig.after_all(LOCAL)
+        assert rig.local.payloads(STOP) == [b"old"]  # the live one
+        assert not rig.remote.on(STOP)
+
+    def test_an_uplink_that_goes_silent(self, rig: TableRig) -> None:
+        """Messages that were sent before the loss was detected count as well."""
+        happened, state = "outgoing/somebody/happened", "outgoing/capabilities"
+        rig.remote.publish(VIDEO_FLAG, TRUE, retain=True)
+        rig.start()
+        assert until(lambda: rig.local.on(VIDEO_FLAG))
+        rig.local.publish(state, b"old", retain=True)
+        assert until(lambda: rig.remote.on(state))
+        link = link_of(rig)
+        link.blackhole()
+        rig.local.publish(VIDEO_FLAG, FALSE, retain=True)
+        rig.local.publish(state, b"new", retain=True)
+        rig.local.publish(happened, b"1")
+        rig.local.publish("outgoing/touch-sensors", b"stream")
+        rig.remote.publish(AUDIO_FLAG, TRUE, retain=True)
+        rig.remote.publish(DRIVE, b"old")
+        assert until(lambda: rig.service.remote.state is State.CONNECTING, 10)
+        rig.local.publish(happened, b"2")
+        link.resume()
+        assert until(lambda: rig.remote.payloads(happened)[-1:] == [b"2"])
+        assert until(lambda: rig.local.on(AUDIO_FLAG))
+        Quiet(rig.local, rig.remote).wait(0.3)
+        expected = {VIDEO_FLAG: FALSE, AUDIO_FLAG: TRUE, state: b"new"}
+        assert rig.retained(LOCAL) == rig.retained(REMOTE) == expected
+        assert rig.remote.payloads(happened) == [b"1", b"2"]
+        assert rig.local.payloads(VIDEO_FLAG) == [TRUE]
+        assert not rig.local.on(DRIVE)
+        assert not rig.remote.on("outgoing/touch-sensors")
+
+    def test_a_frozen_remote_broker_does_not_delay_local_traffic(
+        self, make: Callable[..., TableRig], tmp_path: Path
+    ) -> None:
+        code = f"open({str(tmp_path / 'ran')!r}, 'w')"
+        rig = make(git_pull_control={"command": [sys.executable, "-c", code]})
+        rig.start()
+        other, broker = rig.client(LOCAL), broker_of(rig)
+        broker.freeze()
+        for number in range(400):  # together fewer than the 1000 that mosquitto holds for a slow reader
+            rig.local.publish("outgoing/status", b"%d " % number + bytes(2000), retain=True)
+            rig.local.publish("outgoing/touch-sensors", b"%d" % number)
+        assert until(lambda: len(other.on("outgoing/touch-sensors")) == 400, 10)
+        rig.local.publish("incoming/flags/git-pull", b"true")
+        assert until(lambda: (tmp_path / "ran").exists(), 5)
+        assert until(lambda: rig.service.remote.state is State.CONNECTING, 10)
+        broker.thaw()
+        assert until(lambda: rig.retained(REMOTE).get("outgoing/status", b"").startswith(b"399 "), 10, step=0.3)

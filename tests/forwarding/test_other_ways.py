@@ -1,0 +1,246 @@
+"""Both sides that are one broker, brokers that send our own messages back, and other ways between the brokers."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import subprocess
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pebble.forwarding import cycles
+from pebble.forwarding import service as service_module
+from pebble.forwarding.routing import Drop
+from pebble.forwarding.side import Gate
+from pebble.transports import State
+from tests.forwarding.links import LOCAL, REMOTE, End, MqttEnd, Rig, ZenohEnd
+from tests.forwarding.test_links import AUDIO_FLAG, DRIVE, FALSE, MIRROR_FLAG, PRESS, STOP, TRUE, VIDEO_FLAG, storm
+from tests.services.mqtt_bridge.bridge_rig import Client, Quiet
+from tests.support import AmqttBroker, Broker, free_port, until
+from tests.tcp_proxy import BridgelessProxy, TcpProxy
+
+LIGHTS, STATUS = "incoming/lights-solid", "outgoing/status"
+MOVE = b'{"z": 0.5}'
+Make = Callable[..., Rig]
+
+
+def errors(caplog: pytest.LogCaptureFixture) -> list[str]:
+    return [record.getMessage() for record in caplog.records if record.levelno >= logging.ERROR]
+
+
+@pytest.fixture
+def make() -> Iterator[Make]:
+    """Makes rigs that end with the test, before their ends do."""
+    made: list[Rig] = []
+
+    def make(service: str, local: End, remote: End, **options: Any) -> Rig:
+        made.append(Rig(service, local, remote, **options))
+        return made[-1]
+
+    yield make
+    for rig in made:
+        rig.close()
+    for end in {end for rig in made for end in rig.ends.values()}:
+        end.close()
+
+
+class TestOneBroker:
+    def test_nothing_circulates_with_one_broker_for_both_sides(self, make: Make, tmp_path: Path) -> None:
+        end = MqttEnd(tmp_path)
+        rig = make("bridge", end, end)
+        rig.remote.publish(MIRROR_FLAG, TRUE, retain=True)
+        rig.remote.publish(STATUS, b"{}", retain=True)
+        rig.start()
+        assert rig.gate is Gate.SHUT
+        rig.remote.publish(STOP, PRESS)
+        rig.remote.publish(STOP, PRESS, retain=True)
+        storm((rig.local, VIDEO_FLAG, [TRUE, FALSE] * 100), (rig.local, STATUS, [TRUE] * 200), seconds=0.5, retain=True)
+        Quiet(rig.local, rig.remote).wait(0.5)
+        assert rig.local.payloads(STOP) == [PRESS] * 2
+        assert rig.remote.payloads(VIDEO_FLAG) == [TRUE, FALSE] * 100
+        assert len(rig.remote.on(STATUS)) == 200
+        assert rig.remote.on("outgoing/online")
+
+    def test_a_mirror_of_the_bridges_broker_is_refused(
+        self, make: Make, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        remote, local = MqttEnd(tmp_path), ZenohEnd(tmp_path)
+        mirror = make("mirror", local, remote)
+        mirror.start()
+        mirrored = {**local.section, "mqtt_mirror": remote.section}
+        make("bridge", local, remote, robot=mirror.robot, transport=mirrored).start()
+        assert until(lambda: mirror.gate is Gate.SHUT)
+        mirror.remote.publish("outgoing/programs/reading", b"1", retain=True)
+        mirror.remote.publish(DRIVE, b"1")
+        assert until(lambda: mirror.local.on(DRIVE))
+        Quiet(mirror.local, mirror.remote).wait(0.3)
+        assert mirror.local.payloads(DRIVE) == [b"1"]  # by the bridge
+        assert not mirror.local.on("outgoing/programs/reading")
+        (error,) = errors(caplog)
+        assert f"127.0.0.1:{remote.link.port}" in error
+
+
+class TestWithoutBridgeMode:
+    """amqtt sends our own messages back and hides the retain flag of live ones."""
+
+    @pytest.fixture(scope="class")
+    def amqtt(self) -> Iterator[AmqttBroker]:
+        broker = AmqttBroker()
+        yield broker
+        broker.stop()
+
+    @pytest.fixture
+    def rig(self, make: Make, amqtt: AmqttBroker, tmp_path: Path) -> Rig:
+        return make("bridge", MqttEnd(tmp_path, broker=AmqttBroker()), Shared(tmp_path, broker=amqtt))
+
+    def test_stops_flags_and_commands_arrive_and_come_to_rest(self, rig: Rig) -> None:
+        rig.remote.publish(STOP, b"old", retain=True)
+        rig.start()
+        assert not rig.service.remote.as_published
+        assert not rig.service.transport.exact_echo
+        rig.remote.publish(STOP, PRESS, retain=True)
+        for number in range(1, 51):  # one by one: this broker loses some of a burst now and then
+            rig.remote.publish(DRIVE, b'{"x": 0, "z": 0}')
+            assert until(lambda number=number: len(rig.local.on(DRIVE)) >= number)  # type: ignore[misc]
+        flags = [TRUE, FALSE] * 250
+        storm((rig.local, VIDEO_FLAG, flags), (rig.remote, AUDIO_FLAG, flags[::-1]), seconds=1.0, retain=True)
+        rig.remote.publish("incoming/flags/git-pull", b"true")
+        Quiet(rig.local, rig.remote).wait(1.0, 20)
+        assert rig.local.payloads(STOP) == [PRESS]
+        assert STOP not in rig.retained(LOCAL)
+        assert len(rig.local.on(DRIVE)) == 50
+        assert 1 <= len(rig.remote.on(VIDEO_FLAG)) <= 500
+        assert 1 <= len(rig.local.on(AUDIO_FLAG)) <= 500
+        assert (rig.remote.payloads(VIDEO_FLAG)[-1], rig.local.payloads(AUDIO_FLAG)[-1]) == (FALSE, TRUE)
+        too_late = rig.service.forwarder.counters[f"remote: {Drop.LATE.value}"]  # on a busy machine, behind the flags
+        assert len(rig.local.on("incoming/flags/git-pull")) + too_late == 1
+
+    def test_mirroring_is_refused_with_one_clear_error(self, rig: Rig, caplog: pytest.LogCaptureFixture) -> None:
+        rig.start()
+        rig.local.publish(MIRROR_FLAG, TRUE, retain=True)
+        assert until(lambda: rig.remote.on(MIRROR_FLAG))
+        for number in range(1, 21):
+            rig.local.publish(DRIVE, b'{"x": 0, "z": 1}')
+            assert until(lambda number=number: len(rig.local.on(DRIVE)) >= number)  # type: ignore[misc]
+        rig.remote.publish(LIGHTS, b"{}")
+        assert until(lambda: rig.local.on(LIGHTS))
+        Quiet(rig.local, rig.remote).wait()
+        assert not rig.remote.on(DRIVE)
+        assert len(rig.local.on(LIGHTS)) == 1
+        assert len([one for one in errors(caplog) if "remote-mirror is refused" in one]) == 1
+
+    def test_no_mirror_takes_such_a_broker(
+        self, make: Make, amqtt: AmqttBroker, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        make("mirror", ZenohEnd(tmp_path), Shared(tmp_path, broker=amqtt)).start(ready=False)
+        assert until(lambda: any("bridge mode" in one for one in errors(caplog)))
+
+    def test_it_is_refused_for_one_connection_only_and_not_while_it_is_away_behind_a_proxy(
+        self, make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        monkeypatch.setattr(service_module, "CHECK_AGAIN_S", 60.0)
+        end = MqttEnd(tmp_path)
+        with BridgelessProxy(end.broker.port) as way:
+            end.link.lead_to(way.port)
+            rig = make("mirror", ZenohEnd(tmp_path), end)
+            rig.start(ready=False)
+            assert until(lambda: rig.gate is Gate.SHUT)
+            way.bridgeless = False
+            way.drop()
+            rig.wait_ready()
+            for more in range(3):
+                way.lead_to(free_port())
+                attempts = way.connections + 2 + more
+                assert until(lambda: way.connections > attempts)  # noqa: B023
+                way.lead_to(end.broker.port)
+                assert until(lambda: rig.service.remote.state is State.CONNECTED)
+            rig.wait_ready()
+            rig.remote.publish(DRIVE, b"1")
+            assert until(lambda: rig.local.payloads(DRIVE) == [b"1"])
+        assert len(errors(caplog)) == 1
+
+
+class Shared(MqttEnd):
+    """An end whose broker others go on using."""
+
+    def close(self) -> None:
+        self.link.stop()
+
+
+def test_mosquittos_own_clients_use_a_mirror(make: Make, tmp_path: Path) -> None:
+    rig = make("mirror", ZenohEnd(tmp_path), MqttEnd(tmp_path))
+    rig.start()
+    rig.local.publish(STATUS, b'{"kept": 1}', retain=True)
+    assert until(lambda: rig.remote.on(STATUS))
+    sub, pub = shutil.which("mosquitto_sub"), shutil.which("mosquitto_pub")
+    assert sub, "mosquitto-clients is not installed: `make test` installs it"
+    assert pub
+    where = ["-h", "127.0.0.1", "-p", str(rig.ends[REMOTE].section["port"])]
+    listen = [sub, *where, "-t", f"{rig.base}/outgoing/#", "-F", "%r %t %p", "-C", "1", "-W", "10"]
+    earlier = subprocess.run(listen, capture_output=True, text=True, timeout=20, check=True).stdout.strip()
+    assert earlier == f'1 {rig.base}/{STATUS} {{"kept": 1}}'
+    subprocess.run([pub, *where, "-t", f"{rig.base}/{DRIVE}", "-m", '{"x": 0, "z": 1}', "-q", "1"], check=True)
+    assert until(lambda: rig.local.payloads(DRIVE) == [b'{"x": 0, "z": 1}'])
+
+
+class TestCycles:
+    """What is forwarded comes back: by a mosquitto that forwards it too, or by a second robot of this id."""
+
+    @staticmethod
+    def moves(client: Client) -> int:
+        return client.payloads(DRIVE).count(MOVE)
+
+    @pytest.mark.parametrize(
+        ("direction", "carried", "mirroring"),
+        [("out", DRIVE, b"false"), ("in", "incoming/#", b"true"), ("both", "incoming/#", b"true")],
+    )
+    def test_a_drive_command_comes_to_rest_beside_a_connection_of_the_brokers(
+        self,
+        make: Make,
+        tmp_path: Path,
+        caplog: pytest.LogCaptureFixture,
+        monkeypatch: pytest.MonkeyPatch,
+        direction: str,
+        carried: str,
+        mirroring: bytes,
+    ) -> None:
+        monkeypatch.setattr(cycles, "UNANSWERED", 1)
+        remote = MqttEnd(tmp_path)
+        with TcpProxy(remote.broker.port) as other_way:
+            connection = (
+                *("connection other", f"address 127.0.0.1:{other_way.port}", "notifications false"),
+                f"topic pebble/robots/+/{carried} {direction} 1",
+            )
+            rig = make("bridge", MqttEnd(tmp_path, broker=Broker(tmp_path, *connection)), remote)
+            assert until(lambda: other_way.in_use)
+            rig.start()
+            rig.remote.publish(MIRROR_FLAG, mirroring, retain=True)
+            assert until(lambda: rig.local.on(MIRROR_FLAG))
+            for _ in range(10):
+                rig.remote.publish(DRIVE, MOVE)
+            assert until(lambda: errors(caplog))
+            Quiet(rig.local, rig.remote).wait(0.2)
+            assert len(errors(caplog)) == 1
+            other_way.cut()
+            assert until(lambda: not rig.service.status.circulating)
+            before = self.moves(rig.local)
+            rig.remote.publish(DRIVE, MOVE)
+            assert until(lambda: self.moves(rig.local) == before + 1)
+
+    def test_two_robots_of_one_id_with_crossed_brokers(
+        self, make: Make, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        here, there = MqttEnd(tmp_path), MqttEnd(tmp_path)
+        one = make("bridge", here, there, robot="twin")
+        for rig in (one, make("bridge", there, here, robot="twin")):
+            rig.start()
+        for _ in range(5):
+            one.remote.publish(DRIVE, MOVE)
+            one.local.publish(STATUS, b"{}", retain=True)
+        assert until(lambda: errors(caplog))
+        Quiet(one.local, one.remote).wait(0.2)
+        assert self.moves(one.local) < 50
+        assert len(errors(caplog)) <= 2  # one of each robot

@@ -1,0 +1,162 @@
+"""A side that has gone back to an older save: what was changed since counts, above all what was switched off."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import partial
+from itertools import product
+from pathlib import Path
+
+import pytest
+
+from pebble.forwarding import side as side_module
+from pebble.services.mqtt_bridge.media import Media
+from tests.forwarding.links import LOCAL, REMOTE, End, MqttEnd, Rig, Side, ZenohEnd
+from tests.services.mqtt_bridge.bridge_rig import Quiet
+from tests.sparing_broker import SparingBroker
+from tests.support import some, until
+
+FLAG, STATUS = "incoming/flags/mqtt-audio", "outgoing/autonomy-status"
+STOP, STATE = "incoming/estop", "outgoing/estop/mcu"
+TRUE, FALSE = b'{"value": true}', b'{"value": false}'
+
+#: The service, both ends, and which of them is restored: the one whose programs set the microphone, too.
+LINKS: dict[str, tuple[str, Callable[[Path], End], Callable[[Path], End], Side]] = {
+    "bridge, the robot's broker": ("bridge", partial(MqttEnd, keeps=True), MqttEnd, LOCAL),
+    "bridge, the robot's hub": ("bridge", partial(ZenohEnd, keeps=True), MqttEnd, LOCAL),
+    "mirror, its broker": ("mirror", ZenohEnd, partial(MqttEnd, keeps=True), REMOTE),
+}
+#: Who sets the microphone, in order: an operator, a program on the robot that lives on, and one that is not asked to
+#: repeat what it set. Each history ends with the microphone switched off, after the save.
+HISTORIES = [
+    *("operator:on save operator:off", "program:on save program:off", "once:on save once:off"),
+    *("operator:on save program:off", "operator:on save once:off", "program:on save operator:off"),
+    *("once:on save operator:off", "program:on operator:off program:on save operator:off"),
+    *("save operator:on operator:off", "save program:on operator:off", "save operator:on once:off"),
+    *("operator:off operator:on save operator:off", "program:off once:on save program:off"),
+]
+#: How long the side is away; ``longer``: than an outage in which an operator could choose an earlier value again.
+WHEN = ("briefly", "longer", "while the robot is off")
+Make = Callable[..., Rig]
+
+
+@pytest.fixture
+def make(tmp_path: Path) -> Iterator[Make]:
+    """Makes rigs, and closes them with their ends."""
+    made: list[Rig] = []
+
+    def make(service: str, local: End, remote: End) -> Rig:
+        made.append(Rig(service, local, remote))
+        return made[-1]
+
+    yield make
+    for rig in made:
+        rig.close()
+        for end in rig.ends.values():
+            end.close()
+
+
+@pytest.mark.parametrize(("link", "when", "history"), some(product(LINKS, WHEN, HISTORIES), 11))
+def test_a_microphone_that_was_switched_off_stays_off_when_a_side_is_restored(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make: Make, link: str, when: str, history: str
+) -> None:
+    monkeypatch.setattr(side_module, "RESTORED_S", 0.0 if when == "longer" else 30.0)
+    allowed: list[bool] = []
+    monkeypatch.setattr(Media, "allow", lambda _media, _flag, on: allowed.append(on))
+    service, local, remote, restored = LINKS[link]
+    rig = make(service, local(tmp_path), remote(tmp_path))
+    rig.start()
+    operator, end = rig.clients[restored.other], rig.ends[restored]
+    setters = {"operator": operator, "program": rig.clients[restored], "once": rig.client(restored)}
+
+    def set_microphone(who: str, value: bytes) -> None:
+        others = [client for name, client in setters.items() if name != who]
+        setters[who].publish(FLAG, value, retain=True, remember=who == "program")
+        assert until(lambda: all(client.payloads(FLAG)[-1:] == [value] for client in others))
+        assert until(lambda: rig.service.forwarder.retained.value(f"{rig.base}/{FLAG}") == value)
+
+    for word in history.split():
+        who, _, value = word.partition(":")
+        set_microphone(who, TRUE if value == "on" else FALSE) if value else end.save()
+    assert service == "mirror" or until(lambda: allowed[-1:] == [False])
+    before, seen = rig.connections(restored), len(operator.on(FLAG))
+    if when == WHEN[2]:
+        rig.close()
+    allowed.clear()
+    end.stop()
+    assert when == WHEN[2] or until(lambda: not rig.connections(restored))
+    end.restore()
+    if when == WHEN[2]:
+        rig.start()
+    else:
+        assert until(lambda: rig.connections(restored) > before and rig.synchronized)
+    assert until(lambda: {rig.retained(side).get(FLAG) for side in Side} == {FALSE})
+    assert (True in allowed, TRUE in operator.payloads(FLAG)[seen:]) == (False, False)
+
+
+class TestOperatorsBroker:
+    """Over a bridge between the robot's broker and the operators', which saves."""
+
+    @pytest.fixture
+    def rig(self, make: Make, tmp_path: Path) -> Rig:
+        return make("bridge", MqttEnd(tmp_path), MqttEnd(tmp_path, keeps=True))
+
+    def set_flag(self, rig: Rig, value: bytes, *, here: bool = True) -> None:
+        """By an operator, who is not asked to repeat it; ``here``: it arrives at the robot now."""
+        before = len(rig.local.on(FLAG))
+        rig.remote.publish(FLAG, value, retain=True, remember=False)
+        assert not here or until(lambda: rig.local.payloads(FLAG)[before:] == [value])
+
+    def test_it_gets_the_newest_values_and_its_old_stop_stops_nothing(self, rig: Rig) -> None:
+        rig.start()
+        for stop, state, flag in ((b"{}", b"latched", FALSE), (b"", b"free", TRUE)):
+            for suffix in (STATUS, STATE):
+                rig.local.publish(suffix, state, retain=True)
+            rig.remote.publish(STOP, stop, retain=True, remember=False)
+            self.set_flag(rig, flag)
+            assert until(lambda state=state: rig.remote.payloads(STATE)[-1:] == [state])  # type: ignore[misc]
+            if stop:
+                rig.ends[REMOTE].save()
+        before = rig.connections(REMOTE)
+        rig.ends[REMOTE].stop()
+        rig.ends[REMOTE].restore()
+        assert until(lambda: rig.connections(REMOTE) > before and rig.synchronized)
+        newest = {STATUS: b"free", STATE: b"free", FLAG: TRUE, STOP: b"{}"}
+        assert until(lambda: rig.retained(REMOTE) == newest, 5), rig.retained(REMOTE)
+        rig.after_all(REMOTE)
+        assert rig.retained(LOCAL)[FLAG] == TRUE
+        assert rig.local.payloads(FLAG) == [FALSE, TRUE]
+        assert rig.local.payloads(STOP) == [b"{}", b""]  # the live ones
+
+    def test_a_value_that_an_operator_chose_again_during_an_outage_is_no_older_one(self, rig: Rig) -> None:
+        rig.start()
+        rig.local.publish(STATUS, b"status", retain=True)
+        self.set_flag(rig, FALSE)
+        self.set_flag(rig, TRUE)
+        before = rig.connections(REMOTE)
+        rig.ends[REMOTE].leave()
+        assert until(lambda: not rig.connections(REMOTE))
+        self.set_flag(rig, FALSE, here=False)
+        rig.ends[REMOTE].come_back()
+        assert until(lambda: rig.connections(REMOTE) > before)
+        assert until(lambda: rig.local.payloads(FLAG) == [FALSE, TRUE, FALSE])
+
+    @pytest.mark.parametrize(
+        ("late_s", "by_name"), some([(0.0, False), (0.0, True), (0.7, False), (1.5, False), (1.5, True)], 2)
+    )
+    def test_an_operators_flag_counts_however_late_the_broker_sends_it(
+        self, rig: Rig, monkeypatch: pytest.MonkeyPatch, late_s: float, by_name: bool
+    ) -> None:
+        """Silence does not mean that the broker has no value."""
+        end = rig.ends[REMOTE]
+        assert isinstance(end, MqttEnd)
+        front = SparingBroker(end.broker.port, late_s=late_s, by_name=by_name)
+        end.link.lead_to(front.port)
+        rig.local.publish(FLAG, TRUE, retain=True)
+        rig.remote.publish(FLAG, FALSE, retain=True)
+        for client in (rig.local, rig.remote):
+            client.transport.close()
+        rig.start(ready=False)
+        Quiet(rig.client(LOCAL)).wait(2.0)
+        assert {rig.retained(side).get(FLAG) for side in Side} == {FALSE}
+        front.close()
