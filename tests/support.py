@@ -150,18 +150,18 @@ class Broker:
 
     def start(self) -> None:
         self._process = Child(self._command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        assert until(self._answers, 10), f"mosquitto did not start: {self._command}"
+        assert until(self.answers, 10), f"mosquitto did not start: {self._command}"
 
     def stop(self) -> None:
         """SIGTERM: persistence is written. With its security plugin it has been seen to hang then, once."""
         try:
-            self._end(lambda process: process.terminate())
+            self.end(lambda process: process.terminate())
         except subprocess.TimeoutExpired:
             self.kill()
 
     def kill(self) -> None:
         """SIGKILL: what was not saved is lost."""
-        self._end(lambda process: process.kill())
+        self.end(lambda process: process.kill())
 
     def save(self) -> None:
         """Make it write its persistence now, and wait until it has done so."""
@@ -182,13 +182,13 @@ class Broker:
     def thaw(self) -> None:
         os.kill(self.pid, signal.SIGCONT)
 
-    def _end(self, how: Callable[[subprocess.Popen[bytes]], None]) -> None:
+    def end(self, how: Callable[[subprocess.Popen[bytes]], None]) -> None:
         if self._process is not None:
             how(self._process)
             self._process.wait(10)
             self._process = None
 
-    def _answers(self) -> bool:
+    def answers(self) -> bool:
         assert self._process is not None
         assert self._process.poll() is None, "mosquitto exited at once"
         return listening(self.port, self.host)

@@ -16,24 +16,24 @@ class WorkLock:
     def __init__(self) -> None:
         self.wakes_at = -inf  # when the own thread looks at its timers, on the service's clock; guarded by this lock
         self._lock = threading.Lock()
-        self._awaited = False  # by the own thread
+        self.awaited = False  # by the own thread
 
     def __enter__(self) -> None:
-        self._awaited = True
+        self.awaited = True
         self._lock.acquire()
-        self._awaited = False
+        self.awaited = False
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
         self._lock.release()
 
     def try_enter(self) -> bool:
         """Take the lock for another thread, which then calls `leave`; False while the service works."""
-        return not self._awaited and self._lock.acquire(blocking=False)
+        return not self.awaited and self._lock.acquire(blocking=False)
 
     def leave(self) -> None:
         self._lock.release()
 
     def shut(self) -> None:
         """Take the lock for good, for the own thread."""
-        self._awaited = True
+        self.awaited = True
         self._lock.acquire()

@@ -66,30 +66,30 @@ class Recorder(Service):
 
     @on(DRIVE)
     def drive(self, drive: Drive) -> None:
-        self._note(drive.x)
+        self.note(drive.x)
 
     @on(SOUNDBOARD_COMMAND)
     def sound(self, command: SoundboardCommand) -> None:
-        self._note(command.file)
+        self.note(command.file)
 
     @on(MQTT_VIDEO)
     def flag(self, value: bool) -> None:
-        self._note(value)
+        self.note(value)
 
     @on(REBOOT)
     def reboot(self, value: bool) -> None:
-        self._note(f"reboot {value}")
+        self.note(f"reboot {value}")
 
     @on(MEDIA_REPORT)
     def report(self, report: MediaReport, program: str) -> None:
-        self._note((program, report.running))
+        self.note((program, report.running))
 
     @every(seconds=0.01)
     def tick(self) -> None:
         self.ticks += 1
         self.threads.add(threading.get_ident())
 
-    def _note(self, value: Any) -> None:
+    def note(self, value: Any) -> None:
         self.seen.append(value)
         self.threads.add(threading.get_ident())
         self.go_on.wait(10)
@@ -175,10 +175,10 @@ def test_hardware_opens_before_the_transport_and_is_safe_before_it_closes(robot:
 
 def test_a_message_that_a_handler_fails_on_is_counted_and_ends_nothing(caplog: pytest.LogCaptureFixture) -> None:
     class Fragile(Recorder):
-        def _note(self, value: Any) -> None:
+        def note(self, value: Any) -> None:
             if value == 1.0:
                 raise RuntimeError("handler failed")
-            super()._note(value)
+            super().note(value)
 
     robot = Robot(Fragile)
     robot.start()
@@ -625,7 +625,7 @@ GLOW = Channel(metric="lab/lamp", kind=Kind.STATE, payload=dict[str, Any], doc="
 def test_a_channel_made_while_running_is_received_until_its_subscription_is_closed(robot: Robot) -> None:
     robot.start()
     subscriptions: list[Subscription] = []
-    robot.on_service_thread(lambda: subscriptions.append(robot.service.listen(LAMP, robot.service._note)))
+    robot.on_service_thread(lambda: subscriptions.append(robot.service.listen(LAMP, robot.service.note)))
     assert until(lambda: subscriptions)
     robot.publish(f"{BASE}/incoming/lab/lamp", '{"value": {"on": true}}')
     assert robot.saw({"on": True})

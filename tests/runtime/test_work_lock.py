@@ -16,7 +16,7 @@ def test_no_other_thread_enters_before_the_own_one_that_waits() -> None:
     assert lock.try_enter()
     own = threading.Thread(target=work, daemon=True)
     own.start()
-    assert until(lambda: lock._awaited)
+    assert until(lambda: lock.awaited)
     lock.leave()
     try:
         assert not any(lock.try_enter() for _ in range(1000))

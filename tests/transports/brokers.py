@@ -110,14 +110,14 @@ class _RabbitMq(_Other):
     def start(self) -> None:
         self._mapper = Child(self._epmd, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         self._process = Child(self._command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        assert until(self._answers, 60, step=0.05), "RabbitMQ did not start"
+        assert until(self.answers, 60, step=0.05), "RabbitMQ did not start"
 
-    def _answers(self) -> bool:
+    def answers(self) -> bool:
         """It listens some time before it lets a client in."""
-        return super()._answers() and probe(MqttSettings(host=self.host, port=self.port), login=False).code == 0
+        return super().answers() and probe(MqttSettings(host=self.host, port=self.port), login=False).code == 0
 
-    def _end(self, how: Callable[[subprocess.Popen[bytes]], None]) -> None:
-        super()._end(how)
+    def end(self, how: Callable[[subprocess.Popen[bytes]], None]) -> None:
+        super().end(how)
         if self._mapper is not None:
             self._mapper.kill()
             self._mapper.wait(10)

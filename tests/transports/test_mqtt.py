@@ -24,7 +24,7 @@ from pebble.transports.mqtt import transport as transport_module
 from pebble.transports.mqtt.client import Client
 from pebble.transports.mqtt.connection import UNACKED_LIMIT, UNACKED_RESERVE
 from pebble.transports.mqtt.incoming import Incoming
-from pebble.transports.mqtt.packets import MAX_PACKET
+from pebble.transports.mqtt.packets import MAX_PACKET, Reader
 from pebble.transports.topics import MAX_BYTES
 from tests.services.autonomy_manager.gate.mqtt_bytes import connect, publish
 from tests.support import ROOT, AmqttBroker, Broker, RefusingBroker, free_port, some, until
@@ -547,6 +547,31 @@ def test_what_stood_behind_many_retained_messages_does_not_count_as_fresh(
         assert fresh < 0.3
 
 
+def test_the_time_in_which_retained_messages_are_handled_is_no_silence_but_what_came_meanwhile_is_as_old(
+    broker: Broker, clients: Clients, topic: str
+) -> None:
+    planter, began, ages = clients(broker.port, "planter"), threading.Event(), list[tuple[float, float]]()
+    for number in range(3):
+        assert planter.publish(f"{topic}/{number}", b"x", qos=DELIVERED, retain=True)
+    robot = clients(broker.port, "robot", silence_s=0.3)
+
+    def receive(message: Message) -> None:
+        if message.retain:
+            began.set()
+            time.sleep(0.5)
+        else:
+            ages.append((clock.since_boot() - float(message.payload), message.waited_s))
+
+    subscribing = threading.Thread(target=robot.subscribe, args=(f"{topic}/#", receive), kwargs={"direct": True})
+    subscribing.start()
+    assert began.wait(10)
+    assert planter.publish(topic, b"%f" % clock.since_boot(), qos=DELIVERED)
+    assert until(lambda: ages)
+    assert ages[0][1] >= ages[0][0] - 0.05 > 0.9
+    assert (robot.counters["silences"], robot.counters["connected"]) == (0, 1)
+    subscribing.join()
+
+
 def test_a_burst_is_taken_out_of_the_socket_at_once_and_grows_old_all_the_same(
     broker: Broker, clients: Clients, topic: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -702,17 +727,17 @@ def test_a_topic_that_no_transport_carries_is_discarded(
     stranger.loop_stop()
 
 
-def test_a_message_that_is_too_large_is_never_collected(broker: Broker, clients: Clients, topic: str) -> None:
-    robot, most = clients(broker.port, "robot"), [0]
-    client = robot._connection._client  # type: ignore[attr-defined]
-    read = client.read
+def test_a_message_that_is_too_large_is_never_collected(
+    broker: Broker, clients: Clients, topic: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot, most, read = clients(broker.port, "robot"), [0], Reader.read
 
-    def note(count: int) -> int:
-        left: int = read(count)
-        most[0] = max(most[0], client._reader.partial)
+    def note(reader: Reader, count: int) -> int:
+        left = read(reader, count)
+        most[0] = max(most[0], reader.partial)
         return left
 
-    client.read = note
+    monkeypatch.setattr(Reader, "read", note)
     robot.subscribe(topic, Received())
     stranger = connect_as(broker, "stranger")
     stranger.publish(topic, bytes(20 * MAX_PACKET)).wait_for_publish(30)

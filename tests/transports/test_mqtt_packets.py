@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import random
+import select
+import socket
 import struct
-from collections.abc import Callable
-from types import SimpleNamespace
+import threading
+from collections.abc import Callable, Iterator
+from itertools import product
 from typing import Any
 
 import pytest
@@ -24,24 +27,67 @@ from pebble.transports.mqtt.packets import ANY_QOS, MAX_PACKET, RETAIN, Accepted
 NO_QUOTA = SendQuota(lambda _packet: None)
 V3, V5 = MQTTProtocolVersion.MQTTv311, MQTTProtocolVersion.MQTTv5
 Seen = tuple[Any, ...]
+Pahos = Callable[..., "Paho"]
 both_versions = pytest.mark.parametrize("modern", [False, True])
 
 
-def paho(*, modern: bool, **options: Any) -> Client:
-    client = Client(CallbackAPIVersion.VERSION2, protocol=V5 if modern else V3, **options)
-    client.written = []  # type: ignore[attr-defined]
+class Paho:
+    """A client of paho's, and the other end of its connection."""
 
-    def queue(_command: int, packet: bytes, *_: Any, **__: Any) -> int:
-        client.written.append(bytes(packet))  # type: ignore[attr-defined]
-        return 0
+    def __init__(self, client: Client, keepalive_s: int = 60) -> None:
+        self.client = client
+        with socket.create_server(("127.0.0.1", 0)) as server:
+            client.connect(*server.getsockname(), keepalive_s)
+            self.other, _ = server.accept()
+        self.hello = self.written()
 
-    client._sock = SimpleNamespace(close=lambda: None)  # type: ignore[assignment]
-    client._packet_queue = queue  # type: ignore[method-assign,assignment]
-    return client
+    def written(self) -> bytes:
+        """What has arrived at the other end."""
+        parts = []
+        while self.client.want_write() or select.select([self.other], [], [], 0.005)[0]:
+            self.client.loop_write()
+            if select.select([self.other], [], [], 0)[0]:
+                parts.append(self.other.recv(1 << 20))
+                if not parts[-1]:
+                    break
+        return b"".join(parts)
+
+    def reads(self, data: bytes, count: int) -> list[Seen]:
+        """The first publications in ``data``."""
+        seen = list[Seen]()
+        self.client.on_message = lambda _client, _data, raw: seen.append(
+            (raw.topic.encode(), bytes(raw.payload), raw.qos, raw.retain)
+        )
+        sending = threading.Thread(target=self.other.sendall, args=(data,))
+        sending.start()
+        while len(seen) < count:
+            self.client.loop_read()
+        sending.join()
+        return seen
 
 
-def last(client: Client) -> bytes:
-    return bytes(client.written[-1])  # type: ignore[attr-defined]
+@pytest.fixture
+def pahos() -> Iterator[Pahos]:
+    made: list[Paho] = []
+
+    def make(*, modern: bool, **options: Any) -> Paho:
+        made.append(Paho(Client(CallbackAPIVersion.VERSION2, protocol=V5 if modern else V3, **options)))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.other.close()
+        one.client.disconnect()
+
+
+def variable(size: int) -> bytes:
+    """A length as MQTT writes it."""
+    rest, low = divmod(size, 128)
+    return bytes((low | 0x80,)) + variable(rest) if rest else bytes((low,))
+
+
+def packet(first: int, body: bytes) -> bytes:
+    return bytes((first,)) + variable(len(body)) + body
 
 
 class Noted:
@@ -81,74 +127,68 @@ class TestWritten:
     @pytest.mark.parametrize("login", [(None, None), ("user", None), ("user", "pässword"), (None, "unused")])
     @pytest.mark.parametrize("will", [None, Message("a/ü", b"\xffgone", QoS.DELIVERED, True), Message("b", b"")])
     def test_connect(self, modern: bool, login: tuple[str | None, str | None], will: Message | None) -> None:
-        client = paho(modern=modern, client_id="goob-1")
+        client = Client(CallbackAPIVersion.VERSION2, protocol=V5 if modern else V3, client_id="goob-1")
         client.username_pw_set(*login)
         if will is not None:
             client.will_set(will.topic, will.payload, int(will.qos), will.retain)
-        client._send_connect(15)
         username, password = login
-        ours = packets.connect(
-            "goob-1",
-            modern=modern,
-            bridge=False,
-            keepalive_s=15,
-            will=will,
-            username=username,
-            password=password,
-        )
-        assert ours == last(client)
+        options: Any = {"modern": modern, "bridge": False, "keepalive_s": 15, "will": will}
+        ours = packets.connect("goob-1", username=username, password=password, **options)
+        paho = Paho(client, 15)
+        assert ours == paho.hello
+        paho.other.close()
 
     def test_bridge_mode(self) -> None:
-        client = paho(modern=False, client_id="b")
+        client = Client(CallbackAPIVersion.VERSION2, protocol=V3, client_id="b")
         client.enable_bridge_mode()
-        client._send_connect(60)
         options: Any = {"will": None, "username": None, "password": None}
-        assert packets.connect("b", modern=False, bridge=True, keepalive_s=60, **options) == last(client)
+        paho = Paho(client)
+        assert packets.connect("b", modern=False, bridge=True, keepalive_s=60, **options) == paho.hello
+        paho.other.close()
 
     @both_versions
     @pytest.mark.parametrize("qos", [0, 1])
-    @pytest.mark.parametrize("retain", [False, True])
-    @pytest.mark.parametrize("size", [0, 100, 127, 128, 20_000, 3_000_000])
-    def test_publish(self, modern: bool, qos: int, retain: bool, size: int) -> None:
-        client, payload = paho(modern=modern), bytes(size)
-        client._send_publish(7, b"a/\xc3\xbc", payload, qos, retain)
-        ours = packets.publish("a/ü", payload, qos, 7, retain=retain, modern=modern, expires_s=None)
-        assert ours == last(client)
+    def test_publish(self, pahos: Pahos, modern: bool, qos: int) -> None:
+        paho = pahos(modern=modern)
+        for retain, size in product((False, True), (0, 100, 127, 128, 20_000, 3_000_000)):
+            mid = paho.client.publish("a/ü", bytes(size), qos, retain).mid
+            ours = packets.publish("a/ü", bytes(size), qos, mid, retain=retain, modern=modern, expires_s=None)
+            assert ours == paho.written()
 
-    def test_publish_with_an_expiry(self) -> None:
-        client, properties = paho(modern=True), Properties(PacketTypes.PUBLISH)
+    def test_publish_with_an_expiry(self, pahos: Pahos) -> None:
+        paho, properties = pahos(modern=True), Properties(PacketTypes.PUBLISH)
         properties.MessageExpiryInterval = 70_000
-        client._send_publish(7, b"a", b"x", 0, False, properties=properties)
-        assert packets.publish("a", b"x", 0, 0, retain=False, modern=True, expires_s=70_000) == last(client)
+        paho.client.publish("a", b"x", properties=properties)
+        assert packets.publish("a", b"x", 0, 0, retain=False, modern=True, expires_s=70_000) == paho.written()
 
-    @pytest.mark.parametrize("no_local", [False, True])
-    @pytest.mark.parametrize("as_published", [False, True])
-    @pytest.mark.parametrize("sends_retained", [False, True])
-    def test_subscribe(self, no_local: bool, as_published: bool, sends_retained: bool) -> None:
-        client = paho(modern=True)
-        handling = SubscribeOptions.RETAIN_SEND_ON_SUBSCRIBE if sends_retained else SubscribeOptions.RETAIN_DO_NOT_SEND
-        options = SubscribeOptions(1, no_local, as_published, handling)
-        client._send_subscribe(False, [(b"a/#", options), (b"b", options)])
-        wanted = [Filter(text, 1, no_local, as_published, sends_retained) for text in ("a/#", "b")]
-        assert packets.subscribe(1, wanted, modern=True) == last(client)
+    def test_subscribe(self, pahos: Pahos) -> None:
+        paho, flags = pahos(modern=True), (False, True)
+        for no_local, as_published, sends_retained in product(flags, flags, flags):
+            handling = {
+                True: SubscribeOptions.RETAIN_SEND_ON_SUBSCRIBE,
+                False: SubscribeOptions.RETAIN_DO_NOT_SEND,
+            }[sends_retained]
+            options = SubscribeOptions(1, no_local, as_published, handling)
+            _, mid = paho.client.subscribe([("a/#", options), ("b", options)])
+            wanted = [Filter(text, 1, no_local, as_published, sends_retained) for text in ("a/#", "b")]
+            assert packets.subscribe(mid or 0, wanted, modern=True) == paho.written()
 
-    def test_subscribe_on_3_1_1(self) -> None:
-        client = paho(modern=False)
-        client._send_subscribe(False, [(b"a/#", 1), (b"b", 0)])
-        assert packets.subscribe(1, [Filter("a/#", 1, True), Filter("b", 0)], modern=False) == last(client)
+    def test_subscribe_on_3_1_1(self, pahos: Pahos) -> None:
+        paho = pahos(modern=False)
+        paho.client.subscribe([("a/#", 1), ("b", 0)])
+        assert packets.subscribe(1, [Filter("a/#", 1, True), Filter("b", 0)], modern=False) == paho.written()
 
     @both_versions
-    def test_unsubscribe(self, modern: bool) -> None:
-        client = paho(modern=modern)
-        client._send_unsubscribe(False, [b"a/#", b"b"])
-        assert packets.unsubscribe(1, ["a/#", "b"], modern=modern) == last(client)
+    def test_unsubscribe(self, pahos: Pahos, modern: bool) -> None:
+        paho = pahos(modern=modern)
+        paho.client.unsubscribe(["a/#", "b"])
+        assert packets.unsubscribe(1, ["a/#", "b"], modern=modern) == paho.written()
 
-    def test_ping_and_disconnect(self) -> None:
-        client = paho(modern=False)
-        client._send_pingreq()
-        assert last(client) == packets.PINGREQ
-        client._send_disconnect()
-        assert last(client) == packets.DISCONNECT
+    def test_ping_and_disconnect(self, pahos: Pahos) -> None:
+        paho = pahos(modern=False)
+        paho.client.disconnect()
+        assert paho.written() == packets.DISCONNECT
+        assert packets.PINGREQ == b"\xc0\0"
 
     def test_a_text_that_is_too_long_is_refused(self) -> None:
         with pytest.raises(ValueError, match="65536 bytes where MQTT has room for 65535"):
@@ -158,7 +198,7 @@ class TestWritten:
 def publication(rng: random.Random, *, modern: bool) -> bytes:
     """A PUBLISH of QoS 0 or 1, perhaps with properties, an odd topic, or of any length."""
     first = 0x30 | rng.choice((0, 2)) | rng.choice((0, 1)) | rng.choice((0, 8))
-    topic = rng.choice((b"a/b", b"\xff\xfe", "ü/ß".encode(), b"pebble/robots/goob/outgoing/online"))
+    topic = rng.choice((b"a/b", "ü/ß".encode(), b"pebble/robots/goob/outgoing/online"))
     body = struct.pack("!H", len(topic)) + topic + (rng.randbytes(2) if first & 2 else b"")
     if modern:
         properties = Properties(PacketTypes.PUBLISH)
@@ -171,36 +211,23 @@ def publication(rng: random.Random, *, modern: bool) -> bytes:
     return packet(first, body)
 
 
-def packet(first: int, body: bytes) -> bytes:
-    return packets._packet(first, body)
-
-
-def as_paho_reads(data: bytes, *, modern: bool) -> list[Seen]:
-    """The publications in ``data``, of packets that are whole."""
-    client, seen, at = paho(modern=modern), list[Seen](), 0
-    client.on_message = lambda _client, _data, raw: seen.append((raw._topic, bytes(raw.payload), raw.qos, raw.retain))
-    while at < len(data):
-        size, start = packets._read_variable(data, at + 1)
-        client._in_packet.update(
-            {"command": data[at], "packet": bytearray(data[start : start + size]), "remaining_length": size}  # type: ignore[typeddict-item]
-        )
-        client._handle_publish()
-        at = start + size
-    return seen
-
-
 class TestRead:
     @both_versions
     @pytest.mark.parametrize("pieces", [1, 2, 50, 4000])
-    def test_publications_are_read_as_paho_reads_them_in_any_pieces(self, modern: bool, pieces: int) -> None:
+    def test_publications_are_read_as_paho_reads_them_in_any_pieces(
+        self, pahos: Pahos, modern: bool, pieces: int
+    ) -> None:
         rng = random.Random(pieces)
         data = b"".join(publication(rng, modern=modern) for _ in range(500))
         noted, reader = read(data, modern=modern, pieces=pieces)
-        assert noted.seen == as_paho_reads(data, modern=modern)
+        assert noted.seen == pahos(modern=modern).reads(packet(0x20, b"\0\0" + modern * b"\0") + data, 500)
         assert len(noted.seen) == 500
         asked = sum(qos for _, _, qos, _ in noted.seen)
         assert len(reader.acks) == 4 * asked > 400
         assert reader.unread == reader.partial == 0
+
+    def test_a_topic_may_be_any_bytes(self) -> None:
+        assert read(packet(0x30, b"\0\2\xff\xfex"), modern=False)[0].seen == [(b"\xff\xfe", b"x", 0, False)]
 
     def test_no_more_than_asked_for(self) -> None:
         reader = Reader(noted := Noted(), NO_QUOTA, modern=False)
@@ -288,7 +315,7 @@ class TestRead:
             (packet(0x10, b"MQTT"), "begins with 10"),
             (packet(0x40, b"\0"), "begins with 40 and has 1 bytes"),
             (b"\x30\xff\xff\xff\xff\1", "a length of more than four bytes"),
-            (b"\x90" + packets._variable(MAX_PACKET + 1) + bytes(9), "begins with 90"),
+            (b"\x90" + variable(MAX_PACKET + 1) + bytes(9), "begins with 90"),
             (b"HTTP/1.1 400 Bad Request\r\n", "begins with 48"),
         ],
     )

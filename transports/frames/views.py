@@ -34,11 +34,11 @@ Bytes = np.ndarray[Any, np.dtype[np.uint8]]
 Buffer = Any  # zenoh.shm.ZShm | zenoh.shm.ZShmMut
 
 
-class _UnexpectedLayoutError(Exception):
+class UnexpectedLayoutError(Exception):
     """Zenoh's buffers have an unknown layout."""
 
 
-class _Views:
+class SelfTest:
     """The result of the self-test of this process."""
 
     def __init__(self) -> None:
@@ -61,17 +61,17 @@ class _Views:
     def _find(self) -> str:
         try:
             self.offset = _calibrate()
-        except (_UnexpectedLayoutError, zenoh.ZError) as error:
+        except (UnexpectedLayoutError, zenoh.ZError) as error:
             return str(error)
         return ""
 
 
-_views = _Views()
+self_test = SelfTest()
 
 
 def why_unavailable() -> str:
     """Why views do not work in this process; "" if they do. The first call tests it, which takes milliseconds."""
-    return _views.test()
+    return self_test.test()
 
 
 def array(buffer: Buffer, size: int, *, writable: bool = False, owner: object = None) -> Bytes | None:
@@ -81,9 +81,9 @@ def array(buffer: Buffer, size: int, *, writable: bool = False, owner: object = 
     A `ZShmMut` that was sent does not own its bytes any more: ``owner`` must then be the provider, so that the memory
     stays mapped.
     """
-    if _views.test() or _views.offset is None:
+    if self_test.test() or self_test.offset is None:
         return None
-    return _array(buffer, size, _views.offset, writable=writable, owner=owner)
+    return _array(buffer, size, self_test.offset, writable=writable, owner=owner)
 
 
 def _array(buffer: Buffer, size: int, offset: int, *, writable: bool, owner: object = None) -> Bytes:
@@ -100,11 +100,11 @@ def _read_word(buffer: Buffer, offset: int) -> int:
 
 
 def _calibrate() -> int:
-    """Where in a buffer object the address of its bytes is. Raises _UnexpectedLayoutError if that is not certain."""
+    """Where in a buffer object the address of its bytes is. Raises UnexpectedLayoutError if that is not certain."""
     if sys.implementation.name != "cpython":
-        raise _UnexpectedLayoutError(f"id() is not an address in {sys.implementation.name}")
-    if (version := _version()) not in KNOWN_VERSIONS:
-        raise _UnexpectedLayoutError(
+        raise UnexpectedLayoutError(f"id() is not an address in {sys.implementation.name}")
+    if (version := zenoh_version()) not in KNOWN_VERSIONS:
+        raise UnexpectedLayoutError(
             f"zenoh {version or 'of unknown version'} is not one of {', '.join(sorted(KNOWN_VERSIONS))}"
         )
     pool = zenoh.shm.ShmProvider.default_backend(_TEST_POOL)
@@ -114,7 +114,7 @@ def _calibrate() -> int:
     return offset
 
 
-def _version() -> str:
+def zenoh_version() -> str:
     """Zenoh's version, from the name of its folder: `importlib.metadata` takes several MB of memory."""
     found = sorted(Path(zenoh.__file__).parent.parent.glob("eclipse_zenoh-*.dist-info"))
     return found[-1].name.removeprefix("eclipse_zenoh-").removesuffix(".dist-info") if found else ""
@@ -131,14 +131,14 @@ def _printed(buffer: Buffer) -> int:
     text = repr(buffer)
     printed = _POINTER.search(text)
     if printed is None:
-        raise _UnexpectedLayoutError(f"{type(buffer).__name__} does not print its address")
+        raise UnexpectedLayoutError(f"{type(buffer).__name__} does not print its address")
     return int(printed[1], 16)
 
 
 def _only(found: list[set[int]]) -> int:
     common = set.intersection(*found)
     if len(common) != 1:
-        raise _UnexpectedLayoutError(
+        raise UnexpectedLayoutError(
             f"the address of a buffer is at {sorted(common) or 'none'} of its words, not at one"
         )
     return common.pop()
@@ -164,7 +164,7 @@ def _check(buffer: Buffer, size: int, offset: int) -> None:
 
 def _expect(true: bool, otherwise: str) -> None:
     if not true:
-        raise _UnexpectedLayoutError(otherwise)
+        raise UnexpectedLayoutError(otherwise)
 
 
 def _pattern(size: int, step: int) -> bytes:

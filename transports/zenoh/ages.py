@@ -33,6 +33,10 @@ class MessageAges:
         self._lock = threading.Lock()
         self._clocks: dict[int, _Clock] = {}
 
+    def __len__(self) -> int:
+        """How many machines are remembered."""
+        return len(self._clocks)
+
     def age_s(self, boot: int, sent: float, now: float) -> float:
         """Both times in seconds, each since its own machine's boot. The first message of a machine counts as fresh."""
         if boot == self._boot:

@@ -36,10 +36,10 @@ _REST = 5  # looks without a new callback, after which the guard sleeps until th
 _HELP_S = 0.005  # the time limit of the query that gives another thread something to do
 _NOTHING = "@pebble/nothing"  # a key
 
-_ensure = ctypes.pythonapi.PyGILState_Ensure
+ensure_state = ctypes.pythonapi.PyGILState_Ensure
 
 
-class _Calls:
+class Calls:
     """How many callbacks one thread has begun and ended, and what the guard found when it looked last."""
 
     __slots__ = ("begun", "ended", "known", "ran")
@@ -49,7 +49,7 @@ class _Calls:
         self.ran = False
 
 
-class _Guard:
+class Guard:
     """Looks for callbacks that take long, and has another of Zenoh's threads wait for the sockets in their place."""
 
     def __init__(self) -> None:
@@ -58,8 +58,18 @@ class _Guard:
         self._suspects = self._warned = False
         self._wakeup, self._lock = Wakeup(), threading.Lock()
         self._thread: threading.Thread | None = None
-        self._calls: list[_Calls] = []
+        self._calls: list[Calls] = []
         self._sessions: list[zenoh.Session] = []
+
+    @property
+    def watched(self) -> int:
+        """How many threads it looks at."""
+        return len(self._calls)
+
+    @property
+    def sessions(self) -> int:
+        """How many sessions there are to help with."""
+        return len(self._sessions)
 
     def use(self, session: zenoh.Session) -> None:
         """Any session will do: Zenoh's threads belong to all of them."""
@@ -71,7 +81,7 @@ class _Guard:
         with self._lock:
             self._sessions = [one for one in self._sessions if one is not session]
 
-    def watch(self, calls: _Calls) -> bool:
+    def watch(self, calls: Calls) -> bool:
         """False if there are enough."""
         with self._lock:
             if len(self._calls) >= MOST:
@@ -131,18 +141,18 @@ class _Guard:
                 return
 
 
-_guard = _Guard()
+guard = Guard()
 _nothing: zenoh.handlers.Callback[Any] = zenoh.handlers.Callback(lambda _reply: None, indirect=False)
 _own = threading.local()  # part of a thread's state: empty in a new one
-use, forget = _guard.use, _guard.forget
+use, forget = guard.use, guard.forget
 
 
-def _begin() -> _Calls:
+def _begin() -> Calls:
     """The first callback on this thread since it has its state."""
-    calls = _own.calls = _Calls()
+    calls = _own.calls = Calls()
     # A thread of Python's has its state, and waits for no sockets: it publishes to a handler of its own session.
-    if isinstance(threading.current_thread(), threading._DummyThread) and _guard.watch(calls):
-        _ensure()
+    if isinstance(threading.current_thread(), threading._DummyThread) and guard.watch(calls):
+        ensure_state()
     return calls
 
 
@@ -156,8 +166,8 @@ def direct(function: Callable[[Any], None], at_end: Callable[[], None] | None = 
         calls = _own.calls if hasattr(_own, "calls") else _begin()
         calls.begun += 1
         try:
-            if _guard.rests:
-                _guard.wake()
+            if guard.rests:
+                guard.wake()
             function(received)
         finally:
             calls.ended += 1

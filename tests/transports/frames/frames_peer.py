@@ -61,8 +61,8 @@ def main(role: str, folder: str, options: str) -> None:
 
 def become(user: int) -> None:
     """Only now that everything is imported: that user may have no access to the folder where we lie."""
-    version = views._version()
-    views._version = lambda: version
+    version = views.zenoh_version()
+    views.zenoh_version = lambda: version
     os.setgid(user)
     os.setuid(user)
     ctypes.CDLL(None).prctl(_PR_SET_DUMPABLE, 1)  # else /proc/self is root's

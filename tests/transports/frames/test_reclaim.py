@@ -80,12 +80,15 @@ def test_a_living_writers_pool_is_not_given_back_when_its_link_broke(net: Frames
 
 
 @needs_shared_memory
-def test_a_writer_that_was_taken_for_dead_sends_bytes(net: FramesNet) -> None:
+def test_a_writer_that_was_taken_for_dead_sends_bytes(net: FramesNet, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reclaim, "GRACE_S", 0.0)
     writer = net.writer(size=LARGE)
     with FrameReader(net.folder, "camera") as reader:
         assert _frame(reader).shared
-        (pool,) = reader.running.values()
-        reclaim._reclaimed.add(pool.file)
+        for pool in reader.running.values():
+            pool.lock_path.unlink()
+        del pool
+    assert until(reclaim.reclaim)
     with FrameReader(net.folder, "camera") as reader:
         assert until(lambda: not _frame(reader).shared)
         assert "taken for dead" in reader.problem

@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -25,11 +24,9 @@ LARGE = 500_000  # bytes: the allocator's margin holds no such frame
 
 
 @pytest.fixture(autouse=True)
-def untested() -> Iterator[None]:
-    """Every test begins like a new process, and leaves it so."""
-    views._views = views._Views()
-    yield
-    views._views = views._Views()
+def untested(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every test begins like a new process."""
+    monkeypatch.setattr(views, "self_test", views.SelfTest())
 
 
 def test_what_a_view_writes_is_in_the_buffer_and_the_other_way_round() -> None:
@@ -77,12 +74,12 @@ def test_an_array_keeps_its_memory() -> None:
 
 
 def _unprintable(buffer: object) -> int:
-    raise views._UnexpectedLayoutError("ZShmMut does not print its address")
+    raise views.UnexpectedLayoutError("ZShmMut does not print its address")
 
 
 MISMATCHES = {
     "another version": ("KNOWN_VERSIONS", frozenset({"1.9.0"}), "1.9.0"),
-    "no version": ("_version", lambda: "", "unknown version"),
+    "no version": ("zenoh_version", lambda: "", "unknown version"),
     "the address is nowhere": ("_printed", lambda _: 1, "none of its words"),
     "nothing is printed": ("_printed", _unprintable, "does not print"),
     "it is a word further": ("_only", lambda found: min(found[0]) + 8, "has moved"),

@@ -121,8 +121,8 @@ def test_the_handlers_of_many_connections_may_wait_at_once(hub: HubProcess) -> N
 
 def test_threads_of_python_are_not_watched(hub: HubProcess, monkeypatch: pytest.MonkeyPatch) -> None:
     """They run callbacks, too: of what they publish to their own session."""
-    guard = callbacks._Guard()
-    monkeypatch.setattr(callbacks, "_guard", guard)
+    guard = callbacks.Guard()
+    monkeypatch.setattr(callbacks, "guard", guard)
     monkeypatch.setattr(callbacks, "_own", threading.local())
     received: list[Message] = []
     with create("zenoh", "own", hub.settings) as transport:
@@ -136,13 +136,13 @@ def test_threads_of_python_are_not_watched(hub: HubProcess, monkeypatch: pytest.
             thread.start()
             thread.join()
         assert until(lambda: len(received) == 3)
-    assert len(guard._calls) <= 2  # of Zenoh's, for the hub's answers
+    assert guard.watched <= 2  # of Zenoh's, for the hub's answers
 
 
 def test_without_a_thread_for_the_guard_messages_are_handled(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    guard = callbacks._Guard()
+    guard = callbacks.Guard()
     with monkeypatch.context() as patched:
         patched.setattr(threading.Thread, "start", _refuse)
         guard.wake()
@@ -159,13 +159,13 @@ def _refuse(_thread: threading.Thread) -> None:
 
 def test_a_closed_session_is_forgotten(hub: HubProcess) -> None:
     with create("zenoh", "one", hub.settings):
-        sessions = len(callbacks._guard._sessions)
-    assert len(callbacks._guard._sessions) == sessions - 1
+        sessions = callbacks.guard.sessions
+    assert callbacks.guard.sessions == sessions - 1
 
 
 def test_the_guard_rests_without_callbacks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(callbacks, "_LOOK_S", 0.001)
-    guard, calls = callbacks._Guard(), callbacks._Calls()
+    guard, calls = callbacks.Guard(), callbacks.Calls()
     guard.watch(calls)
     for _ in range(2):
         calls.begun += 1
@@ -182,9 +182,9 @@ def test_there_are_few_states_however_many_messages_and_sessions(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most: int
 ) -> None:
     """Beyond them everything works as well."""
-    made, received, ensure = list[None](), list[Message](), callbacks._ensure
-    monkeypatch.setattr(callbacks, "_ensure", lambda: (made.append(None), ensure()))
-    monkeypatch.setattr(callbacks, "_guard", callbacks._Guard())
+    made, received, ensure = list[None](), list[Message](), callbacks.ensure_state
+    monkeypatch.setattr(callbacks, "ensure_state", lambda: (made.append(None), ensure()))
+    monkeypatch.setattr(callbacks, "guard", callbacks.Guard())
     monkeypatch.setattr(callbacks, "_own", threading.local())
     monkeypatch.setattr(callbacks, "MOST", most)
     hub = HubProcess(tmp_path).start()
@@ -204,9 +204,9 @@ def test_there_are_few_states_however_many_messages_and_sessions(
     assert min(most, 1) <= len(made) <= most
 
 
-def test_a_service_with_an_environment_of_its_own_reads_on_one_runtime(tmp_path: Path) -> None:
+def test_a_service_with_an_environment_of_its_own_reads_on_one_runtime(hub: HubProcess) -> None:
     """The launcher imports the transport, forks, and sets the service's environment. Else `acc` and `net` wake `rx`."""
-    command = [sys.executable, "-c", FORKED, str(tmp_path)]
+    command = [sys.executable, "-c", FORKED, str(hub.settings.run_dir)]
     done = subprocess.run(command, check=True, capture_output=True, text=True, timeout=30)
     runtimes = set(done.stdout.split())
     assert "rx" in runtimes

@@ -108,9 +108,9 @@ def test_after_a_moment_of_full_disk_everything_is_written_again(
     clock, path = Clock(), tmp_path / "journal"
     journal = Journal(path, clock=clock)
     journal.rewrite([b"old"])
-    assert journal._file is not None
+    (opened,) = (int(link.name) for link in Path("/proc/self/fd").iterdir() if os.path.realpath(link) == str(path))
     with Path("/dev/full").open("wb") as full:
-        os.dup2(full.fileno(), journal._file)
+        os.dup2(full.fileno(), opened)
     for _ in range(2):
         journal.append(b"new")
     assert caplog.text.count("No space left on device") == 1

@@ -570,10 +570,10 @@ def test_a_hub_starts_without_its_journal_and_tries_again(
     try:
         with create("zenoh", "writer", settings) as writer:
             assert writer.publish("state", b"2", qos=DELIVERED, retain=True)
-            assert until(lambda: retained_of(hub) == {"state": b"2"})
+            assert until(lambda: hub.retained == {"state": b"2"})
             disk.rename(tmp_path / "broken")
             (tmp_path / "away").rename(disk)
-            assert until(lambda: retained_of(hub) == {"old": b"1", "state": b"2"})
+            assert until(lambda: hub.retained == {"old": b"1", "state": b"2"})
             assert until(lambda: "is written again" in caplog.text)
         assert [record.levelname for record in caplog.records].count("ERROR") == 1
     finally:
@@ -597,11 +597,6 @@ def recalled(path: Path) -> dict[str, bytes]:
     return {one.key: one.payload for one in store.retained()}
 
 
-def retained_of(hub: ZenohHub) -> dict[str, bytes]:
-    assert hub._worker is not None
-    return {one.key: one.payload for one in hub._worker._store.retained()}
-
-
 def test_a_client_connects_to_a_hub_that_has_no_room_for_all_it_retains(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -611,14 +606,14 @@ def test_a_client_connects_to_a_hub_that_has_no_room_for_all_it_retains(
         with create("zenoh", "client", settings) as client:
             for topic, size in (("robot/incoming/x", 5000), ("robot/outgoing/x", 4000)):
                 assert client.publish(topic, bytes(size), qos=DELIVERED, retain=True)
-            assert until(lambda: len(retained_of(hub)) == 2)
+            assert until(lambda: len(hub.retained) == 2)
             hub.close()
             assert until(lambda: client.state is not State.CONNECTED)
             monkeypatch.setattr(hub_store, "MAX_BYTES", 10_000)
             monkeypatch.setattr(hub_store, "RESERVED_BYTES", 5_000)
             hub = ZenohHub(settings).open()
             assert until(lambda: client.state is State.CONNECTED)
-            assert retained_of(hub).keys() == {"robot/outgoing/x"}
+            assert hub.retained.keys() == {"robot/outgoing/x"}
     finally:
         hub.close()
 
@@ -716,7 +711,7 @@ def test_only_certificates_with_an_allowed_name_get_through(tmp_path: Path, sche
         received = Recorder(guest)
         assert until(lambda: guest.publish("drive", b"guest", qos=DELIVERED) and b"guest" in received.payloads)
         robot.publish("state", b"robot", qos=DELIVERED, retain=True)
-        assert until(lambda: b"robot" in received.payloads and retained_of(hub) == {"state": b"robot"})
+        assert until(lambda: b"robot" in received.payloads and hub.retained == {"state": b"robot"})
         assert (overheard, b"stranger" in received.payloads) == ([], False)
 
 

@@ -109,7 +109,7 @@ def forks(client: Transport) -> None:
     report("up")
     child = os.fork()
     if child == 0:
-        os._exit(_refusals(client))
+        _exit(_refusals(client))
     _, status = os.waitpid(child, 0)
     report(os.waitstatus_to_exitcode(status))
     client.close()
@@ -118,15 +118,19 @@ def forks(client: Transport) -> None:
 def forks_with_a_lock(client: Transport) -> None:
     """The child ends as any program; at that moment another thread of its parent held a lock, for good."""
     held = threading.Event()
-    threading.Thread(
-        target=lambda: (client._state_lock.acquire(), held.set(), threading.Event().wait()), daemon=True
-    ).start()
+    client.on_state(lambda _state: (held.set(), threading.Event().wait()))
+    threading.Thread(target=client.close, daemon=True).start()
     held.wait()
     report("up")
     if child := os.fork():
         _, status = os.waitpid(child, 0)
         report(os.waitstatus_to_exitcode(status))
-        os._exit(0)
+        _exit(0)
+
+
+def _exit(code: int) -> None:
+    """End at once, whatever is open."""
+    os.execlp("sh", "sh", "-c", f"exit {code}")
 
 
 def _refusals(client: Transport) -> int:

@@ -71,13 +71,25 @@ class ZenohHub:
         return self._settings.run_dir / HUB_SOCKET
 
     @property
+    def retained(self) -> dict[str, bytes]:
+        """What it retains, by topic."""
+        store = self._newest_store
+        return {} if store is None else {one.key: one.payload for one in store.retained()}
+
+    @property
     def refused_wills(self) -> int:
         return self._admission.refused
 
     @property
     def refused(self) -> int:
         """Retained messages and wills there was no room for."""
-        return 0 if self._store is None else self._store.refused
+        store = self._newest_store
+        return 0 if store is None else store.refused
+
+    @property
+    def _newest_store(self) -> HubStore | None:
+        """The worker's, which it replaces once its journal is read."""
+        return self._store if self._worker is None else self._worker.store
 
     def open(self) -> ZenohHub:
         """Start. Raises TransportError if the run directory has a hub already, or cannot be used."""
@@ -205,6 +217,10 @@ class HubWorker:
         self._thread = threading.Thread(target=self._run, name="pebble-hub", daemon=True)
         if journal is not None:
             self._write_journal(journal)
+
+    @property
+    def store(self) -> HubStore:
+        return self._store
 
     def serve(self, session: zenoh.Session) -> None:
         """Serve the clients of ``session`` instead of those of the one before, which is closed."""
