@@ -400,9 +400,6 @@ class TestMistakes:
             ("services.av_daemon.env", {"A=B": "c"}, "must be the name of a variable, without ="),
             ("services.autonomy_manager.env", {"": "c"}, "must be the name of a variable, without ="),
             ("services.mqtt_bridge.audio_control.publisher_env", {"=": "c"}, "must be the name of a variable"),
-            ("local_mqtt.host", "u" * 64 + ".example", "must be a name or address: 1 to 63 letters"),
-            ("local_mqtt.host", "a..b", "must be a name or address"),
-            ("services.mqtt_bridge.remote_mqtt.host", "u." * 130, "must be a name or address"),
             ("local_mqtt.username", "ü" * 40_000, "is longer than MQTT carries, 65535 bytes"),
             ("local_mqtt.password", "ü" * 40_000, "holds more than MQTT carries, 65535 bytes"),
             ("transport.kind", 5, "must be text, not 5"),
@@ -442,10 +439,7 @@ class TestMistakes:
         script = {"args": [{"key": "a", "type": "intt"}, {"label": "b"}]}
         assert [
             line.partition(":")[0] for line in problems(at("services.autonomy_manager.scripts", {"s": script}))
-        ] == [
-            "services.autonomy_manager.scripts.s.args[0].type",
-            "services.autonomy_manager.scripts.s.args[1].key",
-        ]
+        ] == ["services.autonomy_manager.scripts.s.args[0].type", "services.autonomy_manager.scripts.s.args[1].key"]
 
     @pytest.mark.parametrize(
         ("path", "nearest"),
@@ -543,16 +537,10 @@ class TestMistakes:
         with pytest.raises(ConfigError) as caught:
             load(written(tmp_path, json.dumps(raw)), env={})
         assert sorted(line.partition(":")[0] for line in caught.value.problems) == [
-            "local_mqtt.port",
-            "log_level",
-            "robot.id",
-            "services.av_daemon.video.rotate_degrees",
-            "services.launcher.logs.max_message_chars",
-            "services.mqtt_bridge.heartbeet",
-            "services.mqtt_bridge.remote_mqtt.host",
-            "services.mqtt_bridge.topics.reboot",
-            "services.serial_mcu_bridge.safety.drive_timeout_seconds",
-            "services.serial_mcu_bridge.serial.port",
+            *("local_mqtt.port", "log_level", "robot.id", "services.av_daemon.video.rotate_degrees"),
+            *("services.launcher.logs.max_message_chars", "services.mqtt_bridge.heartbeet"),
+            *("services.mqtt_bridge.remote_mqtt.host", "services.mqtt_bridge.topics.reboot"),
+            *("services.serial_mcu_bridge.safety.drive_timeout_seconds", "services.serial_mcu_bridge.serial.port"),
         ]
 
 

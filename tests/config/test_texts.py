@@ -8,7 +8,6 @@ import logging
 import os
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ from pebble.config.text_files import NotTextError, text_of
 from pebble.config.visible import shown
 from pebble.errors import ConfigError
 from pebble.runtime.parent import MaskingFormatter
-from tests.support import ROOT
+from tests.support import ROOT, some
 
 SECRET = "s3cr3t"
 
@@ -50,6 +49,35 @@ def problems(folder: Path, raw: Any) -> str:
     except ConfigError as error:
         return str(error)
     return ""
+
+
+#: Runs commands of JSON from its input, each as a fork of a process that has imported what they need.
+RUN = """
+import json, os, sys
+from pebble import cli
+import pebble.commands.check, pebble.commands.doctor, pebble.commands.topic
+for words in json.load(sys.stdin):
+    reading, writing = os.pipe()
+    if not os.fork():
+        for stream in (1, 2):
+            os.dup2(writing, stream)
+        os.close(writing)
+        sys.argv = ["pebble", *words]
+        sys.exit(cli.main())
+    os.close(writing)
+    printed = open(reading, "rb").read().decode()
+    print(json.dumps([printed, os.waitstatus_to_exitcode(os.wait()[1])]), flush=True)
+"""
+
+
+def run(commands: list[list[str]]) -> list[tuple[str, int]]:
+    """What each command has printed, and its exit code."""
+    command, text = [sys.executable, "-X", "utf8", "-c", RUN], json.dumps(commands)
+    done = subprocess.run(command, cwd=ROOT, input=text, capture_output=True, text=True, timeout=100, check=False)
+    assert not done.stderr
+    answers = [json.loads(line) for line in done.stdout.splitlines()]
+    assert len(answers) == len(commands)
+    return [(printed, code) for printed, code in answers]
 
 
 REMOTE = "services/mqtt_bridge/remote_mqtt"
@@ -109,21 +137,21 @@ LOGINS = {
 }
 
 
-@pytest.mark.parametrize("case", LOGINS)
-def test_a_secret_is_one_wherever_it_was_put(tmp_path: Path, case: str) -> None:
+def test_a_secret_is_one_wherever_it_was_put(tmp_path: Path) -> None:
     """No command prints it, whether the config is refused or not."""
-    file = tmp_path / "c.json"
-    file.write_text(json.dumps(config(*LOGINS[case])), encoding="utf-8")
-    for words in (["check"], ["check", "--json"], ["doctor"]):
-        command = [sys.executable, "-m", "pebble.cli", *words, str(file)]
-        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60)
-        assert done.stdout + done.stderr
-        assert SECRET not in done.stdout + done.stderr
+    commands = []
+    for case, place in LOGINS.items():
+        file = tmp_path / f"{case}.json"
+        file.write_text(json.dumps(config(*place)), encoding="utf-8")
+        commands += [[*words, str(file)] for words in (["check"], ["check", "--json"])]
+    commands += [["doctor", file] for *_, file in some(commands, 9)]
+    for words, (printed, _) in zip(commands, run(commands), strict=True):
+        assert printed, words
+        assert SECRET not in printed, words
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
+def test_a_secret_on_a_command_line_is_not_printed_again() -> None:
+    commands = [
         ["topic", "list", "--url", f"mqtt://ann:{SECRET}@127.0.0.1"],
         ["topic", "list", "--url", f"mqtt://ann:{SECRET}@127.0.0.1:99999"],
         ["topic", "list", "--url", f"ftp://ann:{SECRET}@127.0.0.1"],
@@ -132,13 +160,10 @@ def test_a_secret_is_one_wherever_it_was_put(tmp_path: Path, case: str) -> None:
         ["nonsense", f"--password={SECRET}"],
         ["web", "--url", f"mqtt://ann:{SECRET}@127.0.0.1:1"],
         ["foxglove", "--host", f"http://ann:{SECRET}@127.0.0.1", "--url", "mqtt://127.0.0.1:1"],
-    ],
-)
-def test_a_secret_on_a_command_line_is_not_printed_again(words: list[str]) -> None:
-    command = [sys.executable, "-m", "pebble.cli", *words]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60)
-    assert done.returncode
-    assert SECRET not in done.stdout + done.stderr
+    ]
+    for words, (printed, code) in zip(commands, run(commands), strict=True):
+        assert code, words
+        assert SECRET not in printed, words
 
 
 def test_the_resolved_config_hides_them(tmp_path: Path) -> None:
@@ -167,34 +192,33 @@ def test_only_what_is_secret_is_hidden(text: str, shown: str) -> None:
 TEXT = json.dumps(config(), indent=1).replace("rover", "röver")
 
 
-@pytest.mark.parametrize(
-    ("encode", "expected"),
-    [
-        (lambda text: text.encode(), ""),
-        (lambda text: text.encode("utf-8-sig"), ""),
-        (lambda text: text.replace("\n", "\r\n").encode("utf-8-sig"), ""),
-        (lambda text: text.replace("\n", "\r").encode(), ""),
-        (lambda text: text.encode("utf-16"), 'is UTF-16 ("Unicode" in Notepad)'),
-        (lambda text: text.encode("utf-16-le"), "is UTF-16"),
-        (lambda text: text.encode("utf-16-be"), "is UTF-16"),
-        (lambda text: text.encode("utf-32"), "is UTF-32"),
-        (lambda text: text.encode("latin-1"), "is not UTF-8 at its byte 24, in line 3, but Latin-1"),
-        (lambda text: text.encode() + b"\0", "its byte"),
-    ],
-)
-def test_a_file_in_another_encoding_is_understood_or_named(
-    tmp_path: Path, encode: Callable[[str], bytes], expected: str
-) -> None:
+ENCODED: list[tuple[bytes, str]] = [
+    (TEXT.encode(), ""),
+    (TEXT.encode("utf-8-sig"), ""),
+    (TEXT.replace("\n", "\r\n").encode("utf-8-sig"), ""),
+    (TEXT.replace("\n", "\r").encode(), ""),
+    (TEXT.encode("utf-16"), 'is UTF-16 ("Unicode" in Notepad)'),
+    (TEXT.encode("utf-16-le"), "is UTF-16"),
+    (TEXT.encode("utf-16-be"), "is UTF-16"),
+    (TEXT.encode("utf-32"), "is UTF-32"),
+    (TEXT.encode("latin-1"), "is not UTF-8 at its byte 24, in line 3, but Latin-1"),
+    (TEXT.encode() + b"\0", "its byte"),
+]
+
+
+def test_a_file_in_another_encoding_is_understood_or_named(tmp_path: Path) -> None:
     """Text files are read in any locale; the same function reads password files and what else people write."""
-    file = tmp_path / "c.json"
-    file.write_bytes(encode(TEXT))
-    env = os.environ | {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0", "PYTHONIOENCODING": "utf-8"}
-    command = [sys.executable, "-m", "pebble.cli", "check", str(file)]
-    done = subprocess.run(command, cwd=ROOT, env=env, capture_output=True, timeout=60)
-    printed = (done.stdout + done.stderr).decode()
-    assert expected in printed
-    assert ("röver" in printed) is not bool(expected)
-    assert "Traceback" not in printed
+    for number, (data, _) in enumerate(ENCODED):
+        (tmp_path / f"{number}.json").write_bytes(data)
+    commands = [["check", str(tmp_path / f"{number}.json")] for number in range(len(ENCODED))]
+    latin = {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0", "PYTHONIOENCODING": "utf-8"}
+    command = [sys.executable, "-m", "pebble.cli", *commands[0]]
+    done = subprocess.run(command, cwd=ROOT, env=os.environ | latin, capture_output=True, check=True, timeout=60)
+    assert "röver" in done.stdout.decode()
+    for (printed, _), (_, expected) in zip(run(commands), ENCODED, strict=True):
+        assert expected in printed
+        assert ("röver" in printed) is not bool(expected)
+        assert "Traceback" not in printed
 
 
 def test_a_sentence_repeats_no_byte_of_the_file() -> None:

@@ -17,13 +17,7 @@ from typing import NoReturn
 import pytest
 
 from tests.robot.rig import DEVICES, Rig
-from tests.robot.test_media import (
-    ASK_AUDIO,
-    AUDIO,
-    AUDIO_FLAG,
-    pictures_come,
-    want_video,
-)
+from tests.robot.test_media import ASK_AUDIO, AUDIO, AUDIO_FLAG, pictures_come, want_video
 from tests.support import ROOT, until
 
 sys.path.insert(0, str(ROOT / "tools"))
@@ -195,10 +189,8 @@ def test_polkit_allows_the_robot_nothing_else(tmp_path: Path) -> None:
     cases += [
         ("pebble", action, {})
         for action in (
-            f"{REBOOT}-ignore-inhibit",
-            "org.freedesktop.login1.power-off",
-            "org.freedesktop.systemd1.manage-unit-files",
-            "org.freedesktop.systemd1.reload-daemon",
+            *(f"{REBOOT}-ignore-inhibit", "org.freedesktop.login1.power-off"),
+            *("org.freedesktop.systemd1.manage-unit-files", "org.freedesktop.systemd1.reload-daemon"),
             "org.freedesktop.policykit.exec",
         )
     ]

@@ -28,13 +28,8 @@ def test_a_topic_comes_apart_into_what_it_was_built_from() -> None:
 @pytest.mark.parametrize(
     "topic",
     [
-        "",
-        "pebble/infrastructure",
-        "pebble/robots/goob/incoming",
-        "pebble/robots/goob/incoming/",
-        "pebble/robots/goob/sideways/online",
-        "pebble/robots//outgoing/online",
-        "$SYS/robots/goob/outgoing/online",
+        *("", "pebble/infrastructure", "pebble/robots/goob/incoming", "pebble/robots/goob/incoming/"),
+        *("pebble/robots/goob/sideways/online", "pebble/robots//outgoing/online", "$SYS/robots/goob/outgoing/online"),
         "/pebble/robots/goob/outgoing/online",
     ],
 )

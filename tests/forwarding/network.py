@@ -80,13 +80,7 @@ class Client(MemoryTransport):
         self._node.detach(self)
 
     def publish(
-        self,
-        topic: str,
-        payload: bytes,
-        *,
-        qos: QoS = QoS.LATEST,
-        retain: bool = False,
-        **_options: bool,
+        self, topic: str, payload: bytes, *, qos: QoS = QoS.LATEST, retain: bool = False, **_options: bool
     ) -> bool:
         self._node.distribute(Message(topic, payload, qos, retain_requested=retain), self)
         return True

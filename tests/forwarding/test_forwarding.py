@@ -52,38 +52,31 @@ def grows_no_more(fill: Callable[[int], None], number: int) -> bool:
 
 
 class TestLoopbackFilter:
-    def test_are_distinguished_from_messages_of_others(self) -> None:
-        loopback = LoopbackFilter(Clock())
-        for payload in (b"1", b"0", b"1"):
-            loopback.expect("t", payload)
-        assert [loopback.is_echo("t", payload) for payload in (b"1", b"2", b"0", b"1", b"1")] == [
-            True, False, True, True, False,
-        ]  # fmt: skip
-
-    def test_topics_do_not_mix(self) -> None:
-        loopback = LoopbackFilter(Clock())
-        loopback.expect("t", b"1")
-        assert not loopback.is_echo("u", b"1")
-
-    def test_lost_ones_are_passed_over(self) -> None:
-        loopback = LoopbackFilter(Clock())
-        for payload in (b"1", b"0"):
-            loopback.expect("t", payload)
-        assert loopback.is_echo("t", b"0")
-        assert not loopback.is_echo("t", b"1")
-
-    def test_expire(self) -> None:
-        clock = Clock()
+    @pytest.mark.parametrize(
+        ("history", "echoes"),
+        [
+            ("t+1 t+0 t+1 t?1 t?2 t?0 t?1 t?1", "yes no yes yes no"),  # not those of others
+            ("t+1 u?1", "no"),  # topics do not mix
+            ("t+1 t+0 t?0 t?1", "yes no"),  # lost ones are passed over
+            ("t+1 late t?1", "no"),
+            ("t+1 unsent t?1", "no"),  # what was not sent does not come back
+        ],
+    )
+    def test_histories(self, history: str, echoes: str) -> None:
+        """A topic and a payload: ``+`` is to be sent, ``?`` was received."""
+        clock, found = Clock(), list[bool]()
         loopback = LoopbackFilter(clock)
-        loopback.expect("t", b"1")
-        clock.now += EXPIRY_S + 0.1
-        assert not loopback.is_echo("t", b"1")
-
-    def test_what_was_not_sent_does_not_come_back(self) -> None:
-        loopback = LoopbackFilter(Clock())
-        loopback.expect("t", b"1")
-        loopback.forget("t")
-        assert not loopback.is_echo("t", b"1")
+        for word in history.split():
+            match word[1], word[2:].encode():
+                case "+", payload:
+                    loopback.expect(word[0], payload)
+                case "?", payload:
+                    found.append(loopback.is_echo(word[0], payload))
+                case "n", _:
+                    loopback.forget("t")
+                case _:
+                    clock.now += EXPIRY_S + 0.1
+        assert found == [word == "yes" for word in echoes.split()]
 
     def test_many_topics_take_no_memory(self) -> None:
         loopback = LoopbackFilter(Clock())
@@ -261,12 +254,7 @@ class TestReconciliation:
             who, _, payload = word.partition(":")
             side = REMOTE if who in "RrB" else LOCAL
             resolution = reconciliation.receive(
-                side,
-                "t",
-                payload.encode(),
-                retained=who.isupper(),
-                other_away=who == "x",
-                went_back=who in "AB",
+                side, "t", payload.encode(), retained=who.isupper(), other_away=who == "x", went_back=who in "AB"
             )
             given.append(resolution)
         assert given == [Resolution[name.upper()] for name in resolutions]

@@ -46,142 +46,77 @@ ACTION = forward(urgent=True)
 FLAGS = ("incoming/flags/remote-mirror", "incoming/flags/mqtt-audio", "incoming/flags/mqtt-video")
 ACTIONS = ("incoming/flags/reboot", "incoming/flags/service-restart", "incoming/flags/git-pull")
 COMMANDS = (
-    "incoming/drive-values",
-    "incoming/estop",
-    "incoming/estop-reset",
-    "incoming/lights-solid",
-    "incoming/lights-flash",
-    "incoming/front-camera",
-    "incoming/audio",
-    "incoming/soundboard-command",
-    "incoming/autonomy-command",
-    "incoming/outlets/o1/power",
-    "incoming/mcu/imu-1/reset",
-    "incoming/mip-raw",
+    *("incoming/drive-values", "incoming/estop", "incoming/estop-reset", "incoming/lights-solid"),
+    *("incoming/lights-flash", "incoming/front-camera", "incoming/audio", "incoming/soundboard-command"),
+    *("incoming/autonomy-command", "incoming/outlets/o1/power", "incoming/mcu/imu-1/reset", "incoming/mip-raw"),
 )
 
 
-class TestLocalOutgoing:
-    """Row 1: {base}/outgoing/# is always forwarded to remote, same QoS, retained as published."""
-
-    @pytest.mark.parametrize("qos", [0, 1])
-    @pytest.mark.parametrize("retain_requested", [False, True])
-    @pytest.mark.parametrize("suffix", ["outgoing/status", "outgoing/wheel-odometry", "outgoing/somebody/elses/metric"])
-    def test_is_forwarded_as_published(self, suffix: str, retain_requested: bool, qos: int) -> None:
-        assert routed(LOCAL, suffix, qos=qos, retain_requested=retain_requested) == forward(
-            qos, retain=retain_requested
-        )
-
-    @pytest.mark.parametrize("suffix", ["outgoing/heartbeat", "outgoing/status", "outgoing/charging-level"])
-    def test_compatibility_topics_too(self, suffix: str) -> None:
-        assert routed(LOCAL, suffix, retain_requested=True) == forward(retain=True)
-
-    def test_a_retained_message_stays_retained(self) -> None:
-        assert routed(LOCAL, "outgoing/capabilities", retain=True) == forward(retain=True)
-
-    def test_where_the_broker_hides_it_the_contract_knows(self) -> None:
-        assert routed(LOCAL, "outgoing/capabilities", retain_requested=None) == forward(retain=True)
-        assert routed(LOCAL, "outgoing/wheel-odometry", retain_requested=None) == forward(retain=False)
-        assert routed(LOCAL, "outgoing/strange", retain_requested=None) == forward(retain=False)
-
-    def test_every_channel_that_may_leave_leaves(self) -> None:
-        leaving = [c for c in CHANNELS if c.direction == OUTGOING and c.remote and c.bridged]
-        assert {type(routed(LOCAL, c.suffix.format(uid="u", name="n", outlet="o1", owner="mcu"))) for c in leaving} == {
-            Forward
-        }
-
-    def test_what_stays_on_the_robot_stays(self) -> None:
-        assert routed(LOCAL, "outgoing/sensors/imu-fast", qos=0) is Drop.STAYS
-
-    @pytest.mark.parametrize("suffix", ["outgoing/front-camera", "outgoing/audio"])
-    def test_media_goes_its_own_way(self, suffix: str) -> None:
-        assert routed(LOCAL, suffix, qos=0) is Drop.MEDIA
-
-
-class TestRemoteIncoming:
-    """Row 2: {base}/incoming/# is always forwarded to local, except incoming/audio-stream."""
-
-    @pytest.mark.parametrize("suffix", COMMANDS)
-    @pytest.mark.parametrize("mirroring", [False, True])
-    def test_commands_are_forwarded(self, suffix: str, mirroring: bool) -> None:
-        expected = DRIVE if suffix == "incoming/drive-values" else COMMAND
-        assert routed(REMOTE, suffix, mirroring=mirroring) == expected
-
-    @pytest.mark.parametrize("suffix", ACTIONS)
-    def test_actions_are_forwarded_but_not_retained(self, suffix: str) -> None:
-        assert routed(REMOTE, suffix) == ACTION
-
-    @pytest.mark.parametrize("suffix", FLAGS)
-    @pytest.mark.parametrize("retain_requested", [None, False, True])
-    def test_flags_are_forwarded_as_retained(self, suffix: str, retain_requested: bool | None) -> None:
-        assert routed(REMOTE, suffix, retain_requested=retain_requested) == FLAG
-
-    @pytest.mark.parametrize("suffix", FLAGS)
-    def test_retained_flags_too(self, suffix: str) -> None:
-        assert routed(REMOTE, suffix, retain=True) == FLAG
-
-    def test_an_unknown_flag_is_retained_as_published(self) -> None:
-        assert routed(REMOTE, "incoming/flags/night", retain_requested=True) == forward(retain=True, urgent=True)
-        assert routed(REMOTE, "incoming/flags/night", retain=True) == forward(retain=True, urgent=True)
-        assert routed(REMOTE, "incoming/flags/night", retain_requested=False) == forward(urgent=True)
-
-    def test_a_known_command_gets_its_quality(self) -> None:
-        assert routed(REMOTE, "incoming/drive-values", qos=0) == DRIVE
-        assert routed(REMOTE, "incoming/strange", qos=0) == forward(0, urgent=True)
-
-    @pytest.mark.parametrize("side", list(Side))
-    @pytest.mark.parametrize("mirroring", [False, True])
-    def test_the_audio_stream_is_not_bridged(self, side: Side, mirroring: bool) -> None:
-        assert routed(side, "incoming/audio-stream", qos=0, mirroring=mirroring) is Drop.MEDIA
+NIGHT, STRANGE = ("incoming/flags/night",), ("incoming/strange",)
+OUT = tuple(f"outgoing/{one}" for one in ("status", "wheel-odometry", "somebody/elses/metric", "heartbeat"))
+REQUESTED, RETAINED, HIDDEN = {"retain_requested": True}, {"retain": True}, {"retain_requested": None}
+Row = tuple[Side, tuple[str, ...], dict[str, Any], Forward | Drop]
+#: By its rows: the side, topics, how they are published, and what becomes of it, whether or not remote-mirror is on.
+A1: list[Row] = [
+    # 1: outgoing/# is always forwarded to remote, same QoS, retained as published
+    *((LOCAL, OUT, {"qos": qos}, forward(qos)) for qos in (0, 1)),
+    *((LOCAL, OUT, {"qos": qos, **REQUESTED}, forward(qos, retain=True)) for qos in (0, 1)),
+    *((LOCAL, ("outgoing/capabilities",), how, forward(retain=True)) for how in (RETAINED, HIDDEN)),
+    (LOCAL, ("outgoing/wheel-odometry", "outgoing/strange"), HIDDEN, forward()),  # the contract knows
+    (LOCAL, ("outgoing/sensors/imu-fast",), {"qos": 0}, Drop.STAYS),
+    (LOCAL, ("outgoing/front-camera", "outgoing/audio"), {"qos": 0}, Drop.MEDIA),
+    # 2: incoming/# is always forwarded to local, except incoming/audio-stream
+    (REMOTE, COMMANDS[1:], {}, COMMAND),
+    *((REMOTE, COMMANDS[:1], how, DRIVE) for how in ({}, {"qos": 0}, HIDDEN)),
+    (REMOTE, STRANGE, {"qos": 0}, forward(0, urgent=True)),
+    (REMOTE, ACTIONS, {}, ACTION),
+    *((REMOTE, FLAGS, how, FLAG) for how in ({}, REQUESTED, HIDDEN, RETAINED)),
+    *((REMOTE, NIGHT, how, FLAG) for how in (REQUESTED, RETAINED)),
+    (REMOTE, NIGHT, {}, forward(urgent=True)),
+    *((side, ("incoming/audio-stream",), {"qos": 0}, Drop.MEDIA) for side in Side),
+    # 3: outgoing/# is never forwarded back into local
+    *((REMOTE, (*OUT, "outgoing/online", "outgoing/logs"), how, Drop.ONE_WAY) for how in ({}, RETAINED)),
+    # 4: incoming/flags/# is always mirrored to remote
+    (LOCAL, FLAGS, {}, FLAG),
+    (LOCAL, ACTIONS, {}, ACTION),
+    (LOCAL, NIGHT, REQUESTED, FLAG),
+    # What happens once is never forwarded if it is retained, or was published to be retained
+    *((side, (*COMMANDS, *ACTIONS), how, Drop.STALE) for side in Side for how in (RETAINED, REQUESTED)),
+]
+#: On the robot's own broker: everything both ways, fast topics included; media not.
+ON_THE_ROBOT: list[Row] = [
+    *((side, ("outgoing/status",), REQUESTED, forward(retain=True)) for side in Side),
+    *((side, ("outgoing/sensors/imu-fast", "outgoing/strange"), {"qos": 0}, forward(0)) for side in Side),
+    *((side, COMMANDS, {}, COMMAND) for side in Side),
+    *((side, ACTIONS, {}, ACTION) for side in Side),
+    *((side, FLAGS, {}, FLAG) for side in Side),
+    *((side, ("outgoing/front-camera", "outgoing/audio", "incoming/audio-stream"), {}, Drop.MEDIA) for side in Side),
+    *((side, (*COMMANDS, *ACTIONS), how, Drop.STALE) for side in Side for how in (RETAINED, REQUESTED)),
+]
 
 
-class TestRemoteOutgoing:
-    """Row 3: {base}/outgoing/# is never forwarded back into local."""
-
-    @pytest.mark.parametrize("suffix", ["outgoing/status", "outgoing/online", "outgoing/strange", "outgoing/logs"])
-    @pytest.mark.parametrize("retain", [False, True])
-    @pytest.mark.parametrize("mirroring", [False, True])
-    def test_never(self, suffix: str, retain: bool, mirroring: bool) -> None:
-        assert routed(REMOTE, suffix, retain=retain, mirroring=mirroring) is Drop.ONE_WAY
-
-
-class TestLocalFlags:
-    """Row 4: {base}/incoming/flags/# is always mirrored to remote."""
-
-    @pytest.mark.parametrize("suffix", FLAGS)
-    @pytest.mark.parametrize("mirroring", [False, True])
-    def test_flags(self, suffix: str, mirroring: bool) -> None:
-        assert routed(LOCAL, suffix, mirroring=mirroring) == FLAG
-
-    @pytest.mark.parametrize("suffix", ACTIONS)
-    def test_actions(self, suffix: str) -> None:
-        assert routed(LOCAL, suffix) == ACTION
-
-    def test_strangers(self) -> None:
-        assert routed(LOCAL, "incoming/flags/night", retain_requested=True) == forward(retain=True, urgent=True)
+@pytest.mark.parametrize("mirroring", [False, True])
+@pytest.mark.parametrize(
+    ("rules", "row"), [*((TABLE_A1, row) for row in A1), *((MIRROR, row) for row in ON_THE_ROBOT)], ids=lambda _: ""
+)
+def test_tables(rules: Rules, row: Row, mirroring: bool) -> None:
+    side, suffixes, how, expected = row
+    found = {suffix: routed(side, suffix, rules=rules, mirroring=mirroring, **how) for suffix in suffixes}
+    assert found == dict.fromkeys(suffixes, expected)
 
 
-class TestLocalIncoming:
-    """Row 5: other {base}/incoming/# is mirrored only while incoming/flags/remote-mirror is true."""
-
-    @pytest.mark.parametrize("suffix", COMMANDS)
-    def test_only_while_mirroring(self, suffix: str) -> None:
-        assert routed(LOCAL, suffix) is Drop.NOT_MIRRORED
-        assert routed(LOCAL, suffix, mirroring=True) == COMMAND
+def test_every_channel_that_may_leave_leaves() -> None:
+    leaving = [c for c in CHANNELS if c.direction == OUTGOING and c.remote and c.bridged]
+    assert {type(routed(LOCAL, c.suffix.format(uid="u", name="n", outlet="o1", owner="mcu"))) for c in leaving} == {
+        Forward
+    }
 
 
-class TestRetainedOneShots:
-    """What happens once is never forwarded if it is retained, or was published to be retained."""
-
-    @pytest.mark.parametrize("suffix", [*COMMANDS, *ACTIONS])
-    @pytest.mark.parametrize("side", list(Side))
-    @pytest.mark.parametrize("rules", [TABLE_A1, MIRROR], ids=["bridge", "mirror"])
-    def test_neither_way(self, rules: Rules, side: Side, suffix: str) -> None:
-        assert routed(side, suffix, rules=rules, retain=True, mirroring=True) is Drop.STALE
-        assert routed(side, suffix, rules=rules, retain_requested=True, mirroring=True) is Drop.STALE
-
-    def test_executed_where_the_broker_hides_it(self) -> None:
-        assert routed(REMOTE, "incoming/drive-values", retain_requested=None) == DRIVE
+@pytest.mark.parametrize("suffix", COMMANDS)
+def test_local_commands_are_mirrored_only_while_remote_mirror_is_on(suffix: str) -> None:
+    """Row 5 of Table A.1."""
+    assert routed(LOCAL, suffix) is Drop.NOT_MIRRORED
+    assert routed(LOCAL, suffix, mirroring=True) == COMMAND
 
 
 class TestOthers:
@@ -190,14 +125,9 @@ class TestOthers:
     @pytest.mark.parametrize(
         "topic",
         [
-            "/pebble/robots/goob/incoming/drive-values",
-            "/pebble/robots/rover2/outgoing/status",
-            "/pebble/robots/rover",
-            f"/{BASE}/incoming",
-            f"/{BASE}/elsewhere/x",
-            "/pebble/infrastructure",
-            "/other/robots/rover/incoming/drive-values",
-            "/drive-values",
+            *("/pebble/robots/goob/incoming/drive-values", "/pebble/robots/rover2/outgoing/status"),
+            *("/pebble/robots/rover", f"/{BASE}/incoming", f"/{BASE}/elsewhere/x", "/pebble/infrastructure"),
+            *("/other/robots/rover/incoming/drive-values", "/drive-values"),
         ],
     )
     def test_other_topics_never_pass(self, topic: str, side: Side, rules: Rules) -> None:
@@ -272,24 +202,6 @@ class TestFilters:
         for number in range(10_000):
             assert subjects[f"{BASE}/outgoing/n{number}"] is not None
         assert len(subjects) < 5000
-
-
-class TestMirrorTable:
-    """On the robot's own broker: everything both ways, fast topics included; media not."""
-
-    @pytest.mark.parametrize("side", list(Side))
-    def test_both_ways(self, side: Side) -> None:
-        assert routed(side, "outgoing/status", rules=MIRROR, retain_requested=True) == forward(retain=True)
-        assert routed(side, "outgoing/sensors/imu-fast", rules=MIRROR, qos=0) == forward(0)
-        assert routed(side, "incoming/drive-values", rules=MIRROR) == COMMAND
-        assert routed(side, "incoming/flags/reboot", rules=MIRROR) == ACTION
-        assert routed(side, "incoming/flags/mqtt-video", rules=MIRROR) == FLAG
-        assert routed(side, "outgoing/strange", rules=MIRROR, qos=0) == forward(0)
-
-    @pytest.mark.parametrize("side", list(Side))
-    @pytest.mark.parametrize("suffix", ["outgoing/front-camera", "outgoing/audio", "incoming/audio-stream"])
-    def test_media_stays_away(self, side: Side, suffix: str) -> None:
-        assert routed(side, suffix, rules=MIRROR) is Drop.MEDIA
 
 
 def test_the_tables_name_every_kind() -> None:

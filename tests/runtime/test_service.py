@@ -39,6 +39,7 @@ from pebble.transports.memory import MemoryHub, MemoryTransport
 from tests.support import until
 
 BASE = "pebble/robots/rover"
+SOUND = f"{BASE}/incoming/soundboard-command"
 DRIVE_TOPIC, REBOOT_TOPIC = f"{BASE}/incoming/drive-values", f"{BASE}/incoming/flags/reboot"
 CHARGING_TOPIC = f"{BASE}/outgoing/charging-status"
 
@@ -127,6 +128,12 @@ class Robot:
     def publish(self, topic: str, payload: str, *, retain: bool = False) -> None:
         assert self.operator.publish(topic, payload.encode(), qos=QoS.DELIVERED, retain=retain)
 
+    def keep_busy(self, topic: str, payload: str, seen: Any) -> None:
+        """Have the service wait inside the handler of this message, until it may go on."""
+        self.service.go_on.clear()
+        self.publish(topic, payload)
+        assert self.saw(seen)
+
     def saw(self, *expected: Any) -> bool:
         return until(lambda: self.service.seen == list(expected))
 
@@ -163,14 +170,19 @@ def robot() -> Iterator[Robot]:
     made.close()
 
 
+@pytest.fixture
+def running(robot: Robot) -> Robot:
+    robot.start()
+    return robot
+
+
 # -- life
 
 
-def test_hardware_opens_before_the_transport_and_is_safe_before_it_closes(robot: Robot) -> None:
-    robot.start()
-    robot.end()
-    assert robot.service.life == ["start closed", "stop connected"]
-    assert robot.service.transport.state is State.CLOSED
+def test_hardware_opens_before_the_transport_and_is_safe_before_it_closes(running: Robot) -> None:
+    running.end()
+    assert running.service.life == ["start closed", "stop connected"]
+    assert running.service.transport.state is State.CLOSED
 
 
 def test_a_message_that_a_handler_fails_on_is_counted_and_ends_nothing(caplog: pytest.LogCaptureFixture) -> None:
@@ -196,15 +208,14 @@ def test_a_message_that_a_handler_fails_on_is_counted_and_ends_nothing(caplog: p
     assert robot.error is None
 
 
-def test_what_a_message_requires_ends_nothing_either(robot: Robot, caplog: pytest.LogCaptureFixture) -> None:
+def test_what_a_message_requires_ends_nothing_either(running: Robot, caplog: pytest.LogCaptureFixture) -> None:
     def fail() -> None:
         raise RuntimeError("the reaction failed")
 
-    robot.start()
-    robot.service.post_message(MQTT_VIDEO, fail, newest_of="reaction")
-    assert until(lambda: robot.service.counters["handler_errors"] == 1)
-    robot.service.post_message(MQTT_VIDEO, lambda: robot.service.seen.append("reacted"))
-    assert robot.saw("reacted")
+    running.service.post_message(MQTT_VIDEO, fail, newest_of="reaction")
+    assert until(lambda: running.service.counters["handler_errors"] == 1)
+    running.service.post_message(MQTT_VIDEO, lambda: running.service.seen.append("reacted"))
+    assert running.saw("reacted")
     assert [record.message for record in caplog.records] == ["failed on a message on flags/mqtt-video (1 so far)"]
 
 
@@ -262,34 +273,29 @@ def test_quit_before_run_ends_at_once(robot: Robot) -> None:
     assert [entry.split()[0] for entry in robot.service.life] == ["start", "stop"]
 
 
-def test_what_waits_when_the_service_quits_is_not_executed(robot: Robot) -> None:
-    robot.start()
-    robot.service.go_on.clear()
-    robot.publish(DRIVE_TOPIC, '{"x": 0.5}')
-    assert robot.saw(0.5)
-    robot.publish(REBOOT_TOPIC, "true")
-    assert until(lambda: robot.service.transport.counters["delivered"] == 2)
-    robot.end()
-    assert robot.service.seen == [0.5]
+def test_what_waits_when_the_service_quits_is_not_executed(running: Robot) -> None:
+    running.keep_busy(DRIVE_TOPIC, '{"x": 0.5}', 0.5)
+    running.publish(REBOOT_TOPIC, "true")
+    assert until(lambda: running.service.transport.counters["delivered"] == 2)
+    running.end()
+    assert running.service.seen == [0.5]
 
 
-def test_everything_runs_on_one_thread(robot: Robot) -> None:
-    robot.start()
-    robot.publish(DRIVE_TOPIC, '{"x": 0.5}')
-    assert robot.saw(0.5)
-    robot.on_service_thread(lambda: robot.service.threads.add(threading.get_ident()))
-    assert until(lambda: robot.service.ticks > 3)
-    assert len(robot.service.threads) == 1
-    assert threading.get_ident() not in robot.service.threads
+def test_everything_runs_on_one_thread(running: Robot) -> None:
+    running.publish(DRIVE_TOPIC, '{"x": 0.5}')
+    assert running.saw(0.5)
+    running.on_service_thread(lambda: running.service.threads.add(threading.get_ident()))
+    assert until(lambda: running.service.ticks > 3)
+    assert len(running.service.threads) == 1
+    assert threading.get_ident() not in running.service.threads
 
 
-def test_timers_go_on_under_a_flood_and_calls_come_when_they_are_due(robot: Robot) -> None:
-    robot.start()
+def test_timers_go_on_under_a_flood_and_calls_come_when_they_are_due(running: Robot) -> None:
     called: list[float] = []
     due = time.monotonic() + 0.05
-    robot.on_service_thread(lambda: robot.service.call_at(due, lambda: called.append(time.monotonic())))
-    before = robot.service.ticks
-    assert until(lambda: robot.publish(DRIVE_TOPIC, '{"x": 0.1}') or (called and robot.service.ticks > before))
+    running.on_service_thread(lambda: running.service.call_at(due, lambda: called.append(time.monotonic())))
+    before = running.service.ticks
+    assert until(lambda: running.publish(DRIVE_TOPIC, '{"x": 0.1}') or (called and running.service.ticks > before))
     assert called[0] >= due
 
 
@@ -405,86 +411,73 @@ def test_a_service_that_has_ended_takes_no_work(idle: Robot) -> None:
 # -- receiving
 
 
-def test_of_several_waiting_drive_commands_only_the_newest_is_handled(robot: Robot) -> None:
-    robot.start()
-    robot.service.go_on.clear()
-    robot.publish(DRIVE_TOPIC, '{"x": 0.01}')
-    assert robot.saw(0.01)
+def test_of_several_waiting_drive_commands_only_the_newest_is_handled(running: Robot) -> None:
+    running.service.go_on.clear()
+    running.publish(DRIVE_TOPIC, '{"x": 0.01}')
+    assert running.saw(0.01)
     for number in range(1, 100):
-        robot.publish(DRIVE_TOPIC, f'{{"x": {number / 100}}}')
-    robot.publish(REBOOT_TOPIC, "true")
-    assert until(lambda: robot.service.transport.counters["delivered"] == 101)
-    robot.service.go_on.set()
-    assert robot.saw(0.01, 0.99, "reboot True")
+        running.publish(DRIVE_TOPIC, f'{{"x": {number / 100}}}')
+    running.publish(REBOOT_TOPIC, "true")
+    assert until(lambda: running.service.transport.counters["delivered"] == 101)
+    running.service.go_on.set()
+    assert running.saw(0.01, 0.99, "reboot True")
 
 
-def test_a_steering_command_that_waited_too_long_is_dropped(robot: Robot) -> None:
-    robot.start()
-    robot.service.go_on.clear()
-    robot.publish(f"{BASE}/incoming/soundboard-command", '{"action": "play", "file": "a"}')
-    assert robot.saw("a")
-    robot.publish(DRIVE_TOPIC, '{"x": 0.5}')
-    robot.publish(f"{BASE}/incoming/soundboard-command", '{"action": "play", "file": "b"}')
-    assert until(lambda: robot.service.transport.counters["delivered"] == 3)
-    robot.ahead_s = 0.6
-    robot.service.go_on.set()
-    assert robot.saw("a", "b")
-    robot.publish(DRIVE_TOPIC, '{"x": 0.25}')
-    assert robot.saw("a", "b", 0.25)
-    assert robot.service.counters["late"] == 1
+def test_a_steering_command_that_waited_too_long_is_dropped(running: Robot) -> None:
+    running.keep_busy(SOUND, '{"action": "play", "file": "a"}', "a")
+    running.publish(DRIVE_TOPIC, '{"x": 0.5}')
+    running.publish(SOUND, '{"action": "play", "file": "b"}')
+    assert until(lambda: running.service.transport.counters["delivered"] == 3)
+    running.ahead_s = 0.6
+    running.service.go_on.set()
+    assert running.saw("a", "b")
+    running.publish(DRIVE_TOPIC, '{"x": 0.25}')
+    assert running.saw("a", "b", 0.25)
+    assert running.service.counters["late"] == 1
 
 
 def test_a_command_that_waited_while_the_machine_was_suspended_is_dropped(
-    robot: Robot, monkeypatch: pytest.MonkeyPatch
+    running: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A message waits in the inbox or before; the service's own clock may have stood still meanwhile."""
     now = clock.since_boot
-    robot.start()
-    robot.service.go_on.clear()
-    robot.publish(f"{BASE}/incoming/soundboard-command", '{"action": "play", "file": "a"}')
-    assert robot.saw("a")
-    robot.publish(DRIVE_TOPIC, '{"x": 0.5}')
-    assert until(lambda: robot.service.transport.counters["delivered"] == 2)
+    running.keep_busy(SOUND, '{"action": "play", "file": "a"}', "a")
+    running.publish(DRIVE_TOPIC, '{"x": 0.5}')
+    assert until(lambda: running.service.transport.counters["delivered"] == 2)
     monkeypatch.setattr(clock, "since_boot", lambda: now() + 3600)
-    robot.service.go_on.set()
-    assert until(lambda: robot.service.counters["late"] == 1)
-    robot.publish(DRIVE_TOPIC, '{"x": 0.25}')
-    assert robot.saw("a", 0.25)
+    running.service.go_on.set()
+    assert until(lambda: running.service.counters["late"] == 1)
+    running.publish(DRIVE_TOPIC, '{"x": 0.25}')
+    assert running.saw("a", 0.25)
 
 
-def test_a_flood_of_commands_that_wait_does_not_push_out_the_one_that_ends_something(robot: Robot) -> None:
-    robot.start()
-    robot.service.go_on.clear()
-    sound = f"{BASE}/incoming/soundboard-command"
-    robot.publish(sound, '{"action": "play", "file": "a"}')
-    assert robot.saw("a")
-    robot.publish(sound, '{"action": "Stop", "file": "the end"}')
+def test_a_flood_of_commands_that_wait_does_not_push_out_the_one_that_ends_something(running: Robot) -> None:
+    running.keep_busy(SOUND, '{"action": "play", "file": "a"}', "a")
+    running.publish(SOUND, '{"action": "Stop", "file": "the end"}')
     for number in range(1500):
-        robot.publish(sound, f'{{"action": "nonsense", "file": "{number}"}}')
-    assert until(lambda: robot.service.transport.counters["delivered"] == 1502)
-    robot.service.go_on.set()
-    assert until(lambda: robot.service.seen[-1] == "1499")
-    assert robot.service.seen[1:3] == ["the end", "501"]
+        running.publish(SOUND, f'{{"action": "nonsense", "file": "{number}"}}')
+    assert until(lambda: running.service.transport.counters["delivered"] == 1502)
+    running.service.go_on.set()
+    assert until(lambda: running.service.seen[-1] == "1499")
+    assert running.service.seen[1:3] == ["the end", "501"]
 
 
-def test_a_command_that_waited_in_the_transport_is_dropped(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
-    robot.start()
-    monkeypatch.setattr(robot.hub, "now", lambda: clock.since_boot() - 0.6)
-    robot.publish(DRIVE_TOPIC, '{"x": 0.5}')
-    assert until(lambda: robot.service.counters["late"] == 1)
+def test_a_command_that_waited_in_the_transport_is_dropped(running: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(running.hub, "now", lambda: clock.since_boot() - 0.6)
+    running.publish(DRIVE_TOPIC, '{"x": 0.5}')
+    assert until(lambda: running.service.counters["late"] == 1)
     monkeypatch.undo()
-    robot.publish(DRIVE_TOPIC, '{"x": 0.25}')
-    assert robot.saw(0.25)
+    running.publish(DRIVE_TOPIC, '{"x": 0.25}')
+    assert running.saw(0.25)
 
 
-def test_commands_that_must_all_be_handled_are(robot: Robot) -> None:
-    robot.start()
-    robot.service.go_on.clear()
-    robot.publish(DRIVE_TOPIC, '{"x": 0.5}')
+def test_commands_that_must_all_be_handled_are(running: Robot) -> None:
+    running.service.go_on.clear()
+    running.publish(DRIVE_TOPIC, '{"x": 0.5}')
     for name in ("a", "b", "c"):
-        robot.publish(f"{BASE}/incoming/soundboard-command", f'{{"action": "play", "file": "{name}"}}')
-    robot.service.go_on.set()
-    assert robot.saw(0.5, "a", "b", "c")
+        running.publish(SOUND, f'{{"action": "play", "file": "{name}"}}')
+    running.service.go_on.set()
+    assert running.saw(0.5, "a", "b", "c")
 
 
 @pytest.mark.parametrize(
@@ -492,7 +485,7 @@ def test_commands_that_must_all_be_handled_are(robot: Robot) -> None:
     [
         (DRIVE_TOPIC, '{"x": 1}'),
         (REBOOT_TOPIC, "true"),
-        (f"{BASE}/incoming/soundboard-command", '{"action": "play", "file": "a"}'),
+        (SOUND, '{"action": "play", "file": "a"}'),
     ],
 )
 def test_retained_commands_are_refused_and_live_ones_are_not(robot: Robot, topic: str, payload: str) -> None:
@@ -515,32 +508,28 @@ def test_a_retained_flag_is_the_last_position_of_a_switch(robot: Robot) -> None:
 
 
 def test_a_malformed_message_is_counted_logged_once_and_replaces_nothing(
-    robot: Robot, caplog: pytest.LogCaptureFixture
+    running: Robot, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.WARNING)
-    robot.start()
-    robot.service.go_on.clear()
-    robot.publish(DRIVE_TOPIC, '{"x": 0.5}')
-    assert robot.saw(0.5)
-    robot.publish(DRIVE_TOPIC, '{"x": 0}')  # a stop, which must not be lost to what follows
+    running.keep_busy(DRIVE_TOPIC, '{"x": 0.5}', 0.5)
+    running.publish(DRIVE_TOPIC, '{"x": 0}')  # a stop, which must not be lost to what follows
     for _ in range(100):
-        robot.publish(DRIVE_TOPIC, '{"x": NaN}')
-    assert until(lambda: robot.service.counters["refused"] == 100)
-    robot.service.go_on.set()
-    assert robot.saw(0.5, 0.0)
+        running.publish(DRIVE_TOPIC, '{"x": NaN}')
+    assert until(lambda: running.service.counters["refused"] == 100)
+    running.service.go_on.set()
+    assert running.saw(0.5, 0.0)
     lines = [record.message for record in caplog.records if "refused a message" in record.message]
     assert len(lines) == 1
     assert lines[0].endswith("(1 so far)")
 
 
-def test_white_space_is_ignored_silently(robot: Robot, caplog: pytest.LogCaptureFixture) -> None:
+def test_white_space_is_ignored_silently(running: Robot, caplog: pytest.LogCaptureFixture) -> None:
     """By such payloads bridges look for cycles."""
-    robot.start()
-    for topic in (DRIVE_TOPIC, f"{BASE}/incoming/soundboard-command", REBOOT_TOPIC):
-        robot.publish(topic, " \t\n" * 8)
-    assert until(lambda: robot.service.counters["blank"] == 3)
-    assert robot.service.seen == []
-    assert robot.service.counters["refused"] == 0
+    for topic in (DRIVE_TOPIC, SOUND, REBOOT_TOPIC):
+        running.publish(topic, " \t\n" * 8)
+    assert until(lambda: running.service.counters["blank"] == 3)
+    assert running.service.seen == []
+    assert running.service.counters["refused"] == 0
     assert "refused" not in caplog.text
 
 
@@ -564,13 +553,12 @@ def charging(value: bool) -> ChargingStatus:
     return ChargingStatus(value=value)
 
 
-def test_delivery_follows_the_channel(robot: Robot) -> None:
-    robot.start()
+def test_delivery_follows_the_channel(running: Robot) -> None:
     touch = TouchSensors(value=TouchValues(a0=1, a1=2, a2=3))
-    robot.on_service_thread(lambda: robot.service.publish(CHARGING_STATUS, charging(True)))
-    robot.on_service_thread(lambda: robot.service.publish(TOUCH_SENSORS, touch))
-    assert until(lambda: len(robot.received) == 2)
-    state, stream = robot.received
+    running.on_service_thread(lambda: running.service.publish(CHARGING_STATUS, charging(True)))
+    running.on_service_thread(lambda: running.service.publish(TOUCH_SENSORS, touch))
+    assert until(lambda: len(running.received) == 2)
+    state, stream = running.received
     assert (state.topic, state.payload, state.qos, state.retain_requested) == (
         CHARGING_TOPIC,
         b'{"value":true}',
@@ -584,26 +572,23 @@ def test_delivery_follows_the_channel(robot: Robot) -> None:
     )
 
 
-def test_the_handler_of_a_pattern_receives_the_names_in_the_topic(robot: Robot) -> None:
-    robot.start()
-    robot.publish(MEDIA_REPORT.topic(BASE, program="camera_publisher"), '{"running": true}')
-    robot.publish(MEDIA_REPORT.topic(BASE, program="audio_receiver"), '{"running": false}')
-    assert robot.saw(("camera_publisher", True), ("audio_receiver", False))
+def test_the_handler_of_a_pattern_receives_the_names_in_the_topic(running: Robot) -> None:
+    running.publish(MEDIA_REPORT.topic(BASE, program="camera_publisher"), '{"running": true}')
+    running.publish(MEDIA_REPORT.topic(BASE, program="audio_receiver"), '{"running": false}')
+    assert running.saw(("camera_publisher", True), ("audio_receiver", False))
 
 
-def test_a_pattern_without_its_name_is_refused_and_counted(robot: Robot, caplog: pytest.LogCaptureFixture) -> None:
-    robot.start()
+def test_a_pattern_without_its_name_is_refused_and_counted(running: Robot, caplog: pytest.LogCaptureFixture) -> None:
     for _ in range(3):
-        robot.publish(f"{BASE}/outgoing/media-report/", '{"running": true}', retain=True)
-    robot.publish(MEDIA_REPORT.topic(BASE, program="camera_publisher"), '{"running": true}')
-    assert robot.saw(("camera_publisher", True))
-    assert robot.service.counters["refused"] == 3
-    assert robot.service.counters["handler_errors"] == 0
+        running.publish(f"{BASE}/outgoing/media-report/", '{"running": true}', retain=True)
+    running.publish(MEDIA_REPORT.topic(BASE, program="camera_publisher"), '{"running": true}')
+    assert running.saw(("camera_publisher", True))
+    assert running.service.counters["refused"] == 3
+    assert running.service.counters["handler_errors"] == 0
     assert len([record for record in caplog.records if record.message.endswith("media-report/' (1 so far)")]) == 1
 
 
-def test_a_pattern_channel_takes_its_names(robot: Robot) -> None:
-    robot.start()
+def test_a_pattern_channel_takes_its_names(running: Robot) -> None:
     manifest = McuManifest(
         protocol="pebble_serial_v1",
         schema_version=1,
@@ -614,61 +599,58 @@ def test_a_pattern_channel_takes_its_names(robot: Robot) -> None:
         model="nano",
         interfaces=[],
     )
-    robot.on_service_thread(lambda: robot.service.publish(MCU_DESCRIBE, manifest, uid="imu-1"))
-    assert until(lambda: robot.received_on(f"{BASE}/outgoing/mcu/imu-1/describe"))
+    running.on_service_thread(lambda: running.service.publish(MCU_DESCRIBE, manifest, uid="imu-1"))
+    assert until(lambda: running.received_on(f"{BASE}/outgoing/mcu/imu-1/describe"))
 
 
 LAMP = Channel(metric="lab/lamp", kind=Kind.COMMAND, payload=dict[str, Any], doc="Made while running.")
 GLOW = Channel(metric="lab/lamp", kind=Kind.STATE, payload=dict[str, Any], doc="Made while running.")
 
 
-def test_a_channel_made_while_running_is_received_until_its_subscription_is_closed(robot: Robot) -> None:
-    robot.start()
+def test_a_channel_made_while_running_is_received_until_its_subscription_is_closed(running: Robot) -> None:
     subscriptions: list[Subscription] = []
-    robot.on_service_thread(lambda: subscriptions.append(robot.service.listen(LAMP, robot.service.note)))
+    running.on_service_thread(lambda: subscriptions.append(running.service.listen(LAMP, running.service.note)))
     assert until(lambda: subscriptions)
-    robot.publish(f"{BASE}/incoming/lab/lamp", '{"value": {"on": true}}')
-    assert robot.saw({"on": True})
-    robot.publish(f"{BASE}/incoming/lab/lamp", "[]")
-    assert until(lambda: robot.service.counters["refused"] == 1)
+    running.publish(f"{BASE}/incoming/lab/lamp", '{"value": {"on": true}}')
+    assert running.saw({"on": True})
+    running.publish(f"{BASE}/incoming/lab/lamp", "[]")
+    assert until(lambda: running.service.counters["refused"] == 1)
     subscriptions[0].close()
-    robot.publish(f"{BASE}/incoming/lab/lamp", '{"on": false}')
-    robot.publish(DRIVE_TOPIC, '{"x": 0.5}')
-    assert robot.saw({"on": True}, 0.5)
+    running.publish(f"{BASE}/incoming/lab/lamp", '{"on": false}')
+    running.publish(DRIVE_TOPIC, '{"x": 0.5}')
+    assert running.saw({"on": True}, 0.5)
 
 
-def test_retained_state_can_be_retracted_and_is_not_published_again(robot: Robot) -> None:
-    robot.start()
+def test_retained_state_can_be_retracted_and_is_not_published_again(running: Robot) -> None:
     topic = f"{BASE}/outgoing/lab/lamp"
-    robot.on_service_thread(lambda: robot.service.publish(GLOW, {"on": True}))
-    robot.on_service_thread(lambda: robot.service.publish(CHARGING_STATUS, charging(True)))
-    assert until(lambda: robot.received_on(topic) and robot.received_on(CHARGING_TOPIC))
-    assert robot.hub.retained[topic].payload == b'{"on":true}'
-    robot.on_service_thread(lambda: robot.service.retract(GLOW))
-    assert until(lambda: robot.received_on(topic)[-1].payload == b"")
-    assert topic not in robot.hub.retained
-    robot.on_service_thread(lambda: robot.service.retract(GLOW))
-    robot.received.clear()
-    robot.hub.stop(forget=True)
-    assert until(lambda: robot.service.transport.state is State.CONNECTING)
-    robot.hub.start()
-    assert until(lambda: robot.received_on(CHARGING_TOPIC))
-    assert not robot.received_on(topic)
+    running.on_service_thread(lambda: running.service.publish(GLOW, {"on": True}))
+    running.on_service_thread(lambda: running.service.publish(CHARGING_STATUS, charging(True)))
+    assert until(lambda: running.received_on(topic) and running.received_on(CHARGING_TOPIC))
+    assert running.hub.retained[topic].payload == b'{"on":true}'
+    running.on_service_thread(lambda: running.service.retract(GLOW))
+    assert until(lambda: running.received_on(topic)[-1].payload == b"")
+    assert topic not in running.hub.retained
+    running.on_service_thread(lambda: running.service.retract(GLOW))
+    running.received.clear()
+    running.hub.stop(forget=True)
+    assert until(lambda: running.service.transport.state is State.CONNECTING)
+    running.hub.start()
+    assert until(lambda: running.received_on(CHARGING_TOPIC))
+    assert not running.received_on(topic)
 
 
-def test_state_is_published_again_after_a_reconnect_and_streams_are_not(robot: Robot) -> None:
-    robot.start()
+def test_state_is_published_again_after_a_reconnect_and_streams_are_not(running: Robot) -> None:
     touch = TouchSensors(value=TouchValues(a0=1, a1=2, a2=3))
-    robot.on_service_thread(lambda: robot.service.publish(TOUCH_SENSORS, touch))
-    robot.on_service_thread(lambda: robot.service.publish(CHARGING_STATUS, charging(False)))
-    assert until(lambda: len(robot.received) == 2)
-    robot.hub.stop(forget=True)
-    assert until(lambda: robot.service.transport.state is State.CONNECTING)
-    robot.on_service_thread(lambda: robot.service.publish(CHARGING_STATUS, charging(True)))
-    robot.received.clear()
-    robot.hub.start()
-    assert until(lambda: robot.received_on(CHARGING_TOPIC))
-    assert {message.payload for message in robot.received} == {b'{"value":true}'}, "the current state, and no stream"
+    running.on_service_thread(lambda: running.service.publish(TOUCH_SENSORS, touch))
+    running.on_service_thread(lambda: running.service.publish(CHARGING_STATUS, charging(False)))
+    assert until(lambda: len(running.received) == 2)
+    running.hub.stop(forget=True)
+    assert until(lambda: running.service.transport.state is State.CONNECTING)
+    running.on_service_thread(lambda: running.service.publish(CHARGING_STATUS, charging(True)))
+    running.received.clear()
+    running.hub.start()
+    assert until(lambda: running.received_on(CHARGING_TOPIC))
+    assert {message.payload for message in running.received} == {b'{"value":true}'}, "the current state, and no stream"
 
 
 def test_state_is_published_again_on_the_configured_interval() -> None:

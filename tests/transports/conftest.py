@@ -11,34 +11,17 @@ from pathlib import Path
 
 import pytest
 
+from tests.transports.memory_net import MemoryNet
+from tests.transports.mqtt_net import MqttNet
 from tests.transports.net import Net
+from tests.transports.zenoh_net import ZenohNet
 
-
-def _memory(_folder: Path, _client: str) -> Net:
-    from tests.transports.memory_net import MemoryNet
-
-    return MemoryNet()
-
-
-def _mqtt311(folder: Path, client: str) -> Net:
-    from tests.transports.mqtt_net import MqttNet
-
-    return MqttNet(folder, "3.1.1", client)
-
-
-def _mqtt5(folder: Path, client: str) -> Net:
-    from tests.transports.mqtt_net import MqttNet
-
-    return MqttNet(folder, "5", client)
-
-
-def _zenoh(folder: Path, _client: str) -> Net:
-    from tests.transports.zenoh_net import ZenohNet
-
-    return ZenohNet(folder)
-
-
-NETS: dict[str, Callable[[Path, str], Net]] = {"memory": _memory, "mqtt311": _mqtt311, "mqtt5": _mqtt5, "zenoh": _zenoh}
+NETS: dict[str, Callable[[Path, str], Net]] = {
+    "memory": lambda _folder, _client: MemoryNet(),
+    "mqtt311": lambda folder, client: MqttNet(folder, "3.1.1", client),
+    "mqtt5": lambda folder, client: MqttNet(folder, "5", client),
+    "zenoh": lambda folder, _client: ZenohNet(folder),
+}
 _numbers = itertools.count(1)
 
 

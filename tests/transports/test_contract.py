@@ -103,27 +103,8 @@ def test_T02_every_allowed_topic_works(net: Net, base: str) -> None:
     client, received, rooted = net.client("odd-topics"), Received(), Received()
     client.subscribe(f"{base}/#", received)
     client.subscribe(f"/{base}", rooted)
-    topics = [
-        f"{base}/{rest}"
-        for rest in (
-            "",
-            "/",
-            "//x",
-            "*",
-            "a?b",
-            "@x",
-            "%2F",
-            "%",
-            "a b",
-            "ü/語/🤖",
-            "$x",
-            "~",
-            "a/$/b",
-            "**",
-            "{}",
-            "&;'\"\\",
-        )
-    ]
+    odd = ("", "/", "//x", "*", "a?b", "@x", "%2F", "%", "a b", "ü/語/🤖", "$x", "~", "a/$/b", "**", "{}", "&;'\"\\")
+    topics = [f"{base}/{rest}" for rest in odd]
     topics += [f"{base}/" + "x" * (1024 - len(base) - 1), base + "/l" * (199 - base.count("/"))]
     for topic in topics:
         assert client.publish(topic, topic.encode(), qos=DELIVERED, retain=topic.endswith("*"))
@@ -134,46 +115,23 @@ def test_T02_every_allowed_topic_works(net: Net, base: str) -> None:
     assert rooted.until(b"root")
 
 
-BAD_TOPICS = {
-    "empty": "",
-    "plus": "a/+",
-    "plus inside": "a+b",
-    "hash": "a/#",
-    "nul": "a\x00b",
-    "control": "a\x1fb",
-    "delete": "a\x7fb",
-    "c1": "a\x85b",
-    "non-character": "a\ufffeb",
-    "non-character of a higher plane": "a\U0010ffff",
-    "not utf-8": "a\ud800b",
-    "too long": "x" * 1025,
-    "too long in bytes": "ü" * 513,
-    "too deep": "/" * 200,
-    "dollar": "$SYS/x",
-    "not a string": None,
-}
-BAD_FILTERS = {
-    "empty": "",
-    "plus inside": "a+/b",
-    "hash inside": "a#",
-    "hash not last": "a/#/b",
-    "nul": "a\x00b",
-    "control": "a\nb",
-    "non-character": "\ufdd0",
-    "not utf-8": "\udfff",
-    "too long": "x" * 1025,
-    "too deep": "+/" * 200,
-    "shared": "$share/group/a",
-}
+BAD_TOPICS = [
+    *("", "a/+", "a+b", "a/#", "a\x00b", "a\x1fb", "a\x7fb", "a\x85b"),
+    *("a\ufffeb", "a\U0010ffff", "a\ud800b"),  # no characters, and half a one
+    *("x" * 1025, "ü" * 513, "/" * 200, "$SYS/x", None),
+]
+BAD_FILTERS = [
+    *("", "a+/b", "a#", "a/#/b", "a\x00b", "a\nb", "\ufdd0", "\udfff", "x" * 1025, "+/" * 200, "$share/group/a")
+]
 
 
 def test_T02_what_no_transport_may_carry_is_refused_before_anything_is_sent(net: Net, base: str) -> None:
     client = net.client("bad-topics")
     before = client.counters["sent"]
-    for topic in BAD_TOPICS.values():
+    for topic in BAD_TOPICS:
         with pytest.raises(TransportError):
             client.publish(topic, b"x", qos=DELIVERED)  # type: ignore[arg-type]
-    for filter_ in BAD_FILTERS.values():
+    for filter_ in BAD_FILTERS:
         with pytest.raises(TransportError):
             client.subscribe(filter_, Received())
     with pytest.raises(TransportError):

@@ -71,9 +71,7 @@ CLIENTS = [(client, protocol) for client in ("pebble", "paho") for protocol in (
 
 
 @pytest.fixture(params=CLIENTS, ids="-".join)
-def made(
-    request: pytest.FixtureRequest,
-) -> Iterator[Callable[[MqttSettings], Transport]]:
+def made(request: pytest.FixtureRequest) -> Iterator[Callable[[MqttSettings], Transport]]:
     client, protocol = request.param
     with ExitStack() as closing:
 

@@ -7,7 +7,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import nullcontext
+from contextlib import closing, nullcontext
 
 import pytest
 
@@ -32,14 +32,14 @@ def sent(payload: bytes, *, topic: bytes = b"a", retain: bool = False, mid: int 
 
 
 class Link:
-    """A connection that is accepted, its messages, and the other end."""
+    """A connection that is accepted after ``round_trip_s``, its messages, and the other end."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, silence_s: float = 2.0, round_trip_s: float = 0.0) -> None:
         self.now = 1000.0
         monkeypatch.setattr(clock, "since_boot", lambda: self.now)
         self.messages: list[Message] = []
         with socket.create_server(("127.0.0.1", 0)) as server:
-            settings = MqttSettings(host="127.0.0.1", port=server.getsockname()[1], silence_s=2.0)
+            settings = MqttSettings(host="127.0.0.1", port=server.getsockname()[1], silence_s=silence_s)
             self.owner = MqttTransport("client", settings)
             opening = Opening("client", settings, None, None, addresses_of(settings.host, settings.port)[0])
             self.counters = Counters()
@@ -49,6 +49,7 @@ class Link:
             self.other, _ = server.accept()
         self.other.settimeout(5)
         assert self.other.recv(4096).startswith(b"\x10")
+        self.now += round_trip_s
         self.other.sendall(b"\x20\2\0\0")
         connecting.join(5)
 
@@ -200,6 +201,26 @@ def test_a_broker_that_answers_no_ping_is_silent(link: Link) -> None:
     with pytest.raises(Silent, match=r"broker has not answered for 2\.0 s"):
         link.idle(0.7)
     assert link.counters["silences"] == 1
+
+
+@pytest.mark.parametrize(("silence_s", "round_trip_s", "limit_s"), [(0.001, 0.0, 0.2), (0.2, 0.15, 0.6)])
+def test_four_pings_and_four_round_trips_are_always_waited_for(
+    monkeypatch: pytest.MonkeyPatch, silence_s: float, round_trip_s: float, limit_s: float
+) -> None:
+    with closing(Link(monkeypatch, silence_s, round_trip_s)) as link:
+        link.idle(limit_s - 0.1)
+        with pytest.raises(Silent, match=f"has not answered for {limit_s} s"):
+            link.idle(0.2)
+
+
+def test_pings_are_never_a_storm(monkeypatch: pytest.MonkeyPatch) -> None:
+    with closing(Link(monkeypatch, silence_s=0.001)) as link:
+        asked = 0
+        for _ in range(50):
+            link.now += 0.01
+            link.connection.pump(0.0, link.messages.extend)
+            asked += link.answer_pings()
+    assert 5 <= asked <= 14, "one in 0.0375 s at most"
 
 
 def test_what_came_in_a_silence_is_not_read(link: Link) -> None:

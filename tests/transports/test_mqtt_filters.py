@@ -12,7 +12,7 @@ from pebble.transports import Message
 from pebble.transports.mqtt import filters
 from pebble.transports.mqtt.filters import BrokerFilters, OwnMessageFilter, cover, overlap
 from pebble.transports.topics import matches
-from tests.support import THOROUGH
+from tests.support import THOROUGH, some
 
 LEVELS = ["a", "b", "$x", "+"]
 TOPICS = [
@@ -35,13 +35,13 @@ CAUGHT = {filter_: caught(filter_) for filter_ in FILTERS}
 
 
 def test_overlap_means_that_a_topic_matches_both() -> None:
-    for one, other in itertools.combinations_with_replacement(FILTERS, 2):
+    for one, other in some(itertools.combinations_with_replacement(FILTERS, 2), 3):
         wanted = bool(CAUGHT[one] & CAUGHT[other])
         assert overlap(one, other) is overlap(other, one) is wanted, (one, other)
 
 
 def test_a_cover_catches_what_both_catch() -> None:
-    for one, other in itertools.combinations(FILTERS, 2):
+    for one, other in some(itertools.combinations(FILTERS, 2), 7):
         if overlap(one, other):
             assert CAUGHT[one] | CAUGHT[other] <= caught(cover(one, other)), (one, other)
 

@@ -3,13 +3,7 @@
 from __future__ import annotations
 
 from pebble.transports import Message, QoS
-from pebble.transports.mqtt.outgoing import (
-    BACKLOG_BYTES,
-    BACKLOG_MESSAGES,
-    Backlog,
-    InFlightTable,
-    PendingAck,
-)
+from pebble.transports.mqtt.outgoing import BACKLOG_BYTES, BACKLOG_MESSAGES, Backlog, InFlightTable, PendingAck
 from pebble.transports.mqtt.suspects import Written
 
 

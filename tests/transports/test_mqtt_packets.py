@@ -164,10 +164,9 @@ class TestWritten:
     def test_subscribe(self, pahos: Pahos) -> None:
         paho, flags = pahos(modern=True), (False, True)
         for no_local, as_published, sends_retained in product(flags, flags, flags):
-            handling = {
-                True: SubscribeOptions.RETAIN_SEND_ON_SUBSCRIBE,
-                False: SubscribeOptions.RETAIN_DO_NOT_SEND,
-            }[sends_retained]
+            handling = {True: SubscribeOptions.RETAIN_SEND_ON_SUBSCRIBE, False: SubscribeOptions.RETAIN_DO_NOT_SEND}[
+                sends_retained
+            ]
             options = SubscribeOptions(1, no_local, as_published, handling)
             _, mid = paho.client.subscribe([("a/#", options), ("b", options)])
             wanted = [Filter(text, 1, no_local, as_published, sends_retained) for text in ("a/#", "b")]

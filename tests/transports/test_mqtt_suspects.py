@@ -14,7 +14,7 @@ from pebble.transports.mqtt.outgoing import InFlightTable
 from pebble.transports.mqtt.suspects import Kind, SuspectTopics
 from tests.support import some
 
-STEP_S = 0.01
+STEP_S = 0.02
 VITAL = ("r/online", "r/capabilities", "r/estop/+")
 #: Seconds between two messages of each topic, the bytes of one, and whether it is retained.
 ROBOT = {

@@ -98,11 +98,7 @@ class TestDecision:
         assert media.requests()[CAMERA] == NO
 
 
-RENAMED = {
-    "video_publisher": "outgoing/eye",
-    "audio_publisher": "outgoing/ear",
-    "audio_receiver": "incoming/mouth",
-}
+RENAMED = {"video_publisher": "outgoing/eye", "audio_publisher": "outgoing/ear", "audio_receiver": "incoming/mouth"}
 
 
 class AskingBridge(World):
@@ -323,11 +319,7 @@ class Robot:
                 "av_daemon": DEVICES,
                 "mqtt_bridge": {
                     "enabled": True,
-                    "remote_mqtt": {
-                        "host": "127.0.0.1",
-                        "port": self._brokers[-1].port,
-                        "silence_seconds": SILENCE_S,
-                    },
+                    "remote_mqtt": {"host": "127.0.0.1", "port": self._brokers[-1].port, "silence_seconds": SILENCE_S},
                 },
             },
         }
@@ -349,7 +341,7 @@ class Robot:
             broker.stop()
 
 
-@pytest.fixture(params=[False, True], ids=["two brokers", "one broker"])
+@pytest.fixture(params=[False, pytest.param(True, marks=pytest.mark.thorough)], ids=["two brokers", "one broker"])
 def one(request: pytest.FixtureRequest) -> bool:
     return bool(request.param)
 

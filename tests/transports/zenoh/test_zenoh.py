@@ -33,47 +33,58 @@ from pebble.transports.zenoh.hub import journal as hub_journal
 from pebble.transports.zenoh.hub import store as hub_store
 from pebble.transports.zenoh.hub.store import HubStore, Retained, StoredWill
 from tests.support import ROOT, free_port, some, until
+from tests.transports.forked import Forked
 from tests.transports.zenoh_net import HubProcess
 
 DELIVERED = QoS.DELIVERED
 CERTIFICATES = ROOT / "tests" / "data" / "tls"
 
 
+#: Roles that show how a program of its own ends; the others begin as forks of one that has imported everything.
+PROGRAMS = ("returns", "raises", "exits", "forks", "forks_with_a_lock")
+
+
 class Actor:
     """A role of tests/transports/zenoh/zenoh_actor.py in its own process."""
 
     def __init__(self, role: str, run_dir: Path) -> None:
-        command = [sys.executable, "-m", "tests.transports.zenoh.zenoh_actor", role, str(run_dir)]
-        pipe = subprocess.PIPE
-        self.process = subprocess.Popen(command, cwd=ROOT, stdin=pipe, stdout=pipe, stderr=pipe, text=True)
+        module, pipe = "tests.transports.zenoh.zenoh_actor", subprocess.PIPE
+        command = [sys.executable, "-m", module, role, str(run_dir)]
+        self._process: Any = (
+            subprocess.Popen(command, cwd=ROOT, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, text=True)
+            if role in PROGRAMS
+            else Forked(module, role, str(run_dir))
+        )
+        self.pid: int = self._process.pid
         assert self.read() == "up"
 
     def read(self) -> str:
-        assert self.process.stdout is not None
-        return self.process.stdout.readline().strip()
+        return str(self._process.stdout.readline()).strip()
 
     def ask(self, line: str = "") -> str:
-        assert self.process.stdin is not None
-        self.process.stdin.write(f"{line}\n")
-        self.process.stdin.flush()
+        self._process.stdin.write(f"{line}\n")
+        self._process.stdin.flush()
         return self.read()
 
     def stop(self) -> None:
         """SIGSTOP, until `resume`."""
-        self.process.send_signal(signal.SIGSTOP)
-        assert until(lambda: Path(f"/proc/{self.process.pid}/stat").read_text().split()[2] == "T")
+        os.kill(self.pid, signal.SIGSTOP)
+        assert until(lambda: Path(f"/proc/{self.pid}/stat").read_text().split()[2] == "T")
 
     def resume(self) -> None:
-        self.process.send_signal(signal.SIGCONT)
+        os.kill(self.pid, signal.SIGCONT)
 
-    def end(self) -> int:
+    def end(self) -> int | None:
         """No further line: the role ends by itself. Returns its exit code."""
-        self.process.communicate(timeout=15)
-        return self.process.returncode
+        with contextlib.suppress(BrokenPipeError):
+            self._process.stdin.close()
+        code: int | None = self._process.wait(15)
+        self._process.stdout.close()
+        return code
 
     def kill(self) -> None:
-        self.process.kill()
-        self.process.communicate(timeout=10)
+        self._process.kill()
+        self.end()
 
 
 class Robot:
@@ -626,7 +637,7 @@ def test_nothing_listens_on_any_network(robot: Robot) -> None:
     talking, listening = robot.actor("pinger"), robot.actor("listener")
     talking.ask("a")
     assert until(lambda: listening.ask() == "1 x")
-    assert _reachable(robot.hub.pid, talking.process.pid, listening.process.pid) == set()
+    assert _reachable(robot.hub.pid, talking.pid, listening.pid) == set()
     with socket.create_server(("127.0.0.1", 0)) as server, socket.socket(type=socket.SOCK_DGRAM) as datagrams:
         datagrams.bind(("127.0.0.1", 0))
         assert {str(os.fstat(one.fileno()).st_ino) for one in (server, datagrams)} <= _reachable(os.getpid())
@@ -818,21 +829,17 @@ def test_a_fork_ends_whatever_its_parent_was_doing(robot: Robot) -> None:
 def test_a_second_hub_is_refused(robot: Robot) -> None:
     with pytest.raises(TransportError, match=r"there is a hub .* already"):
         ZenohHub(robot.settings).open()
-    second = subprocess.run(
-        [sys.executable, "-m", "pebble.runtime.hub", json.dumps({"run_dir": str(robot.run_dir)})],
-        cwd=ROOT, capture_output=True, text=True, timeout=20, check=False,
-    )  # fmt: skip
-    assert (second.returncode, second.stdout) == (1, "")
-    assert "there is a hub for " in second.stderr
+    second = Forked("pebble.runtime.hub", [json.dumps({"run_dir": str(robot.run_dir)})])
+    assert second.wait(20) == 1
+    assert "there is a hub for " in second.printed
     assert robot.client("client").state is State.CONNECTED
 
 
-@pytest.mark.parametrize("arguments", some([[], ["a", "b"], ["{"], ["{}"], ['{"run_dir": 1}']], 4))
-def test_the_hub_explains_its_arguments(arguments: list[str]) -> None:
-    program = [sys.executable, "-m", "pebble.runtime.hub", *arguments]
-    done = subprocess.run(program, cwd=ROOT, capture_output=True, text=True, timeout=20, check=False)
-    assert done.returncode == 1
-    assert "Traceback" not in done.stderr
+def test_the_hub_explains_its_arguments() -> None:
+    for arguments in ([], ["a", "b"], ["{"], ["{}"], ['{"run_dir": 1}']):
+        hub = Forked("pebble.runtime.hub", arguments)
+        assert hub.wait(20) == 1
+        assert "Traceback" not in hub.printed
 
 
 def test_the_hub_runs_as_a_function(tmp_path: Path) -> None:
