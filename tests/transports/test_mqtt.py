@@ -1114,7 +1114,8 @@ def test_only_the_right_password_opens_and_none_is_shown(
 ) -> None:
     caplog.set_level(logging.DEBUG)
     clients(strict_broker.port, username="goob", password="s3cret-word", protocol=protocol)
-    for login, words in (({"username": "goob", "password": "s3cret-wrong"}, "bad user name or password"), ({}, "")):
+    wrong: dict[str, Any] = {"username": "goob", "password": "s3cret-wrong"}
+    for login, words in ((wrong, "bad user name or password"), ({}, "")):
         client = clients(strict_broker.port, **login, protocol=protocol, opened=False)
         client.open(0.3)
         refused = f"broker 127.0.0.1:{strict_broker.port} refused us"
