@@ -58,7 +58,7 @@ quick: .venv/.ready-dev
 	@sh tools/debian-packages.sh mosquitto=mosquitto
 	@rm -f $(TIMES)
 	@$(MAKE) --no-print-directory --jobs=2 check-types check-names
-	@$(VENV) tools/run_tests.py --numprocesses 2 tests/contract tests/forwarding
+	@$(VENV) tools/run_tests.py --numprocesses 2 tests/contract tests/forwarding --ignore tests/forwarding/links
 	@$(VENV) tools/run_tests.py -k memory tests/transports/test_contract.py
 	@$(VENV) tools/run_tests.py -k "drive_forms or silence" tests/robot/test_robot.py
 	@$(SHOW_TIMES)

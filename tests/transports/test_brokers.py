@@ -18,7 +18,7 @@ from pebble.runtime.by_name import ByName, ask_beside
 from pebble.transports import Message, MqttSettings, QoS, State
 from pebble.transports.mqtt import suspects
 from pebble.transports.mqtt.transport import MqttTransport
-from tests.forwarding.links import MqttEnd, Rig, Side
+from tests.forwarding.links.rig import MqttEnd, Rig, Side
 from tests.robot.operator import Operator
 from tests.robot.rig import BASE, STOP
 from tests.robot.rig import Rig as RobotRig

@@ -11,7 +11,7 @@ import pytest
 
 from pebble.forwarding import side as side_module
 from pebble.services.mqtt_bridge.media import Media
-from tests.forwarding.links import LOCAL, REMOTE, End, MqttEnd, Rig, Side, ZenohEnd
+from tests.forwarding.links.rig import LOCAL, REMOTE, End, MqttEnd, Rig, Side, ZenohEnd
 from tests.services.mqtt_bridge.bridge_rig import Quiet
 from tests.sparing_broker import SparingBroker
 from tests.support import some, until

@@ -16,8 +16,18 @@ from pebble.forwarding import service as service_module
 from pebble.forwarding.routing import Drop
 from pebble.forwarding.side import Gate
 from pebble.transports import State
-from tests.forwarding.links import LOCAL, REMOTE, End, MqttEnd, Rig, ZenohEnd
-from tests.forwarding.test_links import AUDIO_FLAG, DRIVE, FALSE, MIRROR_FLAG, PRESS, STOP, TRUE, VIDEO_FLAG, storm
+from tests.forwarding.links.rig import LOCAL, REMOTE, End, MqttEnd, Rig, ZenohEnd
+from tests.forwarding.links.test_table import (
+    AUDIO_FLAG,
+    DRIVE,
+    FALSE,
+    MIRROR_FLAG,
+    PRESS,
+    STOP,
+    TRUE,
+    VIDEO_FLAG,
+    storm,
+)
 from tests.services.mqtt_bridge.bridge_rig import Client, Quiet
 from tests.support import AmqttBroker, Broker, free_port, until
 from tests.tcp_proxy import BridgelessProxy, TcpProxy

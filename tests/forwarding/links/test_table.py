@@ -1,6 +1,6 @@
 """What crosses a bridge or a mirror between real brokers and hubs: one table of messages, in every situation.
 
-The same rules hold in virtual time (test_services.py). Each situation publishes the whole table from both sides: QoS,
+The same rules hold in virtual time (tests/forwarding/test_services.py). Each situation publishes the whole table from both sides: QoS,
 retained or not, direction, known topic or not.
 """
 
@@ -23,7 +23,7 @@ from pebble.forwarding.admission import MAX_UNKNOWN_FLAGS
 from pebble.forwarding.side import Gate
 from pebble.services.mqtt_bridge import service as bridge_module
 from pebble.transports import Message, State
-from tests.forwarding.links import LOCAL, REMOTE, End, MqttEnd, Rig, Side, ZenohEnd
+from tests.forwarding.links.rig import LOCAL, REMOTE, End, MqttEnd, Rig, Side, ZenohEnd
 from tests.services.mqtt_bridge.bridge_rig import Client, Quiet
 from tests.support import Broker, until
 from tests.tcp_proxy import TcpProxy
