@@ -24,8 +24,8 @@ def heartbeat(base: str = GOOB, *, retain: bool = False, metric: str = "online")
     return Message(f"{base}/outgoing/{metric}", json.dumps({"t": 1, "online": True}).encode(), retain=retain)
 
 
-def heartbeats(base: str = GOOB, first: float = 0.0, last: float = 600.0) -> Arriving:
-    return [(first + 0.25 * n, heartbeat(base)) for n in range(int(4 * (last - first)))]
+def heartbeats(base: str = GOOB, first: float = 0.0, last: float = 600.0, every_s: float = 0.25) -> Arriving:
+    return [(first + every_s * n, heartbeat(base)) for n in range(int((last - first) / every_s))]
 
 
 class Asked:
@@ -109,7 +109,7 @@ def test_what_came_before_an_outage_is_asked_for_again() -> None:
 def flood(count: int, *, lasting: bool, last: float = 100.0) -> Arriving:
     for n in range(count):
         yield from (
-            heartbeats(f"evil/robots/e{n}", 0.001, last) if lasting else [(0.001, heartbeat(f"evil/robots/e{n}"))]
+            heartbeats(f"evil/robots/e{n}", 0.001, last, 1.0) if lasting else [(0.001, heartbeat(f"evil/robots/e{n}"))]
         )
 
 

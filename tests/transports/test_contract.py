@@ -36,11 +36,6 @@ def drained(sender: Transport, receiver: Transport, base: str) -> None:
     subscription.close()
 
 
-def arrived_on_another_connection(net: Net, sender: Transport, base: str) -> None:
-    """Wait until what ``sender`` has published is on its way to every subscriber."""
-    drained(sender, net.client("bystander"), base)
-
-
 @contextmanager
 def reconnecting(*clients: Transport) -> Iterator[None]:
     """What happens inside costs ``clients`` their connection; go on when each has a new one."""
@@ -561,7 +556,7 @@ def test_T19_a_message_knows_how_long_it_has_waited_for_a_process_that_stood_sti
     assert sender.publish(base, b"first", qos=DELIVERED)
     assert stopped.wait(10)
     assert sender.publish(base, b"second", qos=DELIVERED)
-    arrived_on_another_connection(net, sender, base)
+    drained(sender, net.client("bystander"), base)  # by then it is on its way to every subscriber
     now = clock.since_boot
     monkeypatch.setattr(clock, "since_boot", lambda: now() + 0.6)
     go_on.set()

@@ -1,7 +1,7 @@
 """What crosses a bridge or a mirror between real brokers and hubs: one table of messages, in every situation.
 
-The same rules hold in virtual time (tests/forwarding/test_services.py). Each situation publishes the whole table from both sides: QoS,
-retained or not, direction, known topic or not.
+The same rules hold in virtual time (tests/forwarding/test_services.py). Each situation publishes the whole table from
+both sides: QoS, retained or not, direction, known topic or not.
 """
 
 from __future__ import annotations
