@@ -57,6 +57,13 @@ def make() -> Iterator[Make]:
         end.close()
 
 
+@pytest.fixture(scope="module")
+def amqtt() -> Iterator[AmqttBroker]:
+    broker = AmqttBroker()
+    yield broker
+    broker.stop()
+
+
 class TestOneBroker:
     def test_nothing_circulates_with_one_broker_for_both_sides(self, make: Make, tmp_path: Path) -> None:
         end = MqttEnd(tmp_path)
@@ -95,12 +102,6 @@ class TestOneBroker:
 
 class TestWithoutBridgeMode:
     """amqtt sends our own messages back and hides the retain flag of live ones."""
-
-    @pytest.fixture(scope="class")
-    def amqtt(self) -> Iterator[AmqttBroker]:
-        broker = AmqttBroker()
-        yield broker
-        broker.stop()
 
     @pytest.fixture
     def rig(self, make: Make, amqtt: AmqttBroker, tmp_path: Path) -> Rig:

@@ -26,7 +26,7 @@ from pebble.transports import Message, State
 from tests.forwarding.links.rig import LOCAL, REMOTE, End, MqttEnd, Rig, Side, ZenohEnd
 from tests.services.mqtt_bridge.bridge_rig import Client, Quiet
 from tests.support import Broker, until
-from tests.tcp_proxy import TcpProxy
+from tests.tcp_proxy import BridgelessProxy, TcpProxy
 
 STOP, RESET, DRIVE = "incoming/estop", "incoming/estop-reset", "incoming/drive-values"
 VIDEO_FLAG, AUDIO_FLAG = "incoming/flags/mqtt-video", "incoming/flags/mqtt-audio"
@@ -132,6 +132,16 @@ class TableRig(Rig):
     def publish_table(self, situation: str) -> None:
         for cell in TABLE:
             self.clients[cell.side].publish(cell.topic, cell.payload(situation), qos=cell.qos, retain=cell.retain)
+
+    def publish_meanwhile(self, situation: str, away: Side) -> None:
+        """The same while a side is away; what the service receives of the other one it has dealt with afterwards."""
+        present, counters = away.other, self.transport(away.other).counters
+        incoming_only = present is REMOTE and self.name == "bridge"
+        topics = [cell.topic for cell in TABLE if cell.side is present]
+        due = sum(topic.startswith("incoming/") or not incoming_only for topic in topics)
+        before, subscribed = counters["delivered"], present in self.service.status.subscribed
+        self.publish_table(situation)
+        assert not subscribed or until(lambda: counters["delivered"] >= before + due), counters.snapshot()
 
     def arrived(self, situation: str) -> Arrived:
         """What came across, by topic."""
@@ -260,13 +270,13 @@ def test_one_side_is_away(rig: TableRig, away: Side) -> None:
             or (not end.survives and rig.transport(away.other).state is State.CONNECTED)
         )
     )
-    rig.publish_table("at the start")
+    rig.publish_meanwhile("at the start", away)
     end.come_back()
     rig.crosses_later("at the start", away)
     rig.crosses_once("between")
     end.leave()
     assert until(lambda: rig.transport(away).state is State.CONNECTING)
-    rig.publish_table("outage")
+    rig.publish_meanwhile("outage", away)
     end.come_back()
     rig.crosses_later("outage", away)
     rig.crosses_once("after")
@@ -369,12 +379,24 @@ def broker_of(rig: Rig) -> Broker:
 
 @over(FIRST)
 class TestBridge:
+    @pytest.fixture
+    def way(self, rig: TableRig) -> Iterator[BridgelessProxy]:
+        """A proxy on the way to the operators' broker."""
+        with BridgelessProxy(broker_of(rig).port) as way:
+            link_of(rig).lead_to(way.port)
+            yield way
+            link_of(rig).lead_to(broker_of(rig).port)
+
+    @pytest.mark.parametrize("bridgeless", [False, True], ids=["bridge mode", "without"])
     def test_what_the_robot_took_back_while_no_bridge_ran_is_removed_and_what_it_still_has_stays(
-        self, make: Callable[..., TableRig], monkeypatch: pytest.MonkeyPatch
+        self, rig: TableRig, monkeypatch: pytest.MonkeyPatch, way: BridgelessProxy, bridgeless: bool
     ) -> None:
+        """Without bridge mode a broker sends back what the new bridge has just published, too."""
         monkeypatch.setattr(bridge_module, "LEFTOVERS_AFTER_S", 0.5)
-        rig, gone, stays = make(), ("mcu/m1/describe", "outlets/1/status"), ("mcu/m2/describe", "autonomy-status")
+        gone, stays = ("mcu/m1/describe", "outlets/1/status"), ("mcu/m2/describe", "autonomy-status")
+        way.bridgeless = bridgeless
         rig.start()
+        assert rig.service.remote.as_published is not bridgeless
         for name in (*gone, *stays):
             rig.local.publish(f"outgoing/{name}", b'{"interfaces": []}', retain=True)
         assert until(lambda: all(rig.remote.on(f"outgoing/{name}") for name in (*gone, *stays)))
