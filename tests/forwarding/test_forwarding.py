@@ -53,7 +53,7 @@ def grows_no_more(fill: Callable[[int], None], number: int) -> bool:
 
 class TestLoopbackFilter:
     @pytest.mark.parametrize(
-        ("history", "echoes"),
+        ("history", "own"),
         [
             ("t+1 t+0 t+1 t?1 t?2 t?0 t?1 t?1", "yes no yes yes no"),  # not those of others
             ("t+1 u?1", "no"),  # topics do not mix
@@ -62,7 +62,7 @@ class TestLoopbackFilter:
             ("t+1 unsent t?1", "no"),  # what was not sent does not come back
         ],
     )
-    def test_histories(self, history: str, echoes: str) -> None:
+    def test_histories(self, history: str, own: str) -> None:
         """A topic and a payload: ``+`` is to be sent, ``?`` was received."""
         clock, found = Clock(), list[bool]()
         loopback = LoopbackFilter(clock)
@@ -76,7 +76,7 @@ class TestLoopbackFilter:
                     loopback.forget("t")
                 case _:
                     clock.now += EXPIRY_S + 0.1
-        assert found == [word == "yes" for word in echoes.split()]
+        assert found == [word == "yes" for word in own.split()]
 
     def test_many_topics_take_no_memory(self) -> None:
         loopback = LoopbackFilter(Clock())
