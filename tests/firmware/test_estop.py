@@ -332,7 +332,7 @@ def test_a_state_has_at_most_300_bytes() -> None:
 def test_without_both_topics_a_stop_is_only_a_zero(refused: str) -> None:
     drill = Drill("benjr", 1)
     drill.broker.refused = {refused}
-    while drill.robot.connection.state != "online":
+    while drill.robot.session.connection.state != "online":
         drill.turn(0.01)
     wait(drill, 0.5)
     assert published(drill, "capabilities")[-1]["value"]["estop"]["available"] is False
@@ -349,7 +349,7 @@ def test_the_refusal_of_the_drive_topic_is_fatal() -> None:
     drill = Drill("benjr", 1)
     drill.broker.refused = {DRIVE}
     drill.run(8.0)
-    assert drill.robot.connection.reason == "subscription refused"
+    assert drill.robot.session.connection.reason == "subscription refused"
     assert not drill.received(f"{BASE}/outgoing/online", START_S)
 
 
