@@ -131,10 +131,10 @@ def test_another_board_is_refused_before_anything_is_changed(board: NodeBoard, r
 class RecordingTools(Tools):
     """Records the modes of the files while mpremote copies them."""
 
-    def __init__(self) -> None:
-        super().__init__(
-            {**QUICK, "mpremote": [sys.executable, "-c", "print('micropython (1, 29, 0) 774 False 0 SAMD21')"]}
-        )
+    def __init__(self, *mpremote: str) -> None:
+        """``mpremote``: arguments of Python for a stand-in; by default one that answers as a board does."""
+        answer = ("-c", "print('micropython (1, 29, 0) 774 False 0 SAMD21')")
+        super().__init__({**QUICK, "mpremote": [sys.executable, *(mpremote or answer)]})
         self.seen: dict[str, int] = {}
         self.lines: list[str] = []
 
@@ -166,8 +166,7 @@ def test_a_tool_that_fails_ends_it_and_leaves_no_password(board: NodeBoard, tmp_
         "print('micropython (1, 29, 0) 774 False 0 SAMD21' if sys.argv[-1].endswith('who.py') else 'no space left')\n"
         "sys.exit(sys.argv[-1] == ':private_config.json')\n"
     )
-    tools = RecordingTools()
-    tools._programs = {**tools._programs, "mpremote": [sys.executable, str(failing)]}
+    tools = RecordingTools(str(failing))
     private = PrivateFiles(settings={"wifi": {"ssid": "Lab", "password": Secret("sesam öffne")}})
     with pytest.raises(PebbleError, match="no space left"):
         execute(FlashOptions(firmware=FIRMWARE["goob"], port=board.port, private=private), tools, lambda _: None)
