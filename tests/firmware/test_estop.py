@@ -221,56 +221,38 @@ def test_a_file_that_cannot_be_read_is_a_stop(content: bytes) -> None:
     assert (states(drill)[-1]["latched"], states(drill)[-1]["persisted"]) == (True, True)
 
 
-def test_the_file_is_written_when_latched_changes_and_not_per_stop() -> None:
+def test_the_file_is_written_when_latched_changes_and_not_per_stop_with_motors_off() -> None:
     drill = online("benjr")
-    written: list[str] = []
-    drill.board.files.before = lambda what, path, _data: written.append(f"{what} {path}")
+    drill.command(0.0, 0.5)
+    wait(drill)
+    written: list[tuple[str, str, Any]] = []
+    drill.board.files.before = lambda what, path, _data: written.append((what, path, drill.outputs()))
     for name in (A, B, A, C, A):
         stop(drill, name)
         wait(drill, 0.3)
-    assert written == ["write /estop.new", f"rename {FILE}"]
+    assert written == [("write", "/estop.new", (0.0, 0.0)), ("rename", FILE, (0.0, 0.0))]
     reset(drill)
     wait(drill, 0.3)
     assert len(written) == 4
     assert json.loads(drill.board.files[FILE])["recent"] == [C, B, A]
 
 
-def test_motors_are_off_before_the_file_is_written() -> None:
-    drill = online("benjr")
-    drill.command(0.0, 0.5)
-    wait(drill)
-    outputs: list[Any] = []
-    drill.board.files.before = lambda *_: outputs.append(drill.outputs())
-    stop(drill)
-    wait(drill)
-    assert outputs == [(0.0, 0.0)] * 2
+@pytest.mark.parametrize(("number", "persisted"), [(errno.ENOSPC, False), (errno.EROFS, None)])
+def test_a_file_that_cannot_be_written_is_no_confirmation_and_is_tried_again_at_the_next_repetition(
+    number: int, persisted: bool | None
+) -> None:
+    def fail(*_: object) -> None:
+        raise failure(number)
 
-
-def test_a_file_that_cannot_be_written_is_no_confirmation_and_is_tried_again_at_the_next_repetition() -> None:
     drill = online("benjr")
-    drill.board.files.before = _fail(errno.ENOSPC)
+    drill.board.files.before = fail
     stop(drill)
     wait(drill, 0.5)
-    assert (states(drill)[-1]["latched"], states(drill)[-1]["persisted"]) == (True, False)
+    assert (states(drill)[-1]["latched"], states(drill)[-1]["persisted"]) == (True, persisted)
     drill.board.files.before = lambda *_: None
     stop(drill)
     wait(drill, 0.5)
     assert states(drill)[-1]["persisted"] is True
-
-
-def test_a_read_only_file_system_is_null() -> None:
-    drill = online("benjr")
-    drill.board.files.before = _fail(errno.EROFS)
-    stop(drill)
-    wait(drill, 0.5)
-    assert (states(drill)[-1]["latched"], states(drill)[-1]["persisted"]) == (True, None)
-
-
-def _fail(number: int) -> Any:
-    def before(*_: object) -> None:
-        raise failure(number)
-
-    return before
 
 
 class PowerLostError(BaseException):
@@ -330,11 +312,7 @@ def test_a_state_has_at_most_300_bytes() -> None:
 
 @pytest.mark.parametrize("refused", [ESTOP, RESET])
 def test_without_both_topics_a_stop_is_only_a_zero(refused: str) -> None:
-    drill = Drill("benjr", 1)
-    drill.broker.refused = {refused}
-    while drill.robot.session.connection.state != "online":
-        drill.turn(0.01)
-    wait(drill, 0.5)
+    drill = online("benjr", refused={refused})
     assert published(drill, "capabilities")[-1]["value"]["estop"]["available"] is False
     drill.command(0.0, 0.5)
     wait(drill)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Iterable
 from itertools import permutations
 from types import SimpleNamespace
 from typing import Any
@@ -13,6 +14,7 @@ import pytest
 from common import sockets
 from tests.firmware.drill import BASE, DRIVE, LIMIT_S, ONLINE, STALE_S, START_S, Drill
 from tests.simulation.virtual_broker import Session, VirtualBroker
+from tests.simulation.virtual_network import Answers
 
 KINDS = ("minilamp", "benjr")
 WEEK_S = 7 * 86_400.0  # more than half a period of the ticks
@@ -20,10 +22,16 @@ EPOCH_MS = 1_800_000_000_000  # of the virtual time server at virtual time 0
 AHEAD = {"minilamp": (1.0, 1.0, 0.0), "benjr": (-0.5, -0.5)}
 
 
-def online(kind: str, seed: int = 1, **conditions: str) -> Drill:
+def online(
+    kind: str, seed: int = 1, *, time: Answers = "answers", refused: Iterable[str] = (), **settings: Any
+) -> Drill:
+    """A robot that is connected; ``refused`` topics cannot be subscribed to, ``settings`` change those of its board."""
     drill = Drill(kind, seed)
-    for name, value in conditions.items():
-        setattr(drill.network.conditions, name, value)
+    drill.network.conditions.ntp = time
+    drill.broker.refused = set(refused)
+    if settings:
+        base = {"robot": {"id": "rover"}, "wifi": {"ssid": "home"}, "mqtt": {"host": "10.0.0.2"}}
+        drill.robot = drill.board.load(kind, {**base, **settings})
     while drill.robot.session.connection.state != "online":
         drill.turn(0.01)
         assert drill.seconds < 30, drill.robot.session.connection.reason
@@ -99,14 +107,12 @@ def test_the_heartbeat_is_stamped_in_real_milliseconds(kind: str) -> None:
 
 
 def test_without_a_time_server_it_counts_from_its_start() -> None:
-    drill = online("benjr", ntp="silent")
+    drill = online("benjr", time="silent")
     assert all(heartbeat["t"] < 60_000 for heartbeat in published(drill, "online"))
 
 
 def test_a_time_server_that_cannot_be_asked_disturbs_nothing() -> None:
-    drill = Drill("benjr", 1)
-    settings = {"robot": {"id": "rover"}, "wifi": {"ssid": "home"}, "mqtt": {"host": "10.0.0.2"}, "ntp": "no..name"}
-    drill.robot = drill.board.load("benjr", settings)
+    drill = online("benjr", ntp="no..name")
     drill.run(10)
     assert drill.robot.session.connection.state == "online"
     assert drill.robot.session.connection.losses == 0
@@ -128,10 +134,8 @@ def test_the_battery_every_five_seconds_and_not_retained(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_reports_get_through_however_long_the_names_are(kind: str) -> None:
-    drill = Drill(kind, 1)
     identity = {"system": "s" * 64, "type": "t" * 64, "id": "\u540d" * 64}
-    settings = {"robot": identity, "wifi": {"ssid": "home"}, "mqtt": {"host": "10.0.0.2"}, "ntp": ""}
-    drill.robot = drill.board.load(kind, settings)
+    drill = online(kind, robot=identity, ntp="")
     drill.run(10)
     base = "/".join(identity.values())
     received = [one.message.topic for one in drill.broker.received]

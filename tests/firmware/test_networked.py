@@ -37,12 +37,7 @@ class Program:
         command = [sys.executable, "-m", "pebble.simulation.networked", "--kind", kind, "--broker", broker, *options]
         with out, err:
             self.process = Child(
-                command,
-                cwd=ROOT,
-                stdin=subprocess.DEVNULL,
-                stdout=out,
-                stderr=err,
-                env={**os.environ, **environment},
+                command, cwd=ROOT, stdin=subprocess.DEVNULL, stdout=out, stderr=err, env={**os.environ, **environment}
             )
 
     @property

@@ -9,6 +9,7 @@ from pebble.errors import ConfigError
 from pebble.services.serial_mcu_bridge.text.goob_base import Charging, Level, Touch, parse
 from pebble.simulation.board import Light, SimulatedMcu
 from pebble.simulation.motion import FULL_SPEED_MM_S, TRACK_MM, RobotMotion
+from tests.support import cases
 
 
 def run(mcu: SimulatedMcu, start: float, seconds: float, command: bytes = b"") -> bytes:
@@ -271,7 +272,7 @@ def test_a_reboot_stops_the_motors_and_reports_the_start() -> None:
 def test_garbage_moves_nothing() -> None:
     mcu = SimulatedMcu("goob", 0.0)
     noise = random.Random(2)
-    for number in range(20_000):
+    for number in range(cases(2_000, 20_000)):
         mcu.receive(b"#" + noise.randbytes(20).replace(b"\n", b"") + b"\n", number * 0.001)
     assert mcu.state().commands == 0
     assert mcu.state().pose.x_mm == 0.0
