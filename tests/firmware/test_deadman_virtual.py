@@ -24,7 +24,7 @@ from tests.firmware.drill import LIMIT_S, ONLINE, RESENT_S, START_S, Drill, Viol
 from tests.firmware.schedules import FAULTS, act, perform
 from tests.support import cases, some
 
-MIXED, SINGLE = cases(70, 700), cases(3, 30)  # schedules per robot; of each fault alone
+MIXED, SINGLE = cases(40, 700), cases(2, 30)  # schedules per robot; of each fault alone
 FIRST_SINGLE = MUTATED = 700  # seeds of single faults begin here; within so many every deliberate bug shows
 
 
@@ -167,7 +167,7 @@ def _performed(kind: str, seed: int, *faults: str) -> Drill:
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_heartbeat_continues(kind: str, fault: str) -> None:
     """Four times a second, whatever happens beside it, and stamped by a clock that never goes back."""
-    for seed in range(10):
+    for seed in range(cases(4, 10)):
         drill = Drill(kind, seed)
         act(drill, (fault,))
         received = [one for one in drill.broker.received if one.message.topic == ONLINE and one.at > START_S + 5.0]

@@ -80,14 +80,15 @@ def test_what_it_refuses(station: Station) -> None:
     assert station.relays == []
 
 
+@pytest.mark.parametrize("commands", [(), (b"\0",)], ids=["left on", "switched off"])
 def test_a_relay_that_is_not_there_is_unreachable_until_it_is_back_and_does_not_come_on_by_itself(
-    station: Station,
+    station: Station, commands: tuple[bytes, ...]
 ) -> None:
     station.command(7, b"\1")
     station.body.connect("o4", False)
     assert states(station.frames()) == {4: (True, False, False)}
     assert of(station.command(7, b"\1"), Type.NACK)[0].payload == b"command_failed"
-    assert len(of(station.command(7, b"\0"), Type.ACK)) == 1
+    assert [len(of(station.command(7, one), Type.ACK)) for one in commands] == [1] * len(commands)
     station.body.connect("o4", True)
     assert states(station.frames()) == {4: (True, True, False)}
     assert station.relays == [("o4", True), ("o4", False)]
