@@ -101,7 +101,9 @@ MUTATIONS = {
     "limits are ignored": Mutation(
         _ROBOT, "_limit_ms = limit_ms and _DRIVE_LIMIT_MS", "_limit_ms = limit_ms", ("limits",)
     ),
-    "a script that resumes": Mutation("common/arbiter.py", "or False:", "or 0 < run <= self.barred:", ("script",)),
+    "a script that resumes": Mutation(
+        "common/arbiter.py", "or False:", "or (run > 0 and not newer(run, self.barred)):", ("script",)
+    ),
     "a script beside a person": Mutation(
         "common/arbiter.py", "elif self._starting", "elif self._held or self._starting", ("script",)
     ),
