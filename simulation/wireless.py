@@ -103,12 +103,12 @@ class WirelessRobot:
     @property
     def online(self) -> bool:
         """Whether the firmware is connected to the broker and subscribed."""
-        return str(self.firmware.connection.state) == "online"
+        return str(self.firmware.session.connection.state) == "online"
 
     @property
     def problem(self) -> str:
         """Why the robot is not online; "" if unknown."""
-        reason = str(self.firmware.connection.reason)
+        reason = str(self.firmware.session.connection.reason)
         return reason if "refused by the broker" in reason else self.network.problem or reason
 
     def step(self) -> None:

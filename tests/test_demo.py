@@ -135,16 +135,20 @@ def test_all_robots_do_what_they_are_commanded(demos: list[Demo], temporary: Pat
     assert demo.folders() == []
 
 
-@pytest.mark.parametrize("sign", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_everything_within_five_seconds(demos: list[Demo], temporary: Path, sign: signal.Signals) -> None:
-    demo = start(demos, temporary, "")
-    assert until(lambda: "forward, stop" in demo.output, START_S), demo.output
+def ends_by(demo: Demo, sign: signal.Signals) -> None:
+    """It ends within some seconds, and leaves nothing."""
     demo.process.send_signal(sign)
     began = time.monotonic()
     assert demo.process.wait(30) == 0, demo.output
     assert time.monotonic() - began <= END_S
     assert demo.leftovers() == []
     assert demo.folders() == []
+
+
+def test_a_signal_ends_everything_within_five_seconds(demos: list[Demo], temporary: Path) -> None:
+    demo = start(demos, temporary, "")
+    assert until(lambda: "forward, stop" in demo.output, START_S), demo.output
+    ends_by(demo, signal.SIGINT)
 
 
 def test_a_closed_terminal_ends_everything_though_its_signal_goes_elsewhere(demos: list[Demo], temporary: Path) -> None:
@@ -176,12 +180,14 @@ extra.find_spec = lambda name: None if name == "starlette" else object()
 import pebble.demo.main as main
 sys.exit(main.run())
 """
-    demos.append(Demo(temporary, code))
-    assert until(lambda: "forward, stop" in demos[0].output, START_S), demos[0].output
-    lines = [line for line in demos[0].output.splitlines() if "starlette" in line]
-    assert lines == ["Without the operator page, which needs packages that are not installed (starlette): "
-                     "pip install 'pebble-robot[web]'"]  # fmt: skip
-    assert not any("pebble.web.program" in line for line in demos[0].leftovers())
+    demos.append(demo := Demo(temporary, code))
+    assert until(lambda: "forward, stop" in demo.output, START_S), demo.output
+    assert [line for line in demo.output.splitlines() if "starlette" in line] == [
+        "Without the operator page, which needs packages that are not installed (starlette): "
+        "pip install 'pebble-robot[web]'"
+    ]
+    assert not any("pebble.web.program" in line for line in demo.leftovers())
+    ends_by(demo, signal.SIGTERM)
 
 
 def test_nothing_outlives_a_demo_that_is_killed(demos: list[Demo], temporary: Path) -> None:

@@ -47,10 +47,9 @@ def test_the_top_level_folders_are_inside_the_package_too(name: str) -> None:
 
 def test_every_folder_of_modules_is_a_package() -> None:
     """Python imports one without `__init__.py`, too, but the import rules do not see it."""
-    folders = {
-        path.rpartition("/")[0] for path in sources() if path.endswith(".py") and not path.startswith(NOT_MODULES)
-    }
-    assert [folder for folder in sorted(folders) if f"{folder}/__init__.py" not in sources()] == []
+    there = sources()
+    folders = {path.rpartition("/")[0] for path in there if path.endswith(".py") and not path.startswith(NOT_MODULES)}
+    assert [folder for folder in sorted(folders) if f"{folder}/__init__.py" not in there] == []
 
 
 def test_the_wheel_holds_every_source_and_nothing_else(wheel: zipfile.ZipFile) -> None:
@@ -58,49 +57,34 @@ def test_the_wheel_holds_every_source_and_nothing_else(wheel: zipfile.ZipFile) -
     assert packed == set(sources())
 
 
-def test_every_module_of_the_wheel_imports_without_the_checkout(wheel: zipfile.ZipFile, tmp_path: Path) -> None:
+def test_every_module_of_the_wheel_imports_without_the_checkout_and_its_firmware_runs_on_a_simulated_board(
+    wheel: zipfile.ZipFile, tmp_path: Path
+) -> None:
     wheel.extractall(tmp_path)
     host_files = [name for name in wheel.namelist() if name.endswith(".py") and not name.startswith(NOT_MODULES)]
     names = [name.removesuffix(".py").removesuffix("/__init__") for name in host_files]
     modules = [name.replace("/", ".") for name in names if not name.endswith("__main__")]
-    code = "import importlib, sys\nfor name in sys.argv[1:]: print(importlib.import_module(name).__file__)"
-    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
-    imported = subprocess.run(
-        [sys.executable, "-c", code, *modules],
-        cwd=tmp_path,
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert imported.returncode == 0, imported.stderr
-    assert all(line.startswith(str(tmp_path)) for line in imported.stdout.splitlines())
-    assert len(imported.stdout.splitlines()) == len(modules)
-
-
-def test_the_firmware_of_the_wheel_runs_on_a_simulated_board(wheel: zipfile.ZipFile, tmp_path: Path) -> None:
-    wheel.extractall(tmp_path)
     code = """
-from pebble.simulation.board import SimulatedMcu
-mcu = SimulatedMcu("goob", 0.0)
+import importlib, sys
+for name in sys.argv[1:]:
+    print(importlib.import_module(name).__file__)
+mcu = sys.modules["pebble.simulation.board"].SimulatedMcu("goob", 0.0)
 print(mcu.board.firmware.module("goob.robot").__file__)
 print(mcu.receive(b"M 1 1\\n", 0.0))
 """
-    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
-    command = [sys.executable, "-c", code]
+    command, environment = [sys.executable, "-c", code, *modules], {**os.environ, "PYTHONPATH": str(tmp_path)}
     ran = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
-    assert ran.stdout.splitlines() == [str(tmp_path / "pebble/firmware/goob/robot.py"), r"b'OK M\r\n'"], ran.stderr
+    assert ran.returncode == 0, ran.stderr
+    *imported, firmware, answer = ran.stdout.splitlines()
+    assert all(line.startswith(str(tmp_path)) for line in imported)
+    assert len(imported) == len(modules)
+    assert (firmware, answer) == (str(tmp_path / "pebble/firmware/goob/robot.py"), r"b'OK M\r\n'")
 
 
-@pytest.mark.parametrize("name", ["transports", "services"])
-def test_the_linter_refuses_the_bare_folder_names(name: str) -> None:
-    checked = subprocess.run(
-        [sys.executable, "-m", "ruff", "check", "--no-cache", "--stdin-filename", "pebble/example.py", "-"],
-        input=f'"""Example."""\n\nimport {name}\n',
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+def test_the_linter_refuses_the_bare_folder_names() -> None:
+    command = [sys.executable, "-m", "ruff", "check", "--no-cache", "--stdin-filename", "pebble/example.py", "-"]
+    example = '"""Example."""\n\nimport services\nimport transports\n'
+    checked = subprocess.run(command, input=example, cwd=ROOT, capture_output=True, text=True, check=False)
     assert "TID251" in checked.stdout
-    assert f"import pebble.{name}: the bare folder name is not an installed package" in checked.stdout
+    for name in ("transports", "services"):
+        assert f"import pebble.{name}: the bare folder name is not an installed package" in checked.stdout

@@ -82,9 +82,10 @@ def test_first_time(): pass
 """
 
 
-def run_tests(folder: Path, content: str) -> tuple[int, str]:
+def run_tests(folder: Path, content: str, workers: int = 1) -> tuple[int, str]:
     (folder / "test_it.py").write_text(content)
-    command = [sys.executable, str(ROOT / "tools/run_tests.py"), "-q", "--numprocesses", "2", f"--rootdir={folder}"]
+    options = ["-q", "--numprocesses", str(workers), f"--rootdir={folder}"]
+    command = [sys.executable, str(ROOT / "tools/run_tests.py"), *options]
     plugins = {"PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", "PYTEST_PLUGINS": "xdist.plugin"}  # others take seconds to import
     environment = {**os.environ, "PYTHONPATH": str(ROOT), **plugins}
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=100, env=environment)
@@ -92,7 +93,7 @@ def run_tests(folder: Path, content: str) -> tuple[int, str]:
 
 
 def test_few_failed_tests_run_once_more_alone_and_are_named(tmp_path: Path) -> None:
-    code, output = run_tests(tmp_path, FLAKY)
+    code, output = run_tests(tmp_path, FLAKY, workers=2)
     assert code == 0
     assert "UNRELIABLE, passed only the second time" in output
     assert "test_it.py::test_second_time[a/b [c]]" in output.partition("UNRELIABLE")[2]

@@ -1,7 +1,9 @@
 """What a robot on Wi-Fi announces about itself (paper A.8.6). Pure."""
 
+from micropython import const
+
 # It also lists what the robot does not offer, because readers assume the presence of what is missing.
-_CAPABILITIES = (
+_CAPABILITIES = const(
     b'{"schema":"pebble-capabilities/v1","t":%d,"value":{"identity":{"system":"%s","type":"%s","id":"%s"},'
     b'"transport":{"kind":"mqtt"},"drive":{"available":true,"controls":true,"arbitrates":true,'
     b'"topic":"%s/incoming/drive-values"},"estop":{"available":%s,"topic":"%s/incoming/estop",'

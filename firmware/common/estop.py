@@ -11,8 +11,8 @@ from common.latch import Latch, reset_of, stop_of
 from common.payload import load
 from common.ticks import diff
 
-_FILE = "/estop.json"
-_NEW = "/estop.new"  # renamed when it is complete: a power cut leaves the old file or the new one
+_FILE = const("/estop.json")
+_NEW = const("/estop.new")  # renamed when it is complete: a power cut leaves the old file or the new one
 _NAMES = const(4)
 _LONGEST_STATE = const(300)
 _PAUSE_MS = const(250)  # between two states

@@ -3,10 +3,10 @@
 import time
 
 import machine
-from micropython import kbd_intr
+from micropython import const, kbd_intr
 
-_WATCHDOG_MS = 2000
-_INTERRUPT_MS = 1000
+_WATCHDOG_MS = const(2000)
+_INTERRUPT_MS = const(1000)
 
 
 def run(build, settings: dict) -> None:

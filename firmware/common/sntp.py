@@ -2,10 +2,12 @@
 
 import struct
 
+from micropython import const
+
 from common.ticks import diff
 
-_TO_UNIX_S = 2208988800  # from 1900, where NTP counts from, to 1970
-_ERA_S = 1 << 32  # NTP's seconds start again in 2036
+_TO_UNIX_S = const(2208988800)  # from 1900, where NTP counts from, to 1970
+_ERA_S = const(1 << 32)  # NTP's seconds start again in 2036
 
 
 def request(nonce: bytes) -> bytes:

@@ -1,6 +1,7 @@
 """MiniLAMP: two wheels and a pair of grousers, all either on or off, on a XIAO ESP32-C6."""
 
 from machine import ADC, Pin
+from micropython import const
 
 from common.drv8833 import Motor
 from common.network_robot import NetworkRobot
@@ -9,7 +10,7 @@ from common.settings import get
 from common.tls import Wrapper
 from minilamp import pins
 
-_THRESHOLD = 0.25  # below it a motor stays off
+_THRESHOLD = const(0.25)  # below it a motor stays off
 
 
 class Body:

@@ -58,7 +58,7 @@ def run_checks(config: Config | None) -> Iterator[Finding]:
 def _robot(config: Config) -> Iterator[Finding]:
     run_dir = config.run_dir()
     yield run_directory(run_dir, os.geteuid())
-    yield leftover_sockets(run_dir, _is_listening)
+    yield leftover_sockets(run_dir, is_listening)
     yield state_directory(config.state_dir())
     for name, line in config.serial_instances().items():
         yield serial_port(Path(str(line.serial.port)), name)
@@ -258,14 +258,15 @@ def leftover_sockets(run_dir: Path, answers: Callable[[Path], bool]) -> Finding:
     return Finding(Level.OK, "sockets", f"{len(sockets)} in use" if sockets else "none: the robot is not up")
 
 
-def _is_listening(path: Path) -> bool:
+def is_listening(path: Path) -> bool:
+    """Whether a process listens on this socket; one that is busy, or of another user, counts."""
     with socket.socket(socket.AF_UNIX) as probe:
         probe.settimeout(1.0)
         try:
             probe.connect(os.fspath(path))
         except (ConnectionRefusedError, FileNotFoundError):
             return False
-        except OSError:  # busy, or of another user: in use
+        except OSError:
             return True
     return True
 

@@ -120,6 +120,9 @@ def test_own_announcements_measure_the_way_through_the_broker() -> None:
 
 def test_announcements_of_many_servers_are_bounded() -> None:
     mine = lease()
-    for number in range(1000):
-        mine.receive(announcement(f"s{number}", EPOCH), 0.0)
-    assert len(mine._others) == 100
+    for number in range(100):
+        mine.receive(announcement(f"s{number:02}", EPOCH), 0.0)
+    mine.receive(announcement("one more", EPOCH + 1), 0.0)
+    assert str(mine.other(0.1)) == "bob (phone) at s99"
+    mine.receive(announcement("s00", EPOCH + 1), 0.0)
+    assert str(mine.other(0.1)) == "bob (phone) at s00"

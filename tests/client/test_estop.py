@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import pytest
 
+from pebble.client import estop
 from pebble.client.estop import MAX_PASSED, MAX_ROBOTS, Progress, StopSender, new_name, send
 from pebble.transports import Message, QoS
 from tests.client.estop_robot import Robot, capabilities, outgoing
@@ -291,22 +292,29 @@ def publish(stop: StopSender, base: str, bodies: list[tuple[str, object]], now: 
     return stop.tick(now)
 
 
+@pytest.fixture(params=[30, pytest.param(MAX_ROBOTS, marks=pytest.mark.thorough)])
+def places(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> int:
+    """How many robots have a place."""
+    monkeypatch.setattr(estop, "MAX_ROBOTS", request.param)
+    return int(request.param)
+
+
 @pytest.mark.parametrize("hold", [False, True])
 @pytest.mark.parametrize(("theirs", "own", "has_place"), CROWDS)
 def test_a_crowd_of_strangers_keeps_the_stop_from_no_robot(
-    theirs: list[tuple[str, object]], own: list[tuple[str, object]], *, has_place: bool, hold: bool
+    places: int, theirs: list[tuple[str, object]], own: list[tuple[str, object]], *, has_place: bool, hold: bool
 ) -> None:
     stop, sent = sender(hold=hold), []
     for step in range(20):
         now = 0.25 * step
-        for number in range(MAX_ROBOTS + 200):
+        for number in range(places + places // 5):
             publish_quietly(stop, f"pebble/robots/r{number}", theirs, now)
         messages = stop.tick(now) + publish(stop, GOOB, own, now)
         sent += [now] * (ESTOP in topics(messages))
     assert sent[0] == 0.0
     assert max(later - earlier for earlier, later in pairwise([*sent, 5.0])) <= 0.5
     assert len(sent) <= 10, "at most twice a second"
-    assert (GOOB in stop.robots, len(stop.robots)) == (has_place, MAX_ROBOTS)
+    assert (GOOB in stop.robots, len(stop.robots)) == (has_place, places)
     assert stop.omitted
     assert not stop.confirmed
 

@@ -83,14 +83,14 @@ def test_texts_of_states_are_short_and_harmless() -> None:
 
 def test_the_number_of_owners_is_limited_and_listed_ones_are_preferred() -> None:
     estop = RobotEstop(GOOB)
-    estop.receive(Robot(GOOB, "serial").capabilities())
     for number in range(3 * MAX_OWNERS):
         estop.receive(outgoing(GOOB, f"estop/o{number}", STATE))
+    assert len(estop.states) == MAX_OWNERS
+    estop.receive(Robot(GOOB, "serial").capabilities())
     assert estop.receive(outgoing(GOOB, "estop/serial", STATE))
     for number in range(3 * MAX_OWNERS):
         estop.receive(outgoing(GOOB, f"estop/p{number}", STATE))
     assert list(estop.latched) == ["serial"]
-    assert len(estop._states) == MAX_OWNERS
 
 
 # -- resets

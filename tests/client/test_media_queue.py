@@ -34,6 +34,23 @@ def drained(queue: MediaQueue, now: float = 0.0) -> list[int]:
     return seqs
 
 
+def show(viewer: ViewerQueue, seq: int, at: float, acknowledged: float, encoding: str = "pbvz") -> None:
+    """A key frame on its way to a page, by the rescue stream if it gets that."""
+    one = frame(seq, keyframe=True, encoding="jpeg" if viewer.rescued else encoding)
+    if viewer.rescued:
+        viewer.offer_rescue(one)
+    else:
+        viewer.offer_direct(one, at)
+    assert viewer.take(at)
+    viewer.acknowledge(seq, acknowledged)
+
+
+def offered(viewer: ViewerQueue, seq: int, at: float, encoding: str = "pbvz") -> tuple[bool, bool]:
+    """Whether it is rescued, and gets small pictures, after this key frame."""
+    viewer.offer_direct(frame(seq, keyframe=True, encoding=encoding), at)
+    return viewer.rescued, viewer.small
+
+
 def test_it_begins_at_a_key_frame() -> None:
     queue = MediaQueue()
     for one in (frame(1), frame(2), frame(3, keyframe=True), frame(4)):
@@ -252,48 +269,30 @@ def test_what_cannot_be_decoded_is_rescued_until_it_can() -> None:
 def test_over_a_thin_connection_small_pictures_come_from_the_rescue_stream(encoding: str) -> None:
     viewer, now = ViewerQueue(ALL, 0.0), 0.0
     for seq in range(2):
-        viewer.offer_direct(frame(seq, keyframe=True, encoding=encoding), now)
-        assert not assess([viewer], encoding, now, can_rescue=True)
+        show(viewer, seq, now, now + THIN_ACK_S + 0.1, encoding)
         assert not viewer.rescued
-        assert viewer.take(now)
         now += THIN_ACK_S + 0.1
-        viewer.acknowledge(seq, now)
-    assert not assess([viewer], encoding, now, can_rescue=True)
+        assert not assess([viewer], encoding, now, can_rescue=True)
     assert (viewer.rescued, viewer.small) == (True, True)
-    viewer.offer_direct(frame(2, keyframe=True, encoding=encoding), now + 9)
-    assert viewer.rescued
-    viewer.offer_direct(frame(3, keyframe=True, encoding=encoding), now + 11)
-    assert not viewer.rescued
+    assert offered(viewer, 2, now + 9, encoding) == (True, True)
+    assert offered(viewer, 3, now + 11, encoding) == (False, False)
 
 
 def test_one_late_acknowledgement_is_no_thin_connection() -> None:
     viewer = ViewerQueue(ALL, 0.0)
     for seq, late_s in enumerate((2.0, 0.1, 2.0, 0.1)):
-        viewer.offer_direct(frame(seq, keyframe=True), 0.0)
-        viewer.take(0.0)
-        viewer.acknowledge(seq, late_s)
+        show(viewer, seq, 0.0, late_s)
         assert not assess([viewer], "pbvz", late_s, can_rescue=True)
     assert not viewer.rescued
 
 
 def test_small_pictures_that_are_late_as_well_do_not_put_off_the_return() -> None:
-    viewer, now = ViewerQueue(ALL, 0.0), 0.0
-    for seq in range(2):
-        viewer.offer_direct(frame(seq, keyframe=True), now)
-        viewer.take(now)
-        now += 0.5
-        viewer.acknowledge(seq, now)
-    assess([viewer], "pbvz", now, can_rescue=True)
-    assert viewer.small
-    rescued_at = now
-    for seq in range(2, 18):
-        viewer.offer_rescue(frame(seq, keyframe=True, encoding="jpeg"))
-        viewer.take(now)
-        now += 0.5
-        viewer.acknowledge(seq, now)
-        assess([viewer], "pbvz", now, can_rescue=True)
-    viewer.offer_direct(frame(18, keyframe=True), rescued_at + 10)
-    assert (viewer.rescued, viewer.small) == (False, False)
+    viewer = ViewerQueue(ALL, 0.0)
+    for seq in range(18):
+        show(viewer, seq, seq / 2, seq / 2 + 0.5)
+        assess([viewer], "pbvz", seq / 2 + 0.5, can_rescue=True)
+        assert viewer.small == (seq > 0)
+    assert offered(viewer, 18, 11.0) == (False, False)
 
 
 def test_frames_that_were_under_way_together_are_late_once() -> None:
@@ -312,15 +311,9 @@ def test_a_page_that_cannot_decode_gets_small_pictures_only_if_it_has_to() -> No
     assess([viewer], "h264", 0.0, can_rescue=True)
     assert (viewer.rescued, viewer.small) == (True, False)
     for seq in range(2):
-        viewer.offer_rescue(frame(seq, keyframe=True, encoding="jpeg"))
-        viewer.take(float(seq))
-        viewer.acknowledge(seq, seq + 1.0)
+        show(viewer, seq, float(seq), seq + 1.0)
     assess([viewer], "h264", 2.0, can_rescue=True)
-    assert (viewer.rescued, viewer.small) == (True, True)
-    viewer.offer_direct(frame(9, keyframe=True, encoding="h264"), 11.0)
-    assert (viewer.rescued, viewer.small) == (True, True)
-    viewer.offer_direct(frame(9, keyframe=True, encoding="h264"), 13.0)
-    assert (viewer.rescued, viewer.small) == (True, False)
+    assert [offered(viewer, 9, at, "h264") for at in (11.0, 13.0)] == [(True, True), (True, False)]
 
 
 # -- the encoding

@@ -127,13 +127,13 @@ def test_run_directory(tmp_path: Path) -> None:
 
 
 def test_leftover_sockets_are_found(tmp_path: Path) -> None:
-    assert doctor.leftover_sockets(tmp_path / "missing", doctor._is_listening).level is Level.OK
+    assert doctor.leftover_sockets(tmp_path / "missing", doctor.is_listening).level is Level.OK
     with socket.socket(socket.AF_UNIX) as living, socket.socket(socket.AF_UNIX) as dying:
         living.bind(str(tmp_path / "living.sock"))
         living.listen()
-        assert doctor.leftover_sockets(tmp_path, doctor._is_listening).text == "1 in use"
+        assert doctor.leftover_sockets(tmp_path, doctor.is_listening).text == "1 in use"
         dying.bind(str(tmp_path / "dead.sock"))
-        finding = doctor.leftover_sockets(tmp_path, doctor._is_listening)
+        finding = doctor.leftover_sockets(tmp_path, doctor.is_listening)
     assert finding.level is Level.WARN
     assert finding.fix == f"rm {tmp_path / 'dead.sock'}"
 

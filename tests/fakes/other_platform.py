@@ -1,7 +1,8 @@
 """Runs a ``pebble`` command line without what only Linux has: ``other_platform.py ARGUMENT…``.
 
-``import MODULE…`` imports modules instead. Modules are hidden from our own code only, because the standard library
-chooses by the platform that it runs on; attributes are deleted after the libraries have been imported.
+``import MODULE…`` imports modules instead, and ``each LINE…`` runs several command lines. Modules are hidden from our
+own code only, because the standard library chooses by the platform that it runs on; attributes are deleted after the
+libraries have been imported.
 """
 
 import builtins
@@ -85,4 +86,13 @@ if sys.argv[1] == "import":
 else:
     from pebble.cli import main
 
-    sys.exit(main())
+    if sys.argv[1] != "each":
+        sys.exit(main())
+    lines, failed = sys.argv[2:], 0
+    for line in lines:
+        sys.argv[1:] = line.split()
+        try:
+            failed |= int(main())
+        except SystemExit as end:
+            failed |= int(end.code or 0)
+    sys.exit(failed)

@@ -35,6 +35,7 @@ RESENT_S: Final = 0.3  # a packet that was lost comes so much later
 STALE_S: Final = 2.45  # no command that is longer on its way moves: 2 s of silence, the longest latency, two slow turns
 BASE: Final = "pebble/robots/rover"
 DRIVE, ONLINE = f"{BASE}/incoming/drive-values", f"{BASE}/outgoing/online"
+NAME: Final = "00000000000000aa"  # of a stop
 ESTOP, RESET, STATE = f"{BASE}/incoming/estop", f"{BASE}/incoming/estop-reset", f"{BASE}/outgoing/estop/mcu"
 
 _WRAP_MS = 1 << 30
@@ -225,13 +226,13 @@ class Drill:
         """Publish a command that must not move a robot."""
         self.broker.publish(DRIVE, payload, qos=qos, retain=retain)
 
-    def stop(self, name: str) -> None:
-        self.broker.publish(ESTOP, json.dumps({"stop": name, "by": "drill"}).encode(), qos=1)
+    def stop(self, name: str = NAME, **more: str) -> None:
+        self.broker.publish(ESTOP, json.dumps({"stop": name, "by": "drill", **more}).encode(), qos=1)
 
-    def reset(self, *, behind: int = 0) -> None:
-        """Reset by the newest state that arrived, or one that is so many stops older."""
+    def reset(self, *, behind: int = 0, **changes: Any) -> None:
+        """Reset by the newest state that arrived, or one that is so many stops older, or with other ``changes``."""
         if state := self.state():
-            order = {"boot": state["boot"], "count": state["count"] - behind, "by": "drill"}
+            order = {"boot": state["boot"], "count": state["count"] - behind, "by": "drill", **changes}
             self.broker.publish(RESET, json.dumps(order).encode(), qos=1)
 
     def state(self) -> dict[str, Any]:

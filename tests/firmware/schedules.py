@@ -92,10 +92,12 @@ def _come_back(drill: Drill) -> None:
     online = since + 0.001
     while drill.seconds < online + STABLE_S or len(drill.received(ONLINE, online)) < 2 or drill.broker.queued:
         drill.turn(0.04)
-        if drill.robot.connection.state != "online":
+        if drill.robot.session.connection.state != "online":
             online = drill.seconds + 0.001  # what is still under way from an old connection does not count
         if drill.seconds > since + BACK_S:
-            raise ViolatedError(f"not online {BACK_S:.0f} s after the last fault: {drill.robot.connection.reason}")
+            raise ViolatedError(
+                f"not online {BACK_S:.0f} s after the last fault: {drill.robot.session.connection.reason}"
+            )
     drill.seen.back = drill.seconds - since
 
 

@@ -12,23 +12,12 @@ import pytest
 
 from pebble.contract import ESTOP_STATE, codec
 from pebble.simulation.micropython.faults import failure
-from tests.firmware.drill import BASE, DRIVE, ESTOP, RESET, START_S, STATE, Drill
+from tests.firmware.drill import BASE, DRIVE, ESTOP, NAME, RESET, START_S, STATE, Drill
 from tests.firmware.test_network_robot import AHEAD, KINDS, online, published
 
 FILE = "/estop.json"
-A, B, C = "00000000000000aa", "00000000000000bb", "00000000000000cc"
+A, B, C = NAME, "00000000000000bb", "00000000000000cc"
 TURN_S = 0.2
-
-
-def stop(drill: Drill, name: str = A, **more: str) -> None:
-    drill.broker.publish(ESTOP, json.dumps({"stop": name, **more}).encode(), qos=1)
-
-
-def reset(drill: Drill, **changes: Any) -> None:
-    """A command with what the newest state says, unless changed."""
-    newest = states(drill)[-1]
-    order = {"boot": newest["boot"], "count": newest["count"], "by": "ann", **changes}
-    drill.broker.publish(RESET, json.dumps(order).encode(), qos=1)
 
 
 def signed(drill: Drill, run: int, z: float = 0.5, **more: Any) -> None:
@@ -45,9 +34,9 @@ def wait(drill: Drill, seconds: float = TURN_S) -> None:
 
 def stopped(kind: str = "benjr", name: str = A) -> Drill:
     drill = online(kind)
-    stop(drill, name)
+    drill.stop(name)
     wait(drill, 0.5)
-    assert states(drill)[-1]["latched"]
+    assert drill.state()["latched"]
     return drill
 
 
@@ -66,7 +55,7 @@ def test_a_stop_halts_latches_and_is_confirmed(kind: str) -> None:
     drill.command(0.0, 0.5)
     wait(drill)
     assert drill.outputs() == AHEAD[kind]
-    stop(drill, by="ann", why="test")
+    drill.stop(by="ann", why="test")
     wait(drill)
     assert not any(drill.outputs())
     message = [one.message for one in drill.broker.received if one.message.topic == STATE][-1]
@@ -82,11 +71,11 @@ def test_a_stop_halts_latches_and_is_confirmed(kind: str) -> None:
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_reset_of_the_newest_state_frees_once_the_stick_was_released(kind: str) -> None:
     drill = stopped(kind)
-    reset(drill)
+    drill.reset()
     drill.nonsense(b'{"z": 0.5}')
     wait(drill)
     assert not any(drill.outputs())
-    assert not states(drill)[-1]["latched"]
+    assert not drill.state()["latched"]
     drill.command(0.0, 0.0)
     drill.command(0.0, 0.5)
     wait(drill)
@@ -96,23 +85,23 @@ def test_a_reset_of_the_newest_state_frees_once_the_stick_was_released(kind: str
 @pytest.mark.parametrize(("changes", "why"), [({"boot": "00000000"}, "boot"), ({"count": 0}, "count")])
 def test_a_reset_of_another_state_is_refused(changes: dict[str, Any], why: str) -> None:
     drill = stopped()
-    reset(drill, **changes)
+    drill.reset(**changes)
     wait(drill, 0.5)
-    assert (states(drill)[-1]["latched"], states(drill)[-1]["reset_refused"]) == (True, why)
+    assert (drill.state()["latched"], drill.state()["reset_refused"]) == (True, why)
 
 
 def test_a_stop_that_is_repeated_changes_nothing_and_is_confirmed_again() -> None:
     drill = stopped()
-    reset(drill)
+    drill.reset()
     wait(drill, 1.0)
     drill.command(0.0, 0.5)
     wait(drill)
     count = len(states(drill))
-    stop(drill)
+    drill.stop()
     wait(drill, 0.5)
     assert any(drill.outputs())
     assert len(states(drill)) == count + 1
-    assert not states(drill)[-1]["latched"]
+    assert not drill.state()["latched"]
 
 
 @pytest.mark.parametrize(
@@ -124,12 +113,12 @@ def test_what_cannot_be_read_is_a_stop_without_a_name(payload: bytes) -> None:
     drill = online("benjr")
     drill.broker.publish(ESTOP, payload, qos=1)
     wait(drill, 0.6)
-    first = states(drill)[-1]
+    first = drill.state()
     assert (first["latched"], first["count"], len(first["recent"][0])) == (True, 1, 16)
     drill.broker.publish(ESTOP, payload, qos=0)
     wait(drill, 0.6)
-    assert states(drill)[-1]["count"] == 2
-    assert states(drill)[-1]["recent"][1:] == first["recent"]
+    assert drill.state()["count"] == 2
+    assert drill.state()["recent"][1:] == first["recent"]
 
 
 @pytest.mark.parametrize("topic", [ESTOP, RESET])
@@ -157,7 +146,7 @@ def test_a_stop_voids_all_commands_of_its_batch(order: str) -> None:
     drill = online("benjr")
     for step in range(3):
         if step == {"before": 2, "after": 0, "around": 1}[order]:
-            stop(drill)
+            drill.stop()
         drill.nonsense(b'{"z": 0.5}')
     wait(drill)
     assert drill.seen.moves == 0
@@ -174,7 +163,7 @@ def test_a_zero_counts_though_a_newer_command_replaces_it() -> None:
     signed(drill, 17)
     wait(drill)
     assert not any(drill.outputs())
-    assert states(drill)[-1]["barred"] == 17
+    assert drill.state()["barred"] == 17
     wait(drill, 2.5)
     signed(drill, 17)
     wait(drill)
@@ -199,18 +188,18 @@ def test_a_command_moves_no_longer_than_it_is_valid(valid_ms: int, runs_s: float
 @pytest.mark.parametrize("kind", KINDS)
 def test_latched_survives_a_power_cut_and_so_does_free(kind: str) -> None:
     drill = stopped(kind)
-    boot = states(drill)[-1]["boot"]
+    boot = drill.state()["boot"]
     reconnect(drill)
-    state = states(drill)[-1]
+    state = drill.state()
     assert (state["latched"], state["count"], state["recent"], state["persisted"]) == (True, 0, [A], True)
     assert state["boot"] != boot
     drill.nonsense(b'{"z": 0.5}')
     wait(drill)
     assert not any(drill.outputs())
-    reset(drill)
+    drill.reset()
     wait(drill, 0.5)
     reconnect(drill)
-    assert (states(drill)[-1]["latched"], states(drill)[-1]["recent"]) == (False, [A])
+    assert (drill.state()["latched"], drill.state()["recent"]) == (False, [A])
 
 
 @pytest.mark.parametrize("content", [b"", b'{"latched":false,"rec', b"[]", b"\xff\xff", b'{"latched":0,"recent":[]}'])
@@ -218,59 +207,41 @@ def test_a_file_that_cannot_be_read_is_a_stop(content: bytes) -> None:
     drill = online("benjr")
     drill.board.files[FILE] = content
     reconnect(drill)
-    assert (states(drill)[-1]["latched"], states(drill)[-1]["persisted"]) == (True, True)
+    assert (drill.state()["latched"], drill.state()["persisted"]) == (True, True)
 
 
-def test_the_file_is_written_when_latched_changes_and_not_per_stop() -> None:
+def test_the_file_is_written_when_latched_changes_and_not_per_stop_with_motors_off() -> None:
     drill = online("benjr")
-    written: list[str] = []
-    drill.board.files.before = lambda what, path, _data: written.append(f"{what} {path}")
+    drill.command(0.0, 0.5)
+    wait(drill)
+    written: list[tuple[str, str, Any]] = []
+    drill.board.files.before = lambda what, path, _data: written.append((what, path, drill.outputs()))
     for name in (A, B, A, C, A):
-        stop(drill, name)
+        drill.stop(name)
         wait(drill, 0.3)
-    assert written == ["write /estop.new", f"rename {FILE}"]
-    reset(drill)
+    assert written == [("write", "/estop.new", (0.0, 0.0)), ("rename", FILE, (0.0, 0.0))]
+    drill.reset()
     wait(drill, 0.3)
     assert len(written) == 4
     assert json.loads(drill.board.files[FILE])["recent"] == [C, B, A]
 
 
-def test_motors_are_off_before_the_file_is_written() -> None:
-    drill = online("benjr")
-    drill.command(0.0, 0.5)
-    wait(drill)
-    outputs: list[Any] = []
-    drill.board.files.before = lambda *_: outputs.append(drill.outputs())
-    stop(drill)
-    wait(drill)
-    assert outputs == [(0.0, 0.0)] * 2
-
-
-def test_a_file_that_cannot_be_written_is_no_confirmation_and_is_tried_again_at_the_next_repetition() -> None:
-    drill = online("benjr")
-    drill.board.files.before = _fail(errno.ENOSPC)
-    stop(drill)
-    wait(drill, 0.5)
-    assert (states(drill)[-1]["latched"], states(drill)[-1]["persisted"]) == (True, False)
-    drill.board.files.before = lambda *_: None
-    stop(drill)
-    wait(drill, 0.5)
-    assert states(drill)[-1]["persisted"] is True
-
-
-def test_a_read_only_file_system_is_null() -> None:
-    drill = online("benjr")
-    drill.board.files.before = _fail(errno.EROFS)
-    stop(drill)
-    wait(drill, 0.5)
-    assert (states(drill)[-1]["latched"], states(drill)[-1]["persisted"]) == (True, None)
-
-
-def _fail(number: int) -> Any:
-    def before(*_: object) -> None:
+@pytest.mark.parametrize(("number", "persisted"), [(errno.ENOSPC, False), (errno.EROFS, None)])
+def test_a_file_that_cannot_be_written_is_no_confirmation_and_is_tried_again_at_the_next_repetition(
+    number: int, persisted: bool | None
+) -> None:
+    def fail(*_: object) -> None:
         raise failure(number)
 
-    return before
+    drill = online("benjr")
+    drill.board.files.before = fail
+    drill.stop()
+    wait(drill, 0.5)
+    assert (drill.state()["latched"], drill.state()["persisted"]) == (True, persisted)
+    drill.board.files.before = lambda *_: None
+    drill.stop()
+    wait(drill, 0.5)
+    assert drill.state()["persisted"] is True
 
 
 class PowerLostError(BaseException):
@@ -289,26 +260,26 @@ def test_a_power_cut_in_the_middle_leaves_the_old_file_or_the_new_one(at: str, t
             raise PowerLostError
 
     drill.board.files.before = before
-    reset(drill)
+    drill.reset()
     with pytest.raises(PowerLostError):
         wait(drill, 1.0)
     drill.board.files.before = lambda *_: None
     reconnect(drill)
-    assert states(drill)[-1]["latched"]
-    assert states(drill)[-1]["recent"] == [A]
+    assert drill.state()["latched"]
+    assert drill.state()["recent"] == [A]
 
 
 def test_at_most_four_states_a_second_and_the_newest_gets_out() -> None:
     drill = online("benjr")
     start = drill.clock.now()
     for number in range(100):
-        stop(drill, f"{number:016x}", by="b" * 99, why="w" * 99)
+        drill.stop(f"{number:016x}", by="b" * 99, why="w" * 99)
         wait(drill, 0.03)
     wait(drill, 0.5)
     times = [one.at for one in drill.broker.received if one.message.topic == STATE and one.at > start]
     assert min(later - earlier for earlier, later in pairwise(times)) > 0.2
-    assert states(drill)[-1]["count"] == 100
-    assert states(drill)[-1]["recent"] == [f"{number:016x}" for number in (99, 98, 97, 96)]
+    assert drill.state()["count"] == 100
+    assert drill.state()["recent"] == [f"{number:016x}" for number in (99, 98, 97, 96)]
 
 
 def test_a_state_has_at_most_300_bytes() -> None:
@@ -317,9 +288,9 @@ def test_a_state_has_at_most_300_bytes() -> None:
     signed(drill, (1 << 30) - 1)
     drill.robot.stops.latch.count = (1 << 30) - 10
     for name in (A, B, C, "00000000000000dd"):
-        stop(drill, name, by="b" * 99, why="w" * 99)
+        drill.stop(name, by="b" * 99, why="w" * 99)
     wait(drill, 0.5)
-    reset(drill, count=1)
+    drill.reset(count=1)
     wait(drill, 0.5)
     payload = drill.received(STATE)[-1]
     state = json.loads(payload)
@@ -330,15 +301,11 @@ def test_a_state_has_at_most_300_bytes() -> None:
 
 @pytest.mark.parametrize("refused", [ESTOP, RESET])
 def test_without_both_topics_a_stop_is_only_a_zero(refused: str) -> None:
-    drill = Drill("benjr", 1)
-    drill.broker.refused = {refused}
-    while drill.robot.connection.state != "online":
-        drill.turn(0.01)
-    wait(drill, 0.5)
+    drill = online("benjr", refused={refused})
     assert published(drill, "capabilities")[-1]["value"]["estop"]["available"] is False
     drill.command(0.0, 0.5)
     wait(drill)
-    stop(drill)
+    drill.stop()
     wait(drill)
     assert any(drill.outputs()) == (refused == ESTOP)  # it is not delivered
     assert states(drill) == []
@@ -349,7 +316,7 @@ def test_the_refusal_of_the_drive_topic_is_fatal() -> None:
     drill = Drill("benjr", 1)
     drill.broker.refused = {DRIVE}
     drill.run(8.0)
-    assert drill.robot.connection.reason == "subscription refused"
+    assert drill.robot.session.connection.reason == "subscription refused"
     assert not drill.received(f"{BASE}/outgoing/online", START_S)
 
 

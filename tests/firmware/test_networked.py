@@ -10,11 +10,14 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from threading import Thread
+from types import SimpleNamespace
 from typing import Any
 
 import msgspec
 import pytest
 
+from pebble.simulation import networked
 from pebble.simulation.mcu import Snapshot
 from pebble.simulation.trace import read_trace
 from pebble.simulation.wireless import KINDS
@@ -34,12 +37,7 @@ class Program:
         command = [sys.executable, "-m", "pebble.simulation.networked", "--kind", kind, "--broker", broker, *options]
         with out, err:
             self.process = Child(
-                command,
-                cwd=ROOT,
-                stdin=subprocess.DEVNULL,
-                stdout=out,
-                stderr=err,
-                env={**os.environ, **environment},
+                command, cwd=ROOT, stdin=subprocess.DEVNULL, stdout=out, stderr=err, env={**os.environ, **environment}
             )
 
     @property
@@ -86,110 +84,132 @@ def retained(port: int, topic: str) -> Any:
     return json.loads(raw) if raw else None
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_it_is_driven_and_reports_its_state(start: Any, broker: Broker, tmp_path: Path, kind: str) -> None:
-    trace = tmp_path / "trace.jsonl"
-    program = start(kind, f"127.0.0.1:{broker.port}", "--id", kind, "--report", "--trace", str(trace))
-    with Operator(broker.port) as operator:
-        assert until(lambda: operator.beating(kind, 0.0) > 1, 15), program.err
-        operator.drive(kind, 0.0, 1.0)
-        assert until(lambda: any(identify.board.motors != (0.0, 0.0) for identify in program.snapshots()))
-        assert until(lambda: [entry.motors for entry in read_trace(trace)] == [(1.0, 1.0), (0.0, 0.0)], 5)
-    last = program.snapshots()[-1]
-    assert (last.board.kind, last.plugged, last.host) == (kind, True, True)
-    assert last.board.pose.x_mm > 50
-    changes = read_trace(trace)
-    assert 0.8 <= (changes[1].ns - changes[0].ns) / 1e9 <= 1.2  # after the last command
-    assert f"connected to the broker at 127.0.0.1:{broker.port}" in program.err
-    capabilities = retained(broker.port, f"pebble/robots/{kind}/outgoing/capabilities")
-    assert capabilities["value"]["identity"]["id"] == kind
-    assert capabilities["value"]["drive"] == {
-        "available": True,
-        "controls": True,
-        "arbitrates": True,
-        "topic": f"pebble/robots/{kind}/incoming/drive-values",
-    }
-
-
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_signal_ends_it_at_once_with_motors_off(
-    start: Any, broker: Broker, tmp_path: Path, number: signal.Signals
+def test_both_are_driven_report_their_state_and_end_at_once_by_a_signal_with_motors_off(
+    start: Any, broker: Broker, tmp_path: Path
 ) -> None:
-    trace = tmp_path / "trace.jsonl"
-    program = start("minilamp", f"127.0.0.1:{broker.port}", "--trace", str(trace))
+    address = f"127.0.0.1:{broker.port}"
+    traces = {kind: tmp_path / f"{kind}.jsonl" for kind in KINDS}
+    programs = {kind: start(kind, address, "--id", kind, "--report", "--trace", str(traces[kind])) for kind in KINDS}
+
+    def motors(kind: str) -> list[Any]:
+        return [entry.motors for entry in read_trace(traces[kind])]
+
     with Operator(broker.port) as operator:
-        assert until(lambda: operator.beating("minilamp", 0.0) > 1, 15), program.err
-        operator.drive("minilamp", 0.0, 1.0)
-        assert until(lambda: (1.0, 1.0) in [entry.motors for entry in read_trace(trace)])
-        program.process.send_signal(number)
-        began = time.monotonic()
-        assert program.process.wait(10) == 0
-        assert time.monotonic() - began <= END_S
-    assert [entry.motors for entry in read_trace(trace)][-2:] == [(1.0, 1.0), (0.0, 0.0)]
+        for kind, program in programs.items():
+            assert until(lambda kind=kind: operator.beating(kind, 0.0) > 1, 15), program.err  # type: ignore[misc]
+            operator.drive(kind, 0.0, 1.0)
+        assert until(lambda: all(motors(kind) == [(1.0, 1.0), (0.0, 0.0)] for kind in KINDS), 5)
+        for (kind, program), number in zip(programs.items(), (signal.SIGTERM, signal.SIGINT), strict=True):
+            moving, *_, last = program.snapshots()
+            assert (last.board.kind, last.plugged, last.host) == (kind, True, True)
+            assert any(one.board.motors != (0.0, 0.0) for one in program.snapshots())
+            assert last.board.pose.x_mm > 50 > moving.board.pose.x_mm
+            began, ended = read_trace(traces[kind])
+            assert 0.8 <= (ended.ns - began.ns) / 1e9 <= 1.2  # after the last command
+            assert f"connected to the broker at {address}" in program.err
+            capabilities = retained(broker.port, f"pebble/robots/{kind}/outgoing/capabilities")["value"]
+            assert capabilities["identity"]["id"] == kind
+            assert capabilities["drive"]["topic"] == f"pebble/robots/{kind}/incoming/drive-values"
+            operator.drive(kind, 0.0, 1.0)
+            assert until(lambda kind=kind: motors(kind)[-1] == (1.0, 1.0))  # type: ignore[misc]
+            program.process.send_signal(number)
+            signalled = time.monotonic()
+            assert program.process.wait(10) == 0
+            assert time.monotonic() - signalled <= END_S
+            assert motors(kind)[-1] == (0.0, 0.0)
 
 
-def test_its_files_survive_the_program(start: Any, broker: Broker, tmp_path: Path) -> None:
+def test_its_files_survive_a_killed_program_which_is_published_as_offline(
+    start: Any, broker: Broker, tmp_path: Path
+) -> None:
     arguments = ("benjr", f"127.0.0.1:{broker.port}", "--files", str(tmp_path / "board"))
-    topic = "pebble/robots/benjr/outgoing/estop/mcu"
+    topic, online = (f"pebble/robots/benjr/outgoing/{metric}" for metric in ("estop/mcu", "online"))
     program = start(*arguments)
     assert until(lambda: (retained(broker.port, topic) or {}).get("latched") is False, 15), program.err
     with Operator(broker.port) as operator:
         operator.send("benjr", b'{"stop": "00000000000000aa"}', metric="estop")
         assert until(lambda: retained(broker.port, topic)["persisted"] and retained(broker.port, topic)["latched"])
     first = retained(broker.port, topic)
+    assert retained(broker.port, online)["online"] is True
     program.process.kill()
     program.process.wait()
+    assert until(lambda: retained(broker.port, online) == {"t": 0, "online": False})
     start(*arguments)
     assert until(lambda: retained(broker.port, topic)["boot"] != first["boot"], 15)
     assert retained(broker.port, topic)["latched"] is True
     assert retained(broker.port, topic)["recent"] == ["00000000000000aa"]
 
 
-def test_a_killed_robot_is_published_as_offline(start: Any, broker: Broker) -> None:
-    program = start("benjr", f"127.0.0.1:{broker.port}")
-    online = "pebble/robots/benjr/outgoing/online"
-    assert until(lambda: (retained(broker.port, online) or {}).get("online") is True, 15), program.err
-    program.process.kill()
-    assert until(lambda: retained(broker.port, online) == {"t": 0, "online": False})
+class Running:
+    """The same program on threads of this process; ``err`` is what all of them write."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+        self.signal = SimpleNamespace(received=False)
+        monkeypatch.setattr(networked, "StopSignal", lambda: self.signal)
+        self._capsys, self._written = capsys, ""
+        self._threads: list[Thread] = []
+
+    def start(self, kind: str, broker: str, *options: str) -> None:
+        arguments = ["--kind", kind, "--broker", broker, *options]
+        self._threads.append(Thread(target=networked.main, args=(arguments,), daemon=True))
+        self._threads[-1].start()
+
+    @property
+    def err(self) -> str:
+        self._written += self._capsys.readouterr().err
+        return self._written
+
+    def end(self) -> None:
+        self.signal.received = True
+        for thread in self._threads:
+            thread.join(10)
 
 
-def test_a_broker_that_is_not_there_is_named_and_waited_for(start: Any, tmp_path: Path) -> None:
+@pytest.fixture
+def running(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Iterator[Running]:
+    made = Running(monkeypatch, capsys)
+    yield made
+    made.end()
+
+
+def test_a_broker_that_is_not_there_is_named_and_waited_for(running: Running, tmp_path: Path) -> None:
     port = free_port()
-    program = start("minilamp", f"localhost:{port}")
-    assert until(lambda: "cannot reach" in program.err, 15)
-    assert f"minilamp: cannot reach the broker at localhost:{port}: Connection refused; it keeps trying" in program.err
+    running.start("minilamp", f"localhost:{port}")
+    wanted = f"minilamp: cannot reach the broker at localhost:{port}: Connection refused; it keeps trying"
+    assert until(lambda: wanted in running.err, 15), running.err
     broker = Broker(tmp_path, port=port)
     try:
-        assert until(lambda: "connected to the broker" in program.err, 20), program.err
+        assert until(lambda: "connected to the broker" in running.err, 20), running.err
     finally:
         broker.kill()
-    assert "Traceback" not in program.err
 
 
-def test_a_login_that_is_refused_is_named(start: Any, tmp_path: Path) -> None:
-    passwords = tmp_path / "passwords"
+def test_a_login_that_is_refused_is_named(running: Running, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    passwords, wrong = tmp_path / "passwords", tmp_path / "wrong"
     subprocess.run(["mosquitto_passwd", "-b", "-c", str(passwords), "ann", "right"], check=True, capture_output=True)
     passwords.chmod(0o644)
+    wrong.write_text("wrong")
+    monkeypatch.setenv("PEBBLE_PASSWORD", "right")
     broker = Broker(tmp_path, "allow_anonymous false", f"password_file {passwords}")
     address = f"127.0.0.1:{broker.port}"
     try:
-        wrong = start("benjr", address, "--username", "ann", PEBBLE_PASSWORD="wrong")
-        right = start("minilamp", address, "--username", "ann", PEBBLE_PASSWORD="right")
-        assert until(lambda: "connected to" in right.err, 15), right.err
-        assert until(lambda: "cannot reach" in wrong.err, 15)
-        assert "refused" in wrong.err
+        running.start("benjr", address, "--username", "ann", "--password-file", str(wrong))
+        running.start("minilamp", address, "--username", "ann")
+        assert until(lambda: "minilamp: connected to" in running.err, 15), running.err
+        assert until(lambda: "benjr: cannot reach" in running.err, 15), running.err
+        assert "refused" in running.err
     finally:
         broker.kill()
 
 
-def test_tls(start: Any, tmp_path: Path) -> None:
+def test_tls(running: Running, tmp_path: Path) -> None:
     broker = Broker(tmp_path, f"certfile {TLS / 'server.crt'}", f"keyfile {TLS / 'server.key'}")
     try:
-        trusting = start("minilamp", f"localhost:{broker.port}", "--ca", str(TLS / "ca.crt"))
-        assert until(lambda: "connected to" in trusting.err, 20), trusting.err
-        doubting = start("minilamp", f"localhost:{broker.port}", "--ca", str(TLS / "other-ca.crt"))
-        assert until(lambda: "cannot reach" in doubting.err, 20)
-        assert "CERTIFICATE_VERIFY_FAILED" in doubting.err
+        for name, ca in (("trusting", "ca.crt"), ("doubting", "other-ca.crt")):
+            running.start("minilamp", f"localhost:{broker.port}", "--id", name, "--ca", str(TLS / ca))
+        assert until(lambda: "connected to" in running.err, 20), running.err
+        assert until(lambda: "cannot reach" in running.err, 20), running.err
+        assert "CERTIFICATE_VERIFY_FAILED" in running.err
     finally:
         broker.kill()
 
@@ -204,11 +224,11 @@ def test_tls(start: Any, tmp_path: Path) -> None:
         (("benjr", "127.0.0.1", "--tls"), "memory"),
     ],
 )
-def test_what_makes_no_sense_is_one_line(start: Any, options: tuple[str, ...], named: str) -> None:
-    program = start(*options)
-    assert program.process.wait(15) == 1
-    assert named in program.err
-    assert len(program.err.splitlines()) == 1
+def test_what_makes_no_sense_is_one_line(running: Running, options: tuple[str, ...], named: str) -> None:
+    kind, broker, *more = options
+    assert networked.main(["--kind", kind, "--broker", broker, *more]) == 1
+    assert named in running.err
+    assert len(running.err.splitlines()) == 1
 
 
 def test_firmware_that_fails_stops_its_motors_and_boots_anew(broker: Broker) -> None:

@@ -82,23 +82,15 @@ def run(board: Board, monkeypatch: pytest.MonkeyPatch, error: BaseException) -> 
         module.run(lambda _settings: Robot(board, error), {})
 
 
-def test_a_robot_that_fails_stops_and_starts_anew(board: Board, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("stops", "end"), [(True, ["feed", "feed", "stop", "reset"]), (False, ["stop", "reset"])])
+def test_a_robot_that_fails_stops_and_starts_anew_also_if_it_cannot_stop(
+    board: Board, monkeypatch: pytest.MonkeyPatch, stops: bool, end: list[str]
+) -> None:
+    monkeypatch.setattr(Robot, "stops", stops)
     with pytest.raises(WasReset):
         run(board, monkeypatch, MemoryError("memory allocation failed"))
-    assert board.calls[-4:] == ["feed", "feed", "stop", "reset"]
-
-
-def test_a_robot_that_cannot_even_stop_starts_anew(board: Board, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Robot, "stops", False)
-    with pytest.raises(WasReset):
-        run(board, monkeypatch, MemoryError("memory allocation failed"))
-    assert board.calls[-2:] == ["stop", "reset"]
-
-
-def test_ctrl_c_works_before_the_watchdog_and_not_after(board: Board, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(WasReset):
-        run(board, monkeypatch, OSError())
-    assert board.calls[:4] == ["ctrl-c 3", "wait 1000", "ctrl-c -1", "watchdog"]
+    assert board.calls[:4] == ["ctrl-c 3", "wait 1000", "ctrl-c -1", "watchdog"]  # Ctrl-C works before it, not after
+    assert board.calls[-len(end) :] == end
 
 
 def test_who_comes_in_by_that_door_finds_no_watchdog(board: Board, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,138 +1,136 @@
-"""MicroPython's official image for the XIAO SAMD21, without select and sys.stdin.buffer: what is different there.
-
-tests/simulation/test_official_image.py drives whole robots on it.
-"""
+"""MicroPython's official image for the XIAO SAMD21, without select and sys.stdin.buffer: what is different there."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from typing import Any
 
 import pytest
 
-from pebble.services.serial_mcu_bridge.pebble_serial_v1.frame import Frame, Type, decode, encode
-from pebble.simulation.bodies import body_of
-from pebble.simulation.micropython.board import Board
-from pebble.simulation.micropython.clock import VirtualClock
+from pebble.services.serial_mcu_bridge.pebble_serial_v1.frame import Type
+from pebble.simulation.micropython.modules.machine import Machine
 from pebble.simulation.micropython.ports import SAMD21_OFFICIAL
 from pebble.simulation.micropython.timers import BoardReset
+from tests.firmware.benches import ASK, Bench, of
 
 
 class SwitchedOff(BaseException):
-    """Ends the endless loop."""
+    """Ends the endless loop of main.py."""
 
 
-class Bench:
-    """``at`` seconds something happens; ``run`` switches on until then."""
+class Endless(Bench):
+    """Runs main.py, whose loop a timer turns, and does what ``plan`` has for that time; ``output`` has times."""
 
     def __init__(self, kind: str = "goob") -> None:
-        self.clock = VirtualClock()
-        self.board = Board(self.clock, port=SAMD21_OFFICIAL)
-        self.body = body_of(kind, self.board)
-        self.robot: Any = self.board.load(kind, {})
-        self.output = b""
-        self._plan: list[tuple[float, Callable[[], None]]] = []
+        super().__init__(kind, port=SAMD21_OFFICIAL)
+        self.output: list[tuple[float, bytes]] = []
+        self.plan: list[tuple[float, Callable[[], object]]] = []
         self._end = 0.0
         self.board.timers.on_wait = self._check
 
-    def at(self, seconds: float, act: Callable[[], None]) -> None:
-        self._plan.append((seconds, act))
+    def type(self, typed: dict[float, bytes]) -> None:
+        self.plan += [(at, lambda data=data: self.board.type(data)) for at, data in typed.items()]  # type: ignore[misc]
 
-    def run(self, seconds: float) -> None:
+    def run(self, seconds: float, *, main: bool = False) -> None:
+        """From switching on, for so long; ``main``: by main.py, with a robot of its own."""
         self._end = seconds
-        self.board.firmware.module("common.run").run(lambda _settings: self.robot, {})
+        if main:
+            self.board.boot()
+            self.board.timers.on_wait = self._check
+        firmware = self.board.firmware
+        with pytest.raises(SwitchedOff):
+            firmware.run(f"{self.kind}/main.py") if main else firmware.module("common.run").run(self._built, {})
+
+    def lines(self, pattern: bytes) -> list[float]:
+        """The times of output lines like this."""
+        return [when for when, data in self.output for line in data.splitlines() if re.fullmatch(pattern, line)]
+
+    def _built(self, _settings: object) -> Any:
+        return self.robot
 
     def _check(self) -> None:
         now = self.clock.now()
         self.body.end_turn()
-        if self.board.console.reading:
-            self.output += self.board.take_output()
-        for entry in [entry for entry in self._plan if entry[0] <= now]:
-            self._plan.remove(entry)
+        if self.board.console.reading and (output := self.board.take_output()):
+            self.output.append((now, output))
+        for entry in [entry for entry in self.plan if entry[0] <= now]:
+            self.plan.remove(entry)
             entry[1]()
         if now >= self._end:
             raise SwitchedOff
 
 
+@pytest.mark.parametrize("kind", ["goob", "fred"])
+def test_it_obeys_answers_and_stops_in_silence(kind: str) -> None:
+    bench = Endless(kind)
+    bench.type({1.5: b"M 0.5 0.5\n", 2.0: b"M 0.5 0.5\r\nL 0 1 0\nX\n", 2.1: b"M 0 \x03 nothing"})
+    bench.run(4.0, main=True)
+    (began, _), (ended, off) = bench.motors
+    assert began == pytest.approx(1.5, abs=0.02)
+    assert off == (0.0, 0.0)
+    assert 2.99 <= ended <= 3.03
+    assert [len(bench.lines(rb"OK M")), len(bench.lines(rb"OK L")), len(bench.lines(rb"ERR .*"))] == [2, 1, 1]
+    assert bench.board.resets == 0
+
+
+@pytest.mark.parametrize(("kind", "rate_hz"), [("goob", 50), ("fred", 2)])
+def test_it_reports_on_time(kind: str, rate_hz: int) -> None:
+    bench = Endless(kind)
+    bench.run(11.0, main=True)
+    reports = bench.lines(rb"T [at]0=.*")
+    assert len([when for when in reports if when > 1.0]) == pytest.approx(rate_hz * 10, abs=2)
+
+
+def test_a_host_that_does_not_read_does_not_keep_the_motors_running() -> None:
+    bench = Endless()
+    bench.board.console.reading = False
+    bench.type({1.2 + 0.1 * count: b"M 1 1\n" for count in range(20)})
+    bench.run(6.0)
+    assert bench.motors[-1][1] == (0.0, 0.0)
+    assert bench.motors[-1][0] - 3.1 <= 1.6, "one wait of half a second may come in between"
+
+
 def test_it_speaks_again_when_the_host_reads_again() -> None:
-    bench = Bench()
+    bench = Endless()
     console = bench.board.console
-    received: list[int] = []
-    bench.at(2.0, lambda: setattr(console, "reading", False))
-    bench.at(4.0, lambda: setattr(console, "reading", True))
-    bench.at(5.6, lambda: received.append(len(bench.output)))
-    with pytest.raises(SwitchedOff):
-        bench.run(6.6)
-    lines = bench.output[received[0] :].split(b"\r\n")
-    assert len([line for line in lines if line.startswith(b"T a0=")]) >= 49
-    assert b"\r\r" not in bench.output
+    bench.plan = [(at, lambda on=on: setattr(console, "reading", on)) for at, on in ((2.0, False), (4.0, True))]  # type: ignore[misc]
+    bench.run(6.6)
+    assert len([when for when in bench.lines(rb"T a0=.*") if when > 5.6]) >= 49
+    assert not any(b"\r\r" in data for _, data in bench.output)
 
 
 def test_a_flood_does_not_keep_the_motors_running() -> None:
-    bench = Bench()
-    moving = []
-    bench.at(1.5, lambda: bench.board.type(b"M 1 1\n" + b"x" * 100_000))
-    bench.at(1.6, lambda: moving.append(bench.body.outputs()))
-    bench.at(2.6, lambda: moving.append(bench.body.outputs()))
-    with pytest.raises(SwitchedOff):
-        bench.run(2.7)
+    bench = Endless()
+    bench.type({1.5: b"M 1 1\n" + b"x" * 100_000})
+    bench.run(2.7)
     assert bench.board.unread > 0
-    assert moving == [(1.0, -1.0), (0.0, 0.0)]
+    (began, motors), (stopped, off) = bench.motors
+    assert (motors, off) == ((1.0, 1.0), (0.0, 0.0))
+    assert stopped - began < 1.1
 
 
 def test_a_fault_in_a_turn_stops_the_motors_and_resets() -> None:
     """A callback's exception is not propagated."""
-    bench = Bench()
+    bench = Endless()
 
     def fail() -> None:
         raise MemoryError
 
-    bench.at(1.5, lambda: bench.board.type(b"M 1 1\n"))
-    bench.at(1.6, lambda: setattr(bench.robot, "step", fail))
+    bench.type({1.5: b"M 1 1\n"})
+    bench.plan.append((1.6, lambda: setattr(bench.robot, "step", fail)))
     with pytest.raises(BoardReset):
         bench.run(3.0)
     assert bench.clock.now() == pytest.approx(1.6, abs=0.02)
     assert bench.body.outputs() == (0.0, 0.0)
 
 
-def test_the_imu_speaks_on_its_two_pins() -> None:
-    bench = Bench("goob_imu")
-    assert bench.robot.ctrl_c, "USB is free there, so Ctrl-C may be let in"
-    assert bench.robot.port._uart.baudrate == 115200
-    bench.board.type(encode(Frame(Type.DESCRIBE_REQ)))
-    for _ in range(1000):
-        bench.clock.advance(0.001)
-        bench.robot.step()
-    kinds = [frame.type for frame in _frames(bench.board.take_output())]
-    assert kinds.count(Type.SAMPLE) == 99
-    assert kinds.count(Type.DESCRIBE) == 1
+class SlowUart:
+    """A port with a buffer of 64 bytes, which 115,200 baud empty by 11.5 in each turn of a millisecond."""
 
-
-def test_the_imu_keeps_up_with_its_slow_line() -> None:
-    """The buffer of the port takes what 115,200 baud have sent, and nothing beyond."""
-    bench = Bench("goob_imu")
-    line = SlowLine(bench.robot.port._uart)
-    bench.robot.port._uart = line
-    bench.board.type(encode(Frame(Type.DESCRIBE_REQ)))
-    for _ in range(3000):
-        bench.clock.advance(0.001)
-        line.room = min(64.0, line.room + 11.5)
-        bench.robot.step()
-    sequences = [frame.sequence for frame in _frames(line.sent) if frame.type is Type.SAMPLE]
-    assert sequences == list(range(1, len(sequences) + 1))
-    assert len(sequences) >= 296
-
-
-def _frames(sent: bytes) -> list[Frame]:
-    """Whole ones. Empty ones mean nothing: a zero may come first, in case half a frame stands before it."""
-    return [decode(raw) for raw in sent.split(b"\0")[:-1] if raw]
-
-
-class SlowLine:
     def __init__(self, uart: Any) -> None:
-        self.any, self.readinto = uart.any, uart.readinto
-        self.room = 64.0
-        self.sent = b""
+        self.any, self.readinto, self.baudrate = uart.any, uart.readinto, uart.baudrate
+        self.room, self.sent = 64.0, b""
 
     def write(self, data: bytes, first: int, count: int) -> int | None:
         taken = min(count, int(self.room))
@@ -141,11 +139,32 @@ class SlowLine:
         return taken or None
 
 
+def test_the_imu_speaks_on_its_two_pins_and_keeps_up_with_its_slow_line() -> None:
+    """The buffer of the port takes what 115,200 baud have sent, and nothing beyond."""
+    lines: list[SlowUart] = []
+
+    def slow(machine: Machine) -> None:
+        kind = machine.UART
+        machine.UART = lambda *pins, **more: lines.append(SlowUart(kind(*pins, **more))) or lines[-1]
+
+    bench = Bench("goob_imu", port=SAMD21_OFFICIAL, change=slow)
+    (line,) = lines
+    assert bench.robot.ctrl_c, "USB is free there, so Ctrl-C may be let in"
+    assert line.baudrate == 115200
+    bench.board.type(ASK)
+    for _ in range(3000):
+        bench.turn(0.001)
+        line.room = min(64.0, line.room + 11.5)
+    frames = bench.read(line.sent)
+    sequences = [frame.sequence for frame in of(frames, Type.SAMPLE)]
+    assert sequences == list(range(1, len(sequences) + 1))
+    assert len(sequences) >= 296
+    assert len(of(frames, Type.DESCRIBE)) == 1
+
+
 def test_with_an_image_that_has_both_ctrl_c_stays_out_of_the_imus_usb() -> None:
     """A DESCRIBE_REQ begins with 3: the host would stop the board just by asking."""
-    board = Board(VirtualClock())
-    body_of("goob_imu", board)
-    robot: Any = board.load("goob_imu", {})
-    assert encode(Frame(Type.DESCRIBE_REQ))[0] == 3
-    assert not robot.ctrl_c
-    assert board.console.interrupt == -1
+    bench = Bench("goob_imu")
+    assert ASK[0] == 3
+    assert not bench.robot.ctrl_c
+    assert bench.board.console.interrupt == -1

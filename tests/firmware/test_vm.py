@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import functools
 import json
 import shutil
 from pathlib import Path
@@ -27,26 +26,21 @@ def functions() -> list[tuple[str, str]]:
 
 
 @pytest.fixture(scope="module")
-def firmware(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return compile_all(tmp_path_factory.mktemp("firmware"))
-
-
-@functools.cache
-def outcome(module: str, firmware: Path) -> dict[str, str]:
-    """Each test's traceback, "" for those that pass; the interpreter is started once per file."""
-    root = firmware.parent / module
-    shutil.copytree(firmware, root)
-    shutil.copy(PURE / f"{module}.py", root)
+def outcomes(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str], str]:
+    """Each test's traceback, "" for those that pass."""
+    root = compile_all(tmp_path_factory.mktemp("firmware"))
+    for file in PURE.glob("test_*.py"):
+        shutil.copy(file, root)
     (root / "vectors").mkdir()
     shutil.copy(ROOT / "tests" / "vectors" / "commands.json", root / "vectors")
-    (root / "module.txt").write_text(module)
+    (root / "modules.json").write_text(json.dumps([file.stem for file in PURE.glob("test_*.py")]))
     done = run(root, SCRIPTS / "run_tests.py")
     assert done.returncode == 0, done.stdout + done.stderr
-    return dict(json.loads(line) for line in done.stdout.splitlines() if line.startswith('["test_'))
+    lines = [json.loads(line) for line in done.stdout.splitlines() if line.startswith('["test_')]
+    return {(module, test): error for module, test, error in lines}
 
 
 @pytest.mark.parametrize(("module", "name"), functions())
-def test_in_micropython(module: str, name: str, firmware: Path) -> None:
-    results = outcome(module, firmware)
-    assert name in results, f"MicroPython did not run it: {results}"
-    assert results[name] == "", f"in MicroPython:\n{results[name]}"
+def test_in_micropython(module: str, name: str, outcomes: dict[tuple[str, str], str]) -> None:
+    assert (module, name) in outcomes, f"MicroPython did not run it: {outcomes}"
+    assert outcomes[module, name] == "", f"in MicroPython:\n{outcomes[module, name]}"

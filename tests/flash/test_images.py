@@ -22,8 +22,7 @@ def uf2(family: int, flags: int = 0x2000) -> bytes:
 
 
 @pytest.mark.parametrize(
-    ("board", "content"),
-    [(ESP32_C6, esp(13)), (ESP8266, esp(0)), (SAMD21, uf2(0x68ED2B88)), (SAMD21, uf2(0, flags=0))],
+    ("board", "content"), [(ESP32_C6, esp(13)), (ESP8266, esp(0)), (SAMD21, uf2(0x68ED2B88)), (SAMD21, uf2(0, flags=0))]
 )
 def test_an_image_for_the_board_is_accepted(board, content: bytes, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
     image = tmp_path / "image"

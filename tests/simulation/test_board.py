@@ -1,13 +1,12 @@
 """The firmware of Goob and Fred on simulated boards, without a real clock or a pty."""
 
 import math
-import random
 
 import pytest
 
 from pebble.errors import ConfigError
 from pebble.services.serial_mcu_bridge.text.goob_base import Charging, Level, Touch, parse
-from pebble.simulation.board import Light, SimulatedMcu
+from pebble.simulation.board import SimulatedMcu
 from pebble.simulation.motion import FULL_SPEED_MM_S, TRACK_MM, RobotMotion
 
 
@@ -22,77 +21,9 @@ def run(mcu: SimulatedMcu, start: float, seconds: float, command: bytes = b"") -
     return output
 
 
-@pytest.mark.parametrize(
-    ("line", "answer", "drive"),
-    [
-        (b"M 0.5 -0.25\n", b"OK M\r\n", (0.5, -0.25)),
-        (b"M 0.5 -0.25\r\n", b"OK M\r\n", (0.5, -0.25)),
-        (b"m 9 -9\n", b"OK M\r\n", (1.0, -1.0)),
-        (b"Motor 0.5 0.5 spare tokens are ignored here\n", b"OK M\r\n", (0.5, 0.5)),
-        (b"M nan inf\n", b"OK M\r\n", (0.0, 0.0)),
-        (b"M x 0.5y\n", b"OK M\r\n", (0.0, 0.5)),
-        (b"M " + b"9" * 200 + b" .5\n", b"OK M\r\n", (1.0, 0.5)),
-        (b"M 0.5\n", b"ERR M needs 2 values\r\n", (0.0, 0.0)),
-        (b"M\n", b"ERR M needs 2 values\r\n", (0.0, 0.0)),
-        (b"X 1 1\n", b"ERR unknown command\r\n", (0.0, 0.0)),
-        (b"\xffM 1 1\n", b"ERR unknown command\r\n", (0.0, 0.0)),
-        (b"\n\r\n \n", b"", (0.0, 0.0)),
-        (b"M 1 1", b"", (0.0, 0.0)),
-        (b"M 1 1 " + b"x" * 300 + b"\n", b"WARN line too long\r\n", (0.0, 0.0)),
-    ],
-)
-def test_commands_as_the_firmware_takes_them(line: bytes, answer: bytes, drive: tuple[float, float]) -> None:
-    mcu = SimulatedMcu("goob", 0.0)
-    assert mcu.receive(line, 0.0) == answer
-    assert mcu.state().drive == drive
-
-
-def test_lights() -> None:
-    mcu = SimulatedMcu("fred", 0.0)
-    assert mcu.receive(b"L 2 0.5 -1\nF 0 1 0 0.01\nL 1 1\nF 1 1 1\n", 0.0).split(b"\r\n") == [
-        b"OK L",
-        b"OK F",
-        b"ERR L needs 3 values",
-        b"ERR F needs 4 values",
-        b"",
-    ]
-    mcu.receive(b"L 2 0.5 -1\n", 0.0)
-    assert mcu.state().light == Light(1.0, 0.5, 0.0)
-
-
-def test_a_light_fades_up_and_down() -> None:
-    mcu = SimulatedMcu("fred", 0.0)
-    run(mcu, 0.0, 1.0)
-    assert mcu.state().light == Light(0.0, 0.0, 1.0), "red for two seconds is what it shows by itself"
-    run(mcu, 1.0, 1.0)
-    assert mcu.state().light == Light(0.0, 0.0, 0.0)
-    mcu.receive(b"F 0 1 0 0.4\n", 2.0)
-    shown = []
-    for step in range(20):
-        run(mcu, 2.0 + step * 0.02, 0.02)
-        shown.append(mcu.state().light.green)
-    assert shown[:10] == sorted(shown[:10])
-    assert shown[9:] == sorted(shown[9:], reverse=True)
-    assert max(shown) == 1.0
-
-
-def test_goobs_headlights_are_white() -> None:
-    mcu = SimulatedMcu("goob", 0.0)
-    mcu.receive(b"L 0 0.5 0\n", 0.0)
-    assert mcu.state().light == Light(0.5, 0.5, 0.5)
-
-
 def test_a_command_may_arrive_in_pieces() -> None:
     mcu = SimulatedMcu("goob", 0.0)
     assert b"".join(mcu.receive(bytes([byte]), 0.0) for byte in b"M 0.5 0.5\nL 0 0 0\n") == b"OK M\r\nOK L\r\n"
-
-
-def test_half_a_command_of_a_dead_host_is_none() -> None:
-    mcu = SimulatedMcu("goob", 0.0)
-    mcu.receive(b"M 0.900", 0.0)
-    run(mcu, 0.0, 0.3)
-    assert mcu.receive(b"M 0.000 0.500\n", 0.31) == b"OK M\r\n"
-    assert mcu.state().drive == (0.0, 0.5)
 
 
 def test_goob_reports() -> None:
@@ -226,26 +157,6 @@ def test_firmware_that_fails_at_every_turn_keeps_starting(monkeypatch: pytest.Mo
     assert mcu.state().motors == (0.0, 0.0)
 
 
-def test_lights_do_not_keep_the_wheels_turning() -> None:
-    mcu = SimulatedMcu("goob", 0.0)
-    mcu.receive(b"M 1 1\n", 0.0)
-    run(mcu, 0.0, 1.5, b"L 0 0 0\n")
-    assert mcu.state().drive == (0.0, 0.0)
-
-
-def test_freds_trims_and_reverse_block() -> None:
-    mcu = SimulatedMcu("fred", 0.0)
-    mcu.receive(b"M 1 1\n", 0.0)
-    assert mcu.state().motors == pytest.approx((0.93, 1.0))
-    mcu.receive(b"M -1 -1\n", 0.3)
-    assert mcu.state().motors == (0.0, 0.0), "reverse is blocked at first"
-    mcu.receive(b"M -1 0\n", 0.33)
-    assert mcu.state().motors == pytest.approx((-0.5 * 0.93, 0.5)), "but turning is not blocked"
-    mcu.receive(b"M -1 -1\n", 0.35)
-    assert mcu.state().motors == pytest.approx((-0.7 * 0.93, -0.7))
-    assert mcu.state().drive == (-1.0, -1.0)
-
-
 def test_the_battery_drains_with_driving_and_fills_on_the_charger() -> None:
     idle, driving, charging = (SimulatedMcu("goob", 0.0) for _ in range(3))
     charging.battery.charging = True
@@ -266,15 +177,6 @@ def test_a_reboot_stops_the_motors_and_reports_the_start() -> None:
     assert mcu.tick(1.0).startswith(b"Starting setup...\r\nDone!\r\nC chg=-1 v=")
     assert mcu.state().drive == (0.0, 0.0)
     assert mcu.state().pose == way
-
-
-def test_garbage_moves_nothing() -> None:
-    mcu = SimulatedMcu("goob", 0.0)
-    noise = random.Random(2)
-    for number in range(20_000):
-        mcu.receive(b"#" + noise.randbytes(20).replace(b"\n", b"") + b"\n", number * 0.001)
-    assert mcu.state().commands == 0
-    assert mcu.state().pose.x_mm == 0.0
 
 
 def test_an_unknown_kind_is_refused() -> None:

@@ -8,17 +8,6 @@ import pytest
 
 from pebble.simulation.micropython.board import Board
 from pebble.simulation.micropython.clock import RealClock, VirtualClock
-from pebble.simulation.micropython.ports import ESP32_C6
-
-
-@pytest.fixture
-def clock() -> VirtualClock:
-    return VirtualClock(1000.0)
-
-
-@pytest.fixture
-def board(clock: VirtualClock) -> Board:
-    return Board(clock, port=ESP32_C6)
 
 
 def test_ticks_start_where_asked_and_wrap(clock: VirtualClock) -> None:

@@ -59,17 +59,6 @@ def test_a_command_on_the_line_switches_a_relay_and_the_trace_has_it(station: Pt
     host.close()
 
 
-def test_a_relay_that_is_taken_away_is_reported(station: PtyMcu, tmp_path: Path) -> None:
-    host = Host(tmp_path / "port")
-    host.send(wire.DESCRIBE_REQ)
-    assert until(lambda: len(host.received(wire.STATE)) >= 4)
-    station.connect("o4", False)
-    assert until(lambda: (8, b"\1\0\0") in [(one.interface, one.payload) for one in host.received(wire.STATE)])
-    host.send(wire.CMD, b"\1", interface=7)
-    assert until(lambda: [one.payload for one in host.received(wire.NACK)] == [b"command_failed"])
-    host.close()
-
-
 def test_only_outlets_that_are_there_can_be_taken_away(station: PtyMcu, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="outlets has no outlet 'o9'"):
         station.connect("o9", False)

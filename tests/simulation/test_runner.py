@@ -103,49 +103,38 @@ class Enough(BaseException):
     """Ends the endless loop."""
 
 
-def turning(board: Board, turns: int) -> None:
-    """Let each turn of the loop take a millisecond, and end it after ``turns``."""
+def looped(clock: VirtualClock, root: Path, turns: int = 5, what: str = "drive", port: Any = ESP32_C6) -> Board:
+    """A board that runs main.py; each turn of the loop takes a millisecond, and it ends after ``turns``."""
+    toy = board(clock, root, port)
 
     def turned() -> None:
-        board.clock.sleep(0.001)
-        if board.watchdog.feeds >= turns:
+        clock.sleep(0.001)
+        if toy.watchdog.feeds >= turns:
             raise Enough
 
-    board.watchdog.on_feed = turned
-
-
-def test_the_real_loop_feeds_the_watchdog_each_turn(clock: VirtualClock, root: Path) -> None:
-    toy = board(clock, root)
-    turning(toy, 500)
-    with pytest.raises(Enough):
+    toy.watchdog.on_feed = turned
+    toy.files[SETTINGS_FILE] = b'{"what": "%s"}' % what.encode()
+    with pytest.raises((Enough, BoardReset)) as ended:
         toy.firmware.run("toy/main.py")
-    assert (toy.watchdog.timeout_ms, toy.watchdog.feeds) == (2000, 500)
-    assert toy.duty(1) == 1.0
+    assert (what == "drive") == (ended.type is Enough)
+    assert {"drive": "", "raise": "machine.reset", "sleep": "watchdog"}[what] in str(ended.value)
+    return toy
 
 
-def test_the_real_loop_on_a_board_with_a_fixed_watchdog(clock: VirtualClock, root: Path) -> None:
-    toy = board(clock, root, ESP8266)
-    turning(toy, 5)
-    with pytest.raises(Enough):
-        toy.firmware.run("toy/main.py")
-    assert toy.watchdog.timeout_ms == 5000
+@pytest.mark.parametrize(("port", "timeout_ms"), [(ESP32_C6, 2000), (ESP8266, 5000)])
+def test_the_real_loop_feeds_the_watchdog_each_turn(
+    clock: VirtualClock, root: Path, port: Any, timeout_ms: int
+) -> None:
+    toy = looped(clock, root, 500, port=port)
+    assert (toy.watchdog.timeout_ms, toy.watchdog.feeds, toy.duty(1)) == (timeout_ms, 500, 1.0)
 
 
 def test_the_real_loop_resets_after_an_error_with_the_motors_off(clock: VirtualClock, root: Path) -> None:
-    toy = board(clock, root)
-    turning(toy, 5)
-    toy.files[SETTINGS_FILE] = b'{"what": "raise"}'
-    with pytest.raises(BoardReset, match=r"machine\.reset"):
-        toy.firmware.run("toy/main.py")
-    assert toy.duty(1) == 0.0
+    assert looped(clock, root, what="raise").duty(1) == 0.0
 
 
 def test_the_watchdog_resets_firmware_that_hangs(clock: VirtualClock, root: Path) -> None:
-    toy = board(clock, root)
-    turning(toy, 5)
-    toy.files[SETTINGS_FILE] = b'{"what": "sleep"}'
-    with pytest.raises(BoardReset, match="watchdog"):
-        toy.firmware.run("toy/main.py")
+    toy = looped(clock, root, what="sleep")
     assert toy.starved(clock.now())
     assert not toy.starved(clock.now() - 0.001), "it was reset at once"
     toy.boot()

@@ -160,7 +160,7 @@ def test_noise():
     noise = Noise(3)
     decoder = Decoder()
     sound = 0
-    for _ in range(20_000):
+    for _ in range(5_000):
         sound += len(received(noise.bytes(noise.next(24)) + b"\0", decoder))
     assert sound < 5, "a CRC of 16 bits lets one of 65,536 pass"
     assert received(CMD, decoder) == [(0x20, 3, 1)]

@@ -24,10 +24,8 @@ def test_adding_wraps() -> None:
     assert diff(add(LAST - 5, 905), LAST - 5) == 905
 
 
-def test_a_grid_is_due_once_per_period_and_makes_up_for_nothing() -> None:
-    grid = Grid(100, LAST - 50)
-    seen = [ms for ms in range(0, 260, 10) if grid.due(add(LAST - 50, ms))]
-    assert seen == [100, 200]
-    assert grid.due(add(LAST - 50, 1250))
-    assert not grid.due(add(LAST - 50, 1299))
-    assert grid.due(add(LAST - 50, 1300))
+def test_a_grid_is_due_once_per_period_makes_up_for_nothing_and_is_delayed_by_nothing() -> None:
+    for start in (0, LAST - 50):
+        grid = Grid(100, start)
+        times = (0, 99, 100, 101, 135, 199, 207, 299, 300, 1250, 1251, 1299, 1300)
+        assert [ms for ms in times if grid.due(add(start, ms))] == [100, 207, 300, 1250, 1300]

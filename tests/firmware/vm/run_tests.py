@@ -1,18 +1,24 @@
-"""In MicroPython: every test of /module.txt's module, one line of JSON each."""
+"""In MicroPython: every test of the modules in /modules.json, one line of JSON each; a module at each turn."""
 
 import io
 import json
 import sys
 
-with open("/module.txt") as file:
-    module = __import__(file.read())
-for name in dir(module):
-    if name.startswith("test_"):
-        error = ""
-        try:
-            getattr(module, name)()
-        except Exception as problem:
-            text = io.StringIO()
-            sys.print_exception(problem, text)
-            error = text.getvalue()
-        print(json.dumps([name, error]))
+with open("/modules.json") as file:
+    waiting = json.load(file)
+
+
+def turn():
+    name = waiting.pop()
+    module = __import__(name)
+    for test in dir(module):
+        if test.startswith("test_"):
+            error = ""
+            try:
+                getattr(module, test)()
+            except Exception as problem:
+                text = io.StringIO()
+                sys.print_exception(problem, text)
+                error = text.getvalue()
+            print(json.dumps([name, test, error]))
+    return bool(waiting)

@@ -27,14 +27,14 @@ def world(**camera: float) -> World:
     return parse_world({"tags": [TAG], "robots": robots, "camera": camera})
 
 
-def follow(goob: LockstepRobot, digest: hashlib._Hash) -> None:
-    """Turn towards the tag and go to it."""
+def follow(goob: LockstepRobot) -> bytes | np.ndarray:
+    """Turn towards the tag and go to it; the picture that showed it, if there was one."""
     picture = goob.picture()
     if picture is None:
-        return
-    digest.update(picture.pixels)
+        return b""
     corners = tags_in(picture.pixels).get(13, np.full((1, 2), 500.0))
     goob.drive(x=(corners[:, 0].mean() - 319.5) / 1000, z=0.4)
+    return picture.pixels
 
 
 def history(seconds: float) -> str:
@@ -43,7 +43,7 @@ def history(seconds: float) -> str:
     fred.write(b"M 0.5 0.1\n")
     while simulated.now() < seconds:
         simulated.step()
-        follow(goob, digest)
+        digest.update(follow(goob))
         digest.update(goob.read() + fred.read() + repr((goob.pose, fred.pose)).encode())
     return digest.hexdigest()
 

@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ import pebble.simulation.world
 from pebble.media.world.pose_page import PoseReader, page_path
 from pebble.media.world.poses import RobotPose, Track
 from pebble.simulation.trace import read_trace
+from pebble.simulation.world import program
 from pebble.simulation.world.program import imu_port_path, port_path, trace_path
 from tests.support import Child, until
 
@@ -61,85 +62,50 @@ def poses(room: Path) -> dict[str, RobotPose]:
     return {name: track.newest.pose for name, track in tracks(room).items()}
 
 
-def refused(room: Path, *options: str) -> str:
-    ended = subprocess.run(command(room, *options), capture_output=True, text=True, timeout=60, check=False)
-    assert ended.returncode == 1
-    assert ended.stdout == ""
-    return ended.stderr
-
-
-def test_its_robots_start_at_their_places_and_drive_by_their_serial_ports(room: Path) -> None:
-    with running(room, "--trace") as world:
+def test_a_world_is_driven_controlled_and_ended_by_its_standard_input(room: Path) -> None:
+    described = json.loads(room.read_text())
+    described["robots"]["goob"]["imu"] = True
+    room.write_text(json.dumps(described))
+    folder = room.parent / "f"
+    goob, imu = port_path(folder, "goob"), imu_port_path(folder, "goob")
+    with running(room, "--trace", "--control") as world:
         start = poses(room)
         assert start["goob"] == pytest.approx((-0.8, 0.4, -0.5236), abs=1e-4)
-        with serial.Serial(str(port_path(room.parent / "f", "goob"))) as port:
-            port.write(b"M 0.5 0.5\n")
-            assert until(lambda: poses(room)["goob"].x > -0.7)
-            assert poses(room)["goob"].y < 0.39
-        assert poses(room)["fred"] == start["fred"]
-        world.terminate()
-        assert world.wait(30) == 0
-    assert "M 0.5 0.5" in [entry.line for entry in read_trace(trace_path(room.parent / "f", "goob"))]
-    assert poses(room) == {}, "nothing is left of a world that has ended"
-
-
-def test_it_prints_what_belongs_in_the_configs(room: Path) -> None:
-    with running(room) as world:
-        world.terminate()
-        printed = world.stdout.read()
-    for name in ("goob", "fred"):
-        assert f'"serial_mcu_bridge": {{"serial":{{"port":"{port_path(room.parent / "f", name)}"}}' in printed
-        assert f'"device":"{room}#{name}"' in printed
-
-
-def test_the_inertial_sensor_of_a_goob_has_a_serial_port_of_its_own(room: Path) -> None:
-    world = json.loads(room.read_text())
-    world["robots"]["goob"]["imu"] = True
-    room.write_text(json.dumps(world))
-    with running(room) as program:
-        port = imu_port_path(room.parent / "f", "goob")
-        with serial.Serial(str(port), timeout=30) as line:
+        with serial.Serial(str(imu), timeout=30) as line:
             assert line.read(100)
-        program.terminate()
-        assert (
-            f'"instances":{{"imu":{{"protocol":"pebble_serial_v1","serial":{{"port":"{port}"' in program.stdout.read()
-        )
-
-
-def test_robots_are_controlled_and_placed_from_standard_input(room: Path) -> None:
-    with running(room, "--control") as world:
         world.stdin.write("goob place 1 -0.5 90\nfred unplug\ngoob fly\ntank reset\ngoob place 1 2\n")
         world.stdin.flush()
         assert until(lambda: poses(room)["goob"] == pytest.approx((1.0, -0.5, 1.5708), abs=1e-4))
-        assert until(lambda: not port_path(room.parent / "f", "fred").is_symlink())
-        assert "known commands: unplug, replug, reset" in world.stderr.readline()
-        assert "begin with a robot (goob, fred) and a command" in world.stderr.readline()
-        assert "place needs three numbers" in world.stderr.readline()
+        assert until(lambda: not port_path(folder, "fred").is_symlink())
+        for complaint in ("known commands: unplug", "begin with a robot (goob, fred)", "place needs three numbers"):
+            assert complaint in world.stderr.readline()
+        with serial.Serial(str(goob)) as port:
+            port.write(b"M 0.5 0.5\n")
+            assert until(lambda: poses(room)["goob"].y > -0.4)
+            assert poses(room)["goob"].x == pytest.approx(1.0, abs=0.01)
+        assert poses(room)["fred"] == start["fred"]
         world.stdin.close()
         assert world.wait(30) == 0, "the end of standard input ends it"
-        world.stdin = None
+        world.stdin, printed = None, world.stdout.read()
+    assert "M 0.5 0.5" in [entry.line for entry in read_trace(trace_path(folder, "goob"))]
+    assert poses(room) == {}, "nothing is left of a world that has ended"
+    assert f'"serial_mcu_bridge": {{"serial":{{"port":"{port_path(folder, "fred")}"}}' in printed
+    assert f'"instances":{{"imu":{{"protocol":"pebble_serial_v1","serial":{{"port":"{imu}"' in printed
+    assert all(f'"device":"{room}#{name}"' in printed for name in ("goob", "fred"))
 
 
-def test_it_reports_the_truth(room: Path) -> None:
+def test_a_world_that_was_killed_starts_again_reports_the_truth_and_is_alone(
+    room: Path, refused: Callable[[Path], str]
+) -> None:
+    with running(room) as world:
+        world.kill()
+        world.wait(30)
     with running(room, "--report") as world:
         report = json.loads(world.stdout.readline())
         assert report["robots"]["goob"]["pose"]["x_mm"] == pytest.approx(-800)
         assert report["robots"]["fred"]["left_mm"] == 0.0
-
-
-def test_a_world_that_was_killed_starts_again(room: Path) -> None:
-    with running(room) as world:
-        world.kill()
-        world.wait(30)
-    with running(room) as world:
-        assert set(poses(room)) == {"goob", "fred"}
-        world.send_signal(signal.SIGINT)
-        assert world.wait(30) == 0
-
-
-def test_a_signal_ends_it_whichever_thread_receives_it(room: Path) -> None:
-    """Libraries start threads when they are imported."""
-    with running(room) as world:
+        assert refused(room) == f"{room}: this world runs already, end its other program first\n"
+        # a signal ends it whichever thread receives it: libraries start threads when they are imported
         tasks = sorted(int(path.name) for path in Path(f"/proc/{world.pid}/task").iterdir())
         tasks.remove(world.pid)
         assert ctypes.CDLL(None).tgkill(world.pid, tasks[0], signal.SIGTERM) == 0
@@ -154,12 +120,21 @@ def test_it_ends_at_once_where_standard_input_has_ended_already(room: Path) -> N
     assert not page_path(room).exists()
 
 
-def test_a_second_program_of_the_same_world_is_refused(room: Path) -> None:
-    with running(room):
-        assert refused(room) == f"{room}: this world runs already, end its other program first\n"
+@pytest.fixture
+def refused(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[[Path], str]:
+    """What the program writes about a room that it does not run, in this process, whose signals stay as they are."""
+    monkeypatch.setattr(program, "EndRequest", lambda: None)
+
+    def refuse(room: Path) -> str:
+        assert program.main([str(room), "--folder", str(room.parent / "f")]) == 1
+        out, err = capsys.readouterr()
+        assert out == ""
+        return err
+
+    return refuse
 
 
-def test_mistakes_in_the_file_are_printed_all_at_once(room: Path) -> None:
+def test_mistakes_in_the_file_are_printed_all_at_once(room: Path, refused: Callable[[Path], str]) -> None:
     room.write_text('{"robots": {"goob": {"x": 0, "y": 0, "kind": "tank"}}, "tag": []}')
     assert refused(room).splitlines() == [
         f'{room}: robots.goob.kind: must be "goob" or "fred"',
@@ -167,7 +142,9 @@ def test_mistakes_in_the_file_are_printed_all_at_once(room: Path) -> None:
     ]
 
 
-def test_a_missing_file_and_a_folder_that_cannot_be_made_are_one_line(room: Path) -> None:
+def test_a_missing_file_and_a_folder_that_cannot_be_made_are_one_line(
+    room: Path, refused: Callable[[Path], str]
+) -> None:
     assert refused(room.with_name("none.json")) == f"{room.with_name('none.json')}: there is no such file\n"
     (room.parent / "f").touch()
     assert refused(room) == f"{room.parent / 'f'}: File exists\n"

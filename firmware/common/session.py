@@ -1,0 +1,154 @@
+"""Sessions with the broker, one after another: connecting, what is read and written, and how much may be in flight."""
+
+import gc
+import os
+import random
+from binascii import hexlify
+
+from micropython import const
+
+from common import mqtt
+from common.connection import Connection
+from common.settings import get, host
+from common.sockets import Stream, query_name
+from common.ticks import diff
+
+_ALIVE_S = const(15)  # MQTT's keepalive: the broker publishes the will after 1.5 times of it
+_LONGEST_PAYLOAD = const(512)
+_OUTGOING = const(420)  # plus three topics: room for a state and the 20 PUBACKs that a broker waits for
+_CHUNKS = const(4)  # reads per turn, at most
+_PACE_MS = const(30)  # between two writes, so that acknowledgements share packets
+# Writes in flight, as far as pings tell. An ESP8266 queues eight; the ninth blocks for up to ten seconds, even if the
+# socket is non-blocking (micropython issue 19704), and a lost packet delays all later ones.
+_IN_FLIGHT = const(7)
+
+
+class Session:
+    """Each turn ``step``, and if it is True ``read`` and ``write``; ``drop`` it after any OSError or ValueError."""
+
+    def __init__(self, settings: dict, root: bytes, topics: tuple, wrap, take) -> None:
+        """``topics``: to subscribe to, the longest one last. ``wrap`` wraps a socket in TLS; None: no TLS.
+
+        ``take(kind, now)`` is called for the SUBACK and for each publication, see `mqtt.Client.take`; it may raise
+        ValueError.
+        """
+        self._settings = settings
+        self._host = host(settings)
+        self.root = root
+        # A broker disconnects a client when another one uses the same id: so it cannot be guessed, and is the same
+        # until the next boot. A broker must accept 23 bytes of it, and may refuse more (3.1.3.1).
+        self._name = b"pebble-" + hexlify(os.urandom(8))
+        self.client = mqtt.Client(_LONGEST_PAYLOAD + len(topics[-1]) + 7, _OUTGOING + 3 * len(root), topics)
+        self._wrap = wrap
+        self._take = take
+        self.connection = Connection()
+        self._open: Stream | None = None  # to the broker; before that, the query for its address
+        self._in_flight = 0  # writes that may not have arrived yet
+        self._behind = 0  # those after the last ping
+        self._asked = False  # whether the answer to that ping is outstanding
+        self.stuck = False  # whether data waits that could not be written
+        self._wrote = 0  # the last write
+
+    def step(self, now: int, server: str, clock) -> bool:
+        """Return whether packets can be exchanged; ``server`` is the DNS server, "": there is no network.
+
+        An OSError says why the session is over. Silence ends it before anything is read: queued commands are stale.
+        """
+        connection = self.connection
+        due = connection.step(now, server != "")
+        if due == "drop":
+            raise OSError(connection.reason)
+        if due == "resolve":
+            self._open = query_name(self._host, server, now, connection.failures)  # type: ignore[assignment]
+        if connection.state == "resolving":
+            self._connect(now, clock)
+            return False
+        return self._open is not None and self._open.ready()
+
+    def _connect(self, now: int, clock) -> None:
+        """Connect once the address is known."""
+        assert self._open
+        address = self._open.address(now)  # type: ignore[attr-defined]  # it is a Question
+        if address is None:
+            return
+        self._open.socket.close()
+        self._open = None
+        settings = self._settings
+        if not address:
+            raise OSError("no address for " + self._host)
+        if self._wrap:
+            self._wrap.set_time(clock.read(now))
+        self._open = Stream(address, get(settings, "mqtt", "port", 8883 if self._wrap else 1883), self._wrap)
+        self.client.restart()
+        packet = mqtt.login(
+            self._name,
+            get(settings, "mqtt", "username", "").encode(),
+            get(settings, "mqtt", "password", "").encode(),
+            self.root + b"/outgoing/online",
+            b'{"t": 0, "online": false}',
+            _ALIVE_S,
+        )
+        self.client.send(*packet)
+        self._wrote = now  # the last write may be longer ago than ticks can measure
+        self._in_flight = 0
+        self._asked = self.stuck = False
+        self.connection.move("connecting", now)
+
+    def drop(self, now: int, reason: str) -> None:
+        if self._open:
+            self._open.socket.close()
+            self._open = None
+        self.connection.reason = reason
+        self.connection.lost(now, random.getrandbits(8))
+
+    def read(self, now: int) -> None:
+        """Read what there is, at most some kilobytes, and pass on all publications in their order."""
+        client = self.client
+        assert self._open
+        for chunk in range(_CHUNKS):
+            if chunk:
+                gc.collect()  # each command leaves some 200 bytes of garbage
+            space = client.space()
+            count = self._open.read(space) if len(space) else 0
+            if not count and len(space) == len(client.data):  # nothing is left from the last turn either
+                break
+            kind = client.take(count)
+            while kind:
+                if kind == "welcome":
+                    client.send(*mqtt.subscription(client.topics))
+                    self.connection.move("subscribing", now)
+                elif kind == "pong":
+                    self._in_flight = self._behind
+                    self._asked = False
+                    self.connection.received(now)
+                else:
+                    self._take(kind, now)
+                    if kind == "subscribed":
+                        self._in_flight = 0
+                        self.connection.move("online", now)
+                kind = client.take()
+            if count < len(space):
+                break
+
+    def publish(self, topic: bytes, payload: bytes, retain: int = 0) -> bool:
+        """Publish on outgoing/``topic``; False: there is no room, and it is dropped, because it would be stale."""
+        return self.client.publish(retain, b"%s/outgoing/%s" % (self.root, topic), payload)
+
+    def write(self, now: int, urgent: bool) -> None:
+        """Write what waits, if it is ``urgent`` or the last write is long enough ago."""
+        client = self.client
+        if not urgent and diff(now, self._wrote) < _PACE_MS and client.waiting < len(client.out) // 2:
+            return
+        if client.waiting and not self._asked and self.connection.state == "online":
+            self._asked = client.send(0xC0)
+            self._behind = -1  # the write with the ping itself does not count
+        self._wrote = now
+        assert self._open
+        while client.waiting and self._in_flight < _IN_FLIGHT:
+            count = self._open.write(client.out, client.waiting)
+            if not count:
+                break
+            client.sent(count)
+            self._in_flight += 1
+            self._behind += 1
+        self.stuck = client.waiting > 0
