@@ -689,7 +689,7 @@ def held_connections(port: int, number: int = cases(400, 1200)) -> Iterator[None
                 with suppress(OSError):
                     clients[place] = socket.create_connection(("127.0.0.1", port), 1)
                     clients[place].setblocking(False)  # type: ignore[union-attr]
-            ending.wait(0.05)
+            ending.wait(0.2)
         for client in clients:
             if client is not None:
                 client.close()
