@@ -14,7 +14,7 @@ import pytest
 
 from pebble.commands import app
 from tests.commands.command_line import Run, config_file, program, running
-from tests.support import ROOT, free_port, until
+from tests.support import ROOT, free_port, some, until
 
 GROUP = ("list", "echo", "pub", "hz", "bw")
 
@@ -122,7 +122,7 @@ def test_up_refuses_a_robot_that_runs_on_its_own_mcu(run: Run, tmp_path: Path) -
     assert "runs on its own MCU" in run.err
 
 
-@pytest.mark.parametrize("closed", ["<&- 2>&-", ">&-", "<&- >&- 2>&-"])
+@pytest.mark.parametrize("closed", some(["<&- >&- 2>&-", "<&- 2>&-", ">&-"], 3))
 def test_a_robot_runs_without_standard_streams(tmp_path: Path, closed: str) -> None:
     config = config_file(
         tmp_path, transport={"kind": "mqtt", "run_dir": str(tmp_path / "run")}, local_mqtt={"port": free_port()}

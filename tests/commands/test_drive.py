@@ -393,15 +393,10 @@ def test_a_broker_that_is_gone_and_comes_back(drive: Drive, lamp: Lamp, broker: 
     driving(console, lamp)
 
 
-@pytest.mark.parametrize("stream", ["stdin", "stdout"])
-def test_without_a_terminal_there_is_one_line(stream: str) -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "pebble", "drive", "minilamp", "--url", "mqtt://127.0.0.1"],
-        cwd=ROOT, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False, timeout=20,
-    )  # fmt: skip
-    assert done.returncode == 1
-    assert done.stderr.startswith("pebble: driving by keys needs a terminal; ")
-    assert done.stderr.count("\n") == 1
+def test_without_a_terminal_there_is_one_line(run: Run) -> None:
+    assert run("drive", "minilamp", "--url", "mqtt://127.0.0.1") == 1
+    assert run.err.startswith("pebble: driving by keys needs a terminal; ")
+    assert run.err.count("\n") == 1
 
 
 def test_an_unreachable_broker_is_reported_before_the_terminal_is_changed() -> None:
