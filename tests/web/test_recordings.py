@@ -154,7 +154,7 @@ def test_what_cannot_be_read_is_named_beside_its_day_and_export(broker: Broker, 
         assert (state["state"], "1 damaged parts" in state["why"]) == ("ready", True)
 
 
-def test_one_export_at_a_time_it_can_be_ended_and_one_that_failed_says_why(
+def test_one_export_at_a_time_it_can_be_ended_and_one_that_failed_has_a_reason(
     archive: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     wanted = {"robot": GOOB, "since": ms(0), "until": ms(SECONDS), "as": "mp4"}
