@@ -61,8 +61,10 @@ class Hall:
         return Page(self.served, cookie=self.cookie(name), **options)
 
     def client(self, name: str = "") -> httpx.Client:
+        """Opens a connection for each request: on one that is kept, an answer may wait for an acknowledgement."""
         headers = {"cookie": self.cookie(name)} if name else {}
-        return httpx.Client(base_url=self.served.origin, headers=headers, timeout=10)
+        limits = httpx.Limits(max_keepalive_connections=0)
+        return httpx.Client(base_url=self.served.origin, headers=headers, timeout=10, limits=limits)
 
     def socket(self, path: str, *, cookie: str = "", origin: str | None = "", host: str = "") -> ClientConnection:
         """A WebSocket with these headers. Raises InvalidStatus."""
