@@ -8,7 +8,7 @@ import subprocess
 import time
 import wave
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -89,12 +89,12 @@ def with_overlays(picture: np.ndarray[Any, Any], overlays: Overlays) -> np.ndarr
 class Files(Screen):
     """Writes a PNG once a second and the sound to a WAV file, with a new file for each change of format."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, clock: Callable[[], float] = time.monotonic) -> None:
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise PebbleError(f"{folder} cannot be made: {error.strerror}") from None
-        self._folder = folder
+        self._folder, self._clock = folder, clock
         self._pictures = self._waves = 0
         self._due = 0.0
         self._seconds = 0.0
@@ -104,7 +104,7 @@ class Files(Screen):
     def show(self, receiver: MediaReceiver) -> None:
         for received in receiver.take_sounds():
             self._write(received)
-        now = time.monotonic()
+        now = self._clock()
         if now < self._due:
             return
         self._due = now + _PICTURE_EVERY_S

@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -81,7 +82,7 @@ class People:
         self._seen = BoundedTable[tuple[Session, float]](_SESSIONS, _SESSIONS << 10, lambda _: 1)
         self._clock = clock
         self._addresses, self._names = Tries(monotonic), Tries(monotonic)
-        self._no_hash = _hash("", b"no such person..")  # compared where the name is unknown: the same time
+        self._no_hash = _no_hash()  # compared where the name is unknown: the same time
 
     def close(self) -> None:
         with self._lock:
@@ -254,6 +255,11 @@ def _usable(password: str) -> str:
     if not MIN_PASSWORD <= len(password) <= MAX_PASSWORD:
         raise PeopleError(f"a password has {MIN_PASSWORD} to {MAX_PASSWORD} characters")
     return password
+
+
+@cache
+def _no_hash() -> bytes:
+    return _hash("", b"no such person..")
 
 
 def _hash(password: str, salt: bytes) -> bytes:

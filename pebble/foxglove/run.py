@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import signal
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from typing import Final, NamedTuple
 
 from pebble.client.broker import Broker
@@ -40,10 +41,13 @@ class Summary(NamedTuple):
 
 def run(settings: Settings, on_ready: Callable[[str], None]) -> Summary:
     """Serve until SIGINT, SIGTERM or SIGHUP; ``on_ready`` gets the address. Raises PebbleError."""
-    return asyncio.run(_serve(settings, on_ready))
+    return asyncio.run(serve(settings, on_ready, _signalled()))
 
 
-async def _serve(settings: Settings, on_ready: Callable[[str], None]) -> Summary:
+async def serve(
+    settings: Settings, on_ready: Callable[[str], None], ending: AbstractContextManager[asyncio.Event]
+) -> Summary:
+    """Serve until the event of ``ending`` is set; ``on_ready`` gets the address. Raises PebbleError."""
     loop, broker, schemas = asyncio.get_running_loop(), Broker(settings.broker, "pebble-foxglove"), Schemas()
     server = Server("Pebble", lambda topic, on: _call(loop, robots, topic, on))
     robots = Robots(broker, server, schemas)
@@ -51,8 +55,8 @@ async def _serve(settings: Settings, on_ready: Callable[[str], None]) -> Summary
     broker.on_state(lambda: None if broker.connected else server.report(f"{settings.where}: {broker.problem}"))
     work = asyncio.create_task(_show(settings, broker, robots, lambda: on_ready(address)))
     try:
-        with _signalled() as signalled:
-            await asyncio.wait({work, asyncio.create_task(signalled.wait())}, return_when=asyncio.FIRST_COMPLETED)
+        with ending as ended:
+            await asyncio.wait({work, asyncio.create_task(ended.wait())}, return_when=asyncio.FIRST_COMPLETED)
         if work.done():
             work.result()
     finally:

@@ -76,31 +76,21 @@ def test_check_shows_links_processes_and_effective_topics_but_no_secret(run: Run
     assert "hush-hush" not in run.out
 
 
+def bridge(**settings: object) -> dict[str, object]:
+    return {"services": {"mqtt_bridge": {"enabled": True, **settings}}}
+
+
 @pytest.mark.parametrize(
     ("keys", "shared"),
     [
         ({}, True),
         ({"robot": {"id": "goob", "platform": "esp8266"}}, True),
-        ({"services": {"mqtt_bridge": {"enabled": True, "remote_mqtt": {"host": "127.0.0.1"}}}}, True),
-        ({"services": {"mqtt_bridge": {"enabled": True, "remote_mqtt": {"host": "broker.example"}}}}, False),
-        ({"services": {"mqtt_bridge": {"enabled": True, "remote_mqtt": {"host": "127.0.0.1", "port": 1884}}}}, False),
-        ({"services": {"mqtt_bridge": {"enabled": True, "remote_mqtt": {"host": "localhost"}}}}, True),
-        (
-            {
-                "services": {
-                    "mqtt_bridge": {"enabled": True, "remote": {"kind": "mqtt"}, "remote_mqtt": {"host": "::1"}}
-                }
-            },
-            True,
-        ),
-        (
-            {
-                "services": {
-                    "mqtt_bridge": {"enabled": True, "remote": {"kind": "zenoh", "connect": ["tcp/10.0.0.2:7447"]}}
-                }
-            },
-            False,
-        ),
+        (bridge(remote_mqtt={"host": "127.0.0.1"}), True),
+        (bridge(remote_mqtt={"host": "broker.example"}), False),
+        (bridge(remote_mqtt={"host": "127.0.0.1", "port": 1884}), False),
+        (bridge(remote_mqtt={"host": "localhost"}), True),
+        (bridge(remote={"kind": "mqtt"}, remote_mqtt={"host": "::1"}), True),
+        (bridge(remote={"kind": "zenoh", "connect": ["tcp/10.0.0.2:7447"]}), False),
         ({"transport": {"kind": "zenoh"}}, False),
         ({"transport": {"kind": "zenoh", "mqtt_mirror": {"host": "127.0.0.1"}}}, True),
     ],

@@ -18,7 +18,7 @@ from typing import Any
 
 import pytest
 
-from pebble.simulation.trace import read_trace
+from pebble.simulation.trace import complete_lines, read_trace
 from pebble.transports import Message, MqttSettings, QoS, create
 from tests.commands.command_line import Run
 from tests.support import ROOT, Broker, Child, gone, some, until
@@ -36,7 +36,7 @@ class Lamp:
         self.commands: list[tuple[float, Any]] = []  # when they reached the broker
         self.announced: list[Any] = []
         self.stops = 0
-        self._trace = folder / "trace"
+        self._trace, self._begin = folder / "trace", 0
         self._transport = create("mqtt", "observer", MqttSettings(host="127.0.0.1", port=broker.port)).open()
         self.capabilities = threading.Event()
         self._transport.subscribe(f"{BASE}/#", self._take)
@@ -51,13 +51,20 @@ class Lamp:
         self._process.wait(10)
         self._transport.close()
 
+    def forget(self) -> None:
+        """Forget what was recorded, while the motors rest."""
+        self.commands.clear()
+        self.announced.clear()
+        self.stops = 0
+        self._begin = complete_lines(self._trace, self._begin)[1]
+
     def publish(self, topic: str, body: object) -> None:
         assert self._transport.publish(topic, json.dumps(body).encode(), qos=QoS.DELIVERED)
 
     @property
     def motors(self) -> list[tuple[float, tuple[float, float]]]:
         """When the motors changed, by the monotonic clock, and to what."""
-        return [(one.ns / 1e9, one.motors) for one in read_trace(self._trace) if one.motors is not None]
+        return [(one.ns / 1e9, one.motors) for one in read_trace(self._trace, self._begin) if one.motors is not None]
 
     @property
     def moving(self) -> bool:
@@ -160,18 +167,19 @@ SHELL = {"PS1": "$ ", "TERM": "xterm", "COLUMNS": "200", "HISTFILE": "/dev/null"
 Drive = Callable[..., Console]
 
 
-@pytest.fixture
-def broker(tmp_path: Path) -> Iterator[Broker]:
-    broker = Broker(tmp_path)
-    yield broker
-    broker.stop()
-
-
-@pytest.fixture
-def lamp(tmp_path: Path, broker: Broker) -> Iterator[Lamp]:
-    lamp = Lamp(tmp_path, broker)
+@pytest.fixture(scope="module")
+def one_lamp(tmp_path_factory: pytest.TempPathFactory, broker: Broker) -> Iterator[Lamp]:
+    lamp = Lamp(tmp_path_factory.mktemp("lamp"), broker)
     yield lamp
     lamp.close()
+
+
+@pytest.fixture
+def lamp(one_lamp: Lamp) -> Lamp:
+    """It rests, and has recorded nothing yet."""
+    assert until(lambda: not one_lamp.moving, 5)
+    one_lamp.forget()
+    return one_lamp
 
 
 @pytest.fixture
@@ -218,7 +226,7 @@ def test_a_held_key_drives_and_its_release_stops(drive: Drive, lamp: Lamp) -> No
     assert sent[0] == {"x": 0, "z": 0.5, "y": 0, "valid_ms": 400}
     assert until(lambda: [command for _, command in lamp.commands[-3:]] == [ZERO] * 3)
     assert 15 <= len([command for command in sent if command["z"]]) <= 45
-    assert lamp.announced[0][BASE]["device"].startswith("terminal on ")
+    assert next(filter(None, lamp.announced))[BASE]["device"].startswith("terminal on ")
     console.type(b"\x03")
     assert console.process.wait(5) == 0
     assert console.restored
@@ -331,12 +339,15 @@ def test_an_emergency_stop_latches(drive: Drive, lamp: Lamp, run: Run, broker: B
     driving(console, lamp)
 
 
-def test_an_emergency_stop_is_sent_on_after_the_terminal_has_ended(drive: Drive, lamp: Lamp) -> None:
+def test_an_emergency_stop_is_sent_on_after_the_terminal_has_ended(
+    drive: Drive, lamp: Lamp, run: Run, broker: Broker
+) -> None:
     console = drive()
     console.type(b"!\x04")
     assert console.process.wait(10) == 0
     assert lamp.stops >= 1
     assert "NOT CONFIRMED" not in console.shown.rpartition("\n")[2]
+    assert run("estop", "reset", "minilamp", f"--url=mqtt://127.0.0.1:{broker.port}") == 0, run.err
 
 
 def test_a_driver_elsewhere_is_respected_until_it_is_taken_over(drive: Drive, lamp: Lamp) -> None:
@@ -382,15 +393,10 @@ def test_a_broker_that_is_gone_and_comes_back(drive: Drive, lamp: Lamp, broker: 
     driving(console, lamp)
 
 
-@pytest.mark.parametrize("stream", ["stdin", "stdout"])
-def test_without_a_terminal_there_is_one_line(stream: str) -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "pebble", "drive", "minilamp", "--url", "mqtt://127.0.0.1"],
-        cwd=ROOT, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False, timeout=20,
-    )  # fmt: skip
-    assert done.returncode == 1
-    assert done.stderr.startswith("pebble: driving by keys needs a terminal; ")
-    assert done.stderr.count("\n") == 1
+def test_without_a_terminal_there_is_one_line(run: Run) -> None:
+    assert run("drive", "minilamp", "--url", "mqtt://127.0.0.1") == 1
+    assert run.err.startswith("pebble: driving by keys needs a terminal; ")
+    assert run.err.count("\n") == 1
 
 
 def test_an_unreachable_broker_is_reported_before_the_terminal_is_changed() -> None:

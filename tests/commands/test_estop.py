@@ -10,7 +10,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import IO, Any
 
@@ -19,7 +19,7 @@ import pytest
 from pebble.commands import estop
 from pebble.transports import Message, MqttSettings, State, create
 from tests.client.estop_robot import Robot, outgoing
-from tests.commands.command_line import Run, config_file, program
+from tests.commands.command_line import Run, config_file, program, running
 from tests.fakes.bad_brokers import BEHAVIOURS, resolving, serving
 from tests.support import Broker, until
 from tests.tcp_proxy import TcpProxy
@@ -101,13 +101,6 @@ class Heartbeat:
 
 
 Make = Callable[..., LiveRobot]
-
-
-@pytest.fixture(scope="module")
-def broker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Broker]:
-    broker = Broker(tmp_path_factory.mktemp("b"))
-    yield broker
-    broker.stop()
 
 
 @pytest.fixture
@@ -214,15 +207,12 @@ def test_a_stop_of_a_robot_that_cannot_be_driven_is_reported_with_that(
 def test_a_robot_that_does_not_answer_is_reported_and_ctrl_c_ends_it(robot_on: Make, url: str) -> None:
     robot = robot_on("serial")
     robot.deaf = True
-    process = program("estop", robot.id, url)
-    try:
+    with running("estop", robot.id, url) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == f"{robot.id}: stop sent\n"
         assert "not confirmed yet: serial has not confirmed" in process.stdout.readline()
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=30)
-    finally:
-        process.kill()
     assert out.startswith(f"{robot.id}: NOT CONFIRMED, no longer sent: serial has not confirmed")
     assert (process.returncode, err) == (1, "")
     assert robot.count("estop") == robot.count("drive-values") >= 2
@@ -233,13 +223,10 @@ def test_a_stop_is_repeated_until_it_is_confirmed_although_nothing_can_be_printe
 ) -> None:
     robot = robot_on("serial")
     robot.deaf = True
-    process = program("estop", robot.id, url, stdout=unread)
-    try:
+    with running("estop", robot.id, url, stdout=unread) as process:
         assert until(lambda: robot.count("estop") >= 4, 30)
         robot.deaf = False
         _, err = process.communicate(timeout=30)
-    finally:
-        process.kill()
     assert (process.returncode, err) == (0, "")
     assert robot.latched
 
@@ -247,23 +234,16 @@ def test_a_stop_is_repeated_until_it_is_confirmed_although_nothing_can_be_printe
 def test_a_hold_goes_on_although_nothing_can_be_printed(robot_on: Make, url: str, unread: IO[str]) -> None:
     robot = robot_on("serial")
     robot.deaf = True
-    process = program("estop", "--all", "--hold", url, stdout=unread, stderr=unread)
-    try:
+    with running("estop", "--all", "--hold", url, stdout=unread, stderr=unread):
         assert until(lambda: robot.count("estop") >= 4, 30)
-    finally:
-        process.kill()
-        process.wait(30)
 
 
 def test_an_old_robot_gets_zeros(robot_on: Make, url: str) -> None:
     robot = robot_on(estop={})
-    process = program("estop", robot.id, url)
-    try:
+    with running("estop", robot.id, url) as process:
         assert until(lambda: robot.count("drive-values") >= 3, 30)
         process.send_signal(signal.SIGTERM)
         out, _ = process.communicate(timeout=30)
-    finally:
-        process.kill()
     assert out.endswith(
         f"{robot.id}: old firmware: zeros are sent, it cannot be latched\n"
         f"{robot.id}: old firmware: NOT LATCHED, zeros are no longer sent\n"
@@ -301,8 +281,7 @@ def at_rest(robot: LiveRobot) -> bool:
 
 def test_a_hold_stops_robots_that_come_online_later(robot_on: Make, url: str) -> None:
     early = robot_on("serial")
-    process = program("estop", "--all", "--hold", url)
-    try:
+    with running("estop", "--all", "--hold", url) as process:
         assert until(lambda: early.latched, 30)
         late = robot_on("serial")
         assert until(lambda: late.latched, 5)
@@ -315,8 +294,6 @@ def test_a_hold_stops_robots_that_come_online_later(robot_on: Make, url: str) ->
         assert until(lambda: at_rest(last)), "its confirmation has arrived"
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=30)
-    finally:
-        process.kill()
     names = {robot.robot.owners[0].latch.recent[0] for robot in (early, late, last)}
     assert (process.returncode, err, len(names)) == (0, "", 1)
     assert f"stop {names.pop()} is held" in out
@@ -327,8 +304,7 @@ def test_a_lost_broker_is_waited_for(tmp_path: Path) -> None:
     broker = Broker(tmp_path)
     robot = LiveRobot(broker.port, "serial")
     robot.deaf = True
-    process = program("estop", robot.id, f"--url=mqtt://127.0.0.1:{broker.port}")
-    try:
+    with running("estop", robot.id, f"--url=mqtt://127.0.0.1:{broker.port}") as process:
         assert until(lambda: robot.count("estop") >= 1, 30)
         broker.kill()
         assert process.stderr is not None
@@ -338,10 +314,8 @@ def test_a_lost_broker_is_waited_for(tmp_path: Path) -> None:
         robot.deaf = False
         broker.start()
         out, _ = process.communicate(timeout=50)
-    finally:
-        process.kill()
-        robot.close()
-        broker.stop()
+    robot.close()
+    broker.stop()
     assert process.returncode == 0, out
     assert robot.latched
 
@@ -351,13 +325,11 @@ def test_a_slow_network_does_not_delay_repetitions(robot_on: Make, broker: Broke
     robot.deaf = True
     times: list[float] = []
     robot.on_stop = lambda: times.append(time.monotonic())
-    with TcpProxy(broker.port, delay_s=0.2) as proxy:
-        process = program("estop", robot.id, f"--url=mqtt://127.0.0.1:{proxy.port}")
-        try:
-            assert until(lambda: len(times) >= 2, 30)
-        finally:
-            process.kill()
-            process.communicate()
+    with (
+        TcpProxy(broker.port, delay_s=0.2) as proxy,
+        running("estop", robot.id, f"--url=mqtt://127.0.0.1:{proxy.port}"),
+    ):
+        assert until(lambda: len(times) >= 2, 30)
     assert times[1] - times[0] < 1.7, "two seconds if it waited for its subscriptions"
 
 
@@ -413,6 +385,15 @@ def test_a_robot_called_reset_can_be_stopped(run: Run, robot_on: Make, url: str)
 # -- reset and status
 
 
+@contextmanager
+def terminal() -> Iterator[tuple[int, int]]:
+    """Both ends of one."""
+    ends = pty.openpty()
+    yield ends
+    for end in ends:
+        os.close(end)
+
+
 def test_a_reset_shows_who_stopped_the_robot_and_frees_it(run: Run, robot_on: Make, url: str) -> None:
     robot = robot_on("left", "right")
     robot.stop(by="ann@desk", why="dog")
@@ -432,18 +413,12 @@ def test_a_reset_shows_who_stopped_the_robot_and_frees_it(run: Run, robot_on: Ma
 def test_a_stop_that_was_not_shown_is_not_reset(robot_on: Make, url: str) -> None:
     robot = robot_on("serial")
     robot.stop()
-    master, slave = pty.openpty()
-    process = program("estop", "reset", robot.id, url, stdin=slave)
-    try:
+    with terminal() as (master, slave), running("estop", "reset", robot.id, url, stdin=slave) as process:
         assert process.stdout is not None
         assert "stopped by ann@desk" in process.stdout.readline()
         robot.stop("fedcba9876543210", by="bob@door")
         os.write(master, b"y\n")
         _, err = process.communicate(timeout=30)
-    finally:
-        process.kill()
-        os.close(master)
-        os.close(slave)
     why = "serial: stopped again meanwhile by bob@door"
     assert err == f"pebble: {robot.id} is still stopped: {why}; look again, then repeat\n"
     assert (process.returncode, robot.latched, robot.count("estop-reset")) == (1, True, 1)
@@ -452,16 +427,9 @@ def test_a_stop_that_was_not_shown_is_not_reset(robot_on: Make, url: str) -> Non
 def test_a_declined_reset_resets_nothing(robot_on: Make, url: str) -> None:
     robot = robot_on("serial")
     robot.stop()
-    master, slave = pty.openpty()
-    process = program("estop", "reset", robot.id, url, stdin=slave)
-    try:
+    with terminal() as (master, slave), running("estop", "reset", robot.id, url, stdin=slave) as process:
         os.write(master, b"n\n")
         assert process.wait(30) == 1
-    finally:
-        process.kill()
-        process.communicate()
-        os.close(master)
-        os.close(slave)
     assert (robot.latched, robot.count("estop-reset")) == (True, 0)
 
 
@@ -533,13 +501,10 @@ def test_a_stopped_robot_is_not_driven_unless_forced(run: Run, robot_on: Make, u
 
 def test_driving_ends_when_the_robot_is_stopped(robot_on: Make, url: str) -> None:
     robot = robot_on("serial")
-    process = program("topic", "pub", "drive-values", '{"z": 0.3}', "--rate=50", url, f"--robot={robot.id}")
-    try:
+    with running("topic", "pub", "drive-values", '{"z": 0.3}', "--rate=50", url, f"--robot={robot.id}") as process:
         assert until(lambda: robot.count("drive-values") >= 3, 30)
         robot.stop()
         _, err = process.communicate(timeout=30)
-    finally:
-        process.kill()
     assert process.returncode == 1
     assert f"{robot.id} is stopped by ann@desk" in err
 

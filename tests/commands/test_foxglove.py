@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -13,13 +12,6 @@ from tests.commands.command_line import Run, config_file
 from tests.foxglove.live import FRED, GOOB, Live, client, online
 from tests.foxglove.watcher import Watcher
 from tests.support import Broker, free_port, until
-
-
-@pytest.fixture
-def broker(tmp_path: Path) -> Iterator[Broker]:
-    broker = Broker(tmp_path)
-    yield broker
-    broker.stop()
 
 
 def test_which_robots_are_shown_has_to_be_named(run: Run, tmp_path: Path) -> None:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import time
 import wave
+from itertools import count
 from pathlib import Path
 
 import cv2
@@ -29,11 +29,13 @@ def received(rate: int, sequence: int = 1) -> ReceivedSound:
     return ReceivedSound(np.full((rate // 50, 1), 1000, np.int16), rate, 1, 0, sequence, "pcm")
 
 
-def test_pictures_and_sound_become_files(receiver: MediaReceiver, tmp_path: Path) -> None:
+def test_pictures_and_sound_become_files(
+    receiver: MediaReceiver, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     picture = np.zeros((48, 64, 3), np.uint8)
     picture[:, :, 2] = 200
     receiver.newest = Decoded(picture, 0, 1, True, "json")
-    receiver._received.extend([received(16_000), received(16_000), received(8_000)])
+    monkeypatch.setattr(receiver, "take_sounds", lambda: [received(16_000), received(16_000), received(8_000)])
     files = Files(tmp_path / "new" / "folder")
     files.show(receiver)
     files.close()
@@ -46,22 +48,20 @@ def test_pictures_and_sound_become_files(receiver: MediaReceiver, tmp_path: Path
 
 
 def test_a_stopped_robot_is_shown(receiver: MediaReceiver, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    files = Files(tmp_path)
+    files = Files(tmp_path, count(0.0, 2.0).__next__)
     files.show(receiver)
     assert "STOP" not in capsys.readouterr().out
     state = {"latched": True, "boot": "0", "count": 1, "recent": [], "by": "ann", "why": "dog", "since": 1}
     receiver.estop.receive(outgoing("pebble/robots/goob", "estop/serial", state))
-    files._due = 0.0
     files.show(receiver)
     assert "EMERGENCY STOP: goob is stopped by ann, " in capsys.readouterr().out
 
 
 def test_overlays_are_drawn_over_the_picture_while_they_are_fresh(receiver: MediaReceiver, tmp_path: Path) -> None:
     receiver.newest = Decoded(np.zeros((48, 64, 3), np.uint8), 0, 1, True, "json")
-    files = Files(tmp_path)
-    for age_s in (0.0, STALE_S + 1):
-        receiver.overlays.receive(b'{"shapes": [[[0, 0], [1, 0], [1, 1], [0, 1]]]}', time.monotonic() - age_s)
-        files._due = 0.0
+    files = Files(tmp_path, iter((10.0, 20.0)).__next__)
+    for at in (10.0, 19.0 - STALE_S):
+        receiver.overlays.receive(b'{"shapes": [[[0, 0], [1, 0], [1, 1], [0, 1]]]}', at)
         files.show(receiver)
     fresh, stale = (cv2.imread(str(tmp_path / name)) for name in ("0001.png", "0002.png"))
     assert fresh[0].any(axis=1).all()  # the upper edge

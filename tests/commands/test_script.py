@@ -55,13 +55,6 @@ class Manager:
             threading.Timer(0.2, self.publish, [status]).start()
 
 
-@pytest.fixture(scope="module")
-def broker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Broker]:
-    broker = Broker(tmp_path_factory.mktemp("broker"))
-    yield broker
-    broker.stop()
-
-
 @pytest.fixture
 def config(broker: Broker, tmp_path: Path) -> Path:
     return config_file(tmp_path, local_mqtt={"host": "127.0.0.1", "port": broker.port})

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.commands.command_line import Run, config_file, program
+from tests.commands.command_line import Run, config_file, running
 from tests.support import Broker
 from tests.transports.zenoh_net import HubProcess
 
@@ -19,15 +19,12 @@ _numbers = itertools.count(1)
 
 
 @pytest.fixture(scope="module")
-def local_transports(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
+def local_transports(broker: Broker, tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
     """A broker and a hub, by kind of transport, as URLs."""
-    folder = tmp_path_factory.mktemp("b")
     run_dir = tmp_path_factory.mktemp("z")
-    broker = Broker(folder)
     hub = HubProcess(run_dir).start()
     yield {"mqtt": f"mqtt://127.0.0.1:{broker.port}", "zenoh": f"zenoh:{run_dir}"}
     hub.end()
-    broker.stop()
 
 
 @pytest.fixture(params=["mqtt", "zenoh"])
@@ -36,19 +33,22 @@ def at(request: pytest.FixtureRequest, local_transports: dict[str, str]) -> tupl
     return "--url", local_transports[request.param], f"--robot=r{next(_numbers)}"
 
 
-def test_what_is_published_is_echoed_on_either_transport(at: tuple[str, str, str]) -> None:
-    echo = program("topic", "echo", "drive-values", "--count", "3", "--seconds", "60", *at)
-    pub = program("topic", "pub", "drive-values", '{"x": 0.5}', "--rate", "20", *at)
-    try:
-        out, err = echo.communicate(timeout=90)
-    finally:
+def test_what_is_published_is_echoed_and_its_rate_measured_on_either_transport(
+    at: tuple[str, str, str], run: Run
+) -> None:
+    assert run("topic", "pub", "charging-level", '{"value": 7.4}', *at) == 0
+    with running("topic", "pub", "drive-values", '{"x": 0.5}', "--rate", "40", *at) as pub:
+        assert run("topic", "echo", "drive-values", "--count", "3", "--seconds", "60", *at) == 0, run.err
+        assert run.out.splitlines()[1::2] == ['{"x": 0.5}'] * 3
+        assert "incoming/drive-values  10 B  qos 1" in run.out
+        assert run("topic", "hz", "drive-values", "--seconds", "2", *at) == 0
+        assert " Hz  min " in run.out
+        assert run("topic", "bw", "drive-values", "--seconds", "2", *at) == 0
+        assert " kbit/s)  mean 10 B" in run.out
+        assert run("topic", "hz", "charging-level", "--seconds", "1.5", *at) == 1, "what is retained does not count"
+        assert set(run.out.splitlines()) == {"no new messages"}
         pub.send_signal(signal.SIGINT)
-        pub_output = pub.communicate(timeout=30)
-        echo.kill()
-    assert (echo.returncode, err) == (0, "")
-    assert out.splitlines()[1::2] == ['{"x": 0.5}'] * 3
-    assert "incoming/drive-values  10 B  qos 1" in out
-    assert (pub.returncode, pub_output) == (130, ("", ""))
+        assert (pub.communicate(timeout=30), pub.returncode) == (("", ""), 130)
 
 
 def test_retained_topics_are_listed_with_their_synonym_and_echoed_raw(at: tuple[str, str, str], run: Run) -> None:
@@ -59,36 +59,17 @@ def test_retained_topics_are_listed_with_their_synonym_and_echoed_raw(at: tuple[
     assert rows["incoming/flags/mqtt-video"] == ["yes", "4", "B", "?", "flag"]
     assert rows["outgoing/heartbeat"][0] == "yes"
     assert rows["outgoing/heartbeat"][-3:] == ["state", "(like", "online)"]
-    out, _ = program("topic", "echo", "online", "--raw", "--count", "1", "--seconds", "30", *at).communicate(timeout=60)
-    assert out == '{"t": 1710969600123}\n'
-
-
-def test_rates_are_measured_and_retained_messages_do_not_count(at: tuple[str, str, str], run: Run) -> None:
-    assert run("topic", "pub", "charging-level", '{"value": 7.4}', *at) == 0
-    silent = program("topic", "hz", "charging-level", "--seconds", "1.5", *at)
-    pub = program("topic", "pub", "drive-values", "{}", "--rate", "40", *at)
-    hz = program("topic", "hz", "drive-values", "--seconds", "3", *at)
-    bw = program("topic", "bw", "drive-values", "--seconds", "3", *at)
-    try:
-        assert " Hz  min " in hz.communicate(timeout=60)[0]
-        assert " kbit/s)  mean 2 B" in bw.communicate(timeout=60)[0]
-        assert set(silent.communicate(timeout=60)[0].splitlines()) == {"no new messages"}
-    finally:
-        pub.kill()
-        pub.communicate()
-    assert (hz.returncode, bw.returncode, silent.returncode) == (0, 0, 1)
+    assert run("topic", "echo", "online", "--raw", "--count", "1", "--seconds", "30", *at) == 0
+    assert run.out == '{"t": 1710969600123}\n'
 
 
 def test_ctrl_c_ends_an_echo_quietly(at: tuple[str, str, str], run: Run) -> None:
     assert run("topic", "pub", "flags/mqtt-audio", "true", *at) == 0
-    process = program("topic", "echo", "flags/mqtt-audio", *at)
-    try:
+    with running("topic", "echo", "flags/mqtt-audio", *at) as process:
         assert process.stdout is not None
         assert "retained" in process.stdout.readline()
         process.send_signal(signal.SIGINT)
         _, err = process.communicate(timeout=30)
-    finally:
-        process.kill()
     assert (process.returncode, err) == (130, "")
 
 
@@ -106,8 +87,8 @@ def test_a_config_leads_to_its_own_side_and_to_the_remote_one(
     for side, where in sides.items():
         assert run("topic", "pub", "status", json.dumps({"value": {"side": side}}), *where) == 0
     for side, where in sides.items():
-        raw = program("topic", "echo", "status", "-n", "1", "-s", "30", "--raw", *where).communicate(timeout=60)[0]
-        assert json.loads(raw)["value"]["side"] == side
+        assert run("topic", "echo", "status", "-n", "1", "-s", "30", "--raw", *where) == 0
+        assert json.loads(run.out)["value"]["side"] == side
 
 
 def test_a_password_comes_from_a_file_or_the_environment(

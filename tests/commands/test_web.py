@@ -21,7 +21,7 @@ from pebble.fleet.audit import Audit
 from pebble.fleet.people import People
 from pebble.fleet.roles import Role
 from tests.commands.command_line import Run, config_file, program
-from tests.support import Broker, free_port
+from tests.support import Broker, free_port, some
 
 SECRET = "sentinel-8472"
 BROKER = {"services": {"mqtt_bridge": {"remote_mqtt": {"host": "broker.example"}}}}
@@ -322,39 +322,20 @@ def started(*arguments: str) -> tuple[subprocess.Popen[str], str]:
     return process, line.split()[5]
 
 
-def test_it_serves_until_ctrl_c(tmp_path: Path) -> None:
-    broker = Broker(tmp_path)
-    process, url = started("--url", f"mqtt://127.0.0.1:{broker.port}", "--port", "0")
-    with urllib.request.urlopen(f"{url}healthz") as response:
-        assert response.read() == b"ok"
-    process.send_signal(signal.SIGINT)
-    assert process.wait(10) == 130
-    assert process.stderr is not None
-    assert process.stderr.read() == ""
-    broker.stop()
-
-
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
-def test_other_signals_end_it_too(tmp_path: Path, number: signal.Signals) -> None:
-    broker = Broker(tmp_path)
+@pytest.mark.parametrize("number", some([signal.SIGTERM, signal.SIGHUP], 2))
+def test_a_signal_ends_it(broker: Broker, number: signal.Signals) -> None:
     process, _ = started("--url", f"mqtt://127.0.0.1:{broker.port}", "--port", "0")
     process.send_signal(number)
-    process.wait(10)
-    assert process.stderr is not None
-    assert process.stderr.read() == ""
-    broker.stop()
+    assert process.communicate(timeout=10)[1] == ""
 
 
-def test_a_port_in_use_is_named(run: Run, tmp_path: Path) -> None:
-    broker = Broker(tmp_path)
+def test_a_port_in_use_is_named(run: Run, broker: Broker) -> None:
     assert run("web", "--url", f"mqtt://127.0.0.1:{broker.port}", "--port", broker.port) == 1
     fact = f"Address already in use (by process {broker.pid} of user {os.getuid()}: '"
     assert run.err.startswith(f"pebble: cannot listen on 127.0.0.1 port {broker.port}: {fact}")
-    broker.stop()
 
 
-def test_https_with_a_certificate_of_ones_own(run: Run, tmp_path: Path) -> None:
-    broker = Broker(tmp_path)
+def test_it_serves_https_with_a_certificate_of_ones_own_until_ctrl_c(run: Run, broker: Broker, tmp_path: Path) -> None:
     people = People(tmp_path / "people.sqlite")
     people.add("alice", SECRET, Role.DRIVER)
     people.close()
@@ -369,15 +350,9 @@ def test_https_with_a_certificate_of_ones_own(run: Run, tmp_path: Path) -> None:
     with urllib.request.urlopen(request, context=trusting) as response:
         cookie = response.headers["set-cookie"]
     assert cookie.startswith("__Host-pebble=")
-    assert {part.strip().lower() for part in cookie.split(";")[1:]} == {
-        "httponly",
-        "max-age=604800",
-        "path=/",
-        "samesite=strict",
-        "secure",
-    }
+    attributes = {part.strip().lower() for part in cookie.split(";")[1:]}
+    assert attributes == {"httponly", "max-age=604800", "path=/", "samesite=strict", "secure"}
     with urllib.request.urlopen(f"{url}ca.pem", context=trusting) as response:
         assert response.read() == (tmp_path / "tls/ca.pem").read_bytes()
     process.send_signal(signal.SIGINT)
-    process.wait(10)
-    broker.stop()
+    assert (process.communicate(timeout=10)[1], process.returncode) == ("", 130)

@@ -11,8 +11,9 @@ import pytest
 from pebble.fleet import audit as audit_module
 from pebble.fleet.audit import Audit
 from pebble.fleet.audit_rows import EACH, GROUPS, OTHERS, WAITING, Entry, Merging, new
+from tests.support import cases
 
-MANY = 100_000
+MANY = cases(5000, 100_000)
 VIEWER = {"user": "viewer", "device": "phone", "address": "192.0.2.7"}
 
 

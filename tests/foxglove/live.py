@@ -1,19 +1,22 @@
-"""``pebble foxglove`` as a process beside a real broker, and robots on it."""
+"""``pebble foxglove`` in a thread, or as a process, beside a real broker, and robots on it."""
 
 from __future__ import annotations
 
+import asyncio
 import json
 import re
 import select
 import signal
-import subprocess
+import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from concurrent.futures import Future
+from contextlib import contextmanager, nullcontext, suppress
 from typing import Any
 
 from pebble.contract import codec
 from pebble.contract.channels import Channel
+from pebble.foxglove.run import Settings, serve
 from pebble.transports import MqttSettings, QoS, Transport, create
 from tests.commands.command_line import program
 from tests.support import Broker
@@ -51,24 +54,43 @@ class Live:
         return self.process.returncode, errors, time.monotonic() - began
 
 
+class Inside:
+    """The same in a thread of this process; ``base``: the robot that is shown."""
+
+    def __init__(self, broker: Broker, base: str) -> None:
+        where = MqttSettings(host="127.0.0.1", port=broker.port)
+        self._settings = Settings(where, f"mqtt://127.0.0.1:{broker.port}", base, "127.0.0.1", 0)
+        self._ready: Future[str] = Future()
+        self._loop, self._ending = asyncio.new_event_loop(), asyncio.Event()
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+        self.address = self._ready.result(30)
+
+    def end(self) -> float:
+        """How many seconds that took."""
+        began = time.monotonic()
+        with suppress(RuntimeError):  # it has ended already
+            self._loop.call_soon_threadsafe(self._ending.set)
+        self._thread.join(20)
+        assert not self._thread.is_alive()
+        return time.monotonic() - began
+
+    def _run(self) -> None:
+        with asyncio.Runner(loop_factory=lambda: self._loop) as runner:
+            runner.run(serve(self._settings, self._ready.set_result, nullcontext(self._ending)))
+
+
 @contextmanager
-def live(broker: Broker, *options: str) -> Iterator[Live]:
-    one = Live(broker, *options)
+def live(broker: Broker, base: str = "+/+/+") -> Iterator[Inside]:
+    one = Inside(broker, base)
     try:
         yield one
     finally:
-        if one.process.poll() is None:
-            one.end()
+        one.end()
 
 
 def publish(robot: Transport, base: str, channel: Channel, value: Any) -> None:
     robot.publish(channel.topic(base), codec.encode(channel, value), qos=QoS.DELIVERED, retain=channel.default_retain)
-
-
-def run_to_its_end(*arguments: str) -> subprocess.CompletedProcess[str]:
-    process = program("foxglove", *arguments)
-    out, errors = process.communicate(timeout=60)
-    return subprocess.CompletedProcess(arguments, process.returncode, out, errors)
 
 
 def online(robot: Transport, base: str, count: int = 1) -> None:

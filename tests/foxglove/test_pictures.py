@@ -19,9 +19,9 @@ from websockets.sync.client import ClientConnection, connect
 
 from pebble.foxglove.server import BACKLOG
 from pebble.media.scene import read_counter
-from tests.foxglove.live import client, live
+from tests.foxglove.live import Live, client, live
 from tests.foxglove.watcher import SUBPROTOCOL, Watcher, parser
-from tests.support import Broker, until
+from tests.support import Broker, some, until
 from tests.web.media.robots import AUDIO, CAMERA, CAPABILITIES, SOUND, VIDEO, PictureRobot, SoundRobot, capabilities
 
 H264, JPEG, SAMPLES = f"{CAMERA}/video", f"{CAMERA}/image", f"{SOUND}/sound"
@@ -77,7 +77,7 @@ def follow_each_other(numbers: list[int | None]) -> bool:
 
 
 def test_h264_is_requested_while_a_client_subscribes_and_passed_on_as_foxglove_expects_it(broker: Broker) -> None:
-    with filming(broker) as robot, live(broker) as server:
+    with filming(broker, fps=30) as robot, live(broker) as server:
         watcher = Watcher(server.address)
         assert until(lambda: {H264, JPEG} <= set(watcher.channels))
         assert robot.requests == []
@@ -151,9 +151,10 @@ def test_a_robot_without_h264_has_no_channel_for_it(broker: Broker) -> None:
         assert H264 not in watcher.channels
 
 
-@pytest.mark.parametrize("by", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("by", some([signal.SIGTERM, signal.SIGINT, signal.SIGHUP], 3))
 def test_a_signal_withdraws_the_requests(broker: Broker, by: signal.Signals) -> None:
-    with filming(broker) as robot, live(broker) as server:
+    with filming(broker) as robot:
+        server = Live(broker)
         watcher = Watcher(server.address)
         watcher.subscribe(H264)
         assert until(lambda: watcher.count(H264), 30)
@@ -172,11 +173,9 @@ def test_it_ends_beside_a_frozen_broker_too(broker: Broker) -> None:
         assert until(lambda: watcher.count(H264), 30)
         broker.freeze()
         try:
-            code, _, seconds = server.end()
+            assert server.end() < 8
         finally:
             broker.thaw()
-        assert code == 0
-        assert seconds < 8
 
 
 @pytest.mark.parametrize(
@@ -210,7 +209,7 @@ def test_why_there_are_no_pictures_is_shown_in_foxglove(broker: Broker) -> None:
 
 
 def test_a_client_that_does_not_read_delays_no_other_and_loses_the_oldest(broker: Broker) -> None:
-    with filming(broker, fps=30, size=(640, 480), encoding="pbvd") as robot, live(broker) as server:
+    with filming(broker, fps=60, size=(640, 480), encoding="pbvd") as robot, live(broker) as server:
         watcher = Watcher(server.address)
         watcher.subscribe(JPEG)
         stopped = not_reading(server.address)

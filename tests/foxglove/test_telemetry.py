@@ -124,7 +124,7 @@ def test_a_robot_that_comes_later_gets_its_channels_then_and_one_that_goes_keeps
 
 
 def test_only_the_robot_that_was_asked_for(broker: Broker, robot: Transport) -> None:
-    with live(broker, "--robot", "fred") as server:
+    with live(broker, FRED) as server:
         watcher = Watcher(server.address)
         for base in (GOOB, FRED):
             online(robot, base)

@@ -5,7 +5,9 @@ from __future__ import annotations
 import socket
 import time
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import TracebackType
 from typing import Any, Self
 
@@ -22,13 +24,23 @@ from tests.web.served import Page, Served
 PASSWORDS = {role.value: f"sentinel-password-of-{role.value}" for role in Role}
 
 
+@cache
+def _one_of_each_role() -> bytes:
+    """The database, made once: each password costs a fraction of a second."""
+    with TemporaryDirectory() as folder:
+        people = People(file := Path(folder) / "people.sqlite")
+        for role in Role:
+            people.add(role.value, PASSWORDS[role.value], role)
+        people.close()
+        return file.read_bytes()
+
+
 class Hall:
     """A server with a login; each role has a person of that name."""
 
     def __init__(self, broker_port: int, folder: Path, **settings: Any) -> None:
+        (folder / "people.sqlite").write_bytes(_one_of_each_role())
         self.people = People(folder / "people.sqlite")
-        for role in Role:
-            self.people.add(role.value, PASSWORDS[role.value], role)
         more = {"people": folder / "people.sqlite", "recordings": folder, **settings}
         self.served = Served(broker_port, login=True, **more)
 
@@ -49,8 +61,10 @@ class Hall:
         return Page(self.served, cookie=self.cookie(name), **options)
 
     def client(self, name: str = "") -> httpx.Client:
+        """Opens a connection for each request: on one that is kept, an answer may wait for an acknowledgement."""
         headers = {"cookie": self.cookie(name)} if name else {}
-        return httpx.Client(base_url=self.served.origin, headers=headers, timeout=10)
+        limits = httpx.Limits(max_keepalive_connections=0)
+        return httpx.Client(base_url=self.served.origin, headers=headers, timeout=10, limits=limits)
 
     def socket(self, path: str, *, cookie: str = "", origin: str | None = "", host: str = "") -> ClientConnection:
         """A WebSocket with these headers. Raises InvalidStatus."""

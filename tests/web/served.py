@@ -23,6 +23,8 @@ from pebble.web.serve import listen, server_config
 from tests.support import until
 
 HEARTBEAT_S = 0.25
+#: The state of a motor owner that is not stopped.
+FREE = {"latched": False, "boot": "b", "count": 0, "recent": [], "by": "", "why": "", "since": 0}
 
 
 class Served:

@@ -3,24 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
 from tests.sparing_broker import SparingBroker
 from tests.support import Broker, until
 from tests.tcp_proxy import TcpProxy
-from tests.web.served import Page, RecordingRobot, Served
+from tests.web.served import FREE, Page, RecordingRobot, Served
 
 GOOB = "pebble/robots/goob"
-FREE = {"latched": False, "boot": "00c0ffee", "count": 0, "recent": [], "by": "", "why": "", "since": 0}
-
-
-@pytest.fixture
-def broker(tmp_path: Path) -> Iterator[Broker]:
-    running = Broker(tmp_path)
-    yield running
-    running.stop()
 
 
 @pytest.fixture

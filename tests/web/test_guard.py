@@ -61,20 +61,23 @@ def ask(
 ) -> tuple[int, dict[str, str], str]:
     """One request as uvicorn hands it over: status, headers and body of the response."""
     pairs = list(headers.items()) if isinstance(headers, dict) else list(headers or [("host", OWN)])
-    scope = {
-        "type": "http",
-        "method": method,
-        "scheme": scheme,
-        "path": path,
-        "query_string": b"",
-        "server": server,
-        "client": ("127.0.0.1", 50000),
-        "headers": [(name.lower().encode(), value.encode("latin-1")) for name, value in pairs],
-    }
     waiting = [
         {"type": "http.request", "body": chunk, "more_body": number < len(chunks or []) - 1}
         for number, chunk in enumerate(chunks or [b""])
     ]
+    sent = _run(app, pairs, waiting, type="http", method=method, scheme=scheme, path=path, server=server)
+    body = b"".join(message.get("body", b"") for message in sent[1:])
+    return sent[0]["status"], {k.decode(): v.decode() for k, v in sent[0]["headers"]}, body.decode()
+
+
+def connect(app: Any, headers: list[tuple[str, str]], *, scheme: str = "ws", path: str = "/ws/control") -> str:
+    """One WebSocket: the type of the first answer."""
+    waiting = [{"type": "websocket.connect"}]
+    return str(_run(app, headers, waiting, type="websocket", scheme=scheme, path=path, server=HERE)[0]["type"])
+
+
+def _run(app: Any, headers: list[tuple[str, str]], waiting: list[Any], **scope: Any) -> list[MutableMapping[str, Any]]:
+    """What the application sends."""
     sent: list[MutableMapping[str, Any]] = []
 
     async def receive() -> Any:
@@ -83,68 +86,55 @@ def ask(
     async def send(message: MutableMapping[str, Any]) -> None:
         sent.append(message)
 
-    asyncio.run(app(scope, receive, send))
-    body = b"".join(message.get("body", b"") for message in sent[1:])
-    return sent[0]["status"], {k.decode(): v.decode() for k, v in sent[0]["headers"]}, body.decode()
-
-
-def connect(app: Any, headers: list[tuple[str, str]], *, scheme: str = "ws", path: str = "/ws/control") -> str:
-    """One WebSocket: the type of the first answer."""
-    scope = {
-        "type": "websocket",
-        "scheme": scheme,
-        "path": path,
-        "query_string": b"",
-        "server": HERE,
-        "client": ("127.0.0.1", 50000),
-        "headers": [(name.lower().encode(), value.encode("latin-1")) for name, value in headers],
-    }
-    sent: list[MutableMapping[str, Any]] = []
-
-    async def receive() -> Any:
-        return {"type": "websocket.connect"}
-
-    async def send(message: MutableMapping[str, Any]) -> None:
-        sent.append(message)
-
-    asyncio.run(app(scope, receive, send))
-    return str(sent[0]["type"])
+    pairs = [(name.lower().encode(), value.encode("latin-1")) for name, value in headers]
+    more = {"query_string": b"", "client": ("127.0.0.1", 50000), "headers": pairs}
+    asyncio.run(app({**scope, **more}, receive, send))
+    return sent
 
 
 POST = {"host": OWN, "origin": f"http://{OWN}", "content-type": "application/json"}
 
 
-@pytest.mark.parametrize("host", [OWN, "localhost:8080", "LOCALHOST:8080", "[::1]:8080", "127.0.0.1.:8080"])
-def test_own_names_are_known(app: App, host: str) -> None:
-    assert ask(Guard(app, settings=settings_for()), headers={"host": host})[0] == 200
+FAIR = {"names": ("Fair.local", "tunnel.example:9000")}
+OPEN = {"host": "0.0.0.0"}
+LAN = ("192.168.1.20", 8080)
+#: Settings, the address of the connection, its scheme, and hosts that are known then, and others.
+HOSTS: dict[str, tuple[dict[str, Any], tuple[str, int], str, list[str], list[str]]] = {
+    "own names": (
+        {}, HERE, "http", [OWN, "localhost:8080", "LOCALHOST:8080", "[::1]:8080", "127.0.0.1.:8080"],
+        ["evil.test:8080", "127.0.0.1", "127.0.0.1:80", "127.0.0.1:8081", "127.0.0.1.evil.test:8080",
+         "localhost.evil.test:8080", "evil.test:8080@127.0.0.1:8080", "127.0.0.1:8080 evil.test", "192.168.1.20:8080",
+         "127.0.0.1:", ":8080", "127.0.0.1:٨٠٨٠".encode().decode("latin-1"), "127.0.0.1:99999999999999999999",
+         "::1:8080", "[::1:8080", ""],
+    ),
+    "further names": (FAIR, HERE, "http", ["fair.local:8080", "tunnel.example:9000"], ["tunnel.example:8080"]),
+    "the port of HTTP": (FAIR, ("127.0.0.1", 80), "http", ["fair.local"], []),
+    "the port of HTTPS": (FAIR, ("127.0.0.1", 443), "https", ["fair.local"], []),
+    "this port without TLS": (FAIR, ("127.0.0.1", 443), "http", [], ["fair.local"]),
+    "for others: the connection's address and the machine's names": (
+        OPEN, LAN, "http", ["192.168.1.20:8080", "lab.example.org:8080", "lab.local:8080", "localhost:8080"],
+        ["192.168.1.21:8080", "example.org:8080", "evil.test:8080"],
+    ),
+    "for others: IPv6": (OPEN, ("fe80::1%eth0", 8080), "http", ["[fe80::1]:8080"], []),
+    "for others: IPv4 in IPv6": (OPEN, ("::ffff:10.0.0.2", 8080), "http", ["10.0.0.2:8080"], []),
+    "a wildcard covers one level": (
+        {"names": ("*.example.org",)}, HERE, "http", ["lab.example.org:8080"],
+        ["a.lab.example.org:8080", "example.org:8080"],
+    ),
+}  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    "host",
-    [
-        "evil.test:8080",
-        "127.0.0.1",
-        "127.0.0.1:80",
-        "127.0.0.1:8081",
-        "127.0.0.1.evil.test:8080",
-        "localhost.evil.test:8080",
-        "evil.test:8080@127.0.0.1:8080",
-        "127.0.0.1:8080 evil.test",
-        "192.168.1.20:8080",
-        "127.0.0.1:",
-        ":8080",
-        "127.0.0.1:٨٠٨٠".encode().decode("latin-1"),
-        "127.0.0.1:99999999999999999999",
-        "::1:8080",
-        "[::1:8080",
-        "",
-    ],
-)
-def test_every_other_host_is_refused(app: App, host: str) -> None:
-    status, _, text = ask(Guard(app, settings=settings_for()), headers={"host": host})
-    assert status == 421
-    assert "--name" in text
+@pytest.mark.parametrize("name", HOSTS)
+def test_only_known_hosts_are_served(app: App, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    monkeypatch.setattr("socket.gethostname", lambda: "Lab.example.org")
+    settings, server, scheme, known, others = HOSTS[name]
+    guard = Guard(app, settings=settings_for(**settings))
+    for host in others:
+        status, _, text = ask(guard, headers={"host": host}, scheme=scheme, server=server)
+        assert (status, "--name" in text) == (421, True), host
     assert app.requests == []
+    for host in known:
+        assert ask(guard, headers={"host": host}, scheme=scheme, server=server)[0] == 200, host
 
 
 def test_a_request_without_host_or_with_two_is_refused(app: App) -> None:
@@ -154,42 +144,12 @@ def test_a_request_without_host_or_with_two_is_refused(app: App) -> None:
     assert app.requests == []
 
 
-def test_further_names_and_default_ports(app: App) -> None:
-    guard = Guard(app, settings=settings_for(names=("Fair.local", "tunnel.example:9000")))
-    assert ask(guard, headers={"host": "fair.local:8080"})[0] == 200
-    assert ask(guard, headers={"host": "tunnel.example:9000"})[0] == 200
-    assert ask(guard, headers={"host": "tunnel.example:8080"})[0] == 421
-    assert ask(guard, headers={"host": "fair.local"}, server=("127.0.0.1", 80))[0] == 200
-    assert ask(guard, headers={"host": "fair.local"}, server=("127.0.0.1", 443), scheme="https")[0] == 200
-    assert ask(guard, headers={"host": "fair.local"}, server=("127.0.0.1", 443))[0] == 421
-
-
-def test_for_other_machines_it_has_the_address_of_the_connection_and_the_names_of_the_machine(
-    app: App, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("socket.gethostname", lambda: "Lab.example.org")
-    guard = Guard(app, settings=settings_for(host="0.0.0.0"))
-    for host in ("192.168.1.20:8080", "lab.example.org:8080", "lab.local:8080", "localhost:8080"):
-        assert ask(guard, headers={"host": host}, server=("192.168.1.20", 8080))[0] == 200, host
-    for host in ("192.168.1.21:8080", "example.org:8080", "evil.test:8080"):
-        assert ask(guard, headers={"host": host}, server=("192.168.1.20", 8080))[0] == 421, host
-    assert ask(guard, headers={"host": "[fe80::1]:8080"}, server=("fe80::1%eth0", 8080))[0] == 200
-    assert ask(guard, headers={"host": "10.0.0.2:8080"}, server=("::ffff:10.0.0.2", 8080))[0] == 200
-
-
 def test_with_a_certificate_it_has_the_names_of_it(app: App, tmp_path: Path) -> None:
     certificates.init(tmp_path, ["robots.local", "10.0.0.5"])
     guard = Guard(app, settings=settings_for(host="0.0.0.0", certificate=tmp_path / "server.pem"))
     assert ask(guard, headers={"host": "robots.local:8080"}, scheme="https")[0] == 200
     assert ask(guard, headers={"host": "10.0.0.5:8080"}, scheme="https")[0] == 200
     assert ask(guard, headers={"host": "other.local:8080"}, scheme="https")[0] == 421
-
-
-def test_a_wildcard_certificate_covers_one_level(app: App) -> None:
-    guard = Guard(app, settings=settings_for(names=("*.example.org",)))
-    assert ask(guard, headers={"host": "lab.example.org:8080"})[0] == 200
-    assert ask(guard, headers={"host": "a.lab.example.org:8080"})[0] == 421
-    assert ask(guard, headers={"host": "example.org:8080"})[0] == 421
 
 
 FOREIGN = [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import re
 import signal
@@ -21,11 +22,12 @@ from websockets.sync.client import connect
 from tests.commands.command_line import program
 from tests.support import Broker, until
 from tests.web.attacker import Everything
-from tests.web.served import Page, RecordingRobot
+from tests.web.served import FREE, Page, RecordingRobot, Served
 
 GOOB = "pebble/robots/goob"
 VICTIM = "pebble/robots/victim"
 EVIL = "pebble/robots/evil"
+NUMBERS = itertools.count(1)
 MB = 1024 * 1024
 
 
@@ -60,24 +62,26 @@ class ServerProcess:
         return self._process.stderr.read()
 
 
-@pytest.fixture
-def log(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What clients subscribe to, by the broker's own words."""
-    return tmp_path / "mosquitto.log"
+    path = tmp_path_factory.mktemp("log") / "mosquitto.log"
+    path.touch()
+    path.chmod(0o666)
+    return path
 
 
-@pytest.fixture
-def broker(tmp_path: Path, log: Path) -> Iterator[Broker]:
-    log.touch()
-    log.chmod(0o666)
-    running = Broker(tmp_path, f"log_dest file {log}", "log_type subscribe")
+@pytest.fixture(scope="module")
+def broker(tmp_path_factory: pytest.TempPathFactory, log: Path) -> Iterator[Broker]:
+    running = Broker(tmp_path_factory.mktemp("broker"), f"log_dest file {log}", "log_type subscribe")
     yield running
     running.stop()
 
 
-@pytest.fixture
-def server(broker: Broker, tmp_path: Path) -> Iterator[ServerProcess]:
-    running = ServerProcess(broker.port, tmp_path)
+@pytest.fixture(scope="module")
+def server(broker: Broker, tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServerProcess]:
+    """One for all attacks: each meets what those before have left behind."""
+    running = ServerProcess(broker.port, tmp_path_factory.mktemp("people"))
     yield running
     written = running.close()
     assert "Traceback" not in written, written
@@ -144,18 +148,68 @@ def many_topics() -> Iterator[tuple[str, bytes]]:
         yield f"pebble/robots/y{number}/outgoing/status", b'{"value":{}}'
 
 
-@pytest.mark.thorough
-def test_a_hundred_thousand_topics(server: ServerProcess, broker: Broker) -> None:
-    with RecordingRobot(broker.port, VICTIM) as robot, server.page() as page:
-        assert drives(page, robot)
-        before = server.memory()
-        assert flood(broker.port, many_topics()) == 100_000
-        assert until(lambda: page.value("", "web/broker", "robots_omitted") > 1000, 30)
-        assert until(lambda: drives(page, robot), 60)
-        assert server.memory() - before < 60 * MB
-        with server.page() as another:
-            assert another.knows(VICTIM)
-            assert len({ref for ref, _ in another.state}) <= 502
+def test_capabilities_that_name_other_topics(server: ServerProcess, broker: Broker, log: Path) -> None:
+    """It is the first one: what others open, the server would have subscribed to."""
+    recorder = Everything(broker.port)
+    with RecordingRobot(broker.port, VICTIM) as victim, server.page() as page:
+        assert page.knows(VICTIM)
+        foreign = [
+            f"{VICTIM}/incoming/drive-values",
+            f"{VICTIM}/incoming/estop-reset",
+            "pebble/robots/evil/incoming/../../victim/incoming/drive-values",
+            "pebble/robots/evil/outgoing/online",
+            "pebble/robots/evil/incoming/",
+            "pebble/robots/evil/incoming/#",
+            "pebble/robots/evil/incoming/+",
+            "pebble/robots/evil2/incoming/drive-values",
+            "$SYS/x",
+            "#",
+            "+/+/+/incoming/drive-values",
+            "",
+            7,
+            ["a"],
+            {"a": 1},
+        ]
+        for number, topic in enumerate(foreign):
+            outgoing = topic.replace("incoming", "outgoing") if isinstance(topic, str) else topic
+            value = {
+                "drive": {"available": True, "controls": True, "topic": topic, "arbitrates": True},
+                "estop": {"available": True, "owners": ["serial"], "topic": topic, "reset_topic": topic},
+                "telemetry": {
+                    f"{key}_topic": outgoing
+                    for key in ("touch", "charging", "charging_level", "wheel_odometry", "imu", "online")
+                },
+                "video": {"available": True, "topic": outgoing, "command_topic": topic, "flag_topic": topic},
+                "media": {"video": {"available": True, "topic": outgoing, "flag": topic}},
+                "autonomy": {"available": True, "topic": topic, "command_topic": topic},
+                "lights": {"available": True, "topic": topic},
+            }
+            with RecordingRobot(broker.port, EVIL, capabilities=value) as evil:
+                assert page.knows(EVIL)
+                assert until(lambda value=value: page.value(EVIL, "capabilities", "value") == value), topic
+                page.send("watch", ref=EVIL)
+                page.send("lease", ref=EVIL, take=True)
+                page.drive(EVIL, number + 1, z=0.5)
+                page.send("stop", ref=EVIL)
+                page.send("estop", ref=EVIL, stop=f"{number:016x}")
+                owners = [{"owner": "serial", "boot": "b", "count": number}]
+                page.send("estop-reset", ref=EVIL, owners=owners)
+                page.send("encoding", ref=EVIL, encoding="json")
+                assert until(lambda evil=evil: any(name.endswith("/estop") for name in evil.topics()))
+                page.send("estop-end", stop=f"{number:016x}")
+                page.send("watch", ref="")
+        time.sleep(0.5)
+        assert victim.received == []
+        published = recorder.incoming()
+        assert published
+        assert {topic for topic in published if not topic.startswith(f"{EVIL}/incoming/")} == set()
+        filters = subscriptions(log)
+        assert {one for one in filters if one.startswith("+/+/+/outgoing/")}
+        own = (f"{EVIL}/outgoing/", f"{EVIL}/incoming/flags/")  # the flags that operators have set
+        odd = {one for one in filters if not one.startswith(("+/+/+/outgoing/", *own))}
+        assert odd == set()
+        assert not {one for one in filters if one.endswith(("/outgoing/#", "/outgoing/+"))}
+    recorder.close()
 
 
 def test_large_and_odd_values(server: ServerProcess, broker: Broker) -> None:
@@ -235,83 +289,6 @@ def test_whatever_robots_publish_pages_receive_json(server: ServerProcess, broke
         assert '"last"' in json.dumps(received[-1])
 
 
-def test_capabilities_that_name_other_topics(server: ServerProcess, broker: Broker, log: Path) -> None:
-    recorder = Everything(broker.port)
-    with RecordingRobot(broker.port, VICTIM) as victim, server.page() as page:
-        assert page.knows(VICTIM)
-        foreign = [
-            f"{VICTIM}/incoming/drive-values",
-            f"{VICTIM}/incoming/estop-reset",
-            "pebble/robots/evil/incoming/../../victim/incoming/drive-values",
-            "pebble/robots/evil/outgoing/online",
-            "pebble/robots/evil/incoming/",
-            "pebble/robots/evil/incoming/#",
-            "pebble/robots/evil/incoming/+",
-            "pebble/robots/evil2/incoming/drive-values",
-            "$SYS/x",
-            "#",
-            "+/+/+/incoming/drive-values",
-            "",
-            7,
-            ["a"],
-            {"a": 1},
-        ]
-        for number, topic in enumerate(foreign):
-            outgoing = topic.replace("incoming", "outgoing") if isinstance(topic, str) else topic
-            value = {
-                "drive": {"available": True, "controls": True, "topic": topic, "arbitrates": True},
-                "estop": {"available": True, "owners": ["serial"], "topic": topic, "reset_topic": topic},
-                "telemetry": {
-                    f"{key}_topic": outgoing
-                    for key in ("touch", "charging", "charging_level", "wheel_odometry", "imu", "online")
-                },
-                "video": {"available": True, "topic": outgoing, "command_topic": topic, "flag_topic": topic},
-                "media": {"video": {"available": True, "topic": outgoing, "flag": topic}},
-                "autonomy": {"available": True, "topic": topic, "command_topic": topic},
-                "lights": {"available": True, "topic": topic},
-            }
-            with RecordingRobot(broker.port, EVIL, capabilities=value) as evil:
-                assert page.knows(EVIL)
-                assert until(lambda value=value: page.value(EVIL, "capabilities", "value") == value), topic
-                page.send("watch", ref=EVIL)
-                page.send("lease", ref=EVIL, take=True)
-                page.drive(EVIL, number + 1, z=0.5)
-                page.send("stop", ref=EVIL)
-                page.send("estop", ref=EVIL, stop=f"{number:016x}")
-                owners = [{"owner": "serial", "boot": "b", "count": number}]
-                page.send("estop-reset", ref=EVIL, owners=owners)
-                page.send("encoding", ref=EVIL, encoding="json")
-                assert until(lambda evil=evil: any(name.endswith("/estop") for name in evil.topics()))
-                page.send("estop-end", stop=f"{number:016x}")
-                page.send("watch", ref="")
-        time.sleep(0.5)
-        assert victim.received == []
-        published = recorder.incoming()
-        assert published
-        assert {topic for topic in published if not topic.startswith(f"{EVIL}/incoming/")} == set()
-        filters = subscriptions(log)
-        assert {one for one in filters if one.startswith("+/+/+/outgoing/")}
-        own = (f"{EVIL}/outgoing/", f"{EVIL}/incoming/flags/")  # the flags that operators have set
-        odd = {one for one in filters if not one.startswith(("+/+/+/outgoing/", *own))}
-        assert odd == set()
-        assert not {one for one in filters if one.endswith(("/outgoing/#", "/outgoing/+"))}
-    recorder.close()
-
-
-@pytest.mark.thorough
-def test_a_page_that_opens_thousands_of_components(server: ServerProcess, broker: Broker, log: Path) -> None:
-    with RecordingRobot(broker.port, VICTIM) as robot, server.page() as page, server.page() as mallory:
-        assert drives(page, robot)
-        before = server.memory()
-        with suppress(ConnectionClosed):
-            for number in range(3000):
-                mallory.send("watch", ref=f"pebble/robots/w{number}")
-        time.sleep(1)
-        assert drives(page, robot)
-        assert server.memory() - before < 40 * MB
-        assert len(subscriptions(log)) < 3000
-
-
 LARGE = b'{"t":1,"value":{"drive":{"available":true},"estop":{"available":true,"owners":["s"]},"a":"%s"}}'
 
 #: What strangers publish of each of their 600 components, all the time. Those who publish all that a robot does cannot
@@ -329,7 +306,8 @@ class Crowd:
     """600 components of a stranger, each of which publishes the same all the time."""
 
     def __init__(self, port: int, metric: str, payload: bytes) -> None:
-        self._port, self._metric, self._payload = port, metric, payload
+        self._port, self._payload = port, payload
+        self._topics = [f"pebble/robots/e{next(NUMBERS)}/outgoing/{metric}" for _ in range(600)]
         self._ending = threading.Event()
         self._publish()
         self._thread = threading.Thread(target=self._run)
@@ -344,7 +322,20 @@ class Crowd:
             self._publish()
 
     def _publish(self) -> None:
-        flood(self._port, ((f"pebble/robots/e{one}/outgoing/{self._metric}", self._payload) for one in range(600)))
+        flood(self._port, ((topic, self._payload) for topic in self._topics))
+
+
+def new_robot(broker: Broker, **options: Any) -> RecordingRobot:
+    return RecordingRobot(broker.port, f"pebble/robots/robot-{next(NUMBERS)}", **options)
+
+
+def is_stopped(page: Page, robot: RecordingRobot, ref: str) -> bool:
+    """Whether the stop of a robot, or of all, reaches this one, which was not stopped before."""
+    assert not robot.latched
+    page.send("estop", ref=ref, stop=(name := f"{next(NUMBERS):016x}"), why="x")
+    stopped = until(lambda: robot.latched, 10)
+    page.send("estop-end", stop=name)  # one of all would collect robots of later tests
+    return stopped
 
 
 @pytest.mark.parametrize(("metric", "payload"), STRANGERS.values(), ids=STRANGERS)
@@ -352,26 +343,51 @@ def test_a_crowd_of_strangers_hides_no_robot_and_keeps_no_stop_from_it(
     broker: Broker, server: ServerProcess, metric: str, payload: Callable[[], bytes]
 ) -> None:
     with closing(Crowd(broker.port, metric, payload())), server.page() as page:
-        with RecordingRobot(broker.port, GOOB) as robot:
-            assert page.knows(GOOB, 15)
-            page.send("estop", ref="", stop="00000000000000aa", why="x")
-            assert until(lambda: robot.latched, 10), "by a stop of all"
-        with RecordingRobot(broker.port, VICTIM, capabilities={}) as robot:
-            page.send("estop", ref=VICTIM, stop="00000000000000ab", why="x")
-            assert until(lambda: robot.latched, 10), "by its own stop, known or not"
+        with new_robot(broker) as robot:
+            robot.publish("estop/serial", FREE, retain=True)  # as its motor owner does when it begins
+            assert page.knows(robot.base, 15)
+            assert is_stopped(page, robot, ""), "by a stop of all"
+        with new_robot(broker, capabilities={}) as robot:
+            assert is_stopped(page, robot, robot.base), "by its own stop, known or not"
 
 
 def test_a_robot_known_from_before_is_shown_and_stopped_at_once(broker: Broker, tmp_path: Path) -> None:
-    server = ServerProcess(broker.port, tmp_path)
-    with RecordingRobot(broker.port, GOOB) as robot:
-        with server.page() as page:
+    with new_robot(broker) as robot:
+        with Served(broker.port, people=tmp_path / "people.sqlite") as served, served.page() as page:
             assert drives(page, robot)
-        time.sleep(0.5)  # until it is saved
-        server.close()
-        with closing(Crowd(broker.port, "capabilities", LARGE % b"")):
-            server = ServerProcess(broker.port, tmp_path)
-            with server.page() as page:
-                assert page.knows(GOOB, 15)
-                page.send("estop", ref="", stop="00000000000000aa", why="x")
-                assert until(lambda: robot.latched, 10)
-    server.close()
+            time.sleep(0.5)  # until it is saved
+        with (
+            closing(Crowd(broker.port, "capabilities", LARGE % b"")),
+            Served(broker.port, people=tmp_path / "people.sqlite") as served,
+            served.page() as page,
+        ):
+            assert page.knows(robot.base, 15)
+            assert is_stopped(page, robot, "")
+
+
+@pytest.mark.thorough
+def test_a_page_that_opens_thousands_of_components(server: ServerProcess, broker: Broker, log: Path) -> None:
+    with RecordingRobot(broker.port, VICTIM) as robot, server.page() as page, server.page() as mallory:
+        assert drives(page, robot)
+        before = server.memory()
+        with suppress(ConnectionClosed):
+            for number in range(3000):
+                mallory.send("watch", ref=f"pebble/robots/w{number}")
+        time.sleep(1)
+        assert drives(page, robot)
+        assert server.memory() - before < 40 * MB
+        assert len(subscriptions(log)) < 3000
+
+
+@pytest.mark.thorough
+def test_a_hundred_thousand_topics(server: ServerProcess, broker: Broker) -> None:
+    with RecordingRobot(broker.port, VICTIM) as robot, server.page() as page:
+        assert drives(page, robot)
+        before = server.memory()
+        assert flood(broker.port, many_topics()) == 100_000
+        assert until(lambda: page.value("", "web/broker", "robots_omitted") > 1000, 30)
+        assert until(lambda: drives(page, robot), 60)
+        assert server.memory() - before < 60 * MB
+        with server.page() as another:
+            assert another.knows(VICTIM)
+            assert len({ref for ref, _ in another.state}) <= 502

@@ -26,8 +26,10 @@ from pebble.fleet.roles import Role
 from pebble.transports import MqttSettings
 from pebble.web.access import login
 from pebble.web.access.guard import Guard
+from tests.fleet.conftest import cheap_hashes as cheap_hashes
 from tests.support import until
 
+pytestmark = pytest.mark.usefixtures("cheap_hashes")
 PASSWORD = "correct horse"
 URL = {"http": "http://pebble.test:8080", "https": "https://pebble.test:8080"}
 STATIC = files("pebble.web") / "static"

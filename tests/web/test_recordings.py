@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
+import asyncio
 import io
 import json
+import multiprocessing
 import os
 import signal
-import sys
-import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from functools import partial
-from itertools import product
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +19,7 @@ import av
 import httpx
 import pytest
 
+from pebble.errors import PebbleError
 from pebble.fleet.people import People
 from pebble.fleet.roles import Role
 from pebble.recordings.library import files
@@ -30,7 +30,8 @@ from tests.recordings.messages import START_NS
 from tests.recordings.others import DAMAGED
 from tests.recordings.playing import GOOB, js, ms
 from tests.recordings.seek.filming import CAMERA, FPS, film
-from tests.support import Broker, until
+from tests.support import Broker, gone, until
+from tests.web import failing_jobs
 from tests.web.served import Served
 
 SECONDS = 40
@@ -44,8 +45,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def archive(broker: Broker, folder: Path) -> Iterator[Served]:
+    """A server with recordings; the process that reads them ends with it."""
     with Served(broker.port, recordings=folder) as running:
         yield running
+        pids = running.app.state.recordings.process.pids
+    assert until(lambda: all(map(gone, pids)), 5)
 
 
 def get(served: Served, path: str, **parameters: Any) -> httpx.Response:
@@ -62,17 +66,27 @@ def test_days_and_their_robots(archive: Served) -> None:
     assert (day["first"], day["last"]) == (ms(0), ms(SECONDS - 0.02))
 
 
-def test_a_timeline_is_indexed_once(archive: Served, folder: Path) -> None:
+def test_a_timeline_that_failed_stays_so_until_a_person_tries_again_and_is_indexed_once(
+    archive: Served, folder: Path
+) -> None:
     pytest.importorskip("duckdb")
-    answers: list[httpx.Response] = []
+    Path(archive.app.state.recordings.scratch).rmdir()  # as systems do with what is temporary
+    (folder / "index").write_text("")
+    asked = partial(get, archive, "timeline", day=DAY, robot=GOOB)
 
-    def made() -> bool:
-        answers.append(get(archive, "timeline", day=DAY, robot=GOOB))
-        return answers[-1].status_code == 200
+    def ended() -> httpx.Response:
+        answers = [asked()]
+        while answers[-1].status_code == 202:
+            time.sleep(0.1)
+            answers.append(asked())
+        return answers[-1]
 
-    assert until(made, 30, step=0.2), answers[-1].text
-    assert {answer.status_code for answer in answers[:-1]} <= {202}
-    found = answers[-1].json()
+    failed = [(answer.status_code, answer.text) for answer in (ended(), asked(), asked())]
+    assert failed == 3 * [(422, f"{folder}/index: File exists; move it away")]
+    (folder / "index").unlink()
+    assert asked().status_code == 422
+    assert asked(again=1).status_code == 202
+    found = ended().json()
     assert found["from"] == ms(0) // 10_000 * 10_000
     assert found["step"] == 10_000
     online, driven, pictures, sound = 1, 2, 64, 128
@@ -84,7 +98,7 @@ def test_a_timeline_is_indexed_once(archive: Served, folder: Path) -> None:
     assert [round(one["until"] - one["since"]) // 1000 for one in found["sessions"]] == [SECONDS + 10]
     assert (folder / "index").is_dir()
     began = time.monotonic()
-    assert get(archive, "timeline", day=DAY, robot=GOOB).status_code == 200
+    assert asked().status_code == 200
     assert time.monotonic() - began < 2.0
 
 
@@ -140,14 +154,24 @@ def test_what_cannot_be_read_is_named_beside_its_day_and_export(broker: Broker, 
         assert (state["state"], "1 damaged parts" in state["why"]) == ("ready", True)
 
 
-def test_one_export_at_a_time_and_it_can_be_ended(archive: Served) -> None:
+def test_one_export_at_a_time_it_can_be_ended_and_one_that_failed_has_a_reason(
+    archive: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
     wanted = {"robot": GOOB, "since": ms(0), "until": ms(SECONDS), "as": "mp4"}
     first = post(archive, "exports", wanted).json()["id"]
     assert post(archive, "exports", wanted).status_code == 409
     post(archive, f"exports/{first}/end", {})
-    second = post(archive, "exports", wanted)
+    with monkeypatch.context() as patched:
+        patched.setattr(questions, "export_job", failing_jobs.ended)
+        second = post(archive, "exports", wanted)
     assert second.status_code == 202
-    post(archive, f"exports/{second.json()['id']}/end", {})
+    place = f"exports/{second.json()['id']}"
+    assert until(lambda: get(archive, place).json()["state"] != "running", 30, step=0.1)
+    shown = get(archive, place).json()
+    assert (shown["state"], shown["why"]) == ("failed", "its process has ended (3): the log of the server says why")
+    third = post(archive, "exports", wanted)
+    assert third.status_code == 202
+    post(archive, f"exports/{third.json()['id']}/end", {})
 
 
 @pytest.mark.parametrize(
@@ -213,15 +237,18 @@ def test_the_page_knows_that_there_are_some(archive: Served) -> None:
     assert httpx.get(f"{archive.origin}/replay/{GOOB}?at=1").status_code == 200
 
 
-def test_the_process_that_reads_ends_with_the_server_and_is_replaced_if_it_dies(broker: Broker, folder: Path) -> None:
-    with Served(broker.port, recordings=folder) as running:
-        assert get(running, "days").status_code == 200
-        (first,) = running.app.state.recordings.process._pool._processes
-        os.kill(first, 9)
-        assert until(lambda: get(running, "days").status_code == 200, 10)
-        (second,) = running.app.state.recordings.process._pool._processes
-    assert second != first
-    assert until(lambda: not Path(f"/proc/{second}").exists() or _is_zombie(second), 5)
+def test_the_process_that_reads_is_replaced_if_it_dies(folder: Path) -> None:
+    async def run() -> None:
+        process = archive_process.ArchiveProcess(folder)
+        first = await process.ask(os.getpid)
+        assert process.pids == [first]
+        os.kill(first, signal.SIGKILL)
+        with pytest.raises(PebbleError, match="the process that reads recordings has ended: try again"):
+            await process.ask(os.getpid)
+        assert await process.ask(os.getpid) != first
+        process.close()
+
+    asyncio.run(run())
 
 
 def test_recorded_commands_reach_no_robot(archive: Served, broker: Broker, folder: Path) -> None:
@@ -251,141 +278,54 @@ def test_what_was_recorded_may_be_read_with_the_json_that_the_page_reads(archive
 # -- jobs that fail
 
 
-def without(package: str, answer: Connection, *arguments: Any) -> None:
-    sys.modules[package] = None  # type: ignore[assignment]
-    _job_of(arguments)(answer, *arguments)
-
-
-def full(answer: Connection, *_: Any) -> None:
-    _fail(answer, OSError(28, "No space left on device", "/tmp/x"))
-
-
-def locked(answer: Connection, *arguments: Any) -> None:
-    _fail(answer, PermissionError(13, "Permission denied", "/data/index"))
-
-
-def faulty(answer: Connection, *_: Any) -> None:
-    _fail(answer, ValueError("a fault\nof two lines"))
-
-
-def too_large(answer: Connection, *_: Any) -> None:
-    _fail(answer, MemoryError())
-
-
-def killed(answer: Connection, *_: Any) -> None:
-    answer.send(("done", 0.5))
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
-def ended(_answer: Connection, *_: Any) -> None:
-    sys.exit(3)
-
-
-def silent(_answer: Connection, *_: Any) -> None:
-    threading.Event().wait()
-
-
-def stopped(answer: Connection, *_: Any) -> None:
-    answer.send(("done", 0.5))
-    os.kill(os.getpid(), signal.SIGSTOP)
-
-
-def _job_of(arguments: tuple[Any, ...]) -> Callable[..., None]:
-    return questions.make_timeline_job if isinstance(arguments[0], Path) else questions.export_job
-
-
-def _fail(answer: Connection, error: Exception) -> None:
-    def work() -> None:
-        raise error
-
-    questions.answer_with(answer, work)
-
-
-FAILURES: dict[str, tuple[Callable[..., None], str]] = {
-    "DuckDB is missing": (partial(without, "duckdb"), 'this needs DuckDB: pip install "pebble-robot[archive]"'),
-    "zstandard is missing": (partial(without, "zstandard"), 'pip install "pebble-robot['),
-    "PyAV is missing": (partial(without, "av"), "film needs PyAV: pip install 'pebble-robot[media]'"),
-    "the disk is full": (full, "No space left on device; make room on its disk"),
-    "the folder is closed": (locked, "/data/index: Permission denied; give the user of this server access to it"),
-    "a fault": (faulty, "ValueError: a fault"),
-    "no memory": (too_large, "there is too little memory: end other programs, or choose less"),
-    "killed": (killed, "its process was killed, as it is where memory runs out"),
-    "ended": (ended, "its process has ended (3): the log of the server says why"),
-    "silent": (silent, "it did nothing for 3 s and was ended: look at the disk, then try again"),
-    "stopped": (stopped, "it did nothing for 3 s and was ended: look at the disk, then try again"),
-}
-NOT_OF = {  # they do without
-    ("timeline", "PyAV is missing"),
-    ("timeline", "zstandard is missing"),
-    ("export", "DuckDB is missing"),
-}
-
-
 @pytest.mark.parametrize(
-    ("kind", "failure"), [one for one in product(["timeline", "export"], FAILURES) if one not in NOT_OF]
-)
-def test_a_job_that_fails_is_shown_with_its_reason_until_a_person_tries_again(
-    broker: Broker, folder: Path, monkeypatch: pytest.MonkeyPatch, kind: str, failure: str
-) -> None:
-    job, why = FAILURES[failure]
-    asked = partial(get, path="timeline", day=DAY, robot=GOOB)
-    with Served(broker.port, recordings=folder) as running, monkeypatch.context() as patched:
-        patched.setattr(archive_process, "SILENT_S", 3.0 if job in (silent, stopped) else archive_process.SILENT_S)
-        patched.setattr(questions, "make_timeline_job" if kind == "timeline" else "export_job", job)
-        if kind == "timeline":
-            assert until(lambda: asked(running).status_code != 202, 30, step=0.1)
-            answers = [asked(running) for _ in range(3)]
-            assert [(one.status_code, why in one.text, "\n" in one.text) for one in answers] == 3 * [(422, True, False)]
-        else:
-            wanted = {"robot": GOOB, "since": ms(5), "until": ms(6), "as": "mkv"}
-            place = f"exports/{post(running, 'exports', wanted).json()['id']}"
-            assert until(lambda: get(running, place).json()["state"] != "running", 30, step=0.1)
-            shown = get(running, place).json()
-            assert (shown["state"], why in shown["why"]) == ("failed", True), shown
-        patched.undo()
-        if kind == "timeline":
-            pytest.importorskip("duckdb")
-            assert asked(running, again=1).status_code == 202
-            assert until(lambda: asked(running).status_code == 200, 30, step=0.1)
-        else:
-            assert post(running, "exports", wanted).status_code == 202
-
-
-@pytest.mark.parametrize(
-    ("break_it", "why"),
+    ("error", "why"),
     [
-        (lambda archive, _: (archive / "index").write_text(""), "index: File exists; move it away"),
-        (lambda _, scratch: scratch.rmdir(), ""),
+        (OSError(28, "No space left on device", "/tmp/x"), "/tmp/x: No space left on device; make room on its disk"),
+        (
+            PermissionError(13, "Permission denied", "/data/index"),
+            "/data/index: Permission denied; give the user of this server access to it",
+        ),
+        (ValueError("a fault\nof two lines"), "ValueError: a fault"),
+        (MemoryError(), "there is too little memory: end other programs, or choose less"),
     ],
 )
-def test_a_timeline_of_a_folder_that_is_not_as_it_was(
-    broker: Broker, tmp_path: Path, break_it: Callable[[Path, Path], object], why: str
-) -> None:
-    pytest.importorskip("duckdb")
-    archive = film(tmp_path, "h264", 2)
-    with Served(broker.port, recordings=archive) as running:
-        break_it(archive, Path(running.app.state.recordings.scratch))
-        asked = partial(get, running, "timeline", day=DAY, robot=GOOB)
-        assert until(lambda: asked().status_code != 202, 30, step=0.1)
-        assert [why in one.text for one in (asked(), asked(), asked())] == [True] * 3
-        assert asked().status_code == (422 if why else 200)
+def test_a_job_answers_with_what_went_wrong_and_what_helps(error: Exception, why: str) -> None:
+    def work() -> str:
+        raise error
+
+    ours, theirs = multiprocessing.Pipe(duplex=False)
+    with suppress(ValueError, MemoryError):  # for the log
+        questions.answer_with(theirs, work)
+    assert ours.recv() == ("failed", why)
 
 
-def test_a_day_names_a_file_of_which_a_part_cannot_be_read(broker: Broker, tmp_path: Path) -> None:
-    pytest.importorskip("duckdb")
-    archive = film(tmp_path, "h264", 2)
-    _flip(next(archive.rglob("*.state.mcap")))
-    with Served(broker.port, recordings=archive) as running:
-        assert "state.mcap" in get(running, "days").text
+def whys(functions: Iterable[Callable[..., None]], *arguments: Path) -> list[str]:
+    """Why jobs failed, each in a process of its own."""
+
+    async def run() -> list[str]:
+        jobs = [archive_process.Job(function, *arguments) for function in functions]
+        while any(job.running for job in jobs):
+            await asyncio.sleep(0.02)
+        return [job.why for job in jobs]
+
+    return asyncio.run(run())
 
 
-def _flip(file: Path) -> None:
-    with file.open("r+b") as opened:
-        opened.write(b"x")
+FAILURES: dict[Callable[..., None], str] = {
+    partial(failing_jobs.without, "duckdb", "timeline"): 'this needs DuckDB: pip install "pebble-robot[archive]"',
+    partial(failing_jobs.without, "zstandard", "export"): 'pip install "pebble-robot[',
+    partial(failing_jobs.without, "av", "export"): "film needs PyAV: pip install 'pebble-robot[media]'",
+    failing_jobs.killed: "its process was killed, as it is where memory runs out",
+}
 
 
-def _is_zombie(pid: int) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
-    except OSError:
-        return True
+def test_a_job_that_ends_without_an_answer_or_lacks_a_package_has_a_reason(folder: Path, tmp_path: Path) -> None:
+    found = whys(FAILURES, folder, tmp_path)
+    assert [why for why, expected in zip(found, FAILURES.values(), strict=True) if expected not in why] == []
+
+
+def test_a_job_that_gives_no_sign_of_life_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(archive_process, "SILENT_S", 1.0)
+    why = "it did nothing for 1 s and was ended: look at the disk, then try again"
+    assert whys([failing_jobs.silent, failing_jobs.stopped]) == [why, why]

@@ -235,41 +235,31 @@ def ask(page: Page, ref: str, tag: str, **fields: Any) -> None:
     page.send(tag, ref=ref, **fields)
 
 
-def test_every_command_reaches_the_robot_in_its_order(page: Page, robot: RecordingRobot) -> None:
+def test_every_command_reaches_the_robot_in_its_order_and_is_in_the_audit(
+    broker: Broker, served: Served, page: Page, robot: RecordingRobot
+) -> None:
+    """The broker remembers flags and nothing else; the audit has no lights and sounds."""
+
+    def noted() -> list[str]:
+        return [f"{one.what}: {one.detail}" for one in served.app.state.audit.read(100) if one.ref == robot.base]
+
     for fields, *_ in PUBLISHED:
         ask(page, robot.base, **fields)
     assert until(lambda: len(asked_of(robot)) == len(PUBLISHED), 5), asked_of(robot)
     assert asked_of(robot) == [(metric, value) for _, metric, value, _ in PUBLISHED]
     assert page.refused == []
-
-
-def test_the_broker_remembers_flags_and_nothing_else(broker: Broker, page: Page, robot: RecordingRobot) -> None:
-    for fields, *_ in PUBLISHED:
-        ask(page, robot.base, **fields)
-    assert until(lambda: len(asked_of(robot)) == len(PUBLISHED), 5)
     retained: list[Message] = []
     with create("mqtt", "later", MqttSettings(host="127.0.0.1", port=broker.port)) as later:
         later.subscribe(f"{robot.base}/incoming/#", retained.append, direct=True)
         assert until(lambda: len(retained) == 3, 3)
     assert {one.topic.rpartition("/")[2] for one in retained} == {"remote-mirror", "mqtt-audio", "mqtt-video"}
-
-
-def test_what_was_asked_is_in_the_audit_but_no_lights_and_sounds(
-    served: Served, page: Page, robot: RecordingRobot
-) -> None:
-    for fields, *_ in PUBLISHED:
-        ask(page, robot.base, **fields)
-
-    def found() -> list[str]:
-        return [f"{one.what}: {one.detail}" for one in served.app.state.audit.read(100) if one.ref == robot.base]
-
-    assert until(lambda: len(found()) == len(PUBLISHED) - 6), (found(), page.refused, page.closed)
-    assert found()[1:4] == [
+    assert until(lambda: len(noted()) == len(PUBLISHED) - 6), (noted(), page.closed)
+    assert noted()[1:4] == [
         "autonomy: file follow, config {}",
         "autonomy: file , config {}",
         "outlet: outlet o1, on True",
     ]
-    assert found()[-1] == "flag: name mqtt-video, on True"
+    assert noted()[-1] == "flag: name mqtt-video, on True"
 
 
 def refusals(page: Page, expected: int = 1) -> list[str]:

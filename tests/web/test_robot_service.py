@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 import urllib.request
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +17,6 @@ import pytest
 from pebble.client import page_packages as extra
 from pebble.web import robot_service
 from tests.support import ROOT, Broker, Child, free_port, until
-
-
-@pytest.fixture
-def broker(tmp_path: Path) -> Iterator[Broker]:
-    running = Broker(tmp_path)
-    yield running
-    running.stop()
 
 
 def written(folder: Path, web: dict[str, Any], **services: Any) -> Path:

@@ -11,7 +11,17 @@ from pebble.client.page_settings import WebSettings
 from pebble.fleet.audit import Audit
 from pebble.fleet.people import People
 from pebble.transports import Message, MqttSettings
+from pebble.web import robots as robots_module
+from pebble.web.robots import Robots
 from pebble.web.server import Server
+from tests.web.served import FREE
+
+_CAPABILITIES = {"t": 1, "value": {"drive": {"available": True}, "estop": {"available": True, "owners": ["serial"]}}}
+
+
+def published(ref: str, metric: str, value: object, *, retain: bool = False) -> Message:
+    return Message(f"{ref}/outgoing/{metric}", json.dumps(value).encode(), retain=retain)
+
 
 GOOB, TOWER = "pebble/robots/goob", "pebble/robots/tower"
 
@@ -30,11 +40,43 @@ def test_what_is_drawn_over_a_picture_of_another_component_follows_its_capabilit
     updated: list[str] = []
     monkeypatch.setattr(server.open_components, "update", updated.append)
     server.robots.sources[GOOB] = TOWER
-    payload = json.dumps({"schema": "pebble-capabilities/v1", "t": 1, "value": {}}).encode()
-    server.receive(Message(f"{TOWER}/outgoing/capabilities", payload), 1.0)
+    server.receive(published(TOWER, "capabilities", {"schema": "pebble-capabilities/v1", "t": 1, "value": {}}), 1.0)
     assert updated == [TOWER, GOOB]
 
 
 @pytest.mark.parametrize("topic", ["pebble/robots/goob/incoming/\x01", "x" * 1100, "a" + "/b" * 250, "#", ""])
 def test_what_no_topic_may_be_called_is_refused_and_nothing_else(server: Server, topic: str) -> None:
     assert server.broker.publish(topic, b"{}") is False
+
+
+#: What speaks for a robot beside strangers who publish capabilities: what it has published, and whether it is known.
+ROBOTS = {
+    "it has a stop": ([published(GOOB, "estop/serial", FREE, retain=True)], False),
+    "it is known from before": ([published(GOOB, "capabilities", _CAPABILITIES, retain=True)], True),
+    "it is alive": (
+        [published(GOOB, "capabilities", _CAPABILITIES), published(GOOB, "online", {"t": 1, "online": True})],
+        False,
+    ),
+}
+
+
+@pytest.mark.parametrize(("messages", "known"), ROBOTS.values(), ids=ROBOTS)
+def test_strangers_keep_no_robot_out_and_push_none_out(
+    monkeypatch: pytest.MonkeyPatch, messages: list[Message], known: bool
+) -> None:
+    monkeypatch.setattr(robots_module, "MAX_COMPONENTS", 20)
+    robots = Robots()
+    robots.before = {GOOB} if known else ()
+
+    def flood() -> None:
+        for number in range(25):
+            robots.receive(published(f"pebble/robots/e{number}", "capabilities", _CAPABILITIES), 1.0)
+
+    flood()
+    for message in messages:
+        robots.receive(message, 1.0)
+    robots.refresh(1.0)
+    assert GOOB in robots.components
+    flood()
+    flood()
+    assert GOOB in robots.components

@@ -14,11 +14,14 @@ from pebble.fleet.audit import Audit
 from pebble.fleet.people import People
 from pebble.runtime.robot_estop import RobotEstop
 from pebble.transports import Message, MqttSettings
+from pebble.web import stops as stops_module
 from pebble.web.server import Server
-from pebble.web.stops import MAX_EACH, MAX_STOPS, Stops
+from pebble.web.stops import MAX_EACH, Stops
+from tests.support import cases
 
 A, B = "pebble/robots/a", "pebble/robots/b"
 FIRST = "f" * 16
+MOST, SAME = cases(96, stops_module.MAX_STOPS), cases(12, stops_module.MAX_SAME)  # of stops, as these tests have it
 
 
 def press(stops: Stops, ref: str, user: str = "ann") -> str:
@@ -35,16 +38,20 @@ def capabilities_of(ref: str) -> Message:
 @pytest.mark.parametrize(
     ("ref", "others"),
     [
-        (A, [(f"pebble/robots/fake{number}", "ann") for number in range(3 * MAX_STOPS)]),
-        (A, [(f"pebble/robots/fake{number}", f"viewer{number}") for number in range(3 * MAX_STOPS)]),
-        (A, [(B, f"viewer{number}") for number in range(3 * MAX_STOPS)]),
-        (A, [("", f"viewer{number}") for number in range(3 * MAX_STOPS)]),
-        ("", [(f"pebble/robots/fake{number}", "ann") for number in range(3 * MAX_STOPS)]),
-        (A, [(f"pebble/robots/real{number}", "ann") for number in range(MAX_STOPS - 1)]),
+        (A, [(f"pebble/robots/fake{number}", "ann") for number in range(3 * MOST)]),
+        (A, [(f"pebble/robots/fake{number}", f"viewer{number}") for number in range(3 * MOST)]),
+        (A, [(B, f"viewer{number}") for number in range(3 * MOST)]),
+        (A, [("", f"viewer{number}") for number in range(3 * MOST)]),
+        ("", [(f"pebble/robots/fake{number}", "ann") for number in range(3 * MOST)]),
+        (A, [(f"pebble/robots/real{number}", "ann") for number in range(MOST - 1)]),
     ],
     ids=["of invented robots", "by many", "of one robot", "of all", "one of all", "of a fleet, by one person"],
 )
-def test_other_stops_end_none_that_is_repeated(ref: str, others: list[tuple[str, str]]) -> None:
+def test_other_stops_end_none_that_is_repeated(
+    monkeypatch: pytest.MonkeyPatch, ref: str, others: list[tuple[str, str]]
+) -> None:
+    for name, value in {"MAX_STOPS": MOST, "MAX_SAME": SAME}.items():
+        monkeypatch.setattr(stops_module, name, value)
     stops = Stops()
     press(stops, ref)
     if ref:

@@ -38,6 +38,11 @@ class ArchiveProcess:
         self._pool: ProcessPoolExecutor | None = None
         self._waiting = 0
 
+    @property
+    def pids(self) -> list[int]:
+        """The process that answers, if it runs."""
+        return [] if self._pool is None else list(self._pool._processes or ())  # those of a pool are not public
+
     async def ask(self, question: Callable[..., AnswerT], *arguments: Any, **options: Any) -> AnswerT:
         """The answer of a function of :mod:`pebble.recordings.seek.questions`. Raises PebbleError."""
         if self._waiting >= MOST_WAITING:

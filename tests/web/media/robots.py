@@ -76,7 +76,7 @@ class MediaRobot(ABC):
         self._requested = self._raised = self._keyframe = False
         self._encoding = self._default
         self._ending = threading.Event()
-        self.transport.subscribe("#", self._on_message, echo=False, direct=True)
+        self.transport.subscribe("#", self.receive, echo=False, direct=True)
         self.announce(given)
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
@@ -112,7 +112,7 @@ class MediaRobot(ABC):
         self._thread.join()
         self.transport.close()
 
-    def _on_message(self, message: Message) -> None:
+    def receive(self, message: Message) -> None:
         self.published.append(message)
         if message.topic == self.flag:
             self._raised = json.loads(message.payload)["value"]
@@ -178,8 +178,8 @@ class SoundRobot(MediaRobot):
         self._speech, self._first = Speech(RATE), 0
         super().__init__(audio, PIECE / RATE, "pcm", transport)
 
-    def _on_message(self, message: Message) -> None:
-        super()._on_message(message)
+    def receive(self, message: Message) -> None:
+        super().receive(message)
         if message.topic == UPLINK:
             self.voice.append(Sound.unpack(message.payload))
 
