@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-import itertools
 import json
+from collections.abc import Callable
 from typing import Any
 
-import pytest
-
 from pebble.services.autonomy_manager.forms import Setting, SettingError, effective
-from tests.web.test_page_core import run
+from tests.web.in_node import Rows, Script, evaluate, rows
 
-BASE = "pebble/robots/goob"
-
+_STORED = """
+const stored = new Map();
+const getItem = (key) => stored.get(key) ?? null;
+globalThis.localStorage = { getItem, setItem: (key, value) => stored.set(key, value) };
+const texts = (map) => Object.fromEntries(map);
+"""
 
 #: The services of a page before one robot; ``sent`` is what it asks for.
 _PAGE = """
@@ -40,16 +42,11 @@ const page = {
 };
 """
 
-# -- lights
-
 BLACK = {"r": 0, "g": 0, "b": 0}
-
-
-def lights(steps: str) -> Any:
-    names = "Lights, Pacer, command, lightsOf, supported, toggleFlash, whyNotLights"
-    return run("../ui/cards/lights-model.js", names, _PAGE + steps)
-
-
+ORANGE = {"r": 1, "g": 0.533, "b": 0}
+lights = Script(
+    {"ui/cards/lights-model.js": "Lights, Pacer, lightsOf, supported, toggleFlash"}, _STORED + _PAGE, anew=True
+)
 _PACER = """
 let now = 1000;
 const timers = [];
@@ -61,219 +58,151 @@ const drag = (ms, value) => {
   if (value !== undefined) pacer.call(() => calls.push([now, value]));
 };
 """
-
-
-def test_a_dragged_colour_is_sent_five_times_a_second_and_the_last_one_always() -> None:
-    calls = lights(_PACER + "for (let i = 0; i < 100; i++) drag(10, i); drag(1000); result = calls;")
-    times = [at for at, _ in calls]
-    assert min(later - at for at, later in itertools.pairwise(times)) >= 200
-    assert len(calls) == 6
-    assert calls[0] == [1010, 0]
-    assert calls[-1][1] == 99
-
-
-def test_single_choices_are_sent_at_once() -> None:
-    assert lights(_PACER + "drag(0, 1); drag(200, 2); drag(500, 3); result = [calls, timers.length];") == [
-        [[1000, 1], [1200, 2], [1700, 3]], 0,
-    ]  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("change", "expected"),
-    [
-        ('{ mode: "solid" }', {"r": 1, "g": 0.533, "b": 0}),
-        ('{ colour: "#0000ff" }', {"r": 0, "g": 0, "b": 1}),
-        ('{ mode: "flash", period: 0.5 }', {"r": 1, "g": 0.533, "b": 0, "period": 0.5}),
-        ('{ mode: "flash", period: 99 }', {"r": 1, "g": 0.533, "b": 0, "period": 10}),
-        ('{ mode: "flash", period: NaN }', {"r": 1, "g": 0.533, "b": 0, "period": 2}),
-        ('{ mode: "off" }', BLACK),
-        ('{ colour: "red" }', {"r": 1, "g": 0.533, "b": 0}),
-    ],
-)
-def test_what_is_asked_of_lights(change: str, expected: dict[str, float]) -> None:
-    assert lights(f"lightsOf(ref).ask(page, {change}); result = sent;") == [expected]
-
-
-def test_lights_that_only_flash_are_off_in_black() -> None:
-    steps = "values[ref].capabilities.value.lights = { solid: false, flash: true };"
-    assert lights(f'{steps} lightsOf(ref).ask(page, {{ mode: "off" }}); result = sent;') == [BLACK | {"period": 2}]
-
-
-@pytest.mark.parametrize(("before", "after"), [("solid", "solid"), ("off", "off")])
-def test_a_flash_ends_in_what_was_before(before: str, after: str) -> None:
-    steps = f"""
-    const one = lightsOf(ref);
-    one.ask(page, {{ mode: "{before}" }});
-    result = [toggleFlash(page, ref), one.mode, toggleFlash(page, ref), one.mode];"""
-    assert lights(steps) == ["", "flash", "", after]
-
-
 _ANSWER = """
 const answer = (n, op) => { page.connection.answers.set(n, { op, n }); [...followers].forEach((fn) => fn()); };
 const one = lightsOf(ref);
 const lit = () => [one.mode, one.colour];
 """
-
-
-def test_lights_that_were_refused_are_as_before() -> None:
-    steps = """
-    one.ask(page, { mode: "solid", colour: "#0000ff" });
-    answer(1, "done");
-    one.pacer.calledAt = -Infinity;
-    result = [toggleFlash(page, ref), lit()];
-    answer(2, "refused");
-    result.push(lit(), followers.size);
-    one.pacer.calledAt = -Infinity;
-    page.commands.setLights = () => 0;
-    one.ask(page, { mode: "off" });
-    result.push(lit());"""
-    blue = ["solid", "#0000ff"]
-    assert lights(_ANSWER + steps) == ["", ["flash", "#0000ff"], blue, 0, blue]
-
-
-def test_a_refusal_does_not_undo_what_was_asked_after_it() -> None:
-    steps = """
-    one.ask(page, { mode: "solid" });
-    one.pacer.calledAt = -Infinity;
-    one.ask(page, { mode: "off" });
-    answer(1, "refused");
-    result = [lit()[0]];
-    answer(2, "done");
-    result.push(lit()[0], followers.size);"""
-    assert lights(_ANSWER + steps) == ["off", "off", 0]
-
-
-def test_a_flash_of_a_silent_robot_can_be_switched_off() -> None:
-    steps = """
-    const one = lightsOf(ref);
-    one.ask(page, { mode: "flash" });
-    values[ref]["web/liveness"].online = false;
-    result = [toggleFlash(page, ref), one.mode, toggleFlash(page, ref)];"""
-    assert lights(steps) == ["", "off", "goob is silent"]
-
-
-@pytest.mark.parametrize(
-    ("change", "why"),
-    [
-        ("page.connection.isOpen = false", "No connection to the server"),
-        ('values[""]["web/broker"].problem = "refused"', "The server cannot reach the broker"),
-        ("page.connection.may = () => false", "Log in as driver to use this"),
-        ('values[ref]["web/liveness"].online = false', "goob is silent"),
-        ("values[ref].capabilities.value.lights.controls = false", "goob takes no such commands"),
-        ("values[ref].capabilities.value.lights.flash = false", "goob has no lights that flash"),
-        ("values[ref].capabilities.value.lights = 7", "goob has no lights that flash"),
-        ("values[ref].capabilities = null", "goob has no lights that flash"),
-        ("delete values[ref]", "goob has no lights that flash"),
-    ],
-)
-def test_why_lights_do_not_flash(change: str, why: str) -> None:
-    assert lights(f"{change}; result = [toggleFlash(page, ref), sent];") == [why, []]
-
-
-@pytest.mark.parametrize(
-    ("section", "expected"),
-    [
-        ({"solid": True, "flash": True}, [True, True]),
-        ({"solid": True, "flash": False}, [True, False]),
-        ({"available": True}, [True, True]),
-        ({"available": True, "flash": False}, [True, False]),
-        ({"solid": "yes", "available": 1}, [False, False]),
-        ({}, [False, False]),
-    ],
-)
-def test_what_lights_can_do(section: dict[str, Any], expected: list[bool]) -> None:
-    steps = f"const can = supported({{ value: {{ lights: {json.dumps(section)} }} }}); result = [can.solid, can.flash];"
-    assert lights(steps) == expected
-
-
-@pytest.mark.parametrize(
-    "stored", ["null", "7", '"x"', "[]", '{"colour":"url(x)","period":"2","mode":"boom","steady":[]}']
-)
-def test_lights_ignore_what_they_cannot_have_remembered(stored: str) -> None:
-    steps = f"""
-    globalThis.localStorage = {{ getItem: () => {json.dumps(stored)}, setItem() {{}} }};
-    const {{ colour, period, mode, steady }} = new Lights("other");
-    result = [colour, period, mode, steady];"""
-    assert lights(steps) == ["#ff8800", 2, "", "off"]
-
+#: What is asked of lights, and what is sent.
+ASKED = {
+    '{ mode: "solid" }': ORANGE,
+    '{ colour: "#0000ff" }': {"r": 0, "g": 0, "b": 1},
+    '{ mode: "flash", period: 0.5 }': ORANGE | {"period": 0.5},
+    '{ mode: "flash", period: 99 }': ORANGE | {"period": 10},
+    '{ mode: "flash", period: NaN }': ORANGE | {"period": 2},
+    '{ mode: "off" }': BLACK,
+    '{ colour: "red" }': ORANGE,
+}
+NO_FLASH = "goob has no lights that flash"
+WHY_NO_FLASH = {
+    "page.connection.isOpen = false": "No connection to the server",
+    'values[""]["web/broker"].problem = "refused"': "The server cannot reach the broker",
+    "page.connection.may = () => false": "Log in as driver to use this",
+    'values[ref]["web/liveness"].online = false': "goob is silent",
+    "values[ref].capabilities.value.lights.controls = false": "goob takes no such commands",
+    "values[ref].capabilities.value.lights.flash = false": NO_FLASH,
+    "values[ref].capabilities.value.lights = 7": NO_FLASH,
+    "values[ref].capabilities = null": NO_FLASH,
+    "delete values[ref]": NO_FLASH,
+}
+#: Sections of capabilities, and whether such lights stay on, and flash.
+ABLE = {
+    "{ solid: true, flash: true }": [True, True],
+    "{ solid: true, flash: false }": [True, False],
+    "{ available: true }": [True, True],
+    "{ available: true, flash: false }": [True, False],
+    '{ solid: "yes", available: 1 }': [False, False],
+    "{}": [False, False],
+}
+REMEMBERED = "null", "7", '"x"', "[]", '{"colour":"url(x)","period":"2","mode":"boom","steady":[]}'
+# fmt: off
+LIGHTS: Rows = {
+    "a dragged colour is sent five times a second and the last one always": (f"""{_PACER}
+        for (let i = 0; i < 100; i++) drag(10, i);
+        drag(1000);
+        const waits = calls.slice(1).map(([at], index) => at - calls[index][0]);
+        result = [Math.min(...waits) >= 200, calls.length, calls[0], calls.at(-1)[1]];""", [True, 6, [1010, 0], 99]),
+    "single choices are sent at once": (
+        f"{_PACER} drag(0, 1); drag(200, 2); drag(500, 3); result = [calls, timers.length];",
+        [[[1000, 1], [1200, 2], [1700, 3]], 0]),
+    **{f"what is asked of lights: {change}": (f"lightsOf(ref).ask(page, {change}); result = sent;", [expected])
+        for change, expected in ASKED.items()},
+    **{f"a flash ends in what was before: {before}": (f"""
+        const one = lightsOf(ref);
+        one.ask(page, {{ mode: "{before}" }});
+        result = [toggleFlash(page, ref), one.mode, toggleFlash(page, ref), one.mode];""", ["", "flash", "", before])
+        for before in ("solid", "off")},
+    "lights that were refused are as before": (f"""{_ANSWER}
+        one.ask(page, {{ mode: "solid", colour: "#0000ff" }});
+        answer(1, "done");
+        one.pacer.calledAt = -Infinity;
+        result = [toggleFlash(page, ref), lit()];
+        answer(2, "refused");
+        result.push(lit(), followers.size);
+        one.pacer.calledAt = -Infinity;
+        page.commands.setLights = () => 0;
+        one.ask(page, {{ mode: "off" }});
+        result.push(lit());""", ["", ["flash", "#0000ff"], ["solid", "#0000ff"], 0, ["solid", "#0000ff"]]),
+    "a refusal does not undo what was asked after it": (f"""{_ANSWER}
+        one.ask(page, {{ mode: "solid" }});
+        one.pacer.calledAt = -Infinity;
+        one.ask(page, {{ mode: "off" }});
+        answer(1, "refused");
+        result = [lit()[0]];
+        answer(2, "done");
+        result.push(lit()[0], followers.size);""", ["off", "off", 0]),
+    "lights that only flash are off in black": ("""
+        values[ref].capabilities.value.lights = { solid: false, flash: true };
+        lightsOf(ref).ask(page, { mode: "off" }); result = sent;""", [BLACK | {"period": 2}]),
+    "a flash of a silent robot can be switched off": ("""
+        const one = lightsOf(ref);
+        one.ask(page, { mode: "flash" });
+        values[ref]["web/liveness"].online = false;
+        result = [toggleFlash(page, ref), one.mode, toggleFlash(page, ref)];""", ["", "off", "goob is silent"]),
+    **{f"why lights do not flash: {change}": (f"{change}; result = [toggleFlash(page, ref), sent];", [why, []])
+        for change, why in WHY_NO_FLASH.items()},
+    **{f"what lights can do: {section}": (f"""
+        const {{ solid, flash }} = supported({{ value: {{ lights: {section} }} }});
+        result = [solid, flash];""", expected) for section, expected in ABLE.items()},
+    **{f"lights ignore what they cannot have remembered: {found}": (f"""
+        globalThis.localStorage = {{ getItem: () => {json.dumps(found)}, setItem() {{}} }};
+        const {{ colour, period, mode, steady }} = new Lights("other");
+        result = [colour, period, mode, steady];""", ["#ff8800", 2, "", "off"]) for found in REMEMBERED},
+}
+# fmt: on
 
 # -- sounds
 
-
-def sounds(steps: str) -> Any:
-    return run("../ui/cards/sounds-model.js", "clips, grouped, play, playing, repeatLast, soundsOf", _PAGE + steps)
-
-
-def test_the_last_sound_is_repeated_as_it_was_played() -> None:
-    steps = """
-    result = [repeatLast(page, ref), play(page, ref, "a/horn.wav", true), repeatLast(page, ref),
-      repeatLast(page, "pebble/robots/fred"), sent];"""
-    played = ["a/horn.wav", True]
-    assert sounds(steps) == ["Play one sound first", "", "", "Play one sound first", [played, played]]
-
-
-def test_what_cannot_be_played_is_not_repeated() -> None:
-    steps = """
-    result = [play(page, ref, "x".repeat(1001), false), repeatLast(page, ref)];
-    values[ref].capabilities.value.soundboard.controls = false;
-    result.push(play(page, ref, "horn.wav", false), repeatLast(page, ref), sent);"""
-    refused = "goob takes no such commands"
-    assert sounds(steps) == ["Its name is too long", "Play one sound first", refused, refused, []]
-
-
+sounds = Script({"ui/cards/sounds-model.js": "clips, grouped, play, playing, repeatLast"}, _STORED + _PAGE, anew=True)
 FILES = ["horn.wav", "Bell.wav", "animals/Cat.wav", "animals/dog.wav", "animals/wild/cat.wav"]
-
-
-@pytest.mark.parametrize(
-    ("words", "most", "folders", "more"),
-    [
-        ("", 60, [["", FILES[:2]], ["animals/", FILES[2:4]], ["animals/wild/", FILES[4:]]], 0),
-        ("CAT", 60, [["animals/", FILES[2:3]], ["animals/wild/", FILES[4:]]], 0),
-        ("  wild   cat ", 60, [["animals/wild/", FILES[4:]]], 0),
-        ("nothing", 60, [], 0),
-        ("", 2, [["", FILES[:2]]], 3),
-    ],
-)
-def test_clips_are_grouped_by_folder_and_bounded(words: str, most: int, folders: list[Any], more: int) -> None:
-    found = sounds(f"result = grouped({json.dumps(FILES)}, {json.dumps(words)}, {most});")
-    assert found == {"folders": folders, "more": more}
-
-
-@pytest.mark.parametrize(
-    ("payload", "expected"),
-    [
-        ({"files": ["a.wav", "a.wav", 7, None, "", "  ", ["b.wav"], "c.wav"]}, ["a.wav", "c.wav"]),
-        ({"value": {"files": ["a.wav"]}}, ["a.wav"]),
-        ({"files": "a.wav"}, None),
-        ({"files": {"0": "a.wav"}}, None),
-        (None, None),
-        (7, None),
-    ],
-)
-def test_only_names_are_clips(payload: Any, expected: Any) -> None:
-    assert sounds(f"result = clips({json.dumps(payload)});") == expected
-
-
-@pytest.mark.parametrize(
-    ("payload", "expected"),
-    [
-        ({"playing": True, "file": "a.wav", "error": None}, ["a.wav", ""]),
-        ({"playing": True, "file": {"x": 1}, "error": 7}, ["a clip", ""]),
-        ({"playing": "yes", "file": "a.wav", "error": "Sound file not found"}, ["", "Sound file not found"]),
-        ([], ["", ""]),
-        (None, ["", ""]),
-    ],
-)
-def test_what_plays(payload: Any, expected: list[str]) -> None:
-    assert sounds(f"const {{ file, error }} = playing({json.dumps(payload)}); result = [file, error];") == expected
-
+WILD = ["animals/wild/", FILES[4:]]
+#: What is searched, how many are shown at most, and the groups; and how many more there are.
+GROUPS = [
+    ("", 60, [["", FILES[:2]], ["animals/", FILES[2:4]], WILD], 0),
+    ("CAT", 60, [["animals/", FILES[2:3]], WILD], 0),
+    ("  wild   cat ", 60, [WILD], 0),
+    ("nothing", 60, [], 0),
+    ("", 2, [["", FILES[:2]]], 3),
+]
+CLIPS = {
+    '{ files: ["a.wav", "a.wav", 7, null, "", "  ", ["b.wav"], "c.wav"] }': ["a.wav", "c.wav"],
+    '{ value: { files: ["a.wav"] } }': ["a.wav"],
+    **dict.fromkeys(('{ files: "a.wav" }', '{ files: { 0: "a.wav" } }', "null", "7"), None),
+}
+#: Status, what plays, and the error.
+PLAYING = {
+    '{ playing: true, file: "a.wav", error: null }': ["a.wav", ""],
+    "{ playing: true, file: { x: 1 }, error: 7 }": ["a clip", ""],
+    '{ playing: "yes", file: "a.wav", error: "Sound file not found" }': ["", "Sound file not found"],
+    "[]": ["", ""],
+    "null": ["", ""],
+}
+# fmt: off
+SOUNDS: Rows = {
+    "the last sound is repeated as it was played": ("""
+        result = [repeatLast(page, ref), play(page, ref, "a/horn.wav", true), repeatLast(page, ref),
+          repeatLast(page, "pebble/robots/fred"), sent];""",
+        ["Play one sound first", "", "", "Play one sound first", [["a/horn.wav", True]] * 2]),
+    "what cannot be played is not repeated": ("""
+        result = [play(page, ref, "x".repeat(1001), false), repeatLast(page, ref)];
+        values[ref].capabilities.value.soundboard.controls = false;
+        result.push(play(page, ref, "horn.wav", false), repeatLast(page, ref), sent);""",
+        ["Its name is too long", "Play one sound first", *["goob takes no such commands"] * 2, []]),
+    **{f"{most} clips with '{words}' are grouped by folder": (
+        f"result = grouped({json.dumps(FILES)}, '{words}', {most});", {"folders": folders, "more": more})
+        for words, most, folders, more in GROUPS},
+    **{f"only names are clips: {payload}": (f"result = clips({payload});", expected)
+        for payload, expected in CLIPS.items()},
+    **{f"what plays: {payload}": (f"const {{ file, error }} = playing({payload}); result = [file, error];", expected)
+        for payload, expected in PLAYING.items()},
+}
+# fmt: on
 
 # -- forms of scripts
 
-
-def forms(steps: str) -> Any:
-    names = "filled, hint, lastScript, mistake, remember, remembered, scripts, whyNotSent"
-    return run("../ui/cards/form-model.js", names, steps)
+forms = Script(
+    {"ui/cards/form-model.js": "filled, hint, lastScript, remember, remembered, scripts, whyNotSent"}, _STORED
+)
 
 
 def entry(key: str, kind: str = "string", **more: Any) -> dict[str, Any]:
@@ -308,16 +237,6 @@ ALL = [
 ]
 
 
-def test_what_was_not_filled_in_is_not_sent() -> None:
-    assert filled(ALL, {"tag": "7"}) == ({"tag": 7}, {})
-
-
-def test_what_was_filled_in_has_the_types_of_json() -> None:
-    texts = {"name": "fred", "laps": "4", "power": "0.25", "search": "false", "family": "B", "tag": "0", "foreign": "x"}
-    expected = {"name": "fred", "laps": 4, "power": 0.25, "search": False, "family": "B", "tag": 0}
-    assert filled(ALL, texts) == (expected, {})
-
-
 MISTAKES = [
     ("tag", "", "required"),
     ("laps", "0", "at least 1"),
@@ -340,17 +259,21 @@ MISTAKES = [
 ]
 
 
+def test_forms_are_sent_in_the_types_of_json() -> None:
+    given = {"name": "fred", "laps": "4", "power": "0.25", "search": "false", "family": "B", "tag": "0", "foreign": "x"}
+    assert filled(ALL, {"tag": "7"}) == ({"tag": 7}, {})  # what was not filled in is not sent
+    sent = {"name": "fred", "laps": 4, "power": 0.25, "search": False, "family": "B", "tag": 0}
+    assert filled(ALL, given) == (sent, {})
+    texts = ["naïve café", "日本", "a b", "3-4", "{}"]
+    found = filled_all(ALL, [{"name": text, "tag": "1"} for text in texts])
+    assert found == [[{"name": text, "tag": 1}, {}] for text in texts]
+
+
 def test_mistakes() -> None:
     found = filled_all(ALL, [{"tag": "1"} | {key: text} for key, text, _ in MISTAKES])
     for (key, text, mistake), (config, mistakes) in zip(MISTAKES, found, strict=True):
         assert mistakes == {key: mistake}, (key, text)
         assert key not in config
-
-
-def test_texts_that_robots_accept() -> None:
-    texts = ["naïve café", "日本", "a b", "3-4", "{}"]
-    found = filled_all(ALL, [{"name": text, "tag": "1"} for text in texts])
-    assert found == [[{"name": text, "tag": 1}, {}] for text in texts]
 
 
 SETTINGS = [
@@ -359,26 +282,8 @@ SETTINGS = [
     Setting(key="name", type="string", default="x"),
     Setting(key="family", type="enum", default="A", options=("A", "B")),
 ]
-TEXTS = [
-    "1",
-    "9",
-    "10",
-    "0",
-    "2.5",
-    "-1",
-    "1e0",
-    ".5",
-    "5.",
-    "1e-1",
-    "A",
-    "C",
-    "1_0",
-    "٣",
-    "x" * 256,
-    "x" * 257,
-    "a\nb",
-    " ",
-]
+TEXTS = ["1", "9", "10", "0", "2.5", "-1", "1e0", ".5", "5.", "1e-1", "A", "C", "1_0", "٣", "a\nb", " "]
+TEXTS += ["x" * 256, "x" * 257]
 
 
 def robot_accepts(values: dict[str, Any]) -> bool:
@@ -410,39 +315,11 @@ def test_a_robot_may_list_anything() -> None:
     fields = {one["key"]: one for one in found[0]["fields"]}
     assert list(fields) == ["a", "b", "c", "d", "__proto__", "e", "f"]
     assert [one["type"] for one in fields.values()] == ["text", "int", "text", "enum", "int", "bool", "text"]
-    assert (fields["b"]["min"], fields["b"]["step"], fields["b"]["required"], fields["b"]["default"]) == (
-        None,
-        None,
-        False,
-        "3",
-    )
+    assert [fields["b"][one] for one in ("min", "step", "required", "default")] == [None, None, False, "3"]
     assert (fields["d"]["options"], fields["d"]["default"]) == (["1", "two"], "7")
     assert fields["f"]["label"] == "f"
     assert found[0]["omitted"] == len(odd) - 7
     assert filled(odd, {"__proto__": "3", "e": "true"})[0] == {"__proto__": 3, "e": True}
-
-
-@pytest.mark.parametrize("payload", [None, 7, [], {}, {"files": None}, {"value": 3}])
-def test_without_a_list_there_are_no_scripts(payload: Any) -> None:
-    assert forms(f"result = scripts({json.dumps(payload)});") is None
-
-
-def test_scripts_of_the_same_label_have_their_folder_beside_it() -> None:
-    files = {
-        "files": [{"file": "a", "label": "Follow"}, {"file": "b", "label": "Follow"}, {"file": "c", "label": "Go"}]
-    }
-    found = forms(f"result = scripts({json.dumps(files)});")
-    assert [one["label"] for one in found] == ["Follow (a)", "Follow (b)", "Go"]
-
-
-def test_a_form_with_mistakes_is_not_sent() -> None:
-    steps = """
-    const reasons = (mistakes, config = {}) => whyNotSent({ config, mistakes: new Map(mistakes) });
-    const long = Object.fromEntries([...Array(64).keys()].map((n) => [`k${n}`, "x".repeat(256)]));
-    result = [reasons([]), reasons([["a", "x"]]), reasons([["a", "x"], ["b", "y"]]), reasons([], long)];"""
-    assert forms(steps) == [
-        "", "The form has 1 mistake", "The form has 2 mistakes", "The settings are too long together",
-    ]  # fmt: skip
 
 
 HINTS = [
@@ -452,68 +329,82 @@ HINTS = [
     (entry("a", "bool", default=False), "default off"),
     (entry("a"), ""),
 ]
+LISTED = {"files": [{"file": "x", "configs": [one | {"key": f"k{n}"} for n, (one, _) in enumerate(HINTS)]}]}
+SAME = ["Follow (a)", "Follow (b)", "Go"]
+#: Payloads, and the labels of the scripts that they list.
+LABELS = {
+    **dict.fromkeys(("null", "7", "[]", "{}", "{ files: null }", "{ value: 3 }"), None),
+    '{ files: [{ file: "a", label: "Follow" }, { file: "b", label: "Follow" }, { file: "c", label: "Go" }] }': SAME,
+}
+NOT_STORED = "{", "7", '{"a":1}', '[[1,2,3],["goob","a",{"x":1}],["goob","a",[["x",1]]],null]'
+# fmt: off
+FORMS: Rows = {
+    "hints": (
+        f"result = scripts({json.dumps(LISTED)})[0].fields.map(hint);", [expected for _, expected in HINTS]),
+    **{f"the scripts of {payload}": (f"result = scripts({payload})?.map((one) => one.label);", labels)
+        for payload, labels in LABELS.items()},
+    "a form with mistakes is not sent": ("""
+        const reasons = (mistakes, config = {}) => whyNotSent({ config, mistakes: new Map(mistakes) });
+        const long = Object.fromEntries([...Array(64).keys()].map((n) => [`k${n}`, "x".repeat(256)]));
+        result = [reasons([]), reasons([["a", "x"]]), reasons([["a", "x"], ["b", "y"]]), reasons([], long)];""",
+        ["", "The form has 1 mistake", "The form has 2 mistakes", "The settings are too long together"]),
+    "forms are remembered by robot and script": ("""
+        remember("goob", "a", new Map([["x", "1"]]));
+        remember("goob", "b", new Map([["x", "2"], ["y", "?"]]));
+        remember("fred", "a", new Map([["x", "3"]]));
+        result = [texts(remembered("goob", "a")), texts(remembered("goob", "b")), texts(remembered("fred", "b")),
+          lastScript("goob"), lastScript("fred"), lastScript("lamp")];""",
+        [{"x": "1"}, {"x": "2"}, {}, "b", "a", ""]),
+    "the memory of forms is bounded": ("""
+        for (let n = 0; n < 40; n++) remember("goob", `script ${n}`, new Map([["x", "y".repeat(200)]]));
+        const many = JSON.parse(stored.get("pebble forms")).length;
+        for (let n = 0; n < 40; n++) remember("goob", `script ${n}`, new Map([["x", "y".repeat(20000)]]));
+        result = [many, stored.get("pebble forms").length < 60000, texts(remembered("goob", "script 39")).x.length];""",
+        [32, True, 20000]),
+    **{f"a memory of something else is none: {found}": (f"""
+        stored.set("pebble forms", {json.dumps(found)});
+        result = [texts(remembered("goob", "a")), lastScript("goob")];""", [{}, ""]) for found in NOT_STORED},
+}
+# fmt: on
 
+# -- what may be asked, and scripts that run
 
-def test_hints() -> None:
-    configs = [field | {"key": f"k{number}"} for number, (field, _) in enumerate(HINTS)]
-    files = {"files": [{"file": "x", "configs": configs}]}
-    found = forms(f"result = scripts({json.dumps(files)})[0].fields.map(hint);")
-    assert found == [expected for _, expected in HINTS]
-
-
-_STORED = """
-const stored = new Map();
-const getItem = (key) => stored.get(key) ?? null;
-globalThis.localStorage = { getItem, setItem: (key, value) => stored.set(key, value) };
-const texts = (map) => Object.fromEntries(map);
-"""
-
-
-def test_forms_are_remembered_by_robot_and_script() -> None:
-    steps = """
-    remember("goob", "a", new Map([["x", "1"]]));
-    remember("goob", "b", new Map([["x", "2"], ["y", "?"]]));
-    remember("fred", "a", new Map([["x", "3"]]));
-    result = [texts(remembered("goob", "a")), texts(remembered("goob", "b")), texts(remembered("fred", "b")),
-      lastScript("goob"), lastScript("fred"), lastScript("lamp")];"""
-    assert forms(_STORED + steps) == [{"x": "1"}, {"x": "2"}, {}, "b", "a", ""]
-
-
-def test_the_memory_of_forms_is_bounded() -> None:
-    steps = """
-    for (let n = 0; n < 40; n++) remember("goob", `script ${n}`, new Map([["x", "y".repeat(200)]]));
-    const many = JSON.parse(stored.get("pebble forms")).length;
-    for (let n = 0; n < 40; n++) remember("goob", `script ${n}`, new Map([["x", "y".repeat(20000)]]));
-    result = [many, stored.get("pebble forms").length < 60000, texts(remembered("goob", "script 39")).x.length];"""
-    assert forms(_STORED + steps) == [32, True, 20000]
-
-
-@pytest.mark.parametrize("stored", ["{", "7", '{"a":1}', '[[1,2,3],["goob","a",{"x":1}],["goob","a",[["x",1]]],null]'])
-def test_a_memory_of_something_else_is_none(stored: str) -> None:
-    steps = f"{_STORED} stored.set('pebble forms', {json.dumps(stored)});"
-    assert forms(f"{steps} result = [texts(remembered('goob', 'a')), lastScript('goob')];") == [{}, ""]
-
-
-# -- what may be asked
-
-MAINTAINER = "Log in as maintainer to use this"
-
-
-@pytest.mark.parametrize(
-    ("change", "whys"),
-    [
-        ("", ["", "", MAINTAINER]),
-        ("page.connection.may = () => true", ["", "", ""]),
-        ("page.connection.may = () => false", ["Log in as driver to use this"] * 2 + [MAINTAINER]),
-        ('values[ref]["web/liveness"].online = false', ["", "goob is silent", MAINTAINER]),
-        ('values[""]["web/broker"].problem = "x"', ["", "The server cannot reach the broker", MAINTAINER]),
-        ('values[""]["web/broker"].connected = false', ["The server cannot reach the broker"] * 3),
-        ("page.connection.isOpen = false", ["No connection to the server"] * 3),
-    ],
+SERVER, BROKER, DRIVER, MAINTAINER = (
+    "No connection to the server",
+    "The server cannot reach the broker",
+    "Log in as driver to use this",
+    "Log in as maintainer to use this",
 )
-def test_what_ends_something_may_be_asked_of_a_silent_robot(change: str, whys: list[str]) -> None:
-    steps = f'{change}; result = [whyNotEnd(page), whyNot(page, ref), whyNot(page, ref, "", "system")];'
-    assert run("../ui/parts/why-not.js", "whyNot, whyNotEnd", _PAGE + steps) == whys
+may = Script({"ui/parts/why-not.js": "whyNot, whyNotEnd", "ui/parts/parts.js": "isGone"}, _PAGE)
+#: What ends something may be asked of a silent robot: why it, what a driver and what a maintainer does may not.
+WHYS = {
+    "": ["", "", MAINTAINER],
+    "page.connection.may = () => true": ["", "", ""],
+    "page.connection.may = () => false": [DRIVER, DRIVER, MAINTAINER],
+    'values[ref]["web/liveness"].online = false': ["", "goob is silent", MAINTAINER],
+    'values[""]["web/broker"].problem = "x"': ["", BROKER, MAINTAINER],
+    'values[""]["web/broker"].connected = false': [BROKER] * 3,
+    "page.connection.isOpen = false": [SERVER] * 3,
+}
+#: The age of a value and its usual period in seconds, and whether its robot is online and the value gone.
+GONE = [
+    (9, 1, True, False),
+    (11, 1, True, True),
+    (11, 5, True, False),
+    (16, 5, True, True),
+    (99, 0, True, False),
+    (0, 1, False, True),
+]
+# fmt: off
+MAY: Rows = {
+    **{f"what may be asked: {change}": (
+        f'{change}; result = [whyNotEnd(page), whyNot(page, ref), whyNot(page, ref, "", "system")];', whys)
+        for change, whys in WHYS.items()},
+    **{f"after {age} s of {period} s a value is gone: {gone}": (
+        f"result = isGone({{ age: {1000 * age}, period: {1000 * period} }}, {json.dumps(online)});", gone)
+        for age, period, online, gone in GONE},
+}
+# fmt: on
 
 
 def test_the_newest_answers_are_remembered_by_the_number_of_the_command() -> None:
@@ -526,93 +417,52 @@ def test_the_newest_answers_are_remembered_by_the_number_of_the_command() -> Non
     for (let n = 3; n <= 500; n++) answer(n, "done");
     answer(0, "refused");
     result.push(connection.answers.size, connection.answers.has(500), connection.answers.has(300));"""
-    assert run("../ui/parts/models.js", "Connection", steps) == ["refused", "done", 200, True, False]
+    assert evaluate({"ui/parts/models.js": "Connection"}, steps) == ["refused", "done", 200, True, False]
 
 
-@pytest.mark.parametrize(
-    ("age", "period", "online", "gone"),
-    [
-        (9, 1, True, False),
-        (11, 1, True, True),
-        (11, 5, True, False),
-        (16, 5, True, True),
-        (99, 0, True, False),
-        (0, 1, False, True),
-    ],
+autonomy = Script({"ui/cards/autonomy-model.js": "Since, statusOf, whyNotStarted"}, _PAGE)
+ODD = (
+    *("null", "7", '"x"', "[]", '{ running: "yes", file: 3 }'),
+    "{ running: true, file: [], dependencies: { a: 1 }, config: [1] }",
 )
-def test_a_value_is_gone(age: float, period: float, online: bool, gone: bool) -> None:
-    steps = f"result = isGone({{ age: {1000 * age}, period: {1000 * period} }}, {json.dumps(online)});"
-    assert run("../ui/parts/parts.js", "isGone", steps) is gone
-
-
-# -- scripts that run
-
-
-def autonomy(steps: str) -> Any:
-    names = "Since, handDriven, statusOf, whyNotStarted"
-    return run("../ui/cards/autonomy-model.js", names, _PAGE + steps)
-
-
-@pytest.mark.parametrize(
-    "payload",
-    [
-        None,
-        7,
-        "x",
-        [],
-        {"running": "yes", "file": 3},
-        {"running": True, "file": [], "dependencies": {"a": 1}, "config": [1]},
-    ],
-)
-def test_a_status_may_be_anything(payload: Any) -> None:
-    status = autonomy(f"result = statusOf({json.dumps(payload)});")
-    assert status["running"] is (isinstance(payload, dict) and payload["running"] is True)
-    assert (status["dependencies"], status["config"], status["error"]) == ([], [], "")
-
-
-def test_a_status_of_a_robot() -> None:
-    payload = {
-        "running": True, "file": "follow", "pid": 7, "overridden": True, "error": None, "config": {"tag_id": 5},
-        "dependencies": [{"file": "wheel-odometry", "pid": 8, "running": True}, {"file": 3, "running": 1}, "x"],
-    }  # fmt: skip
-    status = autonomy(f"result = statusOf({json.dumps(payload)});")
-    assert status == {
+BOB = 'values[ref]["web/driver"] = { by: "bob", you: %s, idle_s: %s }'
+WHY_NOT_STARTED = {
+    "": "",
+    "page.connection.may = () => false": DRIVER,
+    'values[ref]["web/liveness"].online = false': "goob is silent",
+    'values[ref]["web/liveness"].online = null': "goob has not been seen yet",
+    'values[ref]["web/estop"] = { latched: true, by: "eve" }': "Stopped by eve",
+    "values[ref].capabilities.value.autonomy.controls = false": "goob takes no such commands",
+    BOB % ("false", "null"): "",
+    BOB % ("false", "null") + "; drive.arbitrates = false": "bob is driving",
+    BOB % ("true", "null") + '; drive.arbitrates = "yes"': "You are driving",
+    BOB % ("false", "0.1") + "; drive.arbitrates = false": "",
+}
+# fmt: off
+AUTONOMY: Rows = {
+    **{f"a status may be anything: {payload}": (f"""
+        const {{ running, dependencies, config, error }} = statusOf({payload});
+        result = [running, dependencies, config, error];""", ["true" in payload, [], [], ""]) for payload in ODD},
+    "a status of a robot": ("""
+        const dependencies = [{ file: "wheel-odometry", pid: 8, running: true }, { file: 3, running: 1 }, "x"];
+        result = statusOf({ running: true, file: "follow", pid: 7, overridden: true, error: null,
+          config: { tag_id: 5 }, dependencies });""", {
         "running": True, "file": "follow", "pid": 7, "waits": True, "error": "", "config": [["tag_id", 5]],
-        "dependencies": [{"file": "wheel-odometry", "running": True}, {"file": "?", "running": False}],
-    }  # fmt: skip
+        "dependencies": [{"file": "wheel-odometry", "running": True}, {"file": "?", "running": False}]}),
+    "since when a script runs": ("""
+        const since = new Since();
+        const see = (status, at) => { since.update(statusOf(status), at); return [since.at, since.isExact]; };
+        const follow = { running: true, file: "follow", pid: 7 };
+        result = [see(follow, 100), see({ ...follow, overridden: true }, 200), see({ running: false }, 300),
+          see(follow, 400), see({ ...follow, pid: 8 }, 500)];""",
+        [[100, False], [100, False], [300, True], [400, True], [500, True]]),
+    **{f"why no script can be started: {change}": (f"""
+        const {{ drive }} = values[ref].capabilities.value; {change}; result = whyNotStarted(page, ref);""", why)
+        for change, why in WHY_NOT_STARTED.items()},
+}
+# fmt: on
 
 
-def test_since_when_a_script_runs() -> None:
-    steps = """
-    const since = new Since();
-    const see = (status, at) => { since.update(statusOf(status), at); return [since.at, since.isExact]; };
-    const follow = { running: true, file: "follow", pid: 7 };
-    result = [see(follow, 100), see({ ...follow, overridden: true }, 200), see({ running: false }, 300),
-      see(follow, 400), see({ ...follow, pid: 8 }, 500)];"""
-    assert autonomy(steps) == [[100, False], [100, False], [300, True], [400, True], [500, True]]
-
-
-@pytest.mark.parametrize(
-    ("change", "why"),
-    [
-        ("", ""),
-        ("page.connection.may = () => false", "Log in as driver to use this"),
-        ('values[ref]["web/liveness"].online = false', "goob is silent"),
-        ('values[ref]["web/liveness"].online = null', "goob has not been seen yet"),
-        ('values[ref]["web/estop"] = { latched: true, by: "eve" }', "Stopped by eve"),
-        ("values[ref].capabilities.value.autonomy.controls = false", "goob takes no such commands"),
-        ('values[ref]["web/driver"] = { by: "bob", you: false, idle_s: null }', ""),
-        (
-            'values[ref]["web/driver"] = { by: "bob", you: false, idle_s: null }; drive.arbitrates = false',
-            "bob is driving",
-        ),
-        (
-            'values[ref]["web/driver"] = { by: "bob", you: true, idle_s: null }; drive.arbitrates = "yes"',
-            "You are driving",
-        ),
-        ('values[ref]["web/driver"] = { by: "bob", you: false, idle_s: 0.1 }; drive.arbitrates = false', ""),
-    ],
-)
-def test_why_no_script_can_be_started(change: str, why: str) -> None:
-    steps = f"const {{ drive }} = values[ref].capabilities.value; {change}; result = whyNotStarted(page, ref);"
-    assert autonomy(steps) == why
+@rows((lights, LIGHTS), (sounds, SOUNDS), (forms, FORMS), (may, MAY), (autonomy, AUTONOMY))
+def test_each(found: Callable[[], Any], expected: Any) -> None:
+    assert found() == expected

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import json
+from collections.abc import Callable
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
-from tests.web.in_node import STATIC, evaluate
-from tests.web.test_page_core import run
+from tests.web.in_node import STATIC, Rows, Script, evaluate, rows
 
 # -- actions: what is done is listed as [action, phase]
 
@@ -27,9 +26,9 @@ const seen = (...pads) => pads.forEach((one) => actions.padSample(one, usual));
 """
 
 
-def actions(steps: str) -> Any:
-    names = "Actions, ACTIONS, PAD_ACTIONS, keyName, buttonName, buttonOf"
-    return run("actions.js", names, f"{_ACTIONS}{steps}\nawait null;\nresult ??= done;")
+actions = Script(
+    {"core/actions.js": "Actions, ACTIONS, keyName, buttonName"}, _ACTIONS, "await null;\nresult ??= done;"
+)
 
 
 def test_each_key_has_its_action() -> None:
@@ -49,67 +48,46 @@ def test_each_key_has_its_action() -> None:
     assert actions("; ".join(presses)) == [[action, "down"] for action in presses.values()]
 
 
-def test_other_keys_have_none() -> None:
-    presses = ['key("KeyX")', 'key("Slash", { key: "/" })', 'key("KeyW")', 'key("Space")']
-    assert actions(f"result = [{', '.join(presses)}];") == [False] * 4
-
-
-def test_what_is_held_ends_once_when_its_key_is_released() -> None:
-    steps = 'key("KeyT"); key("KeyT", { repeat: true }); actions.keyUp("KeyF"); actions.keyUp("KeyT");'
-    assert actions(f'{steps} actions.keyUp("KeyT");') == [["talk", "down"], ["talk", "up"]]
-
-
-def test_what_is_held_ends_with_a_gesture_and_a_repetition_does_not_begin_it_again() -> None:
-    steps = 'key("KeyT"); actions.clear(); key("KeyT", { repeat: true }); actions.keyUp("KeyT"); key("KeyF");'
-    assert actions(steps) == [["talk", "down"], ["talk", "up"], ["flash", "down"]]
-
-
-def test_only_the_speed_is_repeated() -> None:
-    steps = 'key("NumpadAdd", { key: "+", repeat: true }); key("KeyF", { repeat: true });'
-    assert actions(steps) == [["faster", "down"]]
-
-
-def test_on_the_fleets_screen_there_is_only_the_help() -> None:
-    assert actions('open = false; key("KeyT"); key("KeyF"); seen(pad(), pad(3)); key("Slash", { key: "?" });') == [
-        ["help", "down"]
-    ]
-
-
-def test_an_action_that_fails_keeps_nothing_else_from_being_done() -> None:
-    steps = """
-    const failing = new Actions(() => { throw new Error("no"); });
-    process.on("uncaughtException", () => {});
-    failing.keyDown({ code: "KeyT", key: "t", repeat: false });
-    failing.clear();
-    result = "went on";"""
-    assert actions(steps) == "went on"
-
-
-def test_the_buttons_of_a_gamepad_act_when_they_are_pressed() -> None:
-    assert actions("seen(pad(), pad(3), pad(3), pad(), pad(4), pad(5), pad(12), pad(13));") == [
-        [one, "down"] for one in ("flash", "mute", "repeat", "faster", "slower")
-    ]
-
-
-def test_talking_lasts_as_long_as_its_button_is_held() -> None:
-    assert actions("seen(pad(), pad(6), pad(6), pad());") == [["talk", "down"], ["talk", "up"]]
-
-
-@pytest.mark.parametrize("end", ["seen(null)", "actions.clear()", "seen({ ...pad(6), index: 1 })"])
-def test_talking_by_gamepad_ends_with_what_ends_a_gesture(end: str) -> None:
-    assert actions(f"seen(pad(), pad(6)); {end}; seen(pad(6), pad(6));") == [["talk", "down"], ["talk", "up"]]
-
-
-def test_a_button_that_is_pressed_when_a_gamepad_appears_does_nothing() -> None:
-    assert actions("seen(pad(3), pad(3), pad(), null, pad(3), pad(3));") == []
-
-
-def test_while_buttons_are_learned_they_do_nothing() -> None:
-    assert actions("actions.padOff = true; seen(pad(), pad(3)); actions.padOff = false; seen(pad(3));") == []
-
-
-def test_a_mapping_moves_an_action_to_another_button() -> None:
-    assert actions("usual.buttons = { flash: 7, mute: -1 }; seen(pad(), pad(3, 4), pad(7));") == [["flash", "down"]]
+# fmt: off
+ACTIONS: Rows = {
+    "what is held ends once when its key is released": ("""
+        key("KeyT"); key("KeyT", { repeat: true }); actions.keyUp("KeyF"); actions.keyUp("KeyT");
+        actions.keyUp("KeyT");""", [["talk", "down"], ["talk", "up"]]),
+    "what is held ends with a gesture and a repetition does not begin it again": (
+        'key("KeyT"); actions.clear(); key("KeyT", { repeat: true }); actions.keyUp("KeyT"); key("KeyF");',
+        [["talk", "down"], ["talk", "up"], ["flash", "down"]]),
+    "only the speed is repeated":
+        ('key("NumpadAdd", { key: "+", repeat: true }); key("KeyF", { repeat: true });', [["faster", "down"]]),
+    "on the fleets screen there is only the help": (
+        'open = false; key("KeyT"); key("KeyF"); seen(pad(), pad(3)); key("Slash", { key: "?" });',
+        [["help", "down"]]),
+    "an action that fails keeps nothing else from being done": ("""
+        const failing = new Actions(() => { throw new Error("no"); });
+        process.on("uncaughtException", () => {});
+        failing.keyDown({ code: "KeyT", key: "t", repeat: false });
+        failing.clear();
+        result = "went on";""", "went on"),
+    "the buttons of a gamepad act when they are pressed": (
+        "seen(pad(), pad(3), pad(3), pad(), pad(4), pad(5), pad(12), pad(13));",
+        [[one, "down"] for one in ("flash", "mute", "repeat", "faster", "slower")]),
+    "talking lasts as long as its button is held":
+        ("seen(pad(), pad(6), pad(6), pad());", [["talk", "down"], ["talk", "up"]]),
+    **{f"talking by gamepad ends with what ends a gesture: {end}": (
+        f"seen(pad(), pad(6)); {end}; seen(pad(6), pad(6));", [["talk", "down"], ["talk", "up"]])
+        for end in ("seen(null)", "actions.clear()", "seen({ ...pad(6), index: 1 })")},
+    "other keys have none":
+        ('result = [key("KeyX"), key("Slash", { key: "/" }), key("KeyW"), key("Space")];', [False] * 4),
+    "a button that is pressed when a gamepad appears does nothing":
+        ("seen(pad(3), pad(3), pad(), null, pad(3), pad(3));", []),
+    "while buttons are learned they do nothing":
+        ("actions.padOff = true; seen(pad(), pad(3)); actions.padOff = false; seen(pad(3));", []),
+    "a mapping moves an action to another button":
+        ("usual.buttons = { flash: 7, mute: -1 }; seen(pad(), pad(3, 4), pad(7));", [["flash", "down"]]),
+    "keys are named as they are printed": ("""
+        const azerty = new Map([["KeyW", "z"]]); result = [keyName("KeyW", azerty), keyName("KeyW"),
+        keyName("ArrowUp", azerty), buttonName(3, true), buttonName(3, false)];""", ["Z", "W", "↑", "Y", "button 4"]),
+}
+# fmt: on
 
 
 def test_every_binding_is_in_the_table_once() -> None:
@@ -117,18 +95,10 @@ def test_every_binding_is_in_the_table_once() -> None:
     table = actions(steps)
     keys = [key for _, used, _ in table for key in used]
     buttons = [button for _, _, button in table if button is not None]
-    assert len(set(keys)) == len(keys)
-    assert len(set(buttons)) == len(buttons)
+    assert (len(set(keys)), len(set(buttons))) == (len(keys), len(buttons))
     assert not {8, 9} & set(buttons)
     expected = {"KeyW", "KeyA", "KeyS", "KeyD", "KeyQ", "KeyE", "KeyF", "KeyM", "KeyP", "KeyT", "Space"}
     assert expected <= set(keys)
-
-
-def test_keys_are_named_as_they_are_printed() -> None:
-    steps = 'const azerty = new Map([["KeyW", "z"]]); result = [keyName("KeyW", azerty), keyName("KeyW"),'
-    assert actions(f'{steps} keyName("ArrowUp", azerty), buttonName(3, true), buttonName(3, false)];') == [
-        "Z", "W", "↑", "Y", "button 4",
-    ]  # fmt: skip
 
 
 # -- mappings of gamepads
@@ -150,55 +120,43 @@ const rest = pad([0, 0, 0, 0]);
 """
 
 
-def mapping(steps: str) -> Any:
-    return evaluate({"core/inputs.js": "Inputs, USUAL", "core/pad-mapping.js": "validMapping"}, _MAPPING + steps)
+mapping = Script({"core/inputs.js": "Inputs, USUAL", "core/pad-mapping.js": "validMapping"}, _MAPPING)
 
 
-def test_a_mapping_has_the_axes_and_their_directions() -> None:
-    assert mapping("result = shown(swapped, rest, pad([1, 1, 1, 0]));") == [0, 1, 0]
-    assert mapping("result = shown(swapped, rest, pad([1, 1, 0, 1]));") == [-1, 0, 0]
-    assert mapping("result = shown(swapped, rest, pad([0, 0, 0, -1], 5));") == [0, 0, 1]
-    assert mapping("result = shown(swapped, rest, pad([1, -1, 0, 0]));") == [0, 0, 0]
-    assert mapping("result = shown(undefined, rest, pad([1, -1, 0, 0]));") == [1, 1, 0]
-
-
-def test_a_mapping_has_its_own_dead_zone() -> None:
-    assert mapping("result = shown(swapped, rest, pad([0, 0, 0.2, 0.2]));") == [0, 0, 0]
-    x, z, _ = mapping("result = shown(swapped, rest, pad([0, 0, 0.6, -0.6]));")
-    assert (x, z) == (pytest.approx(0.5), pytest.approx(0.5))
-
-
-def test_axes_and_buttons_that_a_gamepad_does_not_have_do_nothing() -> None:
-    assert mapping("result = shown(swapped, pad([]), pad([1, 1]), { ...pad([]), buttons: [] });") == [0, 0, 0]
-    assert mapping('result = shown(swapped, rest, pad([0, 0, NaN, "1"]));')[1] == 0
-
-
-def test_with_another_mapping_a_gamepad_has_to_be_seen_in_neutral_again() -> None:
-    steps = "shown(undefined, rest, pad([0, 0, 1, 0])); inputs.clear(); result = shown(swapped, pad([0, 0, 1, 0]));"
-    assert mapping(steps) == [0, 0, 0]
-
-
-def test_a_stored_mapping_is_read_as_it_was_written() -> None:
-    steps = "result = [validMapping(JSON.parse(JSON.stringify(swapped))), swapped];"
-    read, written = mapping(steps)
-    assert read == written
-
-
-_NO_MAPPINGS = """
-null, 7, "x", [], {}, { ...swapped, x: null }, { ...swapped, x: { axis: 1.5 } }, { ...swapped, x: swapped.z },
-{ ...swapped, z: { axis: 99 } }, { ...swapped, deadZone: 0 }, { ...swapped, deadZone: 1 },
-{ ...swapped, deadZone: null }, { ...swapped, x: { axis: "constructor" } },
-"""
-
-
-def test_what_is_no_mapping_is_the_usual_one() -> None:
-    assert mapping(f"result = [{_NO_MAPPINGS}].filter((one) => validMapping(one) !== USUAL);") == []
-
-
-def test_no_mapping_has_the_buttons_of_the_emergency_stop() -> None:
-    steps = """result = [8, 9, 99, -2, 1.5, "1", null, {}].map((index) =>
-      validMapping({ ...swapped, buttons: { stop: index, flash: index, talk: -1 } }).buttons);"""
-    assert mapping(steps) == [{"stop": 0, "auxiliary": 1, "talk": -1}] * 8
+# fmt: off
+MAPPING: Rows = {
+    **{f"a mapping has the axes and their directions: {pushed}": (
+        f"result = shown(swapped, rest, pad({pushed}));", seen)
+        for pushed, seen in {
+            "[1, 1, 1, 0]": [0, 1, 0], "[1, 1, 0, 1]": [-1, 0, 0], "[0, 0, 0, -1], 5": [0, 0, 1],
+            "[1, -1, 0, 0]": [0, 0, 0],
+            "[0, 0, 0.2, 0.2]": [0, 0, 0],  # within its own dead zone
+            "[0, 0, 0.6, -0.6]": [pytest.approx(0.5), pytest.approx(0.5), 0],
+        }.items()},
+    "without a mapping it has the usual axes": ("result = shown(undefined, rest, pad([1, -1, 0, 0]));", [1, 1, 0]),
+    "axes and buttons that a gamepad does not have do nothing":
+        ("result = shown(swapped, pad([]), pad([1, 1]), { ...pad([]), buttons: [] });", [0, 0, 0]),
+    "axes that are no numbers do nothing":
+        ('result = shown(swapped, rest, pad([0, 0, NaN, "1"]))[1];', 0),
+    "a stored mapping is read as it was written": (
+        "result = validMapping(JSON.parse(JSON.stringify(swapped)));",
+        {"x": {"axis": 3, "invert": True}, "z": {"axis": 2, "invert": False}, "deadZone": 0.2,
+         "buttons": {"auxiliary": 5, "stop": 2}}),
+    "what is no mapping is the usual one": ("""
+        result = [
+          null, 7, "x", [], {}, { ...swapped, x: null }, { ...swapped, x: { axis: 1.5 } },
+          { ...swapped, x: swapped.z }, { ...swapped, z: { axis: 99 } }, { ...swapped, deadZone: 0 },
+          { ...swapped, deadZone: 1 }, { ...swapped, deadZone: null }, { ...swapped, x: { axis: "constructor" } },
+        ].filter((one) => validMapping(one) !== USUAL);""", []),
+    "with another mapping a gamepad has to be seen in neutral again": (
+        "shown(undefined, rest, pad([0, 0, 1, 0])); inputs.clear(); result = shown(swapped, pad([0, 0, 1, 0]));",
+        [0, 0, 0]),
+    "no mapping has the buttons of the emergency stop": ("""
+        result = [8, 9, 99, -2, 1.5, "1", null, {}].map((index) =>
+        validMapping({ ...swapped, buttons: { stop: index, flash: index, talk: -1 } }).buttons);""",
+        [{"stop": 0, "auxiliary": 1, "talk": -1}] * 8),
+}
+# fmt: on
 
 
 # -- learning a gamepad
@@ -218,9 +176,7 @@ const press = (...buttons) => buttons.forEach((button) => take(pad(rest, button)
 """
 
 
-def learning(steps: str) -> Any:
-    imports = {"core/pad-learning.js": "Learning, STEPS", "core/pad-mapping.js": "validMapping"}
-    return evaluate(imports, _LEARNING + steps)
+learning = Script({"core/pad-learning.js": "Learning", "core/pad-mapping.js": "validMapping"}, _LEARNING)
 
 
 def test_a_gamepad_is_learned_from_what_is_moved() -> None:
@@ -236,50 +192,38 @@ def test_a_gamepad_is_learned_from_what_is_moved() -> None:
     assert "talk" in made["buttons"]
 
 
-def test_a_stick_that_does_not_rest_in_the_middle_gets_a_larger_dead_zone() -> None:
-    steps = "rest[3] = 0.2; forward(); right(); while (learning.step) learning.skip(); result = learning.mapping();"
-    assert learning(steps)["deadZone"] == 0.25
-
-
-def test_each_movement_counts_once_and_only_when_it_is_large() -> None:
-    steps = "take(pad([0.4, -0.03, 1, 0.5])); result = [learning.at];"
-    steps += "take(pad([0, 0, 1, 0.9]), pad([0, 0, 1, 1]), pad([0.9, 0, 1, 1])); result.push(learning.at);"
-    assert learning(f"{steps} take(still); right(); result.push(learning.at);") == [0, 1, 2]
-
-
-@pytest.mark.parametrize(
-    ("steps", "problem"),
-    [
-        ("take(pad([0, 0, -1, 0]));", "This axis does not rest in the middle"),
-        ("forward(); take(pad([0, 0, 1, -1]));", "That is the axis that you pushed before"),
-        ("forward(); right(); press(8);", "Button 9 and Button 10 together are STOP"),
-        ("forward(); right(); press(3, 3);", "That button is taken: Stop for now"),
-    ],
-)
-def test_what_cannot_be_used_is_refused_with_the_reason(steps: str, problem: str) -> None:
-    assert learning(f"{steps} result = learning.problem;").startswith(problem)
-
-
-def test_an_axis_that_rests_outside_of_every_dead_zone_is_refused() -> None:
-    steps = "rest[3] = %s; take(pad([0.02, -0.03, 1, 1])); result = learning.problem !== '';"
-    assert [learning(steps % at) for at in (0.29, 0.32)] == [False, True]
-
-
-def test_a_lever_that_is_left_elsewhere_does_not_hold_up_the_next_step() -> None:
-    steps = "take(pad([0.02, -0.03, 0.2, 0.9])); stay(pad([0.02, -0.03, 0.2, 0])); result = [learning.released];"
-    steps += "take(pad([-0.9, -0.03, 0.2, 0])); take(pad([0.02, 1, 1, 0]), pad([0.02, 1, 1, 0], 3));"
-    assert learning(f"{steps} result.push(learning.axes, learning.buttons);") == [
-        True, {"z": {"axis": 3, "invert": False}, "x": {"axis": 0, "invert": True}}, {"stop": 3},
-    ]  # fmt: skip
-
-
-def test_a_stick_that_is_held_for_long_still_has_to_be_let_go() -> None:
-    steps = "const held = pad([0.02, -0.03, 1, 1]); take(held); stay(held); result = [learning.released];"
-    assert learning(f"{steps} take(still); right(); result.push(learning.released, learning.at);") == [False, True, 2]
-
-
-def test_axes_cannot_be_left_out_and_values_may_be_no_numbers() -> None:
-    assert learning("learning.skip(); take(pad([NaN, Infinity, null])); result = learning.at;") == 0
+# fmt: off
+LEARNING: Rows = {
+    "a stick that does not rest in the middle gets a larger dead zone": ("""
+        rest[3] = 0.2; forward(); right(); while (learning.step) learning.skip();
+        result = learning.mapping().deadZone;""", 0.25),
+    **{f"what cannot be used is refused: {problem}": (
+        f"{steps} result = learning.problem.slice(0, {len(problem)});", problem)
+        for steps, problem in {
+            "take(pad([0, 0, -1, 0]));": "This axis does not rest in the middle",
+            "forward(); take(pad([0, 0, 1, -1]));": "That is the axis that you pushed before",
+            "forward(); right(); press(8);": "Button 9 and Button 10 together are STOP",
+            "forward(); right(); press(3, 3);": "That button is taken: Stop for now",
+        }.items()},
+    **{f"an axis that rests at {at} is refused: {refused}": (
+        f"rest[3] = {at}; take(pad([0.02, -0.03, 1, 1])); result = learning.problem !== '';", refused)
+        for at, refused in ((0.29, False), (0.32, True))},
+    "each movement counts once and only when it is large": ("""
+        take(pad([0.4, -0.03, 1, 0.5])); result = [learning.at];
+        take(pad([0, 0, 1, 0.9]), pad([0, 0, 1, 1]), pad([0.9, 0, 1, 1])); result.push(learning.at);
+        take(still); right(); result.push(learning.at);""", [0, 1, 2]),
+    "a lever that is left elsewhere does not hold up the next step": ("""
+        take(pad([0.02, -0.03, 0.2, 0.9])); stay(pad([0.02, -0.03, 0.2, 0])); result = [learning.released];
+        take(pad([-0.9, -0.03, 0.2, 0])); take(pad([0.02, 1, 1, 0]), pad([0.02, 1, 1, 0], 3));
+        result.push(learning.axes, learning.buttons);""",
+        [True, {"z": {"axis": 3, "invert": False}, "x": {"axis": 0, "invert": True}}, {"stop": 3}]),
+    "a stick that is held for long still has to be let go": ("""
+        const held = pad([0.02, -0.03, 1, 1]); take(held); stay(held); result = [learning.released]; take(still);
+        right(); result.push(learning.released, learning.at);""", [False, True, 2]),
+    "axes cannot be left out and values may be no numbers":
+        ("learning.skip(); take(pad([NaN, Infinity, null])); result = learning.at;", 0),
+}
+# fmt: on
 
 
 # -- the screen that stays on
@@ -296,27 +240,26 @@ const awake = new Awake(locks);
 """
 
 
-def awake(steps: str) -> Any:
-    return run("awake.js", "Awake", f"{_AWAKE}{steps}\nresult = [asked, released];")
+awake = Script({"core/awake.js": "Awake"}, _AWAKE, "result = [asked, released];")
 
 
-def test_the_screen_stays_on_from_when_it_is_wanted_until_it_is_not() -> None:
-    assert awake("for (const on of [false, true, true, false, false]) await awake.want(on);") == [1, 1]
-
-
-def test_what_the_browser_has_taken_away_is_asked_for_again_when_the_page_is_seen() -> None:
-    steps = "await awake.want(true); awake.lock.released = document.hidden = true; await awake.want(true);"
-    assert awake(f"{steps} document.hidden = false; await awake.want(true);") == [2, 0]
-
-
-def test_what_is_granted_too_late_is_given_back() -> None:
-    assert awake("const late = awake.want(true); awake.want(true); await awake.want(false); await late;") == [1, 1]
-
-
-def test_a_browser_that_refuses_is_asked_again_and_one_that_cannot_is_left_alone() -> None:
-    assert awake("granted = false; await awake.want(true); granted = true; await awake.want(true);") == [2, 0]
-    assert awake("await new Awake(undefined).want(true);") == [0, 0]
-    assert awake("locks.request = () => { throw new Error('denied'); }; await awake.want(true);") == [0, 0]
+# fmt: off
+AWAKE: Rows = {
+    "the screen stays on from when it is wanted until it is not":
+        ("for (const on of [false, true, true, false, false]) await awake.want(on);", [1, 1]),
+    "what the browser has taken away is asked for again when the page is seen": ("""
+        await awake.want(true); awake.lock.released = document.hidden = true; await awake.want(true);
+        document.hidden = false; await awake.want(true);""", [2, 0]),
+    "what is granted too late is given back":
+        ("const late = awake.want(true); awake.want(true); await awake.want(false); await late;", [1, 1]),
+    "a browser that refuses is asked again":
+        ("granted = false; await awake.want(true); granted = true; await awake.want(true);", [2, 0]),
+    "a browser that cannot is left alone":
+        ("await new Awake(undefined).want(true);", [0, 0]),
+    "a browser that fails is left alone":
+        ("locks.request = () => { throw new Error('denied'); }; await awake.want(true);", [0, 0]),
+}
+# fmt: on
 
 
 # -- what is joined to the page later; ``later`` runs what it does each second
@@ -377,7 +320,7 @@ def decoded(grid: list[list[int]]) -> str:
 
 
 def codes(*texts: str) -> list[Any]:
-    made: list[Any] = run("qr.js", "qrCode, pathOf", f"result = {json.dumps(texts)}.map(qrCode);")
+    made: list[Any] = evaluate({"core/qr.js": "qrCode"}, "result = given.map(qrCode);", texts)
     return made
 
 
@@ -403,5 +346,6 @@ def test_a_text_that_is_too_long_has_no_code() -> None:
     assert codes("x" * 106, "x" * 107, "ö" * 53, "ö" * 54)[1::2] == [None, None]
 
 
-def test_the_path_draws_each_dark_module() -> None:
-    assert run("qr.js", "pathOf", "result = pathOf([[0, 1], [1, 0]]);") == "M1 0h1v1h-1zM0 1h1v1h-1z"
+@rows((actions, ACTIONS), (mapping, MAPPING), (learning, LEARNING), (awake, AWAKE))
+def test_each(found: Callable[[], Any], expected: Any) -> None:
+    assert found() == expected

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from typing import Any
 
 import pytest
 
-from tests.web.test_page_core import run
+from tests.web.in_node import Rows, Script, evaluate, rows
 
 # -- log lines
 
@@ -18,35 +19,34 @@ const texts = (filter) => book.filtered({ rank: 0, service: "", search: "", ...f
 """
 
 
-def book(steps: str) -> Any:
-    return run("logs.js", "LogBook, MOST", _BOOK + steps + "\nresult ??= texts();")
+book = Script({"core/logs.js": "LogBook, MOST"}, _BOOK, "result ??= texts();")
 
 
-def test_lines_are_taken_once() -> None:
-    assert book("take(1, 'a', 'b'); take(2, 'b', 'c'); take(1, 'a');") == ["a", "b", "c"]
-
-
-def test_missing_numbers_are_shown() -> None:
-    assert book("take(4, 'a'); take(6, 'b'); take(19, 'c');") == [
-        "a", "… 1 line was dropped", "b", "… 12 lines were dropped", "c",
-    ]  # fmt: skip
-    assert book("take(4, 'a'); result = book.cut;") is True  # those before were not dropped: they are old
-    steps = "take(1, 'a'); book.take({ origin: 'b', first: 3, lines: ['z'] });"
-    assert book(steps) == ["a", "… lines may be missing here", "z"]
-
-
-def test_gaps_are_seen_through_every_filter() -> None:
-    steps = "take(1, 'a'); take(3, 'b'); result = texts({ search: 'nothing' });"
-    assert book(steps) == ["… 1 line was dropped"]
-
-
-def test_the_newest_500_lines_are_there() -> None:
-    steps = "for (let i = 1; i <= 700; i++) take(i, `${i}`); result = [texts().length, texts()[0], book.cut, MOST];"
-    assert book(steps) == [500, "201", True, 500]
-
-
-def test_a_cleared_list_shows_what_comes_later() -> None:
-    assert book("take(1, 'a'); book.clear(); take(1, 'a', 'b');") == ["b"]
+# fmt: off
+BOOK: Rows = {
+    "lines are taken once": ("take(1, 'a', 'b'); take(2, 'b', 'c'); take(1, 'a');", ["a", "b", "c"]),
+    "missing numbers are shown": (
+        "take(4, 'a'); take(6, 'b'); take(19, 'c');",
+        ["a", "… 1 line was dropped", "b", "… 12 lines were dropped", "c"]),
+    "those before the first one were not dropped: they are old": ("take(4, 'a'); result = book.cut;", True),
+    "another origin may have other lines": (
+        "take(1, 'a'); book.take({ origin: 'b', first: 3, lines: ['z'] });",
+        ["a", "… lines may be missing here", "z"]),
+    "gaps are seen through every filter":
+        ("take(1, 'a'); take(3, 'b'); result = texts({ search: 'nothing' });", ["… 1 line was dropped"]),
+    "the newest 500 lines are there": (
+        "for (let i = 1; i <= 700; i++) take(i, `${i}`); result = [texts().length, texts()[0], book.cut, MOST];",
+        [500, "201", True, 500]),
+    "a cleared list shows what comes later": ("take(1, 'a'); book.clear(); take(1, 'a', 'b');", ["b"]),
+    "lines are filtered by level service and text": ("""
+        take(1, { level: "DEBUG", service: "imu", message: "d" },
+             { level: "INFO", service: "bridge", message: "Hello" },
+             { level: "odd", service: "imu:left", message: "o" }, { level: "ERROR", service: "imu2", message: "e" });
+        result = [texts({ rank: 1 }), texts({ rank: 3 }), texts({ service: "imu" }), texts({ search: "hELLO" }),
+                  texts({ search: "imu2" }), [...book.services]];""",
+        [["Hello", "o", "e"], ["e"], ["d", "o"], ["Hello"], ["e"], ["imu", "bridge", "imu:left", "imu2"]]),
+}
+# fmt: on
 
 
 @pytest.mark.parametrize(
@@ -67,18 +67,7 @@ def test_a_cleared_list_shows_what_comes_later() -> None:
 )
 def test_a_line_may_be_of_any_shape(raw: object, line: list[object]) -> None:
     steps = f"const one = lineOf({json.dumps(raw)}, 1); result = [one.t, one.level, one.service, one.text];"
-    assert run("logs.js", "lineOf", steps) == line
-
-
-def test_lines_are_filtered_by_level_service_and_text() -> None:
-    steps = """
-    take(1, { level: "DEBUG", service: "imu", message: "d" }, { level: "INFO", service: "bridge", message: "Hello" },
-         { level: "odd", service: "imu:left", message: "o" }, { level: "ERROR", service: "imu2", message: "e" });
-    result = [texts({ rank: 1 }), texts({ rank: 3 }), texts({ service: "imu" }), texts({ search: "hELLO" }),
-              texts({ search: "imu2" }), [...book.services]];"""
-    assert book(steps) == [
-        ["Hello", "o", "e"], ["e"], ["d", "o"], ["Hello"], ["e"], ["imu", "bridge", "imu:left", "imu2"],
-    ]  # fmt: skip
+    assert evaluate({"core/logs.js": "lineOf"}, steps) == line
 
 
 # -- what is seen after an action
@@ -88,58 +77,48 @@ let now = 1000_000;
 const clock = (ms) => String((ms - 1000_000) / 1000);
 let outcome = new Outcome("service-restart", now, "base b1");
 const state = { connected: true, online: true, heartbeatAt: null, boots: "base b1" };
+const words = () => outcome.words(now, clock);
 const see = (seconds, changes) => { now += 1000 * seconds; outcome.see({ ...state, ...changes }, now); };
 """
 
 
-def outcome(steps: str) -> Any:
-    return run("outcome.js", "Outcome", _OUTCOME + steps + "\nresult ??= outcome.words(now, clock);")
+outcome = Script({"core/outcome.js": "Outcome"}, _OUTCOME, "result ??= words();")
 
 
-def test_a_robot_that_goes_and_comes_back() -> None:
-    steps = "see(3.5, { online: false, heartbeatAt: now + 3000 }); see(36, { online: false }); "
-    assert outcome(steps) == ["asked 0", "heartbeat gone 3", "not back for 36 s"]
-    assert outcome(steps + "see(0.5, {});") == ["asked 0", "heartbeat gone 3", "back 40"]
-    assert outcome(steps + "see(0.5, {}); result = outcome.isOver(now);") is True
-
-
-def test_programs_that_start_anew_are_seen_without_a_gap_of_the_heartbeat() -> None:
-    assert outcome("see(2, { boots: 'base b2' });") == ["asked 0", "its programs have started anew 2"]
-
-
-def test_only_after_30_s_nothing_has_happened() -> None:
-    assert outcome("see(29, {});") == ["asked 0", "waiting…"]
-    assert outcome("see(30, {});") == ["asked 0", "nothing changed for 30 s: the robot may not have done it"]
-    assert outcome("see(30, {}); result = outcome.isOver(now);") is False
-
-
-def test_what_was_not_seen_does_not_count() -> None:
-    steps = "see(10, { connected: false }); see(40, { connected: false }); "
-    assert outcome(steps) == ["asked 0", "not seen: there is no connection to the server"]
-    assert outcome(steps + "see(5, { boots: '' });") == ["asked 0", "waiting…"]
-    assert outcome(steps + "see(5, { online: null }); see(20, {});")[1].startswith("nothing changed for 30 s")
-
-
-def test_an_old_heartbeat_is_not_earlier_than_the_request() -> None:
-    assert outcome("see(1, { online: false, heartbeatAt: 5 });")[1] == "heartbeat gone 0"
-
-
-def test_an_update_is_not_seen_by_heartbeats() -> None:
-    steps = "outcome = new Outcome('git-pull', now); see(100, {});"
-    assert outcome(steps) == ["asked 0", "heartbeats do not show an update: its log lines do"]
-    assert outcome(steps + "see(100, {}); result = outcome.isOver(now);") is True
-
-
-def test_a_refusal_is_the_end() -> None:
-    assert outcome("outcome.refused = 'no'; result = [outcome.words(now, clock), outcome.isOver(now)];") == [
-        ["not asked: no"], True,
-    ]  # fmt: skip
+# fmt: off
+OUTCOME: Rows = {
+    "a robot that goes and comes back": ("""
+        see(3.5, { online: false, heartbeatAt: now + 3000 }); see(36, { online: false }); result = [words().at(-1)];
+        see(0.5, {}); result.push(words(), outcome.isOver(now));""",
+        ["not back for 36 s", ["asked 0", "heartbeat gone 3", "back 40"], True]),
+    "programs that start anew are seen without a gap of the heartbeat":
+        ("see(2, { boots: 'base b2' });", ["asked 0", "its programs have started anew 2"]),
+    "only after 30 s nothing has happened": ("see(29, {});", ["asked 0", "waiting…"]),
+    "after 30 s nothing has happened": (
+        "see(30, {}); result = [words(), outcome.isOver(now)];",
+        [["asked 0", "nothing changed for 30 s: the robot may not have done it"], False]),
+    "an update is not seen by heartbeats": (
+        "outcome = new Outcome('git-pull', now); see(100, {}); result = [...words(), outcome.isOver(now + 1e5)];",
+        ["asked 0", "heartbeats do not show an update: its log lines do", True]),
+    "what was not seen does not count": ("""
+        see(10, { connected: false }); see(40, { connected: false }); result = [words().at(-1)];
+        see(5, { boots: '' }); result.push(words().at(-1));""",
+        ["not seen: there is no connection to the server", "waiting…"]),
+    "only what was seen counts": (
+        "see(10, { connected: false }); see(40, { connected: false }); see(5, { online: null }); see(20, {});",
+        ["asked 0", "nothing changed for 30 s: the robot may not have done it"]),
+    "an old heartbeat is not earlier than the request": (
+        "see(1, { online: false, heartbeatAt: 5 }); result = words()[1];", "heartbeat gone 0"),
+    "a refusal is the end": (
+        "outcome.refused = 'no'; result = [words(), outcome.isOver(now)];", [["not asked: no"], True]),
+}
+# fmt: on
 
 
 def test_boots_are_compared_by_owner() -> None:
     owners = json.dumps([{"owner": "b", "boot": "1"}, {"owner": "a", "boot": "2"}])
     steps = f"result = [bootsOf({owners}), bootsOf(undefined), bootsOf('x')];"
-    assert run("outcome.js", "bootsOf", steps) == ["a 2,b 1", "", ""]
+    assert evaluate({"core/outcome.js": "bootsOf"}, steps) == ["a 2,b 1", "", ""]
 
 
 NOT_OFFERED, NO_COMMAND = "This robot does not offer it", "This robot has no command for it in its config"
@@ -162,7 +141,7 @@ NOT_OFFERED, NO_COMMAND = "This robot does not offer it", "This robot has no com
 )
 def test_what_a_robot_lacks_in_every_spelling(action: str, capabilities: object, why: str) -> None:
     value = "undefined" if capabilities is None else json.dumps(capabilities)
-    assert run("outcome.js", "lacks", f"result = lacks({json.dumps(action)}, {value});") == why
+    assert evaluate({"core/outcome.js": "lacks"}, f"result = lacks({json.dumps(action)}, {value});") == why
 
 
 # -- notices
@@ -178,55 +157,7 @@ const level = (value, more = {}) =>
 """
 
 
-def notices(steps: str) -> Any:
-    return run("notices.js", "Notices, Watcher, MOST", _NOTICES + steps + "\nresult ??= texts();")
-
-
-def test_only_changes_are_listed() -> None:
-    assert notices("online('a', true, true, null, true); online('b', false, false); online('c', null, true);") == []
-    assert notices("online('a', true, false); online('b', false, true);") == ["b is online again", "a is offline"]
-
-
-def test_a_flapping_robot_is_one_line_with_a_count() -> None:
-    steps = "for (let i = 0; i < 25; i++) online('a', true, false); online('b', true, false); "
-    assert notices(steps) == ["b is offline", "a is offline 49x"]
-    shown = notices(steps + "result = [notices.unread, notices.list[1].since, notices.list[1].at];")
-    assert shown == [2, 20, 500]
-
-
-def test_the_list_is_bounded_and_can_be_read_and_cleared() -> None:
-    steps = "for (let i = 0; i < 80; i++) online(`r${i}`, true, false); "
-    assert notices(steps + "result = [notices.list.length, texts()[0], notices.unread];") == [50, "r79 is offline", 50]
-    assert notices(steps + "notices.read(); online('z', true, false); result = notices.unread;") == 1
-    assert notices(steps + "notices.clear();") == []
-
-
-def test_a_stop_that_latches() -> None:
-    steps = """
-    watcher.stop("a", { latched: true, by: "x" }, 1); watcher.stop("b", { latched: false }, 1);
-    watcher.stop("b", { latched: true, by: "eve on phone" }, 2); watcher.stop("b", { latched: true, by: "bob" }, 3);
-    watcher.stop("c", { latched: false }, 1); watcher.stop("c", { latched: true }, 2);"""
-    assert notices(steps) == ["c was stopped by an unknown sender", "b was stopped by eve on phone"]
-
-
-def test_a_script_that_fails() -> None:
-    steps = """
-    watcher.script("a", { running: false, error: "old" }, 1); watcher.script("a", { running: false, error: "old" }, 2);
-    watcher.script("a", { running: true, file: "follow", error: null }, 3);
-    watcher.script("a", { running: false, file: "follow", error: { code: 1, toString: 1 } }, 4);"""
-    assert notices(steps) == ['a script follow failed: {"code":1,"toString":1}']
-
-
-def test_a_service_that_ends_again_and_again() -> None:
-    steps = """
-    const services = (state, restarts, last_exit) =>
-      watcher.services("a", { imu: { state, restarts, last_exit } }, ++at);
-    services("ready", 3); services("ready", 3); services("restarting", 3, "signal 9"); services("ready", 4, "signal 9");
-    const first = texts(); services("ready", 5, "signal 9"); services("failed", 5, "exit code 1");
-    services("failed", 5, "exit code 1"); services("ready", 0); result = [first, texts()];"""
-    first, last = notices(steps)
-    assert first == ["a service imu has ended, and is started again (signal 9)"]
-    assert last == ["a service imu fails again and again (exit code 1) 3x"]
+notices = Script({"core/notices.js": "Notices, Watcher, MOST"}, _NOTICES, "result ??= texts();")
 
 
 UNPLUGGED = "a cannot be driven: no board"
@@ -245,29 +176,60 @@ DRIVEABLE = {
     "not known": ("YES UNKNOWN", []),
     "another word": ("YES MAYBE NO", [UNPLUGGED]),
 }
+# fmt: off
+NOTICES: Rows = {
+    "only changes are listed":
+        ("online('a', true, true, null, true); online('b', false, false); online('c', null, true);", []),
+    "changes are listed":
+        ("online('a', true, false); online('b', false, true);", ["b is online again", "a is offline"]),
+    "a flapping robot is one line with a count": ("""
+        for (let i = 0; i < 25; i++) online('a', true, false); online('b', true, false);
+        result = [texts(), notices.unread, notices.list[1].since, notices.list[1].at];""",
+        [["b is offline", "a is offline 49x"], 2, 20, 500]),
+    "the list is bounded and can be read and cleared": ("""
+        for (let i = 0; i < 80; i++) online(`r${i}`, true, false);
+        result = [notices.list.length, texts()[0], notices.unread];
+        notices.read(); online('z', true, false); result.push(notices.unread);
+        notices.clear(); result.push(texts());""", [50, "r79 is offline", 50, 1, []]),
+    "a stop that latches": ("""
+        watcher.stop("a", { latched: true, by: "x" }, 1); watcher.stop("b", { latched: false }, 1);
+        watcher.stop("b", { latched: true, by: "eve on phone" }, 2); watcher.stop("b", { latched: true, by: "bob" }, 3);
+        watcher.stop("c", { latched: false }, 1); watcher.stop("c", { latched: true }, 2);""",
+        ["c was stopped by an unknown sender", "b was stopped by eve on phone"]),
+    "a script that fails": ("""
+        for (const at of [1, 2]) watcher.script("a", { running: false, error: "old" }, at);
+        watcher.script("a", { running: true, file: "follow", error: null }, 3);
+        watcher.script("a", { running: false, file: "follow", error: { code: 1, toString: 1 } }, 4);""",
+        ['a script follow failed: {"code":1,"toString":1}']),
+    "a voltage is low only below a limit of the user": ("level(0.5); level(NaN); level('2');", []),
+    "a voltage that stays low is listed once, and again once it was higher": ("""
+        const low = { limit: 7 }; for (const one of [7.2, 6.9, 7.01, 6.8]) level(one, low);
+        result = texts(); level(7.2, low); level(6.5, low); result.push(...texts());
+        notices.clear(); level(6.5, { ...low, charging: true }); result.push(...texts());""",
+        ["a has a low battery: 6.9 V, below 7", "a has a low battery: 6.5 V, below 7 2x"]),
+    "per cent are low below 20": ("level(19.5, { unit: '%' });", ["a has a low battery: 19.5 %, below 20"]),
+    "per cent are low below a limit of the user": ("level(15, { unit: '%', limit: 10 });", []),
+    "a service that ends again and again": ("""
+        const services = (state, restarts, last_exit) =>
+          watcher.services("a", { imu: { state, restarts, last_exit } }, ++at);
+        const nine = "signal 9";
+        services("ready", 3); services("ready", 3); services("restarting", 3, nine); services("ready", 4, nine);
+        result = texts(); services("ready", 5, nine); services("failed", 5, "exit code 1");
+        services("failed", 5, "exit code 1"); services("ready", 0); result.push(...texts());""",
+        ["a service imu has ended, and is started again (signal 9)",
+         "a service imu fails again and again (exit code 1) 3x"]),
+    **{f"of a robot that is driven, {what}": (f"""
+        for (const one of "{states}".split(" "))
+          watcher.driveable("a", {{ state: one.toLowerCase(), why: "no board" }}, one < "a", ++at);""", expected)
+        for what, (states, expected) in DRIVEABLE.items()},
+    **{f"a state of any shape, {odd}": (f"""
+        for (const name of ["online", "stop", "script", "services"]) watcher[name]("a", {odd}, 1);
+        watcher.driveable("a", {odd}, true, 1);""", [])
+        for odd in ("null", "3", "[]", '"x"', "{}", "{ services: 1, __proto__: null }")},
+}
+# fmt: on
 
 
-@pytest.mark.parametrize(("states", "expected"), DRIVEABLE.values(), ids=DRIVEABLE)
-def test_a_robot_that_is_driven_and_can_no_longer_be(states: str, expected: list[str]) -> None:
-    reported = [[{"state": one.lower(), "why": "no board"}, one.isupper()] for one in states.split()]
-    assert notices(f"for (const one of {json.dumps(reported)}) watcher.driveable('a', ...one, ++at);") == expected
-
-
-def test_a_voltage_is_low_only_below_a_limit_of_the_user() -> None:
-    assert notices("level(0.5); level(NaN); level('2');") == []
-    steps = "const low = { limit: 7 }; level(7.2, low); level(6.9, low); level(7.01, low); level(6.8, low); "
-    assert notices(steps) == ["a has a low battery: 6.9 V, below 7"]
-    assert notices(steps + "level(7.2, low); level(6.5, low);") == ["a has a low battery: 6.5 V, below 7 2x"]
-    assert notices(steps + "notices.clear(); level(6.5, { ...low, charging: true });") == []
-
-
-def test_per_cent_are_low_below_20_unless_the_user_has_another_limit() -> None:
-    assert notices("level(19.5, { unit: '%' });") == ["a has a low battery: 19.5 %, below 20"]
-    assert notices("level(15, { unit: '%', limit: 10 });") == []
-
-
-@pytest.mark.parametrize("odd", ["null", "3", "[]", '"x"', "{}", "{ services: 1, __proto__: null }"])
-def test_states_of_any_shape_are_no_notices(odd: str) -> None:
-    calls = f"watcher[name]('a', {odd}, 1); watcher.driveable('a', {odd}, true, 1);"
-    steps = f"for (const name of ['online', 'stop', 'script', 'services']) {{ {calls} }}"
-    assert notices(steps) == []
+@rows((book, BOOK), (outcome, OUTCOME), (notices, NOTICES))
+def test_each(found: Callable[[], Any], expected: Any) -> None:
+    assert found() == expected

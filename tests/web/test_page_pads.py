@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
-import pytest
-
+from tests.web.in_node import Rows, rows
 from tests.web.test_page_driver import driver
 
 _REAL = """
@@ -22,8 +23,7 @@ const stops = () => done.filter((op) => /stop/.test(op));
 """
 
 
-def shown(steps: str) -> Any:
-    return driver(_REAL + steps)
+shown = replace(driver, before=driver.before + _REAL)
 
 
 #: What a browser may list before the real one, and what is said of it; "" nothing needs to be said.
@@ -53,130 +53,94 @@ STRANGE = {
 }
 
 
-@pytest.mark.parametrize("one", STRANGE)
-def test_whatever_is_listed_first_the_one_that_is_touched_drives_and_stops(one: str) -> None:
-    first, code = STRANGE[one]
-    steps = f"""const first = () => ({first});
-    show(first(), real(0)); const said = codes(); done.length = 0;
-    show(first(), real(1)); const z = driver.output.z;
-    show(first(), real(0)); show(first(), real(0, 8, 9)); show(first(), real(0)); show(first(), real(0, 0));
-    result = [said, z, stops()];"""
-    assert shown(steps) == [[code] if code else [], 0.6, ["estop: gamepad", "stop"]]
-
-
-@pytest.mark.parametrize(
-    "list_of", ["null", "undefined", "[null, undefined, , real(0)]", "{ length: 2, 1: real(0) }", "[7, 'x', real(0)]"]
-)
-def test_lists_of_gamepads_of_any_shape_are_taken(list_of: str) -> None:
-    steps = f"pads = {list_of}; driver.tick(); result = [driver.failed.size, driver.pads.choice.here.length];"
-    assert shown(steps) == [0, int("real" in list_of) + list_of.count("7, 'x'") * 2]
-
-
-def test_a_browser_that_shows_no_gamepads_to_this_page_changes_nothing_else() -> None:
-    for denied in ("undefined", "() => { throw new Error('denied'); }"):
-        steps = f'navigator.getGamepads = {denied}; driver.tick(); key("KeyW");'
-        assert shown(f"{steps} result = [driver.failed.size, driver.output.z];") == [0, 0.6]
-
-
-# -- stops
-
-
-def test_the_emergency_stop_of_each_gamepad_counts_whichever_drives() -> None:
-    steps = """show(pad(0), real(0)); show(pad(1), real(0)); done.length = 0;
-    show(pad(1), real(0, 8, 9)); const z = driver.output.z;
-    show(pad(1), real(0)); show(pad(1, 8, 9), real(0)); result = [z, stops()];"""
-    assert shown(steps) == [0, ["estop: gamepad", "estop: gamepad"]]
-
-
-def test_each_of_two_stops_while_the_other_one_is_held_for_good() -> None:
-    steps = """const worn = () => ({ ...pad(0, 8, 9), id: "worn" });
-    show(worn(), real(0)); done.length = 0; show(worn(), real(0)); const held = stops();
-    show(worn(), real(0, 8, 9)); result = [held, stops()];"""
-    assert shown(steps) == [[], ["estop: gamepad"]]
-
-
-def test_each_of_two_stops_before_the_rest_of_the_page_is_here() -> None:
-    steps = """driver.pads = null; show(pad(0, 8, 9), real(0)); done.length = 0;
-    show(pad(0, 8, 9), real(0, 8, 9)); result = stops();"""
-    assert shown(steps) == ["estop: gamepad"]
-
-
-def test_a_stop_that_is_held_for_good_is_sent_once_and_reported() -> None:
-    """Else no reset would last."""
-    steps = """const worn = () => pad(0, 8, 9);
-    pass(2500, worn()); pass(500, null); show(worn()); // a loose contact
-    time += 60_000; show(worn()); time += 60_000; show(null); time += 60_000; show(worn()); // a tab in the background
-    result = [stops(), codes(), driver.reason()];"""
-    assert shown(steps) == [["estop: gamepad"], ["stop-held"], None]
-
-
-# -- which drives
-
-
-@pytest.mark.parametrize(
-    ("steps", "z"),
-    [
-        ("show(pad(0), real(0)); show(pad(0), real(1));", 0.6),  # it was touched last
-        ("show(pad(1), real(0)); show(pad(1), real(1));", 0.6),  # the other one was never touched
-        ("show(pad(0), real(1));", 0),  # it was not seen in neutral
-        ("show(pad(0), real(0)); show(pad(1), real(0)); pass(300, pad(1), real(0.3));", 0.6),  # brushed
-        ("show(pad(0), real(0)); show(pad(1), real(0)); show(pad(1), real(1));", 0.6),  # one device, listed twice
-        ("show(pad(0), real(0, 5)); show(pad(0), real(1));", 0.6),  # pressed, then pushed
-        ("document.hasFocus = () => false; show(pad(0), real(0)); show(pad(0), real(1));", 0),  # another window
-    ],
-)
-def test_which_gamepad_drives(steps: str, z: float) -> None:
-    assert shown(f"{steps} result = driver.output.z;") == z
-
-
-def test_a_takeover_stops_and_drives_only_after_a_release() -> None:
-    steps = """show(pad(0), real(0)); pass(500, pad(-1), real(0)); pass(500, pad(-1), real(1));
-    result = [driver.pads.pad.id, driver.output.z];
-    show(pad(0), real(0)); show(pad(0), real(1)); result.push(driver.output.z);"""
-    assert shown(steps) == ["Xbox", 0, 0.6]
-
-
-def test_one_that_cannot_be_used_can_be_chosen_and_reports_why_it_does_not_drive() -> None:
-    steps = """const worn = odd({ axes: [0, -1] });
-    show(worn, real(0)); driver.pads.pick("0 Receiver"); show(worn, real(0));
-    result = [codes(), driver.output.z];"""
-    assert shown(steps) == [["off-centre"], 0]
-
-
-def test_a_gamepad_that_stands_still_while_it_is_deflected_is_given_up_and_reported() -> None:
-    steps = """const frozen = real(1); show(real(0)); pass(2500, frozen); result = [driver.output.z];
-    pass(1000, frozen); result.push(driver.output.z, driver.reason().code);"""
-    assert shown(steps) == [0.6, 0, "pad"]
-
-
-@pytest.mark.parametrize(
-    "steps",
-    [
-        "key('KeyW', { repeat: true }); driver.tick();",  # held in another window
-        "key('KeyW', { timeStamp: time - 5000 }); driver.tick();",  # pressed while the page stood still
-        "driver.stickStart(1); driver.stick(0, 1); driver.interrupt(); driver.tick();",  # by a second finger
-        "key('KeyW'); driver.space();",
-    ],
-)
-def test_keys_and_fingers_that_do_not_count_are_reported(steps: str) -> None:
-    assert shown(f"{steps} result = [driver.output.z, driver.reason().code];") == [0, "release"]
-
-
-def test_a_gamepad_in_another_window_is_reported_and_its_stop_counts() -> None:
-    steps = """document.hasFocus = () => false; show(real(0)); show(real(1)); result = [codes(), driver.output.z];
-    show(real(1, 8, 9)); result.push(stops());"""
-    assert shown(steps) == [["focus"], 0, ["estop: gamepad"]]
+LISTS = {
+    "null": 0,
+    "undefined": 0,
+    "[null, undefined, , real(0)]": 1,
+    "{ length: 2, 1: real(0) }": 1,
+    "[7, 'x', real(0)]": 3,
+}
+#: Why it drives, or does not: what is shown, and the axis.
+WHICH = {
+    "it was touched last": ("show(pad(0), real(0)); show(pad(0), real(1));", 0.6),
+    "the other one was never touched": ("show(pad(1), real(0)); show(pad(1), real(1));", 0.6),
+    "it was not seen in neutral": ("show(pad(0), real(1));", 0),
+    "brushed": ("show(pad(0), real(0)); show(pad(1), real(0)); pass(300, pad(1), real(0.3));", 0.6),
+    "one device, listed twice": ("show(pad(0), real(0)); show(pad(1), real(0)); show(pad(1), real(1));", 0.6),
+    "pressed, then pushed": ("show(pad(0), real(0, 5)); show(pad(0), real(1));", 0.6),
+    "another window": ("document.hasFocus = () => false; show(pad(0), real(0)); show(pad(0), real(1));", 0),
+}
+# fmt: off
+SHOWN: Rows = {
+    **{f"the one that is touched drives and stops though first is listed {what}": (f"""
+        const first = () => ({first});
+        show(first(), real(0)); const said = codes(); done.length = 0;
+        show(first(), real(1)); const z = driver.output.z;
+        show(first(), real(0)); show(first(), real(0, 8, 9)); show(first(), real(0)); show(first(), real(0, 0));
+        result = [said, z, stops()];""", [[code] if code else [], 0.6, ["estop: gamepad", "stop"]])
+        for what, (first, code) in STRANGE.items()},
+    **{f"a list of gamepads of any shape is taken: {given}": (
+        f"pads = {given}; driver.tick(); result = [driver.failed.size, driver.pads.choice.here.length];", [0, count])
+        for given, count in LISTS.items()},
+    **{f"a browser that shows no gamepads changes nothing else: {denied}": (f"""
+        navigator.getGamepads = {denied}; driver.tick(); key("KeyW");
+        result = [driver.failed.size, driver.output.z];""", [0, 0.6])
+        for denied in ("undefined", "() => { throw new Error('denied'); }")},
+    **{f"which drives: {why}": (f"{steps} result = driver.output.z;", z) for why, (steps, z) in WHICH.items()},
+    **{f"it is reported and does not count: {what}": (
+        f"{steps} driver.tick(); result = [driver.output.z, driver.reason().code];", [0, "release"])
+        for what, steps in {
+            "a key that is held in another window": "key('KeyW', { repeat: true });",
+            "a key that was pressed while the page stood still": "key('KeyW', { timeStamp: time - 5000 });",
+            "a second finger": "driver.stickStart(1); driver.stick(0, 1); driver.interrupt();",
+            "a key before the space bar": "key('KeyW'); driver.space();",
+        }.items()},
+    **{f"a part that fails ends what is driven, is reported and keeps no stop back: {part}": (f"""
+        console.error = () => {{}}; key("KeyW"); driver.tick(); const z = driver.output.z;
+        const {{ {part} }} = driver; driver.{part} = () => {{ throw new Error("no"); }};
+        driver.tick(); result = [z, driver.output.z, driver.reason().code];
+        driver.latch("button"); result.push(stops());
+        driver.{part} = {part}; driver.tick(); driver.keyUp({{ code: "KeyW", key: "w" }});
+        driver.tick(); result.push(driver.reason());""", [0.6, 0, "failed", ["estop: button"], None])
+        for part in ("readPads", "update", "watchLease")},
+    "the emergency stop of each gamepad counts whichever drives": ("""
+        show(pad(0), real(0)); show(pad(1), real(0)); done.length = 0;
+        show(pad(1), real(0, 8, 9)); const z = driver.output.z;
+        show(pad(1), real(0)); show(pad(1, 8, 9), real(0)); result = [z, stops()];""",
+        [0, ["estop: gamepad", "estop: gamepad"]]),
+    "each of two stops while the other one is held for good": ("""
+        const worn = () => ({ ...pad(0, 8, 9), id: "worn" });
+        show(worn(), real(0)); done.length = 0; show(worn(), real(0)); const held = stops();
+        show(worn(), real(0, 8, 9)); result = [held, stops()];""", [[], ["estop: gamepad"]]),
+    "each of two stops before the rest of the page is here": ("""
+        driver.pads = null; show(pad(0, 8, 9), real(0)); done.length = 0;
+        show(pad(0, 8, 9), real(0, 8, 9)); result = stops();""", ["estop: gamepad"]),
+    "a stop that is held for good is sent once and reported: else no reset would last": ("""
+        const worn = () => pad(0, 8, 9);
+        pass(2500, worn()); pass(500, null); show(worn()); // a loose contact
+        time += 60_000; show(worn()); time += 60_000; show(null); time += 60_000; show(worn()); // a hidden tab
+        result = [stops(), codes(), driver.reason()];""", [["estop: gamepad"], ["stop-held"], None]),
+    "a takeover stops and drives only after a release": ("""
+        show(pad(0), real(0)); pass(500, pad(-1), real(0)); pass(500, pad(-1), real(1));
+        result = [driver.pads.pad.id, driver.output.z];
+        show(pad(0), real(0)); show(pad(0), real(1)); result.push(driver.output.z);""", ["Xbox", 0, 0.6]),
+    "one that cannot be used can be chosen and reports why it does not drive": ("""
+        const worn = odd({ axes: [0, -1] });
+        show(worn, real(0)); driver.pads.pick("0 Receiver"); show(worn, real(0));
+        result = [codes(), driver.output.z];""", [["off-centre"], 0]),
+    "a gamepad that stands still while it is deflected is given up and reported": ("""
+        const frozen = real(1); show(real(0)); pass(2500, frozen); result = [driver.output.z];
+        pass(1000, frozen); result.push(driver.output.z, driver.reason().code);""", [0.6, 0, "pad"]),
+    "a gamepad in another window is reported and its stop counts": ("""
+        document.hasFocus = () => false; show(real(0)); show(real(1)); result = [codes(), driver.output.z];
+        show(real(1, 8, 9)); result.push(stops());""", [["focus"], 0, ["estop: gamepad"]]),
+}
+# fmt: on
 
 
 # -- what fails in the page's own code
 
 
-@pytest.mark.parametrize("part", ["readPads", "update", "watchLease"])
-def test_a_part_that_fails_ends_what_is_driven_is_reported_and_keeps_no_stop_back(part: str) -> None:
-    steps = f"""console.error = () => {{}}; key("KeyW"); driver.tick(); const z = driver.output.z;
-    const {{ {part} }} = driver; driver.{part} = () => {{ throw new Error("no"); }};
-    driver.tick(); result = [z, driver.output.z, driver.reason().code];
-    driver.latch("button"); result.push(stops());
-    driver.{part} = {part}; driver.tick(); driver.keyUp({{ code: "KeyW", key: "w" }});
-    driver.tick(); result.push(driver.reason());"""
-    assert shown(steps) == [0.6, 0, "failed", ["estop: button"], None]
+@rows((shown, SHOWN))
+def test_each(found: Callable[[], Any], expected: Any) -> None:
+    assert found() == expected

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
-import pytest
-
-from tests.web.in_node import STATIC, evaluate
+from tests.web.in_node import STATIC, Rows, Script, evaluate, rows
 
 # -- the microphone and talks: a question of the browser is answered by ``answer()`` or ``answer(error)``
 
@@ -72,85 +71,68 @@ const talk = async (on) => { sound.talk(on); await turn(); };
 """
 
 
-def microphone(steps: str) -> Any:
-    imports = {"media/microphone.js": "Microphone"}
-    return evaluate(imports, f"{_BROWSER}const microphone = new Microphone(new AudioContext());\n{steps}")
+microphone = Script(
+    {"media/microphone.js": "Microphone"}, f"{_BROWSER}const microphone = new Microphone(new AudioContext());\n"
+)
 
 
-def sound(steps: str) -> Any:
-    imports = {"ui/robot/sound-model.js": "Sound", "core/store.js": "Store"}
-    return evaluate(imports, f"{_BROWSER}{_SOUND}{steps}\nsound.leave();")
+sound = Script({"ui/robot/sound-model.js": "Sound", "core/store.js": "Store"}, _BROWSER + _SOUND, "sound.leave();")
 
 
-def test_a_microphone_that_is_opened_twice_at_a_time_is_opened_once() -> None:
-    steps = """const both = [microphone.open(), microphone.open()]; await turn();
-    result = [questions.length]; await answer(); result.push(await Promise.all(both), streams.length);
-    microphone.close(); result.push(open().length, sources);"""
-    assert microphone(steps) == [1, ["", ""], 1, 0, 0]
+# fmt: off
+MICROPHONE: Rows = {
+    "a microphone that is opened twice at a time is opened once": ("""
+        const both = [microphone.open(), microphone.open()]; await turn();
+        result = [questions.length]; await answer(); result.push(await Promise.all(both), streams.length);
+        microphone.close(); result.push(open().length, sources);""", [1, ["", ""], 1, 0, 0]),
+    "a microphone that cannot be joined is given back and the next attempt begins anew": ("""
+        broken = "source"; const first = microphone.open(); await turn(); await answer();
+        result = [await first, open().length];
+        broken = ""; const second = microphone.open(); await turn(); await answer();
+        result.push(await second, open().length, sources); microphone.close();""",
+        ["The microphone cannot be opened: no source", 0, "", 1, 1]),
+    "a device that was taken away leaves no source": ("""
+        for (let i = 0; i < 3; i++) {
+          const opened = microphone.open(); await turn(); await answer(); await opened;
+          streams.at(-1).track.live = false;
+        }
+        result = sources;""", 1),
+}
+# fmt: on
 
 
-def test_a_microphone_that_cannot_be_joined_is_given_back_and_the_next_attempt_begins_anew() -> None:
-    steps = """broken = "source"; const first = microphone.open(); await turn(); await answer();
-    result = [await first, open().length];
-    broken = ""; const second = microphone.open(); await turn(); await answer();
-    result.push(await second, open().length, sources); microphone.close();"""
-    assert microphone(steps) == ["The microphone cannot be opened: no source", 0, "", 1, 1]
-
-
-def test_a_device_that_was_taken_away_leaves_no_source() -> None:
-    steps = """for (let i = 0; i < 3; i++) {
-      const opened = microphone.open(); await turn(); await answer(); await opened;
-      streams.at(-1).track.live = false;
-    }
-    result = sources;"""
-    assert microphone(steps) == 1
-
-
-def test_a_talk_uses_the_microphone_which_is_muted_until_the_next_one() -> None:
-    steps = """await talk(true); await answer(); result = [heard()];
-    await talk(false); result.push(open().length, heard());
-    await talk(true); result.push(heard(), questions.length, [...told]);"""
-    assert sound(steps) == [1, 1, 0, 1, 0, ["open", "talk 1", "end", "talk 2"]]
-
-
-def test_a_question_that_is_answered_during_the_next_talk_is_of_that_talk() -> None:
-    steps = """await talk(true); await talk(false); await talk(true); await answer();
-    result = [heard(), streams.length, told.at(-1), sound.talking?.number];"""
-    assert sound(steps) == [1, 1, "talk 2", 2]
-
-
-@pytest.mark.parametrize("end", ["await talk(false)", "sound.interrupt()", "go('')"])
-def test_a_microphone_that_is_granted_after_the_talk_is_given_back(end: str) -> None:
-    assert sound(f"await talk(true); {end}; await answer(); result = [open().length, told.includes('talk 1')];") == [
-        0, False,
-    ]  # fmt: skip
-
-
-@pytest.mark.parametrize("before", ["", "await talk(false);"])
-def test_what_interrupts_a_gesture_closes_the_microphone(before: str) -> None:
-    steps = f"await talk(true); await answer(); {before} sound.interrupt(); result = [open().length, sound.talking];"
-    assert sound(steps) == [0, None]
-
-
-def test_why_a_talk_has_failed_is_known_until_the_next_one_or_another_component() -> None:
-    steps = """const denied = () => Object.assign(new Error("no"), { name: "NotAllowedError" });
-    await talk(true); await answer(denied()); result = [sound.problem, sound.talking];
-    sound.endedAt = -Infinity; sound.step(); result.push(sound.problem !== "");
-    await talk(false); await talk(true); result.push(sound.problem);
-    await talk(false); await answer(denied()); result.push(sound.problem !== "");
-    go("pebble/robots/minilamp"); result.push(sound.problem);"""
-    why = "The microphone is blocked: allow it for this page in the browser"
-    assert sound(steps) == [why, None, True, "", True, ""]
-
-
-def test_a_talk_that_cannot_begin_is_no_talk() -> None:
-    steps = "broken = 'worker'; await talk(true); result = [sound.talking, sound.problem, questions.length];"
-    assert sound(steps) == [None, "Talking has failed: no worker", 0]
-
-
-def test_a_key_that_cannot_talk_shows_why() -> None:
-    steps = "connection.may = () => false; await talk(true); result = [shown, sound.talking];"
-    assert sound(steps) == [["Not done: Log in as driver to talk"], None]
+# fmt: off
+SOUND: Rows = {
+    "a talk uses the microphone which is muted until the next one": ("""
+        await talk(true); await answer(); result = [heard()];
+        await talk(false); result.push(open().length, heard());
+        await talk(true); result.push(heard(), questions.length, [...told]);""",
+        [1, 1, 0, 1, 0, ["open", "talk 1", "end", "talk 2"]]),
+    "a question that is answered during the next talk is of that talk": ("""
+        await talk(true); await talk(false); await talk(true); await answer();
+        result = [heard(), streams.length, told.at(-1), sound.talking?.number];""", [1, 1, "talk 2", 2]),
+    **{f"a microphone that is granted after the talk is given back: {end}": (
+        f"await talk(true); {end}; await answer(); result = [open().length, told.includes('talk 1')];", [0, False])
+        for end in ("await talk(false)", "sound.interrupt()", "go('')")},
+    **{f"what interrupts a gesture closes the microphone: {before}": (
+        f"await talk(true); await answer(); {before} sound.interrupt(); result = [open().length, sound.talking];",
+        [0, None]) for before in ("", "await talk(false);")},
+    "why a talk has failed is known until the next one or another component": ("""
+        const denied = () => Object.assign(new Error("no"), { name: "NotAllowedError" });
+        await talk(true); await answer(denied()); result = [sound.problem, sound.talking];
+        sound.endedAt = -Infinity; sound.step(); result.push(sound.problem !== "");
+        await talk(false); await talk(true); result.push(sound.problem);
+        await talk(false); await answer(denied()); result.push(sound.problem !== "");
+        go("pebble/robots/minilamp"); result.push(sound.problem);""",
+        ['The microphone is blocked: allow it for this page in the browser', None, True, "", True, ""]),
+    "a talk that cannot begin is no talk": (
+        "broken = 'worker'; await talk(true); result = [sound.talking, sound.problem, questions.length];",
+        [None, "Talking has failed: no worker", 0]),
+    "a key that cannot talk shows why": (
+        "connection.may = () => false; await talk(true); result = [shown, sound.talking];",
+        [["Not done: Log in as driver to talk"], None]),
+}
+# fmt: on
 
 
 # -- the worker
@@ -223,3 +205,8 @@ def test_the_lead_at_the_loudspeaker_grows_when_the_worker_is_late_and_shrinks_a
     const many = stats();
     result.push(run(60), stats() < many);"""
     assert evaluate({"media/playout.js": "Playout"}, steps) == [20, 40, 20, True]
+
+
+@rows((microphone, MICROPHONE), (sound, SOUND))
+def test_each(found: Callable[[], Any], expected: Any) -> None:
+    assert found() == expected
