@@ -27,7 +27,7 @@ class MediaPages:
 
         class Handler(BaseHTTPRequestHandler):
             def do_GET(self) -> None:
-                pages._answer(self)
+                pages.answer(self)
 
             def do_POST(self) -> None:
                 pages.posted[self.path] = self.rfile.read(int(self.headers["content-length"]))
@@ -55,7 +55,7 @@ class MediaPages:
         self._server.shutdown()
         self._server.server_close()
 
-    def _answer(self, request: BaseHTTPRequestHandler) -> None:
+    def answer(self, request: BaseHTTPRequestHandler) -> None:
         path = request.path
         file = (STATIC if path.startswith(("/media/", "/core/")) else PAGES) / path.lstrip("/")
         data = self._data.get(path)

@@ -80,7 +80,7 @@ TWO = packed(AT + 0.25, 12, b"front-camera", b"\0\xff") + packed(AT + 1, 0, "gr�
 BOTH = [[AT + 0.25, 12, "front-camera", [0, 255]], [AT + 1, 0, "größe", []]]
 
 
-def test_flags_are_those_of_the_server():
+def test_flags_are_those_of_the_server() -> None:
     names = "STATE, CHAIN, INCOMING, PICTURE, SOUND"
     found = evaluate({"core/replay/frames.js": names}, f"result = [{names}];")
     assert found == [Flag.STATE, Flag.CHAIN, Flag.INCOMING, Flag.PICTURE, Flag.SOUND]
@@ -192,7 +192,7 @@ RUN: Rows = {
 # fmt: on
 
 
-def test_a_recording_of_heartbeats_shows_when_the_robot_was_silent():
+def test_a_recording_of_heartbeats_shows_when_the_robot_was_silent() -> None:
     steps = """const beats = new Heartbeats(); const views = [beats.view(1000)];
     for (let t = 1000; t <= 3000; t += 250) beats.receive(t, { t: t - 42 });
     views.push(beats.view(3100), beats.view(9000)); beats.receive(9100, { t: 9090, online: false });
@@ -203,7 +203,7 @@ def test_a_recording_of_heartbeats_shows_when_the_robot_was_silent():
     assert found[3][0] is False
 
 
-def test_what_was_sent_is_listed_without_a_line_for_each_command():
+def test_what_was_sent_is_listed_without_a_line_for_each_command() -> None:
     steps = """const incoming = new Incoming();
     for (let t = 0; t < 2000; t += 100) incoming.take(t, "drive-values", { x: 0.25, z: t / 1e9 + 3 }, 9);
     incoming.take(2000, "lights", { r: 1 }, 9); incoming.take(2100, "lights", { r: 0 }, 9);
@@ -217,7 +217,7 @@ def test_what_was_sent_is_listed_without_a_line_for_each_command():
     assert last == [["5 bytes", 1]]
 
 
-def test_answers_of_the_server():
+def test_answers_of_the_server() -> None:
     steps = """const answers = [
       new Response(new Uint8Array(0), { headers: { "x-next": "2500.5", "x-complete": "0" } }),
       new Response(new Uint8Array(0), { headers: { "x-next": "" } }),
