@@ -76,6 +76,7 @@ def test_a_browser_opens_the_page_and_keeps_its_complaints(stage: Stage, browser
         assert opened.until(lambda: opened.errors == ["deliberate"])
 
 
+@pytest.mark.thorough  # tools/run_tests.py looks for processes that any test leaves behind
 def test_nothing_outlives_a_stage() -> None:
     with Stage("minilamp") as stage:
         pids = [stage.server.pid, *(program.pid for program in stage.robots["minilamp"].programs)]
