@@ -45,7 +45,7 @@ def robot_names() -> tuple[str, ...]:
 @pytest.fixture(scope="module")
 def stage(robot_names: tuple[str, ...]) -> Iterator[Stage]:
     """Whole robots: MiniLAMP alone is ready in a second."""
-    with Stage(*robot_names) as running:
+    with Stage(*robot_names, room=False) as running:
         yield running
 
 

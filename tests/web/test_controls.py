@@ -1,6 +1,6 @@
 """Every control of the fleet and of a robot's page, used in a browser; what it does is asserted at the robot.
 
-Robots on Zenoh (goob), on MQTT (fred) and on microcontrollers (minilamp, benjr).
+The robots are microcontrollers; those with pictures are in test_pictures_of_robots.
 """
 
 from __future__ import annotations
@@ -20,6 +20,11 @@ pytestmark = pytest.mark.alone  # deadlines are checked
 
 
 @pytest.fixture(scope="module")
+def robot_names() -> tuple[str, ...]:
+    return ("minilamp", "benjr")
+
+
+@pytest.fixture(scope="module")
 def _benjr_page(browser: Browser, stage: Stage) -> Iterator[Console]:
     with console(browser, stage, "benjr", theme="dark") as opened:
         yield opened
@@ -35,14 +40,13 @@ def at_benjr(_benjr_page: Console) -> Iterator[Console]:
 # -- keys
 
 
-@pytest.mark.parametrize(("name", "keys"), [("goob", 4), ("fred", 4), ("minilamp", 8), ("benjr", 8)])
-def test_each_key_turns_the_wheels_while_it_is_held(browser: Browser, stage: Stage, name: str, keys: int) -> None:
-    """Letters at every robot, and arrows where no picture takes the processors."""
-    with console(browser, stage, name) as opened, used(opened) as robot:
-        for key, wheels in list(KEYS.items())[:keys]:
-            assert robot.drive(key, wheels=wheels), (key, robot.wheels, robot.reason)
-            robot.let_go()
-            assert robot.rests(), key
+@pytest.mark.parametrize("page", ["at_lamp", "at_benjr"])
+def test_each_key_turns_the_wheels_while_it_is_held(request: pytest.FixtureRequest, page: str) -> None:
+    robot: Console = request.getfixturevalue(page)
+    for key, wheels in KEYS.items():
+        assert robot.drive(key, wheels=wheels), (key, robot.wheels, robot.reason)
+        robot.let_go()
+        assert robot.rests(), key
 
 
 def test_two_keys_are_mixed_and_opposite_ones_rest(at_benjr: Console) -> None:
@@ -185,9 +189,7 @@ def test_a_stop_latches_the_robot_which_stays_at_rest(at_lamp: Console, wire: Wi
     assert at_lamp.stays_at_rest()
 
 
-def test_stop_all_latches_every_robot_and_each_is_reset_by_itself(
-    browser: Browser, stage: Stage, at_lamp: Console, wire: Wire
-) -> None:
+def test_stop_all_latches_every_robot_and_each_is_reset_by_itself(stage: Stage, at_lamp: Console, wire: Wire) -> None:
     assert at_lamp.drive()
     at_lamp.test("stop-all").click()
     assert at_lamp.tab.until(lambda: all(wire.latched(name) for name in stage.robots), 3)
@@ -201,14 +203,10 @@ def test_stop_all_latches_every_robot_and_each_is_reset_by_itself(
     assert wire.latched("minilamp")
     at_lamp.hold_button("reset-hold")
     assert at_lamp.tab.until(lambda: not wire.latched("minilamp"), 3)
-    assert all(wire.latched(name) for name in ("goob", "fred", "benjr"))
+    assert wire.latched("benjr")
     assert at_lamp.press_anew()
-    for name in ("goob", "fred", "benjr"):
-        at_lamp.page.evaluate(
-            "([ref, view]) => window.pebble.commands.reset(ref, view.owners)",
-            [stage.ref(name), at_lamp.state("web/estop", stage.ref(name))],
-        )
-    assert at_lamp.tab.until(lambda: not any(wire.latched(name) for name in stage.robots), 3)
+    at_lamp.reset("benjr")
+    assert at_lamp.tab.until(lambda: not wire.latched("benjr"), 3)
 
 
 # -- control
@@ -254,90 +252,23 @@ def test_a_second_tab_stops_by_the_space_bar_and_takes_over_by_a_hold(
         assert second.tab.complaints() == []
 
 
-# -- pictures
-
-
-@pytest.mark.page
-def test_the_camera_runs_while_its_picture_is_shown(browser: Browser, stage: Stage, wire: Wire) -> None:
-    with console(browser, stage, "fred") as robot, used(robot):
-        assert robot.tab.until(lambda: wire.camera("fred"), 5)
-        robot.test("encoding").select_option("json")
-        assert robot.tab.until(
-            lambda: wire.last("fred/incoming/front-camera") == {"enabled": True, "encoding": "json"}, 5
-        )
-        assert robot.tab.until("window.pebble.video.info?.encoding === 'json'")
-        robot.test("encoding").select_option("")
-        assert robot.tab.until("window.pebble.video.info?.encoding === 'h264'")
-        robot.test("video").click()
-        assert robot.tab.until("window.pebble.video.ref === ''", 1)
-        assert robot.because("", within=1)  # without a picture that is wanted none is too old
-        assert robot.press_anew()
-        assert robot.tab.until(lambda: wire.last("fred/incoming/front-camera") == {"enabled": False}, 8)
-        assert robot.tab.until(lambda: wire.last("fred/incoming/flags/mqtt-video") == {"value": False}, 1)
-        robot.test("video").click()
-        assert robot.tab.until("window.pebble.video.info !== null")
-        assert wire.last("fred/incoming/flags/mqtt-video") == {"value": True}
-
-
-@pytest.mark.page
-def test_a_robot_shows_the_picture_of_another_which_must_be_new(at_lamp: Console, stage: Stage, wire: Wire) -> None:
-    at_lamp.page.evaluate(
-        "([ref, source]) => window.pebble.commands.setPictureFrom(ref, source)", [at_lamp.ref, stage.ref("goob")]
-    )
-    assert at_lamp.tab.until("window.pebble.video.info !== null")
-    assert at_lamp.tab.until(lambda: wire.camera("goob"), 5)
-    at_lamp.take()
-    assert at_lamp.drive()
-    wire.publish("goob/incoming/flags/mqtt-video", {"value": False}, retain=True)
-    assert at_lamp.because("picture", within=6)
-    assert at_lamp.rests()
-    at_lamp.test("see").click()
-    assert at_lamp.stays_at_rest()  # its key is still held
-    assert at_lamp.press_anew()
-    wire.publish("goob/incoming/flags/mqtt-video", {"value": True}, retain=True)
-    assert at_lamp.tab.until("window.pebble.video.age().ms < 1000")
-    at_lamp.test("picture-from").select_option(stage.ref("fred"))
-    assert at_lamp.tab.until(lambda: at_lamp.page.evaluate("window.pebble.video.ref") == stage.ref("fred"), 3)
-    assert at_lamp.tab.until("window.pebble.video.info !== null")
-    at_lamp.test("picture-from").select_option("")
-    assert at_lamp.tab.until("window.pebble.video.ref === ''", 3)
-
-
-@pytest.mark.page
-def test_full_screen_has_stop_and_can_be_left(browser: Browser, stage: Stage, wire: Wire) -> None:
-    with console(browser, stage, "goob", theme="dark") as robot, used(robot):
-        robot.test("full-screen").click()
-        assert robot.tab.until("document.fullscreenElement !== null", 3)
-        assert robot.drive()
-        robot.test("stop-one").click()
-        assert robot.tab.until(lambda: wire.latched("goob"), 2)
-        assert robot.rests()
-        robot.page.get_by_label("Leave full screen").click()
-        assert robot.tab.until("document.fullscreenElement === null", 3)
-        robot.take()
-
-
 # -- the fleet
 
 
-def test_the_fleet_stops_robots_and_never_starts_a_camera(browser: Browser, stage: Stage, wire: Wire) -> None:
+def test_the_fleet_stops_robots(browser: Browser, stage: Stage, wire: Wire) -> None:
     with tab(browser, stage.url) as fleet:
-        assert fleet.until(lambda: fleet.page.locator(".fleet-card").count() == 4)
-        asked = len(wire.received)
-        fleet.test("thumbnails").check()
-        fleet.test("card-fred").hover()
+        assert fleet.until(lambda: fleet.page.locator(".fleet-card").count() == 2)
         fleet.test("stop-benjr").click()
         assert fleet.until(lambda: wire.latched("benjr"), 2)
-        assert not wire.latched("fred")
+        assert not wire.latched("minilamp")
         names = "[...document.querySelectorAll('.fleet-card h2')].map((one) => one.textContent).join()"
-        assert fleet.page.evaluate(names) == "benjr,fred,goob,minilamp"
+        assert fleet.page.evaluate(names) == "benjr,minilamp"
         fleet.test("sort").select_option("battery")
-        assert fleet.until(f"{names} !== 'benjr,fred,goob,minilamp'", 2)
-        fleet.test("filter").fill("RED")
-        assert fleet.until(f"{names} === 'fred'", 2)
-        assert not [one for one in wire.received[asked:] if one[0].endswith("/front-camera") and one[1]["enabled"]]
-        fleet.test("card-fred").get_by_role("link").click()
-        assert fleet.until("window.pebble.driver.ref === 'pebble/robots/fred'", 2)
+        assert fleet.until(f"{names} === 'minilamp,benjr'", 2)
+        fleet.test("filter").fill("LAMP")
+        assert fleet.until(f"{names} === 'minilamp'", 2)
+        fleet.test("card-minilamp").get_by_role("link").click()
+        assert fleet.until("window.pebble.driver.ref === 'pebble/robots/minilamp'", 2)
         assert fleet.complaints() == []
 
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Callable
 from typing import Any
 
-import pytest
-
 from tests.services.serial_mcu_bridge import mcu_wire as wire
-from tests.web.in_node import evaluate
+from tests.web.in_node import Rows, Script, rows
 from tests.web.states import LAMP_MCU, described
 
 _MODULES = {
@@ -19,9 +19,16 @@ _MODULES = {
 }
 
 
+script = Script(_MODULES)
+
+
+def of(expression: str, *values: Any) -> str:
+    """Steps: what ``expression`` makes of ``v``, the ``values``."""
+    return f"const v = {json.dumps(values)}; result = {expression};"
+
+
 def run(expression: str, *values: Any) -> Any:
-    """What ``expression`` makes of ``v``, the ``values``."""
-    return evaluate(_MODULES, f"const v = given; result = {expression};", list(values))
+    return script(of(expression, *values))
 
 
 def test_a_manifest_is_read() -> None:
@@ -53,14 +60,6 @@ HOSTILE = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("payload", HOSTILE)
-def test_a_manifest_of_any_shape_is_read_without_an_exception(payload: Any) -> None:
-    run(
-        "[readManifest(v[0])?.interfaces.map((one) => [unsendable(one), command(one, new Map()), range, step])]",
-        payload,
-    )
-
-
 def test_what_is_too_much_is_counted() -> None:
     fields = [{"name": f"f{n}", "type": "u8"} for n in range(44)]
     one = {"name": "a", "dir": "out", "encoding": {"fields": fields}}
@@ -74,47 +73,32 @@ def interface(*fields: dict[str, Any]) -> dict[str, Any]:
 
 
 COMMAND = "command(readManifest(v[0]).interfaces[0], new Map(v[1]))"
-
-
-@pytest.mark.parametrize(
-    ("field", "entered", "value"),
-    [
-        ({"type": "bool"}, True, True),
-        ({"type": "bool"}, None, False),
-        ({"type": "u8"}, "255", 255),
-        ({"type": "i8"}, " -128 ", -128),
-        ({"type": "u32"}, "4294967295", 4294967295),
-        ({"type": "i32"}, "-2147483648", -2147483648),
-        ({"type": "f32"}, "1.5e3", 1500),
-        ({"type": "f32"}, "-0.25", -0.25),
-        ({"type": "u8", "scale": 0.5}, "127.5", 127.5),
-        ({"type": "i16", "scale": -0.1, "offset": 10}, "3286.8", 3286.8),
-    ],
-)
-def test_what_is_entered_becomes_json_of_the_fields_type(field: dict[str, Any], entered: Any, value: Any) -> None:
-    made = run(COMMAND, interface({"name": "x", **field}), [["x", entered], ["y", "7"]])
-    assert made == {"value": {"x": value}, "problems": []}
-    assert type(made["value"]["x"]) is type(value)
-
-
-@pytest.mark.parametrize(
-    ("field", "entered", "problem"),
-    [
-        ({"type": "u8"}, "", "x: 0 to 255"),
-        ({"type": "u8"}, "256", "x: 0 to 255"),
-        ({"type": "u8"}, "-1", "x: 0 to 255"),
-        ({"type": "u8"}, "1.5", "x: a whole number, 0 to 255"),
-        ({"type": "u8"}, "0x1g", "x: 0 to 255"),
-        ({"type": "u8"}, True, "x: 0 to 255"),
-        ({"type": "u8", "scale": 0.5, "unit": "%"}, "128", "x: 0 to 127.5 %"),
-        ({"type": "f32", "unit": "m"}, "far", "x: a number m"),
-        ({"type": "f32"}, "1e39", "x: a number"),
-        ({"type": "f32"}, "Infinity", "x: a number"),
-    ],
-)
-def test_what_the_field_cannot_hold_is_not_sent(field: dict[str, Any], entered: Any, problem: str) -> None:
-    made = run(COMMAND, interface({"name": "x", **field}), [["x", entered]])
-    assert made == {"value": {}, "problems": [problem]}
+#: Fields, what is entered, and the value of the field's type.
+ENTERED: list[tuple[dict[str, Any], Any, Any]] = [
+    ({"type": "bool"}, True, True),
+    ({"type": "bool"}, None, False),
+    ({"type": "u8"}, "255", 255),
+    ({"type": "i8"}, " -128 ", -128),
+    ({"type": "u32"}, "4294967295", 4294967295),
+    ({"type": "i32"}, "-2147483648", -2147483648),
+    ({"type": "f32"}, "1.5e3", 1500),
+    ({"type": "f32"}, "-0.25", -0.25),
+    ({"type": "u8", "scale": 0.5}, "127.5", 127.5),
+    ({"type": "i16", "scale": -0.1, "offset": 10}, "3286.8", 3286.8),
+]
+#: Fields, what is entered that they cannot hold, and the problem.
+REFUSED: list[tuple[dict[str, Any], Any, str]] = [
+    ({"type": "u8"}, "", "x: 0 to 255"),
+    ({"type": "u8"}, "256", "x: 0 to 255"),
+    ({"type": "u8"}, "-1", "x: 0 to 255"),
+    ({"type": "u8"}, "1.5", "x: a whole number, 0 to 255"),
+    ({"type": "u8"}, "0x1g", "x: 0 to 255"),
+    ({"type": "u8"}, True, "x: 0 to 255"),
+    ({"type": "u8", "scale": 0.5, "unit": "%"}, "128", "x: 0 to 127.5 %"),
+    ({"type": "f32", "unit": "m"}, "far", "x: a number m"),
+    ({"type": "f32"}, "1e39", "x: a number"),
+    ({"type": "f32"}, "Infinity", "x: a number"),
+]
 
 
 def test_names_of_fields_are_only_names() -> None:
@@ -141,18 +125,10 @@ def lines(payload: Any) -> list[list[Any]]:
     return [[line["depth"], line["key"], line["text"]] for line in made["lines"]]
 
 
-def test_nested_objects_become_lines_farther_in() -> None:
-    payload = {"t": 1, "value": {"pose": {"x": 1.25, "y": [1, 2]}, "ok": True}, "seq": 9}
-    assert lines(payload) == [
-        [0, "pose", ""],
-        [1, "x", "1.25"],
-        [1, "y", "[1, 2]"],
-        [0, "ok", "true"],
-        [0, "seq", "9"],
-    ]
-
-
-def test_a_plain_value_has_its_unit() -> None:
+def test_payloads_become_lines_nested_ones_farther_in() -> None:
+    nested = {"t": 1, "value": {"pose": {"x": 1.25, "y": [1, 2]}, "ok": True}, "seq": 9}
+    expected = [[0, "pose", ""], [1, "x", "1.25"], [1, "y", "[1, 2]"], [0, "ok", "true"], [0, "seq", "9"]]
+    assert lines(nested) == expected
     assert lines({"value": 7.92, "unit": "v"}) == [[0, "", "7.92 v"]]
     assert lines(7) == [[0, "", "7"]]
     assert lines([]) == [[0, "", "[]"]]
@@ -180,41 +156,8 @@ def test_outlets_are_those_that_are_listed_and_those_that_report() -> None:
     listed = {"value": {"outlets": {"available": True, "outlets": [{"name": "o1", "controls": False}, {"name": "o2"}]}}}
     assert outlets(listed, "outlets/o1/status", "outlets/o9/status") == {"o1": False, "o2": True, "o9": False}
     assert outlets(None, "outlets/o1/status", "outlets/o1/other", "outlets/x") == {"o1": True}
-    assert (
-        outlets({"value": {"outlets": {"available": True, "outlets": [1, None, {}, {"name": 7}, {"name": ""}]}}}) == {}
-    )
-
-
-@pytest.mark.parametrize(
-    ("name", "controls", "report", "why"),
-    [
-        ("o1", True, {}, ""),
-        ("o1", True, {"bound": True, "reachable": True, "on": False}, ""),
-        ("o1", True, {"reachable": False}, "outlet is unreachable"),
-        ("o1", True, {"bound": False, "reachable": False}, "no device is bound to this outlet"),
-        ("o1", False, {}, "this outlet cannot be switched from here: its robot lists no control"),
-        ("a/b", True, {}, "its name cannot be part of a topic"),
-        ("x" * 65, True, {}, "its name cannot be part of a topic"),
-        ("😀" * 64, True, {}, ""),
-    ],
-)
-def test_why_an_outlet_cannot_be_switched(name: str, controls: bool, report: dict[str, Any], why: str) -> None:
-    assert run("obstacle(...v)", name, controls, report, True) == why
-
-
-@pytest.mark.parametrize("report", [{"reachable": False}, {"bound": False}, {"on": True}])
-def test_an_outlet_can_be_switched_off_whatever_it_reports(report: dict[str, Any]) -> None:
-    assert run("obstacle(...v)", "o1", True, report, False) == ""
-
-
-@pytest.mark.parametrize(
-    ("now", "gone", "left"),
-    [(50, False, [0, 10, 40]), (65, False, [10, 40]), (200, False, [40]), (65, True, [10, 40]), (200, True, [])],
-)
-def test_a_sparkline_loses_what_is_older_also_when_nothing_arrives(now: int, gone: bool, left: list[int]) -> None:
-    points = [{"at": 1000 * at} for at in (0, 10, 40)]
-    seen = run("lastMinute(...v).map(({ at }) => at / 1000)", points, 1000 * now, gone)
-    assert seen == left
+    odd = [1, None, {}, {"name": 7}, {"name": ""}]
+    assert outlets({"value": {"outlets": {"available": True, "outlets": odd}}}) == {}
 
 
 def test_a_sparkline_has_the_last_minute() -> None:
@@ -230,3 +173,45 @@ def test_a_sparkline_has_the_last_minute() -> None:
     assert 150 < count <= 250
     assert first >= 35_000
     assert last[0] == last[1]
+
+
+NOT_TOPIC = "its name cannot be part of a topic"
+#: Names of outlets, whether they can be switched, what they report, and why they cannot be switched on.
+OBSTACLES: list[tuple[str, bool, dict[str, Any], str]] = [
+    ("o1", True, {}, ""),
+    ("o1", True, {"bound": True, "reachable": True, "on": False}, ""),
+    ("o1", True, {"reachable": False}, "outlet is unreachable"),
+    ("o1", True, {"bound": False, "reachable": False}, "no device is bound to this outlet"),
+    ("o1", False, {}, "this outlet cannot be switched from here: its robot lists no control"),
+    ("a/b", True, {}, NOT_TOPIC),
+    ("x" * 65, True, {}, NOT_TOPIC),
+    ("😀" * 64, True, {}, ""),
+]
+#: Times in seconds, whether the value is gone, and the times that are left.
+SPARKS = [(50, False, [0, 10, 40]), (65, False, [10, 40]), (200, False, [40]), (65, True, [10, 40]), (200, True, [])]
+POINTS = [{"at": 1000 * at} for at in (0, 10, 40)]
+# fmt: off
+ROWS: Rows = {
+    **{f"a manifest of any shape is read without an exception: {str(payload)[:80]}": (of(
+        "[readManifest(v[0])?.interfaces.map((one) => [unsendable(one), command(one, new Map())]), true][1]", payload),
+        True) for payload in HOSTILE},
+    **{f"what is entered becomes JSON of the field's type: {field} {entered}": (of(
+        f"JSON.stringify({COMMAND})", interface({"name": "x", **field}), [["x", entered], ["y", "7"]]),
+        json.dumps({"value": {"x": value}, "problems": []}, separators=(",", ":")))
+        for field, entered, value in ENTERED},
+    **{f"what the field cannot hold is not sent: {field} {entered}": (of(
+        COMMAND, interface({"name": "x", **field}), [["x", entered]]), {"value": {}, "problems": [problem]})
+        for field, entered, problem in REFUSED},
+    **{f"why {name[:8]} {controls} {report} cannot be switched": (
+        of("obstacle(...v)", name, controls, report, True), why) for name, controls, report, why in OBSTACLES},
+    **{f"an outlet can be switched off whatever it reports: {report}": (
+        of("obstacle(...v)", "o1", True, report, False), "") for report in ({"reachable": False}, {"bound": False}, {"on": True})},
+    **{f"a sparkline loses what is older also when nothing arrives: {now} s, {gone}": (of(
+        "lastMinute(...v).map(({ at }) => at / 1000)", POINTS, 1000 * now, gone), left) for now, gone, left in SPARKS},
+}
+# fmt: on
+
+
+@rows((script, ROWS))
+def test_each(found: Callable[[], Any], expected: Any) -> None:
+    assert found() == expected

@@ -148,20 +148,9 @@ def test_what_is_sent_is_the_same_program(tmp_path: Path) -> None:
         for place, source in zip(paths[-2:], (path.read_bytes(), stripped(path.read_bytes(), "js")), strict=True):
             place.parent.mkdir(parents=True, exist_ok=True)
             place.write_bytes(source)
-    command = [
-        "node",
-        str(COMPILER),
-        *PRINT,
-        "--module",
-        "esnext",
-        "--target",
-        "esnext",
-        "--rootDir",
-        str(tmp_path),
-        "--outDir",
-        str(tmp_path / "out"),
-        *paths,
-    ]
+    options = ["--module", "esnext", "--target", "esnext"]
+    folders = ["--rootDir", str(tmp_path), "--outDir", str(tmp_path / "out")]
+    command = ["node", str(COMPILER), *PRINT, *options, *folders, *paths]
     subprocess.run(command, capture_output=True, check=False, timeout=60)  # it misses all types, and prints
     for before, after in zip(paths[::2], paths[1::2], strict=True):
         printed = [(tmp_path / "out" / one.relative_to(tmp_path)).read_text() for one in (before, after)]
