@@ -205,7 +205,8 @@ ROWS: Rows = {
     **{f"why {name[:8]} {controls} {report} cannot be switched": (
         of("obstacle(...v)", name, controls, report, True), why) for name, controls, report, why in OBSTACLES},
     **{f"an outlet can be switched off whatever it reports: {report}": (
-        of("obstacle(...v)", "o1", True, report, False), "") for report in ({"reachable": False}, {"bound": False}, {"on": True})},
+        of("obstacle(...v)", "o1", True, report, False), "")
+        for report in ({"reachable": False}, {"bound": False}, {"on": True})},
     **{f"a sparkline loses what is older also when nothing arrives: {now} s, {gone}": (of(
         "lastMinute(...v).map(({ at }) => at / 1000)", POINTS, 1000 * now, gone), left) for now, gone, left in SPARKS},
 }
