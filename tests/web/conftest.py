@@ -6,12 +6,14 @@ Not for the whole session: while Playwright runs, asyncio.run fails in this proc
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 
 import pytest
 from playwright.sync_api import Browser
 
 from tests.support import Broker
 from tests.web.browser import chromium
+from tests.web.canned import CannedServer, Show, serving, showing
 from tests.web.console import Console, Wire, console, used
 from tests.web.served import Served
 from tests.web.stage import Stage
@@ -34,6 +36,19 @@ def served(broker: Broker) -> Iterator[Served]:
 def browser() -> Iterator[Browser]:
     with chromium() as running:
         yield running
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[CannedServer]:
+    """It shows what ``show`` is given."""
+    with serving() as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def show(server: CannedServer, browser: Browser) -> Show:
+    """Opens the page in a state: ``with show(state, size, …) as opened``."""
+    return partial(showing, server, browser)
 
 
 @pytest.fixture(scope="module")

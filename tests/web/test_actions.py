@@ -9,10 +9,10 @@ from contextlib import contextmanager
 from typing import Any
 
 import pytest
-from playwright.sync_api import Browser, Route
+from playwright.sync_api import Browser
 
-from tests.web.browser import Tab, tab
-from tests.web.canned import serving
+from tests.web.browser import Tab, answer, tab
+from tests.web.canned import CannedServer, Show
 from tests.web.console import BACK, FORWARD, LEFT, RIGHT, Console, Wheels, Wire, console, pad, used
 from tests.web.stage import Stage
 from tests.web.states import STATES
@@ -40,7 +40,7 @@ def robot_names() -> tuple[str, ...]:
 def _benjr_page(browser: Browser, stage: Stage) -> Iterator[Console]:
     with console(browser, stage, "benjr") as opened:
         for name, source in _MODULES.items():
-            opened.page.route(f"**/ui/cards/{name}", _answer(source))
+            opened.page.route(f"**/ui/cards/{name}", answer(source))
         opened.tab.until("!!window.pebble?.driver.actions")
         opened.page.evaluate(_SOUND)
         yield opened
@@ -51,13 +51,6 @@ def at_benjr(_benjr_page: Console) -> Iterator[Console]:
     with used(_benjr_page) as ready:
         ready.page.evaluate("() => { calls.length = 0 }")
         yield ready
-
-
-def _answer(source: str) -> Any:
-    def fulfil(route: Route) -> None:
-        route.fulfill(body=source, content_type="text/javascript")
-
-    return fulfil
 
 
 def _calls(robot: Console) -> Any:
@@ -327,8 +320,9 @@ def _watching(browser: Browser, url: str) -> Iterator[Tab]:
         yield opened
 
 
-def test_a_screen_that_only_watches_sends_nothing_but_stops(browser: Browser) -> None:
-    with serving(STATES["driving"]) as canned, _watching(browser, f"{canned.url}{canned.state.path}") as opened:
+def test_a_screen_that_only_watches_sends_nothing_but_stops(browser: Browser, server: CannedServer) -> None:
+    server.show(STATES["driving"])
+    with _watching(browser, server.url + server.state.path) as opened:
         for key in ("KeyW", "KeyA", "KeyQ", "KeyF", "KeyP", "KeyT", "KeyM", "Minus", "Space"):
             opened.page.keyboard.press(key, delay=60)
         opened.page.evaluate(
@@ -336,21 +330,21 @@ def test_a_screen_that_only_watches_sends_nothing_but_stops(browser: Browser) ->
         )
         opened.page.evaluate("() => { pebble.commands.take(true); pebble.commands.act(pebble.driver.ref, 'reboot') }")
         opened.page.keyboard.press("Control+Space")
-        assert opened.until(lambda: bool(canned.sent("estop")), 2)
-        assert {message["op"] for message in canned.received} <= {"hello", "watch", "read-logs", "stop", "estop"}
-        assert [message["token"] for message in canned.sent("hello")] == [""]
+        assert opened.until(lambda: bool(server.sent("estop")), 2)
+        assert {message["op"] for message in server.received} <= {"hello", "watch", "read-logs", "stop", "estop"}
+        assert [message["token"] for message in server.sent("hello")] == [""]
 
 
-def test_it_takes_no_lease_back(browser: Browser) -> None:
-    with serving(STATES["driving"]) as canned, tab(browser, canned.url + canned.state.path) as opened:
-        assert opened.until(lambda: len(canned.sent("hello")) == 1)
-        opened.page.goto(canned.url)
+def test_it_takes_no_lease_back(show: Show, server: CannedServer) -> None:
+    with show(STATES["driving"]) as opened:
+        assert opened.until(lambda: len(server.sent("hello")) == 1)
+        opened.page.goto(server.url)
         assert opened.until("window.pebble?.connection.isOpen")
-        assert canned.sent("hello")[-1]["token"] == "canned"
+        assert server.sent("hello")[-1]["token"] == "server"
         opened.test("watch").click()
-        assert opened.until(lambda: opened.page.url == f"{canned.url}/?watch")
+        assert opened.until(lambda: opened.page.url == f"{server.url}/?watch")
         assert opened.until("window.pebble?.connection.isOpen")
-        assert canned.sent("hello")[-1]["token"] == ""
+        assert server.sent("hello")[-1]["token"] == ""
         opened.page.locator("[data-test=card-goob] a").click()
         assert opened.page.url.endswith("/r/pebble/robots/goob?watch")
         assert opened.complaints() == []

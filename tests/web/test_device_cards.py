@@ -7,10 +7,9 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
-from playwright.sync_api import Browser
 
-from tests.web.browser import PIXELS, Tab, tab
-from tests.web.canned import CannedServer, State, Value, serving
+from tests.web.browser import PIXELS, Tab
+from tests.web.canned import CannedServer, Show, State, Value
 from tests.web.states import GOOB, STATES, at, changed, devices, liveness, outlet
 
 pytestmark = pytest.mark.page
@@ -19,16 +18,9 @@ O2 = "outlets/o2/status"
 
 
 @pytest.fixture(scope="module")
-def server() -> Iterator[CannedServer]:
-    with serving() as canned:
-        yield canned
-
-
-@pytest.fixture(scope="module")
-def cards(server: CannedServer, browser: Browser) -> Iterator[Tab]:
+def cards(show: Show) -> Iterator[Tab]:
     """The page of a robot with outlets and microcontrollers; its tests send, but change nothing."""
-    server.show(STATES["devices"])
-    with tab(browser, server.url + STATES["devices"].path) as opened:
+    with show(STATES["devices"]) as opened:
         opened.test("mcu-lamp-1").wait_for()
         opened.test("outlet-o1").wait_for()
         yield opened
@@ -64,10 +56,9 @@ def test_outlets_have_their_state_and_the_reason_why_they_are_off(cards: Tab) ->
     assert "no control" in reason(cards, "outlet-o3")
 
 
-def test_what_was_asked_is_shown_until_the_outlet_reports_it(server: CannedServer, browser: Browser) -> None:
+def test_what_was_asked_is_shown_until_the_outlet_reports_it(show: Show, server: CannedServer) -> None:
     report = outlet("o2")
-    server.show(with_values(lambda _now: (GOOB, O2, report, 0.0), repeated={O2: 0.1}))
-    with tab(browser, server.url + server.state.path) as opened:
+    with show(with_values(lambda _now: (GOOB, O2, report, 0.0), repeated={O2: 0.1})) as opened:
         opened.test("outlet-o2").click()
         assert opened.until(lambda: server.sent("outlet"))
         assert server.sent("outlet") == [{"op": "outlet", "ref": GOOB, "outlet": "o2", "on": True}]
@@ -81,9 +72,8 @@ def test_what_was_asked_is_shown_until_the_outlet_reports_it(server: CannedServe
         assert opened.until(lambda: [one["on"] for one in server.sent("outlet")] == [True, False])
 
 
-def test_a_refusal_stands_at_what_was_asked(server: CannedServer, browser: Browser) -> None:
-    server.show(replace(STATES["devices"], refused="No, why"))
-    with tab(browser, server.url + server.state.path) as opened:
+def test_a_refusal_stands_at_what_was_asked(show: Show) -> None:
+    with show(replace(STATES["devices"], refused="No, why")) as opened:
         opened.test("outlet-o2").click()
         card = opened.page.locator('[data-card="outlets"]')
         assert opened.until(lambda: card.get_by_text("not done: No, why").count() == 1)
@@ -96,10 +86,9 @@ def test_a_refusal_stands_at_what_was_asked(server: CannedServer, browser: Brows
         assert "not done" not in opened.test("mcu-in-arm").inner_text()
 
 
-def test_what_is_on_can_be_switched_off_while_the_robot_is_silent(server: CannedServer, browser: Browser) -> None:
+def test_what_is_on_can_be_switched_off_while_the_robot_is_silent(show: Show, server: CannedServer) -> None:
     silent = at(GOOB, "web/liveness", liveness(online=False, silent_s=9.0, latency_ms=None))
-    server.show(with_values(silent))
-    with tab(browser, server.url + server.state.path) as opened:
+    with show(with_values(silent)) as opened:
         assert opened.until(lambda: opened.test("outlet-o2").is_disabled())
         assert reason(opened, "outlet-o2") == "goob is silent"
         assert opened.test("outlet-state-o1").inner_text() == "was on"
@@ -107,9 +96,8 @@ def test_what_is_on_can_be_switched_off_while_the_robot_is_silent(server: Canned
         assert opened.until(lambda: [one["on"] for one in server.sent("outlet")] == [False])
 
 
-def test_a_viewer_may_look(server: CannedServer, browser: Browser) -> None:
-    server.show(STATES["devices-viewer"])
-    with tab(browser, server.url + server.state.path) as opened:
+def test_a_viewer_may_look(show: Show) -> None:
+    with show(STATES["devices-viewer"]) as opened:
         assert opened.until(lambda: opened.test("outlet-o1").is_disabled())
         assert reason(opened, "outlet-o1") == "Log in as driver to use this"
         assert opened.test("send-lamp").is_disabled()
@@ -193,7 +181,7 @@ HOSTILE: dict[str, Any] = {
 }
 
 
-def test_hostile_manifests_reports_and_capabilities_do_no_harm(server: CannedServer, browser: Browser) -> None:
+def test_hostile_manifests_reports_and_capabilities_do_no_harm(show: Show, server: CannedServer) -> None:
     odd = [
         at(GOOB, f"mcu/{SCRIPT.replace('/', '')} {name}/describe", manifest) for name, manifest in HOSTILE.items()
     ]  # fmt: skip
@@ -201,8 +189,7 @@ def test_hostile_manifests_reports_and_capabilities_do_no_harm(server: CannedSer
         at(GOOB, f"outlets/odd{n}/status", value) for n, value in enumerate([7, "x", [], {}, {"value": []}, nested(30)])
     ]
     odd += [at(GOOB, "mcu/lamp-1/lamp", [1]), at(GOOB, "mcu/lamp-1/glow", {"value": {"lux": {"a": nested(25)}}})]
-    server.show(with_values(*odd))
-    with tab(browser, server.url + server.state.path) as opened:
+    with show(with_values(*odd)) as opened:
         opened.test("mcu-hs105-sta").wait_for()
         assert opened.until(lambda: opened.page.locator(".mcu").count() == len(HOSTILE) + 2)
         assert opened.page.locator(".mcu img, .card .failed").count() == 0
@@ -215,9 +202,8 @@ def test_hostile_manifests_reports_and_capabilities_do_no_harm(server: CannedSer
 # -- all values
 
 
-def test_values_of_a_component_of_any_type_are_shown_in_lines(server: CannedServer, browser: Browser) -> None:
-    server.show(STATES["satellite"])
-    with tab(browser, server.url + server.state.path) as opened:
+def test_values_of_a_component_of_any_type_are_shown_in_lines(show: Show) -> None:
+    with show(STATES["satellite"]) as opened:
         shown = opened.test("value-status")
         shown.wait_for()
         assert [" ".join(line.split()) for line in shown.locator("li").all_inner_texts()] == [

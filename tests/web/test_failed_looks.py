@@ -5,10 +5,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from playwright.sync_api import Browser
 
-from tests.web.browser import Size, Theme, tab
-from tests.web.canned import serving
+from tests.web.browser import Size, Theme
+from tests.web.canned import Show
 from tests.web.states import STATES
 
 pytestmark = pytest.mark.page
@@ -33,36 +32,23 @@ LATE = ("drive-settings.js", "key-hints.js", "telemetry.js", "map.js", "lights.j
 
 @pytest.mark.parametrize("theme", ["light", "dark"])
 @pytest.mark.parametrize("size", ["desktop", "phone"])
-def test_the_stick_is_seen_in_forced_colours(browser: Browser, size: Size, theme: Theme) -> None:
-    with serving(STATES["driving"]) as server:
-        url = server.url + STATES["driving"].path
-        with tab(browser, url, size, theme, forced_colors="active") as opened:
-            opened.uncover("stick")
-            assert opened.until(
-                "getComputedStyle(document.querySelector('.knob')).forcedColorAdjust === 'none'"
-            )  # its sheet is here
-            for one in DRAWN:
-                data = np.frombuffer(opened.page.locator(one).first.screenshot(), np.uint8)
-                picture = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
-                assert picture is not None
-                assert int(picture.max()) - int(picture.min()) > 100, one
-            left = "document.querySelector('.stick-arrow.n')"
-            assert opened.page.evaluate(f"getComputedStyle({left}).borderLeftColor") == "rgba(0, 0, 0, 0)", "a triangle"
+def test_the_stick_is_seen_in_forced_colours(show: Show, size: Size, theme: Theme) -> None:
+    with show(STATES["driving"], size, theme=theme, forced_colors="active") as opened:
+        opened.uncover("stick")
+        sheet = "getComputedStyle(document.querySelector('.knob')).forcedColorAdjust === 'none'"
+        assert opened.until(sheet)
+        for one in DRAWN:
+            data = np.frombuffer(opened.page.locator(one).first.screenshot(), np.uint8)
+            picture = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
+            assert picture is not None
+            assert int(picture.max()) - int(picture.min()) > 100, one
+        left = "document.querySelector('.stick-arrow.n')"
+        assert opened.page.evaluate(f"getComputedStyle({left}).borderLeftColor") == "rgba(0, 0, 0, 0)", "a triangle"
 
 
 @pytest.mark.parametrize("size", ["desktop", "phone"])
-def test_what_still_loads_lies_over_nothing(browser: Browser, size: Size) -> None:
-    with serving(STATES["driving"]) as server, tab(browser, "about:blank", size) as opened:
-        for name in (
-            "drive-settings.js",
-            "key-hints.js",
-            "telemetry.js",
-            "map.js",
-            "lights.js",
-            "plots.js",
-            "panels.css",
-        ):
-            opened.context.route(f"**/{name}", lambda _: None)  # it never comes
-        opened.page.goto(server.url + STATES["driving"].path)
+def test_what_still_loads_lies_over_nothing(show: Show, size: Size) -> None:
+    late = {f"**/{name}": lambda _: None for name in LATE}  # they never come
+    with show(STATES["driving"], size, routes=late) as opened:
         assert opened.until(f"{COVERED}[0] > 0", 20)
         assert opened.until(f"{COVERED}.slice(1).join() === '0,0'", 5), opened.page.evaluate(COVERED)

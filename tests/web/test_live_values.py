@@ -5,10 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
-from playwright.sync_api import Browser
 
-from tests.web.browser import tab
-from tests.web.canned import serving
+from tests.web.canned import CannedServer, Show
 from tests.web.states import GOOB, STATES
 
 pytestmark = pytest.mark.page
@@ -21,9 +19,9 @@ SEND = """async ([ref, count]) => {
 }"""
 
 
-def test_a_value_that_stops_becomes_late_and_the_next_one_is_fresh(browser: Browser) -> None:
+def test_a_value_that_stops_becomes_late_and_the_next_one_is_fresh(show: Show) -> None:
     state = replace(STATES["fleet"], repeated={})
-    with serving(state) as server, tab(browser, server.url + state.path) as opened:
+    with show(state) as opened:
         level = opened.test("card-goob").get_by_text("7.00 V")
         opened.test("card-goob").wait_for()
         opened.page.evaluate(SEND, [GOOB, 6])
@@ -34,10 +32,10 @@ def test_a_value_that_stops_becomes_late_and_the_next_one_is_fresh(browser: Brow
         assert opened.until(lambda: level.inner_text() == "7.00 V 0 s old", 3), level.inner_text()
 
 
-def test_the_state_of_an_earlier_connection_allows_no_driving(browser: Browser) -> None:
+def test_the_state_of_an_earlier_connection_allows_no_driving(show: Show, server: CannedServer) -> None:
     state = replace(STATES["driving"], repeated={})
     reason = "pebble.driver.reason()?.code"
-    with serving(state) as server, tab(browser, server.url + state.path) as opened:
+    with show(state) as opened:
         assert opened.until(f"window.pebble && {reason} === undefined", 10)
         # another server answers, and what it knows comes a moment later
         assert opened.page.evaluate(f"pebble.driver.socket.welcome(pebble.driver.socket.you), {reason}") == "server"

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import pytest
@@ -14,7 +14,7 @@ from playwright.sync_api import Browser, Page
 
 from tests.support import ROOT
 from tests.web.browser import Size, Tab, Theme, tab
-from tests.web.canned import CannedServer, serving
+from tests.web.canned import CannedServer, Show
 from tests.web.states import STATES
 
 PICTURES = ROOT / "build" / "page"
@@ -281,12 +281,6 @@ CASES = [(screen, size) for screen in SCREENS for size in screen.sizes]
 
 
 @pytest.fixture(scope="module")
-def server() -> Iterator[CannedServer]:
-    with serving() as canned:
-        yield canned
-
-
-@pytest.fixture(scope="module")
 def axe() -> str:
     if not AXE.exists():
         missing = pytest.fail if os.environ.get("CI") == "true" else pytest.skip
@@ -300,7 +294,7 @@ def case(request: pytest.FixtureRequest) -> tuple[Screen, Size]:
     return chosen
 
 
-def test_screen(server: CannedServer, browser: Browser, axe: str, case: tuple[Screen, Size]) -> None:
+def test_screen(show: Show, server: CannedServer, browser: Browser, axe: str, case: tuple[Screen, Size]) -> None:
     screen, size = case
     state = STATES[screen.state]
     server.show(state)

@@ -6,10 +6,10 @@ from collections.abc import Iterator
 from contextlib import suppress
 
 import pytest
-from playwright.sync_api import Browser, Error, Page
+from playwright.sync_api import Error, Page
 
-from tests.web.browser import Tab, tab
-from tests.web.canned import serving
+from tests.web.browser import Tab
+from tests.web.canned import CannedServer, Show
 from tests.web.states import GOOB, STATES
 
 _DENY = """for (const [owner, names] of [%s]) for (const name of names.split(" "))
@@ -77,8 +77,8 @@ _RARE = pytest.mark.page
 
 
 @pytest.fixture(scope="module")
-def driving(browser: Browser) -> Iterator[Tab]:
-    with serving(STATES["driving"]) as canned, tab(browser, canned.url + canned.state.path) as opened:
+def driving(show: Show) -> Iterator[Tab]:
+    with show(STATES["driving"]) as opened:
         assert opened.until(f"{_WORDS}.includes('connected ·') && pebble.driver.pads !== null")
         yield opened
 
@@ -86,15 +86,12 @@ def driving(browser: Browser) -> Iterator[Tab]:
 @pytest.mark.parametrize(
     "denied", [one if one == "everything throws" else pytest.param(one, marks=_RARE) for one in DENIED]
 )
-def test_what_a_browser_denies_keeps_no_page_from_its_server(browser: Browser, denied: str) -> None:
-    with (
-        serving(STATES["driving"]) as canned,
-        tab(browser, canned.url + canned.state.path, script=DENIED[denied]) as opened,
-    ):
+def test_what_a_browser_denies_keeps_no_page_from_its_server(show: Show, server: CannedServer, denied: str) -> None:
+    with show(STATES["driving"], script=DENIED[denied]) as opened:
         assert opened.until(f"{_WORDS}.includes('connected ·')"), opened.page.evaluate(_WORDS)
         assert opened.until("window.pebble.driver.pads !== null")  # all of the rest is there, too
         opened.page.keyboard.press("Control+Space")
-        assert opened.until(lambda: any(op.get("op") == "estop" for op in canned.received))
+        assert opened.until(lambda: any(op.get("op") == "estop" for op in server.received))
         assert opened.errors == []
 
 
@@ -118,15 +115,15 @@ def test_state_is_shown_whatever_others_do_to_the_page(driving: Tab, change: str
         pytest.param("document.write('<p>to be read</p>')", marks=_RARE),
     ],
 )
-def test_a_page_whose_whole_document_was_replaced_is_loaded_again(browser: Browser, change: str) -> None:
+def test_a_page_whose_document_was_replaced_is_loaded_again(show: Show, server: CannedServer, change: str) -> None:
     """What listened to keys and buttons may have gone with it."""
-    with serving(STATES["driving"]) as canned, tab(browser, canned.url + canned.state.path) as opened:
+    with show(STATES["driving"]) as opened:
         assert opened.until("window.pebble?.driver.pads != null")
         with suppress(Error):  # it is gone before it can answer
             opened.page.evaluate(f"() => {{ pebble.old = true; {change}; }}")
         assert opened.until(lambda: _is_new(opened.page))
         opened.page.keyboard.press("Control+Space")
-        assert opened.until(lambda: any(op.get("op") == "estop" for op in canned.received))
+        assert opened.until(lambda: any(op.get("op") == "estop" for op in server.received))
 
 
 def _is_new(page: Page) -> bool:
@@ -143,10 +140,12 @@ def _is_new(page: Page) -> bool:
         "value: function () { throw new DOMException('denied', 'SecurityError'); }",
     ],
 )
-def test_without_sockets_the_page_reports_no_connection_and_stops_by_a_request(browser: Browser, how: str) -> None:
+def test_without_sockets_the_page_has_no_connection_and_stops_by_a_request(
+    show: Show, server: CannedServer, how: str
+) -> None:
     script = _DENY % ("[window, 'WebSocket']", how)
-    with serving(STATES["driving"]) as canned, tab(browser, canned.url + canned.state.path, script=script) as opened:
+    with show(STATES["driving"], script=script) as opened:
         assert opened.until(f"{_WORDS}.includes('No connection to the server')")
         opened.page.keyboard.press("Control+Space")
-        assert opened.until(lambda: any(name == "estop" for name, _ in canned.posted))
+        assert opened.until(lambda: any(name == "estop" for name, _ in server.posted))
         assert opened.errors == []

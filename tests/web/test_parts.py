@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import pytest
-from playwright.sync_api import Browser
 
-from tests.web.browser import tab
-from tests.web.canned import CannedServer, serving
+from tests.web.browser import answer
+from tests.web.canned import CannedServer, Show
 from tests.web.states import GOOB, STATES
 
 pytestmark = pytest.mark.page
@@ -19,17 +16,8 @@ SHOWN = "document.querySelector('.vital .chip:last-child').innerText + document.
 HERE = r"performance.getEntriesByType('resource').map((one) => one.name.match(/(\w+).js$/)?.[1])"
 
 
-@pytest.fixture(scope="module")
-def server() -> Iterator[CannedServer]:
-    with serving() as canned:
-        canned.show(STATES["driving"])
-        yield canned
-
-
-def test_a_screen_that_cannot_be_fetched_is_tried_again_while_stop_works(server: CannedServer, browser: Browser):
-    with tab(browser, "about:blank") as opened:
-        opened.context.route(SCREEN, lambda route: route.abort())
-        opened.page.goto(server.url + STATES["driving"].path)
+def test_a_screen_that_cannot_be_fetched_is_tried_again_while_stop_works(show: Show, server: CannedServer):
+    with show(STATES["driving"], routes={SCREEN: lambda route: route.abort()}) as opened:
         opened.page.locator(".loading").wait_for()
         opened.page.keyboard.down("KeyW")
         opened.page.wait_for_timeout(300)
@@ -46,8 +34,8 @@ def test_a_screen_that_cannot_be_fetched_is_tried_again_while_stop_works(server:
         assert opened.until(lambda: opened.page.locator(".loading").count() == 0)  # those of cards come and go
 
 
-def test_the_other_screens_are_here_without_a_server(server: CannedServer, browser: Browser):
-    with tab(browser, server.url) as opened:
+def test_the_other_screens_are_here_without_a_server(show: Show):
+    with show(STATES["fleet"]) as opened:
         assert opened.until(lambda: set(LATER) <= set(opened.page.evaluate(HERE)))
         opened.context.set_offline(True)
         opened.page.locator("[data-test^=card-]", has_text="goob").locator("a").first.click()
@@ -56,8 +44,8 @@ def test_the_other_screens_are_here_without_a_server(server: CannedServer, brows
         opened.test("theme-dark").wait_for()
 
 
-def test_only_one_panel_is_open(server: CannedServer, browser: Browser):
-    with tab(browser, server.url + STATES["driving"].path) as opened:
+def test_only_one_panel_is_open(show: Show) -> None:
+    with show(STATES["driving"]) as opened:
         opened.test("bell").click()
         opened.test("panel-notices").wait_for()
         opened.test("help").click()
@@ -68,10 +56,8 @@ def test_only_one_panel_is_open(server: CannedServer, browser: Browser):
         assert opened.until(lambda: opened.page.locator("dialog").count() == 1)
 
 
-def test_a_driver_sees_that_the_robot_can_no_longer_be_driven_and_then_that_it_can(
-    server: CannedServer, browser: Browser
-):
-    with tab(browser, server.url + STATES["driving"].path) as opened:
+def test_a_driver_sees_that_the_robot_can_no_longer_be_driven_and_then_that_it_can(show: Show) -> None:
+    with show(STATES["driving"]) as opened:
         opened.test("bell").wait_for()
         for state, chip, hint in (
             ("yes", "You drive", "drag the stick"),
@@ -86,8 +72,8 @@ def test_a_driver_sees_that_the_robot_can_no_longer_be_driven_and_then_that_it_c
         assert opened.until("document.querySelector('.notice-driveable').innerText.includes('can be driven again 2')")
 
 
-def test_a_button_that_is_switched_off_while_it_is_held_does_nothing(browser: Browser):
-    with serving(STATES["stopped"]) as stopped, tab(browser, stopped.url + STATES["stopped"].path) as opened:
+def test_a_button_that_is_switched_off_while_it_is_held_does_nothing(show: Show, server: CannedServer) -> None:
+    with show(STATES["stopped"]) as opened:
         opened.test("reset").click()
         opened.test("reset-hold").hover()
         opened.page.evaluate("pebble.pressedAt = performance.now()")
@@ -97,17 +83,14 @@ def test_a_button_that_is_switched_off_while_it_is_held_does_nothing(browser: Br
         assert opened.until(lambda: opened.page.locator(".held").count() == 0, 0.9)
         opened.page.evaluate("delete pebble.connection.may; pebble.connection.changed()")
         assert opened.until("performance.now() - pebble.pressedAt > 1500")
-        assert stopped.sent("estop-reset") == []
+        assert server.sent("estop-reset") == []
 
 
-def test_the_picture_outlives_what_belongs_to_it(browser: Browser):
+def test_the_picture_outlives_what_belongs_to_it(show: Show):
     """What a robot reports of its own stream is drawn by a part that is fetched later; here that part fails."""
-    with serving(STATES["driving"]) as canned, tab(browser, "about:blank") as opened:
-        broken = "export const Layer = () => { throw new Error('broken'); }; export const Tools = Layer;"
-        opened.context.route(
-            "**/ui/robot/picture-extras.js", lambda route: route.fulfill(body=broken, content_type="text/javascript")
-        )
-        opened.page.goto(canned.url + STATES["driving"].path)
+    broken = "export const Layer = () => { throw new Error('broken'); }; export const Tools = Layer;"
+    extras = {"**/ui/robot/picture-extras.js": answer(broken)}
+    with show(STATES["driving"], routes=extras) as opened:
         assert opened.until(lambda: opened.page.locator(".failed").count() == 2)
         assert opened.until(lambda: opened.page.locator(".canvas canvas").is_visible())
         assert opened.test("video").is_enabled()

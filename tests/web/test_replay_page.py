@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 from urllib.parse import quote
 
@@ -12,15 +13,15 @@ import pytest
 from playwright.sync_api import Browser, Route
 
 from tests.web import recorded
-from tests.web.browser import PIXELS, Tab, tab
-from tests.web.canned import CannedServer, serving
+from tests.web.browser import PIXELS, Tab
+from tests.web.canned import CannedServer, Show
 from tests.web.recorded import DAY, END, GAP, ROBOT, START
 from tests.web.states import STATES
 
 pytest.importorskip("duckdb")  # it makes timelines
 pytestmark = [pytest.mark.page, pytest.mark.timeout(180)]
 
-SEGMENTS = re.compile("/archive/segment")
+SEGMENTS, TIMELINE = re.compile("/archive/segment"), re.compile("/archive/timeline")
 AT = START + 30_000
 #: What every page sends of itself, on any screen.
 USUAL = {"hello", "echo", "watch"}
@@ -28,17 +29,10 @@ _DRAWN = """(at) => { const { player, drawnAt } = window.pebble?.replay ?? {};
   return Boolean(drawnAt) && drawnAt.seeks === player.seeks && drawnAt.receivedMs === at; }"""
 
 
-@pytest.fixture(scope="module")
-def server() -> Iterator[CannedServer]:
-    with serving() as canned:
-        yield canned
-
-
 @pytest.fixture
-def replay(server: CannedServer, browser: Browser) -> Iterator[Tab]:
+def replay(show: Show, server: CannedServer) -> Iterator[Tab]:
     """Half a minute after the begin, paused; whatever a test does there, no robot is sent anything."""
-    server.show(STATES["replay"])
-    with tab(browser, server.url + STATES["replay"].path) as opened:
+    with show(STATES["replay"]) as opened:
         assert shown(opened, AT)
         assert opened.until("!!window.pebble?.replay?.timeline", 30)
         yield opened
@@ -64,9 +58,8 @@ def stored(opened: Tab, metric: str) -> Any:
     return opened.page.evaluate("([ref, m]) => pebble.replay.store.get(ref, m)?.value", [ROBOT, metric])
 
 
-def test_the_way_to_a_day_and_a_robot(server: CannedServer, browser: Browser):
-    server.show(STATES["recordings"])
-    with tab(browser, f"{server.url}/") as opened:
+def test_the_way_to_a_day_and_a_robot(show: Show) -> None:
+    with show(replace(STATES["recordings"], path="/")) as opened:
         opened.page.get_by_role("link", name="Recordings").click()
         day = opened.test(f"day-{DAY}")
         day.wait_for()
@@ -84,9 +77,8 @@ def test_the_way_to_a_day_and_a_robot(server: CannedServer, browser: Browser):
         assert opened.complaints() == []
 
 
-def test_no_way_leads_there_without_recordings(server: CannedServer, browser: Browser):
-    server.show(STATES["fleet"])
-    with tab(browser, f"{server.url}/") as opened:
+def test_no_way_leads_there_without_recordings(show: Show) -> None:
+    with show(STATES["fleet"]) as opened:
         opened.test("phone").wait_for()
         assert opened.page.locator("a[href^='/replay']").count() == 0
 
@@ -204,9 +196,8 @@ def test_the_end_of_the_recording_is_shown(replay: Tab):
     assert replay.test("play").inner_text() == "Play"
 
 
-def test_a_time_at_which_nothing_was_recorded(server: CannedServer, browser: Browser):
-    server.show(STATES["replay-gap"])
-    with tab(browser, server.url + STATES["replay-gap"].path) as opened:
+def test_a_time_at_which_nothing_was_recorded(show: Show) -> None:
+    with show(STATES["replay-gap"]) as opened:
         assert opened.until(lambda: "No picture was recorded here" in opened.test("cover").inner_text(), 15)
 
 
@@ -235,8 +226,7 @@ def test_a_damaged_answer_is_played_as_far_as_it_is_whole(replay: Tab):
     replay.page.unroute(SEGMENTS)
 
 
-def test_a_day_that_is_being_indexed(server: CannedServer, browser: Browser):
-    server.show(STATES["replay"])
+def test_a_day_that_is_being_indexed(show: Show) -> None:
     answers = iter(range(1, 3))
 
     def indexing(route: Route) -> None:
@@ -246,17 +236,16 @@ def test_a_day_that_is_being_indexed(server: CannedServer, browser: Browser):
         else:
             route.continue_()
 
-    with tab(browser, "about:blank") as opened:
-        opened.context.route(re.compile("/archive/timeline"), indexing)
-        opened.page.goto(server.url + STATES["replay"].path)
+    with show(STATES["replay"], routes={TIMELINE: indexing}) as opened:
         opened.page.get_by_text("This day is being indexed: 25 %").wait_for()
         assert opened.until("!!window.pebble?.replay?.timeline", 30)
         opened.page.get_by_text("not recorded (1)").wait_for()
 
 
 @pytest.mark.parametrize("size", ["desktop", "phone"])
-def test_a_day_that_cannot_be_indexed_is_tried_again_by_people_only(browser: Browser, server: CannedServer, size):
-    server.show(STATES["replay"])
+def test_a_day_that_cannot_be_indexed_is_tried_again_by_people_only(
+    show: Show, server: CannedServer, browser: Browser, size
+) -> None:
     asked: list[str] = []
 
     def failing(route: Route) -> None:
@@ -266,9 +255,7 @@ def test_a_day_that_cannot_be_indexed_is_tried_again_by_people_only(browser: Bro
         else:
             route.fulfill(status=422, body='this needs DuckDB: pip install "pebble-robot[archive]"')
 
-    with tab(browser, "about:blank", size) as opened:
-        opened.context.route(re.compile("/archive/timeline"), failing)
-        opened.page.goto(server.url + STATES["replay"].path)
+    with show(STATES["replay"], size, routes={TIMELINE: failing}) as opened:
         opened.page.get_by_text("this needs DuckDB: pip install").wait_for()
         opened.page.wait_for_timeout(1500)  # three questions of a page that would go on
         before = len(asked)
@@ -332,9 +319,8 @@ def test_a_stretch_is_downloaded_and_a_download_is_cancelled(replay: Tab):
     assert replay.until(lambda: replay.test("download").is_enabled())
 
 
-def test_stop_all_works_here_as_everywhere(server: CannedServer, browser: Browser):
-    server.show(STATES["replay"])
-    with tab(browser, server.url + STATES["replay"].path) as opened:
+def test_stop_all_works_here_as_everywhere(show: Show, server: CannedServer) -> None:
+    with show(STATES["replay"]) as opened:
         assert shown(opened, AT)
         opened.test("stop-all").click()
         assert opened.until(lambda: server.sent("estop"))
@@ -345,9 +331,8 @@ def test_stop_all_works_here_as_everywhere(server: CannedServer, browser: Browse
         assert opened.until(lambda: len(server.sent("estop")) == 2)
 
 
-def test_space_stops_robots_again_once_the_page_is_left(server: CannedServer, browser: Browser):
-    server.show(STATES["replay"])
-    with tab(browser, server.url + STATES["replay"].path) as opened:
+def test_space_stops_robots_again_once_the_page_is_left(show: Show, server: CannedServer) -> None:
+    with show(STATES["replay"]) as opened:
         assert shown(opened, AT)
         opened.test("badge").get_by_role("link").click()
         assert opened.until(f"pebble.driver.ref === '{ROBOT}' && pebble.replay === null")
@@ -355,9 +340,8 @@ def test_space_stops_robots_again_once_the_page_is_left(server: CannedServer, br
         assert opened.until(lambda: server.sent("stop") == [{"op": "stop", "ref": ROBOT}])
 
 
-def test_two_hundred_seeks_leave_nothing_behind(server: CannedServer, browser: Browser):
+def test_two_hundred_seeks_leave_nothing_behind(show: Show, server: CannedServer) -> None:
     """Bitmaps are closed, requests given up, and there is one worker."""
-    server.show(STATES["replay"])
     counting = """const made = window.made = { open: 0, workers: 0 };
       const close = ImageBitmap.prototype.close; const drawn = CanvasRenderingContext2D.prototype.drawImage;
       const known = new WeakSet();
@@ -374,7 +358,7 @@ def test_two_hundred_seeks_leave_nothing_behind(server: CannedServer, browser: B
         while (performance.now() < end && !(replay.player.seeks > seeks && replay.drawnAt.seeks ===
         replay.player.seeks)) await later(2); }
       return [replay.player.seeks, replay.drawnAt.seeks]; }"""
-    with tab(browser, server.url + STATES["replay"].path, script=counting) as opened:
+    with show(STATES["replay"], script=counting) as opened:
         assert shown(opened, AT)
         times = [START + (7919 * number) % 85_000 + 1000 for number in range(240)]
         cdp = opened.cdp()
@@ -459,9 +443,8 @@ def test_a_snapshot_is_named_after_the_time_at_which_it_was_taken(replay: Tab):
     assert download.value.suggested_filename == "goob-2026-11-22T10-00-29.png"
 
 
-def test_a_phone_has_all_of_it_and_fingers_move_the_day(server: CannedServer, browser: Browser):
-    server.show(STATES["replay"])
-    with tab(browser, server.url + STATES["replay"].path, "phone") as opened:
+def test_a_phone_has_all_of_it_and_fingers_move_the_day(show: Show) -> None:
+    with show(STATES["replay"], "phone") as opened:
         assert shown(opened, AT)
         assert opened.until("!!window.pebble?.replay?.timeline", 30)
         canvas = opened.test("timeline")

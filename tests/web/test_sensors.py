@@ -7,8 +7,8 @@ import itertools
 import re
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,8 +16,8 @@ import pytest
 from PIL import Image
 from playwright.sync_api import Browser
 
-from tests.web.browser import PIXELS, Tab, tab
-from tests.web.canned import CannedServer, State, serving
+from tests.web.browser import PIXELS, Tab
+from tests.web.canned import CannedServer, Show, showing
 from tests.web.states import GOOB, MINE, SENSORS, STATES, STREAM, asked, at, changed, fleet, liveness, with_stream
 
 pytestmark = pytest.mark.page
@@ -39,24 +39,13 @@ CanvasRenderingContext2D.prototype.fillText = function (...text) {
 
 
 @pytest.fixture(scope="module")
-def server() -> Iterator[CannedServer]:
-    with serving() as canned:
-        yield canned
-
-
-@contextmanager
-def showing(
-    server: CannedServer, browser: Browser, state: State, size: Any = "desktop", **options: Any
-) -> Iterator[Tab]:
-    server.show(state)
-    with tab(browser, server.url + state.path, size, **options) as opened:
-        assert opened.until("!!window.pebble?.connection.you")
-        yield opened
+def show(server: CannedServer, browser: Browser) -> Show:
+    return partial(showing, server, browser, when="!!window.pebble?.connection.you")
 
 
 @pytest.fixture(scope="module")
-def _sensors(server: CannedServer, browser: Browser) -> Iterator[Tab]:
-    with showing(server, browser, SENSORS, script=COUNT) as opened:
+def _sensors(show: Show) -> Iterator[Tab]:
+    with show(SENSORS, script=COUNT) as opened:
         yield opened
 
 
@@ -131,9 +120,9 @@ def test_the_newest_values_are_text(sensors: Tab) -> None:
     assert len(set(dashes)) == 3
 
 
-def test_the_last_values_of_a_silent_robot_are_old_ones(server: CannedServer, browser: Browser) -> None:
+def test_the_last_values_of_a_silent_robot_are_old_ones(show: Show) -> None:
     silent = at(GOOB, "web/liveness", liveness(online=False, silent_s=9.0, latency_ms=None))
-    with showing(server, browser, replace(SENSORS, values=changed(SENSORS.values, silent), repeated={})) as opened:
+    with show(replace(SENSORS, values=changed(SENSORS.values, silent), repeated={})) as opened:
         see(opened, "plot-battery")
         text = opened.test("plot-battery").locator("li")
         assert opened.until(lambda: re.fullmatch(r"battery\s+– \(\d+ s ago: 7\.92 V\)", text.inner_text()))
@@ -168,8 +157,8 @@ def test_a_pause_and_a_closed_card_draw_nothing(sensors: Tab) -> None:
     assert sensors.until(lambda: line(sensors, "plot-touch", 0.25, 0.5) > 10), "what was remembered is there again"
 
 
-def test_a_plot_is_added_remembered_and_removed(server: CannedServer, browser: Browser) -> None:
-    with showing(server, browser, SENSORS) as opened:
+def test_a_plot_is_added_remembered_and_removed(show: Show) -> None:
+    with show(SENSORS) as opened:
         see(opened, "plots-add")
         add = opened.test("plots-add")
         add.select_option("sensors/imu accel_mps2")
@@ -187,11 +176,11 @@ def test_a_plot_is_added_remembered_and_removed(server: CannedServer, browser: B
         assert opened.complaints() == []
 
 
-def test_uplot_is_fetched_with_the_plots_only(server: CannedServer, browser: Browser) -> None:
+def test_uplot_is_fetched_with_the_plots_only(show: Show) -> None:
     fetched = (
         "performance.getEntriesByType('resource').map((one) => one.name).filter((one) => /uPlot/.test(one)).length"
     )
-    with showing(server, browser, replace(SENSORS, path="/")) as opened:
+    with show(replace(SENSORS, path="/")) as opened:
         opened.page.locator("[data-test^=card-]").first.wait_for()
         assert opened.page.evaluate(fetched) == 0
 
@@ -212,8 +201,8 @@ NASTY: list[Any] = [
 
 
 @pytest.mark.parametrize("metric", ["sensors/imu", "wheel-odometry", "video-overlays", "status", "charging-level"])
-def test_no_payload_breaks_a_card(server: CannedServer, browser: Browser, metric: str) -> None:
-    with showing(server, browser, SENSORS) as opened:
+def test_no_payload_breaks_a_card(show: Show, metric: str) -> None:
+    with show(SENSORS) as opened:
         opened.test("plot-battery").wait_for()
         for payload in NASTY:
             opened.page.evaluate(
@@ -252,9 +241,9 @@ def trail(opened: Tab) -> dict[str, int]:
 
 
 @pytest.mark.parametrize("samples", [True, False])
-def test_a_position_that_cannot_change_is_explained(server: CannedServer, browser: Browser, samples: bool) -> None:
+def test_a_position_that_cannot_change_is_explained(show: Show, samples: bool) -> None:
     odometry = asked(telemetry={"touch_sensors": samples})
-    with showing(server, browser, replace(SENSORS, values=changed(SENSORS.values, odometry))) as opened:
+    with show(replace(SENSORS, values=changed(SENSORS.values, odometry))) as opened:
         see(opened, "map")
         assert opened.until(lambda: opened.test("map-pose").inner_text().startswith("x "))
         lacks = opened.test("map-lacks")
@@ -292,8 +281,8 @@ def test_the_map_is_moved_zoomed_and_centred(sensors: Tab) -> None:
     assert sensors.until(lambda: trail(sensors)["middle"] > 30)
 
 
-def test_one_finger_scrolls_the_page_and_two_zoom_the_map(server: CannedServer, browser: Browser) -> None:
-    with showing(server, browser, SENSORS, "phone") as opened:
+def test_one_finger_scrolls_the_page_and_two_zoom_the_map(show: Show) -> None:
+    with show(SENSORS, "phone") as opened:
         opened.test("tab-sensors").click()
         opened.test("map").wait_for()
         assert opened.until(lambda: opened.page.locator(".loading").count() == 0)  # a card above it would move it
@@ -384,17 +373,15 @@ OVERLAYS = STATES["overlays"]
         pytest.param("landscape", {}),
     ],
 )
-def test_what_is_drawn_over_a_picture_is_where_it_belongs(
-    server: CannedServer, browser: Browser, size: Any, options: dict[str, Any]
-) -> None:
-    with showing(server, browser, OVERLAYS, size, **options) as opened:
+def test_what_is_drawn_over_a_picture_is_where_it_belongs(show: Show, size: Any, options: dict[str, Any]) -> None:
+    with show(OVERLAYS, size, **options) as opened:
         opened.page.evaluate(_PLAIN)
         assert_a_square_in_the_middle(opened, options.get("device_scale_factor", 1))
         assert opened.complaints() == []
 
 
-def test_in_full_screen_too_where_stop_and_the_reason_remain(server: CannedServer, browser: Browser) -> None:
-    with showing(server, browser, OVERLAYS) as opened:
+def test_in_full_screen_too_where_stop_and_the_reason_remain(show: Show, server: CannedServer) -> None:
+    with show(OVERLAYS) as opened:
         opened.page.evaluate(_PLAIN)
         opened.test("full-screen").click()
         assert opened.until("!!document.fullscreenElement && !!document.querySelector('.immersive')")
@@ -405,8 +392,8 @@ def test_in_full_screen_too_where_stop_and_the_reason_remain(server: CannedServe
         assert opened.until(lambda: server.sent("estop"))
 
 
-def test_overlays_vanish_half_a_second_after_the_last(server: CannedServer, browser: Browser) -> None:
-    with showing(server, browser, replace(OVERLAYS, repeated={"web/liveness": 1.0})) as opened:
+def test_overlays_vanish_half_a_second_after_the_last(show: Show) -> None:
+    with show(replace(OVERLAYS, repeated={"web/liveness": 1.0})) as opened:
         assert opened.until("!!document.querySelector('[data-test=overlays-canvas]')")
         opened.page.evaluate(SET, ["video-overlays", {"shapes": [[[0.2, 0.2], [0.8, 0.8]]]}])
         canvas = 'document.querySelector("[data-test=overlays-canvas]")'
@@ -417,8 +404,8 @@ def test_overlays_vanish_half_a_second_after_the_last(server: CannedServer, brow
         assert time.monotonic() - began < 1.5
 
 
-def test_overlays_are_switched_off_and_stay_so(server: CannedServer, browser: Browser) -> None:
-    with showing(server, browser, OVERLAYS) as opened:
+def test_overlays_are_switched_off_and_stay_so(show: Show) -> None:
+    with show(OVERLAYS) as opened:
         opened.test("overlays").click()
         assert opened.until("!document.querySelector('[data-test=overlays-canvas]')")
         opened.page.reload()
@@ -427,8 +414,8 @@ def test_overlays_are_switched_off_and_stay_so(server: CannedServer, browser: Br
         assert opened.page.evaluate("!document.querySelector('[data-test=overlays-canvas]')")
 
 
-def test_a_snapshot_is_what_is_on_the_canvas_under_its_time(server: CannedServer, browser: Browser) -> None:
-    with showing(server, browser, STATES["driving"]) as opened:
+def test_a_snapshot_is_what_is_on_the_canvas_under_its_time(show: Show) -> None:
+    with show(STATES["driving"]) as opened:
         with opened.page.expect_download() as saved:
             opened.test("snapshot").click()
         name = saved.value.suggested_filename
@@ -445,9 +432,9 @@ def test_a_snapshot_is_what_is_on_the_canvas_under_its_time(server: CannedServer
 OWN = STATES["own-stream"]
 
 
-def test_a_robots_own_stream_is_shown_in_a_frame_and_never_called_live(server: CannedServer, browser: Browser) -> None:
+def test_a_robots_own_stream_is_shown_in_a_frame_and_never_called_live(show: Show, server: CannedServer) -> None:
     reason = "pebble.driver.reason()?.code ?? ''"
-    with showing(server, browser, OWN) as opened:
+    with show(OWN) as opened:
         assert opened.until(f"{reason} === ''")
         opened.test("open-stream").click()
         frame = opened.test("stream")
@@ -472,8 +459,8 @@ def test_a_robots_own_stream_is_shown_in_a_frame_and_never_called_live(server: C
         assert opened.complaints() == []
 
 
-def test_an_address_that_is_newer_than_the_page_needs_a_reload(server: CannedServer, browser: Browser) -> None:
-    with showing(server, browser, replace(OWN, frames="")) as opened:
+def test_an_address_that_is_newer_than_the_page_needs_a_reload(show: Show, server: CannedServer) -> None:
+    with show(replace(OWN, frames="")) as opened:
         opened.test("open-stream").click()
         opened.test("reload-stream").wait_for()
         assert opened.test("stream").count() == 0
@@ -492,36 +479,36 @@ def test_an_address_that_is_newer_than_the_page_needs_a_reload(server: CannedSer
         "http://127.0.0.1:{port}/stream",
     ],
 )
-def test_what_may_not_be_shown_is_not(server: CannedServer, browser: Browser, address: str) -> None:
+def test_what_may_not_be_shown_is_not(show: Show, address: str) -> None:
     state = replace(
         OWN, values=changed(fleet, MINE, with_stream(address)), frames=f"{STREAM} http://127.0.0.1:{{port}}"
     )
-    with showing(server, browser, state) as opened:
+    with show(state) as opened:
         assert opened.test("open-stream").is_disabled()
         assert opened.page.locator("#why-stream").inner_text()
         assert opened.page.evaluate("document.querySelectorAll('iframe').length") == 0
 
 
-def test_an_address_that_was_entered_is_shown_instead(server: CannedServer, browser: Browser) -> None:
+def test_an_address_that_was_entered_is_shown_instead(show: Show) -> None:
     entered = at(GOOB, "web/stream-address", {"url": f"{STREAM}/stream"})
     state = replace(OWN, values=changed(fleet, MINE, with_stream("http://other.local/"), entered))
-    with showing(server, browser, state) as opened:
+    with show(state) as opened:
         opened.test("open-stream").click()
         assert "own stream" in opened.page.frame_locator("[data-test=stream]").locator("body").inner_text(timeout=5000)
 
 
-def test_who_only_drives_enters_no_address(server: CannedServer, browser: Browser) -> None:
-    with showing(server, browser, STATES["driving"]) as opened:
+def test_who_only_drives_enters_no_address(show: Show) -> None:
+    with show(STATES["driving"]) as opened:
         opened.test("stream-address").click()
         opened.test("stream-url").fill("http://camera.local:8889/cam")
         assert opened.test("set-stream").is_disabled()
         assert "maintainer" in opened.page.locator("#why-stream-address").inner_text()
 
 
-def test_an_address_is_entered_and_taken_back(server: CannedServer, browser: Browser) -> None:
+def test_an_address_is_entered_and_taken_back(show: Show, server: CannedServer) -> None:
     url, maintainer = "http://camera.local:8889/cam", {"role": "maintainer", "rights": ["drive", "reset", "system"]}
     state = replace(STATES["driving"], welcome={"user": "max", **maintainer})
-    with showing(server, browser, state) as opened:
+    with show(state) as opened:
         opened.test("stream-address").click()
         use, address = opened.test("set-stream"), opened.test("stream-url")
         assert use.is_disabled()
@@ -540,7 +527,7 @@ def test_an_address_is_entered_and_taken_back(server: CannedServer, browser: Bro
         assert opened.complaints() == []
 
 
-def test_another_component_whose_picture_is_shown_offers_its_stream(server: CannedServer, browser: Browser) -> None:
+def test_another_component_whose_picture_is_shown_offers_its_stream(show: Show) -> None:
     tower = "pebble/towers/tower-1"
     values = changed(
         fleet,
@@ -548,6 +535,6 @@ def test_another_component_whose_picture_is_shown_offers_its_stream(server: Cann
         at(GOOB, "web/picture-from", {"source": tower}),
         at(tower, "status", {"value": {"url": f"{STREAM}/stream"}}),
     )
-    with showing(server, browser, replace(OWN, values=values)) as opened:
+    with show(replace(OWN, values=values)) as opened:
         opened.test("open-stream").click()
         assert opened.test("stream").get_attribute("title") == "The own stream of tower-1"
