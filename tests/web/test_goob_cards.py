@@ -1,6 +1,7 @@
 """The cards of a robot at the whole Goob: what its MCU, loudspeaker, scripts and relays do, and what its sensors sent.
 
-On a desktop and, by ``make page-tests``, on a phone, where the cards are behind tabs.
+On a desktop and, by ``make page-tests``, on a phone, where the cards are behind tabs. What is not tested in each run
+is tested there at a robot that records what it is asked.
 """
 
 from __future__ import annotations
@@ -50,8 +51,10 @@ class Reports:
 
 
 @pytest.fixture(scope="module")
-def robot_names() -> tuple[str, ...]:
-    return ("goob",)
+def stage() -> Iterator[Stage]:
+    """Goob with its clips and scripts, which it has in its room."""
+    with Stage("goob") as running:
+        yield running
 
 
 @pytest.fixture(scope="module")
@@ -83,6 +86,7 @@ def test_lights_reach_the_mcu(goob: Console, stage: Stage) -> None:
     assert goob.tab.until(lambda: lines(stage)[before + 2 :] == ["L 0.000 0.000 0.000"], 5), lines(stage)
 
 
+@pytest.mark.thorough
 def test_a_clip_is_played_and_stopped(goob: Console, stage: Stage, reports: Reports) -> None:
     name = "horn.wav"
 
@@ -103,6 +107,7 @@ def test_a_clip_is_played_and_stopped(goob: Console, stage: Stage, reports: Repo
     goob.test("repeat").uncheck()
 
 
+@pytest.mark.thorough
 def test_a_script_is_started_with_a_setting_and_stopped(goob: Console, reports: Reports) -> None:
     goob.uncover("start-script")
     goob.test("script").select_option("wheel-odometry")
@@ -124,6 +129,7 @@ def test_a_script_is_started_with_a_setting_and_stopped(goob: Console, reports: 
     assert status()["error"] is None
 
 
+@pytest.mark.thorough
 def test_a_flag_is_retained_at_the_broker(goob: Console, stage: Stage, wire: Wire) -> None:
     topic = "goob/incoming/flags/mqtt-audio"
     flag = lambda: goob.state("web/flags")["mqtt_audio"]
@@ -159,6 +165,7 @@ def test_a_relay_is_switched_on_and_off(goob: Console) -> None:
     assert goob.tab.until(lambda: goob.test("outlet-state-o1").inner_text() == "off")
 
 
+@pytest.mark.thorough
 def test_an_unreachable_outlet_has_its_reason(goob: Console) -> None:
     switch = goob.uncover("outlet-o4")
     assert switch.is_disabled()
@@ -196,6 +203,7 @@ def rows(goob: Console, metric: str, kind: str = "numbers") -> list[Any]:
     return found
 
 
+@pytest.mark.thorough
 def test_the_battery_is_plotted_as_the_broker_carried_it(goob: Console, reports: Reports) -> None:
     goob.uncover("plot-battery")
     assert goob.tab.until(lambda: len(rows(goob, "charging-level")) >= 1, 20)
@@ -204,6 +212,7 @@ def test_the_battery_is_plotted_as_the_broker_carried_it(goob: Console, reports:
     assert goob.tab.until(lambda: newest() in goob.test("plot-battery").inner_text())
 
 
+@pytest.mark.thorough
 def test_what_was_sent_before_a_reload_is_plotted_after_it(goob: Console, reports: Reports) -> None:
     goob.uncover("plot-acceleration")
     assert goob.tab.until(lambda: len(rows(goob, "sensors/imu")) >= 15, 20)

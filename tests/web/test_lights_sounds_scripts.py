@@ -13,46 +13,29 @@ from playwright.sync_api import Browser, Locator
 from tests.support import Broker
 from tests.web.browser import Tab, tab
 from tests.web.served import RecordingRobot, Served
+from tests.web.states import setting
 
 pytestmark = pytest.mark.page
 
 BASE = "pebble/robots/recorder"
-CAPABILITIES = {
-    "drive": {"available": True, "controls": True},  # it does not arbitrate
-    "lights": {"solid": True, "flash": True},
-    "soundboard": {"available": True, "controls": True},
-    "autonomy": {"available": True, "controls": True},
-}
+#: It does not arbitrate drive commands.
+OFFERED = {"available": True, "controls": True}
+CAPABILITIES = {"drive": OFFERED, "soundboard": OFFERED, "autonomy": OFFERED, "lights": {"solid": True, "flash": True}}
 CLIPS = ["horn.wav", "signals/beep.wav", *(f"speech/number {number}.wav" for number in range(300))]
 CONFIGS = [
-    {
-        "key": "tag_id",
-        "label": "Tag ID",
-        "type": "int",
-        "default": None,
-        "arg": "",
-        "required": True,
-        "min": 0,
-        "max": 34,
-    },
-    {"key": "distance", "label": "Distance (m)", "type": "float", "default": 0.6, "arg": "", "min": 0.2, "max": 3.0},
-    {"key": "search", "label": "Search", "type": "bool", "default": True, "arg": ""},
-    {"key": "family", "label": "Family", "type": "enum", "default": "25H9", "arg": "", "options": ["25H9", "36H11"]},
-    {"key": "name", "label": "Name", "type": "string", "default": "tag", "arg": ""},
+    setting("tag_id", "Tag ID", "int", required=True, min=0, max=34),
+    setting("distance", "Distance (m)", "float", 0.6, min=0.2, max=3.0),
+    setting("search", "Search", "bool", True),
+    setting("family", "Family", "enum", "25H9", options=["25H9", "36H11"]),
+    setting("name", "Name", "string", "tag"),
 ]
 SCRIPTS = [
     {"file": "april-follow", "label": "Follow a tag", "configs": CONFIGS},
     {"file": "circle", "label": "Drive in a circle", "configs": []},
 ]
-IDLE: dict[str, Any] = {
-    "running": False,
-    "file": None,
-    "pid": None,
-    "dependencies": [],
-    "error": None,
-    "config": None,
-    "timestamp": 1.0,
-}
+IDLE: dict[str, Any] = {"running": False, "timestamp": 1.0, "dependencies": []}
+IDLE |= dict.fromkeys(("file", "pid", "error", "config"))
+QUIET: dict[str, Any] = {"playing": False, "file": None, "error": None, "timestamp": 1.0}
 PIDS = itertools.count(100)
 
 
@@ -87,7 +70,7 @@ def _tab(browser: Browser, served: Served, robot: Robot) -> Iterator[Tab]:
 def opened(_tab: Tab, robot: Robot) -> Iterator[Tab]:
     """The page of a robot at rest, with no complaints at the end."""
     robot.show("soundboard-files", {"files": CLIPS, "controls": True, "timestamp": 1.0})
-    robot.show("soundboard-status", {"playing": False, "file": None, "error": None, "timestamp": 1.0})
+    robot.show("soundboard-status", QUIET)
     robot.show("autonomy-files", {"files": SCRIPTS, "controls": True, "timestamp": 1.0})
     robot.show("autonomy-status", IDLE)
     assert _tab.until(lambda: _tab.test("clip").count() > 0 and _tab.test("script").count() == 1)
@@ -112,20 +95,22 @@ def why(control: Locator) -> str:
 
 
 def test_lights_solid_flashing_and_off(opened: Tab, robot: Robot) -> None:
+    def set_period(text: str) -> None:
+        opened.test("lights-period").fill(text)
+        opened.test("lights-period").press("Enter")
+
+    blue, black = {"b": 1.0, "g": 0.0, "r": 0.0}, {"b": 0.0, "g": 0.0, "r": 0.0}
     opened.test("colour-blue").click()
-    assert opened.until(lambda: robot.asked("lights-solid") == [{"b": 1.0, "g": 0.0, "r": 0.0}], 3)
-    opened.test("lights-period").fill("0.5")
-    opened.test("lights-period").press("Enter")
+    assert opened.until(lambda: robot.asked("lights-solid") == [blue], 3)
+    set_period("0.5")
     opened.test("lights-flash").click()
-    assert opened.until(lambda: robot.asked("lights-flash") == [{"b": 1.0, "g": 0.0, "r": 0.0, "period": 0.5}], 3)
-    opened.test("lights-period").fill("1.25")
-    opened.test("lights-period").press("Enter")
+    assert opened.until(lambda: robot.asked("lights-flash") == [blue | {"period": 0.5}], 3)
+    set_period("1.25")
     assert opened.until(lambda: [one["period"] for one in robot.asked("lights-flash")] == [0.5, 1.25], 3)
-    opened.test("lights-period").fill("99")
-    opened.test("lights-period").press("Enter")
+    set_period("99")
     assert opened.test("lights-period").input_value() == "1.25"
     opened.test("lights-off").click()
-    assert opened.until(lambda: robot.asked("lights-solid")[1:] == [{"b": 0.0, "g": 0.0, "r": 0.0}], 3)
+    assert opened.until(lambda: robot.asked("lights-solid")[1:] == [black], 3)
     assert opened.test("lights-off").get_attribute("aria-pressed") == "true"
 
 
@@ -173,15 +158,13 @@ def test_hundreds_of_clips_are_filtered_and_one_is_played(opened: Tab, robot: Ro
     assert opened.until(lambda: robot.asked("soundboard-command"), 3)
     name = "speech/number 299.wav"
     assert robot.asked("soundboard-command") == [{"action": "play", "enabled": True, "file": name}]
-    robot.show("soundboard-status", {"playing": True, "file": name, "error": None, "timestamp": 2.0})
+    robot.show("soundboard-status", QUIET | {"playing": True, "file": name})
     assert opened.until(lambda: name in text(opened, "playing"), 3)
     opened.test("clip").click()  # it plays: the same button ends it
     assert opened.until(lambda: len(robot.asked("soundboard-command")) == 2, 3)
     assert robot.asked("soundboard-command")[1]["action"] == "stop"
     opened.test("repeat").check()
-    robot.show(
-        "soundboard-status", {"playing": False, "file": None, "error": "player exited with code 1", "timestamp": 3.0}
-    )
+    robot.show("soundboard-status", QUIET | {"error": "player exited with code 1"})
     assert opened.until(lambda: opened.test("sound-error").count() == 1, 3)
     opened.test("clip").click()
     opened.test("repeat").uncheck()
@@ -252,10 +235,8 @@ def test_what_runs_and_its_end(opened: Tab, robot: Robot) -> None:
     opened.test("effective").click()
     shown = opened.page.locator(".effective dl").inner_text().split("\n")
     assert {"0.8", "7"} <= {line.strip() for line in shown}
-    assert opened.page.locator(".dependencies").inner_text().split("\n") == [
-        "● wheel-odometry runs",
-        "✖ locations does not run",
-    ]
+    lines = opened.page.locator(".dependencies").inner_text().split("\n")
+    assert lines == ["● wheel-odometry runs", "✖ locations does not run"]
     robot.show("autonomy-status", running(overridden=True))
     assert opened.until(lambda: "waits: a person drives" in text(opened, "script-state"), 3)
     opened.test("end-script").click()
@@ -327,23 +308,12 @@ METRICS = "soundboard-files", "soundboard-status", "autonomy-files", "autonomy-s
 
 
 def test_a_robot_may_report_anything(opened: Tab, robot: Robot) -> None:
+    form = {"file": MARKUP, "label": LONG, "configs": [{"key": MARKUP, "label": MARKUP}]}
+    on = {"running": True, "playing": True}
     texts = [
-        {
-            "files": [
-                MARKUP,
-                LONG[:2000],
-                {"file": MARKUP, "label": LONG, "configs": [{"key": MARKUP, "label": MARKUP}]},
-            ]
-        },
-        {
-            "running": True,
-            "playing": True,
-            "file": LONG,
-            "error": MARKUP,
-            "config": {MARKUP: DEEP},
-            "dependencies": [DEEP, {}],
-        },
-        {"running": True, "playing": True, "file": DEEP, "error": DEEP, "config": DEEP, "dependencies": LONG},
+        {"files": [MARKUP, LONG[:2000], form]},
+        {**on, "file": LONG, "error": MARKUP, "config": {MARKUP: DEEP}, "dependencies": [DEEP, {}]},
+        {**on, "file": DEEP, "error": DEEP, "config": DEEP, "dependencies": LONG},
     ]
     for value in [*ODD, *texts]:
         for metric in METRICS:

@@ -10,11 +10,11 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import pytest
-from playwright.sync_api import Browser, Page
+from playwright.sync_api import Page
 
 from tests.support import ROOT
-from tests.web.browser import Size, Tab, Theme, tab
-from tests.web.canned import CannedServer, Show
+from tests.web.browser import Size, Tab, Theme
+from tests.web.canned import Show
 from tests.web.states import STATES
 
 PICTURES = ROOT / "build" / "page"
@@ -29,28 +29,32 @@ WIDTHS: dict[Size, tuple[int, ...]] = {
 pytestmark = [pytest.mark.page, pytest.mark.timeout(180)]
 
 
+#: What a person does with a page.
+Act = Callable[[Page], None]
+
+
 def _nothing(_page: Page) -> None:
     pass
 
 
-def _press(*selectors: str) -> Callable[[Page], None]:
+def _all(*acts: Act) -> Act:
+    """One after another."""
+
     def act(page: Page) -> None:
-        for selector in selectors:
-            page.locator(selector).first.click()
+        for one in acts:
+            one(page)
 
     return act
 
 
-def _at(place: str, *pressed: str) -> Callable[[Page], None]:
+def _press(*selectors: str) -> Act:
+    return _all(*(lambda page, selector=selector: page.locator(selector).first.click() for selector in selectors))  # type: ignore[misc]
+
+
+def _at(place: str, *pressed: str) -> Act:
     """Show this place below the header, once these were pressed."""
-
-    def act(page: Page) -> None:
-        for selector in pressed:
-            page.locator(selector).first.click()
-        top = "(place) => document.querySelector(place).getBoundingClientRect().top"
-        page.evaluate("(top) => scrollBy(0, top - 90)", page.evaluate(top, place))
-
-    return act
+    top = "(place) => scrollBy(0, document.querySelector(place).getBoundingClientRect().top - 90)"
+    return _all(_press(*pressed), lambda page: page.evaluate(top, place))
 
 
 def _trouble(page: Page) -> None:
@@ -74,21 +78,13 @@ def _trouble(page: Page) -> None:
     )
 
 
-def _trouble_and_press(*selectors: str) -> Callable[[Page], None]:
-    def act(page: Page) -> None:
-        _trouble(page)
-        _press(*selectors)(page)
-
-    return act
+def _trouble_and_press(*selectors: str) -> Act:
+    return _all(_trouble, _press(*selectors))
 
 
-def _do(script: str, *selectors: str) -> Callable[[Page], None]:
-    def act(page: Page) -> None:
-        page.evaluate(f"() => {{ {script} }}")
-        page.wait_for_timeout(200)
-        _press(*selectors)(page)
-
-    return act
+def _do(script: str, *selectors: str) -> Act:
+    done = lambda page: page.evaluate(f"() => {{ {script} }}")
+    return _all(done, lambda page: page.wait_for_timeout(200), _press(*selectors))
 
 
 def _timeline(page: Page) -> None:
@@ -101,7 +97,7 @@ def _recordings_link(page: Page) -> None:
     page.get_by_role("link", name="Recordings").wait_for()
 
 
-def _scroll_to(selector: str) -> Callable[[Page], None]:
+def _scroll_to(selector: str) -> Act:
     return lambda page: page.locator(selector).first.scroll_into_view_if_needed()
 
 
@@ -118,13 +114,10 @@ def _drive(page: Page) -> None:
     page.keyboard.down("KeyD")
 
 
-def _at_card(name: str) -> Callable[[Page], None]:
+def _at_card(name: str) -> Act:
     """Scroll to a card."""
-
-    def act(page: Page) -> None:
-        page.locator(f'[data-card="{name}"]').evaluate("(card) => card.scrollIntoView({ block: 'center' })")
-
-    return act
+    centre = "(card) => card.scrollIntoView({ block: 'center' })"
+    return lambda page: page.locator(f'[data-card="{name}"]').evaluate(centre)
 
 
 def _mistaken(page: Page) -> None:
@@ -134,16 +127,11 @@ def _mistaken(page: Page) -> None:
     page.locator('[data-test="set-search"]').uncheck()
 
 
-def _on_phone(tab_: str, then: Callable[[Page], None] = _nothing) -> Callable[[Page], None]:
-    def act(page: Page) -> None:
-        page.locator(f'[data-test="tab-{tab_}"]').click()
-        page.locator(".card button").first.wait_for()
-        then(page)
-
-    return act
+def _on_phone(tab_: str, then: Act = _nothing) -> Act:
+    return _all(_press(f'[data-test="tab-{tab_}"]'), lambda page: page.locator(".card button").first.wait_for(), then)
 
 
-def _show_card(name: str) -> Callable[[Page], None]:
+def _show_card(name: str) -> Act:
     def act(page: Page) -> None:
         card = page.locator(f"[data-card={name}]")
         card.scroll_into_view_if_needed()
@@ -166,9 +154,9 @@ class Screen(NamedTuple):
 
     name: str
     state: str
-    act: Callable[[Page], None] = _nothing
+    act: Act = _nothing
     sizes: tuple[Size, ...] = ("desktop", "phone")
-    hold: Callable[[Page], None] = _nothing  # after the measurements, which change the window's size
+    hold: Act = _nothing  # after the measurements, which change the window's size
 
 
 ALL: tuple[Size, ...] = ("desktop", "phone", "landscape")
@@ -200,6 +188,7 @@ WHEN = {
     "script-drives": "Stop apriltag-follow",
 }
 _OUTLETS, _VALUES = (f'[data-card="{card}"]' for card in ("outlets", "values"))
+_SENSORS, _MORE = _press("[data-test=tab-sensors]"), _press("[data-test=tab-more]")
 _LAMP, _LUX = '[data-test="mcu-lamp-1"]', '[data-test="reading-lux"]'
 SCREENS = [
     *(
@@ -223,15 +212,15 @@ SCREENS = [
     Screen("open-on-phone", "fleet", _do("pebble.panels.show('phone')")),
     Screen("left-handed", "driving", _do("pebble.settings.set('side', 'left')"), ("landscape",)),
     Screen("reset-asked", "stopped", _press(".banner-actions button")),
-    Screen("sensors", "driving", _press("[data-test=tab-sensors]"), ("phone",)),
-    Screen("more", "driving", _press("[data-test=tab-more]"), ("phone",)),
+    Screen("sensors", "driving", _SENSORS, ("phone",)),
+    Screen("more", "driving", _MORE, ("phone",)),
     Screen("settings", "driving", _press("[data-test=tab-more]", ".wide"), ("phone",)),
     Screen("drawer", "driving", _press(".round"), ("landscape",)),
     Screen("outlets", "devices", sizes=("desktop",), hold=_at(_OUTLETS)),
-    Screen("outlets", "devices", _press("[data-test=tab-more]"), ("phone",), _at(_OUTLETS)),
-    Screen("outlets-viewer", "devices-viewer", _press("[data-test=tab-more]"), ("phone",), _at(_OUTLETS)),
+    Screen("outlets", "devices", _MORE, ("phone",), _at(_OUTLETS)),
+    Screen("outlets-viewer", "devices-viewer", _MORE, ("phone",), _at(_OUTLETS)),
     Screen("mcus", "devices", sizes=("desktop",), hold=_at(_LAMP, _LUX)),
-    Screen("mcus", "devices", _press("[data-test=tab-more]"), ("phone",), _at(_LAMP, _LUX)),
+    Screen("mcus", "devices", _MORE, ("phone",), _at(_LAMP, _LUX)),
     Screen("values", "devices", sizes=("desktop",), hold=_at(_VALUES, f"{_VALUES} summary")),
     Screen("small", "driving", sizes=("small",)),
     Screen("lights", "asked", _press('[data-test="colour-blue"]'), ("desktop",), _at_card("lights")),
@@ -245,23 +234,11 @@ SCREENS = [
     Screen("scripts", "asked-busy", _on_phone("more"), ("phone",), _at_card("autonomy")),
     Screen("form", "asked", _on_phone("more", _mistaken), ("phone",), _at_card("autonomy")),
     Screen("logs", "operating", sizes=("desktop",), hold=_scroll_to(".log-foot")),
-    Screen("logs", "operating", _press("[data-test=tab-more]"), ("phone",), _scroll_to(".log-foot")),
+    Screen("logs", "operating", _MORE, ("phone",), _scroll_to(".log-foot")),
     Screen("system", "operating", sizes=("desktop",), hold=_scroll_to(".system .flag:last-child")),
-    Screen("system", "operating", _press("[data-test=tab-more]"), ("phone",), _scroll_to(".system .flag:last-child")),
-    Screen(
-        "services",
-        "operating",
-        _press("[data-test=tab-sensors]"),
-        ("phone",),
-        _scroll_to(".services-list li:last-child"),
-    ),
-    Screen(
-        "boards",
-        "undriveable",
-        _press("[data-test=tab-sensors]"),
-        ("phone",),
-        _scroll_to("[data-test=mcu-line-relays]"),
-    ),
+    Screen("system", "operating", _MORE, ("phone",), _scroll_to(".system .flag:last-child")),
+    Screen("services", "operating", _SENSORS, ("phone",), _scroll_to(".services-list li:last-child")),
+    Screen("boards", "undriveable", _SENSORS, ("phone",), _scroll_to("[data-test=mcu-line-relays]")),
     Screen("system-ask", "operating", _press("[data-test=service-restart]"), ("desktop",)),
     Screen("system-ask", "operating", _press("[data-test=tab-more]", "[data-test=service-restart]"), ("phone",)),
     Screen("notices", "driving", _trouble_and_press("[data-test=bell]"), ("desktop",)),
@@ -288,17 +265,9 @@ def axe() -> str:
     return AXE.read_text()
 
 
-@pytest.fixture(params=CASES, ids=lambda case: f"{case[0].name}-{case[1]}")
-def case(request: pytest.FixtureRequest) -> tuple[Screen, Size]:
-    chosen: tuple[Screen, Size] = request.param
-    return chosen
-
-
-def test_screen(show: Show, server: CannedServer, browser: Browser, axe: str, case: tuple[Screen, Size]) -> None:
-    screen, size = case
-    state = STATES[screen.state]
-    server.show(state)
-    with tab(browser, server.url + state.path, size) as opened:
+@pytest.mark.parametrize(("screen", "size"), CASES, ids=[f"{screen.name}-{size}" for screen, size in CASES])
+def test_screen(show: Show, axe: str, screen: Screen, size: Size) -> None:
+    with show(STATES[screen.state], size) as opened:
         _wait(opened, WHEN.get(screen.state, ""))
         screen.act(opened.page)
         problems = _measured(opened.page, size)
@@ -339,20 +308,16 @@ _SMALL = """(selector) => [...document.querySelectorAll(selector)]
 _NEAR = """([selector, offset]) => {
   scrollTo(0, offset);
   const found = new Set();
+  const around = (low, high) => [low - 23, low - 12, low - 2, high + 2, high + 12, high + 23];
+  const along = (low, high) => Array.from({ length: Math.floor((high - low) / 5) + 1 }, (_, i) => low + 5 * i);
   for (const stop of document.querySelectorAll(".stop")) {
-    const box = stop.getBoundingClientRect();
-    if (box.bottom < 0 || box.top > innerHeight) continue;
-    for (let x = box.left - 23; x <= box.right + 23; x += 5) {
-      for (const y of [box.top - 23, box.top - 12, box.top - 2, box.bottom + 2, box.bottom + 12, box.bottom + 23]) {
-        const hit = document.elementFromPoint(x, y)?.closest(selector);
-        if (hit && hit !== stop) found.add(`near ${stop.textContent}: ${hit.outerHTML.slice(0, 120)}`);
-      }
-    }
-    for (let y = box.top; y <= box.bottom; y += 5) {
-      for (const x of [box.left - 23, box.left - 12, box.left - 2, box.right + 2, box.right + 12, box.right + 23]) {
-        const hit = document.elementFromPoint(x, y)?.closest(selector);
-        if (hit && hit !== stop) found.add(`near ${stop.textContent}: ${hit.outerHTML.slice(0, 120)}`);
-      }
+    const { left, right, top, bottom } = stop.getBoundingClientRect();
+    if (bottom < 0 || top > innerHeight) continue;
+    const places = along(left - 23, right + 23).flatMap((x) => around(top, bottom).map((y) => [x, y]));
+    places.push(...along(top, bottom).flatMap((y) => around(left, right).map((x) => [x, y])));
+    for (const place of places) {
+      const hit = document.elementFromPoint(...place)?.closest(selector);
+      if (hit && hit !== stop) found.add(`near ${stop.textContent}: ${hit.outerHTML.slice(0, 120)}`);
     }
   }
   return [...found];

@@ -6,8 +6,10 @@ import base64
 import json
 import random
 import struct
+import threading
 import zlib
 from collections.abc import Iterator, Sequence
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +25,55 @@ from pebble.media.scene import Scene, noise, read_counter
 from pebble.media.video import make_encoder
 from tests.support import ROOT, cases
 from tests.web.browser import tab
-from tests.web.media_pages import MediaPages
+
+STATIC = ROOT / "pebble" / "web" / "static"
+PAGE = Path(__file__).with_name("pixels.js")
+
+
+class MediaPages:
+    """Serves the page's modules, the test's pages, and byte strings; takes byte strings that a page posts."""
+
+    def __init__(self) -> None:
+        self.posted: dict[str, bytes] = {}
+        self._data = {"/": b'<!doctype html><script type="module" src="/pixels.js"></script>'}
+        pages = self
+
+        class Handler(BaseHTTPRequestHandler):
+            def do_GET(self) -> None:
+                pages.answer(self)
+
+            def do_POST(self) -> None:
+                pages.posted[self.path] = self.rfile.read(int(self.headers["content-length"]))
+                self.send_response(204)
+                self.end_headers()
+
+            def log_message(self, *_args: object) -> None:
+                """Log nothing."""
+
+        self._server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        self.url = f"http://127.0.0.1:{self._server.server_address[1]}"
+        threading.Thread(target=self._server.serve_forever, daemon=True).start()
+
+    def offer(self, parts: Sequence[bytes]) -> str:
+        """Serve byte strings, each behind its length; returns their path."""
+        name = f"/data/{len(self._data)}"
+        self._data[name] = b"".join(struct.pack(">I", len(part)) + part for part in parts)
+        return name
+
+    def close(self) -> None:
+        self._server.shutdown()
+        self._server.server_close()
+
+    def answer(self, request: BaseHTTPRequestHandler) -> None:
+        path = request.path
+        file = PAGE if path == "/pixels.js" else STATIC / path.lstrip("/")
+        data = self._data.get(path) or (file.read_bytes() if file.is_file() else b"")
+        request.send_response(200)
+        request.send_header("content-type", "text/html" if path == "/" else "text/javascript")
+        request.send_header("content-length", str(len(data)))
+        request.end_headers()
+        request.wfile.write(data)
+
 
 EXACT = ("json", "pbvd", "pbvz")
 T0 = 1_710_969_600_000
@@ -38,7 +88,7 @@ def pages() -> Iterator[MediaPages]:
 
 @pytest.fixture(scope="module")
 def page(pages: MediaPages, browser: Browser) -> Iterator[Any]:
-    with tab(browser, f"{pages.url}/pixels.html") as one:
+    with tab(browser, f"{pages.url}/") as one:
         assert one.until("window.ready === true")
         yield one.page
 
@@ -66,7 +116,7 @@ def check(page: Any, pages: MediaPages) -> Any:
                     "difference": 0,
                 }
             )
-        paths = [pages.offer_list(payloads), pages.offer_list(pictures)]
+        paths = [pages.offer(payloads), pages.offer(pictures)]
         result = page.evaluate("paths => window.compare(...paths)", paths)
         assert result["shown"] == expected
         assert result["wants"] == wants
@@ -278,7 +328,7 @@ def counters(posted: bytes) -> list[int | None]:
 
 
 def h264_counters(page: Any, pages: MediaPages, payloads: Sequence[bytes]) -> list[int | None]:
-    problem = page.evaluate("paths => window.post(...paths)", [pages.offer_list(payloads), "/posted"])
+    problem = page.evaluate("paths => window.post(...paths)", [pages.offer(payloads), "/posted"])
     assert problem == "" or len(payloads) > 0
     return counters(pages.posted["/posted"])
 

@@ -75,18 +75,4 @@ window.post = async (payloadsPath, target) => {
   return decoder.sequence.problem;
 };
 
-/** Milliseconds that each payload takes. */
-window.timed = async (payloadsPath) => {
-  const decoder = new PictureDecoder();
-  const took = [];
-  for (const payload of await list(payloadsPath)) {
-    const start = performance.now();
-    const made = await decoder.feed(payload);
-    took.push(performance.now() - start);
-    made?.bitmap.close();
-  }
-  decoder.h264.close();
-  return took;
-};
-
 window.ready = true;
