@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 from tests.web.in_node import Rows, rows
-from tests.web.test_page_driver import driver
+from tests.web.modules.test_driver import driver
 
 _REAL = """
 const real = (z, ...pressed) => ({ ...pad(z, ...pressed), id: "Xbox", index: 1, mapping: "standard" });

@@ -31,12 +31,6 @@ _SOUND = """() => {
 
 
 @pytest.fixture(scope="module")
-def robot_names() -> tuple[str, ...]:
-    """BenJr alone: its motors have more speeds than on and off."""
-    return ("benjr",)
-
-
-@pytest.fixture(scope="module")
 def _benjr_page(browser: Browser, stage: Stage) -> Iterator[Console]:
     with console(browser, stage, "benjr") as opened:
         for name, source in _MODULES.items():

@@ -20,11 +20,6 @@ pytestmark = pytest.mark.alone  # deadlines are checked
 
 
 @pytest.fixture(scope="module")
-def robot_names() -> tuple[str, ...]:
-    return ("minilamp", "benjr")
-
-
-@pytest.fixture(scope="module")
 def _benjr_page(browser: Browser, stage: Stage) -> Iterator[Console]:
     with console(browser, stage, "benjr", theme="dark") as opened:
         yield opened

@@ -27,21 +27,14 @@ def people(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def robots(people: Path) -> Iterator[Stage]:
+def stage(people: Path) -> Iterator[Stage]:
     with Stage("goob", "minilamp", room=False, people=people) as running:
         yield running
 
 
 @pytest.fixture(scope="module")
-def wire(robots: Stage) -> Iterator[Wire]:
-    running = Wire(robots)
-    yield running
-    running.close()
-
-
-@pytest.fixture(scope="module")
-def at_goob(browser: Browser, robots: Stage) -> Iterator[Console]:
-    with console(browser, robots, "goob") as opened:
+def at_goob(browser: Browser, stage: Stage) -> Iterator[Console]:
+    with console(browser, stage, "goob") as opened:
         assert opened.tab.until(lambda: opened.test("log-lines").count() == 1)
         assert opened.tab.until(lambda: opened.test("bell").count() == 1)
         yield opened
@@ -77,9 +70,9 @@ def test_what_a_service_logs_is_on_the_page_and_can_be_filtered(at_goob: Console
     assert at_goob.tab.until(lambda: text not in shown(at_goob), 2)
 
 
-def child(robots: Stage, name: str) -> int:
+def child(stage: Stage, name: str) -> int:
     """The pid of a service of goob; 0 if it does not run."""
-    launcher = robots.robots["goob"].launcher
+    launcher = stage.robots["goob"].launcher
     for stat in Path("/proc").glob("[0-9]*/stat"):
         try:
             head, _, rest = stat.read_text().rpartition(")")
@@ -90,11 +83,11 @@ def child(robots: Stage, name: str) -> int:
     return 0
 
 
-def test_the_service_that_keeps_restarting_is_found(at_goob: Console, robots: Stage) -> None:
+def test_the_service_that_keeps_restarting_is_found(at_goob: Console, stage: Stage) -> None:
     row = at_goob.test(f"service-{SERVICE}")
     for count in (1, 2):
-        assert at_goob.tab.until(lambda: child(robots, SERVICE) != 0)
-        os.kill(child(robots, SERVICE), signal.SIGKILL)
+        assert at_goob.tab.until(lambda: child(stage, SERVICE) != 0)
+        os.kill(child(stage, SERVICE), signal.SIGKILL)
         assert at_goob.tab.until(lambda count=count: f"restarted {count}×" in row.inner_text()), row.inner_text()
     assert re.search(r"the last time \d s ago; 2× in the last 10 min; last exit: signal 9", row.inner_text())
     at_goob.test(f"logs-of-{SERVICE}").click()
@@ -125,10 +118,10 @@ def restarts(robot: Console) -> bool:
 
 
 def test_a_restart_is_asked_gone_and_back_and_moves_nothing(
-    browser: Browser, at_goob: Console, robots: Stage, people: Path
+    browser: Browser, at_goob: Console, stage: Stage, people: Path
 ) -> None:
     """While another page drives: its gesture is over, and it may go on with a new one."""
-    with console(browser, robots, "goob") as driver:
+    with console(browser, stage, "goob") as driver:
         driver.test("video").click()  # its picture would end the gesture, too
         with used(driver, complaints=False):
             at_goob.test("service-restart").click()
@@ -144,16 +137,16 @@ def test_a_restart_is_asked_gone_and_back_and_moves_nothing(
     entries = [one for one in audit.read(100) if one.what == "action"]
     audit.close()
     for one in entries:
-        assert (one.ref, one.user, one.detail) == (robots.ref("goob"), "local", "name service-restart")
+        assert (one.ref, one.user, one.detail) == (stage.ref("goob"), "local", "name service-restart")
     assert entries
 
 
-def test_troubles_of_another_robot_are_listed(at_goob: Console, robots: Stage, wire: Wire) -> None:
+def test_troubles_of_another_robot_are_listed(at_goob: Console, stage: Stage, wire: Wire) -> None:
     """All of it is about robots that are not open, in the browser."""
     wire.publish("minilamp/incoming/estop", {"stop": "00112233445566cc", "by": "eve", "why": "test"})
     spoken = at_goob.page.locator("[data-test=announcement]")
     assert at_goob.tab.until(lambda: spoken.inner_text() == "minilamp was stopped by eve", 5), spoken.inner_text()
-    mcu = robots.robots["minilamp"].programs[0]
+    mcu = stage.robots["minilamp"].programs[0]
     os.kill(mcu.pid, signal.SIGKILL)
     assert at_goob.tab.until(lambda: spoken.inner_text() == "minilamp is offline", 10), spoken.inner_text()
     at_goob.test("bell").click()
@@ -164,8 +157,8 @@ def test_troubles_of_another_robot_are_listed(at_goob: Console, robots: Stage, w
     assert at_goob.tab.until("window.pebble.driver.ref === 'pebble/robots/minilamp'", 2)
 
 
-def test_a_phone_restarts_a_robot_and_reads_its_logs(browser: Browser, robots: Stage, wire: Wire) -> None:
-    with console(browser, robots, "goob", "phone") as phone:
+def test_a_phone_restarts_a_robot_and_reads_its_logs(browser: Browser, stage: Stage, wire: Wire) -> None:
+    with console(browser, stage, "goob", "phone") as phone:
         assert restarts(phone)
         wire.publish("goob/incoming/soundboard-command", {"action": "dance"})
         phone.uncover("log-lines")

@@ -82,11 +82,6 @@ def phone(browser: Browser, stage: Stage, size: Size = "phone", theme: Theme = "
         held.fingers.lift()
 
 
-@pytest.fixture(scope="module")
-def robot_names() -> tuple[str, ...]:
-    return ("minilamp",)
-
-
 @pytest.fixture
 def at_lamp(browser: Browser, stage: Stage) -> Iterator[Phone]:
     with phone(browser, stage) as opened:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import pytest
 from playwright.sync_api import Browser
 
@@ -10,6 +12,13 @@ from tests.web.console import KEYS, Console, Wire, console, used
 from tests.web.stage import Stage
 
 pytestmark = pytest.mark.page  # deadlines are checked
+
+
+@pytest.fixture(scope="module")
+def stage() -> Iterator[Stage]:
+    """The demo's four robots."""
+    with Stage(room=False) as running:
+        yield running
 
 
 @pytest.mark.parametrize("name", ["goob", "fred"])

@@ -22,11 +22,6 @@ def status(url: str) -> int:
         return int(answer.status)
 
 
-@pytest.fixture(scope="module")
-def robot_names() -> tuple[str, ...]:
-    return ("minilamp",)
-
-
 def test_the_traces_show_what_a_robot_is_commanded(stage: Stage) -> None:
     transport = create("mqtt", "driver", MqttSettings(host="127.0.0.1", port=stage.broker_port))
     transport.open()
