@@ -300,7 +300,7 @@ def test_it_takes_no_lease_back(show: Show, server: CannedServer) -> None:
         assert opened.until(lambda: len(server.sent("hello")) == 1)
         opened.page.goto(server.url)
         assert opened.until("window.pebble?.connection.isOpen")
-        assert server.sent("hello")[-1]["token"] == "server"
+        assert server.sent("hello")[-1]["token"] == "canned"
         opened.test("watch").click()
         assert opened.until(lambda: opened.page.url == f"{server.url}/?watch")
         assert opened.until("window.pebble?.connection.isOpen")
