@@ -79,8 +79,6 @@ class CannedServer:
         self.state = State()
         self.received: list[dict[str, Any]] = []  # what pages sent, without the answers to pings
         self.posted: list[tuple[str, Any]] = []
-        self.reachable = True
-        self._changed: list[tuple[asyncio.Event, asyncio.AbstractEventLoop]] = []
         app = Starlette(
             routes=[
                 Route("/", self._page),

@@ -18,7 +18,20 @@ from playwright.sync_api import Browser
 
 from tests.web.browser import PIXELS, Tab
 from tests.web.canned import CannedServer, Show, showing
-from tests.web.states import GOOB, MINE, SENSORS, STATES, STREAM, asked, at, changed, fleet, liveness, with_stream
+from tests.web.states import (
+    GOOB,
+    MINE,
+    SENSORS,
+    STATES,
+    STREAM,
+    TOWER,
+    asked,
+    at,
+    changed,
+    fleet,
+    liveness,
+    with_stream,
+)
 
 pytestmark = pytest.mark.page
 
@@ -90,10 +103,7 @@ def line(opened: Tab, name: str, begin: float = 0.2, end: float = 1.0) -> int:
     return sum(begin <= column < end for column in opened.page.evaluate(_LINE, name))
 
 
-@pytest.mark.parametrize(
-    "name",
-    ["plot-battery", pytest.param("plot-attitude"), pytest.param("plot-rates"), "plot-acceleration", "plot-touch"],
-)
+@pytest.mark.parametrize("name", [f"plot-{one}" for one in ("battery", "attitude", "rates", "acceleration", "touch")])
 def test_a_plot_shows_what_was_before_and_goes_on(sensors: Tab, name: str) -> None:
     see(sensors, name)
     assert sensors.until(lambda: line(sensors, name, 0.25, 0.5) > 10), "the past"
@@ -157,8 +167,14 @@ def test_a_pause_and_a_closed_card_draw_nothing(sensors: Tab) -> None:
     assert sensors.until(lambda: line(sensors, "plot-touch", 0.25, 0.5) > 10), "what was remembered is there again"
 
 
+FETCHED = "performance.getEntriesByType('resource').some(({ name }) => /uPlot/.test(name))"
+
+
 def test_a_plot_is_added_remembered_and_removed(show: Show) -> None:
-    with show(SENSORS) as opened:
+    with show(replace(SENSORS, path="/")) as opened:
+        opened.page.locator("[data-test^=card-]").first.wait_for()
+        assert not opened.page.evaluate(FETCHED)  # it comes with the plots only
+        opened.page.goto(opened.page.url + SENSORS.path.lstrip("/"))
         see(opened, "plots-add")
         add = opened.test("plots-add")
         add.select_option("sensors/imu accel_mps2")
@@ -176,15 +192,6 @@ def test_a_plot_is_added_remembered_and_removed(show: Show) -> None:
         assert opened.complaints() == []
 
 
-def test_uplot_is_fetched_with_the_plots_only(show: Show) -> None:
-    fetched = (
-        "performance.getEntriesByType('resource').map((one) => one.name).filter((one) => /uPlot/.test(one)).length"
-    )
-    with show(replace(SENSORS, path="/")) as opened:
-        opened.page.locator("[data-test^=card-]").first.wait_for()
-        assert opened.page.evaluate(fetched) == 0
-
-
 SET = "([metric, value]) => pebble.store.set(pebble.route.ref, metric, value)"
 NASTY: list[Any] = [
     None,
@@ -200,18 +207,16 @@ NASTY: list[Any] = [
 ]
 
 
-@pytest.mark.parametrize("metric", ["sensors/imu", "wheel-odometry", "video-overlays", "status", "charging-level"])
-def test_no_payload_breaks_a_card(show: Show, metric: str) -> None:
+def test_no_payload_breaks_a_card(show: Show) -> None:
     with show(SENSORS) as opened:
         opened.test("plot-battery").wait_for()
-        for payload in NASTY:
-            opened.page.evaluate(
-                "([metric, value]) => pebble.store.set(pebble.route.ref, metric, value)", [metric, payload]
-            )
-            opened.page.wait_for_timeout(120)
-        see(opened, "map")
-        assert opened.page.locator(".failed").count() == 0
-        assert opened.page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+        for metric in ("sensors/imu", "wheel-odometry", "video-overlays", "status", "charging-level"):
+            for payload in NASTY:
+                opened.page.evaluate(SET, [metric, payload])
+                opened.page.wait_for_timeout(120)
+            see(opened, "map")
+            assert opened.page.locator(".failed").count() == 0, metric
+            assert opened.page.evaluate("document.documentElement.scrollWidth <= innerWidth"), metric
         assert opened.errors == []
 
 
@@ -366,11 +371,11 @@ OVERLAYS = STATES["overlays"]
 @pytest.mark.parametrize(
     ("size", "options"),
     [
-        pytest.param("desktop", {"viewport": {"width": 1280, "height": 800}}),
+        ("desktop", {"viewport": {"width": 1280, "height": 800}}),
         ("desktop", {"viewport": {"width": 1100, "height": 560}}),  # bars on both sides of the picture
-        pytest.param("desktop", {"viewport": {"width": 1281, "height": 701}, "device_scale_factor": 2}),
+        ("desktop", {"viewport": {"width": 1281, "height": 701}, "device_scale_factor": 2}),
         ("phone", {}),
-        pytest.param("landscape", {}),
+        ("landscape", {}),
     ],
 )
 def test_what_is_drawn_over_a_picture_is_where_it_belongs(show: Show, size: Any, options: dict[str, Any]) -> None:
@@ -380,7 +385,9 @@ def test_what_is_drawn_over_a_picture_is_where_it_belongs(show: Show, size: Any,
         assert opened.complaints() == []
 
 
-def test_in_full_screen_too_where_stop_and_the_reason_remain(show: Show, server: CannedServer) -> None:
+def test_overlays_in_full_screen_where_stop_and_the_reason_remain_and_overlays_that_are_off(
+    show: Show, server: CannedServer
+) -> None:
     with show(OVERLAYS) as opened:
         opened.page.evaluate(_PLAIN)
         opened.test("full-screen").click()
@@ -390,6 +397,13 @@ def test_in_full_screen_too_where_stop_and_the_reason_remain(show: Show, server:
         assert_a_square_in_the_middle(opened)
         opened.test("stop-one").click()
         assert opened.until(lambda: server.sent("estop"))
+        opened.page.get_by_label("Leave full screen").click()
+        opened.test("overlays").click()
+        assert opened.until("!document.querySelector('[data-test=overlays-canvas]')")
+        opened.page.reload()
+        opened.test("overlays").wait_for()  # they stay so
+        assert not opened.test("overlays").is_checked()
+        assert opened.page.evaluate("!document.querySelector('[data-test=overlays-canvas]')")
 
 
 def test_overlays_vanish_half_a_second_after_the_last(show: Show) -> None:
@@ -402,16 +416,6 @@ def test_overlays_vanish_half_a_second_after_the_last(show: Show) -> None:
         began = time.monotonic()
         assert opened.until(lambda: not opened.page.evaluate(inked), 3)
         assert time.monotonic() - began < 1.5
-
-
-def test_overlays_are_switched_off_and_stay_so(show: Show) -> None:
-    with show(OVERLAYS) as opened:
-        opened.test("overlays").click()
-        assert opened.until("!document.querySelector('[data-test=overlays-canvas]')")
-        opened.page.reload()
-        opened.test("overlays").wait_for()
-        assert not opened.test("overlays").is_checked()
-        assert opened.page.evaluate("!document.querySelector('[data-test=overlays-canvas]')")
 
 
 def test_a_snapshot_is_what_is_on_the_canvas_under_its_time(show: Show) -> None:
@@ -470,43 +474,44 @@ def test_an_address_that_is_newer_than_the_page_needs_a_reload(show: Show, serve
         assert "own stream" in opened.page.frame_locator("[data-test=stream]").locator("body").inner_text(timeout=5000)
 
 
-@pytest.mark.parametrize(
-    "address",
-    [
-        pytest.param("javascript:parent.ran = 1"),
-        pytest.param("data:text/html,x"),
-        pytest.param("http://user:secret@localhost/"),
-        "http://127.0.0.1:{port}/stream",
-    ],
-)
+OWN_HOST = "http://127.0.0.1:{port}/stream"
+NOT_SHOWN = ["javascript:parent.ran = 1", "data:text/html,x", "http://user:secret@localhost/", OWN_HOST]
+
+
+@pytest.mark.parametrize("address", NOT_SHOWN)
 def test_what_may_not_be_shown_is_not(show: Show, address: str) -> None:
-    state = replace(
-        OWN, values=changed(fleet, MINE, with_stream(address)), frames=f"{STREAM} http://127.0.0.1:{{port}}"
-    )
-    with show(state) as opened:
+    frames = f"{STREAM} http://127.0.0.1:{{port}}"
+    with show(replace(OWN, values=changed(fleet, MINE, with_stream(address)), frames=frames)) as opened:
         assert opened.test("open-stream").is_disabled()
         assert opened.page.locator("#why-stream").inner_text()
         assert opened.page.evaluate("document.querySelectorAll('iframe').length") == 0
 
 
-def test_an_address_that_was_entered_is_shown_instead(show: Show) -> None:
-    entered = at(GOOB, "web/stream-address", {"url": f"{STREAM}/stream"})
-    state = replace(OWN, values=changed(fleet, MINE, with_stream("http://other.local/"), entered))
-    with show(state) as opened:
+TOWER_SHOWN = (
+    at(GOOB, "web/picture-from", {"source": TOWER}),
+    at(TOWER, "status", {"value": {"url": f"{STREAM}/stream"}}),
+)
+ENTERED = with_stream("http://other.local/"), at(GOOB, "web/stream-address", {"url": f"{STREAM}/stream"})
+
+
+@pytest.mark.parametrize(
+    ("values", "title"), [(ENTERED, "The own stream of goob"), (TOWER_SHOWN, "The own stream of tower-1")]
+)
+def test_another_stream_is_shown_instead(show: Show, values: tuple[Any, ...], title: str) -> None:
+    """One whose address was entered, or of the component whose picture is shown."""
+    with show(replace(OWN, values=changed(fleet, MINE, *values))) as opened:
         opened.test("open-stream").click()
+        assert opened.test("stream").get_attribute("title") == title
         assert "own stream" in opened.page.frame_locator("[data-test=stream]").locator("body").inner_text(timeout=5000)
-
-
-def test_who_only_drives_enters_no_address(show: Show) -> None:
-    with show(STATES["driving"]) as opened:
-        opened.test("stream-address").click()
-        opened.test("stream-url").fill("http://camera.local:8889/cam")
-        assert opened.test("set-stream").is_disabled()
-        assert "maintainer" in opened.page.locator("#why-stream-address").inner_text()
 
 
 def test_an_address_is_entered_and_taken_back(show: Show, server: CannedServer) -> None:
     url, maintainer = "http://camera.local:8889/cam", {"role": "maintainer", "rights": ["drive", "reset", "system"]}
+    with show(STATES["driving"]) as opened:
+        opened.test("stream-address").click()
+        opened.test("stream-url").fill(url)
+        assert opened.test("set-stream").is_disabled()
+        assert "maintainer" in opened.page.locator("#why-stream-address").inner_text()
     state = replace(STATES["driving"], welcome={"user": "max", **maintainer})
     with show(state) as opened:
         opened.test("stream-address").click()
@@ -525,16 +530,3 @@ def test_an_address_is_entered_and_taken_back(show: Show, server: CannedServer) 
         opened.test("unset-stream").click()
         assert opened.until(lambda: server.sent("stream-address")[-1]["url"] == "")
         assert opened.complaints() == []
-
-
-def test_another_component_whose_picture_is_shown_offers_its_stream(show: Show) -> None:
-    tower = "pebble/towers/tower-1"
-    values = changed(
-        fleet,
-        MINE,
-        at(GOOB, "web/picture-from", {"source": tower}),
-        at(tower, "status", {"value": {"url": f"{STREAM}/stream"}}),
-    )
-    with show(replace(OWN, values=values)) as opened:
-        opened.test("open-stream").click()
-        assert opened.test("stream").get_attribute("title") == "The own stream of tower-1"

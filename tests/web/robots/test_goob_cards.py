@@ -1,7 +1,7 @@
-"""The cards of a robot at the whole Goob: what its MCU, loudspeaker, scripts and relays do, and what its sensors sent.
+"""The cards of a robot at the whole Goob: what its MCU and its relays do, and what its sensors sent.
 
-On a desktop and, by ``make page-tests``, on a phone, where the cards are behind tabs. What is not tested in each run
-is tested there at a robot that records what it is asked.
+On a desktop and, by ``make page-tests``, on a phone, where the cards are behind tabs. Clips and scripts are tested at a
+robot that records what it is asked (test_lights_sounds_scripts).
 """
 
 from __future__ import annotations
@@ -15,13 +15,12 @@ from typing import Any
 import pytest
 from playwright.sync_api import Browser
 
-from pebble.simulation.loudspeaker import Playback, playbacks
 from pebble.transports import Message, MqttSettings, create
 from tests.web.console import Console, Wire, console
 from tests.web.stage import Stage
 
 pytestmark = pytest.mark.alone  # deadlines are checked
-_REPORTS = ("autonomy-status", "soundboard-status", "charging-level", "sensors/imu", "wheel-odometry")
+_REPORTS = ("charging-level", "sensors/imu", "wheel-odometry")
 _SWITCHES_S = 5.0
 
 
@@ -36,10 +35,6 @@ class Reports:
         for metric in _REPORTS:
             self._transport.subscribe(self._prefix + metric, self._receive)
 
-    def last(self, metric: str) -> Any:
-        """The newest report; {} before the first one."""
-        return (self.received[metric] or [{}])[-1]
-
     def values(self, metric: str) -> list[Any]:
         return [payload["value"] for payload in list(self.received[metric])]
 
@@ -52,8 +47,7 @@ class Reports:
 
 @pytest.fixture(scope="module")
 def stage() -> Iterator[Stage]:
-    """Goob with its clips and scripts, which it has in its room."""
-    with Stage("goob") as running:
+    with Stage("goob", room=False) as running:
         yield running
 
 
@@ -84,49 +78,6 @@ def test_lights_reach_the_mcu(goob: Console, stage: Stage) -> None:
     assert goob.tab.until(lambda: lines(stage)[before + 1 :] == ["F 0.000 0.000 1.000 2.000"], 5), lines(stage)
     goob.test("lights-off").click()
     assert goob.tab.until(lambda: lines(stage)[before + 2 :] == ["L 0.000 0.000 0.000"], 5), lines(stage)
-
-
-@pytest.mark.thorough
-def test_a_clip_is_played_and_stopped(goob: Console, stage: Stage, reports: Reports) -> None:
-    name = "horn.wav"
-
-    def played() -> list[Playback]:
-        return [one for one in playbacks(stage.folder / "goob" / "played") if one.file.endswith(name)]
-
-    before = len(played())
-    goob.uncover("clip")
-    goob.test("repeat").check()
-    goob.test("sound-filter").fill("horn")
-    goob.test("clip").click()
-    assert goob.tab.until(lambda: reports.last("soundboard-status").get("file") == name, 5)
-    assert goob.tab.until(lambda: name in goob.test("playing").inner_text(), 3)
-    assert goob.tab.until(lambda: len(played()) >= before + 2, 10)  # it is repeated
-    goob.test("stop-sound").click()
-    assert goob.tab.until(lambda: reports.last("soundboard-status")["playing"] is False, 5)
-    assert goob.tab.until(lambda: all(one.ended_ns for one in played()), 2)
-    goob.test("repeat").uncheck()
-
-
-@pytest.mark.thorough
-def test_a_script_is_started_with_a_setting_and_stopped(goob: Console, reports: Reports) -> None:
-    goob.uncover("start-script")
-    goob.test("script").select_option("wheel-odometry")
-    start = goob.test("start-script")
-    goob.test("set-magnets").fill("0")
-    assert goob.tab.until(start.is_disabled, 2)
-    assert goob.page.locator("#why-start").inner_text() == "The form has 1 mistake"
-    goob.test("set-magnets").fill("12")
-    goob.test("set-second_channel").select_option("none")
-    assert goob.tab.until(start.is_enabled, 2)
-    start.click()
-    status = lambda: reports.last("autonomy-status")
-    assert goob.tab.until(lambda: status().get("running") is True, 10), status()
-    config = status()["config"]
-    assert (config["magnets"], config["second_channel"], config["wheel_diameter_mm"]) == (12, "none", 61.0)
-    assert goob.tab.until(lambda: "wheel-odometry runs, since " in goob.test("script-state").inner_text(), 3)
-    goob.test("end-script").click()
-    assert goob.tab.until(lambda: status()["running"] is False, 10), status()
-    assert status()["error"] is None
 
 
 @pytest.mark.thorough

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 import urllib.request
-from collections.abc import Callable
 
 import pytest
 from playwright.sync_api import Browser
@@ -12,7 +11,7 @@ from playwright.sync_api import Browser
 from pebble.contract import DRIVE, codec
 from pebble.contract.payloads import Drive
 from pebble.transports import MqttSettings, QoS, create
-from tests.support import gone, until
+from tests.support import until
 from tests.web.browser import tab
 from tests.web.stage import Stage
 
@@ -69,12 +68,3 @@ def test_a_browser_opens_the_page_and_keeps_its_complaints(stage: Stage, browser
         assert opened.until(lambda: opened.violations)
         opened.page.evaluate("() => { setTimeout(() => { throw new Error('deliberate') }) }")
         assert opened.until(lambda: opened.errors == ["deliberate"])
-
-
-@pytest.mark.thorough  # tools/run_tests.py looks for processes that any test leaves behind
-def test_nothing_outlives_a_stage() -> None:
-    with Stage("minilamp") as stage:
-        pids = [stage.server.pid, *(program.pid for program in stage.robots["minilamp"].programs)]
-        alive: Callable[[], list[int]] = lambda: [pid for pid in pids if not gone(pid)]
-        assert alive() == pids
-    assert alive() == []
