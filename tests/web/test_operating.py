@@ -26,7 +26,7 @@ from tests.web.served import Page, RecordingRobot, Served
 NAMES = itertools.count(1)
 
 
-def lines(page: Page) -> list[object]:
+def lines(page: Page) -> list[Any]:
     """The log lines that a page has received."""
     return [line for message in list(page.logs) for line in message["lines"]]
 
