@@ -292,10 +292,11 @@ class Opened:
         await asyncio.gather(*self.tasks)
 
     async def close(self) -> None:
-        """Returns when it has begun to receive nothing more."""
+        """Returns when it has begun to receive nothing more: the broker is about to end the first subscription."""
         self.components.close(self.base)
         while len(self.tasks) == 1:
             await asyncio.sleep(0)
+        await asyncio.sleep(0)
 
 
 async def opened_while_it_is_being_closed() -> None:

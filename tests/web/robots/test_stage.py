@@ -26,7 +26,7 @@ def test_the_traces_show_what_a_robot_is_commanded(stage: Stage) -> None:
     transport.open()
     began = time.monotonic_ns()
     assert not stage.wheels_turning("minilamp", since_ns=began)
-    assert stage.last_motion_ns("minilamp") == 0
+    assert stage.last_motion_ns("minilamp") < began
 
     def drive(axes: Drive) -> None:
         transport.publish(
