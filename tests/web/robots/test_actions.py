@@ -175,6 +175,7 @@ def test_the_buttons_of_a_gamepad_stop(at_benjr: Console, wire: Wire) -> None:
     at_benjr.pads(pad(0, 1, 8, 9))
     assert at_benjr.tab.until(lambda: wire.latched("benjr"), 2)
     assert at_benjr.rests()
+    assert at_benjr.because("stopped", within=2)  # else the next test would not see what it has to reset
 
 
 # -- mappings of gamepads
