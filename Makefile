@@ -41,9 +41,7 @@ COMPUTING := tests/config tests/contract tests/media tests/motion tests/percepti
 	$(addprefix tests/bench/test_,compare.py plots.py ratios.py report.py results.py) \
 	$(addprefix tests/firmware/test_,compile.py deadman_virtual.py golden.py heap.py motor_boards.py outlets.py) \
 	$(addprefix tests/firmware/test_,types.py vm.py) \
-	$(addprefix tests/web/test_,card_models.py driving_lockstep.py jitter.py log_lines.py manifest.py page_actions.py) \
-	$(addprefix tests/web/test_,page_core.py page_driver.py page_operating.py page_sound.py page_sources.py recent.py) \
-	$(addprefix tests/web/test_,series.py store.py types.py)
+	$(addprefix tests/web/,modules $(addprefix test_,driving_lockstep.py log_lines.py page_clock.py recent.py types.py))
 # Files with tests of whole robots, to collect no others; those that take longest come first.
 ALONE = $(shell grep --recursive --files-with-matches --include=test_*.py 'mark\.alone' \
 	tests/services tests/robot/test_faults.py tests | grep --invert-match tests/test_demo.py | awk '!seen[$$0]++')

@@ -1,6 +1,6 @@
 """Puts the pictures of the page's states in build/page together: docs/page-states-desktop.jpg and -phone.jpg.
 
-Run it after ``pytest tests/web/test_look.py``, and look at both.
+Run it after ``pytest tests/web/page/test_look.py``, and look at both.
 """
 
 import sys
@@ -25,7 +25,7 @@ def sheet(size: str) -> int:
     (width, height), scale, columns, quality, others = SHEETS[size]
     paths = [path for kind in (size, *others) for path in sorted(PICTURES.glob(f"*-{kind}-*.png"))]
     if not paths:
-        sys.exit(f"{PICTURES} has no pictures: run pytest tests/web/test_look.py first")
+        sys.exit(f"{PICTURES} has no pictures: run pytest tests/web/page/test_look.py first")
     tile = int(width * scale), int(height * scale)
     step = tile[0] + GAP, tile[1] + LABEL + GAP
     rows = -(-len(paths) // columns)

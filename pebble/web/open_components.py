@@ -38,9 +38,9 @@ from pebble.web.robots import Robots
 
 log = logging.getLogger(__name__)
 
-_KEEP_S = 5.0  # so long they are still received after the last page has closed the component
+KEEP_S = 5.0  # so long they are still received after the last page has closed the component
 _FLAGS_METRIC = "web/flags"
-_STEP_S = 1.0  # between two changes of what is received of one component: capabilities may change without end
+STEP_S = 1.0  # between two changes of what is received of one component: capabilities may change without end
 
 #: The component and channel of what a topic carries, where its own name does not tell them.
 _Carried = tuple[str, Channel] | None
@@ -64,15 +64,29 @@ _FLAG_FIELDS = {flag: flag.metric.removeprefix("flags/").replace("-", "_") for f
 class OpenComponents:
     """Subscribes while at least one page has a component open. Only the event loop calls it."""
 
-    def __init__(self, broker: Broker, robots: Robots, spawn: Callable[[Coroutine[Any, Any, None]], None]) -> None:
+    def __init__(
+        self,
+        broker: Broker,
+        robots: Robots,
+        spawn: Callable[[Coroutine[Any, Any, None]], None],
+        *,
+        keep_s: float = KEEP_S,
+        step_s: float = STEP_S,
+    ) -> None:
         """``spawn`` runs a coroutine in the background."""
         self._broker, self._robots, self._spawn = broker, robots, spawn
+        self._keep_s, self._step_s = keep_s, step_s
         self._pages: Counter[str] = Counter()
         self._subscriptions: dict[str, dict[str, Subscription]] = {}  # by component and filter
         self._following: set[str] = set()  # components whose task runs
         self._wanted: dict[str, dict[str, _Carried]] = {}  # by component and filter
         self._flags: dict[str, FlagsView] = {}
         broker.on_state(self._forget_flags)
+
+    @property
+    def known(self) -> set[str]:
+        """The components of which anything is received or remembered here."""
+        return {*self._pages, *self._subscriptions, *self._wanted, *self._flags}
 
     def __contains__(self, ref: object) -> bool:
         """Whether a page has it open."""
@@ -87,7 +101,7 @@ class OpenComponents:
 
     def close(self, ref: str) -> None:
         """A page has closed it."""
-        self._broker.loop.call_later(_KEEP_S, self._closed, ref)
+        self._broker.loop.call_later(self._keep_s, self._closed, ref)
 
     def _closed(self, ref: str) -> None:
         """Some time later: whoever loads the page anew finds everything."""
@@ -127,7 +141,7 @@ class OpenComponents:
                         continue
                     self._forget(ref)
                     return
-                await asyncio.sleep(_STEP_S)
+                await asyncio.sleep(self._step_s)
                 if ref in self._pages and set(self._filters(ref)) == set(done):
                     return
         finally:
@@ -187,7 +201,7 @@ class OpenComponents:
     def _forget_flags(self) -> None:
         """They arrive again with the next connection, except those that are removed meanwhile."""
         if self._broker.connected:
-            self._broker.loop.call_later(_STEP_S, self._show_all_flags)
+            self._broker.loop.call_later(self._step_s, self._show_all_flags)
             return
         for ref in list(self._flags):
             del self._flags[ref]

@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import pytest
-from playwright.sync_api import Browser, BrowserContext, CDPSession, Locator, Page
+from playwright.sync_api import Browser, BrowserContext, CDPSession, Locator, Page, Route
 
 from pebble.bench import page_rig as program
 
@@ -124,19 +124,36 @@ class Tab:
 
 @contextmanager
 def tab(
-    browser: Browser, url: str, size: Size = "desktop", theme: Theme = "light", *, script: str = "", **options: Any
+    browser: Browser,
+    url: str,
+    size: Size = "desktop",
+    theme: Theme = "light",
+    *,
+    script: str = "",
+    routes: Mapping[Any, Callable[[Route], object]] | None = None,
+    **options: Any,
 ) -> Iterator[Tab]:
-    """Open ``url`` in a context of its own; ``script`` runs before the page's; ``options`` are those of a context."""
+    """Open ``url`` in a context of its own; ``script`` runs before the page's; ``options`` are those of a context.
+
+    ``routes`` answer requests instead of the server, by what their addresses match.
+    """
     width, height = SIZES[size]
     touch = size != "desktop"
     usual = {"viewport": {"width": width, "height": height}, "has_touch": touch, "is_mobile": touch}
     context = browser.new_context(**{**usual, "color_scheme": theme, **options})
     try:
+        for pattern, answer in (routes or {}).items():
+            context.route(pattern, answer)
         opened = _prepared(context, script)
         opened.page.goto(url, timeout=1000 * _OPEN_S, wait_until="domcontentloaded")
         yield opened
     finally:
         context.close()
+
+
+def answer(source: str) -> Callable[[Route], object]:
+    """A route that has this module instead of the server's."""
+    return lambda route: route.fulfill(body=source, content_type="text/javascript")
 
 
 def _prepared(context: BrowserContext, script: str) -> Tab:

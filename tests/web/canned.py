@@ -16,7 +16,7 @@ import threading
 import time
 import zlib
 from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import asynccontextmanager, contextmanager, suppress
+from contextlib import AbstractContextManager, asynccontextmanager, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from importlib.resources import files
 from typing import Any
@@ -24,6 +24,7 @@ from typing import Any
 import msgspec
 import uvicorn
 from PIL import Image
+from playwright.sync_api import Browser
 from starlette.applications import Starlette
 from starlette.requests import Request
 from starlette.responses import HTMLResponse, JSONResponse, Response
@@ -41,6 +42,7 @@ from pebble.web.recordings import routes as recordings
 from pebble.web.static_files import StaticFiles
 from tests.support import ROOT, free_port, until
 from tests.web import recorded
+from tests.web.browser import Size, Tab, tab
 
 PING_S = 0.5
 PICTURE_S = 0.1
@@ -77,8 +79,6 @@ class CannedServer:
         self.state = State()
         self.received: list[dict[str, Any]] = []  # what pages sent, without the answers to pings
         self.posted: list[tuple[str, Any]] = []
-        self.reachable = True
-        self._changed: list[tuple[asyncio.Event, asyncio.AbstractEventLoop]] = []
         app = Starlette(
             routes=[
                 Route("/", self._page),
@@ -316,6 +316,21 @@ def serving(state: State | None = None) -> Iterator[CannedServer]:
         yield server
     finally:
         server.close()
+
+
+#: Opens the page in a state of the server; further options are those of :func:`tests.web.browser.tab`.
+Show = Callable[..., AbstractContextManager[Tab]]
+
+
+@contextmanager
+def showing(
+    server: CannedServer, browser: Browser, state: State, size: Size = "desktop", *, when: str = "true", **options: Any
+) -> Iterator[Tab]:
+    """The page in a state of the server, as soon as an expression is true."""
+    server.show(state)
+    with tab(browser, server.url + state.path, size, **options) as opened:
+        assert opened.until(when)
+        yield opened
 
 
 def main() -> None:

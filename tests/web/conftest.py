@@ -1,4 +1,4 @@
-"""What the tests of one module share: a broker and a server; one browser, and whole robots.
+"""What the tests of one module share: a broker and a server, one browser, and pages in given states.
 
 Not for the whole session: while Playwright runs, asyncio.run fails in this process.
 """
@@ -6,15 +6,15 @@ Not for the whole session: while Playwright runs, asyncio.run fails in this proc
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 
 import pytest
 from playwright.sync_api import Browser
 
 from tests.support import Broker
 from tests.web.browser import chromium
-from tests.web.console import Console, Wire, console, used
+from tests.web.canned import CannedServer, Show, serving, showing
 from tests.web.served import Served
-from tests.web.stage import Stage
 
 
 @pytest.fixture(scope="module")
@@ -37,33 +37,13 @@ def browser() -> Iterator[Browser]:
 
 
 @pytest.fixture(scope="module")
-def robot_names() -> tuple[str, ...]:
-    """The robots of ``stage``; none: the demo's four. A module that needs fewer has a fixture of its own."""
-    return ()
-
-
-@pytest.fixture(scope="module")
-def stage(robot_names: tuple[str, ...]) -> Iterator[Stage]:
-    """Whole robots: MiniLAMP alone is ready in a second."""
-    with Stage(*robot_names) as running:
+def server() -> Iterator[CannedServer]:
+    """It shows what ``show`` is given."""
+    with serving() as running:
         yield running
 
 
 @pytest.fixture(scope="module")
-def wire(stage: Stage) -> Iterator[Wire]:
-    running = Wire(stage)
-    yield running
-    running.close()
-
-
-@pytest.fixture(scope="module")
-def lamp_page(browser: Browser, stage: Stage) -> Iterator[Console]:
-    with console(browser, stage, "minilamp") as opened:
-        yield opened
-
-
-@pytest.fixture
-def at_lamp(lamp_page: Console) -> Iterator[Console]:
-    """Minilamp's page: it has no camera, so it is ready at once."""
-    with used(lamp_page) as ready:
-        yield ready
+def show(server: CannedServer, browser: Browser) -> Show:
+    """Opens the page in a state: ``with show(state, size, …) as opened``."""
+    return partial(showing, server, browser)

@@ -85,10 +85,11 @@ class Console:
         """Wait until driving is off for one of these reasons; "" is that it is on."""
         return self.tab.until(lambda: self.reason in codes, within)
 
-    def reset(self) -> None:
-        """Without the page's controls: end the stop of this robot."""
-        view = self.state("web/estop")
-        self.page.evaluate("([ref, owners]) => window.pebble.commands.reset(ref, owners)", [self.ref, view["owners"]])
+    def reset(self, name: str = "") -> None:
+        """Without the page's controls: end the stop of this robot, or of another one."""
+        ref = self.stage.ref(name or self.name)
+        owners = self.state("web/estop", ref)["owners"]
+        self.page.evaluate("([ref, owners]) => window.pebble.commands.reset(ref, owners)", [ref, owners])
 
     def take(self) -> None:
         """Take control; there may be a stop to be reset, or a picture to wait for. Ends with nothing held."""

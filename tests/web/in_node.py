@@ -1,4 +1,4 @@
-"""Modules of the page in Node.js, without a browser."""
+"""Modules of the page in Node.js, without a browser: once, or for each row of a table."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import json
 import select
 import shutil
 import subprocess
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -15,6 +17,8 @@ import pytest
 from tests.support import ROOT
 
 STATIC = ROOT / "pebble" / "web" / "static"
+#: What is done, and the value of ``result`` after it, by what that shows.
+Rows = Mapping[str, tuple[str, Any]]
 _EVALUATOR = Path(__file__).with_name("evaluate.mjs")
 _TIMEOUT_S = 30.0
 
@@ -33,11 +37,8 @@ def evaluate(imports: dict[str, str], steps: str, given: Any = None) -> Any:
     ``imports``: the names that are imported, or "* as name", by the module below the page's static files. Raises
     AssertionError with the error of the steps.
     """
-    lines = [
-        f"import {names if names.startswith('*') else f'{{ {names} }}'} from {json.dumps((STATIC / path).as_uri())};"
-        for path, names in imports.items()
-    ]
-    lines += ['import { parentPort as _parent } from "node:worker_threads";']
+    lines = ['import { parentPort as _parent } from "node:worker_threads";']
+    lines += [_imported(path, names) for path, names in imports.items()]
     lines += [
         f"const given = {json.dumps(given)};",
         "let result;",
@@ -56,3 +57,68 @@ def evaluate(imports: dict[str, str], steps: str, given: Any = None) -> Any:
     answer = json.loads(node.stdout.readline())
     assert "error" not in answer, answer["error"]
     return json.loads(answer["value"])
+
+
+def _imported(path: str, names: str, query: str = "") -> str:
+    to = names.removeprefix("* as ") if names.startswith("*") else f"{{ {names} }}"
+    return f"const {to} = await import({json.dumps((STATIC / path).as_uri() + query)});"
+
+
+@dataclass(frozen=True)
+class Script:
+    """Steps that have the same modules and the same ``before`` them; ``after`` may give ``result`` its usual value.
+
+    ``anew``: the modules keep a state, and are new for each row of a table.
+    """
+
+    imports: dict[str, str]
+    before: str = ""
+    after: str = ""
+    anew: bool = False
+
+    def __call__(self, steps: str, given: Any = None) -> Any:
+        return evaluate(self.imports, f"{self.before}{steps}\n{self.after}", given)
+
+    def each(self, all_steps: Sequence[str]) -> list[dict[str, Any]]:
+        """The value, or the error, of each of these steps: all in one thread, since to start one takes longest."""
+        functions = [self._function(steps, f"?row={number}" * self.anew) for number, steps in enumerate(all_steps)]
+        steps = f"""result = [];
+for (const row of [{", ".join(functions)}]) {{
+  process.removeAllListeners("uncaughtException");
+  result.push(await row().catch((error) => ({{ error: String(error?.stack ?? error) }})));
+}}"""
+        answers: list[dict[str, Any]] = evaluate({}, steps)
+        return answers
+
+    def _function(self, steps: str, query: str) -> str:
+        imports = "\n".join(_imported(path, names, query) for path, names in self.imports.items())
+        return (
+            f"async () => {{ {imports}\nlet result;\n{self.before}{steps}\n{self.after}\nreturn {{ value: result }}; }}"
+        )
+
+
+def rows(*tables: tuple[Script, Rows]) -> pytest.MarkDecorator:
+    """Tests each row of some tables: ``found()`` is what its steps lead to."""
+    return pytest.mark.parametrize(
+        ("found", "expected"),
+        [
+            pytest.param(found, expected, id=name)
+            for script, table in tables
+            for (name, (_, expected)), found in zip(table.items(), _results(script, table), strict=True)
+        ],
+    )
+
+
+def _results(script: Script, table: Rows) -> list[Callable[[], Any]]:
+    """What all rows of a table lead to: the first that is asked for evaluates all."""
+
+    @cache
+    def answers() -> list[dict[str, Any]]:
+        return script.each([steps for steps, _ in table.values()])
+
+    def result(number: int) -> Any:
+        answer = answers()[number]
+        assert "error" not in answer, answer["error"]
+        return answer.get("value")
+
+    return [lambda number=number: result(number) for number in range(len(table))]  # type: ignore[misc]

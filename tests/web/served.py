@@ -85,6 +85,8 @@ class Page:
         headers = {"cookie": cookie} if cookie else None
         self.state: dict[tuple[str, str], Any] = {}
         self.refused: list[dict[str, Any]] = []
+        self.done: list[dict[str, Any]] = []
+        self.logs: list[dict[str, Any]] = []  # with their lines
         self.series: list[dict[str, Any]] = []
         self.welcome: dict[str, Any] = {}
         self.bye: dict[str, Any] = {}
@@ -158,6 +160,10 @@ class Page:
                     self.state = {key: value for key, value in self.state.items() if key[0] != ref}
             case "series":
                 self.series.append(message)
+            case "logs":
+                self.logs.append(message)
+            case "done":
+                self.done.append(message)
             case "refused":
                 self.refused.append(message)
             case "welcome":

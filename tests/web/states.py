@@ -20,16 +20,8 @@ TOWER, EVE, SAT = "pebble/towers/tower-1", "pebble/people/eve", "pebble/satellit
 GOOB_PATH = f"/r/{GOOB}"
 
 #: What arrives again and again, and how often in seconds.
-LIVE = {
-    "web/liveness": 1.0,
-    "sensors/imu": 0.2,
-    "touch-sensors": 0.1,
-    "charging-level": 5.0,
-    "online": 1.0,
-    "position": 1.0,
-    "wheel-odometry": 0.1,
-    "video-overlays": 0.1,
-}
+LIVE = {"web/liveness": 1.0, "online": 1.0, "position": 1.0, "charging-level": 5.0, "sensors/imu": 0.2}
+LIVE |= dict.fromkeys(("touch-sensors", "wheel-odometry", "video-overlays"), 0.1)
 VIEWER = {"user": "visitor", "role": "viewer", "rights": []}
 
 Values = Callable[[int], list[Value]]
@@ -66,38 +58,15 @@ def driver(by: str = "", device: str = "", *, you: bool = False, server: str = "
 
 def estop(now: int, by: str = "", *, sending: str = "", text: str = "", why: str = "button") -> dict[str, Any]:
     """Latched if ``by`` is given."""
-    owner = {
-        "owner": "base",
-        "latched": bool(by),
-        "boot": "b1",
-        "count": 3,
-        "by": by,
-        "why": why if by else "",
-        "since": now - 95_000 if by else 0,
-        "persisted": True,
-        "reset_refused": None,
-    }
-    head = {key: owner[key] for key in ("latched", "by", "why", "since")}
-    return {
-        **head,
-        "available": True,
-        "owners": [owner],
-        "sending": sending,
-        "sending_text": text,
-        "stop": "00112233445566aa",
-    }
+    head = {"latched": bool(by), "by": by, "why": why if by else "", "since": now - 95_000 if by else 0}
+    owner = {"owner": "base", "boot": "b1", "count": 3, "persisted": True, "reset_refused": None} | head
+    sent = {"sending": sending, "sending_text": text, "stop": "00112233445566aa"}
+    return {**head, "available": True, "owners": [owner], **sent}
 
 
 def flow(state: str = "flowing", why: str = "") -> dict[str, Any]:
-    return {
-        "state": state,
-        "why": why,
-        "encoding": "pbvz",
-        "per_second": 10.0,
-        "kbits": 212.0,
-        "viewers": 2,
-        "pinned": "",
-    }
+    sent = {"encoding": "pbvz", "per_second": 10.0, "kbits": 212.0}
+    return {"state": state, "why": why, "viewers": 2, "pinned": ""} | sent
 
 
 def sound(state: str = "rest", why: str = "", *, talker: str = "") -> dict[str, Any]:
@@ -105,22 +74,17 @@ def sound(state: str = "rest", why: str = "", *, talker: str = "") -> dict[str, 
 
 
 def imu(now: int) -> dict[str, Any]:
-    vector = {"x": 0.1, "y": -0.2, "z": 9.8}
-    value = {
-        "accel_mps2": vector,
-        "gyro_dps": {"x": 0.4, "y": 0.1, "z": 12.3},
-        "temp_c": 31.5,
-        "orientation_deg": {"roll": 1.2, "pitch": -0.7},
-        "accel_norm_g": 1.01,
-    }
+    value = {"accel_mps2": {"x": 0.1, "y": -0.2, "z": 9.8}, "gyro_dps": {"x": 0.4, "y": 0.1, "z": 12.3}}
+    value |= {"temp_c": 31.5, "orientation_deg": {"roll": 1.2, "pitch": -0.7}, "accel_norm_g": 1.01}
     return {"t": now, "seq": 12, "mcu_ms": 1200, "value": value}
 
 
 def services(**more: Any) -> dict[str, Any]:
+    ready = {"state": "ready", "restarts": 0, "last_exit": None}
     value = {
-        "mqtt_bridge": {"state": "ready", "restarts": 0, "last_exit": None},
-        "serial_mcu_bridge": {"state": "ready", "restarts": 1, "last_exit": "exit code 1"},
-        "av_daemon": {"state": "ready", "restarts": 0, "last_exit": None},
+        "mqtt_bridge": ready,
+        "serial_mcu_bridge": ready | {"restarts": 1, "last_exit": "exit code 1"},
+        "av_daemon": ready,
         "autonomy_manager": {"state": "restarting", "restarts": 2, "last_exit": "signal 9"},
     }
     return {"t": 0, "value": {"services": value, **more}}
@@ -219,14 +183,8 @@ def described(mcu: wire.M) -> Any:
     return msgspec.to_builtins(parse_describe(mcu.describe()).payload())
 
 
-LAMP_MCU = wire.LAMP.but(
-    interfaces=(
-        *wire.LAMP.interfaces,
-        wire.I(
-            5, "arm", wire.IN, wire.KIND_COMMAND, (wire.F("angle", wire.I16, 0.1, 0.0, "deg"), wire.F("k", wire.F32))
-        ),
-    )
-)
+_ARM = (wire.F("angle", wire.I16, 0.1, 0.0, "deg"), wire.F("k", wire.F32))
+LAMP_MCU = wire.LAMP.but(interfaces=(*wire.LAMP.interfaces, wire.I(5, "arm", wire.IN, wire.KIND_COMMAND, _ARM)))
 
 
 def devices(now: int) -> list[Value]:
@@ -286,12 +244,8 @@ def satellite(now: int) -> list[Value]:
 def odometry(seconds: float) -> dict[str, Any]:
     """On a loop of 1.6 m, as the script wheel-odometry publishes it."""
     angle = seconds / 8
-    value = {
-        "x_mm": 800 * math.sin(angle),
-        "y_mm": 500 * math.sin(2 * angle),
-        "heading_rad": math.atan2(1000 * math.cos(2 * angle), 800 * math.cos(angle)),
-        "distance_mm": 100 * seconds,
-    }
+    value = {"x_mm": 800 * math.sin(angle), "y_mm": 500 * math.sin(2 * angle), "distance_mm": 100 * seconds}
+    value["heading_rad"] = math.atan2(1000 * math.cos(2 * angle), 800 * math.cos(angle))
     return {"value": value, "unit": "mm", "source": "wheel-odometry", "timestamp": seconds}
 
 
@@ -359,111 +313,78 @@ def with_stream(address: str) -> Callable[[int], Value]:
 
 NO_BOARD = "cannot open /dev/ttyACM0: No such file or directory"
 #: Of goob the motor board is unplugged; of fred it is silent, perhaps by design.
+_BOARDS = {
+    "serial": {"state": "absent", "why": NO_BOARD},
+    "imu": {"state": "ready", "heard_ms": 0},
+    "relays": {"state": "silent", "heard_ms": 10_000},
+}
 UNDRIVEABLE = (
-    at(
-        GOOB,
-        "status",
-        services(
-            mcu={
-                "serial": {"state": "absent", "why": NO_BOARD},
-                "imu": {"state": "ready", "heard_ms": 0},
-                "relays": {"state": "silent", "heard_ms": 10_000},
-            },
-            driveable={"state": "no", "why": f"serial: {NO_BOARD}"},
-        ),
-    ),
+    at(GOOB, "status", services(mcu=_BOARDS, driveable={"state": "no", "why": f"serial: {NO_BOARD}"})),
     at(FRED, "status", services(driveable={"state": "unknown", "why": "serial: its board has sent nothing yet"})),
 )
 
 #: The server has recordings.
 REPLAYING = State("/replay", fleet, LIVE, {"recordings": True}, recordings=True)
 
+SILENT = at(GOOB, "web/liveness", liveness(online=False, silent_s=5.2))
+NO_BROKER = {"connected": False, "problem": "connection refused by 10.0.0.2:8883", "robots_omitted": 0}
+UNCONFIRMED = "base has not confirmed it"
+BOB_DRIVES = at(GOOB, "web/driver", driver("bob", "phone"))
+EVE_STOPPED = (stopped(GOOB, "eve on phone"), stopped(FRED, "eve on phone"))
+
+
+def of(path: str, *changes: Callable[[int], Value], base: Values = fleet, **more: Any) -> State:
+    """A state with these changes, in which everything that is live arrives."""
+    return State(path, changed(base, *changes), **{"repeated": LIVE, **more})
+
+
 STATES: dict[str, State] = {
-    "fleet": State("/", changed(fleet, at(GOOB, "web/driver", driver("bob", "phone"))), LIVE),
-    "fleet-stopped": State(
-        "/", changed(fleet, stopped(GOOB, "eve on phone"), stopped(FRED, "eve on phone", why="button, all")), LIVE
-    ),
-    "fleet-undriveable": State("/", changed(fleet, *UNDRIVEABLE), LIVE),
-    "undriveable": State(GOOB_PATH, changed(fleet, MINE, *UNDRIVEABLE), LIVE),
+    "fleet": of("/", BOB_DRIVES),
+    "fleet-stopped": of("/", stopped(GOOB, "eve on phone"), stopped(FRED, "eve on phone", why="button, all")),
+    "fleet-undriveable": of("/", *UNDRIVEABLE),
+    "undriveable": of(GOOB_PATH, MINE, *UNDRIVEABLE),
     "fleet-empty": State("/", lambda _now: []),
     "fleet-lost": State("/", fleet, silent=True),
-    "fleet-watching": State("/?watch", fleet, LIVE),
+    "fleet-watching": of("/?watch"),
     "driving": DRIVING,
     "operating": OPERATING,
     "recordings": REPLAYING,
     "replay": replace(REPLAYING, path=f"/replay/{GOOB}?at={START + 30_000}"),
     "replay-gap": replace(REPLAYING, path=f"/replay/{GOOB}?at={GAP[0] + 60_000}"),
     "driving-recorded": replace(DRIVING, welcome={"recordings": True}),
-    "system-offline": replace(
-        OPERATING, values=changed(fleet, at(GOOB, "web/liveness", liveness(online=False, silent_s=5.2)))
-    ),
-    "watching": State(f"{GOOB_PATH}?watch", changed(fleet, stopped(FRED, "eve on phone")), LIVE),
-    "free": State(GOOB_PATH, fleet, LIVE),
+    "system-offline": replace(OPERATING, values=changed(fleet, SILENT)),
+    "watching": of(f"{GOOB_PATH}?watch", stopped(FRED, "eve on phone")),
+    "free": of(GOOB_PATH),
     "odometry": SENSORS,
-    "overlays": replace(DRIVING, values=changed(fleet, MINE, at(GOOB, "video-overlays", OVERLAYS))),
-    "own-stream": replace(DRIVING, values=changed(fleet, MINE, with_stream(f"{STREAM}/stream")), frames=STREAM),
-    "taken": State(GOOB_PATH, changed(fleet, at(GOOB, "web/driver", driver("bob", "phone"))), LIVE),
-    "viewer": State(GOOB_PATH, fleet, LIVE, VIEWER),
-    "stopped": State(
-        GOOB_PATH, changed(fleet, MINE, stopped(GOOB, "eve on phone"), stopped(FRED, "eve on phone")), LIVE
-    ),
-    "stop-sent": State(
-        GOOB_PATH, changed(fleet, MINE, stopped(GOOB, "", sending="sent", text="base has not confirmed it")), LIVE
-    ),
-    "stop-old": State(
-        f"/r/{LAMP}",
-        changed(fleet, stopped(LAMP, "", sending="old", text="it has no emergency stop")),
-        LIVE,
-    ),
-    "not-confirmed": State(
-        GOOB_PATH,
-        changed(
-            fleet, MINE, stopped(GOOB, "", sending="not confirmed", text="base has not confirmed it: it may be off")
-        ),
-        LIVE,
+    "overlays": of(GOOB_PATH, MINE, at(GOOB, "video-overlays", OVERLAYS), logs=logs),
+    "own-stream": of(GOOB_PATH, MINE, with_stream(f"{STREAM}/stream"), logs=logs, frames=STREAM),
+    "taken": of(GOOB_PATH, BOB_DRIVES),
+    "viewer": of(GOOB_PATH, welcome=VIEWER),
+    "stopped": of(GOOB_PATH, MINE, *EVE_STOPPED),
+    "stop-sent": of(GOOB_PATH, MINE, stopped(GOOB, "", sending="sent", text=UNCONFIRMED)),
+    "stop-old": of(f"/r/{LAMP}", stopped(LAMP, "", sending="old", text="it has no emergency stop")),
+    "not-confirmed": of(
+        GOOB_PATH, MINE, stopped(GOOB, "", sending="not confirmed", text=f"{UNCONFIRMED}: it may be off")
     ),
     "lost": State(GOOB_PATH, changed(fleet, MINE), silent=True, freezes=True),
-    "no-broker": State(
-        GOOB_PATH,
-        changed(
-            fleet,
-            MINE,
-            at(
-                "",
-                "web/broker",
-                {"connected": False, "problem": "connection refused by 10.0.0.2:8883", "robots_omitted": 0},
-            ),
-        ),
-        LIVE,
-    ),
-    "silent": State(
-        GOOB_PATH,
-        changed(fleet, MINE, at(GOOB, "web/liveness", liveness(online=False, silent_s=5.2))),
-        {},
-        pictures=False,
-    ),
+    "no-broker": of(GOOB_PATH, MINE, at("", "web/broker", NO_BROKER)),
+    "silent": of(GOOB_PATH, MINE, SILENT, repeated={}, pictures=False),
     "old-picture": replace(DRIVING, freezes=True),
-    "no-picture": replace(
-        DRIVING, pictures=False, values=changed(fleet, MINE, at(GOOB, "web/picture", flow("starting")))
-    ),
-    "listening": replace(DRIVING, values=changed(fleet, MINE, at(GOOB, "web/sound", sound("flowing", talker="bob")))),
-    "no-sound": replace(
-        DRIVING,
-        values=changed(
-            fleet, MINE, at(GOOB, "web/sound", sound("refused", "its sound cannot be switched on from here"))
-        ),
+    "no-picture": of(GOOB_PATH, MINE, at(GOOB, "web/picture", flow("starting")), logs=logs, pictures=False),
+    "listening": of(GOOB_PATH, MINE, at(GOOB, "web/sound", sound("flowing", talker="bob")), logs=logs),
+    "no-sound": of(
+        GOOB_PATH, MINE, at(GOOB, "web/sound", sound("refused", "its sound cannot be switched on from here")), logs=logs
     ),
     "old-page": replace(DRIVING, welcome={"version": "of another server"}),
     "plain-http": replace(DRIVING, welcome={"drives": False}),
-    "tower": State(f"/r/{TOWER}", fleet, LIVE),
-    "person": State(f"/r/{EVE}", fleet, LIVE),
-    "devices": State(GOOB_PATH, changed(devices, MINE), {**LIVE, "mcu/lamp-1/glow": 0.2}),
-    "devices-viewer": State(GOOB_PATH, devices, LIVE, VIEWER),
-    "satellite": State(f"/r/{SAT}", satellite, LIVE),
-    "no-camera": State(f"/r/{LAMP}", fleet, LIVE),
-    "other-camera": replace(
-        DRIVING,
-        values=changed(fleet, MINE, at(GOOB, "web/picture-from", {"source": TOWER}), at(TOWER, "web/picture", flow())),
+    "tower": of(f"/r/{TOWER}"),
+    "person": of(f"/r/{EVE}"),
+    "devices": of(GOOB_PATH, MINE, base=devices, repeated={**LIVE, "mcu/lamp-1/glow": 0.2}),
+    "devices-viewer": of(GOOB_PATH, base=devices, welcome=VIEWER),
+    "satellite": of(f"/r/{SAT}", base=satellite),
+    "no-camera": of(f"/r/{LAMP}"),
+    "other-camera": of(
+        GOOB_PATH, MINE, at(GOOB, "web/picture-from", {"source": TOWER}), at(TOWER, "web/picture", flow()), logs=logs
     ),
 }
 
@@ -498,13 +419,9 @@ SCRIPTS = {
     "controls": True,
     "timestamp": 1.0,
 }
+_SPOKEN = (f"speech/number {n}.wav" for n in range(140))
 CLIPS = {
-    "files": [
-        "horn.wav",
-        "intro.mp3",
-        *(f"speech/number {n}.wav" for n in range(140)),
-        "warn/siren, long and loud.wav",
-    ],
+    "files": ["horn.wav", "intro.mp3", *_SPOKEN, "warn/siren, long and loud.wav"],
     "controls": True,
     "timestamp": 1.0,
 }
@@ -515,12 +432,8 @@ def script(now: int, **more: Any) -> Value:
     config = {"tag_id": 5, "distance_m": 0.6, "search": True, "family": "APRILTAG_36H11"}
     parts = [{"file": "wheel-odometry", "pid": 812, "running": True}]
     status = {"running": True, "file": "apriltag-follow", "pid": 813, "dependencies": parts, "error": None}
-    return (
-        GOOB,
-        "autonomy-status",
-        status | {"config": config, "timestamp": now / 1000, "controls": True} | more,
-        4000,
-    )
+    status |= {"config": config, "timestamp": now / 1000, "controls": True}
+    return (GOOB, "autonomy-status", status | more, 4000)
 
 
 def clip(**more: Any) -> Callable[[int], Value]:
@@ -536,27 +449,18 @@ ASKED = changed(
     at(GOOB, "autonomy-status", {"running": False, "timestamp": 1.0, "error": None}, 9000),
 )
 NOT_ARBITRATED = asked(drive={"available": True, "controls": True})
+ENDED = {"running": False, "timestamp": 1.0, "error": "apriltag-follow exited with code 1"}
+BUSY = clip(error="the loudspeaker is busy (talk-back plays)")
 STATES |= {
-    "asked": State(GOOB_PATH, changed(ASKED, MINE), LIVE),
-    "asked-busy": State(
+    "asked": of(GOOB_PATH, MINE, base=ASKED),
+    "asked-busy": of(
         GOOB_PATH,
-        changed(ASKED, MINE, lambda now: script(now, overridden=True), clip(playing=True, file="speech/number 3.wav")),
-        LIVE,
+        MINE,
+        lambda now: script(now, overridden=True),
+        clip(playing=True, file="speech/number 3.wav"),
+        base=ASKED,
     ),
-    "asked-failed": State(
-        GOOB_PATH,
-        changed(
-            ASKED,
-            MINE,
-            at(
-                GOOB,
-                "autonomy-status",
-                {"running": False, "timestamp": 1.0, "error": "apriltag-follow exited with code 1"},
-            ),
-            clip(error="the loudspeaker is busy (talk-back plays)"),
-        ),
-        LIVE,
-    ),
-    "asked-viewer": State(GOOB_PATH, ASKED, LIVE, VIEWER),
-    "script-drives": State(GOOB_PATH, changed(ASKED, MINE, NOT_ARBITRATED, lambda now: script(now)), LIVE),
+    "asked-failed": of(GOOB_PATH, MINE, at(GOOB, "autonomy-status", ENDED), BUSY, base=ASKED),
+    "asked-viewer": of(GOOB_PATH, base=ASKED, welcome=VIEWER),
+    "script-drives": of(GOOB_PATH, MINE, NOT_ARBITRATED, lambda now: script(now), base=ASKED),
 }

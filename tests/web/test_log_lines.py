@@ -20,33 +20,29 @@ def read(lines: LogLines, after: int = 0) -> list[tuple[int, list[object]]]:
     return found
 
 
+def taken(*lines: bytes) -> LogLines:
+    made = LogLines()
+    for line in lines:
+        made.add(line)
+    return made
+
+
 def test_lines_are_numbered_from_1_and_sent_once() -> None:
-    lines = LogLines()
-    for text in (b'{"message":"a"}', b'"b"'):
-        lines.add(text)
-    assert read(lines) == [(1, [{"message": "a"}, "b"])]
-    assert read(lines, 1) == [(2, ["b"])]
-    assert read(lines, 2) == []
+    lines = taken(b'{"message":"a"}', b'"b"')
+    runs = [[(1, [{"message": "a"}, "b"])], [(2, ["b"])], []]
+    assert [read(lines, after) for after in range(3)] == runs
 
 
 def test_what_is_dropped_leaves_a_gap() -> None:
-    lines = LogLines()
-    lines.add(b'"a"')
-    lines.add(b'"' + b"x" * MAX_LINE_BYTES + b'"')
-    lines.add(b"[" * 1000)
-    lines.add(b'"b"')
+    lines = taken(b'"a"', b'"' + b"x" * MAX_LINE_BYTES + b'"', b"[" * 1000, b'"b"')
     lines.refused += 3
     lines.add(b'"c"')
     assert read(lines) == [(1, ["a"]), (4, ["b"]), (8, ["c"])]
 
 
 def test_a_page_that_is_too_slow_sees_from_where_there_are_lines() -> None:
-    lines = LogLines()
-    for number in range(MAX_LINES + 20):
-        lines.add(str(number).encode())
-    runs = read(lines, 5)
-    assert runs[0][0] == 21
-    assert sum(len(run) for _, run in runs) == MAX_LINES
+    runs = read(taken(*(str(number).encode() for number in range(MAX_LINES + 20))), 5)
+    assert (runs[0][0], sum(len(run) for _, run in runs)) == (21, MAX_LINES)
 
 
 def test_plain_text_becomes_a_string() -> None:
@@ -58,10 +54,7 @@ def test_plain_text_becomes_a_string() -> None:
 
 @given(st.lists(st.binary(max_size=2000), max_size=40), st.integers(0, 50))
 def test_whatever_arrives_is_bounded_and_valid_json(payloads: list[bytes], after: int) -> None:
-    lines = LogLines()
-    for payload in payloads * 8:
-        lines.add(payload)
-    runs = read(lines, after)
+    runs = read(taken(*payloads * 8), after)
     sizes = [sum(len(json.dumps(line)) for line in run) for _, run in runs]
     assert sum(sizes) <= 6 * MAX_BYTES  # Python escapes what msgspec does not
     assert sum(len(run) for _, run in runs) <= MAX_LINES
@@ -71,14 +64,9 @@ def test_whatever_arrives_is_bounded_and_valid_json(payloads: list[bytes], after
 
 
 def test_a_message_to_a_page_is_short_but_has_a_line() -> None:
-    lines = LogLines()
-    for _ in range(30):
-        lines.add(json.dumps("x" * 2000).encode())
-    for size in (len(json.dumps(run)) for _, run in read(lines)):
-        assert size <= PART_BYTES + 100
-    long = LogLines()
-    long.add(json.dumps("x" * (MAX_LINE_BYTES - 10)).encode())
-    assert len(read(long)) == 1
+    runs = read(taken(*[json.dumps("x" * 2000).encode()] * 30))
+    assert max(len(json.dumps(run)) for _, run in runs) <= PART_BYTES + 100
+    assert len(read(taken(json.dumps("x" * (MAX_LINE_BYTES - 10)).encode()))) == 1
 
 
 def status(**restarts: object) -> bytes:
@@ -94,15 +82,9 @@ def test_restarts_are_dated_when_they_are_seen() -> None:
     assert seen.view().times == {"b": (3000, 3000), "a": (4000,)}
     assert not seen.receive(status(a=0, b=0), 5000)  # the whole robot was restarted
     assert seen.receive(status(a=1, b=0), 6000)
-    assert seen.view().times["a"] == (4000, 6000)
-
-
-def test_restarts_in_a_status_of_any_age_are_not_dated() -> None:
-    seen = Restarts()
-    assert not seen.receive(status(a=3), 1000)
-    assert not seen.receive(status(a=8), 2000, dated=False)  # the broker was away meanwhile
-    assert seen.receive(status(a=9), 3000)
-    assert seen.view().times == {"a": (3000,)}
+    assert not seen.receive(status(a=8, b=0), 7000, dated=False)  # the broker was away meanwhile
+    assert seen.receive(status(a=9, b=0), 8000)
+    assert seen.view().times["a"] == (4000, 6000, 8000)
 
 
 def test_only_the_newest_restarts_of_some_services_are_remembered() -> None:
@@ -114,18 +96,12 @@ def test_only_the_newest_restarts_of_some_services_are_remembered() -> None:
     assert set(map(len, seen.view().times.values())) == {MAX_TIMES}
 
 
-@given(
-    st.recursive(
-        st.none()
-        | st.booleans()
-        | st.integers()
-        | st.text(max_size=5)
-        | st.floats(allow_nan=False, allow_infinity=False),
-        lambda inside: (
-            st.lists(inside, max_size=3)
-            | st.dictionaries(st.sampled_from(["value", "services", "a", "restarts"]), inside, max_size=3)
-        ),
-    )
+SCALARS = (
+    st.none() | st.booleans() | st.integers() | st.text(max_size=5) | st.floats(allow_nan=False, allow_infinity=False)
 )
+KEYS = st.sampled_from(["value", "services", "a", "restarts"])
+
+
+@given(st.recursive(SCALARS, lambda inside: st.lists(inside, max_size=3) | st.dictionaries(KEYS, inside, max_size=3)))
 def test_a_status_may_be_of_any_shape(value: object) -> None:
     Restarts().receive(json.dumps(value).encode(), 1)

@@ -6,7 +6,7 @@ import asyncio
 import itertools
 import json
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Coroutine, Iterator
 from pathlib import Path
 from typing import Any, cast
 
@@ -17,7 +17,6 @@ from websockets.sync.client import connect
 from pebble.client.broker import Broker as BrokerOfPages
 from pebble.errors import TransportError
 from pebble.transports import Message, MqttSettings, QoS, create
-from pebble.web import open_components
 from pebble.web.open_components import OpenComponents
 from pebble.web.robots import Interest, Robots
 from tests.support import Broker, until
@@ -27,26 +26,9 @@ from tests.web.served import Page, RecordingRobot, Served
 NAMES = itertools.count(1)
 
 
-class Reader(Page):
-    """A page that collects log lines."""
-
-    def __init__(self, served: Served, **options: Any) -> None:
-        self.logs: list[dict[str, Any]] = []
-        self.done: list[dict[str, Any]] = []
-        super().__init__(served, **options)
-
-    @property
-    def lines(self) -> list[object]:
-        return [line for message in list(self.logs) for line in message["lines"]]
-
-    def _take(self, message: dict[str, Any]) -> None:
-        match message["op"]:
-            case "logs":
-                self.logs.append(message)
-            case "done":
-                self.done.append(message)
-            case _:
-                super()._take(message)
+def lines(page: Page) -> list[Any]:
+    """The log lines that a page has received."""
+    return [line for message in list(page.logs) for line in message["lines"]]
 
 
 @pytest.fixture
@@ -56,8 +38,8 @@ def robot(broker: Broker) -> Iterator[RecordingRobot]:
 
 
 @pytest.fixture
-def page(served: Served, robot: RecordingRobot) -> Iterator[Reader]:
-    with Reader(served) as one:
+def page(served: Served, robot: RecordingRobot) -> Iterator[Page]:
+    with Page(served) as one:
         assert one.knows(robot.base)
         one.send("watch", ref=robot.base)
         assert until(lambda: one.value(robot.base, "web/flags") is not None)
@@ -91,24 +73,24 @@ def test_a_page_that_reads_logs_receives_those_from_before_and_those_that_come(p
     assert until(lambda: _logged(robot, page, "first"))
     assert page.logs == []  # it has not asked
     page.send("read-logs", ref=robot.base, on=True)
-    assert until(lambda: page.lines)
+    assert until(lambda: lines(page))
     robot.publish("logs", {"t": 1, "level": "INFO", "service": "a", "message": "second"})
     publish(broker, f"{robot.base}/outgoing/logs", b"plain text")
-    assert until(lambda: page.lines[-1:] == ["plain text"])
+    assert until(lambda: lines(page)[-1:] == ["plain text"])
     first = page.logs[0]
-    assert page.lines[-2]["message"] == "second"
+    assert lines(page)[-2]["message"] == "second"
     page.send("read-logs", ref=robot.base, on=False)
     robot.publish("logs", {"message": "unread"})
     robot.publish("charging-level", {"value": 3.5})
     assert until(lambda: page.value(robot.base, "charging-level") is not None)
-    assert page.lines[-1] == "plain text"
-    seen = len(page.lines)
+    assert lines(page)[-1] == "plain text"
+    seen = len(lines(page))
     page.send("read-logs", ref=robot.base, on=True, origin=first["origin"], after=seen)
-    assert until(lambda: page.lines[-1] == {"message": "unread"})
-    assert len(page.lines) == seen + 1
+    assert until(lambda: lines(page)[-1] == {"message": "unread"})
+    assert len(lines(page)) == seen + 1
 
 
-def _logged(robot: RecordingRobot, page: Reader, text: str) -> bool:
+def _logged(robot: RecordingRobot, page: Page, text: str) -> bool:
     """Publish until the server receives it: it subscribes a moment after the page has opened the robot."""
     robot.publish("logs", {"message": text})
     robot.publish("status", {"value": {"text": text}})
@@ -120,7 +102,7 @@ def test_lines_that_the_server_drops_leave_a_gap(page, robot, broker) -> None:
     assert until(lambda: _logged(robot, page, "ready"))
     publish(broker, f"{robot.base}/outgoing/logs", b"x" * 20_000)
     robot.publish("logs", {"message": "last"})
-    assert until(lambda: page.lines[-1:] == [{"message": "last"}])
+    assert until(lambda: lines(page)[-1:] == [{"message": "last"}])
     last = page.logs[-1]
     before = page.logs[-2]
     assert last["first"] == before["first"] + len(before["lines"]) + 1
@@ -147,8 +129,8 @@ def test_logs_of_another_component_are_not_sent(page, robot, served, broker) -> 
         assert until(lambda: _logged(robot, page, "mine"))
         other.publish("logs", {"message": "theirs"})
         robot.publish("logs", {"message": "end"})
-        assert until(lambda: {"message": "end"} in page.lines)
-        assert {"message": "theirs"} not in page.lines
+        assert until(lambda: {"message": "end"} in lines(page))
+        assert {"message": "theirs"} not in lines(page)
 
 
 # -- flags
@@ -177,7 +159,7 @@ def test_a_flag_is_read_where_the_capabilities_name_it_but_only_of_the_robot_its
     publish(broker, f"{base}/incoming/flags/eye", b"true", retain=True)
     publish(broker, f"{base}/incoming/flags/mqtt-audio", b"true", retain=True)
     publish(broker, "pebble/robots/other/incoming/flags/mqtt-audio", b"false", retain=True)
-    with RecordingRobot(broker.port, base, capabilities=named) as robot, Reader(served) as page:
+    with RecordingRobot(broker.port, base, capabilities=named) as robot, Page(served) as page:
         assert page.knows(base)
         page.send("watch", ref=base)
         wanted = {"remote_mirror": None, "mqtt_audio": True, "mqtt_video": True}
@@ -189,14 +171,20 @@ def test_a_flag_is_read_where_the_capabilities_name_it_but_only_of_the_robot_its
 # -- actions
 
 
-def test_an_action_goes_to_the_topic_that_the_capabilities_name(served, broker) -> None:
+@pytest.mark.parametrize(
+    ("flag", "topic"),
+    [("again", "again"), ("pebble/robots/other/incoming/flags/reboot", "service-restart")],
+    ids=["that the capabilities name", "but never another robot's"],
+)
+def test_an_action_goes_to_the_topic(served, broker, flag: str, topic: str) -> None:
     base = f"pebble/robots/rig{next(NAMES)}"
-    capabilities = {"system": {"service_restart": {"flag_topic": f"{base}/incoming/flags/again"}}}
-    with RecordingRobot(broker.port, base, capabilities=capabilities) as robot, Reader(served) as page:
+    named = flag if "/" in flag else f"{base}/incoming/flags/{flag}"
+    capabilities = {"system": {"service_restart": {"flag_topic": named}}}
+    with RecordingRobot(broker.port, base, capabilities=capabilities) as robot, Page(served) as page:
         assert page.knows(base)
         page.send("action", ref=base, name="service-restart")
         page.send("action", ref=base, name="reboot")
-        wanted = [(f"{base}/incoming/flags/again", {"value": True}), (f"{base}/incoming/flags/reboot", {"value": True})]
+        wanted = [(f"{base}/incoming/flags/{name}", {"value": True}) for name in (topic, "reboot")]
         assert until(lambda: [(topic, value) for _, topic, value in robot.received] == wanted), robot.received
         assert until(lambda: [one["cmd"] for one in page.done] == ["action", "action"])
     assert until(lambda: [one.detail for one in _audit(served, base)] == ["name service-restart", "name reboot"])
@@ -231,15 +219,6 @@ def test_an_answer_has_the_number_of_what_was_asked(page, robot) -> None:
     ]
 
 
-def test_an_action_never_goes_to_another_robot(served, broker) -> None:
-    base = f"pebble/robots/rig{next(NAMES)}"
-    lie = {"system": {"reboot": {"flag_topic": "pebble/robots/other/incoming/flags/reboot"}}}
-    with RecordingRobot(broker.port, base, capabilities=lie) as robot, Reader(served) as page:
-        assert page.knows(base)
-        page.send("action", ref=base, name="reboot")
-        assert until(lambda: robot.topics() == {f"{base}/incoming/flags/reboot"})
-
-
 def _audit(served: Served, ref: str) -> list[Any]:
     return [entry for entry in served.app.state.audit.read(100) if entry.ref == ref and entry.what == "action"]
 
@@ -251,13 +230,13 @@ def test_restarts_are_dated_for_pages_that_come_later(served, broker, robot) -> 
     def services(count: int) -> dict[str, Any]:
         return {"value": {"services": {"imu": {"state": "ready", "restarts": count, "last_exit": "signal 9"}}}}
 
-    with Reader(served) as page:
+    with Page(served) as page:
         assert page.knows(robot.base)
         robot.publish("status", services(1), retain=True)
         assert until(lambda: page.value(robot.base, "status") == services(1))
         robot.publish("status", services(2), retain=True)
         assert until(lambda: len((page.value(robot.base, "web/restarts") or {}).get("times", {}).get("imu", [])) == 1)
-    with Reader(served) as later:
+    with Page(served) as later:
         assert until(lambda: later.value(robot.base, "web/restarts") is not None)
 
 
@@ -292,100 +271,91 @@ class SlowBroker:
         self.filters.discard(filter_)
 
 
-def test_a_component_that_is_opened_while_it_is_being_closed_is_received(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(open_components, "_KEEP_S", 0)
-    monkeypatch.setattr(open_components, "_STEP_S", 0)
+class Opened:
+    """What is received of one robot while pages open and close it; its broker is as slow as the test lets it."""
+
     base = "pebble/robots/rig"
 
-    async def work() -> None:
-        broker, robots, tasks = SlowBroker(), Robots(), []
-        opened = OpenComponents(
-            cast(BrokerOfPages, broker), robots, lambda work: tasks.append(asyncio.ensure_future(work))
+    def __init__(self) -> None:
+        self.broker, self.robots = SlowBroker(), Robots()
+        self.tasks: list[asyncio.Future[None]] = []
+        self.components = OpenComponents(
+            cast(BrokerOfPages, self.broker),
+            self.robots,
+            lambda work: self.tasks.append(asyncio.ensure_future(work)),
+            keep_s=0,
+            step_s=0,
         )
-        opened.open(base)
-        await asyncio.gather(*tasks)
-        everything = set(broker.filters)
-        opened.close(base)
-        while len(tasks) == 1:
+
+    async def open(self) -> None:
+        self.components.open(self.base)
+        await asyncio.gather(*self.tasks)
+
+    async def close(self) -> None:
+        """Returns when it has begun to receive nothing more: the broker is about to end the first subscription."""
+        self.components.close(self.base)
+        while len(self.tasks) == 1:
             await asyncio.sleep(0)
-        opened.open(base)
-        broker.may_unsubscribe.set()
-        await asyncio.gather(*tasks)
-        assert broker.filters == everything
-        assert base in robots.logs
-
-    asyncio.run(work())
+        await asyncio.sleep(0)
 
 
-def test_one_topic_that_cannot_be_received_holds_back_no_other(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    monkeypatch.setattr(open_components, "_STEP_S", 0)
-    base = "pebble/robots/rig"
+async def opened_while_it_is_being_closed() -> None:
+    rig = Opened()
+    await rig.open()
+    everything = set(rig.broker.filters)
+    await rig.close()
+    rig.components.open(rig.base)
+    rig.broker.may_unsubscribe.set()
+    await asyncio.gather(*rig.tasks)
+    assert rig.broker.filters == everything
+    assert rig.base in rig.robots.logs
 
+
+async def no_component_leaves_nothing() -> None:
+    rig, other = Opened(), Interest(lambda: None)
+    rig.broker.may_unsubscribe.set()
+    rig.robots.join(other)
+    rig.components.open(rig.base)
+    rig.robots.set_server_metric(rig.base, "web/picture-from", {"source": ""})
+    await asyncio.gather(*rig.tasks)
+    assert rig.robots.value(rig.base, "web/flags") is not None
+    await rig.close()
+    await asyncio.gather(*rig.tasks)
+    assert (rig.broker.filters, rig.robots.logs, rig.components.known, other.gone) == (set(), {}, set(), {rig.base})
+    assert [rig.robots.value(rig.base, f"web/{metric}") for metric in ("flags", "picture-from")] == [None, None]
+
+
+async def capabilities_pass_no_channel_off_as_another() -> None:
+    rig = Opened()
+    telemetry = {"imu_topic": f"{rig.base}/outgoing/front-camera", "touch_topic": f"{rig.base}/outgoing/renamed"}
+    value = {"telemetry": telemetry, "video": {"flag_topic": f"{rig.base}/incoming/estop"}}
+    payload = json.dumps({"schema": "pebble-capabilities/v1", "t": 1, "value": value}).encode()
+    rig.robots.receive(Message(f"{rig.base}/outgoing/capabilities", payload), 0.0)
+    await rig.open()
+    assert {f"{rig.base}/outgoing/renamed", f"{rig.base}/incoming/flags/mqtt-video"} <= rig.broker.filters
+    assert not {f"{rig.base}/outgoing/front-camera", f"{rig.base}/incoming/estop"} & rig.broker.filters
+
+
+@pytest.mark.parametrize(
+    "story",
+    [opened_while_it_is_being_closed, no_component_leaves_nothing, capabilities_pass_no_channel_off_as_another],
+)
+def test_components_that_are_opened_and_closed(story: Callable[[], Coroutine[Any, Any, None]]) -> None:
+    asyncio.run(story())
+
+
+def test_one_topic_that_cannot_be_received_holds_back_no_other(caplog: pytest.LogCaptureFixture) -> None:
     async def work() -> None:
-        broker, tasks = SlowBroker(), []
-        opened = OpenComponents(
-            cast(BrokerOfPages, broker), Robots(), lambda work: tasks.append(asyncio.ensure_future(work))
-        )
-        broker.refuses = f"{base}/outgoing/sensors/imu"
-        opened.open(base)
+        rig = Opened()
+        rig.broker.refuses = f"{rig.base}/outgoing/sensors/imu"
+        rig.components.open(rig.base)
         for _ in range(100):
             await asyncio.sleep(0)
-        assert {f"{base}/outgoing/logs", f"{base}/incoming/flags/mqtt-video"} <= broker.filters
-        assert [record.getMessage() for record in caplog.records] == [f"{broker.refuses} is not received: no"]
-        broker.refuses = ""
-        await asyncio.gather(*tasks)
-        assert f"{base}/outgoing/sensors/imu" in broker.filters
-
-    asyncio.run(work())
-
-
-def test_what_is_no_component_leaves_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(open_components, "_KEEP_S", 0)
-    monkeypatch.setattr(open_components, "_STEP_S", 0)
-    base = "pebble/robots/made-up"
-
-    async def work() -> None:
-        broker, robots, tasks = SlowBroker(), Robots(), []
-        broker.may_unsubscribe.set()
-        other = Interest(lambda: None)
-        robots.join(other)
-        opened = OpenComponents(
-            cast(BrokerOfPages, broker), robots, lambda work: tasks.append(asyncio.ensure_future(work))
-        )
-        opened.open(base)
-        robots.set_server_metric(base, "web/picture-from", {"source": ""})
-        await asyncio.gather(*tasks)
-        assert robots.value(base, "web/flags") is not None
-        opened.close(base)
-        while len(tasks) == 1:
-            await asyncio.sleep(0)
-        await asyncio.gather(*tasks)
-        assert (broker.filters, robots.logs, robots._server) == (set(), {}, {})
-        assert (opened._wanted, opened._subscriptions, opened._flags) == ({}, {}, {})
-        assert other.gone == {base}
-
-    asyncio.run(work())
-
-
-def test_capabilities_cannot_pass_one_channel_off_as_another() -> None:
-    async def work() -> None:
-        base, robots, tasks = "pebble/robots/rig", Robots(), []
-        telemetry = {"imu_topic": f"{base}/outgoing/front-camera", "touch_topic": f"{base}/outgoing/renamed"}
-        value = {"telemetry": telemetry, "video": {"flag_topic": f"{base}/incoming/estop"}}
-        payload = json.dumps({"schema": "pebble-capabilities/v1", "t": 1, "value": value}).encode()
-        robots.receive(Message(f"{base}/outgoing/capabilities", payload), 0.0)
-        broker = SlowBroker()
-        opened = OpenComponents(
-            cast(BrokerOfPages, broker), robots, lambda work: tasks.append(asyncio.ensure_future(work))
-        )
-        opened.open(base)
-        while f"{base}/outgoing/video-overlays" not in broker.filters:
-            await asyncio.sleep(0)
-        assert {f"{base}/outgoing/renamed", f"{base}/incoming/flags/mqtt-video"} <= broker.filters
-        assert not {f"{base}/outgoing/front-camera", f"{base}/incoming/estop"} & broker.filters
-        tasks[0].cancel()
+        assert {f"{rig.base}/outgoing/logs", f"{rig.base}/incoming/flags/mqtt-video"} <= rig.broker.filters
+        assert [record.getMessage() for record in caplog.records] == [f"{rig.broker.refuses} is not received: no"]
+        rig.broker.refuses = ""
+        await asyncio.gather(*rig.tasks)
+        assert f"{rig.base}/outgoing/sensors/imu" in rig.broker.filters
 
     asyncio.run(work())
 
@@ -397,7 +367,7 @@ def test_the_name_of_a_page_without_a_login_counts_for_its_voice_and_for_a_stop_
     base = f"pebble/robots/rig{next(NAMES)}"
     audio = {"available": True, "controls": True, "topic": f"{base}/outgoing/audio"}
     url = f"ws://127.0.0.1:{served.port}/ws/sound?ref={base}&name=Alice&device=phone"
-    with RecordingRobot(broker.port, base, capabilities={"audio": audio}), Reader(served) as page:
+    with RecordingRobot(broker.port, base, capabilities={"audio": audio}), Page(served) as page:
         assert page.knows(base)
         with connect(url, origin=served.origin) as sound:
             sound.send(struct.pack(">BII", 1, 1, 0) + bytes(640))
@@ -415,7 +385,7 @@ def test_the_name_of_a_page_without_a_login_counts_for_its_voice_and_for_a_stop_
 
 
 def test_without_a_login_a_page_gives_its_own_name(served, robot) -> None:
-    with Reader(served, name="Alice \u202e", device="phone") as alice, Reader(served) as other:
+    with Page(served, name="Alice \u202e", device="phone") as alice, Page(served) as other:
         assert alice.welcome["user"] == "Alice ?"
         assert other.welcome["user"] == "local"
         assert other.knows(robot.base)

@@ -1,0 +1,468 @@
+"""What is behind the cards Lights, Sounds and Autonomy, without a browser: in Node.js."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from typing import Any
+
+from pebble.services.autonomy_manager.forms import Setting, SettingError, effective
+from tests.web.in_node import Rows, Script, evaluate, rows
+
+_STORED = """
+const stored = new Map();
+const getItem = (key) => stored.get(key) ?? null;
+globalThis.localStorage = { getItem, setItem: (key, value) => stored.set(key, value) };
+const texts = (map) => Object.fromEntries(map);
+"""
+
+#: The services of a page before one robot; ``sent`` is what it asks for.
+_PAGE = """
+const ref = "pebble/robots/goob";
+const values = {
+  "": { "web/broker": { problem: "" } },
+  [ref]: {
+    "web/liveness": { online: true },
+    capabilities: { value: {
+      lights: { solid: true, flash: true }, soundboard: { available: true, controls: true },
+      autonomy: { available: true, controls: true }, drive: { available: true, arbitrates: true },
+    } },
+  },
+};
+const sent = [];
+const followers = new Set();
+const onChange = (fn) => { followers.add(fn); return () => followers.delete(fn); };
+const page = {
+  connection: { isOpen: true, may: (right) => right === "drive", answers: new Map(), onChange },
+  store: { get: (at, metric) => (metric in (values[at] ?? {}) ? { value: values[at][metric] } : undefined) },
+  commands: {
+    setLights: (_ref, colour) => sent.push(colour),
+    playSound: (_ref, file, repeat) => sent.push([file, repeat]),
+  },
+};
+"""
+
+BLACK = {"r": 0, "g": 0, "b": 0}
+ORANGE = {"r": 1, "g": 0.533, "b": 0}
+lights = Script(
+    {"ui/cards/lights-model.js": "Lights, Pacer, lightsOf, supported, toggleFlash"}, _STORED + _PAGE, anew=True
+)
+_PACER = """
+let now = 1000;
+const timers = [];
+const pacer = new Pacer(200, () => now, (fn, ms) => timers.push([fn, now + ms]));
+const calls = [];
+const drag = (ms, value) => {
+  while (timers.length && timers[0][1] <= now + ms) { const [fn, at] = timers.shift(); ms -= at - now; now = at; fn(); }
+  now += ms;
+  if (value !== undefined) pacer.call(() => calls.push([now, value]));
+};
+"""
+_ANSWER = """
+const answer = (n, op) => { page.connection.answers.set(n, { op, n }); [...followers].forEach((fn) => fn()); };
+const one = lightsOf(ref);
+const lit = () => [one.mode, one.colour];
+"""
+#: What is asked of lights, and what is sent.
+ASKED = {
+    '{ mode: "solid" }': ORANGE,
+    '{ colour: "#0000ff" }': {"r": 0, "g": 0, "b": 1},
+    '{ mode: "flash", period: 0.5 }': ORANGE | {"period": 0.5},
+    '{ mode: "flash", period: 99 }': ORANGE | {"period": 10},
+    '{ mode: "flash", period: NaN }': ORANGE | {"period": 2},
+    '{ mode: "off" }': BLACK,
+    '{ colour: "red" }': ORANGE,
+}
+NO_FLASH = "goob has no lights that flash"
+WHY_NO_FLASH = {
+    "page.connection.isOpen = false": "No connection to the server",
+    'values[""]["web/broker"].problem = "refused"': "The server cannot reach the broker",
+    "page.connection.may = () => false": "Log in as driver to use this",
+    'values[ref]["web/liveness"].online = false': "goob is silent",
+    "values[ref].capabilities.value.lights.controls = false": "goob takes no such commands",
+    "values[ref].capabilities.value.lights.flash = false": NO_FLASH,
+    "values[ref].capabilities.value.lights = 7": NO_FLASH,
+    "values[ref].capabilities = null": NO_FLASH,
+    "delete values[ref]": NO_FLASH,
+}
+#: Sections of capabilities, and whether such lights stay on, and flash.
+ABLE = {
+    "{ solid: true, flash: true }": [True, True],
+    "{ solid: true, flash: false }": [True, False],
+    "{ available: true }": [True, True],
+    "{ available: true, flash: false }": [True, False],
+    '{ solid: "yes", available: 1 }': [False, False],
+    "{}": [False, False],
+}
+REMEMBERED = "null", "7", '"x"', "[]", '{"colour":"url(x)","period":"2","mode":"boom","steady":[]}'
+# fmt: off
+LIGHTS: Rows = {
+    "a dragged colour is sent five times a second and the last one always": (f"""{_PACER}
+        for (let i = 0; i < 100; i++) drag(10, i);
+        drag(1000);
+        const waits = calls.slice(1).map(([at], index) => at - calls[index][0]);
+        result = [Math.min(...waits) >= 200, calls.length, calls[0], calls.at(-1)[1]];""", [True, 6, [1010, 0], 99]),
+    "single choices are sent at once": (
+        f"{_PACER} drag(0, 1); drag(200, 2); drag(500, 3); result = [calls, timers.length];",
+        [[[1000, 1], [1200, 2], [1700, 3]], 0]),
+    **{f"what is asked of lights: {change}": (f"lightsOf(ref).ask(page, {change}); result = sent;", [expected])
+        for change, expected in ASKED.items()},
+    **{f"a flash ends in what was before: {before}": (f"""
+        const one = lightsOf(ref);
+        one.ask(page, {{ mode: "{before}" }});
+        result = [toggleFlash(page, ref), one.mode, toggleFlash(page, ref), one.mode];""", ["", "flash", "", before])
+        for before in ("solid", "off")},
+    "lights that were refused are as before": (f"""{_ANSWER}
+        one.ask(page, {{ mode: "solid", colour: "#0000ff" }});
+        answer(1, "done");
+        one.pacer.calledAt = -Infinity;
+        result = [toggleFlash(page, ref), lit()];
+        answer(2, "refused");
+        result.push(lit(), followers.size);
+        one.pacer.calledAt = -Infinity;
+        page.commands.setLights = () => 0;
+        one.ask(page, {{ mode: "off" }});
+        result.push(lit());""", ["", ["flash", "#0000ff"], ["solid", "#0000ff"], 0, ["solid", "#0000ff"]]),
+    "a refusal does not undo what was asked after it": (f"""{_ANSWER}
+        one.ask(page, {{ mode: "solid" }});
+        one.pacer.calledAt = -Infinity;
+        one.ask(page, {{ mode: "off" }});
+        answer(1, "refused");
+        result = [lit()[0]];
+        answer(2, "done");
+        result.push(lit()[0], followers.size);""", ["off", "off", 0]),
+    "lights that only flash are off in black": ("""
+        values[ref].capabilities.value.lights = { solid: false, flash: true };
+        lightsOf(ref).ask(page, { mode: "off" }); result = sent;""", [BLACK | {"period": 2}]),
+    "a flash of a silent robot can be switched off": ("""
+        const one = lightsOf(ref);
+        one.ask(page, { mode: "flash" });
+        values[ref]["web/liveness"].online = false;
+        result = [toggleFlash(page, ref), one.mode, toggleFlash(page, ref)];""", ["", "off", "goob is silent"]),
+    **{f"why lights do not flash: {change}": (f"{change}; result = [toggleFlash(page, ref), sent];", [why, []])
+        for change, why in WHY_NO_FLASH.items()},
+    **{f"what lights can do: {section}": (f"""
+        const {{ solid, flash }} = supported({{ value: {{ lights: {section} }} }});
+        result = [solid, flash];""", expected) for section, expected in ABLE.items()},
+    **{f"lights ignore what they cannot have remembered: {found}": (f"""
+        globalThis.localStorage = {{ getItem: () => {json.dumps(found)}, setItem() {{}} }};
+        const {{ colour, period, mode, steady }} = new Lights("other");
+        result = [colour, period, mode, steady];""", ["#ff8800", 2, "", "off"]) for found in REMEMBERED},
+}
+# fmt: on
+
+# -- sounds
+
+sounds = Script({"ui/cards/sounds-model.js": "clips, grouped, play, playing, repeatLast"}, _STORED + _PAGE, anew=True)
+FILES = ["horn.wav", "Bell.wav", "animals/Cat.wav", "animals/dog.wav", "animals/wild/cat.wav"]
+WILD = ["animals/wild/", FILES[4:]]
+#: What is searched, how many are shown at most, and the groups; and how many more there are.
+GROUPS = [
+    ("", 60, [["", FILES[:2]], ["animals/", FILES[2:4]], WILD], 0),
+    ("CAT", 60, [["animals/", FILES[2:3]], WILD], 0),
+    ("  wild   cat ", 60, [WILD], 0),
+    ("nothing", 60, [], 0),
+    ("", 2, [["", FILES[:2]]], 3),
+]
+CLIPS = {
+    '{ files: ["a.wav", "a.wav", 7, null, "", "  ", ["b.wav"], "c.wav"] }': ["a.wav", "c.wav"],
+    '{ value: { files: ["a.wav"] } }': ["a.wav"],
+    **dict.fromkeys(('{ files: "a.wav" }', '{ files: { 0: "a.wav" } }', "null", "7"), None),
+}
+#: Status, what plays, and the error.
+PLAYING = {
+    '{ playing: true, file: "a.wav", error: null }': ["a.wav", ""],
+    "{ playing: true, file: { x: 1 }, error: 7 }": ["a clip", ""],
+    '{ playing: "yes", file: "a.wav", error: "Sound file not found" }': ["", "Sound file not found"],
+    "[]": ["", ""],
+    "null": ["", ""],
+}
+# fmt: off
+SOUNDS: Rows = {
+    "the last sound is repeated as it was played": ("""
+        result = [repeatLast(page, ref), play(page, ref, "a/horn.wav", true), repeatLast(page, ref),
+          repeatLast(page, "pebble/robots/fred"), sent];""",
+        ["Play one sound first", "", "", "Play one sound first", [["a/horn.wav", True]] * 2]),
+    "what cannot be played is not repeated": ("""
+        result = [play(page, ref, "x".repeat(1001), false), repeatLast(page, ref)];
+        values[ref].capabilities.value.soundboard.controls = false;
+        result.push(play(page, ref, "horn.wav", false), repeatLast(page, ref), sent);""",
+        ["Its name is too long", "Play one sound first", *["goob takes no such commands"] * 2, []]),
+    **{f"{most} clips with '{words}' are grouped by folder": (
+        f"result = grouped({json.dumps(FILES)}, '{words}', {most});", {"folders": folders, "more": more})
+        for words, most, folders, more in GROUPS},
+    **{f"only names are clips: {payload}": (f"result = clips({payload});", expected)
+        for payload, expected in CLIPS.items()},
+    **{f"what plays: {payload}": (f"const {{ file, error }} = playing({payload}); result = [file, error];", expected)
+        for payload, expected in PLAYING.items()},
+}
+# fmt: on
+
+# -- forms of scripts
+
+forms = Script(
+    {"ui/cards/form-model.js": "filled, hint, lastScript, remember, remembered, scripts, whyNotSent"}, _STORED
+)
+
+
+def entry(key: str, kind: str = "string", **more: Any) -> dict[str, Any]:
+    return {"key": key, "label": key.upper(), "type": kind, "default": None, "arg": f"--{key}"} | more
+
+
+def filled_all(configs: list[Any], forms_: list[dict[str, str]]) -> list[Any]:
+    """What is sent of each form, and its mistakes."""
+    files = {"files": [{"file": "x", "label": "X", "configs": configs}]}
+    steps = f"""
+    const [script] = scripts({json.dumps(files)});
+    result = JSON.parse({json.dumps(json.dumps(forms_))}).map((texts) => {{
+      const {{ config, mistakes }} = filled(script.fields, new Map(Object.entries(texts)));
+      return [config, Object.fromEntries(mistakes)];
+    }});"""
+    found: list[Any] = forms(steps)
+    return found
+
+
+def filled(configs: list[Any], texts: dict[str, str]) -> tuple[dict[str, Any], dict[str, str]]:
+    ((config, mistakes),) = filled_all(configs, [texts])
+    return config, mistakes
+
+
+ALL = [
+    entry("name", default="goob"),
+    entry("laps", "int", default=3, min=1, max=9, step=1),
+    entry("power", "float", default=0.5, min=0.1, max=1.0),
+    entry("search", "bool", default=True),
+    entry("family", "enum", default="A", options=["A", "B"]),
+    entry("tag", "int", required=True),
+]
+
+
+MISTAKES = [
+    ("tag", "", "required"),
+    ("laps", "0", "at least 1"),
+    ("laps", "10", "at most 9"),
+    ("laps", "2.5", "must be a whole number"),
+    ("laps", "?", "must be a number"),
+    ("laps", " ", "must be a number"),
+    ("laps", "two", "must be a number"),
+    ("tag", "1e15", "must be a whole number"),
+    ("power", "1e999", "must be a number"),
+    ("power", "NaN", "must be a number"),
+    ("power", "Infinity", "must be a number"),
+    ("power", "0.05", "at least 0.1"),
+    ("name", "-x", "must not begin with -"),
+    ("name", "x" * 257, "at most 256 characters"),
+    ("name", "a\tb", "must have no control characters"),
+    ("name", "a\u00a0b", "must have no control characters"),
+    ("family", "C", "choose one of the list"),
+    ("search", "maybe", "choose one of the list"),
+]
+
+
+def test_forms_are_sent_in_the_types_of_json() -> None:
+    given = {"name": "fred", "laps": "4", "power": "0.25", "search": "false", "family": "B", "tag": "0", "foreign": "x"}
+    assert filled(ALL, {"tag": "7"}) == ({"tag": 7}, {})  # what was not filled in is not sent
+    sent = {"name": "fred", "laps": 4, "power": 0.25, "search": False, "family": "B", "tag": 0}
+    assert filled(ALL, given) == (sent, {})
+    texts = ["naïve café", "日本", "a b", "3-4", "{}"]
+    found = filled_all(ALL, [{"name": text, "tag": "1"} for text in texts])
+    assert found == [[{"name": text, "tag": 1}, {}] for text in texts]
+
+
+def test_mistakes() -> None:
+    found = filled_all(ALL, [{"tag": "1"} | {key: text} for key, text, _ in MISTAKES])
+    for (key, text, mistake), (config, mistakes) in zip(MISTAKES, found, strict=True):
+        assert mistakes == {key: mistake}, (key, text)
+        assert key not in config
+
+
+SETTINGS = [
+    Setting(key="laps", type="int", default=3, min=1, max=9),
+    Setting(key="power", type="float", default=0.5, min=0.1, max=1),
+    Setting(key="name", type="string", default="x"),
+    Setting(key="family", type="enum", default="A", options=("A", "B")),
+]
+TEXTS = ["1", "9", "10", "0", "2.5", "-1", "1e0", ".5", "5.", "1e-1", "A", "C", "1_0", "٣", "a\nb", " "]
+TEXTS += ["x" * 256, "x" * 257]
+
+
+def robot_accepts(values: dict[str, Any]) -> bool:
+    try:
+        effective(SETTINGS, values)
+    except SettingError:
+        return False
+    return True
+
+
+def test_the_form_and_the_robot_accept_the_same() -> None:
+    cases = [(setting.key, text) for setting in SETTINGS for text in TEXTS]
+    found = filled_all([setting.entry() for setting in SETTINGS], [{key: text} for key, text in cases])
+    for (key, text), (config, mistakes) in zip(cases, found, strict=True):
+        assert robot_accepts(config or {key: text}) is not bool(mistakes), (key, text)
+
+
+def test_a_robot_may_list_anything() -> None:
+    odd: list[Any] = [
+        7, None, [], {"key": 1}, {"key": ""}, {"key": "x" * 101}, {"key": "a"},
+        entry("a", "colour", default={"x": 1}, min="0"),
+        entry("b", "int", default="3", min="0", max=None, step=-1, required="yes"), entry("c", "enum", options="abc"),
+        entry("d", "enum", options=[1, 1, {"x": 1}, "two"], default=7), entry("__proto__", "int"),
+        entry("e", "bool", default=None, required=True), {"key": "f", "label": ["x"], "type": None},
+    ]  # fmt: skip
+    files = {"files": [{"file": "x", "configs": odd}, {"file": 7}, "y", {"file": "z", "label": 1, "configs": "none"}]}
+    found = forms(f"result = scripts({json.dumps(files)});")
+    assert [one["file"] for one in found] == ["x", "z"]
+    fields = {one["key"]: one for one in found[0]["fields"]}
+    assert list(fields) == ["a", "b", "c", "d", "__proto__", "e", "f"]
+    assert [one["type"] for one in fields.values()] == ["text", "int", "text", "enum", "int", "bool", "text"]
+    assert [fields["b"][one] for one in ("min", "step", "required", "default")] == [None, None, False, "3"]
+    assert (fields["d"]["options"], fields["d"]["default"]) == (["1", "two"], "7")
+    assert fields["f"]["label"] == "f"
+    assert found[0]["omitted"] == len(odd) - 7
+    assert filled(odd, {"__proto__": "3", "e": "true"})[0] == {"__proto__": 3, "e": True}
+
+
+HINTS = [
+    (entry("a", "int", min=1, max=9, default=3), "a whole number, 1 to 9, default 3"),
+    (entry("a", "float", min=0.5), "at least 0.5"),
+    (entry("a", "float", max=2, default=1.5), "at most 2, default 1.5"),
+    (entry("a", "bool", default=False), "default off"),
+    (entry("a"), ""),
+]
+LISTED = {"files": [{"file": "x", "configs": [one | {"key": f"k{n}"} for n, (one, _) in enumerate(HINTS)]}]}
+SAME = ["Follow (a)", "Follow (b)", "Go"]
+#: Payloads, and the labels of the scripts that they list.
+LABELS = {
+    **dict.fromkeys(("null", "7", "[]", "{}", "{ files: null }", "{ value: 3 }"), None),
+    '{ files: [{ file: "a", label: "Follow" }, { file: "b", label: "Follow" }, { file: "c", label: "Go" }] }': SAME,
+}
+NOT_STORED = "{", "7", '{"a":1}', '[[1,2,3],["goob","a",{"x":1}],["goob","a",[["x",1]]],null]'
+# fmt: off
+FORMS: Rows = {
+    "hints": (
+        f"result = scripts({json.dumps(LISTED)})[0].fields.map(hint);", [expected for _, expected in HINTS]),
+    **{f"the scripts of {payload}": (f"result = scripts({payload})?.map((one) => one.label);", labels)
+        for payload, labels in LABELS.items()},
+    "a form with mistakes is not sent": ("""
+        const reasons = (mistakes, config = {}) => whyNotSent({ config, mistakes: new Map(mistakes) });
+        const long = Object.fromEntries([...Array(64).keys()].map((n) => [`k${n}`, "x".repeat(256)]));
+        result = [reasons([]), reasons([["a", "x"]]), reasons([["a", "x"], ["b", "y"]]), reasons([], long)];""",
+        ["", "The form has 1 mistake", "The form has 2 mistakes", "The settings are too long together"]),
+    "forms are remembered by robot and script": ("""
+        remember("goob", "a", new Map([["x", "1"]]));
+        remember("goob", "b", new Map([["x", "2"], ["y", "?"]]));
+        remember("fred", "a", new Map([["x", "3"]]));
+        result = [texts(remembered("goob", "a")), texts(remembered("goob", "b")), texts(remembered("fred", "b")),
+          lastScript("goob"), lastScript("fred"), lastScript("lamp")];""",
+        [{"x": "1"}, {"x": "2"}, {}, "b", "a", ""]),
+    "the memory of forms is bounded": ("""
+        for (let n = 0; n < 40; n++) remember("goob", `script ${n}`, new Map([["x", "y".repeat(200)]]));
+        const many = JSON.parse(stored.get("pebble forms")).length;
+        for (let n = 0; n < 40; n++) remember("goob", `script ${n}`, new Map([["x", "y".repeat(20000)]]));
+        result = [many, stored.get("pebble forms").length < 60000, texts(remembered("goob", "script 39")).x.length];""",
+        [32, True, 20000]),
+    **{f"a memory of something else is none: {found}": (f"""
+        stored.set("pebble forms", {json.dumps(found)});
+        result = [texts(remembered("goob", "a")), lastScript("goob")];""", [{}, ""]) for found in NOT_STORED},
+}
+# fmt: on
+
+# -- what may be asked, and scripts that run
+
+SERVER, BROKER, DRIVER, MAINTAINER = (
+    "No connection to the server",
+    "The server cannot reach the broker",
+    "Log in as driver to use this",
+    "Log in as maintainer to use this",
+)
+may = Script({"ui/parts/why-not.js": "whyNot, whyNotEnd", "ui/parts/parts.js": "isGone"}, _PAGE)
+#: What ends something may be asked of a silent robot: why it, what a driver and what a maintainer does may not.
+WHYS = {
+    "": ["", "", MAINTAINER],
+    "page.connection.may = () => true": ["", "", ""],
+    "page.connection.may = () => false": [DRIVER, DRIVER, MAINTAINER],
+    'values[ref]["web/liveness"].online = false': ["", "goob is silent", MAINTAINER],
+    'values[""]["web/broker"].problem = "x"': ["", BROKER, MAINTAINER],
+    'values[""]["web/broker"].connected = false': [BROKER] * 3,
+    "page.connection.isOpen = false": [SERVER] * 3,
+}
+#: The age of a value and its usual period in seconds, and whether its robot is online and the value gone.
+GONE = [
+    (9, 1, True, False),
+    (11, 1, True, True),
+    (11, 5, True, False),
+    (16, 5, True, True),
+    (99, 0, True, False),
+    (0, 1, False, True),
+]
+# fmt: off
+MAY: Rows = {
+    **{f"what may be asked: {change}": (
+        f'{change}; result = [whyNotEnd(page), whyNot(page, ref), whyNot(page, ref, "", "system")];', whys)
+        for change, whys in WHYS.items()},
+    **{f"after {age} s of {period} s a value is gone: {gone}": (
+        f"result = isGone({{ age: {1000 * age}, period: {1000 * period} }}, {json.dumps(online)});", gone)
+        for age, period, online, gone in GONE},
+}
+# fmt: on
+
+
+def test_the_newest_answers_are_remembered_by_the_number_of_the_command() -> None:
+    steps = """
+    const connection = new Connection("v");
+    const answer = (n, op) => connection.answered({ op, cmd: "outlet", ref: "a", n, why: "no" });
+    answer(1, "refused");
+    answer(2, "done");
+    result = [connection.answers.get(1).op, connection.answers.get(2).op];
+    for (let n = 3; n <= 500; n++) answer(n, "done");
+    answer(0, "refused");
+    result.push(connection.answers.size, connection.answers.has(500), connection.answers.has(300));"""
+    assert evaluate({"ui/parts/models.js": "Connection"}, steps) == ["refused", "done", 200, True, False]
+
+
+autonomy = Script({"ui/cards/autonomy-model.js": "Since, statusOf, whyNotStarted"}, _PAGE)
+ODD = (
+    *("null", "7", '"x"', "[]", '{ running: "yes", file: 3 }'),
+    "{ running: true, file: [], dependencies: { a: 1 }, config: [1] }",
+)
+BOB = 'values[ref]["web/driver"] = { by: "bob", you: %s, idle_s: %s }'
+WHY_NOT_STARTED = {
+    "": "",
+    "page.connection.may = () => false": DRIVER,
+    'values[ref]["web/liveness"].online = false': "goob is silent",
+    'values[ref]["web/liveness"].online = null': "goob has not been seen yet",
+    'values[ref]["web/estop"] = { latched: true, by: "eve" }': "Stopped by eve",
+    "values[ref].capabilities.value.autonomy.controls = false": "goob takes no such commands",
+    BOB % ("false", "null"): "",
+    BOB % ("false", "null") + "; drive.arbitrates = false": "bob is driving",
+    BOB % ("true", "null") + '; drive.arbitrates = "yes"': "You are driving",
+    BOB % ("false", "0.1") + "; drive.arbitrates = false": "",
+}
+# fmt: off
+AUTONOMY: Rows = {
+    **{f"a status may be anything: {payload}": (f"""
+        const {{ running, dependencies, config, error }} = statusOf({payload});
+        result = [running, dependencies, config, error];""", ["true" in payload, [], [], ""]) for payload in ODD},
+    "a status of a robot": ("""
+        const dependencies = [{ file: "wheel-odometry", pid: 8, running: true }, { file: 3, running: 1 }, "x"];
+        result = statusOf({ running: true, file: "follow", pid: 7, overridden: true, error: null,
+          config: { tag_id: 5 }, dependencies });""", {
+        "running": True, "file": "follow", "pid": 7, "waits": True, "error": "", "config": [["tag_id", 5]],
+        "dependencies": [{"file": "wheel-odometry", "running": True}, {"file": "?", "running": False}]}),
+    "since when a script runs": ("""
+        const since = new Since();
+        const see = (status, at) => { since.update(statusOf(status), at); return [since.at, since.isExact]; };
+        const follow = { running: true, file: "follow", pid: 7 };
+        result = [see(follow, 100), see({ ...follow, overridden: true }, 200), see({ running: false }, 300),
+          see(follow, 400), see({ ...follow, pid: 8 }, 500)];""",
+        [[100, False], [100, False], [300, True], [400, True], [500, True]]),
+    **{f"why no script can be started: {change}": (f"""
+        const {{ drive }} = values[ref].capabilities.value; {change}; result = whyNotStarted(page, ref);""", why)
+        for change, why in WHY_NOT_STARTED.items()},
+}
+# fmt: on
+
+
+@rows((lights, LIGHTS), (sounds, SOUNDS), (forms, FORMS), (may, MAY), (autonomy, AUTONOMY))
+def test_each(found: Callable[[], Any], expected: Any) -> None:
+    assert found() == expected

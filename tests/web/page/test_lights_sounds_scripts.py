@@ -1,0 +1,330 @@
+"""The cards Lights, Sounds and Autonomy in a browser, before a robot that records what it is asked."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from functools import partial
+from typing import Any
+
+import pytest
+from playwright.sync_api import Browser, Locator
+
+from tests.support import Broker
+from tests.web.browser import Tab, tab
+from tests.web.served import RecordingRobot, Served
+from tests.web.states import setting
+
+pytestmark = pytest.mark.page
+
+BASE = "pebble/robots/recorder"
+#: It does not arbitrate drive commands.
+OFFERED = {"available": True, "controls": True}
+CAPABILITIES = {"drive": OFFERED, "soundboard": OFFERED, "autonomy": OFFERED, "lights": {"solid": True, "flash": True}}
+CLIPS = ["horn.wav", "signals/beep.wav", *(f"speech/number {number}.wav" for number in range(300))]
+CONFIGS = [
+    setting("tag_id", "Tag ID", "int", required=True, min=0, max=34),
+    setting("distance", "Distance (m)", "float", 0.6, min=0.2, max=3.0),
+    setting("search", "Search", "bool", True),
+    setting("family", "Family", "enum", "25H9", options=["25H9", "36H11"]),
+    setting("name", "Name", "string", "tag"),
+]
+SCRIPTS = [
+    {"file": "april-follow", "label": "Follow a tag", "configs": CONFIGS},
+    {"file": "circle", "label": "Drive in a circle", "configs": []},
+]
+IDLE: dict[str, Any] = {"running": False, "timestamp": 1.0, "dependencies": []}
+IDLE |= dict.fromkeys(("file", "pid", "error", "config"))
+QUIET: dict[str, Any] = {"playing": False, "file": None, "error": None, "timestamp": 1.0}
+PIDS = itertools.count(100)
+
+
+def running(file: str = "april-follow", **more: Any) -> dict[str, Any]:
+    return IDLE | {"running": True, "file": file, "pid": next(PIDS), "config": {"tag_id": 7, "distance": 0.8}} | more
+
+
+class Robot(RecordingRobot):
+    """What it was asked since ``forget``."""
+
+    def asked(self, metric: str) -> list[Any]:
+        topic = f"{self.base}/incoming/{metric}"
+        return [payload for _, name, payload in list(self.received) if name == topic]
+
+    def show(self, metric: str, value: Any) -> None:
+        self.publish(metric, value, retain=True)
+
+
+@pytest.fixture(scope="module")
+def robot(broker: Broker) -> Iterator[Robot]:
+    with Robot(broker.port, BASE, capabilities=CAPABILITIES) as one:
+        yield one
+
+
+@pytest.fixture(scope="module")
+def _tab(browser: Browser, served: Served, robot: Robot) -> Iterator[Tab]:
+    with tab(browser, f"{served.origin}/r/{BASE}") as opened:
+        yield opened
+
+
+@pytest.fixture
+def opened(_tab: Tab, robot: Robot) -> Iterator[Tab]:
+    """The page of a robot at rest, with no complaints at the end."""
+    robot.show("soundboard-files", {"files": CLIPS, "controls": True, "timestamp": 1.0})
+    robot.show("soundboard-status", QUIET)
+    robot.show("autonomy-files", {"files": SCRIPTS, "controls": True, "timestamp": 1.0})
+    robot.show("autonomy-status", IDLE)
+    assert _tab.until(lambda: _tab.test("clip").count() > 0 and _tab.test("script").count() == 1)
+    assert _tab.until(lambda: _tab.test("lights-solid").is_enabled())
+    robot.received.clear()
+    before = len(_tab.complaints())
+    yield _tab
+    assert _tab.complaints()[before:] == []
+
+
+def text(opened: Tab, name: str) -> str:
+    return str(opened.test(name).inner_text())
+
+
+def why(control: Locator) -> str:
+    """The reason that a screen reader reads for a control that is off."""
+    assert control.is_disabled()
+    return str(control.evaluate("(one) => document.getElementById(one.getAttribute('aria-describedby')).textContent"))
+
+
+# -- lights
+
+
+def test_lights_solid_flashing_and_off(opened: Tab, robot: Robot) -> None:
+    def set_period(text: str) -> None:
+        opened.test("lights-period").fill(text)
+        opened.test("lights-period").press("Enter")
+
+    blue, black = {"b": 1.0, "g": 0.0, "r": 0.0}, {"b": 0.0, "g": 0.0, "r": 0.0}
+    opened.test("colour-blue").click()
+    assert opened.until(lambda: robot.asked("lights-solid") == [blue], 3)
+    set_period("0.5")
+    opened.test("lights-flash").click()
+    assert opened.until(lambda: robot.asked("lights-flash") == [blue | {"period": 0.5}], 3)
+    set_period("1.25")
+    assert opened.until(lambda: [one["period"] for one in robot.asked("lights-flash")] == [0.5, 1.25], 3)
+    set_period("99")
+    assert opened.test("lights-period").input_value() == "1.25"
+    opened.test("lights-off").click()
+    assert opened.until(lambda: robot.asked("lights-solid")[1:] == [black], 3)
+    assert opened.test("lights-off").get_attribute("aria-pressed") == "true"
+
+
+_DRAG = """async (input) => {
+  for (let step = 0; step <= 50; step++) {
+    input.value = `#${(5 * step).toString(16).padStart(2, "0")}00ff`;
+    input.dispatchEvent(new Event("input", { bubbles: true }));
+    await new Promise((resolve) => setTimeout(resolve, 10));
+  }
+}"""
+
+
+def test_a_dragged_colour_is_sent_now_and_then_and_at_last(opened: Tab, robot: Robot) -> None:
+    opened.test("colour").evaluate(_DRAG)
+    assert opened.until(
+        lambda: (robot.asked("lights-solid") or [{"r": 0}])[-1]["r"] == pytest.approx(250 / 255, abs=0.001), 3
+    )
+    times = [at for at, name, _ in robot.received if name.endswith("/lights-solid")]
+    assert len(times) <= 2 + (times[-1] - times[0]) / 0.2
+
+
+def test_a_browser_remembers_what_it_asked_of_lights(
+    opened: Tab, browser: Browser, served: Served, robot: Robot
+) -> None:
+    opened.test("colour-green").click()
+    opened.test("lights-flash").click()
+    assert opened.until(lambda: robot.asked("lights-flash"), 3)
+    page = opened.context.new_page()
+    page.goto(f"{served.origin}/r/{BASE}")
+    page.locator('[data-test="colour-green"][aria-pressed="true"]').wait_for()
+    page.locator('[data-test="lights-flash"][aria-pressed="true"]').wait_for()
+    page.close()
+
+
+# -- sounds
+
+
+def test_hundreds_of_clips_are_filtered_and_one_is_played(opened: Tab, robot: Robot) -> None:
+    assert opened.test("clip").count() == 60
+    assert text(opened, "more-clips") == "… 242 more: use the filter."
+    assert why(opened.test("repeat-last")) == "Play one sound first"
+    opened.test("sound-filter").fill("NUMBER 299")
+    assert opened.until(lambda: opened.test("clip").count() == 1, 2)
+    opened.test("clip").click()
+    assert opened.until(lambda: robot.asked("soundboard-command"), 3)
+    name = "speech/number 299.wav"
+    assert robot.asked("soundboard-command") == [{"action": "play", "enabled": True, "file": name}]
+    robot.show("soundboard-status", QUIET | {"playing": True, "file": name})
+    assert opened.until(lambda: name in text(opened, "playing"), 3)
+    opened.test("clip").click()  # it plays: the same button ends it
+    assert opened.until(lambda: len(robot.asked("soundboard-command")) == 2, 3)
+    assert robot.asked("soundboard-command")[1]["action"] == "stop"
+    opened.test("repeat").check()
+    robot.show("soundboard-status", QUIET | {"error": "player exited with code 1"})
+    assert opened.until(lambda: opened.test("sound-error").count() == 1, 3)
+    opened.test("clip").click()
+    opened.test("repeat").uncheck()
+    opened.test("repeat-last").click()
+    assert opened.until(lambda: len(robot.asked("soundboard-command")) == 4, 3)
+    assert [one.get("repeat") for one in robot.asked("soundboard-command")[2:]] == [True, True]
+    opened.test("stop-sound").click()
+    assert opened.until(lambda: robot.asked("soundboard-command")[-1]["action"] == "stop", 3)
+    opened.test("sound-filter").fill("")
+
+
+# -- scripts
+
+
+def test_a_form_is_sent_when_it_has_no_mistakes(opened: Tab, robot: Robot) -> None:
+    opened.test("script").select_option("Follow a tag")
+    start = opened.test("start-script")
+    assert why(start) == "The form has 1 mistake"
+    assert "required" in text(opened, "why-tag_id")
+    opened.test("set-distance").press_sequentially("-")
+    assert opened.until(lambda: why(start) == "The form has 2 mistakes", 2)
+    opened.test("set-distance").press_sequentially("5")
+    assert opened.until(lambda: "at least 0.2" in text(opened, "why-distance"), 2)
+    assert opened.test("set-distance").input_value() == "-5"
+    opened.test("restore-distance").click()
+    assert opened.test("set-distance").input_value() == ""
+    opened.test("set-tag_id").fill("35")
+    assert opened.until(lambda: "at most 34" in text(opened, "why-tag_id"), 2)
+    opened.test("set-tag_id").fill("7")
+    assert opened.until(start.is_enabled, 2)
+    opened.test("set-distance").fill("0.8")
+    opened.test("set-search").uncheck()
+    opened.test("set-family").select_option("36H11")
+    start.click()
+    assert opened.until(lambda: robot.asked("autonomy-command"), 3)
+    config = {"tag_id": 7, "distance": 0.8, "search": False, "family": "36H11"}
+    assert robot.asked("autonomy-command") == [{"action": "start", "file": "april-follow", "config": config}]
+    opened.test("set-search").check()
+    opened.test("set-family").select_option("25H9")
+    opened.test("set-name").fill("other")
+    start.click()
+    assert opened.until(lambda: len(robot.asked("autonomy-command")) == 2, 3)
+    assert robot.asked("autonomy-command")[1]["config"] == {"tag_id": 7, "distance": 0.8, "name": "other"}
+
+
+def test_a_form_is_remembered_for_its_robot_and_script(opened: Tab, robot: Robot, served: Served) -> None:
+    opened.test("script").select_option("Follow a tag")
+    opened.test("set-tag_id").fill("9")
+    opened.test("script").select_option("Drive in a circle")
+    assert opened.until(lambda: opened.test("set-tag_id").count() == 0, 2)
+    opened.test("script").select_option("Follow a tag")
+    assert opened.test("set-tag_id").input_value() == "9"
+    opened.test("restore-all").click()
+    assert opened.test("set-tag_id").input_value() == ""
+    opened.test("set-tag_id").fill("11")
+    page = opened.context.new_page()
+    page.goto(f"{served.origin}/r/{BASE}")
+    page.locator('[data-test="set-tag_id"]').wait_for()
+    assert page.locator('[data-test="set-tag_id"]').input_value() == "11"
+    page.close()
+
+
+def test_what_runs_and_its_end(opened: Tab, robot: Robot) -> None:
+    parts = [{"file": "wheel-odometry", "pid": 5, "running": True}, {"file": "locations", "pid": 6, "running": False}]
+    robot.show("autonomy-status", running(dependencies=parts))
+    assert opened.until(lambda: "april-follow runs, since " in text(opened, "script-state"), 3)
+    assert "before" not in text(opened, "script-state")
+    opened.test("effective").click()
+    shown = opened.page.locator(".effective dl").inner_text().split("\n")
+    assert {"0.8", "7"} <= {line.strip() for line in shown}
+    lines = opened.page.locator(".dependencies").inner_text().split("\n")
+    assert lines == ["● wheel-odometry runs", "✖ locations does not run"]
+    robot.show("autonomy-status", running(overridden=True))
+    assert opened.until(lambda: "waits: a person drives" in text(opened, "script-state"), 3)
+    opened.test("end-script").click()
+    assert opened.until(lambda: robot.asked("autonomy-command") == [{"action": "stop"}], 3)
+    robot.show("autonomy-status", IDLE | {"error": "april-follow exited with code 1"})
+    assert opened.until(lambda: "exited with code 1" in text(opened, "script-error"), 3)
+    assert text(opened, "script-state") == "No script runs."
+
+
+# -- driving beside a script, at a robot that does not arbitrate
+
+
+@pytest.fixture
+def driver(opened: Tab, robot: Robot) -> Iterator[Tab]:
+    """It has the control."""
+    opened.page.evaluate("document.activeElement.blur()")
+    opened.test("take").click()
+    assert opened.until("window.pebble.driver.reason() === null")
+    yield opened
+    opened.page.keyboard.up("KeyW")
+    opened.test("release").click()
+    assert opened.until("window.pebble.driver.reason()?.code === 'free'", 3)
+
+
+def moves(robot: Robot) -> bool:
+    return any(one["z"] for one in robot.asked("drive-values"))
+
+
+def test_a_person_has_to_stop_the_script_and_to_press_again(driver: Tab, robot: Robot) -> None:
+    robot.show("autonomy-status", running())
+    driver.test("stop-script").wait_for()
+    assert text(driver, "stop-script") == "Stop april-follow"
+    assert "april-follow is driving: stop it first" in text(driver, "why")
+    driver.page.keyboard.down("KeyW")
+    driver.test("stop-script").click()
+    assert driver.until(lambda: robot.asked("autonomy-command") == [{"action": "stop"}], 3)
+    robot.show("autonomy-status", IDLE)
+    assert driver.until("window.pebble.driver.reason()?.code === 'release'", 3)
+    driver.page.wait_for_timeout(300)  # six commands of a gesture
+    assert not moves(robot)
+    driver.page.keyboard.up("KeyW")
+    driver.page.keyboard.down("KeyW")
+    assert driver.until(lambda: moves(robot), 3)
+
+
+def test_no_script_starts_while_a_person_drives(driver: Tab, robot: Robot) -> None:
+    driver.test("script").select_option("Drive in a circle")
+    driver.page.evaluate("document.activeElement.blur()")
+    assert driver.until(driver.test("start-script").is_enabled, 2)
+    driver.page.keyboard.down("KeyW")
+    assert driver.until(lambda: moves(robot), 3)
+    assert driver.until(driver.test("start-script").is_disabled, 3)
+    assert why(driver.test("start-script")) == "You are driving"
+    driver.page.keyboard.up("KeyW")
+    assert driver.until(driver.test("start-script").is_enabled, 3)
+
+
+# -- robots that report anything
+
+DEEP: Any = "x"
+for _ in range(20):
+    DEEP = [DEEP]
+ODD = [None, 7, "text", [], [1], {}, {"value": None}, {"files": 7}, {"files": [DEEP, {"file": "x", "configs": [DEEP]}]}]
+MARKUP = "<img src=x onerror=alert(1)>"
+LONG = "long " * 5000
+
+
+METRICS = "soundboard-files", "soundboard-status", "autonomy-files", "autonomy-status"
+
+
+def test_a_robot_may_report_anything(opened: Tab, robot: Robot) -> None:
+    form = {"file": MARKUP, "label": LONG, "configs": [{"key": MARKUP, "label": MARKUP}]}
+    on = {"running": True, "playing": True}
+    texts = [
+        {"files": [MARKUP, LONG[:2000], form]},
+        {**on, "file": LONG, "error": MARKUP, "config": {MARKUP: DEEP}, "dependencies": [DEEP, {}]},
+        {**on, "file": DEEP, "error": DEEP, "config": DEEP, "dependencies": LONG},
+    ]
+    for value in [*ODD, *texts]:
+        for metric in METRICS:
+            robot.show(metric, value)
+        for metric in METRICS:
+            assert opened.until(partial(_has, opened, metric, value)), (metric, value)
+        opened.page.wait_for_timeout(60)  # it is drawn
+        assert opened.page.locator(".failed, img").count() == 0, value
+    assert opened.page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+
+
+def _has(opened: Tab, metric: str, value: Any) -> bool:
+    found = opened.page.evaluate("([ref, metric]) => window.pebble.store.get(ref, metric)?.value", [BASE, metric])
+    return bool(found == value)

@@ -1,0 +1,463 @@
+"""Recordings on the page, in Chromium, before the real routes of recordings: /replay never sends a robot anything."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+import pytest
+from playwright.sync_api import Browser, Route
+
+from tests.web import recorded
+from tests.web.browser import PIXELS, Tab
+from tests.web.canned import CannedServer, Show
+from tests.web.recorded import DAY, END, GAP, ROBOT, START
+from tests.web.states import STATES
+
+pytest.importorskip("duckdb")  # it makes timelines
+pytestmark = [pytest.mark.page, pytest.mark.timeout(180)]
+
+SEGMENTS, TIMELINE = re.compile("/archive/segment"), re.compile("/archive/timeline")
+AT = START + 30_000
+#: What every page sends of itself, on any screen.
+USUAL = {"hello", "echo", "watch"}
+_DRAWN = """(at) => { const { player, drawnAt } = window.pebble?.replay ?? {};
+  return Boolean(drawnAt) && drawnAt.seeks === player.seeks && drawnAt.receivedMs === at; }"""
+
+
+@pytest.fixture
+def replay(show: Show, server: CannedServer) -> Iterator[Tab]:
+    """Half a minute after the begin, paused; whatever a test does there, no robot is sent anything."""
+    with show(STATES["replay"]) as opened:
+        assert shown(opened, AT)
+        assert opened.until("!!window.pebble?.replay?.timeline", 30)
+        yield opened
+        assert {message["op"] for message in server.received} <= USUAL
+        assert [message["ref"] for message in server.sent("watch")] == [""] * len(server.sent("watch"))
+        assert opened.complaints() == []
+
+
+def shown(opened: Tab, at: int, within: float = 15.0) -> bool:
+    """Whether the picture that was received at this time is drawn, after the newest seek."""
+    return opened.until(lambda: opened.page.evaluate(_DRAWN, at), within)
+
+
+def position(opened: Tab) -> float:
+    return float(opened.page.evaluate("pebble.replay.player.position"))
+
+
+def seek(opened: Tab, at: float) -> None:
+    opened.page.evaluate("(at) => pebble.replay.seek(at)", at)
+
+
+def stored(opened: Tab, metric: str) -> Any:
+    return opened.page.evaluate("([ref, m]) => pebble.replay.store.get(ref, m)?.value", [ROBOT, metric])
+
+
+def test_the_way_to_a_day_and_a_robot(show: Show) -> None:
+    with show(replace(STATES["recordings"], path="/")) as opened:
+        opened.page.get_by_role("link", name="Recordings").click()
+        day = opened.test(f"day-{DAY}")
+        day.wait_for()
+        assert "10:00 to 10:06" in day.inner_text()
+        assert "1 gap" in day.inner_text()
+        day.get_by_role("link", name="goob").click()
+        assert opened.until("window.pebble?.replay?.player.seeks > 0", 30)
+        assert START - 10_000 <= position(opened) <= START  # where its first session begins
+        opened.test("badge").get_by_role("link").click()
+        assert opened.until(lambda: opened.page.url.endswith(f"/r/{ROBOT}"))
+        opened.page.get_by_role("link", name="Recordings").click()
+        assert opened.until("window.pebble?.replay?.player.seeks > 0", 30)
+        opened.page.go_back()
+        assert opened.until("pebble.route.ref !== '' && pebble.replay === null")
+        assert opened.complaints() == []
+
+
+def test_no_way_leads_there_without_recordings(show: Show) -> None:
+    with show(STATES["fleet"]) as opened:
+        opened.test("phone").wait_for()
+        assert opened.page.locator("a[href^='/replay']").count() == 0
+
+
+def test_a_time_in_the_address_is_shown_and_follows_seeks(replay: Tab):
+    assert "Recording of 22 Nov, 10:00:30" in replay.test("badge").inner_text()
+    assert replay.test("time").inner_text().startswith("10:00:30.000")
+    assert "10:00:29.960" in replay.test("picture-time").inner_text()  # when it was taken
+    seek(replay, AT + 12_345)
+    assert shown(replay, AT + 12_300)
+    assert replay.until(lambda: replay.page.url.endswith(f"/replay/{ROBOT}?at={AT + 12_345}"))
+
+
+def test_the_picture_is_the_one_of_that_time(replay: Tab):
+    """Pixel by pixel the one that the server makes of it, but for its compression."""
+    script = f"""async (address) => {{ {PIXELS}
+      const bitmap = await createImageBitmap(await (await fetch(address)).blob());
+      const other = new OffscreenCanvas(bitmap.width, bitmap.height);
+      other.getContext("2d").drawImage(bitmap, 0, 0);
+      const [a, b] = [pixelsOf(pebble.replay.video.canvas), pixelsOf(other)];
+      return a.length === b.length ? a.reduce((sum, one, i) => sum + Math.abs(one - b[i]), 0) / a.length : 999;
+    }}"""
+    difference = replay.page.evaluate(script, f"/archive/frame?robot={quote(ROBOT)}&at={AT}&w=480")
+    assert difference < 4
+
+
+def test_playing_and_its_keys(replay: Tab):
+    keys = replay.page.keyboard
+    keys.press("Space")
+    assert replay.until("pebble.replay.player.playing")
+    assert replay.until(lambda: position(replay) > AT + 1500)
+    assert replay.until("pebble.replay.drawnAt.receivedMs > pebble.replay.player.position - 400")
+    keys.press("Space")
+    assert replay.until("!pebble.replay.player.playing")
+    at = position(replay)
+    for key, step in (("ArrowRight", 10_000), ("Shift+ArrowLeft", -60_000), ("ArrowLeft", -10_000)):
+        before = position(replay)
+        keys.press(key)
+        assert position(replay) == max(0, before + step), key
+    assert at > AT
+    for key, speed in (("+", 2), ("+", 4), ("-", 2)):
+        keys.press(key)
+        assert replay.page.evaluate("pebble.replay.player.speed") == speed
+    keys.press("End")
+    assert replay.until(lambda: END - 10_000 <= position(replay) <= END + 10_000)
+    keys.press("Home")
+    assert replay.until(lambda: START - 10_000 <= position(replay) <= START)
+
+
+def test_a_key_in_a_list_is_not_the_replays(replay: Tab):
+    replay.test("speed").focus()
+    replay.page.keyboard.press("ArrowRight")
+    assert position(replay) == AT
+
+
+def test_the_cards_show_that_time_and_none_of_them_sends(replay: Tab):
+    assert stored(replay, "sensors/imu")["t"] == AT
+    assert stored(replay, "web/liveness")["latency_ms"] == pytest.approx(42, abs=0.01)
+    cards = replay.page.locator("[data-card]").evaluate_all("(all) => all.map((one) => one.dataset.card)")
+    assert {"telemetry", "map", "plots", "logs", "values"} <= set(cards)
+    assert not {"lights", "sounds", "autonomy", "outlets", "mcus", "system", "voice"} & set(cards)
+    assert replay.until(lambda: "7.91 V" in replay.page.locator("[data-card=telemetry]").inner_text())
+    assert replay.until(lambda: "line 10" in replay.test("log-lines").inner_text())
+    assert "line 11" not in replay.test("log-lines").inner_text()
+    assert "x -0.46 m" in replay.test("map-pose").inner_text()
+    seek(replay, AT - 20_000)
+    assert replay.until(lambda: stored(replay, "sensors/imu")["t"] == AT - 20_000)
+    assert replay.until(lambda: "line 3" in replay.test("log-lines").inner_text())
+    assert "line 10" not in replay.test("log-lines").inner_text()
+    assert replay.page.evaluate("pebble.store.get('pebble/robots/goob', 'touch-sensors').value.value.a0") == 512  # live
+
+
+def test_plots_and_the_trail_grow_while_it_plays_and_begin_anew_with_a_seek(replay: Tab):
+    replay.page.evaluate("pebble.replay.player.setSpeed(8)")
+    replay.test("play").click()
+    trail = """async () => {
+      const { recorderOf } = await import(`/static/${pebble.connection.version}/ui/parts/recorder.js`);
+      return recorderOf(pebble.replay.page, 'pebble/robots/goob').all.get('poses wheel-odometry')?.times ?? []; }"""
+    assert replay.until(lambda: len(replay.page.evaluate(trail)) > 8)
+    replay.test("play").click()
+    seek(replay, START + 5000)
+    assert replay.until(lambda: replay.page.evaluate(trail) == [START + 5000])
+
+
+def test_what_was_sent_is_shown_and_not_sent_again(replay: Tab):
+    assert replay.until(lambda: "forward 0." in replay.test("sent-drive").inner_text())
+    assert "drive-values" in replay.test("sent").inner_text()
+    seek(replay, START + 60_500)
+    assert replay.until(lambda: "at rest" in replay.test("sent-drive").inner_text())
+
+
+def test_overlays_are_those_of_that_time(replay: Tab):
+    inked = (
+        f"""(canvas) => {{ {PIXELS} return pixelsOf(canvas).filter((value, i) => i % 4 === 3 && value > 0).length; }}"""
+    )
+    overlays = replay.test("overlays-canvas")
+    assert replay.until(lambda: overlays.evaluate(inked) > 500)
+    replay.test("overlays").uncheck()
+    assert replay.until(lambda: overlays.count() == 0)
+
+
+def test_a_gap_is_left_out_and_explained(replay: Tab):
+    seek(replay, GAP[0] - 1200)
+    replay.test("play").click()
+    replay.test("skipped").wait_for()
+    assert replay.test("skipped").inner_text() == "Skipped 3 min 20 s: no connection to the broker"
+    assert position(replay) >= GAP[1]
+    assert replay.until(f"pebble.replay.drawnAt.receivedMs >= {GAP[1]}")
+
+
+def test_the_end_of_the_recording_is_shown(replay: Tab):
+    seek(replay, END - 700)
+    replay.test("play").click()
+    assert replay.until(lambda: "end of the recording" in replay.test("time").inner_text())
+    assert replay.test("play").inner_text() == "Play"
+
+
+def test_a_time_at_which_nothing_was_recorded(show: Show) -> None:
+    with show(STATES["replay-gap"]) as opened:
+        assert opened.until(lambda: "No picture was recorded here" in opened.test("cover").inner_text(), 15)
+
+
+def test_a_server_that_fails_is_asked_again(replay: Tab):
+    replay.test("play").click()
+    replay.page.route(SEGMENTS, lambda route: route.fulfill(status=503, body="the disk is gone"))
+    replay.test("problem").wait_for()
+    assert "the disk is gone. Trying again…" in replay.test("problem").inner_text()
+    replay.page.unroute(SEGMENTS)
+    assert replay.until("!pebble.replay.player.problem && !pebble.replay.player.waiting")
+    at = position(replay)
+    assert replay.until(lambda: position(replay) > at + 500)
+    replay.console[:] = [line for line in replay.console if "503" not in line]  # Chromium's own line for each
+
+
+def test_a_damaged_answer_is_played_as_far_as_it_is_whole(replay: Tab):
+    def cut(route: Route) -> None:
+        answer = route.fetch()
+        route.fulfill(response=answer, body=answer.body()[:-9])
+
+    replay.page.route(SEGMENTS, cut)
+    seek(replay, AT + 5000)
+    assert shown(replay, AT + 5000)
+    replay.test("problem").wait_for()
+    assert "cut short at byte" in replay.test("problem").inner_text()
+    replay.page.unroute(SEGMENTS)
+
+
+def test_a_day_that_is_being_indexed(show: Show) -> None:
+    answers = iter(range(1, 3))
+
+    def indexing(route: Route) -> None:
+        number = next(answers, 0)
+        if number:
+            route.fulfill(status=202, json={"indexing": number / 4})
+        else:
+            route.continue_()
+
+    with show(STATES["replay"], routes={TIMELINE: indexing}) as opened:
+        opened.page.get_by_text("This day is being indexed: 25 %").wait_for()
+        assert opened.until("!!window.pebble?.replay?.timeline", 30)
+        opened.page.get_by_text("not recorded (1)").wait_for()
+
+
+@pytest.mark.parametrize("size", ["desktop", "phone"])
+def test_a_day_that_cannot_be_indexed_is_tried_again_by_people_only(
+    show: Show, server: CannedServer, browser: Browser, size
+) -> None:
+    asked: list[str] = []
+
+    def failing(route: Route) -> None:
+        asked.append(route.request.url)
+        if "again=1" in route.request.url:
+            route.continue_()
+        else:
+            route.fulfill(status=422, body='this needs DuckDB: pip install "pebble-robot[archive]"')
+
+    with show(STATES["replay"], size, routes={TIMELINE: failing}) as opened:
+        opened.page.get_by_text("this needs DuckDB: pip install").wait_for()
+        opened.page.wait_for_timeout(1500)  # three questions of a page that would go on
+        before = len(asked)
+        assert before <= 2
+        opened.test("try-again").click()
+        assert opened.until("!!window.pebble?.replay?.timeline", 30)
+        assert len(asked) == before + 1
+
+
+def test_the_timeline_is_zoomed_moved_and_clicked(replay: Tab):
+    canvas = replay.test("timeline")
+    box = canvas.bounding_box()
+    assert box is not None
+    shown_ms = "(canvas) => [Number(canvas.dataset.from), Number(canvas.dataset.to)]"
+    since, until = canvas.evaluate(shown_ms)
+    replay.test("zoom-day").click()
+    assert replay.until(lambda: canvas.evaluate(shown_ms)[1] - canvas.evaluate(shown_ms)[0] == 86_400_000)
+    for _ in range(40):
+        replay.test("zoom-in").click()
+    assert replay.until(lambda: canvas.evaluate(shown_ms)[1] - canvas.evaluate(shown_ms)[0] == 60_000)
+    since, until = canvas.evaluate(shown_ms)
+    assert since <= AT <= until
+    replay.page.mouse.click(box["x"] + box["width"] / 4, box["y"] + 60)
+    assert replay.until(lambda: abs(position(replay) - (since + 15_000)) < 200)
+    replay.page.mouse.move(box["x"] + box["width"] / 2, box["y"] + 60)
+    replay.test("hover").wait_for()
+    assert replay.until("document.querySelector('.timeline-hover img')?.naturalWidth === 160")
+    replay.page.mouse.down()
+    replay.page.mouse.move(box["x"] + box["width"] / 4, box["y"] + 60, steps=5)
+    replay.page.mouse.up()
+    assert replay.until(lambda: abs(canvas.evaluate(shown_ms)[0] - since - 15_000) < 200)
+    replay.page.mouse.wheel(0, 400)
+    assert replay.until(lambda: canvas.evaluate(shown_ms)[1] - canvas.evaluate(shown_ms)[0] > 200_000)
+    assert abs(position(replay) - (since + 15_000)) < 200  # none of this was a click
+    assert replay.until("document.querySelector('.timeline-strip img')?.naturalWidth >= 160")
+
+
+def test_sessions_lead_to_their_beginning(replay: Tab):
+    replay.test("session").last.click()
+    assert replay.until(lambda: GAP[1] - 10_000 <= position(replay) <= GAP[1])
+
+
+def test_a_stretch_is_downloaded_and_a_download_is_cancelled(replay: Tab):
+    replay.test("mark-in").click()
+    seek(replay, AT + 4000)
+    replay.test("mark-out").click()
+    assert replay.test("stretch").inner_text() == "10:00:30 – 10:00:34"
+    replay.test("download-as").select_option("mcap")
+    replay.test("download").click()
+    replay.test("download-file").wait_for(timeout=60_000)
+    with replay.page.expect_download() as download:
+        replay.test("download-file").click()
+    assert download.value.suggested_filename.endswith(".mcap")
+    assert download.value.path().read_bytes()[:5] == b"\x89MCAP"
+    replay.test("download-end").click()
+    assert replay.until(lambda: replay.test("download-file").count() == 0)
+    replay.test("mark-clear").click()
+    replay.test("download-as").select_option("mp4")
+    replay.test("download").click()
+    replay.test("download-end").click()
+    assert replay.until(lambda: replay.test("download").is_enabled())
+
+
+def test_stop_all_works_here_as_everywhere(show: Show, server: CannedServer) -> None:
+    with show(STATES["replay"]) as opened:
+        assert shown(opened, AT)
+        opened.test("stop-all").click()
+        assert opened.until(lambda: server.sent("estop"))
+        (stop,) = server.sent("estop")
+        assert stop["ref"] == ""
+        opened.page.keyboard.press("Escape")
+        opened.page.keyboard.press("Escape")
+        assert opened.until(lambda: len(server.sent("estop")) == 2)
+
+
+def test_space_stops_robots_again_once_the_page_is_left(show: Show, server: CannedServer) -> None:
+    with show(STATES["replay"]) as opened:
+        assert shown(opened, AT)
+        opened.test("badge").get_by_role("link").click()
+        assert opened.until(f"pebble.driver.ref === '{ROBOT}' && pebble.replay === null")
+        opened.page.keyboard.press("Space")
+        assert opened.until(lambda: server.sent("stop") == [{"op": "stop", "ref": ROBOT}])
+
+
+def test_two_hundred_seeks_leave_nothing_behind(show: Show, server: CannedServer) -> None:
+    """Bitmaps are closed, requests given up, and there is one worker."""
+    counting = """const made = window.made = { open: 0, workers: 0 };
+      const close = ImageBitmap.prototype.close; const drawn = CanvasRenderingContext2D.prototype.drawImage;
+      const known = new WeakSet();
+      CanvasRenderingContext2D.prototype.drawImage = function (image, ...more) {
+        if (image instanceof ImageBitmap && !known.has(image)) { known.add(image); made.open++; }
+        return drawn.call(this, image, ...more);
+      };
+      ImageBitmap.prototype.close = function () { if (known.delete(this)) made.open--; return close.call(this); };
+      const { Worker: Old } = window;
+      window.Worker = class extends Old { constructor(...all) { super(...all); made.workers++; } };"""
+    seeks = """async (times) => { const { replay } = pebble;
+    const later = (ms) => new Promise((go) => setTimeout(go, ms));
+      for (const at of times) { const { seeks } = replay.player; replay.seek(at); const end = performance.now() + 4000;
+        while (performance.now() < end && !(replay.player.seeks > seeks && replay.drawnAt.seeks ===
+        replay.player.seeks)) await later(2); }
+      return [replay.player.seeks, replay.drawnAt.seeks]; }"""
+    with show(STATES["replay"], script=counting) as opened:
+        assert shown(opened, AT)
+        times = [START + (7919 * number) % 85_000 + 1000 for number in range(240)]
+        cdp = opened.cdp()
+        opened.page.evaluate(seeks, times[:40])
+        cdp.send("HeapProfiler.collectGarbage")
+        before = opened.page.evaluate("performance.memory.usedJSHeapSize")
+        arrived, drawn = opened.page.evaluate(seeks, times[40:])
+        assert arrived == drawn == 241
+        cdp.send("HeapProfiler.collectGarbage")
+        grown = opened.page.evaluate("performance.memory.usedJSHeapSize") - before
+        assert opened.page.evaluate("made") == {"open": 0, "workers": 1}
+        assert grown < 8_000_000
+        assert opened.page.evaluate("pebble.replay.player.bytes") < 16_000_000
+        assert opened.complaints() == []
+
+
+def test_sound_is_played_at_its_own_speed_only_and_after_a_click(replay: Tab):
+    assert replay.page.evaluate("pebble.replay.sound.context") is None
+    replay.test("play").click()
+    replay.test("replay-sound").click()
+    assert replay.until("pebble.replay.sound.stats?.received > 20 && pebble.replay.sound.context.state === 'running'")
+    assert replay.page.evaluate("pebble.replay.sound.stats.refused") == 0
+    assert replay.until("pebble.replay.sound.stats.bufferedMs > 0")
+    replay.test("speed").select_option("2")
+    replay.page.get_by_text("Sound is played at speed ×1 only").wait_for()
+    assert replay.until("pebble.replay.sound.context.state === 'suspended'")
+    replay.test("speed").select_option("1")
+    assert replay.until("pebble.replay.sound.context.state === 'running' && pebble.replay.sound.stats?.received > 20")
+    replay.test("replay-sound").click()
+    assert replay.until("pebble.replay.sound.context.state === 'suspended'")
+
+
+#: Records what is played, and when pictures are drawn: of each block its time, and of each picture when it was
+#: received.
+_LISTEN = """() => { const { sound } = pebble.replay; const { context } = sound;
+  Object.assign(window, { blocks: [], drawn: [] });
+  sound.speaker.node.port.onmessage = ({ data }) => {
+    const { contextTime, performanceTime } = context.getOutputTimestamp();
+    blocks.push([performanceTime + 1000 * (data.at - contextTime), [...data.left]]);
+  };
+  sound.speaker.node.port.postMessage({ taps: true });
+  const draw = pebble.replay.draw;
+  pebble.replay.pictures.draw = (bitmap, info) => { draw.call(pebble.replay, bitmap, info);
+    drawn.push([performance.now(), info.capturedMs]); };
+}"""
+
+
+def test_sound_and_pictures_are_together(replay: Tab):
+    """What was captured at one time is heard and seen within 80 ms; on a busy machine not always."""
+    replay.test("play").click()
+    replay.test("replay-sound").click()
+    assert replay.until("pebble.replay.sound.stats?.received > 20")
+    seek(replay, AT)
+    assert replay.until("pebble.replay.drawnAt.seeks === pebble.replay.player.seeks")
+    replay.page.evaluate(_LISTEN)
+    assert any(abs(_apart(replay)) < 80 for _ in range(4))
+
+
+def _apart(opened: Tab) -> float:
+    """By how many ms sound is heard later than its picture is drawn."""
+    opened.page.evaluate("() => { blocks.length = drawn.length = 0; }")
+    assert opened.until("blocks.length * 128 > 2.5 * pebble.replay.sound.context.sampleRate", 20)
+    blocks, drawn, rate = opened.page.evaluate("[blocks, drawn, pebble.replay.sound.context.sampleRate]")
+    samples = np.concatenate([samples for _, samples in blocks])
+    first = float(np.median(np.array([at for at, _ in blocks]) - 128_000 / rate * np.arange(len(blocks))))
+    seconds = 2
+    piece = np.interp(
+        np.arange(16_000 * seconds) / 16_000, np.arange(rate * seconds) / rate, samples[-rate * seconds :]
+    )
+    original = recorded.speech().astype(float)
+    spectrum = np.fft.rfft(original) * np.conj(np.fft.rfft(piece, len(original)))
+    captured = START + int(np.argmax(np.fft.irfft(spectrum, len(original)))) / 16 - recorded.SOUND_LATE_MS
+    played_at = first + 1000 * (len(samples) / rate - seconds)
+    loop_ms = len(original) / 16
+    seen = float(np.median([at - captured_ms for at, captured_ms in drawn]))
+    return (played_at - captured - seen + loop_ms / 2) % loop_ms - loop_ms / 2
+
+
+def test_a_snapshot_is_named_after_the_time_at_which_it_was_taken(replay: Tab):
+    with replay.page.expect_download() as download:
+        replay.test("snapshot").click()
+    assert download.value.suggested_filename == "goob-2026-11-22T10-00-29.png"
+
+
+def test_a_phone_has_all_of_it_and_fingers_move_the_day(show: Show) -> None:
+    with show(STATES["replay"], "phone") as opened:
+        assert shown(opened, AT)
+        assert opened.until("!!window.pebble?.replay?.timeline", 30)
+        canvas = opened.test("timeline")
+        canvas.scroll_into_view_if_needed()
+        box = canvas.bounding_box()
+        assert box is not None
+        shown_ms = "(canvas) => [Number(canvas.dataset.from), Number(canvas.dataset.to)]"
+        since, until = canvas.evaluate(shown_ms)
+        opened.page.touchscreen.tap(box["x"] + box["width"] / 10, box["y"] + 60)
+        assert opened.until(lambda: abs(position(opened) - (since + (until - since) / 10)) < 3000)
+        middle, y, cdp = box["x"] + box["width"] / 2, box["y"] + 60, opened.cdp()
+        for kind, apart in (("touchStart", 20), ("touchMove", 40), ("touchMove", 80), ("touchEnd", 0)):
+            points = [{"x": middle - apart, "y": y, "id": 1}, {"x": middle + apart, "y": y, "id": 2}]
+            cdp.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points if apart else []})
+        assert opened.until(lambda: canvas.evaluate(shown_ms)[1] - canvas.evaluate(shown_ms)[0] < (until - since) / 2)
+        assert opened.complaints() == []

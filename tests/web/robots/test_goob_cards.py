@@ -1,0 +1,211 @@
+"""The cards of a robot at the whole Goob: what its MCU and its relays do, and what its sensors sent.
+
+On a desktop and, by ``make page-tests``, on a phone, where the cards are behind tabs. Clips and scripts are tested at a
+robot that records what it is asked (test_lights_sounds_scripts).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from playwright.sync_api import Browser
+
+from pebble.transports import Message, MqttSettings, create
+from tests.web.console import Console, Wire, console
+from tests.web.stage import Stage
+
+pytestmark = pytest.mark.alone  # deadlines are checked
+_REPORTS = ("charging-level", "sensors/imu", "wheel-odometry")
+_SWITCHES_S = 5.0
+
+
+class Reports:
+    """What goob reports at the broker of its operators."""
+
+    def __init__(self, stage: Stage) -> None:
+        self.received: dict[str, list[Any]] = {metric: [] for metric in _REPORTS}
+        self._prefix = f"{stage.ref('goob')}/outgoing/"
+        self._transport = create("mqtt", "reports", MqttSettings(host="127.0.0.1", port=stage.broker_port))
+        self._transport.open()
+        for metric in _REPORTS:
+            self._transport.subscribe(self._prefix + metric, self._receive)
+
+    def values(self, metric: str) -> list[Any]:
+        return [payload["value"] for payload in list(self.received[metric])]
+
+    def close(self) -> None:
+        self._transport.close()
+
+    def _receive(self, message: Message) -> None:
+        self.received[message.topic.removeprefix(self._prefix)].append(json.loads(message.payload))
+
+
+@pytest.fixture(scope="module")
+def stage() -> Iterator[Stage]:
+    with Stage("goob", room=False) as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def reports(stage: Stage) -> Iterator[Reports]:
+    running = Reports(stage)
+    yield running
+    running.close()
+
+
+@pytest.fixture(scope="module", params=["desktop", pytest.param("phone", marks=pytest.mark.page)])
+def goob(browser: Browser, stage: Stage, reports: Reports, request: pytest.FixtureRequest) -> Iterator[Console]:
+    with console(browser, stage, "goob", request.param) as opened:
+        yield opened
+        assert opened.tab.complaints() == []
+
+
+def lines(stage: Stage) -> list[str]:
+    """The lines about lights that the MCU has received."""
+    return [entry.line for entry in stage.lines("goob") if entry.line[:1] in "LF"]
+
+
+def test_lights_reach_the_mcu(goob: Console, stage: Stage) -> None:
+    before = len(lines(stage))
+    goob.uncover("colour-red").click()
+    assert goob.tab.until(lambda: lines(stage)[before:] == ["L 0.000 0.000 1.000"], 5), lines(stage)
+    goob.test("lights-flash").click()
+    assert goob.tab.until(lambda: lines(stage)[before + 1 :] == ["F 0.000 0.000 1.000 2.000"], 5), lines(stage)
+    goob.test("lights-off").click()
+    assert goob.tab.until(lambda: lines(stage)[before + 2 :] == ["L 0.000 0.000 0.000"], 5), lines(stage)
+
+
+@pytest.mark.thorough
+def test_a_flag_is_retained_at_the_broker(goob: Console, stage: Stage, wire: Wire) -> None:
+    topic = "goob/incoming/flags/mqtt-audio"
+    flag = lambda: goob.state("web/flags")["mqtt_audio"]
+    goob.uncover("flag-mqtt-audio").check()
+    assert goob.tab.until(lambda: wire.last(topic) == {"value": True}, 3)
+    assert goob.tab.until(lambda: flag() is True, 3), (flag(), wire.all(topic))
+    later = Wire(stage)
+    assert goob.tab.until(lambda: later.last(topic) == {"value": True}, 3)
+    later.close()
+    wire.publish(topic, {"value": False}, retain=True)  # another operator
+    assert goob.tab.until(lambda: flag() is False, 3), (flag(), wire.all(topic))
+    assert goob.tab.until(lambda: not goob.test("flag-mqtt-audio").is_checked(), 3)
+    wire.publish(topic, None, retain=True)
+    assert goob.tab.until(lambda: flag() is None, 3)
+
+
+# -- outlets and microcontrollers
+
+
+def switched(goob: Console, *changes: str) -> bool:
+    """Whether these are the newest changes of the relays."""
+    return goob.tab.until(lambda: goob.stage.relays("goob")[-len(changes) :] == list(changes), _SWITCHES_S)
+
+
+def test_a_relay_is_switched_on_and_off(goob: Console) -> None:
+    switch = goob.uncover("outlet-o1")
+    switch.click()
+    assert switched(goob, "o1 on")
+    assert goob.tab.until(lambda: switch.get_attribute("aria-checked") == "true")
+    assert goob.test("outlet-asked-o1").count() == 0
+    switch.click()
+    assert switched(goob, "o1 on", "o1 off")
+    assert goob.tab.until(lambda: goob.test("outlet-state-o1").inner_text() == "off")
+
+
+@pytest.mark.thorough
+def test_an_unreachable_outlet_has_its_reason(goob: Console) -> None:
+    switch = goob.uncover("outlet-o4")
+    assert switch.is_disabled()
+    why = goob.page.locator(f'[id="{switch.get_attribute("aria-describedby")}"]')
+    assert why.inner_text() == "outlet is unreachable"
+
+
+def test_a_generated_form_reaches_the_microcontroller(goob: Console) -> None:
+    field, state = goob.uncover("mcu-in-o2_set").locator('[data-test="field-on"]'), goob.test("outlet-state-o2")
+    for switch, word in ((field.check, "on"), (field.uncheck, "off")):
+        switch()
+        goob.test("send-o2_set").click()
+        assert switched(goob, f"o2 {word}")
+        assert goob.tab.until(lambda word=word: state.inner_text() == word)  # type: ignore[misc]
+
+
+def test_what_a_microcontroller_measures_is_shown(goob: Console) -> None:
+    values = goob.uncover("mcu-out-imu")
+    assert goob.tab.until(lambda: "accel_norm_g" in values.inner_text())
+    assert goob.tab.until(lambda: "/s" in values.inner_text())
+    assert "stays on the robot" in goob.test("mcu-out-imu_fast").inner_text()
+
+
+# -- what its sensors sent, and where it is
+
+#: Every row that the page remembers of a metric.
+_ROWS = """async ([kind, metric]) => {
+  const { recorderOf } = await import(`/static/${pebble.connection.version}/ui/parts/recorder.js`);
+  return recorderOf(pebble, pebble.route.ref).all.get(`${kind} ${metric}`)?.rows ?? [];
+}"""
+
+
+def rows(goob: Console, metric: str, kind: str = "numbers") -> list[Any]:
+    found: list[Any] = goob.page.evaluate(_ROWS, [kind, metric])
+    return found
+
+
+@pytest.mark.thorough
+def test_the_battery_is_plotted_as_the_broker_carried_it(goob: Console, reports: Reports) -> None:
+    goob.uncover("plot-battery")
+    assert goob.tab.until(lambda: len(rows(goob, "charging-level")) >= 1, 20)
+    assert {row["value"] for row in rows(goob, "charging-level")} <= set(reports.values("charging-level"))
+    newest = lambda: f"{reports.values('charging-level')[-1]:.2f}"
+    assert goob.tab.until(lambda: newest() in goob.test("plot-battery").inner_text())
+
+
+@pytest.mark.thorough
+def test_what_was_sent_before_a_reload_is_plotted_after_it(goob: Console, reports: Reports) -> None:
+    goob.uncover("plot-acceleration")
+    assert goob.tab.until(lambda: len(rows(goob, "sensors/imu")) >= 15, 20)
+    before = rows(goob, "sensors/imu")
+    shown, carried = ([row["accel_norm_g"] for row in some] for some in (before, reports.values("sensors/imu")))
+    assert set(shown) <= set(carried)
+    goob.page.reload()
+    assert goob.tab.until("!!window.pebble?.connection.you")
+    goob.uncover("plot-acceleration")
+    assert goob.tab.until(lambda: any(row in before for row in rows(goob, "sensors/imu")[:1]), 10)
+    times = goob.page.evaluate(_ROWS.replace("rows ?? []", "times"), ["numbers", "sensors/imu"])
+    assert times == sorted(set(times))
+
+
+def test_the_map_follows_goob_while_it_drives(goob: Console, stage: Stage, wire: Wire, reports: Reports) -> None:
+    """Its hall sensors are not published: odometry is where its simulated MCU says that it is."""
+
+    def publish() -> float:
+        pose = stage.robots["goob"].mcu_reports[-1].board.pose
+        value = {"x_mm": pose.x_mm, "y_mm": pose.y_mm, "heading_rad": pose.heading_rad}
+        wire.publish("goob/outgoing/wheel-odometry", {"value": value, "unit": "mm", "timestamp": time.time()})
+        goob.page.wait_for_timeout(50)
+        return math.hypot(pose.x_mm - start[0], pose.y_mm - start[1])
+
+    pose = stage.robots["goob"].mcu_reports[-1].board.pose
+    start = pose.x_mm, pose.y_mm
+    assert goob.tab.until(lambda: publish() >= 0 and bool(rows(goob, "wheel-odometry", "poses")), 20)
+    goob.uncover("map")
+    words = goob.test("map-pose").inner_text()
+    goob.uncover("stick")
+    goob.take()
+    assert goob.persists(lambda: goob.down("KeyW"), lambda: publish() > 100, goob.let_go)
+    goob.let_go()
+    assert goob.rests()
+    goob.uncover("map")
+
+    def agree() -> bool:
+        publish()
+        last, text = reports.values("wheel-odometry")[-1], goob.test("map-pose").inner_text()
+        return text != words and text.startswith(f"x {last['x_mm'] / 1000:.2f} m")
+
+    assert goob.tab.until(agree, 5)
+    xs = {round(pose["x"], 3) for pose in rows(goob, "wheel-odometry", "poses")}
+    assert len(xs) > 1
+    assert xs <= {round(one["x_mm"] / 1000, 3) for one in reports.values("wheel-odometry")}
