@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.services.serial_mcu_bridge.mcu_rig import LocalNetwork, Rig
+from tests.kit.board import LocalNetwork, Rig
 from tests.support import Broker
 
 

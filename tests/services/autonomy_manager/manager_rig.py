@@ -15,7 +15,7 @@ from typing import Any
 import msgspec
 
 from pebble.transports import Message
-from tests.services.serial_mcu_bridge.mcu_rig import BASE, ROBOT, Listener, LocalNetwork
+from tests.kit.board import BASE, ROBOT, Listener, LocalNetwork
 from tests.support import ROOT, Child, gone, until
 
 #: Sleeps, and ends as asked; leaves its command line beside itself. It speaks no MQTT and drives nothing.

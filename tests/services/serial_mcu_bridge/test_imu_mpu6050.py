@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from pebble.services.serial_mcu_bridge.text.device_log import DeviceLogLine
 from pebble.services.serial_mcu_bridge.text.imu_mpu6050 import Motion, Summary, parse
-from tests.services.serial_mcu_bridge.mcu_rig import BASE, Rig, ScriptedMcu
+from tests.kit.board import BASE, Rig, ScriptedMcu
 from tests.services.serial_mcu_bridge.mcu_wire import M
 from tests.support import until
 

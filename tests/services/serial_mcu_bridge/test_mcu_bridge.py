@@ -16,8 +16,8 @@ from pebble.services.serial_mcu_bridge.devices import peers
 from pebble.services.serial_mcu_bridge.pebble_serial_v1 import host
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.host import SILENCE_S
 from pebble.transports import QoS
+from tests.kit.board import Rig, motion, summary, wait_for_payload
 from tests.services.serial_mcu_bridge import mcu_wire as wire
-from tests.services.serial_mcu_bridge.mcu_rig import Rig, motion, summary, wait_for_payload
 from tests.services.serial_mcu_bridge.mcu_wire import IMU, LAMP, STATION, F, I, M
 from tests.services.serial_mcu_bridge.test_pebble_serial_hostile import ATTACKS
 from tests.support import cases, until

@@ -12,8 +12,8 @@ import pytest
 
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.manifest import parse_describe
 from pebble.transports import QoS, State
+from tests.kit.board import Rig, motion, wait_for_payload
 from tests.services.serial_mcu_bridge import mcu_wire as wire
-from tests.services.serial_mcu_bridge.mcu_rig import Rig, motion, wait_for_payload
 from tests.services.serial_mcu_bridge.mcu_wire import IMU, LAMP, M
 from tests.support import until
 

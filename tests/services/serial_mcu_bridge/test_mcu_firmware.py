@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from pebble.simulation.pty import PtyMcu
+from tests.kit.board import Rig, motion
 from tests.services.serial_mcu_bridge import mcu_wire as wire
-from tests.services.serial_mcu_bridge.mcu_rig import Rig, motion
 from tests.services.serial_mcu_bridge.mcu_wire import IMU
 from tests.support import until
 

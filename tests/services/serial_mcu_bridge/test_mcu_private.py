@@ -19,9 +19,9 @@ from pebble.services.mqtt_bridge.private_topics import PrivateTopics
 from pebble.services.mqtt_bridge.service import MqttBridge
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.manifest import parse_describe
 from pebble.transports import Message, MqttSettings, create
+from tests.kit.board import BASE, Listener, Rig, Running, motion, wait_for_payload
 from tests.services.mqtt_bridge.bridge_rig import gate_of
 from tests.services.serial_mcu_bridge import mcu_wire as wire
-from tests.services.serial_mcu_bridge.mcu_rig import BASE, Listener, Rig, Running, motion, wait_for_payload
 from tests.services.serial_mcu_bridge.mcu_wire import IMU, F, I, M
 from tests.support import Broker, until
 

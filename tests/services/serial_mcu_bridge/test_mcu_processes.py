@@ -18,8 +18,8 @@ from pebble.services.serial_mcu_bridge.devices.described_bridge import Described
 from pebble.services.serial_mcu_bridge.serial_service import bridge_of
 from pebble.services.serial_mcu_bridge.text.imu_bridge import ImuBridge
 from pebble.services.serial_mcu_bridge.text.motor_bridge import MotorBridge
+from tests.kit.board import BASE, Rig, wait_for_payload
 from tests.services.serial_mcu_bridge import mcu_wire as wire
-from tests.services.serial_mcu_bridge.mcu_rig import BASE, Rig, wait_for_payload
 from tests.services.serial_mcu_bridge.mcu_wire import STATION
 from tests.support import ROOT, until
 
