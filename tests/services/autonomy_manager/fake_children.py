@@ -15,7 +15,7 @@ from pebble.services.autonomy_manager.child import Launch
 from pebble.services.autonomy_manager.script import Script
 from pebble.services.autonomy_manager.service import AutonomyManager
 from pebble.transports import Message, QoS
-from tests.kit.board import BASE, Listener, LocalNetwork, Running
+from tests.kit.robot import BASE, Listener, LocalNetwork, Running
 from tests.support import until
 
 MOTORS = {"enabled": True, "serial": {"port": "/dev/null"}}

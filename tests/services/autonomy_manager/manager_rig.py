@@ -15,7 +15,7 @@ from typing import Any
 import msgspec
 
 from pebble.transports import Message
-from tests.kit.board import BASE, ROBOT, Listener, LocalNetwork
+from tests.kit.robot import BASE, ROBOT, Listener, LocalNetwork
 from tests.support import ROOT, Child, gone, until
 
 #: Sleeps, and ends as asked; leaves its command line beside itself. It speaks no MQTT and drives nothing.

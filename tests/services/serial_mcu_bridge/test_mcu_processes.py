@@ -18,7 +18,8 @@ from pebble.services.serial_mcu_bridge.devices.described_bridge import Described
 from pebble.services.serial_mcu_bridge.serial_service import bridge_of
 from pebble.services.serial_mcu_bridge.text.imu_bridge import ImuBridge
 from pebble.services.serial_mcu_bridge.text.motor_bridge import MotorBridge
-from tests.kit.board import BASE, Rig, wait_for_payload
+from tests.kit.board import Rig
+from tests.kit.robot import BASE
 from tests.services.serial_mcu_bridge import mcu_wire as wire
 from tests.services.serial_mcu_bridge.mcu_wire import STATION
 from tests.support import ROOT, until
@@ -57,9 +58,9 @@ def test_a_terminated_process_withdraws_its_device(rig: Rig) -> None:
     command = [sys.executable, "-m", "pebble.services.serial_mcu_bridge", str(path), "sockets"]
     with subprocess.Popen(command, cwd=ROOT) as process:
         try:
-            assert wait_for_payload(rig.world, "mcu/hs105-sta/describe")
+            rig.described("hs105-sta")
             mcu.send(wire.frame(wire.STATE, b"\1\1\0", 2))
-            assert wait_for_payload(rig.world, "outlets/o1/status")
+            assert rig.got("outlets/o1/status")
             rig.world.command("outlets/o1/power", {"on": True})
             assert until(mcu.commands)
         finally:
