@@ -190,10 +190,13 @@ class Program(Forked):
     def send_signal(self, number: int) -> None:
         os.kill(self.pid, number)
 
+    def terminate(self) -> None:
+        self.send_signal(signal.SIGTERM)
+
     def end(self, number: int = signal.SIGTERM) -> int | None:
         """Send a signal, and return the exit code."""
         if self.poll() is None:
-            os.kill(self.pid, number)
+            self.send_signal(number)
         code = self.wait(10)
         assert self.poll() is not None, "the program does not end"
         return code
