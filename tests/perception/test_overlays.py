@@ -10,6 +10,7 @@ import pytest
 
 from pebble.contract import APRILTAG_DATA, APRILTAG_LOCATIONS, VIDEO_OVERLAYS, codec
 from pebble.contract.payloads import TagLocations
+from pebble.perception.camera_model import CameraModel
 from pebble.perception.overlays import locations, overlays, tag_data, tags_in
 from pebble.perception.tags import Place, Tag, TagGeometry
 
@@ -64,7 +65,7 @@ def test_corners_outside_of_the_picture_are_clamped() -> None:
 
 
 def test_a_tag_that_another_program_found_has_its_place() -> None:
-    half = 0.125 / 2.0 * TagGeometry(0.25)._camera.matrix(*SIZE)[0, 0]
+    half = 0.125 / 2.0 * CameraModel.of_hfov().matrix(*SIZE)[0, 0]
     square = np.array([[-half, -half], [half, -half], [half, half], [-half, half]]) + np.array([319.5, 239.5])
     payload = locations("s", [Tag(13, square, Place(0.0, 0.0))], SIZE, 0.0)
     (tag,) = tags_in(payload, 13, TagGeometry(0.25))

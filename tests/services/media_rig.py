@@ -1,13 +1,19 @@
-"""One media program as a process of its own, with the robot's local transport and a broker for operators."""
+"""One media program as a process of its own, a device in this process, and an operator at a broker."""
 
 from __future__ import annotations
 
-from typing import Any, Self
+import threading
+import time
+from abc import ABC, abstractmethod
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Generic, Protocol, Self, TypeVar
 
 import msgspec
 
 from pebble.contract.payloads import MediaReport
-from pebble.transports import MqttSettings, State, Transport, create
+from pebble.transports import Message, MqttSettings, QoS, State, Transport, create
+from pebble.transports.frames import FrameWriter
 from tests.kit.robot import BASE as BASE
 from tests.kit.robot import ROBOT, SILENCE_S, Program, ProgramRobot
 from tests.support import until
@@ -59,3 +65,66 @@ def client(name: str, port: int) -> Transport:
     transport = create("mqtt", name, MqttSettings(host="127.0.0.1", port=port, silence_s=SILENCE_S)).open(10)
     assert transport.state is State.CONNECTED, transport.problem
     return transport
+
+
+class Device(ABC):
+    """A camera or a microphone: writes into its stream ``hertz`` times a second, while anybody reads."""
+
+    def __init__(self, folder: Path, stream: str, hertz: float, capacity: int, **options: Any) -> None:
+        self.writer, self._hertz = FrameWriter(folder, stream, capacity=capacity, **options), hertz
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def __enter__(self) -> Self:
+        self.writer.open()
+        self._thread.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self._stopping.set()
+        self._thread.join(10)
+        self.writer.close()
+
+    @abstractmethod
+    def write(self, number: int) -> None:
+        """Write what is due at that number; they are counted from 1, and also while nobody reads."""
+
+    def _run(self) -> None:
+        began, number = time.monotonic(), 0
+        while not self._stopping.wait(max(0.0, began + number / self._hertz - time.monotonic())):
+            number += 1
+            if self.writer.wanted:
+                self.write(number)
+
+
+class Encoded(Protocol):
+    @property
+    def encoding(self) -> str: ...
+
+
+T = TypeVar("T", bound=Encoded)
+
+
+class Operator(ABC, Generic[T]):
+    """Decodes every packet of one topic of the robot."""
+
+    def __init__(self, port: int, metric: str) -> None:
+        self.transport = client(f"operator-{metric}", port)
+        self.received: list[T] = []
+        self.transport.subscribe(f"{BASE}/outgoing/{metric}", self.receive, qos=QoS.LATEST)
+
+    @abstractmethod
+    def receive(self, message: Message) -> None: ...
+
+    def wait(self, count: int, timeout: float = 20.0) -> list[T]:
+        """Until so many packets more have come; returns these."""
+        before = len(self.received)
+        came = until(lambda: len(self.received) >= before + count, timeout)
+        assert came, f"{len(self.received) - before} packets came"
+        return self.received[before:]
+
+    def wait_for(self, encoding: str) -> None:
+        assert until(lambda: bool(self.received) and self.received[-1].encoding == encoding, 20), f"no {encoding} came"
+
+    def close(self) -> None:
+        self.transport.close()

@@ -19,7 +19,7 @@ from pebble.services.serial_mcu_bridge.line.port import Port
 from pebble.services.serial_mcu_bridge.line.serial_line import LineState, SerialLine
 from pebble.services.serial_mcu_bridge.text.goob_base import STOP, drive_line, lights_line
 from pebble.simulation.pty import PtyMcu
-from tests.support import until
+from tests.support import cases, until
 
 STOPPED = "M 0.000 0.000"
 
@@ -84,7 +84,10 @@ def test_the_stop_is_sent_at_open_and_again_after_boot(mcu: PtyMcu, connect: Con
     first, second = (entry.ns for entry in mcu.trace.entries() if entry.event == "line")
     assert second - first >= 0.4e9  # the first one may be read late
     host.line.close()
+    host.line.close()
     assert host.states == [LineState.BOOTING, LineState.READY, LineState.CLOSED]
+    assert not host.line.drive(drive_line(1, 1))
+    SerialLine("/nothing", 115200, stop=STOP, on_bytes=lambda _chunk: None).close()
 
 
 @pytest.mark.parametrize("half", ["M 0.900", "M 0.400 0."])
@@ -142,13 +145,10 @@ def test_of_a_burst_the_last_command_is_sent_and_few_before_it(mcu: PtyMcu, host
     assert sent == sorted(sent)
     assert len(sent) < 500
     assert host.line.output.outbox.superseded == 1000 - len(sent)
-
-
-def test_a_burst_that_ends_in_a_stop_ends_stopped(mcu: PtyMcu, host: Host) -> None:
     for number in range(500):
         host.line.drive(drive_line(number / 1000, 1.0))
     host.line.halt()
-    assert until(lambda: mcu.trace.lines()[-1] == STOPPED and mcu.state().drive == (0.0, 0.0))
+    assert until(lambda: mcu.trace.lines()[-1] == STOPPED and mcu.state().drive == (0.0, 0.0)), "it ends in a stop"
 
 
 def test_the_stop_is_the_last_line_even_while_others_still_drive(mcu: PtyMcu, host: Host) -> None:
@@ -165,7 +165,7 @@ def test_the_stop_is_the_last_line_even_while_others_still_drive(mcu: PtyMcu, ho
 
 
 def test_a_burst_cut_off_by_the_end_ends_with_the_stop(mcu: PtyMcu, connect: Connect) -> None:
-    for round_ in range(1, 21):
+    for round_ in range(1, cases(5, 20) + 1):
         host = connect(mcu.symlink, boot_s=0.0, baud=4_000_000)
         assert until(host.is_ready, step=0.0005)
         for number in range(50):
@@ -173,13 +173,6 @@ def test_a_burst_cut_off_by_the_end_ends_with_the_stop(mcu: PtyMcu, connect: Con
         host.line.close()
         assert until(lambda n=round_: [entry.event for entry in mcu.trace.entries()].count("closed") == n)  # type: ignore[misc]
         assert mcu.trace.lines()[-1] == STOPPED
-
-
-def test_closing_twice_and_closing_what_never_opened(mcu: PtyMcu, host: Host, tmp_path: Path) -> None:
-    host.line.close()
-    host.line.close()
-    assert not host.line.drive(drive_line(1, 1))
-    SerialLine(str(tmp_path / "none"), 115200, stop=STOP, on_bytes=lambda _chunk: None).close()
 
 
 def test_after_a_replug_the_first_line_is_the_stop(mcu: PtyMcu, host: Host) -> None:
