@@ -84,7 +84,7 @@ def test_a_near_tag_that_fills_the_picture_is_backed_away_from_before_a_search()
     assert robot.step(2.0, Place(0.61, 0.0)).reason == "hold"
 
 
-def test_a_rate_is_kept_repeats_nothing_and_may_be_raised() -> None:
+def test_a_rate_repeats_nothing_and_may_be_raised() -> None:
     rate = Rate(10.0)
     assert sum(rate.due(tick / 15) for tick in range(1500)) == pytest.approx(1000, abs=1)
     rate = Rate(10.0)

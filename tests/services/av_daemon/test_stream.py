@@ -244,22 +244,10 @@ def test_a_hung_device_is_replaced_and_does_no_harm_when_it_wakes(
     assert len(writer.threads) == 1
 
 
-def test_a_device_that_hangs_while_it_opens_is_given_up_too(streams: Streams, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(health, "_OPENING_S", 0.2)
-    release, healthy = threading.Event(), Device()
-
-    def hang() -> Source:
-        release.wait()
-        raise DeviceError("at last")
-
-    ways = iter([hang, healthy])
-    stream = streams(Remembering(), lambda: next(ways)())
-    assert until(lambda: report(stream).running)
-    release.set()
-    assert report(stream).last_error == "the device does not answer"
-
-
-def test_threads_that_hang_do_not_become_more_and_more(streams: Streams, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_device_that_hangs_while_it_opens_is_given_up_but_only_four_times(
+    streams: Streams, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Threads that hang do not become more and more."""
     monkeypatch.setattr(health, "_OPENING_S", 0.05)
     release, tries = threading.Event(), []
 
@@ -268,8 +256,9 @@ def test_threads_that_hang_do_not_become_more_and_more(streams: Streams, monkeyp
         release.wait()
         raise DeviceError("at last")
 
-    streams(Remembering(), hang, delay=0.01)
+    stream = streams(Remembering(), hang, delay=0.01)
     assert until(lambda: len(tries) == 4)
+    assert report(stream).last_error == "the device does not answer"
     time.sleep(0.5)  # ten times as long as a try may take
     assert len(tries) == 4
     release.set()
@@ -302,9 +291,7 @@ class TestHealth:
         device.opening(200.0)
         device.frame(FrameInfo(format="mjpeg"), 211.0)
         assert device.failed("no") == 2
-
-    def test_the_configured_wait_may_be_none_or_long(self) -> None:
-        assert [Health(0.0).failed("no"), Health(60.0).failed("no")] == [0, 60]
+        assert [Health(0.0).failed("no"), Health(60.0).failed("no")] == [0, 60], "none, or long, as configured"
 
     def test_silence_counts_only_while_a_sign_of_life_is_due(self) -> None:
         device = Health(2.0)

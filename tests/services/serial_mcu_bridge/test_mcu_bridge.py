@@ -297,10 +297,7 @@ def test_new_firmware_while_it_runs(rig: Rig) -> None:
 
 
 def test_an_inertial_channel_configured_as_retained_is_cleared(memory: Rig) -> None:
-    mcu = memory.mcu(IMU)
-    memory.bridge(publish={"low_rate_retain": True})
-    memory.described("goob-imu-nano")
-    assert memory.claimed()
+    mcu, _ = memory.up(IMU, publish={"low_rate_retain": True})
     mcu.send(wire.frame(wire.SAMPLE, motion(), 1), wire.frame(wire.STATE, summary(), 2))
     assert memory.got("sensors/imu")
     assert memory.world.on("sensors/imu")[0].retain_requested
@@ -419,9 +416,7 @@ def test_an_absent_sensor_is_waited_for(memory: Rig) -> None:
 
 
 def test_the_process_may_end_when_the_port_fails(memory: Rig) -> None:
-    mcu = memory.mcu(LAMP)
-    running = memory.bridge(health={"exit_on_serial_error": True})
-    memory.described("lamp-1")
+    mcu, running = memory.up(LAMP, health={"exit_on_serial_error": True})
     mcu.unplug()
     assert until(lambda: not running.alive, 3)
     assert running.error is not None
@@ -433,10 +428,7 @@ def test_a_refused_alias_is_logged_and_its_interface_still_works(memory: Rig, ca
         I(1, "drive", wire.IN, wire.KIND_COMMAND, (F("x", wire.I8),), "drive-values"),
         I(2, "reboot", wire.OUT, wire.KIND_STATE, (F("v", wire.U8),), "online", "", wire.RETAIN),
     ))  # fmt: skip
-    mcu = memory.mcu(rogue)
-    memory.bridge()
-    memory.described("rogue")
-    assert memory.claimed()
+    mcu, _ = memory.up(rogue)
     mcu.send(wire.frame(wire.STATE, b"\1", 2))
     assert memory.got("mcu/rogue/reboot")
     memory.world.command("drive-values", {"x": 1, "z": 0})

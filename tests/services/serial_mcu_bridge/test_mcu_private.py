@@ -152,11 +152,12 @@ def test_which_topics_are_known_as_private(topics: PrivateTopics) -> None:
 
 def test_memory_is_bounded(topics: PrivateTopics) -> None:
     for number in range(300):
-        topics.admit(Message(f"{OUT}/mcu/spy-{number}/slow", b"{}", retain_requested=True))
-    waiting = sum(len(topics.admit(described(SPY, f"spy-{number}"))) - 1 for number in range(300))
-    assert waiting == 256
+        assert passed(topics, value(f"lab/slow-{number}", "slow", retain=True)) == []
+    assert len(topics.admit(described())) == 1 + 256, "waiting values"
+    for number in range(300):
+        topics.admit(described(SPY, f"spy-{number}"))
     slow = [Message(f"{OUT}/mcu/spy-{number}/slow", b"{}") for number in range(300)]
-    assert sum(len(topics.admit(message)) for message in slow) == 256, "of MCUs"
+    assert sum(len(topics.admit(message)) for message in slow) == 256, "MCUs"
 
 
 # -- manifests that are only partly readable
