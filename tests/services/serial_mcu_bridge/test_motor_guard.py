@@ -142,21 +142,18 @@ def test_at_most_four_states_a_second_and_the_last_one_is_published(rig: Rig) ->
     assert rig.states[-1].recent[0] == f"{89:016x}"
 
 
-def test_repetitions_do_not_delay_the_state_that_confirms_a_stop(rig: Rig) -> None:
+def test_repetitions_get_the_state_again_and_do_not_delay_what_confirms_a_stop(rig: Rig) -> None:
     for _ in range(10):
         rig.stop(A)
         rig.advance(0.01)
     assert rig.written()
     assert (rig.states[-1].recent, rig.states[-1].persisted) == ([A], True)
-
-
-def test_a_later_repetition_gets_the_state_again(rig: Rig) -> None:
-    rig.stop(A)
-    assert rig.written()
-    before = len(rig.states)
-    rig.advance(0.5)
-    rig.stop(A)
-    assert rig.states[before:] == [rig.state]
+    rig.advance(1)
+    for repeat in (lambda: rig.stop(A), lambda: rig.guard.repeat_state(rig.now)):  # the latter for restored brokers
+        before = len(rig.states)
+        repeat()
+        assert rig.states[before:] == [rig.state]
+        rig.advance(5)
 
 
 def test_a_restart_begins_as_it_was(rig: Rig, path: Path, make: Make) -> None:
@@ -200,13 +197,6 @@ def test_a_file_that_is_none_of_ours_counts_as_a_stop_and_bars_nothing(
     assert rig.guard.judge(SCRIPT, rig.now) == (None if rig.state.latched else 0.75)
 
 
-def test_where_nothing_can_be_saved_persisted_is_null(tmp_path: Path, make: Make) -> None:
-    (tmp_path / "file").touch()
-    rig = make(tmp_path / "file" / "estop.json")
-    rig.stop()
-    assert (rig.states[-1].latched, rig.states[-1].persisted) == (True, None)
-
-
 def test_a_failed_write_is_published_and_repeated(rig: Rig, path: Path) -> None:
     path.mkdir(parents=True)
     rig.stop()
@@ -246,18 +236,13 @@ def test_a_reset_is_obeyed_only_for_the_newest_state_and_if_it_is_fresh(rig: Rig
     assert (rig.state.latched, rig.state.reset_refused) == (False, None)
 
 
-def test_a_barred_run_is_published(rig: Rig) -> None:
+def test_a_barred_run_is_published_and_stays_barred_after_a_restart(rig: Rig, path: Path, make: Make) -> None:
     assert rig.guard.judge(SCRIPT, rig.now) == 0.75
     assert rig.state.barred == 6
     assert rig.guard.judge(Drive(), rig.now) == 0
     assert rig.states[-1].barred == 7
     assert rig.guard.judge(SCRIPT, rig.now + 10) is None
     assert rig.counters["overruled"] == 1
-
-
-def test_a_run_stays_barred_when_the_process_is_killed_and_starts_again(rig: Rig, path: Path, make: Make) -> None:
-    assert rig.guard.judge(SCRIPT, rig.now) == 0.75
-    assert rig.guard.judge(Drive(), rig.now) == 0
     rig.close()
     again = make()
     assert again.state.barred == 7
@@ -285,15 +270,6 @@ def test_the_largest_state_has_400_bytes_at_most(rig: Rig) -> None:
     rig.reset(EstopState(latched=True, boot="", count=1000, recent=[], by="", why="", since=0), 0.0)
     rig.guard.reset(EstopReset(boot=rig.state.boot, count=7), 0.0, rig.now)
     assert len(msgspec.json.encode(rig.state)) <= 400
-
-
-def test_a_state_can_be_repeated_for_brokers_that_have_an_older_one(rig: Rig) -> None:
-    rig.stop()
-    assert rig.written()
-    rig.advance(5)
-    before = len(rig.states)
-    rig.guard.repeat_state(rig.now)
-    assert rig.states[before:] == [rig.state]
 
 
 @pytest.mark.parametrize(
@@ -362,12 +338,12 @@ def test_a_stop_in_a_file_that_appears(
     assert again.state.latched == (bool(found) or before == "a stop")
 
 
-def test_a_folder_that_can_be_written_later_gets_the_stop(tmp_path: Path, make: Make) -> None:
+def test_where_nothing_can_be_saved_persisted_is_null_and_later_it_gets_the_stop(make: Make, tmp_path: Path) -> None:
     (tmp_path / "state").write_text("in the way")
     rig = make(tmp_path / "state" / "estop.json")
     rig.stop()
     rig.guard.save_again()
-    assert rig.states[-1].persisted is None
+    assert (rig.states[-1].latched, rig.states[-1].persisted) == (True, None)
     (tmp_path / "state").unlink()
     rig.guard.save_again()
     assert rig.written()

@@ -111,20 +111,16 @@ def test_input_from_before_and_during_boot_is_thrown_away(mcu: PtyMcu, connect: 
     assert b"Done!" not in host.received
 
 
-def test_a_command_waits_for_the_boot_and_comes_after_the_stop(mcu: PtyMcu, connect: Connect) -> None:
-    host = connect(mcu.symlink, boot_s=0.3)
-    assert until(lambda: host.line.drive(drive_line(0.5, 0.5)))
-    assert traced(mcu, "M 0.500 0.500")
-    assert mcu.trace.lines() == [STOPPED, STOPPED, "M 0.500 0.500"]
-
-
-def test_a_command_too_old_after_the_boot_is_a_stop(mcu: PtyMcu, connect: Connect) -> None:
-    host = connect(mcu.symlink, boot_s=1.0)
+@pytest.mark.parametrize(("boot_s", "sent", "expired"), [(0.3, "M 0.500 0.500", 0), (1.0, STOPPED, 1)])
+def test_a_command_waits_for_the_boot_and_one_too_old_then_is_a_stop(
+    mcu: PtyMcu, connect: Connect, boot_s: float, sent: str, expired: int
+) -> None:
+    host = connect(mcu.symlink, boot_s=boot_s)
     assert until(lambda: host.line.drive(drive_line(0.5, 0.5)))
     assert until(host.is_ready)
     assert until(lambda: len(mcu.trace.lines()) == 3)
-    assert mcu.trace.lines() == [STOPPED] * 3
-    assert host.line.output.outbox.expired == 1
+    assert mcu.trace.lines() == [STOPPED, STOPPED, sent]
+    assert host.line.output.outbox.expired == expired
 
 
 def test_lines_go_down_and_answers_come_up(mcu: PtyMcu, host: Host) -> None:
@@ -194,15 +190,6 @@ def test_after_a_replug_the_first_line_is_the_stop(mcu: PtyMcu, host: Host) -> N
     assert host.line.opened == 2
 
 
-def test_a_port_that_comes_late_is_found(mcu: PtyMcu, connect: Connect) -> None:
-    mcu.unplug()
-    host = connect(mcu.symlink)
-    assert until(lambda: host.line.state is LineState.ABSENT)
-    assert "No such file" in host.line.problem
-    mcu.replug()
-    assert until(host.is_ready)
-
-
 def test_a_path_that_leads_to_another_device_is_followed(tmp_path: Path, connect: Connect) -> None:
     with PtyMcu("goob", tmp_path / "old") as old, PtyMcu("goob", tmp_path / "new") as new:
         link = tmp_path / "by-id"
@@ -215,7 +202,14 @@ def test_a_path_that_leads_to_another_device_is_followed(tmp_path: Path, connect
         assert until(lambda: new.trace.lines() == [STOPPED] * 2)
 
 
-def test_a_port_in_use_is_refused_until_it_is_free(mcu: PtyMcu, connect: Connect) -> None:
+def test_a_port_that_comes_late_is_found_and_one_in_use_refused_until_it_is_free(mcu: PtyMcu, connect: Connect) -> None:
+    mcu.unplug()
+    host = connect(mcu.symlink)
+    assert until(lambda: host.line.state is LineState.ABSENT)
+    assert "No such file" in host.line.problem
+    mcu.replug()
+    assert until(host.is_ready)
+    host.line.close()
     other = Port(str(mcu.symlink), 460800)
     host = connect(mcu.symlink)
     assert until(lambda: "another program has it open" in host.line.problem)

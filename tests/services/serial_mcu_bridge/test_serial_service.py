@@ -246,30 +246,13 @@ def test_a_command_is_valid_for_its_valid_ms(bench: Bench) -> None:
     assert until(lambda: bench.lines[-1] == STOPPED, 2)
 
 
-def test_people_go_before_scripts(bench: Bench) -> None:
-    script = {"z": 0.25, "source": "autonomy", "run": 7}
-    bench.send("drive-values", script)
-    assert until(lambda: bench.service.counters["overruled"] == 1)  # the owner has just started
-    time.sleep(2)
-    bench.send("drive-values", script)
-    assert bench.line("M 0.250 0.250")
-    bench.drive(0.5)
-    bench.send("drive-values", {**script, "z": 0.75})
-    assert bench.line("M 0.500 0.500")
-    bench.drive(0, valid_ms=0)
-    assert until(lambda: bench.state.get("barred") == 7, 5)
-    time.sleep(2.1)
-    bench.send("drive-values", {**script, "z": 0.75})
-    bench.send("drive-values", {**script, "z": 1, "run": 8})
-    assert bench.line("M 1.000 1.000")
-    assert "M 0.750 0.750" not in bench.lines
-
-
-def test_a_script_that_a_person_ended_does_not_move_the_motors_after_a_restart(bench: Bench) -> None:
+def test_a_script_waits_for_a_person_who_ends_it_and_moves_nothing_after_a_restart(bench: Bench) -> None:
     script = {"z": 0.25, "source": "autonomy", "run": 7}
     time.sleep(2)
     bench.send("drive-values", script)
     assert bench.line("M 0.250 0.250")
+    assert bench.moves(0.5)
+    bench.send("drive-values", {**script, "z": 0.75})  # people go before scripts
     bench.drive(0, valid_ms=0)
     assert until(lambda: bench.state.get("barred") == 7, 5)
     bench.restart()
@@ -281,6 +264,7 @@ def test_a_script_that_a_person_ended_does_not_move_the_motors_after_a_restart(b
     bench.send("drive-values", {**script, "run": 8, "z": 0.5})
     assert bench.line("M 0.500 0.500")
     assert "M 0.250 0.250" not in bench.lines[before:]
+    assert "M 0.750 0.750" not in bench.lines
 
 
 def test_stops_are_subscribed_to_before_drive_commands() -> None:
