@@ -25,13 +25,11 @@ def test_locations() -> None:
     assert np.allclose(detection.pop("corners_norm"), NORM)
     assert np.allclose(detection.pop("center_norm"), [0.15, 0.15])
     assert detection == {"marker_id": 13}
-    assert got | {"detections": []} == {
-        "source": "apriltag-locations",
-        "detections": [],
-        "frame_width": 640,
-        "frame_height": 480,
-        "timestamp": 5.0,
-    }
+    frame = {"frame_width": 640, "frame_height": 480, "timestamp": 5.0}
+    assert got | {"detections": []} == {"source": "apriltag-locations", "detections": [], **frame}
+    outside = Tag(1, np.array([[-3, 0], [700, 0], [700, 500], [0, 500]]), Place(1.0, 0.0))
+    (detection,) = locations("s", [outside], SIZE, 0.0).detections
+    assert detection.corners_norm == [(0, 0), (1, 0), (1, 1), (0, 1)], "clamped"
 
 
 def test_overlays() -> None:
@@ -48,20 +46,8 @@ def test_the_followed_tag_and_none() -> None:
     assert b'"of"' not in codec.encode(APRILTAG_DATA, tag_data(13, TAG, SIZE, 5.0, of=1))
     assert json.loads(codec.encode(APRILTAG_DATA, tag_data(13, TAG, SIZE, 5.0, of=2)))["of"] == 2
     none = json.loads(codec.encode(APRILTAG_DATA, tag_data(13, None, SIZE, 5.0)))
-    assert none == {
-        "detected": False,
-        "marker_id": 13,
-        "corners_norm": [],
-        "distance_m": None,
-        "angle_rad": None,
-        "timestamp": 5.0,
-    }
-
-
-def test_corners_outside_of_the_picture_are_clamped() -> None:
-    tag = Tag(1, np.array([[-3, 0], [700, 0], [700, 500], [0, 500]]), Place(1.0, 0.0))
-    (detection,) = locations("s", [tag], SIZE, 0.0).detections
-    assert detection.corners_norm == [(0, 0), (1, 0), (1, 1), (0, 1)]
+    unknown = {"corners_norm": [], "distance_m": None, "angle_rad": None}
+    assert none == {"detected": False, "marker_id": 13, **unknown, "timestamp": 5.0}
 
 
 def test_a_tag_that_another_program_found_has_its_place() -> None:

@@ -131,7 +131,7 @@ def test_a_killed_manager_leaves_no_script_and_nothing_it_started(mqtt: ManagerR
 def test_a_stopped_manager_leaves_none_either_and_publishes_so(rig: ManagerRig) -> None:
     pids = family(rig, PARENT)
     rig.end()
-    assert all(map(gone, pids))
+    assert until(lambda: all(map(gone, pids)), 1), "killed when it ended"
     assert until(lambda: (rig.status["running"], rig.status["pid"]) == (False, None))
 
 
