@@ -1,14 +1,10 @@
-"""A robot with a camera in a simulated world follows a tag: firmware, renderer, finder and controller on one clock.
-
-``python -m tests.perception.follow_rig`` prints the table of all starts, latencies and pictures.
-"""
+"""A robot with a camera in a simulated world follows a tag: firmware, renderer, finder and controller on one clock."""
 
 from __future__ import annotations
 
 import math
 import random
 import re
-import sys
 from typing import Any, NamedTuple
 
 from pebble.contract.payloads import Drive, TouchValues
@@ -124,23 +120,3 @@ CAMERAS: dict[str, dict[str, Any]] = {
     "blurred and JPEG": {"motion_blur_ms": 30, "jpeg_quality": 20},
     "all of it": {"latency_ms": 150, "motion_blur_ms": 30, "jpeg_quality": 20},
 }
-
-
-def main(seeds: int) -> None:
-    for name, camera in CAMERAS.items():
-        for kind, options in (("tag", {}), ("tag and odometry", {"by_odometry": True}),
-                              ("the same, tag hidden 2 s", {"by_odometry": True, "hidden": (2.0, 4.0)})):  # fmt: skip
-            results = [FollowRig(seed, **options, **camera).run(30.0) for seed in range(seeds)]
-            times = sorted(result.arrived_s or math.inf for result in results)
-            distances = [result.distance_m for result in results]
-            bearing = max(abs(result.bearing_deg) for result in results)
-            sys.stdout.write(
-                f"{name:17} {kind:25} arrived {sum(time <= 20 for time in times)}/{seeds} in 20 s, "
-                f"p50 {times[seeds // 2]:.1f} worst {times[-1]:.1f} s, "
-                f"{min(distances):.3f} to {max(distances):.3f} m, bearing {bearing:.1f} degrees\n"
-            )
-            sys.stdout.flush()
-
-
-if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 8)

@@ -23,23 +23,26 @@ def follower(**settings: Any) -> Follower:
     return Follower(FollowSettings(**settings))
 
 
-def test_at_the_wanted_distance_it_stands() -> None:
-    assert follower().step(0.0, AHEAD) == Command()
+def sign(value: float) -> int:
+    return (value > 0) - (value < 0)
 
 
 @pytest.mark.parametrize(
-    ("distance", "angle", "x", "z"), [(2.0, 0.0, 0, 1), (2.0, 0.2, 1, 1), (2.0, -0.2, -1, 1), (0.4, 0.0, 0, -1)]
+    ("distance", "angle", "x", "z"),
+    [(0.6, 0.0, 0, 0), (2.0, 0.0, 0, 1), (2.0, 0.2, 1, 1), (2.0, -0.2, -1, 1), (0.4, 0.0, 0, -1)],
 )
-def test_it_drives_and_steers_towards_the_distance(distance: float, angle: float, x: int, z: int) -> None:
+def test_it_steers_towards_the_distance_and_stands_there(distance: float, angle: float, x: int, z: int) -> None:
     command = follower().step(0.0, Place(distance, angle))
-    assert (command.x > 0) - (command.x < 0) == x
-    assert (command.z > 0) - (command.z < 0) == z
+    assert (sign(command.x), sign(command.z)) == (x, z)
 
 
-def test_far_away_at_least_the_minimum_power_and_room_for_steering() -> None:
-    assert follower(vision_forward_kp=0.1).step(0.0, Place(2.0, 0.0)).z == 0.8
+def test_powers_have_a_minimum_a_maximum_and_room_for_steering() -> None:
+    assert follower(vision_forward_kp=0.1).step(0.0, FAR).z == 0.8, "far away"
     command = follower().step(0.0, Place(3.0, 0.3))
     assert command.x + command.z == pytest.approx(1.0)
+    assert follower(turn_power=0.3).step(0.0, Place(2.0, 0.9)).x == 0.3, "the most"
+    assert follower().step(0.0, Place(0.6, 0.09)).x == pytest.approx(0.12), "the least"
+    assert follower().step(0.0, Place(0.6, 0.07)).x == 0.0, "within the deadband"
 
 
 def test_outside_of_the_cone_it_turns_in_pulses_with_pauses() -> None:
@@ -47,12 +50,6 @@ def test_outside_of_the_cone_it_turns_in_pulses_with_pauses() -> None:
     commands = [robot.step(0.1 * tick, Place(2.0, -0.4)) for tick in range(7)]
     assert [command.x < 0 for command in commands] == [True, False, False, True, False, False, True]
     assert {command.z for command in commands} == {0.0}
-
-
-def test_the_turn_power_is_the_most_and_a_small_turn_has_a_minimum() -> None:
-    assert follower(turn_power=0.3).step(0.0, Place(2.0, 0.9)).x == 0.3
-    assert follower().step(0.0, Place(0.6, 0.09)).x == pytest.approx(0.12)
-    assert follower().step(0.0, Place(0.6, 0.07)).x == 0.0, "within the deadband"
 
 
 def test_holding_ends_only_beyond_threshold_and_hysteresis() -> None:
@@ -87,17 +84,11 @@ def test_a_near_tag_that_fills_the_picture_is_backed_away_from_before_a_search()
     assert robot.step(2.0, Place(0.61, 0.0)).reason == "hold"
 
 
-def test_a_rate_of_ten_from_fifteen_pictures() -> None:
+def test_a_rate_repeats_nothing_and_may_be_raised() -> None:
     rate = Rate(10.0)
     assert sum(rate.due(tick / 15) for tick in range(1500)) == pytest.approx(1000, abs=1)
-
-
-def test_a_rate_repeats_nothing_that_is_late() -> None:
     rate = Rate(10.0)
     assert [rate.due(now) for now in (0.0, 5.0, 5.01, 5.05, 5.11)] == [True, True, False, False, True]
-
-
-def test_a_raised_rate_counts_at_once() -> None:
     rate = Rate(2.0)
     assert rate.due(0.0)
     rate.hz = 20.0
@@ -131,21 +122,14 @@ def test_the_goal_is_on_the_way_to_the_tag() -> None:
     assert robot.step(1.0, goal).reason == "goal reached"
 
 
-def test_it_drives_blind_for_a_bounded_time() -> None:
+def test_it_drives_blind_for_a_bounded_time_and_without_odometry_waits_and_searches() -> None:
     robot = blind()
     assert robot.step(5.9, Pose(0.5, 0.0, 0.0)).reason == "odometry"
     assert robot.step(6.1, Pose(0.5, 0.0, 0.0)).z == 0.0
-
-
-def test_without_odometry_it_waits_and_searches_as_with_the_camera_alone() -> None:
     robot = blind()
     assert [robot.step(now, None).reason for now in (0.2, 0.5, 1.0)] == ["drive", "wait", "search"]
-
-
-def test_locations_that_are_late_are_no_picture() -> None:
     robot = blind(place=Place(1.0, 0.6))
-    assert robot.step(0.3, None).reason == "turn"
-    assert robot.step(0.4, None).reason == "wait"
+    assert [robot.step(now, None).reason for now in (0.3, 0.4)] == ["turn", "wait"], "late locations are no picture"
 
 
 @pytest.mark.parametrize(
@@ -160,17 +144,10 @@ def test_poses_of_other_producers(value: dict[str, Any], unit: str) -> None:
     assert pose_of(WheelOdometry(value=value, unit=unit, timestamp=0.0)) == pytest.approx((1.5, -0.5, 0.5))
 
 
-@pytest.mark.parametrize(
-    "value",
-    [
-        {},
-        {"x_mm": 1, "y_mm": 2},
-        {"x_mm": "1", "y_mm": 2, "heading_rad": 0},
-        {"x_mm": math.nan, "y_mm": 0, "heading_rad": 0},
-    ],
-)
-def test_what_is_no_pose_is_none(value: dict[str, Any]) -> None:
-    assert pose_of(WheelOdometry(value=value, timestamp=0.0)) is None
+def test_what_is_no_pose_is_none() -> None:
+    numbers: list[Any] = ["1", math.nan]
+    wrong = [{}, {"x_mm": 1, "y_mm": 2}, *({"x_mm": number, "y_mm": 2, "heading_rad": 0} for number in numbers)]
+    assert [pose_of(WheelOdometry(value=value, timestamp=0.0)) for value in wrong] == [None] * 4
     assert pose_of(None) is None
 
 

@@ -1,89 +1,84 @@
-"""Odometry in lockstep with Goob's firmware; the whole table: ``python -m tests.perception.accuracy``."""
+"""Odometry in lockstep with Goob's firmware."""
 
 from __future__ import annotations
 
 import math
+import random
 
 import pytest
 
 from pebble.contract.payloads import Drive, EstopState
-from tests.perception.accuracy import ONE_SENSOR, square, straight, wander
+from pebble.perception.odometry import WheelGeometry
+from pebble.simulation.motion import FULL_SPEED_MM_S, TRACK_MM
 from tests.perception.wheels_rig import WheelsRig
-from tests.support import some
+from tests.support import cases, some
 
-FIELDS = [
-    "x_mm",
-    "y_mm",
-    "heading_rad",
-    "heading_deg",
-    "left_mm",
-    "right_mm",
-    "distance_mm",
-    "left_crossings",
-    "right_crossings",
-    "unknown_direction_events",
-    "left_step_total",
-    "right_step_total",
-    "left_mm_per_step",
-    "right_mm_per_step",
-    "left_extrema_events",
-    "right_extrema_events",
-    "left_rejected_sign_flips",
-    "right_rejected_sign_flips",
-    "left_stall_events",
-    "right_stall_events",
-    "sample_seq",
-    "publish_seq",
-]
+ONE_SENSOR = WheelGeometry(quadrature="")
+FIELDS = """
+    x_mm y_mm heading_rad heading_deg left_mm right_mm distance_mm left_crossings right_crossings
+    unknown_direction_events left_step_total right_step_total left_mm_per_step right_mm_per_step
+    left_extrema_events right_extrema_events left_rejected_sign_flips right_rejected_sign_flips
+    left_stall_events right_stall_events sample_seq publish_seq
+"""
 
 
 @pytest.mark.parametrize(("power", "start"), some([(0.1, 1), (0.4, 3), (0.7, 5), (1.0, 7), (-1.0, 2)], 2))
 @pytest.mark.parametrize("geometry", [None, ONE_SENSOR])
-def test_2_m_straight_are_right_within_10_mm(power: float, start: int, geometry: object) -> None:
-    distance, pose = straight(power, start=start, geometry=geometry)  # type: ignore[arg-type]
-    assert abs(distance) < 3
-    assert pose < 10
+def test_2_m_straight_are_right_within_10_mm(power: float, start: int, geometry: WheelGeometry | None) -> None:
+    rig = WheelsRig(geometry=geometry, start_mm=(start * 5.3, start * 3.7))
+    rig.wait(0.5)
+    rig.drive(2000 / FULL_SPEED_MM_S / abs(power), z=power)
+    rig.stop()
+    assert abs(rig.odometry.distance_mm - math.hypot(rig.motion.pose.x_mm, rig.motion.pose.y_mm)) < 3
+    assert rig.error_mm() < 10
 
 
 @pytest.mark.parametrize(("side", "gyro"), [(1, False), (-1, True)])
 def test_a_square_ends_where_it_began(side: int, gyro: bool) -> None:
-    rig = square(side, gyro=gyro)
+    """``side`` 1 turns to the left, −1 to the right; each is 1 m."""
+    rig = WheelsRig(gyro=gyro)
+    rig.wait(2.0)
+    for _ in range(4):
+        rig.drive(1000 / FULL_SPEED_MM_S / 0.5, z=0.5)
+        rig.stop()
+        rig.drive(math.pi / 4 * TRACK_MM / FULL_SPEED_MM_S / 0.3, x=-side * 0.3)
+        rig.stop()
     assert rig.error_mm() < 25
     assert rig.error_deg() < 1.5
     assert rig.odometry.value().get("heading_source") == {True: "gyro", False: None}[gyro]
 
 
-def test_reversals_without_a_stop_lose_no_step() -> None:
-    for seed in range(3):
-        left, right = wander(seed, noise=3.0)
-        assert abs(left) < 2, "its second sensor shows the direction"
-        assert abs(right) < 10
+@pytest.mark.parametrize("seed", range(cases(1, 3)))
+def test_reversals_without_a_stop_lose_no_step(seed: int) -> None:
+    """Twenty random commands, each straight after the other."""
+    rig, chosen = WheelsRig(noise=3.0, start_mm=(seed * 5.3, seed * 3.7)), random.Random(seed)
+    rig.wait(0.5)
+    for _ in range(20):
+        rig.drive(chosen.uniform(0.2, 2.0), x=chosen.uniform(-1, 1), z=chosen.uniform(-1, 1))
+    rig.stop()
+    left, right = rig.wheel_errors_mm()
+    assert abs(left) < 2, "its second sensor shows the direction"
+    assert abs(right) < 10
 
 
 def test_all_fields_of_the_payload() -> None:
     rig = WheelsRig()
     rig.drive(1.0, z=0.5)
     value = rig.odometry.value()
-    assert list(value) == FIELDS
+    assert list(value) == FIELDS.split()
     assert value["left_mm_per_step"] == pytest.approx(math.pi * 61 / 10, abs=1e-5)
     assert value["sample_seq"] == 50
     assert (value["publish_seq"], rig.odometry.value()["publish_seq"]) == (1, 2)
     assert (value["left_stall_events"], value["unknown_direction_events"]) == (0, 0)
 
 
-def test_moving_is_known_and_ends() -> None:
-    rig = WheelsRig()
+def test_moving_ends_and_standing_adds_no_distance_although_the_sensors_are_noisy() -> None:
+    rig = WheelsRig(noise=3.0)
     assert not rig.odometry.moving(rig.now)
-    rig.drive(0.5, z=0.3)
+    rig.drive(2.0, z=0.5)
     assert rig.odometry.moving(rig.now)
     rig.stop(1.0)
     assert not rig.odometry.moving(rig.now)
-
-
-def test_standing_adds_no_distance_although_the_sensors_are_noisy() -> None:
-    rig = WheelsRig(noise=3.0)
-    rig.drive(2.0, z=0.5)
-    rig.stop()
     before = rig.odometry.distance_mm
     rig.wait(20.0)
     assert rig.odometry.distance_mm == pytest.approx(before, abs=1)

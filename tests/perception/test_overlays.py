@@ -10,6 +10,7 @@ import pytest
 
 from pebble.contract import APRILTAG_DATA, APRILTAG_LOCATIONS, VIDEO_OVERLAYS, codec
 from pebble.contract.payloads import TagLocations
+from pebble.perception.camera_model import CameraModel
 from pebble.perception.overlays import locations, overlays, tag_data, tags_in
 from pebble.perception.tags import Place, Tag, TagGeometry
 
@@ -24,13 +25,11 @@ def test_locations() -> None:
     assert np.allclose(detection.pop("corners_norm"), NORM)
     assert np.allclose(detection.pop("center_norm"), [0.15, 0.15])
     assert detection == {"marker_id": 13}
-    assert got | {"detections": []} == {
-        "source": "apriltag-locations",
-        "detections": [],
-        "frame_width": 640,
-        "frame_height": 480,
-        "timestamp": 5.0,
-    }
+    frame = {"frame_width": 640, "frame_height": 480, "timestamp": 5.0}
+    assert got | {"detections": []} == {"source": "apriltag-locations", "detections": [], **frame}
+    outside = Tag(1, np.array([[-3, 0], [700, 0], [700, 500], [0, 500]]), Place(1.0, 0.0))
+    (detection,) = locations("s", [outside], SIZE, 0.0).detections
+    assert detection.corners_norm == [(0, 0), (1, 0), (1, 1), (0, 1)], "clamped"
 
 
 def test_overlays() -> None:
@@ -47,24 +46,12 @@ def test_the_followed_tag_and_none() -> None:
     assert b'"of"' not in codec.encode(APRILTAG_DATA, tag_data(13, TAG, SIZE, 5.0, of=1))
     assert json.loads(codec.encode(APRILTAG_DATA, tag_data(13, TAG, SIZE, 5.0, of=2)))["of"] == 2
     none = json.loads(codec.encode(APRILTAG_DATA, tag_data(13, None, SIZE, 5.0)))
-    assert none == {
-        "detected": False,
-        "marker_id": 13,
-        "corners_norm": [],
-        "distance_m": None,
-        "angle_rad": None,
-        "timestamp": 5.0,
-    }
-
-
-def test_corners_outside_of_the_picture_are_clamped() -> None:
-    tag = Tag(1, np.array([[-3, 0], [700, 0], [700, 500], [0, 500]]), Place(1.0, 0.0))
-    (detection,) = locations("s", [tag], SIZE, 0.0).detections
-    assert detection.corners_norm == [(0, 0), (1, 0), (1, 1), (0, 1)]
+    unknown = {"corners_norm": [], "distance_m": None, "angle_rad": None}
+    assert none == {"detected": False, "marker_id": 13, **unknown, "timestamp": 5.0}
 
 
 def test_a_tag_that_another_program_found_has_its_place() -> None:
-    half = 0.125 / 2.0 * TagGeometry(0.25)._camera.matrix(*SIZE)[0, 0]
+    half = 0.125 / 2.0 * CameraModel.of_hfov().matrix(*SIZE)[0, 0]
     square = np.array([[-half, -half], [half, -half], [half, half], [-half, half]]) + np.array([319.5, 239.5])
     payload = locations("s", [Tag(13, square, Place(0.0, 0.0))], SIZE, 0.0)
     (tag,) = tags_in(payload, 13, TagGeometry(0.25))

@@ -34,10 +34,8 @@ def picture(
     printed = cv2.aruco.generateImageMarker(tags, number, cells * CELL)
     printed = cv2.copyMakeBorder(printed, CELL, CELL, CELL, CELL, cv2.BORDER_CONSTANT, value=255)
     matrix = (camera or CameraModel.of_hfov()).matrix(*SIZE)
-    half, rotation = (
-        EDGE_M / 2,
-        np.array([[math.cos(yaw), 0, math.sin(yaw)], [0, 1, 0], [-math.sin(yaw), 0, math.cos(yaw)]]),
-    )
+    half, turn = EDGE_M / 2, (math.cos(yaw), math.sin(yaw))
+    rotation = np.array([[turn[0], 0, turn[1]], [0, 1, 0], [-turn[1], 0, turn[0]]])
     square = np.array([[-half, -half, 0], [half, -half, 0], [half, half, 0], [-half, half, 0]])  # y down
     points = square @ rotation.T + np.array([right_m, 0.0, ahead_m])
     corners = points @ matrix.T
@@ -82,10 +80,6 @@ def test_an_unknown_family_is_named_with_the_known_ones() -> None:
         TagFinder(family="APRILTAG_99H9")
 
 
-def test_without_a_tag_nothing_is_found() -> None:
-    assert TagFinder().find(np.full((480, 640, 3), 90, np.uint8)) == []
-
-
 @pytest.mark.parametrize(
     "corners", [np.zeros((4, 2)), np.full((4, 2), 0.5), np.array([[0, 0], [9, 9], [0, 0], [9, 9]])]
 )
@@ -121,17 +115,13 @@ def test_a_calibration_is_read_from_the_first_folder_that_has_one_and_scaled(tmp
     folders = [tmp_path / "script", tmp_path / "config"]
     for folder in folders:
         folder.mkdir()
+    assert CameraModel.find(folders).matrix(*SIZE)[0, 0] == pytest.approx(624, abs=1), "without one, the original's"
     (folders[1] / CALIBRATION).write_text(CALIBRATED)
     camera = CameraModel.find(folders)
     assert camera.matrix(*SIZE)[0] == pytest.approx([500.0, 0.0, 300.5])
     image, _ = picture(13, ahead_m=1.0, right_m=0.3, camera=camera)
     (tag,) = TagFinder(EDGE_M, camera).find(image)
     assert (tag.distance_m, tag.angle_rad) == pytest.approx((math.hypot(1, 0.3), math.atan(0.3)), rel=0.02)
-
-
-def test_without_a_calibration_the_field_of_view_is_the_originals(tmp_path: Path) -> None:
-    focal = CameraModel.find([tmp_path]).matrix(*SIZE)[0, 0]
-    assert focal == pytest.approx(624, abs=1)
 
 
 @pytest.mark.parametrize("text", ["", "nonsense", "%YAML:1.0\n---\nimage_width: 3\n", CALIBRATED.replace("320", "0")])
@@ -149,11 +139,8 @@ LEFT, RIGHT, FAR, NEAR, BEHIND = (1.0, -0.3), (1.0, 0.3), (2.0, 0.1), (0.7, 0.1)
 def seen(distance_m: float, angle_rad: float, *, number: int = 13, edge: float | None = None) -> Tag:
     """A tag in that place, with an edge of so many pixels: by default what it has at that distance."""
     edge, x = edge or 100.0 / distance_m, 320.0 + 500.0 * angle_rad
-    return Tag(
-        number,
-        np.array([[x, 200], [x + edge, 200], [x + edge, 200 + edge], [x, 200 + edge]]),
-        Place(distance_m, angle_rad),
-    )
+    corners = np.array([[x, 200], [x + edge, 200], [x + edge, 200 + edge], [x, 200 + edge]])
+    return Tag(number, corners, Place(distance_m, angle_rad))
 
 
 @pytest.mark.parametrize(
@@ -244,9 +231,9 @@ def test_what_is_no_picture_is_refused_with_a_sentence(wrong: Any, why: str) -> 
         TagFinder().find(wrong)
 
 
-@pytest.mark.parametrize("edge", [1, 2, 3, 5, 9])
-def test_a_small_picture_has_no_tags(edge: int) -> None:
-    assert TagFinder().find(COLOURS[:edge, :edge]) == []
+def test_small_and_empty_pictures_have_no_tags() -> None:
+    for grey in (COLOURS, *(COLOURS[:edge, :edge] for edge in (1, 2, 3, 5, 9)), np.full((480, 640, 3), 90, np.uint8)):
+        assert TagFinder().find(grey) == []
 
 
 def test_a_part_of_a_picture_is_one() -> None:

@@ -8,8 +8,11 @@ import pytest
 
 from tests.script.station import Station
 
+#: For what depends on the transport: how a process ends.
+BOTH = pytest.mark.parametrize("shared", ["mqtt", "zenoh"], indirect=True)
 
-@pytest.fixture(scope="module", params=["mqtt", "zenoh"])
+
+@pytest.fixture(scope="module", params=["mqtt", pytest.param("zenoh", marks=pytest.mark.thorough)])
 def shared(request: pytest.FixtureRequest) -> Iterator[Station]:
     station = Station(request.param)
     yield station

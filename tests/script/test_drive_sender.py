@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from pebble.contract.payloads import Drive, EstopState
 from pebble.script.drive_sender import HOLD_S, MAX_PER_S, DriveSender
+from tests.support import cases
 
 RUN = 17
 AHEAD = Drive(z=0.5)
@@ -66,6 +67,7 @@ steps = st.lists(
 )
 
 
+@settings(max_examples=cases(40, 100))
 @given(steps)
 def test_at_most_50_a_second_and_every_stop_at_once(wanted: list[tuple[float, float]]) -> None:
     sending = Sending()
@@ -84,7 +86,7 @@ def test_at_most_50_a_second_and_every_stop_at_once(wanted: list[tuple[float, fl
         assert len(in_a_second) <= MAX_PER_S
 
 
-@settings(max_examples=50)
+@settings(max_examples=cases(20, 50))
 @given(
     st.lists(
         st.tuples(st.sampled_from([0.0, 0.3, 0.6]), st.sampled_from([0.0005, 0.001, 0.019])), min_size=1, max_size=6
@@ -104,6 +106,7 @@ def test_a_flood_of_commands_is_at_most_50_a_second(pattern: list[tuple[float, f
     assert all(later - first > 1.0 for first, later in zip(times, times[MAX_PER_S:], strict=False))
 
 
+@settings(max_examples=cases(40, 100))
 @given(steps)
 def test_nothing_is_published_twice_nor_out_of_order(wanted: list[tuple[float, float]]) -> None:
     sending = Sending()
@@ -115,28 +118,28 @@ def test_nothing_is_published_twice_nor_out_of_order(wanted: list[tuple[float, f
     assert moving == sorted(set(moving))
 
 
-def test_a_stop_replaces_what_waits() -> None:
-    sending = Sending()
-    sending.drive(AHEAD)
-    sending.drive(Drive(z=0.9))
+def test_a_stop_replaces_what_waits_and_nothing_follows_the_final_one() -> None:
+    sending, ended = Sending(), Sending()
+    for one in (sending, ended):
+        one.drive(AHEAD)
+        one.drive(Drive(z=0.9))
     assert sending.drive(ZERO)
-    sending.wait(1.0)
-    assert sending.values == [0.5, 0.0]
+    ended.sender.end("over", ended.now)
+    assert not ended.drive(AHEAD)
+    ended.sender.end("again", ended.now)
+    for one in (sending, ended):
+        one.wait(1.0)
+        assert one.values == [0.5, 0.0]
+    assert ended.sender.refusal(ended.now) == "over"
 
 
-def test_a_stop_that_was_not_accepted_is_published_again_at_once() -> None:
-    sending = Sending()
-    sending.drive(AHEAD)
-    sending.accepts = False
-    assert not sending.drive(ZERO)
-    assert not sending.drive(ZERO)
-    assert sending.values == [0.5, 0.0, 0.0]
-
-
-def test_without_a_connection_nothing_has_an_effect() -> None:
+def test_without_a_connection_nothing_has_an_effect_and_a_stop_is_published_again() -> None:
     sending = Sending()
     sending.accepts = False
     assert not sending.drive(AHEAD)
+    assert not sending.drive(ZERO)
+    assert not sending.drive(ZERO)
+    assert sending.values == [0.5, 0.0, 0.0], "at once"
 
 
 def test_a_script_waits_while_a_person_drives() -> None:
@@ -170,15 +173,6 @@ def test_its_own_commands_and_older_runs_do_not_refuse_it() -> None:
     assert not sending.sender.overridden(sending.now)
 
 
-def test_a_run_that_an_operator_bars_ends() -> None:
-    sending = Sending()
-    sending.drive(AHEAD)
-    sending.owner(barred=RUN)
-    assert not sending.drive(AHEAD)
-    sending.wait(0.2)
-    assert sending.sender.ended(sending.now) == "stopped by an operator"
-
-
 @pytest.mark.parametrize("barred_first", [False, True])
 def test_a_newer_run_supersedes_it(barred_first: bool) -> None:
     sending = Sending()
@@ -207,17 +201,22 @@ def test_a_script_that_never_drives_is_not_ended_and_publishes_nothing() -> None
 @pytest.mark.parametrize(
     ("change", "why"),
     [
+        ({"barred": RUN}, "stopped by an operator"),
         ({"latched": True, "count": 1, "by": "anna", "why": "fire"}, "emergency stop by anna (fire)"),
         ({"count": 1, "by": "anna"}, "emergency stop by anna"),  # stopped and reset between two states
         ({"boot": "b2"}, "serial, which moves the wheels, has restarted"),
     ],
 )
 def test_a_run_does_not_outlive(change: dict[str, object], why: str) -> None:
-    sending = Sending()
-    sending.owner()
-    sending.drive(AHEAD)
-    sending.owner(**change)
-    assert not sending.drive(AHEAD)
+    sending, away = Sending(), Sending()
+    for one in (sending, away):
+        one.owner()
+        one.drive(AHEAD)
+    away.sender.owners({}, away.now)
+    for one in (sending, away):
+        one.owner(**change)
+        assert not one.drive(AHEAD), "also if the owner was away meanwhile"
+    sending.wait(0.2)
     assert sending.sender.ended(sending.now) == why
 
 
@@ -230,24 +229,3 @@ def test_a_stopped_robot_refuses_and_a_reset_does_not_start_it() -> None:
     sending.owner()
     assert sending.sender.ended(sending.now).startswith("the emergency stop was reset")
     assert sending.published == []
-
-
-def test_an_owner_that_returns_after_a_while_has_restarted() -> None:
-    sending = Sending()
-    sending.owner()
-    sending.drive(AHEAD)
-    sending.sender.owners({}, sending.now)
-    sending.owner(boot="b2")
-    assert not sending.drive(AHEAD)
-
-
-def test_nothing_follows_the_final_stop() -> None:
-    sending = Sending()
-    sending.drive(AHEAD)
-    sending.drive(Drive(z=0.9))
-    sending.sender.end("over", sending.now)
-    assert not sending.drive(AHEAD)
-    sending.sender.end("again", sending.now)
-    sending.wait(1.0)
-    assert sending.values == [0.5, 0.0]
-    assert sending.sender.refusal(sending.now) == "over"

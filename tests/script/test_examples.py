@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import sys
+from contextlib import ExitStack
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -15,7 +16,7 @@ from pebble.contract import WHEEL_ODOMETRY, Channel
 from pebble.contract.payloads import WheelOdometry
 from pebble.simulation.world.script_robot import SimulatedRobot
 from tests.services.autonomy_manager.manager_rig import ManagerRig
-from tests.support import ROOT, gone, until
+from tests.support import ROOT, Broker, gone, until
 
 TEXT = (ROOT / "docs" / "scripts.md").read_text()
 ROOM = ROOT / "simulation" / "world" / "room.json"
@@ -64,21 +65,21 @@ def test_a_channel_of_its_own() -> None:
     assert module(text).MOOD.topic("pebble/robots/goob") == "pebble/robots/goob/outgoing/mood"
 
 
-def test_a_script_in_shell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_script_in_shell(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """The manager passes its options, signs what it drives, and stops the wheels."""
     monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}:{os.environ['PATH']}")
-    rig = ManagerRig("mqtt", tmp_path)
-    try:
-        (script,), (manifest,) = blocks("sh"), blocks("json")
+    (script,), (manifest,) = blocks("sh"), blocks("json")
+    with ExitStack() as ends:
+        broker = Broker(tmp_path)
+        ends.callback(broker.stop)
+        rig = ends.enter_context(ManagerRig("mqtt", broker.port))
         folder = rig.script("turn", script, "turn.sh", arbitrate=True)
         (folder / "script.json").write_text(manifest)
         rig.start()
-        pid = rig.run("turn", power=0.3)
+        pid = rig.run_script("turn", power=0.3)
         assert until(lambda: {"x": 0.3} in [{"x": drive.get("x")} for drive in rig.drives], 20), rig.logged()
         rig.command({"action": "stop"})
-        assert until(lambda: rig.status["running"] is False)
+        assert rig.becomes(running=False)
         assert gone(pid)
         assert until(lambda: not any(rig.drives[-1].get(axis, 0.0) for axis in "xz"))
         assert {drive["source"] for drive in rig.drives} == {"autonomy"}
-    finally:
-        rig.close()

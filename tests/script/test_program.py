@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -15,6 +16,7 @@ from pebble.config import LAUNCHER_LOCK
 from pebble.contract.payloads import Drive
 from pebble.script import EXIT_ENDED
 from tests.commands.command_line import config_file
+from tests.script.conftest import BOTH
 from tests.script.station import Station
 from tests.support import Child, gone, until
 
@@ -38,6 +40,7 @@ def ended_by_signal(script: subprocess.Popen[str]) -> str:
     return output
 
 
+@BOTH
 @pytest.mark.parametrize(
     ("body", "code"),
     [
@@ -58,6 +61,7 @@ def test_a_script_that_ends_stops_the_wheels(station: Station, body: str, code: 
     assert [received.drive.moves for received in station.received].count(False) == 1
 
 
+@BOTH
 @pytest.mark.alone
 @pytest.mark.parametrize(
     "body",
@@ -110,22 +114,22 @@ robot.sleep(60)"""
     assert 0.9 not in [received.drive.z for received in station.received]
 
 
-def test_a_run_that_an_operator_ends(station: Station) -> None:
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ({"barred": 17}, "stopped by an operator"),
+        ({"latched": True, "count": 1, "by": "anna"}, "emergency stop by anna"),
+    ],
+)
+def test_a_run_that_is_ended_at_the_motors(station: Station, change: dict[str, Any], why: str) -> None:
     script = station.driven("while robot.drive(z=0.5): time.sleep(0.02)\ntime.sleep(0.3)\nrobot.sleep(60)", run=17)
-    station.publish_state(barred=17)
+    station.publish_state(**change)
     code, output = ended(script)
     assert code == EXIT_ENDED
-    assert output.endswith("[WARNING] stopped by an operator\n"), output
+    assert output.endswith(f"[WARNING] {why}\n"), output
 
 
-def test_a_run_ends_with_an_emergency_stop(station: Station) -> None:
-    script = station.driven("robot.drive(z=0.5)\nrobot.sleep(60)")
-    station.publish_state(latched=True, count=1, by="anna")
-    code, output = ended(script)
-    assert code == EXIT_ENDED
-    assert output.endswith("[WARNING] emergency stop by anna\n")
-
-
+@BOTH
 def test_of_two_runs_the_newer_one_drives(station: Station) -> None:
     loop = "while True:\n    print(robot.drive(z=0.5), robot.why_refused)\n    robot.sleep(0.05)"
     older = station.driven(loop)

@@ -10,7 +10,7 @@ from tests.script.station import Station
 from tests.scripts.stand_in import Sensors
 
 
-@pytest.fixture(scope="module", params=["mqtt", "zenoh"])
+@pytest.fixture(scope="module", params=["zenoh", pytest.param("mqtt", marks=pytest.mark.thorough)])
 def sensors(request: pytest.FixtureRequest) -> Iterator[Sensors]:
     station = Station(request.param)
     sensors = Sensors(station)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import signal
 from itertools import pairwise
+from typing import Any
 
 import pytest
 
@@ -12,13 +13,19 @@ from tests.scripts.stand_in import Sensors
 from tests.support import until
 
 
+def end(script: Any) -> str:
+    """What it has printed."""
+    script.send_signal(signal.SIGTERM)
+    output: str = script.communicate(timeout=20)[0]
+    return output
+
+
 def test_locations_are_published_at_their_rate_and_emptied_at_the_end(sensors: Sensors) -> None:
     sensors.subscribe("apriltag-locations", "video-overlays")
     script = sensors.start("apriltag-locations")
     found, drawn = sensors.messages["apriltag-locations"], sensors.messages["video-overlays"]
     assert until(lambda: len(found) > 24, 30)
-    script.send_signal(signal.SIGTERM)
-    script.communicate(timeout=20)
+    end(script)
     (detection,) = found[5]["detections"]
     assert (detection["marker_id"], found[5]["frame_width"], found[5]["source"]) == (13, 640, "apriltag-locations")
     assert drawn[5]["shapes"] == [[pytest.approx(corner) for corner in detection["corners_norm"]]]
@@ -44,8 +51,7 @@ def test_a_follower_drives_towards_the_tag_and_stops(sensors: Sensors) -> None:
     assert until(lambda: not data[-1]["detected"], 10)
     assert (data[-1]["corners_norm"], data[-1]["distance_m"]) == ([], None)
     sensors.visible = True
-    script.send_signal(signal.SIGTERM)
-    script.communicate(timeout=20)
+    end(script)
     assert until(station.rests)
     assert until(lambda: not data[-1]["detected"] and sensors.messages["video-overlays"][-1]["shapes"] == [])
 
@@ -62,8 +68,7 @@ def test_odometry_measures_the_way_and_rests_at_a_lower_rate(sensors: Sensors) -
     moving = [one["timestamp"] for one in published if 100 < one["value"]["x_mm"] < 500]
     assert 6 < len(moving) / (moving[-1] - moving[0]) < 26, "20 a second, not the 2 at rest"
     assert sensors.messages["wheel-odometry"] == []
-    script.send_signal(signal.SIGTERM)
-    script.communicate(timeout=20)
+    end(script)
 
 
 def test_following_by_odometry_uses_what_two_other_scripts_publish(sensors: Sensors) -> None:
@@ -83,8 +88,7 @@ def test_following_by_odometry_uses_what_two_other_scripts_publish(sensors: Sens
     assert station.received[-1].drive.z > 0.3, "it drives on to where the tag was"
     sensors.visible = True
     for script in (follower, locations, odometry):
-        script.send_signal(signal.SIGTERM)
-        script.communicate(timeout=20)
+        end(script)
     assert until(station.rests)
 
 
@@ -105,9 +109,9 @@ def test_of_two_tags_with_one_id_a_follower_keeps_to_the_one_that_it_has(
     assert distances == {2.0}, "the farther one"
     sensors.two = False
     for script in scripts:
-        script.send_signal(signal.SIGTERM)
-        output, _ = script.communicate(timeout=20)
-        assert output.count("2 tags with id 13: using the one 9 degrees to the right, nearest to the last one") == 1
+        assert (
+            end(script).count("2 tags with id 13: using the one 9 degrees to the right, nearest to the last one") == 1
+        )
 
 
 def test_a_topic_of_commands_is_refused(sensors: Sensors) -> None:

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.services.serial_mcu_bridge.mcu_rig import LocalNetwork, Rig
+from tests.kit.board import Rig
+from tests.kit.robot import LocalNetwork
 from tests.support import Broker
 
 

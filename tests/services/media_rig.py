@@ -1,108 +1,130 @@
-"""One media program as a process of its own, with the robot's local transport and a broker for operators."""
+"""One media program as a process of its own, a device in this process, and an operator at a broker."""
 
 from __future__ import annotations
 
-import json
-import shutil
-import subprocess
-import sys
-import tempfile
-from contextlib import ExitStack
+import threading
+import time
+from abc import ABC, abstractmethod
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Generic, Protocol, Self, TypeVar
 
 import msgspec
 
-from pebble.config import Config, load
 from pebble.contract.payloads import MediaReport
-from pebble.runtime.connections import hub_settings, local_transport
 from pebble.transports import Message, MqttSettings, QoS, State, Transport, create
-from tests.support import ROOT, Child, until
+from pebble.transports.frames import FrameWriter
+from tests.kit.robot import BASE as BASE
+from tests.kit.robot import ROBOT, SILENCE_S, Program, ProgramRobot
+from tests.support import until
 
-BASE = "pebble/robots/rover"
-_SILENCE_S = 5.0  # a machine that does too much at once is not a broker that stopped answering
 
-
-class MediaProgram:
+class MediaProgram(ProgramRobot):
     """``python -m pebble.services.<name>`` of a robot with ``kind`` inside, and what it reports there.
 
     ``section`` of services.mqtt_bridge.media holds the ``options``; operators' requests come on ``request``.
     """
 
+    process: Program
+
     def __init__(
         self, name: str, section: str, request: str, kind: str, local_port: int, remote_port: int, **options: Any
     ) -> None:
-        self.name, self._request, self._kind = name, f"{BASE}/incoming/{request}", kind
-        self._ends = ExitStack()
-        self.folder = Path(tempfile.mkdtemp(prefix="pbl"))  # short: it holds unix sockets
-        self._ends.callback(shutil.rmtree, self.folder, ignore_errors=True)
-        self.config = self._write_config(local_port, remote_port, {section: options})
-        self.reports: list[MediaReport] = []
-        self.process: subprocess.Popen[bytes]
+        remote = {"host": "127.0.0.1", "port": remote_port, "silence_seconds": SILENCE_S}
+        bridge = {"enabled": True, "remote_mqtt": remote, "media": {section: options}}
+        super().__init__(kind, local_port, {"mqtt_bridge": bridge}, robot=ROBOT)
+        self.name, self._request, self.run_dir = name, request, self.config.run_dir()
 
     def __enter__(self) -> Self:
-        if self._kind == "zenoh":
-            self._start("pebble.runtime.hub", msgspec.json.encode(hub_settings(self.config), enc_hook=str).decode())
-        self.local = local_transport(self.config, "somebody").open(10)
-        self._ends.callback(self.local.close)
-        assert self.local.state is State.CONNECTED, self.local.problem
-        self.local.subscribe(f"{BASE}/outgoing/media-report/{self.name}", self._note)
         self.start()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
-        self._ends.close()
-
     def start(self) -> None:
-        self.process = self._start(f"pebble.services.{self.name}", str(self.config.path))
-
-    @property
-    def run_dir(self) -> Path:
-        return self.config.run_dir()
+        self.process = self.run(f"pebble.services.{self.name}")
 
     def ask(self, **request: Any) -> None:
         """What the bridge passes on from operators."""
-        body = json.dumps({"enabled": True, **request}).encode()
-        assert until(lambda: self.local.publish(self._request, body, qos=QoS.DELIVERED)), self.local.problem
+        self.world.command(self._request, {"enabled": True, **request})
+
+    @property
+    def reports(self) -> list[MediaReport]:
+        found = self.world.on(f"media-report/{self.name}")
+        return [msgspec.json.decode(message.payload, type=MediaReport) for message in found]
 
     @property
     def newest(self) -> MediaReport:
         """The last report; before the first one, one that says nothing."""
-        return self.reports[-1] if self.reports else MediaReport(running=False)
+        return [MediaReport(running=False), *self.reports][-1]
 
     def reported(self, timeout: float = 15.0, **expected: Any) -> bool:
         """Until the newest report says so."""
         return until(lambda: all(getattr(self.newest, name) == value for name, value in expected.items()), timeout)
 
-    def _note(self, message: Message) -> None:
-        self.reports.append(msgspec.json.decode(message.payload, type=MediaReport))
-
-    def _start(self, module: str, argument: str) -> subprocess.Popen[bytes]:
-        process = Child([sys.executable, "-m", module, argument], cwd=ROOT)
-        self._ends.callback(process.wait, 10)
-        self._ends.callback(process.terminate)
-        return process
-
-    def _write_config(self, local_port: int, remote_port: int, media: dict[str, Any]) -> Config:
-        run_dir = self.folder / "run"
-        run_dir.mkdir(mode=0o700)
-        raw = {
-            "robot": {"id": "rover"},
-            "transport": {"kind": self._kind, "run_dir": str(run_dir)},
-            "local_mqtt": _broker(local_port),
-            "services": {"mqtt_bridge": {"enabled": True, "remote_mqtt": _broker(remote_port), "media": media}},
-        }
-        path = self.folder / "robot.json"
-        path.write_text(json.dumps(raw))
-        return load(path)
-
-
-def _broker(port: int) -> dict[str, Any]:
-    return {"host": "127.0.0.1", "port": port, "silence_seconds": _SILENCE_S}
-
 
 def client(name: str, port: int) -> Transport:
-    transport = create("mqtt", name, MqttSettings(host="127.0.0.1", port=port, silence_s=_SILENCE_S)).open(10)
+    transport = create("mqtt", name, MqttSettings(host="127.0.0.1", port=port, silence_s=SILENCE_S)).open(10)
     assert transport.state is State.CONNECTED, transport.problem
     return transport
+
+
+class Device(ABC):
+    """A camera or a microphone: writes into its stream ``hertz`` times a second, while anybody reads."""
+
+    def __init__(self, folder: Path, stream: str, hertz: float, capacity: int, **options: Any) -> None:
+        self.writer, self._hertz = FrameWriter(folder, stream, capacity=capacity, **options), hertz
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def __enter__(self) -> Self:
+        self.writer.open()
+        self._thread.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self._stopping.set()
+        self._thread.join(10)
+        self.writer.close()
+
+    @abstractmethod
+    def write(self, number: int) -> None:
+        """Write what is due at that number; they are counted from 1, and also while nobody reads."""
+
+    def _run(self) -> None:
+        began, number = time.monotonic(), 0
+        while not self._stopping.wait(max(0.0, began + number / self._hertz - time.monotonic())):
+            number += 1
+            if self.writer.wanted:
+                self.write(number)
+
+
+class Encoded(Protocol):
+    @property
+    def encoding(self) -> str: ...
+
+
+T = TypeVar("T", bound=Encoded)
+
+
+class Operator(ABC, Generic[T]):
+    """Decodes every packet of one topic of the robot."""
+
+    def __init__(self, port: int, metric: str) -> None:
+        self.transport = client(f"operator-{metric}", port)
+        self.received: list[T] = []
+        self.transport.subscribe(f"{BASE}/outgoing/{metric}", self.receive, qos=QoS.LATEST)
+
+    @abstractmethod
+    def receive(self, message: Message) -> None: ...
+
+    def wait(self, count: int, timeout: float = 20.0) -> list[T]:
+        """Until so many packets more have come; returns these."""
+        before = len(self.received)
+        came = until(lambda: len(self.received) >= before + count, timeout)
+        assert came, f"{len(self.received) - before} packets came"
+        return self.received[before:]
+
+    def wait_for(self, encoding: str) -> None:
+        assert until(lambda: bool(self.received) and self.received[-1].encoding == encoding, 20), f"no {encoding} came"
+
+    def close(self) -> None:
+        self.transport.close()

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
-import subprocess
 import sys
-from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 
 import pytest
 
@@ -17,7 +14,8 @@ from pebble.contract import MQTT_VIDEO, VIDEO_CONTROL
 from pebble.contract.payloads import MediaRequest
 from pebble.runtime.parent import ProgramRequest
 from pebble.services.mqtt_bridge.media import Media
-from tests.support import Child, gone, until
+from tests.kit.robot import ProgramRobot
+from tests.support import Broker, gone, until
 
 #: Leaves its number and that of a child of its own, and says something.
 STREAMER = """
@@ -33,66 +31,52 @@ time.sleep(60)
 REMOTE = {"host": "far", "username": "pit", "password_env": "UPLINK"}
 
 
-class Stream:
+class Stream(ProgramRobot):
     """The service as a process of its own, with ``command`` to run."""
 
-    def __init__(self, folder: Path, command: list[str], **more: Any) -> None:
-        self.folder = folder
-        section = {"enabled": True, "command": command, "cwd": str(folder), "env": {"STREAM_NAME": "pit"}, **more}
-        raw = {
-            "robot": {"id": "pitcam"},
-            "transport": {"kind": "zenoh", "run_dir": str(folder / "run")},
-            "services": {"mqtt_bridge": {"enabled": True, "remote_mqtt": REMOTE}, "video_stream": section},
-        }
-        config = folder / "pitcam.json"
-        config.write_text(json.dumps(raw))
-        self.process = Child(
-            [sys.executable, "-m", "pebble.services.video_stream", str(config)],
-            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env={**os.environ, "UPLINK": "topsecret"},
-        )  # fmt: skip
+    def __init__(self, port: int, *command: str) -> None:
+        super().__init__("mqtt", port, {}, robot="pitcam")
+        section = {"command": command, "cwd": str(self.folder), "env": {"STREAM_NAME": "pit"}}
+        bridge = {"enabled": True, "remote_mqtt": REMOTE}
+        self.raw["services"] = {"mqtt_bridge": bridge, "video_stream": {"enabled": True, **section}}
+        self.write()
+        self.process = self.run("pebble.services.video_stream")
 
     def pids(self) -> list[int]:
         """The process ids of the program and of what it started."""
         assert until((self.folder / "pids").exists, 15)
         return [int(word) for word in (self.folder / "pids").read_text().split()]
 
-    def ended(self) -> tuple[int, str]:
-        output, _ = self.process.communicate(timeout=15)
-        return self.process.returncode, output
+
+Make = Callable[..., Stream]
 
 
 @pytest.fixture
-def streaming(tmp_path: Path) -> Iterator[Stream]:
-    stream = Stream(tmp_path, [sys.executable, "-c", STREAMER])
-    yield stream
-    stream.process.kill()
-    stream.process.wait()
+def make(local: Broker, monkeypatch: pytest.MonkeyPatch) -> Iterator[Make]:
+    monkeypatch.setenv("UPLINK", "topsecret")
+    with ExitStack() as ends:
+        yield lambda *command: ends.enter_context(Stream(local.port, *command))
 
 
-def test_the_program_runs_and_ends_with_all_it_started(streaming: Stream) -> None:
-    pids = streaming.pids()
-    assert not any(gone(pid) for pid in pids)
-    streaming.process.terminate()
-    code, output = streaming.ended()
-    assert (code, "streaming as pit ''" in output) == (0, True)
-    assert until(lambda: all(gone(pid) for pid in pids), 5)
+DEAF = "import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN)\n"
 
 
-def test_a_program_that_will_not_end_is_killed(tmp_path: Path) -> None:
-    stubborn = f"import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN)\n{STREAMER}"
-    stream = Stream(tmp_path, [sys.executable, "-c", stubborn])
+@pytest.mark.parametrize("before", ["", DEAF])
+def test_the_program_ends_with_all_it_started_also_if_it_does_not_want_to(make: Make, before: str) -> None:
+    stream = make(sys.executable, "-c", before + STREAMER)
     pids = stream.pids()
-    stream.process.terminate()
-    assert stream.ended()[0] == 0
+    assert not any(gone(pid) for pid in pids)
+    assert stream.process.end() == 0
     assert until(lambda: all(gone(pid) for pid in pids), 5)
+    assert "streaming as pit ''" in stream.process.stdout.read() + stream.process.printed
 
 
-def test_a_killed_service_leaves_no_program(streaming: Stream) -> None:
-    program = streaming.pids()[0]
-    os.kill(streaming.process.pid, signal.SIGKILL)
+def test_a_killed_service_leaves_no_program(make: Make) -> None:
+    stream = make(sys.executable, "-c", STREAMER)
+    program, child = stream.pids()
+    stream.process.kill()
     assert until(lambda: gone(program), 5)
-    for pid in streaming.pids()[1:]:  # its own children are its own business then
-        os.kill(pid, signal.SIGKILL)
+    os.kill(child, signal.SIGKILL)  # its own children are its own business then
 
 
 @pytest.mark.parametrize(
@@ -103,11 +87,11 @@ def test_a_killed_service_leaves_no_program(streaming: Stream) -> None:
     ],
 )
 def test_a_program_that_ends_or_never_starts_ends_the_service_with_the_reason(
-    tmp_path: Path, command: list[str], reason: str
+    make: Make, command: list[str], reason: str
 ) -> None:
-    code, output = Stream(tmp_path, command).ended()
-    assert code == 1
-    assert reason in output
+    process = make(*command).process
+    assert process.wait(15) == 1
+    assert reason in process.printed
 
 
 def test_operators_switch_it_as_they_switch_a_camera() -> None:

@@ -16,7 +16,7 @@ _context = multiprocessing.get_context("forkserver")
 _context.set_forkserver_preload(
     [
         *("__main__", "tests.transports.frames.frames_peer", "tests.transports.peer", "pebble.runtime.hub"),
-        "tests.transports.zenoh.zenoh_actor",
+        *("tests.transports.zenoh.zenoh_actor", "tests.kit.robot"),
     ]
 )
 

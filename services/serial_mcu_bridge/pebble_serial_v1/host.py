@@ -43,7 +43,7 @@ ANSWER_S = 10.0  # an outlet controller that switches a power outlet over Wi-Fi 
 _DOUBT_S = 10.0  # between two requests because of readings that do not fit the manifest
 _REMEMBERED = 16  # manifests
 _OPEN_COMMANDS = 64  # that wait for their answers
-_WAITING = 8  # kinds per interface: so many commands may wait to be sent; a newer one replaces the oldest
+WAITING = 8  # kinds per interface: so many commands may wait to be sent; a newer one replaces the oldest
 _U32 = 0xFFFFFFFF
 
 
@@ -185,7 +185,7 @@ class Session:
         self._commands[self._sequence] = _Command(interface.name, now + ANSWER_S)
         if len(self._commands) > _OPEN_COMMANDS:
             self._commands.popitem(last=False)
-        slot = self._slots[interface.id] = (self._slots.get(interface.id, 0) + 1) % _WAITING
+        slot = self._slots[interface.id] = (self._slots.get(interface.id, 0) + 1) % WAITING
         return Send(f"command {interface.id}/{slot}", data)
 
     # -- received frames

@@ -20,7 +20,7 @@ PROTOCOL: Final = "pebble_serial_v1"
 #: The level below ``mcu/{uid}/`` that is the topic of the manifest itself.
 RESERVED: Final = "describe"
 
-_MOST_INTERFACES = 64  # with 64 fields each they exceed FRAME_LIMIT: frame.py says what fits
+MOST_INTERFACES = 64  # with 64 fields each they exceed FRAME_LIMIT: frame.py says what fits
 _MOST_FIELDS = 64  # of one interface
 _MOST_LEVELS = 8  # of a channel
 _ENCODINGS = {1: "struct_v1"}
@@ -110,8 +110,8 @@ def parse_describe(payload: bytes, base: str = "") -> Manifest:
     """
     reader = _Reader(payload)
     hello = _hello(reader)
-    if hello.interface_count > _MOST_INTERFACES:
-        raise PayloadError(f"{hello.interface_count} interfaces, more than {_MOST_INTERFACES}")
+    if hello.interface_count > MOST_INTERFACES:
+        raise PayloadError(f"{hello.interface_count} interfaces, more than {MOST_INTERFACES}")
     interfaces = tuple(_interface(reader) for _ in range(hello.interface_count))
     reader.end()
     _all_differ("interface id", [interface.id for interface in interfaces])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from pebble.services.audio_publisher.rate_control import LevelControl, Step, steps
 from pebble.services.audio_publisher.sender import known_encoding
 
@@ -29,11 +31,19 @@ def at_ease() -> LevelControl:
     return levels
 
 
-def test_it_begins_small_and_has_everything_soon() -> None:
+#: How old what waits is, for so many seconds from the start, the changes of the level meanwhile, and the level then.
+FROM_THE_START = {
+    "it begins small and has everything soon": (0.06, 2.5, 2, 0),
+    "what stands in a queue earns nothing": (0.09, 60, 0, 2),
+    "on a link that begins slow it stays small": (0.18, 60, 0, 2),
+}
+
+
+@pytest.mark.parametrize(("age_s", "seconds", "changes", "level"), FROM_THE_START.values(), ids=FROM_THE_START)
+def test_from_the_start(age_s: float, seconds: float, changes: int, level: int) -> None:
     levels = LevelControl(2, 0.0)
     assert levels.level == 2
-    assert len(watch(levels, 0.06, 0.0, 2.5)) == 2
-    assert levels.level == 0
+    assert (len(watch(levels, age_s, 0.0, seconds)), levels.level) == (changes, level)
 
 
 def test_time_in_which_nothing_was_seen_earns_nothing() -> None:
@@ -52,27 +62,14 @@ def test_confirmations_that_are_held_back_are_not_a_slow_link() -> None:
     assert levels.level == 0
 
 
-def test_what_stands_in_a_queue_earns_nothing() -> None:
-    levels = LevelControl(2, 0.0)
-    assert watch(levels, 0.09, 0.0, 60) == []
-
-
-def test_a_link_that_is_fast_changes_nothing() -> None:
+def test_slowness_goes_down_step_by_step_and_all_is_as_before_in_the_end() -> None:
     levels = at_ease()
-    assert watch(levels, 0.06, 5.0, 600) == []
-
-
-def test_on_a_link_that_begins_slow_it_stays_small() -> None:
-    levels = LevelControl(2, 0.0)
-    assert watch(levels, 0.18, 0.0, 60) == []
-
-
-def test_slowness_goes_down_step_by_step() -> None:
-    levels = at_ease()
-    changes = watch(levels, 0.18, 10.0, 10)
-    assert len(changes) == 2
-    assert changes[-1] < 10 + 1, "commands wait behind what waits"
-    assert levels.level == 2
+    assert watch(levels, 0.06, 5.0, 600) == [], "a fast link changes nothing"
+    changes = watch(levels, 0.18, 610.0, 10)
+    assert (len(changes), levels.level) == (2, 2)
+    assert changes[-1] < 610 + 1, "commands wait behind what waits"
+    watch(levels, 0.0, 620.0, 100)
+    assert levels.level == 0
 
 
 def test_a_moment_of_slowness_is_nothing() -> None:
@@ -98,13 +95,6 @@ def test_steps_back_are_tried_ever_more_rarely() -> None:
     assert tries[0] > 5
     assert tries == sorted(tries)
     assert tries[-1] > 4 * tries[0]
-
-
-def test_all_is_as_before_in_the_end() -> None:
-    levels = at_ease()
-    watch(levels, 0.18, 10.0, 5.0)
-    watch(levels, 0.0, 15.0, 100)
-    assert levels.level == 0
 
 
 def test_what_a_request_means() -> None:

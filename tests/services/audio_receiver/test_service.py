@@ -6,7 +6,8 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from functools import cache
 from pathlib import Path
 from statistics import median
@@ -24,8 +25,6 @@ from pebble.transports import QoS
 from tests.services.audio_rig import RECORDER, Program
 from tests.services.media_rig import BASE, client
 from tests.support import Broker, until
-
-NAME = "audio_receiver"
 
 
 class Recorder:
@@ -93,126 +92,116 @@ def operator(remote: Broker) -> Iterator[Operator]:
     operator.transport.close()
 
 
-def listening(robot: Program) -> bool:
-    return robot.reported(running=True, last_error=None, doing="is silent")
+Receive = Callable[..., Program]
 
 
-def test_received_speech_is_played(local: Broker, remote: Broker, operator: Operator, recorder: Recorder) -> None:
-    with Program(
-        NAME, "mqtt", local.port, remote.port, command=recorder.command, device="plug:x", latency_ms=300
-    ) as robot:
-        assert listening(robot)
-        operator.speak(seconds=2)
-        speech = Speech(16000).samples(0, 32000)[:, 0].astype(float)
-        assert until(lambda: len(recorder.samples()) >= 32000 * 0.98)
-        assert recorder.calls == ["16000-1-plug:x"]
-        assert best_match(recorder.samples()[:28000], np.pad(speech, (8000, 8000))) > 0.95
-        assert robot.reported(encoding="pcm", last_error=None, doing="plays 16 kHz, 1 channel")
-        assert until(lambda: (robot.newest.bitrate or 0) > 0)
+@pytest.fixture
+def receive(local: Broker, remote: Broker, recorder: Recorder) -> Iterator[Receive]:
+    """Starts the receiver of a robot with this kind inside, and returns once it reports."""
+    with ExitStack() as ends:
+
+        def started(kind: str = "mqtt", problem: str | None = None, **options: Any) -> Program:
+            options = {"command": recorder.command, **options}
+            robot = ends.enter_context(Program("audio_receiver", kind, local.port, remote.port, **options))
+            assert robot.reported(running=True, last_error=problem, doing="is silent")
+            return robot
+
+        yield started
 
 
-def test_opus_on_a_robot_with_zenoh_inside(
-    local: Broker, remote: Broker, operator: Operator, recorder: Recorder
-) -> None:
-    with Program(NAME, "zenoh", local.port, remote.port, command=recorder.command, latency_ms=300) as robot:
-        assert listening(robot)
-        operator.speak("opus", 2, bundle=2)
-        speech = np.pad(Speech(16000).samples(0, 32000)[:, 0].astype(float), (8000, 8000))
-        assert until(lambda: len(recorder.samples()) >= 32000 * 0.95)
-        played, loud = recorder.samples()[:28000], envelope(speech, 16000)
-        assert max(best_match(envelope(played[shift:], 16000), loud) for shift in range(0, 320, 40)) > 0.9
-        assert robot.reported(encoding="opus", last_error=None)
+def test_received_speech_is_played(receive: Receive, operator: Operator, recorder: Recorder) -> None:
+    robot = receive(device="plug:x", latency_ms=300)
+    operator.speak(seconds=2)
+    speech = Speech(16000).samples(0, 32000)[:, 0].astype(float)
+    assert until(lambda: len(recorder.samples()) >= 32000 * 0.98)
+    assert recorder.calls == ["16000-1-plug:x"]
+    assert best_match(recorder.samples()[:28000], np.pad(speech, (8000, 8000))) > 0.95
+    assert robot.reported(encoding="pcm", last_error=None, doing="plays 16 kHz, 1 channel")
+    assert until(lambda: (robot.newest.bitrate or 0) > 0)
 
 
-def test_a_change_of_format_begins_another_player(
-    local: Broker, remote: Broker, operator: Operator, recorder: Recorder
-) -> None:
-    with Program(NAME, "mqtt", local.port, remote.port, command=recorder.command) as robot:
-        assert listening(robot)
-        operator.speak(seconds=0.5)
-        operator.speak(seconds=0.5, rate=48000, channels=2)
-        operator.speak("opus", seconds=0.5)
-        assert until(lambda: len(recorder.calls) == 3 and len(recorder.samples(2)) > 5000)
-        assert recorder.calls == ["16000-1-default", "48000-2-default", "16000-1-default"]
-        assert robot.newest.restarts == 0
+def test_opus_on_a_robot_with_zenoh_inside(receive: Receive, operator: Operator, recorder: Recorder) -> None:
+    robot = receive("zenoh", latency_ms=300)
+    operator.speak("opus", 2, bundle=2)
+    speech = np.pad(Speech(16000).samples(0, 32000)[:, 0].astype(float), (8000, 8000))
+    assert until(lambda: len(recorder.samples()) >= 32000 * 0.95)
+    played, loud = recorder.samples()[:28000], envelope(speech, 16000)
+    assert max(best_match(envelope(played[shift:], 16000), loud) for shift in range(0, 320, 40)) > 0.9
+    assert robot.reported(encoding="opus", last_error=None)
 
 
-def test_a_restarted_sender_is_played(local: Broker, remote: Broker, operator: Operator, recorder: Recorder) -> None:
-    with Program(NAME, "mqtt", local.port, remote.port, command=recorder.command) as robot:
-        assert listening(robot)
-        operator.speak(seconds=0.6)
-        operator.numbers = sequence_numbers()
-        operator.speak(seconds=0.6)
-        assert until(lambda: len(recorder.samples()) >= 18000)
+def test_a_change_of_format_begins_another_player(receive: Receive, operator: Operator, recorder: Recorder) -> None:
+    robot = receive()
+    operator.speak(seconds=0.5)
+    operator.speak(seconds=0.5, rate=48000, channels=2)
+    operator.speak("opus", seconds=0.5)
+    assert until(lambda: len(recorder.calls) == 3 and len(recorder.samples(2)) > 5000)
+    assert recorder.calls == ["16000-1-default", "48000-2-default", "16000-1-default"]
+    assert robot.newest.restarts == 0
 
 
-def test_a_player_that_dies_is_started_again(
-    local: Broker, remote: Broker, operator: Operator, recorder: Recorder
-) -> None:
-    with Program(NAME, "mqtt", local.port, remote.port, command=recorder.command) as robot:
-        assert listening(robot)
-        operator.speak(seconds=0.3)
-        assert until(lambda: len(recorder.pids) == 1)
-        os.kill(recorder.pids[0], signal.SIGKILL)
-        operator.speak(seconds=1.2)
-        assert until(lambda: len(recorder.pids) == 2 and len(recorder.samples(1)) > 3000)
-        assert robot.reported(restarts=1)
+def test_a_restarted_sender_is_played(receive: Receive, operator: Operator, recorder: Recorder) -> None:
+    receive()
+    operator.speak(seconds=0.6)
+    operator.numbers = sequence_numbers()
+    operator.speak(seconds=0.6)
+    assert until(lambda: len(recorder.samples()) >= 18000)
+
+
+def test_a_player_that_dies_is_started_again(receive: Receive, operator: Operator, recorder: Recorder) -> None:
+    robot = receive()
+    operator.speak(seconds=0.3)
+    assert until(lambda: len(recorder.pids) == 1)
+    os.kill(recorder.pids[0], signal.SIGKILL)
+    operator.speak(seconds=1.2)
+    assert until(lambda: len(recorder.pids) == 2 and len(recorder.samples(1)) > 3000)
+    assert robot.reported(restarts=1)
 
 
 def test_a_player_that_hangs_is_replaced_and_blocks_nothing_else(
-    local: Broker, remote: Broker, operator: Operator, recorder: Recorder
+    receive: Receive, operator: Operator, recorder: Recorder
 ) -> None:
-    with Program(NAME, "mqtt", local.port, remote.port, command=recorder.command) as robot:
-        assert listening(robot)
-        operator.speak(seconds=0.3)
-        assert until(lambda: len(recorder.pids) == 1)
-        os.kill(recorder.pids[0], signal.SIGSTOP)
-        seen = len(robot.reports)
-        operator.speak(seconds=3.5)
-        assert len(robot.reports) >= seen + 2
-        assert until(lambda: len(recorder.pids) == 2 and len(recorder.samples(1)) > 3000)
-        robot.process.send_signal(signal.SIGTERM)
-        assert robot.process.wait(5) == 0
+    robot = receive()
+    operator.speak(seconds=0.3)
+    assert until(lambda: len(recorder.pids) == 1)
+    os.kill(recorder.pids[0], signal.SIGSTOP)
+    seen = len(robot.reports)
+    operator.speak(seconds=3.5)
+    assert len(robot.reports) >= seen + 2
+    assert until(lambda: len(recorder.pids) == 2 and len(recorder.samples(1)) > 3000)
+    robot.process.send_signal(signal.SIGTERM)
+    assert robot.process.wait(5) == 0
 
 
-def test_a_player_that_is_not_installed_is_named_once(
-    local: Broker, remote: Broker, operator: Operator, capfd: pytest.CaptureFixture[str]
-) -> None:
-    with Program(NAME, "mqtt", local.port, remote.port, command=["no-such-player", "-"]) as robot:
-        assert robot.reported(running=True, last_error="no-such-player is not installed")
-        operator.speak(seconds=0.5)
-        assert until(lambda: (robot.newest.dropped or 0) > 10)
-        assert robot.newest.last_error == "no-such-player is not installed"
-    assert capfd.readouterr().err.count("no sound: no-such-player is not installed") == 1
+def test_a_player_that_is_not_installed_is_named_once(receive: Receive, operator: Operator) -> None:
+    robot = receive(command=["no-such-player", "-"], problem="no-such-player is not installed")
+    operator.speak(seconds=0.5)
+    assert until(lambda: (robot.newest.dropped or 0) > 10)
+    assert robot.newest.last_error == "no-such-player is not installed"
+    assert robot.process.printed.count("no sound: no-such-player is not installed") == 1
 
 
-def test_garbage_and_retained_packets_play_nothing(
-    local: Broker, remote: Broker, operator: Operator, recorder: Recorder
-) -> None:
+def test_garbage_and_retained_packets_play_nothing(receive: Receive, operator: Operator, recorder: Recorder) -> None:
     packet = make_sound_encoder("pcm", rate=16000, channels=1).encode(bytes(640), 1000)[0]
     operator.send(packet, retain=True)
-    with Program(NAME, "mqtt", local.port, remote.port, command=recorder.command) as robot:
-        assert listening(robot)
-        for size in range(200):
-            operator.send(bytes(range(256))[:size])
-            operator.send(packet[:size])
-        assert until(lambda: (robot.newest.rate or 0) > 0)
-        assert recorder.calls == []
-        operator.speak(seconds=0.3)
-        assert until(lambda: recorder.calls == ["16000-1-default"])
+    robot = receive()
+    for size in range(200):
+        operator.send(bytes(range(256))[:size])
+        operator.send(packet[:size])
+    assert until(lambda: (robot.newest.rate or 0) > 0)
+    assert recorder.calls == []
+    operator.speak(seconds=0.3)
+    assert until(lambda: recorder.calls == ["16000-1-default"])
 
 
-def test_delay_from_the_operator_to_the_player(
-    local: Broker, remote: Broker, operator: Operator, recorder: Recorder
-) -> None:
+def test_delay_from_the_operator_to_the_player(receive: Receive, operator: Operator, recorder: Recorder) -> None:
     """Every sample of a packet is its number, so what was recorded last tells which one was played last."""
-    with Program(NAME, "mqtt", local.port, remote.port, command=recorder.command) as robot:
-        assert listening(robot)
-        behind, began = [], time.monotonic()
-        for number in range(1, 101):
-            time.sleep(max(0.0, began + 0.02 * number - time.monotonic()))  # as a microphone does
-            body = np.full(320, number, "<i2").tobytes()
-            operator.send(Sound(Codec.PCM16LE, 1, 16000, 320, number, 1000 + 20 * number, body).pack())
-            played = recorder.samples()
-            behind.append(number - (played[-1] if len(played) else 0))
-        assert median(behind[50:]) < 45  # 0.9 s, on a busy machine; the usual is 5
+    receive()
+    behind, began = [], time.monotonic()
+    for number in range(1, 101):
+        time.sleep(max(0.0, began + 0.02 * number - time.monotonic()))  # as a microphone does
+        body = np.full(320, number, "<i2").tobytes()
+        operator.send(Sound(Codec.PCM16LE, 1, 16000, 320, number, 1000 + 20 * number, body).pack())
+        played = recorder.samples()
+        behind.append(number - (played[-1] if len(played) else 0))
+    assert median(behind[50:]) < 45  # 0.9 s, on a busy machine; the usual is 5

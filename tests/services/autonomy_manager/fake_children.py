@@ -15,7 +15,7 @@ from pebble.services.autonomy_manager.child import Launch
 from pebble.services.autonomy_manager.script import Script
 from pebble.services.autonomy_manager.service import AutonomyManager
 from pebble.transports import Message, QoS
-from tests.services.serial_mcu_bridge.mcu_rig import BASE, Listener, LocalNetwork, Running
+from tests.kit.robot import BASE, Listener, LocalNetwork, Running
 from tests.support import until
 
 MOTORS = {"enabled": True, "serial": {"port": "/dev/null"}}
@@ -85,7 +85,7 @@ class Bench:
 
     @property
     def status(self) -> dict[str, Any]:
-        found: dict[str, Any] = msgspec.json.decode(self.world.retained("autonomy-status")[0])
+        found: dict[str, Any] = self.world.newest("autonomy-status")
         found.pop("timestamp")
         return found
 
@@ -104,11 +104,17 @@ class Bench:
         assert self.becomes(running=True, file=file)
         return next(child for child in self.children.all[before:] if child.launch.file == file)
 
+    def stop(self, child: FakeChild) -> None:
+        """Command a stop, and wait until a process is asked to end."""
+        self.command({"action": "stop"})
+        assert until(lambda: child.signals == [signal.SIGTERM])
+
     def owner(self, **fields: Any) -> None:
         """Publish the state of the motor owner."""
         state = {"latched": False, "boot": "aa", "count": 0, "recent": [], "by": "", "why": "", "since": 0, **fields}
         raw = msgspec.json.encode(EstopState(**state))
         self.world.transport.publish(f"{BASE}/outgoing/estop/serial", raw, qos=QoS.DELIVERED, retain=True)
+        self.quiet()
 
     def drive(self, **fields: Any) -> None:
         self.world.command("drive-values", fields)

@@ -6,16 +6,14 @@ import json
 import os
 import signal
 import stat
-import subprocess
 import sys
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from pebble.transports import Message
-from tests.services.serial_mcu_bridge.mcu_rig import BASE, ROBOT, Listener, LocalNetwork
+from tests.kit.robot import ROBOT, Program, ProgramRobot
 from tests.support import ROOT, Child, gone, until
 
 #: Sleeps, and ends as asked; leaves its command line beside itself. It speaks no MQTT and drives nothing.
@@ -27,22 +25,21 @@ time.sleep(600)
 """
 
 
-class ManagerRig:
+class ManagerRig(ProgramRobot):
     """``scripts`` of the config are those written with :meth:`script`; drive commands are collected as well."""
 
-    def __init__(self, kind: str, folder: Path, **section: Any) -> None:
-        self._ends = ExitStack()
-        self.folder, self.root = folder, folder / "scripts"
+    process: Program | Child | None = None
+
+    def __init__(self, kind: str, port: int, **section: Any) -> None:
+        super().__init__(kind, port, {}, robot=ROBOT)
+        self.root, self.log = self.folder / "scripts", self.folder / "log"
         self.root.mkdir()
-        self.network = LocalNetwork(kind, folder)
-        self._ends.callback(self.network.close)
-        self.world = Listener(self.network.client("world"))
-        self._ends.callback(self.world.transport.close)
         self.drives: list[dict[str, Any]] = []
-        self.world.transport.subscribe(f"{BASE}/incoming/drive-values", self._on_drive, direct=True)
-        self.section: dict[str, Any] = {"scan_interval_seconds": 1, "stop_timeout_seconds": 2, **section}
+        self.world.transport.subscribe(f"{self.world.base}/incoming/drive-values", self._on_drive, direct=True)
+        times = {"scan_interval_seconds": 1, "stop_timeout_seconds": 2}
+        self.section: dict[str, Any] = {"enabled": True, "autonomy_root": str(self.root), **times, **section}
         self.section["scripts"] = {}
-        self.process: subprocess.Popen[str] | None = None
+        self.raw["services"] = {"autonomy_manager": self.section}
         self._ends.callback(self.end)
 
     def script(self, name: str, text: str = SLEEPER, file: str = "run.py", **section: Any) -> Path:
@@ -56,23 +53,13 @@ class ManagerRig:
 
     def start(self, *command: str) -> None:
         """Start the manager alone, or with ``command`` what runs it."""
-        config, before = self.folder / f"{ROBOT}.json", len(self.world.on("autonomy-files"))
-        raw = {
-            "robot": {"id": ROBOT},
-            "transport": {
-                "kind": "mqtt",
-                "run_dir": str(self.folder / "run"),
-                **self.network.transport,
-                "state_dir": str(self.folder / "state"),
-            },
-            "local_mqtt": self.network.local_mqtt,
-            "services": {"autonomy_manager": {"enabled": True, "autonomy_root": str(self.root), **self.section}},
-        }
-        config.write_text(json.dumps(raw))
-        self.log = self.folder / "log"
-        with self.log.open("a") as log:
-            words = command or ("pebble.services.autonomy_manager",)
-            self.process = Child([sys.executable, "-m", *words, str(config)], cwd=ROOT, stderr=log)
+        before = len(self.world.on("autonomy-files"))
+        self.config = self.write()
+        if command:
+            with self.log.open("a") as log:
+                self.process = Child([sys.executable, "-m", *command, str(self.path)], cwd=ROOT, stderr=log)
+        else:
+            self.process = Program("pebble.services.autonomy_manager", str(self.path))
         assert until(lambda: len(self.world.on("autonomy-files")) > before and self.listed(), 20), self.logged()
 
     def end(self, number: signal.Signals = signal.SIGTERM) -> None:
@@ -84,30 +71,35 @@ class ManagerRig:
     def listed(self) -> bool:
         """Whether every script is in the published list."""
         files = self.newest("autonomy-files")
-        return files is not None and {entry["file"] for entry in files["files"]} >= set(self.section["scripts"])
+        return bool(files) and {entry["file"] for entry in files["files"]} >= set(self.section["scripts"])
 
     def newest(self, metric: str) -> Any:
-        payloads = self.world.retained(metric)
-        return msgspec.json.decode(payloads[0]) if payloads else None
+        return self.world.newest(metric)
 
     @property
     def status(self) -> dict[str, Any]:
-        return self.newest("autonomy-status") or {}
+        status: dict[str, Any] = self.newest("autonomy-status")
+        return status
+
+    def becomes(self, timeout: float = 10.0, **fields: Any) -> bool:
+        """Wait until the status has these fields."""
+        return self.world.became("autonomy-status", timeout, **fields)
 
     def command(self, body: Any, *, retain: bool = False) -> None:
         self.world.command("autonomy-command", body, retain=retain)
 
-    def run(self, name: str, **config: Any) -> int:
-        """Start a script, and return its pid once it is published as running."""
+    def launch(self, name: str, **config: Any) -> None:
+        """Send the command that starts a script."""
         self.command({"action": "start", "file": name, "config": config})
-        assert until(lambda: self.status.get("running") and self.status["file"] == name), (self.status, self.logged())
+
+    def run_script(self, name: str, **config: Any) -> int:
+        """Start a script, and return its pid once it is published as running."""
+        self.launch(name, **config)
+        assert self.becomes(running=True, file=name), (self.status, self.logged())
         return int(self.status["pid"])
 
     def logged(self) -> str:
-        return self.log.read_text()
-
-    def close(self) -> None:
-        self._ends.close()
+        return self.process.printed if isinstance(self.process, Program) else self.log.read_text()
 
     def _on_drive(self, message: Message) -> None:
         self.drives.append(msgspec.json.decode(message.payload))

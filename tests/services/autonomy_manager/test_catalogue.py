@@ -63,9 +63,6 @@ def test_folders_with_an_entry_point_are_scripts(tmp_path: Path, caplog: pytest.
     assert list(found) == ["Alpha", "beta", "elsewhere", "other"]
     assert found["beta"].command == (sys.executable, str(tmp_path / "beta/run.py"))
     assert "'bad]name' is not offered: rename its folder" in caplog.text
-
-
-def test_a_missing_folder_has_no_scripts(tmp_path: Path) -> None:
     assert scripts(tmp_path / "missing") == {}
 
 
@@ -145,22 +142,14 @@ def test_any_program_with_a_manifest_is_a_script(tmp_path: Path) -> None:
     program = write(tmp_path, "plain", "#!/bin/sh", file="start")
     program.chmod(stat.S_IRWXU)
     write(tmp_path, "venv", "import pebble.script\nraise SystemExit(1)")
-    section = {"plain": {"entrypoint": "start"}, "venv": {"python": "venv/bin/python"}}
+    write(tmp_path, "old", "print 'hi'")
+    section = {"plain": {"entrypoint": "start"}, "venv": {"python": "venv/bin/python"}, "old": {"python": "python2"}}
     found = scripts(tmp_path, scripts=section)
     assert found["shell"].command == (str(tmp_path / "shell/go.sh"), "-v")
     assert [setting.key for setting in found["shell"].settings] == ["n"]
     assert found["plain"].command == (str(program),)
+    assert found["old"].broken == "", "what another Python runs may be written for that"
     assert found["venv"].command == (str(tmp_path / "venv/bin/python"), str(tmp_path / "venv/run.py"))
-
-
-def test_a_script_that_fails_to_answer_is_offered_without_settings(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    write(tmp_path, "walk", "import pebble.script\nraise SystemExit('no camera')")
-    with caplog.at_level(logging.WARNING):
-        walk = scripts(tmp_path)["walk"]
-    assert (walk.settings, walk.broken) == ((), "its --describe ended with code 1: no camera")
-    assert "walk is offered without settings: its --describe ended with code 1: no camera" in caplog.text
 
 
 @pytest.mark.parametrize(
@@ -176,8 +165,9 @@ def test_a_script_that_fails_to_answer_is_offered_without_settings(
             "its --describe ended with code 1: TypeError: option tags",
         ),
         ("from pebble import run\n\ndef main(robot:\n    pass", "run.py, line 3: '(' was never closed"),
+        ("import pebble.script\nraise SystemExit('no camera')", "its --describe ended with code 1: no camera"),
     ],
-    ids=["no module", "an option's type", "syntax"],
+    ids=["no module", "an option's type", "syntax", "ends"],
 )
 def test_a_broken_script_is_not_started_and_the_reason_is_logged_once(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, text: str, reason: str
@@ -186,15 +176,10 @@ def test_a_broken_script_is_not_started_and_the_reason_is_logged_once(
     catalogue = Catalogue(config(tmp_path))
     with caplog.at_level(logging.WARNING):
         found = [scanned(catalogue)["follow"] for _ in range(2)]
-    assert all(script.broken.startswith(reason) for script in found), found
+    assert all(script.broken.startswith(reason) and script.settings == () for script in found), found
     assert caplog.text.count(reason) == 1
     write(tmp_path, "follow", PRETENDS)
     assert scanned(catalogue)["follow"].broken == ""
-
-
-def test_what_another_python_runs_may_be_written_for_that(tmp_path: Path) -> None:
-    write(tmp_path, "old", "print 'hi'")
-    assert scripts(tmp_path, scripts={"old": {"python": "python2"}})["old"].broken == ""
 
 
 def test_only_a_script_without_a_gate_gets_the_password_of_the_robots_broker(tmp_path: Path) -> None:

@@ -23,18 +23,18 @@ def script(folder: Path, text: str, mode: int) -> Path:
     return path
 
 
-def test_a_file_that_is_not_executable_is_named_with_the_command_that_makes_it_so(tmp_path: Path) -> None:
-    path = script(tmp_path, "#!/bin/sh\n", 0o644)
-    with pytest.raises(PebbleError, match=f"^{path} is not executable: chmod \\+x {path}$"):
-        started(path)
-
-
 @pytest.mark.parametrize(
-    ("first", "named"), [("#!/no/such/sh -e\n", "'/no/such/sh'"), ("#!/bin/sh\r\n", r"'/bin/sh\\r'")]
+    ("first", "mode", "problem"),
+    [
+        ("#!/bin/sh\n", 0o644, "^{path} is not executable: chmod \\+x {path}$"),
+        ("#!/no/such/sh -e\n", 0o755, "there is no '/no/such/sh', which its first line names"),
+        ("#!/bin/sh\r\n", 0o755, r"there is no '/bin/sh\\r', which its first line names"),
+    ],
 )
-def test_a_missing_interpreter_is_named(first: str, named: str, tmp_path: Path) -> None:
-    with pytest.raises(PebbleError, match=f"there is no {named}, which its first line names"):
-        started(script(tmp_path, first, 0o755))
+def test_what_cannot_be_executed_is_named_with_the_reason(first: str, mode: int, problem: str, tmp_path: Path) -> None:
+    path = script(tmp_path, first, mode)
+    with pytest.raises(PebbleError, match=problem.format(path=path)):
+        started(path)
 
 
 @pytest.mark.parametrize("first", ["#!/bin/sh\n", "#!/bin/sh\t-e\n", "#!/usr/bin/env -S sh -e\n", "\n"])

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.services.autonomy_manager.manager_rig import SLEEPER, ManagerRig, alive, started
-from tests.support import gone, until
+from tests.support import Broker, gone, until
 
 #: Starts a process of its own, and leaves both numbers.
 PARENT = """
@@ -41,26 +41,30 @@ while :; do sleep 0.1; done
 """
 
 
-def rigged(kind: str, folder: Path) -> Iterator[ManagerRig]:
-    rig = ManagerRig(kind, folder)
-    yield rig
-    rig.close()
-
-
 @pytest.fixture(params=["mqtt", "zenoh"])
-def rig(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[ManagerRig]:
-    yield from rigged(request.param, tmp_path)
+def rig(request: pytest.FixtureRequest, local: Broker) -> Iterator[ManagerRig]:
+    with ManagerRig(request.param, local.port) as rig:
+        yield rig
 
 
 @pytest.fixture
-def mqtt(tmp_path: Path) -> Iterator[ManagerRig]:
-    yield from rigged("mqtt", tmp_path)
+def mqtt(local: Broker) -> Iterator[ManagerRig]:
+    with ManagerRig("mqtt", local.port) as rig:
+        yield rig
 
 
-def family(folder: Path) -> list[int]:
+def pids_in(folder: Path) -> list[int]:
     """The numbers of a PARENT and its child."""
     assert until((folder / "pids").exists)
     return [int(word) for word in (folder / "pids").read_text().split()]
+
+
+def family(rig: ManagerRig, text: str, *command: str) -> list[int]:
+    """Start the manager, or what runs it, and a script that starts a process; return the numbers of both."""
+    folder = rig.script("family", text)
+    rig.start(*command)
+    rig.run_script("family")
+    return pids_in(folder)
 
 
 def test_a_script_is_listed_started_and_stopped(rig: ManagerRig) -> None:
@@ -73,15 +77,15 @@ def test_a_script_is_listed_started_and_stopped(rig: ManagerRig) -> None:
         {"file": "walk", "label": "walk",
          "configs": [{"key": "speed", "label": "speed", "type": "float", "default": 0.5, "arg": "--speed", "max": 1}]},
     ]  # fmt: skip
-    pid = rig.run("walk", speed="0.25")
+    pid = rig.run_script("walk", speed="0.25")
     assert until(lambda: started(folder))
-    assert started(folder) == [(pid, ["--config", str(rig.folder / "rover.json"), "--speed", "0.25"], None)]
+    assert started(folder) == [(pid, ["--config", str(rig.path), "--speed", "0.25"], None)]
     assert rig.status["config"] == {"speed": 0.25}
     rig.command({"value": {"enabled": False}})
-    assert until(lambda: rig.status["running"] is False)
+    assert rig.becomes(running=False)
     assert gone(pid)
     assert rig.status["error"] is None
-    rig.run("ours")
+    rig.run_script("ours")
     assert until(lambda: started(rig.root / "ours"))
     ((_, arguments, run),) = started(rig.root / "ours")
     assert (arguments[2:], rig.drives[0]["run"] < int(run or 0)) == (["--n", "1"], True)
@@ -104,7 +108,7 @@ def test_many_starts_never_run_two_scripts_at_once_and_the_last_one_runs(rig: Ma
     for number in range(25):
         rig.command({"action": "start", "file": ("a", "needs", "b")[number % 3]})
         time.sleep(0.06)  # 25 of them in about 2 s
-    rig.command({"action": "start", "file": "needs"})
+    rig.launch("needs")
     assert until(lambda: rig.status["file"] == "needs" and len(alive(mains[2])) == 1 and not alive(mains[0]))
     ended.set()
     watcher.join()
@@ -117,10 +121,7 @@ def test_many_starts_never_run_two_scripts_at_once_and_the_last_one_runs(rig: Ma
 
 @pytest.mark.parametrize("text", [PARENT, DEAF + PARENT, OURS + DEAF + PARENT], ids=["foreign", "deaf", "ours"])
 def test_a_killed_manager_leaves_no_script_and_nothing_it_started(mqtt: ManagerRig, text: str) -> None:
-    folder = mqtt.script("family", text)
-    mqtt.start()
-    mqtt.run("family")
-    pids = family(folder)
+    pids = family(mqtt, text)
     mqtt.end(signal.SIGKILL)
     killed = time.monotonic()
     assert until(lambda: all(map(gone, pids)), 5)
@@ -128,23 +129,17 @@ def test_a_killed_manager_leaves_no_script_and_nothing_it_started(mqtt: ManagerR
 
 
 def test_a_stopped_manager_leaves_none_either_and_publishes_so(rig: ManagerRig) -> None:
-    folder = rig.script("family", PARENT)
-    rig.start()
-    rig.run("family")
-    pids = family(folder)
+    pids = family(rig, PARENT)
     rig.end()
-    assert all(map(gone, pids))
+    assert until(lambda: all(map(gone, pids)), 1), "killed when it ended"
     assert until(lambda: (rig.status["running"], rig.status["pid"]) == (False, None))
 
 
 def test_a_script_that_will_not_end_is_killed_with_all_it_started(mqtt: ManagerRig) -> None:
     mqtt.section["stop_timeout_seconds"] = 0.3
-    folder = mqtt.script("family", DEAF + PARENT)
-    mqtt.start()
-    mqtt.run("family")
-    pids = family(folder)
+    pids = family(mqtt, DEAF + PARENT)
     mqtt.command({"action": "stop"})
-    assert until(lambda: mqtt.status["running"] is False)
+    assert mqtt.becomes(running=False)
     assert until(lambda: all(map(gone, pids)))
     assert mqtt.status["error"] is None
 
@@ -152,9 +147,9 @@ def test_a_script_that_will_not_end_is_killed_with_all_it_started(mqtt: ManagerR
 def test_what_a_script_leaves_behind_ends_with_it(mqtt: ManagerRig) -> None:
     folder = mqtt.script("family", PARENT.replace("time.sleep(600)\n", "raise SystemExit(3)\n", 2)[:-1])
     mqtt.start()
-    mqtt.command({"action": "start", "file": "family"})
-    assert until(lambda: mqtt.status.get("error") == "family exited with code 3")
-    assert until(lambda: all(map(gone, family(folder))))
+    mqtt.launch("family")
+    assert mqtt.becomes(error="family exited with code 3")
+    assert until(lambda: all(map(gone, pids_in(folder))))
 
 
 def test_a_shell_script_with_a_manifest_is_a_script(mqtt: ManagerRig) -> None:
@@ -162,11 +157,11 @@ def test_a_shell_script_with_a_manifest_is_a_script(mqtt: ManagerRig) -> None:
     manifest = {"label": "In shell", "command": ["./go.sh"], "configs": [{"key": "n", "type": "int", "arg": "-n"}]}
     (folder / "script.json").write_text(json.dumps(manifest))
     mqtt.start()
-    pid = mqtt.run("shell", n=7)
+    pid = mqtt.run_script("shell", n=7)
     assert until(lambda: f"[shell {pid}] 08:00:00 [ERROR] no camera\n" in mqtt.logged())
-    assert (folder / "arguments").read_text() == f"--config {mqtt.folder / 'rover.json'} -n 7\n"
+    assert (folder / "arguments").read_text() == f"--config {mqtt.path} -n 7\n"
     mqtt.command(False)
-    assert until(lambda: mqtt.status["running"] is False)
+    assert mqtt.becomes(running=False)
     assert (folder / "ended").exists()
     assert until(lambda: f"[shell {pid}] asked to end\n" in mqtt.logged())
     assert until(lambda: len(mqtt.drives) == 5)  # one at the manager's start, four around the script's end
@@ -181,7 +176,7 @@ def test_a_retained_start_runs_nothing_when_the_manager_starts(rig: ManagerRig) 
     rig.command({"action": "start", "file": "walk"}, retain=True)
     for _ in range(2):
         rig.start()
-        rig.run("live")  # after the retained command has been refused
+        rig.run_script("live")  # after the retained command has been refused
         rig.end()
     assert {(status["file"], status["error"]) for status in rig.world.payloads("autonomy-status")} == {
         (None, None),
@@ -192,21 +187,21 @@ def test_a_retained_start_runs_nothing_when_the_manager_starts(rig: ManagerRig) 
 def test_a_new_manager_stops_the_wheels_with_a_run_above_its_predecessors(mqtt: ManagerRig) -> None:
     mqtt.script("ours", OURS + SLEEPER)
     mqtt.start()
-    mqtt.run("ours")
+    mqtt.run_script("ours")
     assert until(lambda: started(mqtt.root / "ours"))
     mqtt.end(signal.SIGKILL)
     before = len(mqtt.drives)
     mqtt.start()
     assert until(lambda: len(mqtt.drives) > before)
     assert mqtt.drives[before]["run"] > int(started(mqtt.root / "ours")[0][2] or 0)
-    assert until(lambda: mqtt.status["running"] is False)
+    assert mqtt.becomes(running=False)
 
 
 def test_a_flood_of_lines_is_bounded(mqtt: ManagerRig) -> None:
     mqtt.script("flood", "import sys\nfor n in range(50_000):\n    print('line', n)\nprint('x' * 100_000)\nsys.exit(1)")
     mqtt.start()
-    mqtt.command({"action": "start", "file": "flood"})
-    assert until(lambda: mqtt.status.get("error") == "flood exited with code 1", 20)
+    mqtt.launch("flood")
+    assert mqtt.becomes(20, error="flood exited with code 1")
     lines = [line for line in mqtt.logged().splitlines() if line.startswith("[flood ")]
     assert 200 <= len(lines) <= 2500
     assert lines[0].endswith("] line 0")
@@ -215,11 +210,8 @@ def test_a_flood_of_lines_is_bounded(mqtt: ManagerRig) -> None:
 
 
 def test_a_launcher_logs_a_scripts_lines_under_its_name_and_when_killed_leaves_no_script(mqtt: ManagerRig) -> None:
-    folder = mqtt.script("family", "print('08:00:00 [ERROR] no camera', flush=True)" + PARENT)
-    mqtt.start("pebble", "up")
-    pid = mqtt.run("family")
-    pids = family(folder)
-    expected = ("autonomy_manager:family", "ERROR", pid, "[autonomy_manager:family] no camera")
+    pids = family(mqtt, "print('08:00:00 [ERROR] no camera', flush=True)" + PARENT, "pebble", "up")
+    expected = ("autonomy_manager:family", "ERROR", pids[0], "[autonomy_manager:family] no camera")
     assert until(lambda: expected in [
         tuple(record[key] for key in ("service", "level", "pid", "message")) for record in mqtt.world.payloads("logs")
     ])  # fmt: skip
@@ -236,15 +228,11 @@ def test_scripts_inherit_nothing_of_the_launchers(mqtt: ManagerRig, monkeypatch:
     folder = mqtt.script("look", text, env={"TEA": "hot"})
     mqtt.section["env"] = {"TEA": "cold", "CUP": "1"}
     mqtt.start()
-    mqtt.command({"action": "start", "file": "look"})
+    mqtt.launch("look")
     assert until(lambda: mqtt.status.get("running") is False and (folder / "env").exists() and not alive(str(folder)))
     variables, leads_group, stdin = json.loads((folder / "env").read_text())
     assert not variables.keys() & {"PEBBLE_WANTED", "PEBBLE_RUN", "PEBBLE_NOTIFY_FD"}
-    assert (variables["TEA"], variables["CUP"], variables["PEBBLE_CONFIG"]) == (
-        "hot",
-        "1",
-        str(mqtt.folder / "rover.json"),
-    )
+    assert (variables["TEA"], variables["CUP"], variables["PEBBLE_CONFIG"]) == ("hot", "1", str(mqtt.path))
     assert (leads_group, stdin) == (True, "")
 
 
@@ -254,9 +242,9 @@ def test_a_start_before_all_scripts_are_listed_is_refused_with_the_reason(mqtt: 
     slow.mkdir()
     (slow / "run.py").write_text("import os, time\nwhile not os.path.exists('go'): time.sleep(0.01)\n" + OURS + SLEEPER)
     mqtt.start()
-    mqtt.command({"action": "start", "file": "slow"})
+    mqtt.launch("slow")
     expected = "Unknown autonomy file: slow: scripts are still being listed, try again"
-    assert until(lambda: mqtt.status.get("error") == expected), mqtt.status
+    assert mqtt.becomes(error=expected), mqtt.status
     (slow / "go").touch()
     assert until(lambda: len(mqtt.newest("autonomy-files")["files"]) == 2)
-    mqtt.run("slow")
+    mqtt.run_script("slow")

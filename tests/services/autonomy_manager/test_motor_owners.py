@@ -27,12 +27,9 @@ def owners() -> MotorOwners:
     return owners
 
 
-def test_a_free_robot_refuses_nothing(owners: MotorOwners) -> None:
+def test_only_a_latched_robot_refuses_and_names_who(owners: MotorOwners) -> None:
     assert (owners.refusal, owners.barred) == ("", 7)
     assert owners.ending(8, owners.baseline()) == ""
-
-
-def test_a_latched_one_refuses_and_names_who(owners: MotorOwners) -> None:
     owners.receive("serial", state(latched=True, by="ann\x07"))
     assert owners.refusal == "emergency stop by ann? of motor owner serial: reset it first"
 

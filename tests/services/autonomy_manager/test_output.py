@@ -19,17 +19,12 @@ def log() -> Log:
     return Log()
 
 
-def test_chunks_become_lines(log: Log) -> None:
-    for chunk in (b"one\r\ntw", b"o\n\n  \nth", b"ree"):
+def test_chunks_become_lines_and_long_ones_are_cut(log: Log) -> None:
+    for chunk in (b"one\r\ntw", b"o\n\n  \nth", b"ree\n", b"x" * 1_000_000 + b"\nnext"):
         log.output.feed(chunk, 0.0)
     log.output.end()
-    assert log.lines == [b"one", b"two", b"three"]
+    assert log.lines == [b"one", b"two", b"three", b"x" * LONGEST_LINE, b"next"]
     assert log.warnings == []
-
-
-def test_a_long_line_is_cut(log: Log) -> None:
-    log.output.feed(b"x" * 1_000_000 + b"\nnext\n", 0.0)
-    assert log.lines == [b"x" * LONGEST_LINE, b"next"]
 
 
 def test_a_flood_is_cut_and_counted_and_ends_with_its_second(log: Log) -> None:

@@ -30,7 +30,7 @@ SCRIPTS = {
     entry.file: entry
     for entry in (
         *(script("walk"), script("sing"), script("eyes"), script("wheel"), script("follow", "eyes", "wheel")),
-        *(script("lost", "nose"), script("old", ours=False, arbitrate=False)),
+        script("old", ours=False, arbitrate=False),
     )
 }
 IDLE = {
@@ -59,16 +59,15 @@ def test_it_begins_idle_and_stops_what_a_predecessor_may_have_left(bench: Bench)
     assert bench.status == IDLE
     (halt,) = bench.drives
     assert (halt["source"], halt["x"], halt["z"]) == ("autonomy", 0, 0)
-    assert run_of(bench.start("walk")) > halt["run"]
-
-
-def test_a_start_has_the_config_the_options_and_a_run(bench: Bench) -> None:
     walk = bench.start("walk", speed="0.25", unknown=[1])
+    assert run_of(walk) > halt["run"]
     assert walk.launch.command[0:2] == ("walk", "--config")
     assert walk.launch.command[3:] == ("--speed", "0.25")
     assert walk.launch.environment["PEBBLE_CONFIG"] == walk.launch.command[2]
     assert walk.launch.tie is TERM
     assert bench.status == {**IDLE, "running": True, "file": "walk", "pid": walk.pid, "config": {"speed": 0.25}}
+    zero = {"x": 0.0, "z": 0.0, "y": 0.0, "source": "autonomy", "run": run_of(walk)}
+    assert until(lambda: bench.drives[-1] == zero), "else a person who stops it before it drives would not end it"
 
 
 def test_a_script_of_others_gets_no_run_and_is_killed_with_the_manager(bench: Bench) -> None:
@@ -101,11 +100,8 @@ def test_a_start_has_many_forms_and_so_has_a_stop(bench: Bench, body: dict[str, 
 @pytest.mark.parametrize(
     ("body", "error"),
     [
-        ({"action": "start"}, "Start command missing file"),
         (True, "Start command missing file"),
-        ({"action": "start", "file": "dance"}, "Unknown autonomy file: dance"),
         ({"action": "start", "file": "sing", "config": {"speed": 2}}, "Invalid config for sing: speed above maximum 1"),
-        ({"action": "start", "file": "lost"}, "Failed to start lost: Dependency script not found: nose"),
     ],
 )
 def test_a_refused_start_leaves_the_running_script_alone(bench: Bench, body: Any, error: str) -> None:
@@ -126,41 +122,25 @@ def test_nonsense_does_nothing(bench: Bench) -> None:
     assert (walk.signals, bench.children.files) == ([], ["walk"])
 
 
-def test_motor_owners_know_a_run_before_it_drives(bench: Bench) -> None:
-    """Else a person who stops a script that has not driven yet would not end it."""
-    walk = bench.start("walk")
-    assert until(lambda: bench.drives[-1] == {"x": 0.0, "z": 0.0, "y": 0.0, "source": "autonomy", "run": run_of(walk)})
-
-
-def test_stop_halts_the_wheels_first_and_again_when_the_process_has_ended(bench: Bench) -> None:
-    walk = bench.start("walk")
-    bench.command({"action": "stop"})
-    assert until(lambda: walk.signals == [TERM])
-    assert bench.zeros(run_of(walk)) == 1
-    assert bench.status["running"] is True  # until it has ended
-    walk.end(0)
-    assert bench.becomes(**IDLE)
-    bench.advance(0.11)
-    bench.advance(0.2)
-    assert bench.zeros(run_of(walk)) == 4
-
-
-def test_a_run_that_has_ended_is_barred(bench: Bench) -> None:
+def test_stop_halts_the_wheels_and_the_run_that_has_ended_is_barred(bench: Bench) -> None:
     """Else a process that left the script's process group could drive on."""
     walk = bench.start("walk")
-    bench.command({"action": "stop"})
-    assert until(lambda: walk.signals == [TERM])
+    bench.stop(walk)
+    assert bench.zeros(run_of(walk)) == 1, "first"
+    assert bench.status["running"] is True  # until it has ended
     walk.end(0)
     assert bench.becomes(**IDLE)
     bench.quiet()
     assert (bench.drives[-1]["run"], bench.drives[-1]["x"], bench.drives[-1]["z"]) == (run_of(walk) + 1, 0, 0)
+    bench.advance(0.11)
+    bench.advance(0.2)
+    assert bench.zeros(run_of(walk)) == 4, "and again when the process has ended"
     assert run_of(bench.start("sing")) > run_of(walk) + 1, "a person may have barred that number meanwhile"
 
 
 def test_what_does_not_end_is_killed(bench: Bench) -> None:
     walk = bench.start("walk")
-    bench.command({"action": "stop"})
-    assert until(lambda: walk.signals == [TERM])
+    bench.stop(walk)
     bench.advance(7.9)
     assert walk.signals == [TERM]
     bench.advance(0.2)
@@ -178,21 +158,16 @@ def test_only_the_newest_request_counts_while_another_script_ends(bench: Bench) 
     walk.end(0)
     assert bench.becomes(running=True, file="eyes")
     assert bench.children.files == ["eyes"]
-
-
-def test_a_stop_forgets_what_was_to_start_next(bench: Bench) -> None:
-    walk = bench.start("walk")
     bench.command({"action": "start", "file": "sing"})
     bench.command({"action": "stop"})
     bench.quiet()
-    walk.end(0)
+    bench.children.all[-1].end(0)
     assert bench.becomes(**IDLE)
-    assert bench.children.files == []
+    assert bench.children.files == [], "a stop forgets what was to start next"
 
 
 @pytest.mark.parametrize(
-    ("code", "error"),
-    [(0, None), (3, "walk exited with code 3"), (-9, "walk was ended by signal 9")],
+    ("code", "error"), [(0, None), (3, "walk exited with code 3"), (-9, "walk was ended by signal 9")]
 )
 def test_an_end_stops_the_wheels_and_nothing_is_started_again(bench: Bench, code: int, error: str | None) -> None:
     walk = bench.start("walk")
@@ -269,7 +244,6 @@ def test_without_a_broker_a_script_that_speaks_mqtt_is_refused(tmp_path: Path) -
 
 def test_a_run_is_above_what_motor_owners_have_barred(bench: Bench) -> None:
     bench.owner(barred=500_000_000)
-    bench.quiet()
     assert run_of(bench.start("walk")) > 500_000_000
 
 
@@ -285,7 +259,6 @@ def test_an_emergency_stop_ends_the_script_and_refuses_others_until_the_reset(be
     bench.command({"action": "start", "file": "sing"})
     assert bench.becomes(error=f"Failed to start sing: {error}")
     bench.owner(count=1, by="ann")
-    bench.quiet()
     bench.start("sing")
 
 
@@ -299,7 +272,6 @@ def test_an_emergency_stop_ends_the_script_and_refuses_others_until_the_reset(be
 )
 def test_what_ended_a_run_at_the_motors_ends_its_script(bench: Bench, fields: dict[str, Any], error: str) -> None:
     bench.owner()
-    bench.quiet()
     walk = bench.start("walk")
     bench.owner(**fields)
     assert bench.becomes(error=error)
@@ -308,15 +280,12 @@ def test_what_ended_a_run_at_the_motors_ends_its_script(bench: Bench, fields: di
 
 def test_a_stop_while_another_script_ends_cancels_the_next_one(bench: Bench) -> None:
     bench.owner()
-    bench.quiet()
     walk = bench.start("walk")
     bench.command({"action": "start", "file": "sing"})
     bench.owner(latched=True, count=1)
-    bench.quiet()
     walk.end(0)
     assert bench.becomes(**{**IDLE, "error": "emergency stop of motor owner serial: reset it first"})
     bench.owner(count=1)
-    bench.quiet()
     assert bench.children.files == []
 
 

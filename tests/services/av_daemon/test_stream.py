@@ -107,20 +107,32 @@ def report(stream: Stream) -> MediaReport:
     return stream.report(time.monotonic())
 
 
+def synthetic() -> Callable[[], Source]:
+    return sources.camera(options(video={**SMALL, "backend": "synthetic"}), time.monotonic())
+
+
+def numbers_of(writer: Remembering) -> list[int | None]:
+    return [read_counter(picture(data, info)) for info, data in writer.frames]
+
+
+def rests(stream: Stream) -> bool:
+    return until(lambda: report(stream).doing == "rests: nobody reads")
+
+
 # -- while somebody reads
 
 
 def test_a_device_is_open_only_while_it_has_readers(streams: Streams) -> None:
     writer, device = Remembering(wanted=False), Device()
     stream = streams(writer, device)
-    assert until(lambda: report(stream).doing == "rests: nobody reads")
+    assert rests(stream)
     assert (device.openings, report(stream).running, report(stream).readers) == (0, False, 0)
     writer.wanted = True
     assert until(lambda: report(stream).running)
     assert report(stream).readers == 1
     writer.wanted = False
     assert until(lambda: device.closings == 1)
-    assert until(lambda: report(stream).doing == "rests: nobody reads")
+    assert rests(stream)
     writer.wanted = True
     assert until(lambda: device.openings == 2)
     assert report(stream).restarts == 0
@@ -140,42 +152,30 @@ def test_who_comes_back_soon_finds_the_device_open(streams: Streams) -> None:
 
 
 @pytest.mark.parametrize("born", [True, False])
-def test_frames_are_born_in_the_segment_where_that_is_possible(streams: Streams, born: bool) -> None:
+def test_frames_are_born_in_the_segment_where_that_is_possible_and_stamped(streams: Streams, born: bool) -> None:
     writer = Remembering(born=born)
-    stream = streams(writer, sources.camera(options(video={**SMALL, "backend": "synthetic"}), time.monotonic()))
+    stream = streams(writer, synthetic())
     assert until(lambda: len(writer.frames) >= 5)
-    numbers = [read_counter(picture(data, info)) for info, data in writer.frames[:5]]
+    numbers = numbers_of(writer)[:5]
     assert None not in numbers
     assert numbers == sorted(set(numbers))
     assert (writer.counters["born"] >= 5) is born
     assert (report(stream).encoding, report(stream).width, report(stream).height) == ("bgr24", 320, 240)
-
-
-def test_frames_are_stamped_when_they_are_complete(streams: Streams) -> None:
-    writer = Remembering()
-    streams(writer, sources.camera(options(video={**SMALL, "backend": "synthetic"}), time.monotonic()))
-    assert until(lambda: len(writer.frames) >= 3)
     behind_s = (time.monotonic_ns() - writer.frames[-1][0].captured_ns) / 1e9
-    assert 0 <= behind_s < 5
+    assert 0 <= behind_s < 5, "stamped when it was complete"
     assert abs(time.time() - behind_s - writer.frames[-1][0].captured_ms / 1e3) < 5
 
 
-def test_the_wall_clock_may_jump(streams: Streams, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_wall_clock_may_jump_and_the_rate_is_reported(streams: Streams, monkeypatch: pytest.MonkeyPatch) -> None:
     true = time.time_ns
     leaps = iter([10**18, -(10**18)] * 1000)
     monkeypatch.setattr(time, "time_ns", lambda: true() + next(leaps))
     writer = Remembering()
-    streams(writer, sources.camera(options(video={**SMALL, "backend": "synthetic"}), time.monotonic()))
+    stream = streams(writer, synthetic())
     assert until(lambda: len(writer.frames) >= 20)
-    stamps = [info.captured_ns for info, _ in writer.frames]
-    numbers = [read_counter(picture(data, info)) for info, data in writer.frames]
+    stamps, numbers = [info.captured_ns for info, _ in writer.frames], numbers_of(writer)
     seconds = (stamps[19] - stamps[0]) / 1e9
     assert seconds == pytest.approx((numbers[19] - numbers[0]) / 30, abs=5)  # a leap is of 30 years
-
-
-def test_the_rate_is_reported(streams: Streams) -> None:
-    writer = Remembering()
-    stream = streams(writer, sources.camera(options(video={**SMALL, "backend": "synthetic"}), time.monotonic()))
     assert until(lambda: 28 <= (report(stream).rate or 0) <= 32, 30)
 
 
@@ -189,6 +189,11 @@ def test_a_device_that_is_not_there_is_tried_again_ever_more_slowly(streams: Str
     assert until(lambda: report(stream).running)
     assert device.openings == 4
     assert report(stream).restarts == 3
+    absent = Device(refuses=1000)
+    stream = streams(writer, absent)
+    assert until(lambda: absent.openings >= 2)
+    writer.wanted = False
+    assert rests(stream), "it delays nothing"
 
 
 @pytest.mark.parametrize("error", [DeviceError("unplugged"), ValueError("of a library")])
@@ -201,15 +206,7 @@ def test_a_device_that_fails_is_opened_again(streams: Streams, error: Exception)
     assert len(writer.frames) >= 6
 
 
-def test_a_failed_device_without_readers_delays_nothing(streams: Streams) -> None:
-    writer, device = Remembering(), Device(refuses=1000)
-    stream = streams(writer, device)
-    assert until(lambda: device.openings >= 2)
-    writer.wanted = False
-    assert until(lambda: report(stream).doing == "rests: nobody reads")
-
-
-def test_a_killed_capture_program_is_started_again(streams: Streams, rpicam: Installed) -> None:
+def test_a_killed_program_is_started_again_and_ends_without_readers(streams: Streams, rpicam: Installed) -> None:
     writer = Remembering()
     stream = streams(writer, sources.camera(options(video={**SMALL, "backend": "libcamera"}), 0.0))
     assert until(lambda: len(writer.frames) >= 3)
@@ -220,14 +217,8 @@ def test_a_killed_capture_program_is_started_again(streams: Streams, rpicam: Ins
     assert rpicam.gone(rpicam.pids[0])
     assert report(stream).restarts == 1
     assert "signal 9" in (report(stream).last_error or "")
-
-
-def test_its_program_ends_without_readers(streams: Streams, rpicam: Installed) -> None:
-    writer = Remembering()
-    streams(writer, sources.camera(options(video={**SMALL, "backend": "libcamera"}), 0.0))
-    assert until(lambda: writer.frames)
     writer.wanted = False
-    assert rpicam.gone(rpicam.pids[0])
+    assert rpicam.gone(rpicam.pids[1]), "it ends without readers"
 
 
 # -- when it hangs
@@ -253,22 +244,10 @@ def test_a_hung_device_is_replaced_and_does_no_harm_when_it_wakes(
     assert len(writer.threads) == 1
 
 
-def test_a_device_that_hangs_while_it_opens_is_given_up_too(streams: Streams, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(health, "_OPENING_S", 0.2)
-    release, healthy = threading.Event(), Device()
-
-    def hang() -> Source:
-        release.wait()
-        raise DeviceError("at last")
-
-    ways = iter([hang, healthy])
-    stream = streams(Remembering(), lambda: next(ways)())
-    assert until(lambda: report(stream).running)
-    release.set()
-    assert report(stream).last_error == "the device does not answer"
-
-
-def test_threads_that_hang_do_not_become_more_and_more(streams: Streams, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_device_that_hangs_while_it_opens_is_given_up_but_only_four_times(
+    streams: Streams, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Threads that hang do not become more and more."""
     monkeypatch.setattr(health, "_OPENING_S", 0.05)
     release, tries = threading.Event(), []
 
@@ -277,8 +256,9 @@ def test_threads_that_hang_do_not_become_more_and_more(streams: Streams, monkeyp
         release.wait()
         raise DeviceError("at last")
 
-    streams(Remembering(), hang, delay=0.01)
+    stream = streams(Remembering(), hang, delay=0.01)
     assert until(lambda: len(tries) == 4)
+    assert report(stream).last_error == "the device does not answer"
     time.sleep(0.5)  # ten times as long as a try may take
     assert len(tries) == 4
     release.set()
@@ -311,9 +291,7 @@ class TestHealth:
         device.opening(200.0)
         device.frame(FrameInfo(format="mjpeg"), 211.0)
         assert device.failed("no") == 2
-
-    def test_the_configured_wait_may_be_none_or_long(self) -> None:
-        assert [Health(0.0).failed("no"), Health(60.0).failed("no")] == [0, 60]
+        assert [Health(0.0).failed("no"), Health(60.0).failed("no")] == [0, 60], "none, or long, as configured"
 
     def test_silence_counts_only_while_a_sign_of_life_is_due(self) -> None:
         device = Health(2.0)

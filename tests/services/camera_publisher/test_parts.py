@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from fractions import Fraction
+from itertools import product
 from pathlib import Path
+from queue import Empty, Queue
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
-from pebble.config import Config, parse
+from pebble.config import parse
 from pebble.errors import PayloadError, PebbleError
 from pebble.media.decode import VideoDecoder
 from pebble.media.video import make_encoder
@@ -25,10 +27,8 @@ from pebble.transports.base import Outgoing
 from pebble.transports.counters import Counters
 from pebble.transports.frames import Frame, FrameInfo
 from pebble.transports.memory import MemoryHub, MemoryTransport
-from tests.services.mqtt_bridge.bridge_rig import Running
+from tests.kit.robot import BASE, ROBOT, Listener, Running
 from tests.support import until
-
-BASE = "pebble/robots/rover"
 
 
 class TestKeyframes:
@@ -58,16 +58,9 @@ def frame(width: int = 64, height: int = 48, form: str = "bgr24") -> Frame:
     """Red in its upper left quarter, black elsewhere."""
     picture = np.zeros((height, width, 3), np.uint8)
     picture[: height // 2, : width // 2] = (0, 0, 255)
-    packed = {"bgr24": _bgr24, "mjpeg": _mjpeg, "nv12": _nv12}[form](picture)
-    return Frame(FrameInfo(captured_ns=1, captured_ms=1, format=form, width=width, height=height), packed, shared=False)
-
-
-def _bgr24(picture: Any) -> Any:
-    return picture.reshape(-1)
-
-
-def _mjpeg(picture: Any) -> Any:
-    return cv2.imencode(".jpg", picture)[1].reshape(-1)
+    packed = {"bgr24": np.ravel, "mjpeg": lambda made: cv2.imencode(".jpg", made)[1].reshape(-1), "nv12": _nv12}
+    info = FrameInfo(captured_ns=1, captured_ms=1, format=form, width=width, height=height)
+    return Frame(info, packed[form](picture), shared=False)
 
 
 def _nv12(picture: Any) -> Any:
@@ -118,11 +111,13 @@ def test_what_is_sent_has_the_wanted_size(
     assert (picture.shape[1], picture.shape[0]) == size
 
 
-@pytest.mark.parametrize("form", ["bgr24", "mjpeg", "nv12", "yuyv", "s16le", "", "hdr"])
-@pytest.mark.parametrize(("width", "height"), [(64, 48), (0, 0), (-4, 8), (1 << 40, 2)])
-def test_what_is_no_picture_is_refused(form: str, width: int, height: int) -> None:
-    info = FrameInfo(format=form, width=width, height=height)
-    for size in (0, 1, 1000):
+FORMS = ("bgr24", "mjpeg", "nv12", "yuyv", "s16le", "", "hdr")
+SIZES = ((64, 48), (0, 0), (-4, 8), (1 << 40, 2))
+
+
+def test_what_is_no_picture_is_refused() -> None:
+    for form, (width, height), size in product(FORMS, SIZES, (0, 1, 1000)):
+        info = FrameInfo(format=form, width=width, height=height)
         with pytest.raises(PayloadError):
             Shape(None, None, 0).picture(Frame(info, np.zeros(size, np.uint8), shared=False))
 
@@ -134,59 +129,63 @@ class Doubtful(Frame):
         return False
 
 
-class Bench:
-    """The service in this process; frames are put into its feed, as its reader would."""
+class Feed(Queue[Frame]):
+    """Stands in for the reader of the camera's frames: it has those that a test puts into it."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
-        self.local, self.remote = MemoryHub(), MemoryHub()
-
-        def remote_transport(_config: Config, name: str) -> MemoryTransport:
-            return MemoryTransport(name, self.remote)
-
-        monkeypatch.setattr(module, "remote_transport", remote_transport)
-        monkeypatch.setattr(CameraPublisher, "_make_reader", lambda _service: Silent())
-        config = parse({"robot": {"id": "rover"}}, folder=folder, env={})
-        self.operator = MemoryTransport("operator", self.remote).open()
-        self.received: list[Message] = []
-        self.operator.subscribe(f"{BASE}/outgoing/#", self.received.append)
-        self.service = CameraPublisher(config, MemoryTransport("robot", self.local))
-        self._running = Running(self.service)
-        assert until(lambda: self.service._reader.enabled)
-        self._captured = 0
-
-    def show(self, kind: type[Frame] = Frame, form: str = "bgr24", data: Any = None) -> None:
-        """A frame, long after the one before it; returns once it has been dealt with."""
-        self._captured += 1
-        original = frame()
-        info = FrameInfo(
-            captured_ns=self._captured * 1_000_000_000,
-            captured_ms=self._captured,
-            format=form,
-            width=64,
-            height=48,
-        )
-        before = sum(self.service.counters[what] for what in ("sent", "overwritten", "failed", "refused"))
-        self.service._reader._put(kind(info, original.data if data is None else data, shared=False))
-        self.service._reader._on_frame()
-        assert until(
-            lambda: sum(self.service.counters[what] for what in ("sent", "overwritten", "failed", "refused")) > before
-        )
-
-    def close(self) -> None:
-        self._running.stop()
-        self.operator.close()
-
-
-class Silent:
-    """A reader without a writer."""
-
-    def __enter__(self) -> Silent:
+    def __enter__(self) -> Feed:
         return self
 
     def __exit__(self, *_: object) -> None: ...
 
-    def read(self, timeout: float) -> None:
-        until(lambda: False, timeout, step=0.05)
+    def read(self, timeout: float) -> Frame | None:
+        try:
+            return self.get(timeout=timeout)
+        except Empty:
+            return None
+
+
+ENDS = ("sent", "overwritten", "failed", "refused")
+
+
+class Bench:
+    """The service in this process, between two networks in memory."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
+        self.local, self.remote, self.feed = MemoryHub(), MemoryHub(), Feed()
+        monkeypatch.setattr(module, "remote_transport", lambda _config, name: MemoryTransport(name, self.remote))
+        monkeypatch.setattr(module, "FrameReader", lambda *_, **__: self.feed)
+        config = parse({"robot": {"id": ROBOT}}, folder=folder, env={})
+        self.operator = Listener(MemoryTransport("operator", self.remote))
+        self.robot = Listener(MemoryTransport("client", self.local))
+        self.service = CameraPublisher(config, MemoryTransport("robot", self.local))
+        self._running = Running(self.service)
+        self._captured = 0
+
+    @property
+    def pictures(self) -> list[bytes]:
+        return [message.payload for message in self.operator.on("front-camera")]
+
+    def show(self, kind: type[Frame] = Frame, form: str = "bgr24", data: Any = None) -> None:
+        """A frame, long after the one before it; returns once it has been dealt with."""
+        self._captured += 1
+        times = {"captured_ns": self._captured * 1_000_000_000, "captured_ms": self._captured}
+        before = self._dealt_with()
+        self.feed.put(
+            kind(
+                FrameInfo(format=form, width=64, height=48, **times),
+                frame().data if data is None else data,
+                shared=False,
+            )
+        )
+        assert until(lambda: self._dealt_with() > before)
+
+    def _dealt_with(self) -> int:
+        return sum(self.service.counters[what] for what in ENDS)
+
+    def close(self) -> None:
+        self._running.stop()
+        self.operator.transport.close()
+        self.robot.transport.close()
 
 
 @pytest.fixture
@@ -196,26 +195,22 @@ def bench(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Bench]:
     bench.close()
 
 
-def spoil_view(bench: Bench) -> None:
-    bench.show(Doubtful)
-    assert bench.service.counters["overwritten"] == 1
-
-
-def spoil_frame(bench: Bench) -> None:
-    bench.show(form="mjpeg", data=np.zeros(100, np.uint8))
-    assert bench.service.counters["failed"] == 1
-
-
-@pytest.mark.parametrize("spoil", [spoil_view, spoil_frame])
-def test_after_a_bad_frame_comes_a_full_picture(bench: Bench, spoil: Callable[[Bench], None]) -> None:
+@pytest.mark.parametrize(
+    ("kind", "form", "data", "counter"),
+    [(Doubtful, "bgr24", None, "overwritten"), (Frame, "mjpeg", np.zeros(100, np.uint8), "failed")],
+)
+def test_after_a_bad_frame_comes_a_full_picture(
+    bench: Bench, kind: type[Frame], form: str, data: Any, counter: str
+) -> None:
     decoder = VideoDecoder()
     for _ in range(2):
         bench.show()
-    spoil(bench)
+    bench.show(kind, form, data)
+    assert bench.service.counters[counter] == 1
     for _ in range(2):
         bench.show()
-    assert until(lambda: len(bench.received) == 4)
-    pictures = [decoder.feed(message.payload) for message in bench.received]
+    assert until(lambda: len(bench.pictures) == 4)
+    pictures = [decoder.feed(payload) for payload in bench.pictures]
     assert [picture is not None and picture.captured_ms for picture in pictures] == [1, 2, 4, 5]
     assert [picture is not None and picture.keyframe for picture in pictures][2]
 
@@ -227,13 +222,12 @@ def test_without_h264_there_is_a_problem_and_json_is_sent(bench: Bench, monkeypa
         return make_encoder(name, **options)
 
     monkeypatch.setattr(module, "make_encoder", without_av)
-    operator = MemoryTransport("somebody", bench.local).open()
-    operator.publish(f"{BASE}/incoming/front-camera", b'{"enabled": true, "encoding": "h264"}')
-    assert until(lambda: bench.service._problem == "h264 needs PyAV")
+    bench.show()  # it runs
+    bench.robot.command("front-camera", {"enabled": True, "encoding": "h264"})
+    assert bench.robot.became("media-report/camera_publisher", last_error="h264 needs PyAV", encoding="json")
     bench.show()
-    assert until(lambda: bench.received)
-    assert bench.received[-1].payload.startswith(b"{")
-    operator.close()
+    assert until(lambda: len(bench.pictures) == 2)
+    assert bench.pictures[-1].startswith(b"{")
 
 
 class Far(MemoryTransport):

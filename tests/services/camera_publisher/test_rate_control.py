@@ -13,6 +13,7 @@ from pebble.services.camera_publisher.rate_control import STEPS, LevelControl, R
 from pebble.services.camera_publisher.send_window import Acknowledged, SendWindow
 from pebble.transports.base import Outgoing
 from pebble.transports.counters import Counters
+from tests.support import cases, some
 
 KILOBIT = 125.0  # bytes
 
@@ -77,7 +78,7 @@ class Run:
 
 
 @pytest.mark.parametrize("delay_s", [0.001, 0.05, 0.2])
-@pytest.mark.parametrize("kbits", [64, 128, 256, 512, 1000, 2000])
+@pytest.mark.parametrize("kbits", some([64, 128, 256, 512, 1000, 2000], 2))
 def test_pictures_stay_young_on_any_link(kbits: int, delay_s: float) -> None:
     run = Run(lambda _now: kbits, delay_s=delay_s).run(60)
     assert run.worst_age(0) < 3.5  # the very first, at full size
@@ -92,19 +93,14 @@ def test_the_rate_is_the_last_to_go(kbits: int) -> None:
     assert 0 < run.level_at(30) < 7
 
 
-def test_a_good_link_gets_everything() -> None:
-    run = Run(lambda _now: 2000).run(60)
+@pytest.mark.parametrize(("kbits", "delay_s"), [(2000, 0.01), (20_000, 0.4)])
+def test_a_good_link_gets_everything_and_a_long_way_is_not_a_slow_link(kbits: int, delay_s: float) -> None:
+    run = Run(lambda _now: kbits, delay_s=delay_s).run(60)
     assert not run.levels
     assert run.rate(2, 60) == pytest.approx(10, rel=0.02)
 
 
-def test_a_long_way_is_not_a_slow_link() -> None:
-    run = Run(lambda _now: 20_000, delay_s=0.4).run(60)
-    assert not run.levels
-    assert run.rate(2, 60) == pytest.approx(10, rel=0.02)
-
-
-@pytest.mark.parametrize("beacon_s", [0.05, 0.0666, 0.09, 0.1024])
+@pytest.mark.parametrize("beacon_s", some([0.0666, 0.05, 0.1024, 0.09], 2))
 @pytest.mark.parametrize("fps", [10.0, 15.0, 30.0])
 def test_confirmations_that_are_held_back_are_not_a_slow_link(fps: float, beacon_s: float) -> None:
     run = Run(lambda _: 20_000, full=4_000, fps=fps, delay_s=0.002, beacon_s=beacon_s).run(30)
@@ -133,8 +129,8 @@ def test_a_link_that_breaks_down_is_answered_at_once() -> None:
 
 
 def test_a_steady_link_is_not_probed_all_the_time() -> None:
-    run = Run(lambda _now: 300).run(300)
-    assert len([at for at, _ in run.levels if at > 60]) <= 16
+    run = Run(lambda _now: 300).run(cases(160, 300))
+    assert len([at for at, _ in run.levels if at > 60]) <= cases(7, 16)
 
 
 def test_what_is_reduced_has_words() -> None:
@@ -164,6 +160,11 @@ class TestSendWindow:
         assert [frame.took_s for frame in queue.poll(0, 0.1, 4.1)] == [pytest.approx(1.1)]
         assert queue.age_s(0.0, 9.0) == 0.0
         assert len(queue) == 0
+        queue.sent(1000, 1.0)
+        assert queue.poll(2, 0.0, 1.01), "a ping is no frame"
+        queue.sent(1000, 1.0)
+        queue.clear()
+        assert queue.age_s(0.0, 100.0) == 0.0, "a lost connection takes everything along"
 
     @pytest.mark.parametrize(
         ("real_s", "counted_s"), [(0.0, 0.0), (0.05, 0.0), (0.075, 0.0375), (0.1, 0.1), (3.0, 3.0)]
@@ -179,14 +180,3 @@ class TestSendWindow:
             queue.sent(10_000, number)
             assert len(queue.poll(0, 0.0, number)) == 1
         assert queue.age_s(0.0, 1e6) == 0.0
-
-    def test_a_ping_is_no_frame(self) -> None:
-        queue = SendWindow()
-        queue.sent(1000, 1.0)
-        assert queue.poll(2, 0.0, 1.01)
-
-    def test_a_lost_connection_takes_everything_along(self) -> None:
-        queue = SendWindow()
-        queue.sent(1000, 1.0)
-        queue.clear()
-        assert queue.age_s(0.0, 100.0) == 0.0

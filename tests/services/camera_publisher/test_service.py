@@ -23,7 +23,7 @@ from tests.tcp_proxy import SlowTcpProxy
 def viewer(remote: Broker) -> Iterator[Viewer]:
     viewer = Viewer(remote.port)
     yield viewer
-    viewer.transport.close()
+    viewer.close()
 
 
 def rate_of(pictures: list[Seen]) -> float:
@@ -42,7 +42,9 @@ def test_every_form_in_turn_at_the_wanted_rate(local: Broker, remote: Broker, vi
         first = viewer.wait(1)[0]
         assert (first.encoding, first.keyframe, first.shape) == ("json", True, (240, 320, 3))
         viewer.wait(61)  # and more of them while the machine has too much to do to keep a camera's beat
-        assert until(lambda: rate_of(viewer.seen[-61:]) == pytest.approx(10, rel=0.02), 60), rate_of(viewer.seen[-61:])
+        assert until(lambda: rate_of(viewer.received[-61:]) == pytest.approx(10, rel=0.02), 60), rate_of(
+            viewer.received[-61:]
+        )
         for encoding in ("pbvd", "pbvz", "h264"):
             robot.ask(encoding=encoding)
             viewer.wait_for(encoding)
@@ -51,7 +53,7 @@ def test_every_form_in_turn_at_the_wanted_rate(local: Broker, remote: Broker, vi
         robot.ask(encoding="smoke signals")
         viewer.wait_for("json")
         assert until(lambda: robot.reports[-1].rate == pytest.approx(10, abs=0.7), 60)
-        assert are_what_was_captured(viewer.seen, camera)
+        assert are_what_was_captured(viewer.received, camera)
         assert viewer.decoder.counters.refused == 0
 
 
@@ -71,7 +73,7 @@ def test_keyframes_on_request_once_a_second(local: Broker, remote: Broker, viewe
         viewer.wait(5)
 
         def keyframes() -> list[int]:
-            return [picture.captured_ms for picture in viewer.seen if picture.keyframe]
+            return [picture.captured_ms for picture in viewer.received if picture.keyframe]
 
         while len(keyframes()) < 4:  # many operators, all of them impatient
             robot.ask(encoding="h264", keyframe=True)
@@ -88,10 +90,10 @@ def test_nothing_is_encoded_while_the_remote_side_is_away(local: Broker, remote:
         assert robot.reported(running=False, doing="rests: the remote side is away")
         assert until(lambda: robot.reports[-1].last_error)
         assert until(lambda: not camera.writer.wanted)
-        before = len(viewer.seen)
+        before = len(viewer.received)
         remote.start()
-        assert until(lambda: len(viewer.seen) > before + 5, 20)
-        assert viewer.seen[before].keyframe
+        assert until(lambda: len(viewer.received) > before + 5, 20)
+        assert viewer.received[before].keyframe
         assert robot.reported(running=True, last_error=None)
 
 
@@ -123,9 +125,9 @@ def test_a_slow_connection_gets_recent_pictures_and_delays_nothing_else(
         camera = ends.enter_context(Camera(robot.run_dir, 15, (640, 480)))
         assert until(lambda: robot.reports and robot.reports[-1].reduced is not None, 15)
         pictures = viewer.wait(80)
-        assert worst_age_ms(viewer.seen) < 1500
+        assert worst_age_ms(viewer.received) < 1500
         assert worst_age_ms(pictures[-60:]) < 800
-        assert until(lambda: rate_of(viewer.seen[-60:]) > 8, 60)
+        assert until(lambda: rate_of(viewer.received[-60:]) > 8, 60)
         assert delays.worst_s() < 0.5
         assert link.passed * 8 / 256_000 > 2  # it was in use
         link.kbits = 20_000

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,47 +9,47 @@ from pathlib import Path
 from typing import Any
 
 from pebble.config import parse
-from pebble.errors import TransportError
 from pebble.services.serial_mcu_bridge.text.motor_bridge import MotorBridge
 from pebble.simulation.pty import PtyMcu
-from pebble.transports import Message, MqttSettings, QoS, create
+from pebble.transports import MqttSettings, create
 from pebble.transports.memory import MemoryHub
+from tests.kit.robot import BASE as BASE
+from tests.kit.robot import ROBOT, Listener, Running
 from tests.support import Broker, until
 
-BASE = "pebble/robots/rover"
 STOP = {"stop": "c9a9f10cc9a9f10c", "by": "eve", "why": "a test"}
+STOPPED = "M 0.000 0.000"
 
 
 class Bench:
     """The service in a thread of its own, an MCU, and an operator on the same network: in memory, or at a broker."""
+
+    service: MotorBridge
+    running: Running
 
     def __init__(self, folder: Path, kind: str, *, broker: Broker | None = None, **section: Any) -> None:
         self.mcu = PtyMcu(kind, folder / "tty")
         self.mcu.__enter__()
         serial = {"enabled": True, "serial": {"port": str(folder / "tty")}, **section}
         transport = {"kind": "mqtt", "state_dir": str(folder / "state"), "run_dir": str(folder / "run")}
-        raw = {"robot": {"id": "rover"}, "transport": transport, "services": {"serial_mcu_bridge": serial}}
+        raw = {"robot": {"id": ROBOT}, "transport": transport, "services": {"serial_mcu_bridge": serial}}
         config = parse(raw, folder=folder, env={})
         settings = MemoryHub() if broker is None else MqttSettings(host="127.0.0.1", port=broker.port)
         network = "memory" if broker is None else "mqtt"
-        self.operator = create(network, "operator", settings).open()
-        self.received: list[Message] = []
-        self.operator.subscribe(f"{BASE}/outgoing/#", self.received.append)
-        self.failure: TransportError | None = None  # what ended the service
+        self.world = Listener(create(network, "operator", settings))
+        self.operator = self.world.transport
         self._new_service = lambda: MotorBridge(config, create(network, "robot", settings))
         self.start()
 
     def start(self) -> None:
         self.service = self._new_service()
-        self._thread = threading.Thread(target=self._run)
-        self._thread.start()
-        assert until(lambda: len(self.mcu.trace.lines()) >= 2, 5)  # the stop after opening and after booting
+        self.running = Running(self.service)
+        assert until(lambda: len(self.lines) >= 2, 5)  # the stop after opening and after booting
 
-    def _run(self) -> None:
-        try:
-            self.service.run()
-        except TransportError as error:
-            self.failure = error
+    @property
+    def lines(self) -> list[str]:
+        """What the MCU has received."""
+        return self.mcu.trace.lines()
 
     @contextmanager
     def occupied(self) -> Iterator[None]:
@@ -68,39 +67,55 @@ class Bench:
         finally:
             ends.set()
 
-    def send(self, suffix: str, body: Any) -> None:
-        self.operator.publish(f"{BASE}/{suffix}", json.dumps(body).encode(), qos=QoS.DELIVERED)
+    def send(self, metric: str, body: Any) -> None:
+        self.world.command(metric, body)
+
+    def drive(self, z: float = 0.0, **more: Any) -> None:
+        self.send("drive-values", {"z": z, **more})
+
+    def moves(self, z: float, **more: Any) -> bool:
+        """Drive straight, and wait until the MCU is told so."""
+        self.drive(z, **more)
+        return self.line(f"M {z:.3f} {z:.3f}")
+
+    def shines(self, **colours: float) -> bool:
+        """Switch the lights on, and wait until the MCU is told so: what was sent before has been handled."""
+        self.send("lights-solid", colours)
+        return self.line("L " + " ".join(f"{colours.get(one, 0):.3f}" for one in "bgr"))
 
     def payloads(self, metric: str) -> list[Any]:
-        topic = f"{BASE}/outgoing/{metric}"
-        return [json.loads(message.payload) for message in self.received if message.topic == topic and message.payload]
+        return self.world.payloads(metric)
 
     def line(self, text: str) -> bool:
-        return until(lambda: text in self.mcu.trace.lines(), 5)
+        return until(lambda: text in self.lines, 5)
+
+    @property
+    def state(self) -> dict[str, Any]:
+        """The newest state of the emergency stop."""
+        state: dict[str, Any] = self.world.newest("estop/serial")
+        return state
+
+    def stopped(self) -> bool:
+        return until(lambda: self.state.get("latched") and self.state["persisted"], 5)
+
+    def send_reset(self) -> None:
+        self.send("estop-reset", {"boot": self.state["boot"], "count": self.state["count"], "by": "eve"})
+
+    def reset(self) -> bool:
+        self.send_reset()
+        return until(lambda: not self.state["latched"], 5)
 
     def stop(self) -> None:
-        self.service.quit()
-        self._thread.join(5)
+        self.running.stop()
+
+    def restart(self) -> None:
+        """Stop it, and start it again; returns once that one has published its state."""
+        boot = self.state.get("boot")
+        self.stop()
+        self.start()
+        assert until(lambda: self.state.get("boot") not in (boot, None), 5)
 
     def close(self) -> None:
         self.stop()
         self.operator.close()
         self.mcu.__exit__(None, None, None)
-
-
-def state(bench: Bench) -> dict[str, Any]:
-    states = bench.payloads("estop/serial")
-    return states[-1] if states else {}
-
-
-def stopped(bench: Bench) -> bool:
-    return until(lambda: state(bench).get("latched") and state(bench)["persisted"], 5)
-
-
-def send_reset(bench: Bench) -> None:
-    bench.send("incoming/estop-reset", {"boot": state(bench)["boot"], "count": state(bench)["count"], "by": "eve"})
-
-
-def reset(bench: Bench) -> bool:
-    send_reset(bench)
-    return until(lambda: not state(bench)["latched"], 5)

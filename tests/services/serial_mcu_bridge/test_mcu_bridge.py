@@ -7,7 +7,6 @@ import os
 import random
 import time
 from contextlib import suppress
-from typing import Any
 
 import pytest
 
@@ -16,8 +15,8 @@ from pebble.services.serial_mcu_bridge.devices import peers
 from pebble.services.serial_mcu_bridge.pebble_serial_v1 import host
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.host import SILENCE_S
 from pebble.transports import QoS
+from tests.kit.board import Rig, motion, summary
 from tests.services.serial_mcu_bridge import mcu_wire as wire
-from tests.services.serial_mcu_bridge.mcu_rig import Rig, motion, summary, wait_for_payload
 from tests.services.serial_mcu_bridge.mcu_wire import IMU, LAMP, STATION, F, I, M
 from tests.services.serial_mcu_bridge.test_pebble_serial_hostile import ATTACKS
 from tests.support import cases, until
@@ -57,8 +56,8 @@ def test_it_is_found_within_two_seconds_and_publishes_its_manifest(rig: Rig) -> 
     time.sleep(0.5)  # the port is absent at first
     mcu.stream(100, motion())
     mcu.plug()
-    assert wait_for_payload(rig.world, "mcu/goob-imu-nano/describe")
-    assert wait_for_payload(rig.world, "sensors/imu-fast")
+    rig.described("goob-imu-nano")
+    assert rig.got("sensors/imu-fast")
     assert rig.world.first("mcu/goob-imu-nano/describe") - mcu.plugged_at < 2
     assert rig.world.first("mcu/goob-imu-nano/imu_fast") - mcu.plugged_at < 2
     assert rig.world.first("sensors/imu-fast") - mcu.plugged_at < 2
@@ -72,10 +71,7 @@ def test_it_is_found_within_two_seconds_and_publishes_its_manifest(rig: Rig) -> 
 
 @pytest.mark.alone
 def test_a_hundred_samples_a_second_without_loss(rig: Rig) -> None:
-    mcu = rig.mcu(IMU)
-    rig.bridge()
-    assert wait_for_payload(rig.world, "mcu/goob-imu-nano/describe")
-    assert rig.claimed()
+    mcu, _ = rig.up(IMU)
     mcu.stream(100, motion())
     seconds = cases(2, 5)
     time.sleep(seconds)
@@ -87,14 +83,11 @@ def test_a_hundred_samples_a_second_without_loss(rig: Rig) -> None:
 
 
 def test_the_bodies_of_an_inertial_sensor(memory: Rig) -> None:
-    mcu = memory.mcu(IMU)
-    memory.bridge()
-    assert wait_for_payload(memory.world, "mcu/goob-imu-nano/describe")
-    assert memory.claimed()
+    mcu, _ = memory.up(IMU)
     began = time.time_ns() // 1_000_000
     mcu.send(wire.frame(wire.STATE, summary(), 2, 7, 700))  # a summary before the first motion is not published
     mcu.send(wire.frame(wire.SAMPLE, motion(), 1, 8, 800), wire.frame(wire.STATE, summary(), 2, 9, 900))
-    assert wait_for_payload(memory.world, "sensors/imu")
+    assert memory.got("sensors/imu")
     (fast,), (slow,) = memory.world.payloads("sensors/imu-fast"), memory.world.payloads("sensors/imu")
     assert list(fast) == ["t", "seq", "mcu_ms", "value"]
     assert (fast["seq"], fast["mcu_ms"]) == (8, 800)
@@ -135,13 +128,10 @@ def test_the_bodies_of_an_inertial_sensor(memory: Rig) -> None:
 
 
 def test_qos_and_retain_follow_the_interface(rig: Rig) -> None:
-    mcu = rig.mcu(LAMP)
-    rig.bridge()
-    assert wait_for_payload(rig.world, "mcu/lamp-1/describe")
-    assert rig.claimed()
+    mcu, _ = rig.up(LAMP)
     mcu.send(wire.frame(wire.STATE, b"\x0b", 2), wire.frame(wire.STATE, b"\1", 3), wire.frame(wire.SAMPLE, bytes(4), 4))
-    assert wait_for_payload(rig.world, "mcu/lamp-1/glow")
-    assert [body["value"] for body in rig.world.payloads("lights/lamp")] == [{"level": 5.5}]
+    assert rig.got("mcu/lamp-1/glow")
+    assert rig.values("lights/lamp") == [{"level": 5.5}]
     late = rig.listener("late")
     assert until(lambda: len(late.received) >= 3)
     time.sleep(0.2)
@@ -158,42 +148,33 @@ def test_a_state_that_is_sent_only_once_is_not_lost(rig: Rig) -> None:
     mcu.after_describing = wire.frame(wire.STATE, b"\x0a", 2) + wire.frame(wire.STATE, b"\x0b", 2)
     rig.bridge()
     mcu.plug()
-    assert wait_for_payload(rig.world, "lights/lamp")
+    assert rig.got("lights/lamp")
     for metric in ("mcu/lamp-1/lamp", "lights/lamp"):
-        assert [body["value"] for body in rig.world.payloads(metric)] == [{"level": 5.5}]
+        assert rig.values(metric) == [{"level": 5.5}]
 
 
 # -- commands
 
 
-@pytest.mark.parametrize(
-    ("topic", "wrap"), [("mcu/lamp-1/lamp", lambda body: body), ("lights/lamp", lambda body: {"value": body})]
-)
-def test_a_command_reaches_the_mcu(rig: Rig, topic: str, wrap: Any) -> None:
-    mcu = rig.mcu(LAMP)
-    rig.bridge()
-    assert wait_for_payload(rig.world, "mcu/lamp-1/describe")
-    assert rig.claimed()
-    rig.world.command(topic, wrap({"level": 40, "on": True}))
-    assert until(mcu.commands)
-    (command,) = mcu.commands()
-    assert (command.interface, command.payload) == (1, b"\x50\x01")
-    assert command.ms == pytest.approx(time.time() * 1000 % 2**32, abs=5000)
+def test_a_command_reaches_the_mcu(rig: Rig) -> None:
+    mcu, _ = rig.up(LAMP)
+    rig.world.command("mcu/lamp-1/lamp", {"level": 40, "on": True})
+    rig.world.command("lights/lamp", {"value": {"level": 40, "on": True}})
+    assert until(lambda: len(mcu.commands()) == 2)
+    for command in mcu.commands():
+        assert (command.interface, command.payload) == (1, b"\x50\x01")
+        assert command.ms == pytest.approx(time.time() * 1000 % 2**32, abs=5000)
 
 
 def test_what_does_not_fit_never_reaches_the_mcu(memory: Rig, caplog: pytest.LogCaptureFixture) -> None:
-    mcu = memory.mcu(LAMP)
-    running = memory.bridge()
-    assert wait_for_payload(memory.world, "mcu/lamp-1/describe")
-    assert memory.claimed()
+    mcu, running = memory.up(LAMP)
     caplog.set_level(logging.WARNING)
     bad = [{"level": 10}, {"level": 200, "on": True}, {"level": 1, "on": "false"}, {"level": 1, "on": 1},
            {"level": "5", "on": True}, [], 5, None, True, b"\xff", b"{", b"[" * 40_000]  # fmt: skip
     for body in bad:
         memory.world.command("mcu/lamp-1/lamp", body)
     memory.world.command("mcu/lamp-1/lamp", {"level": 0, "on": False})
-    assert until(mcu.commands)
-    assert [command.payload for command in mcu.commands()] == [b"\0\0"]
+    assert mcu.obeyed() == [(1, b"\0\0")]
     assert running.service.counters["refused"] == len(bad)
     assert "lamp: on is missing" in caplog.text
 
@@ -203,18 +184,15 @@ def test_a_retained_command_is_refused(rig: Rig) -> None:
     rig.world.command("mcu/lamp-1/lamp", {"level": 40, "on": True}, retain=True)
     rig.world.command("lights/lamp", {"level": 40, "on": True}, retain=True)
     running = rig.bridge()
-    assert wait_for_payload(rig.world, "mcu/lamp-1/describe")
+    rig.described("lamp-1")
     assert until(lambda: running.service.counters["stale"] == 2)
     rig.world.command("lights/lamp", {"level": 1, "on": False})
-    assert until(mcu.commands)
-    assert [command.payload for command in mcu.commands()] == [b"\2\0"]
+    assert mcu.obeyed() == [(1, b"\2\0")]
 
 
 def test_answers_are_logged(memory: Rig, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.DEBUG)
-    mcu = memory.mcu(STATION)
-    memory.bridge()
-    assert wait_for_payload(memory.world, "mcu/hs105-sta/describe")
+    mcu, _ = memory.up(STATION)
     memory.world.command("mcu/hs105-sta/o1_set", {"on": True})
     assert until(lambda: "o1_set: command 2 accepted" in caplog.text)
     mcu.answers = lambda received: wire.frame(wire.NACK, b"slot_unconfigured", received.interface, received.sequence)
@@ -225,16 +203,11 @@ def test_answers_are_logged(memory: Rig, caplog: pytest.LogCaptureFixture) -> No
 
 
 def test_many_commands_at_once_all_arrive_unless_they_are_far_too_many(memory: Rig) -> None:
-    mcu = memory.mcu(STATION)
-    memory.bridge()
-    assert wait_for_payload(memory.world, "mcu/hs105-sta/describe")
+    mcu, _ = memory.up(STATION)
     for number in range(4):
         memory.world.command(f"mcu/hs105-sta/o{number + 1}_set", {"on": True})
         memory.world.command(f"mcu/hs105-sta/o{number + 1}_set", {"on": False})
-    assert until(lambda: len(mcu.commands()) == 8)
-    assert [(command.interface, command.payload) for command in mcu.commands()] == [
-        (interface, payload) for interface in (1, 3, 5, 7) for payload in (b"\1", b"\0")
-    ]
+    assert mcu.obeyed(8) == [(interface, payload) for interface in (1, 3, 5, 7) for payload in (b"\1", b"\0")]
 
 
 # -- plugging in and out, restarts and new firmware
@@ -244,13 +217,12 @@ def test_many_commands_at_once_all_arrive_unless_they_are_far_too_many(memory: R
 def test_an_unplugged_device_is_cleared_and_a_replugged_one_is_requested_again(rig: Rig) -> None:
     mcu = rig.mcu(LAMP, sends_hello=False)
     running = rig.bridge()
-    assert wait_for_payload(rig.world, "mcu/lamp-1/describe")
+    rig.described("lamp-1")
     assert rig.claimed()
     mcu.send(wire.frame(wire.STATE, b"\x0b", 2))
-    assert wait_for_payload(rig.world, "lights/lamp")
+    assert rig.got("lights/lamp")
     mcu.unplug()
-    for metric in ("mcu/lamp-1/describe", "mcu/lamp-1/lamp", "lights/lamp"):
-        assert until(lambda metric=metric: rig.world.retained(metric) == [], 3), f"{metric} is still retained"
+    assert rig.cleared("mcu/lamp-1/describe", "mcu/lamp-1/lamp", "lights/lamp")
     late = rig.listener("late")
     time.sleep(0.3)
     assert late.received == []
@@ -258,105 +230,87 @@ def test_an_unplugged_device_is_cleared_and_a_replugged_one_is_requested_again(r
     assert until(lambda: running.service.counters["no_device"] == 1)
     asked = mcu.asked()
     mcu.plug()
-    assert until(lambda: rig.world.retained("mcu/lamp-1/describe"), 3)
+    rig.described("lamp-1")
     assert rig.world.at[-1] - mcu.plugged_at < 2
     assert mcu.asked() > asked
     assert rig.claimed()
     rig.world.command("lights/lamp", {"level": 40, "on": True})
-    assert until(mcu.commands)
-    assert len(mcu.commands()) == 1, "the command sent while it was unplugged was dropped"
+    assert len(mcu.obeyed()) == 1, "the command sent while it was unplugged was dropped"
 
 
 def test_a_known_device_is_usable_after_its_hello(memory: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(host, "ASK_AFTER_OPENING_S", 60.0)  # until then only a HELLO causes a request
-    mcu = memory.mcu(LAMP)
-    memory.bridge()
-    assert wait_for_payload(memory.world, "mcu/lamp-1/describe")
+    mcu, _ = memory.up(LAMP)
     asked = mcu.asked()
     mcu.unplug()
-    assert until(lambda: memory.world.retained("mcu/lamp-1/describe") == [])
+    assert memory.cleared("mcu/lamp-1/describe")
     mcu.plug()
-    assert until(lambda: memory.world.retained("mcu/lamp-1/describe"))
+    memory.described("lamp-1")
     assert mcu.asked() == asked
 
 
 def test_a_partial_frame_of_an_earlier_host_does_not_damage_the_first_command(
     memory: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    mcu = memory.mcu(LAMP)
-    running = memory.bridge()
-    assert until(lambda: memory.world.retained("mcu/lamp-1/describe"), 5)
+    mcu, running = memory.up(LAMP)
     mcu.unplug()
-    assert until(lambda: not memory.world.retained("mcu/lamp-1/describe"), 5)
+    assert memory.cleared("mcu/lamp-1/describe")
     monkeypatch.setattr(host, "ASK_AFTER_OPENING_S", 60.0)  # the command is the first frame after opening
     mcu.half = wire.frame(wire.CMD, b"\x50\x01", 1, 7)[:9]
     mcu.plug()
-    assert until(lambda: memory.world.retained("mcu/lamp-1/describe"), 5)
+    memory.described("lamp-1")
     asked = mcu.asked()
     memory.world.command("mcu/lamp-1/lamp", {"level": 40, "on": True})
-    assert until(mcu.commands)
+    assert mcu.obeyed()
     assert mcu.asked() == asked
     assert running.service.counters["unanswered"] == 0
 
 
 def test_another_device_at_the_same_line(memory: Rig) -> None:
-    mcu = memory.mcu(LAMP)
-    memory.bridge()
-    assert wait_for_payload(memory.world, "mcu/lamp-1/describe")
+    mcu, _ = memory.up(LAMP)
     mcu.unplug()
     mcu.manifest = LAMP.but(uid="lamp-2", hash="other")
     mcu.plug()
-    assert wait_for_payload(memory.world, "mcu/lamp-2/describe")
+    memory.described("lamp-2")
     assert memory.world.retained("mcu/lamp-1/describe") == []
     memory.world.command("mcu/lamp-1/lamp", {"level": 40, "on": True})
     memory.world.command("mcu/lamp-2/lamp", {"level": 1, "on": True})
-    assert until(mcu.commands)
-    assert [command.payload for command in mcu.commands()] == [b"\2\1"]
+    assert mcu.obeyed() == [(1, b"\2\1")]
 
 
 def test_new_firmware_while_it_runs(rig: Rig) -> None:
-    mcu = rig.mcu(LAMP)
-    rig.bridge()
-    assert wait_for_payload(rig.world, "mcu/lamp-1/describe")
-    assert rig.claimed()
+    mcu, _ = rig.up(LAMP)
     mcu.send(wire.frame(wire.STATE, b"\x0b", 2))
-    assert wait_for_payload(rig.world, "lights/lamp")
+    assert rig.got("lights/lamp")
     renumbered = tuple(I(**{**vars(one), "id": one.id + 10, "channel": ""}) for one in LAMP.interfaces)
     mcu.manifest = LAMP.but(interfaces=renumbered, hash="h2")
     mcu.send(wire.frame(wire.HELLO, mcu.manifest.hello()))
     assert until(lambda: [body["schema_hash"] for body in rig.world.payloads("mcu/lamp-1/describe")] == ["h1", "h2"], 3)
-    assert until(lambda: rig.world.retained("lights/lamp") == [])
+    assert rig.cleared("lights/lamp")
     assert rig.claimed()
     rig.world.command("lights/lamp", {"level": 40, "on": True})
     rig.world.command("mcu/lamp-1/lamp", {"level": 1, "on": True})
-    assert until(mcu.commands)
-    assert [command.interface for command in mcu.commands()] == [11]
+    assert [interface for interface, _ in mcu.obeyed()] == [11]
     mcu.send(wire.frame(wire.STATE, b"\x0c", 2), wire.frame(wire.STATE, b"\x0d", 12))
     assert until(lambda: len(rig.world.payloads("mcu/lamp-1/lamp")) == 2)
     assert rig.world.payloads("mcu/lamp-1/lamp")[-1]["value"] == {"level": 6.5}
 
 
 def test_an_inertial_channel_configured_as_retained_is_cleared(memory: Rig) -> None:
-    mcu = memory.mcu(IMU)
-    memory.bridge(publish={"low_rate_retain": True})
-    assert wait_for_payload(memory.world, "mcu/goob-imu-nano/describe")
-    assert memory.claimed()
+    mcu, _ = memory.up(IMU, publish={"low_rate_retain": True})
     mcu.send(wire.frame(wire.SAMPLE, motion(), 1), wire.frame(wire.STATE, summary(), 2))
-    assert wait_for_payload(memory.world, "sensors/imu")
+    assert memory.got("sensors/imu")
     assert memory.world.on("sensors/imu")[0].retain_requested
     mcu.unplug()
-    assert until(lambda: memory.world.retained("sensors/imu") == [])
+    assert memory.cleared("sensors/imu")
 
 
 def test_a_stopping_bridge_clears_its_retained_messages(rig: Rig) -> None:
-    mcu = rig.mcu(LAMP)
-    running = rig.bridge()
-    assert wait_for_payload(rig.world, "mcu/lamp-1/describe")
+    mcu, running = rig.up(LAMP)
     mcu.send(wire.frame(wire.STATE, b"\x0b", 2))
-    assert wait_for_payload(rig.world, "mcu/lamp-1/lamp")
+    assert rig.got("mcu/lamp-1/lamp")
     running.stop()
-    assert until(lambda: rig.world.retained("mcu/lamp-1/describe") == [])
-    assert until(lambda: rig.world.retained("mcu/lamp-1/lamp") == [])
+    assert rig.cleared("mcu/lamp-1/describe", "mcu/lamp-1/lamp")
 
 
 def test_a_stale_manifest_of_a_killed_bridge_is_cleared_by_the_next(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -366,13 +320,13 @@ def test_a_stale_manifest_of_a_killed_bridge_is_cleared_by_the_next(rig: Rig, mo
     manifest = b'{"protocol":"pebble_serial_v1","schema_version":1,"interface_count":0,"schema_hash":"h",' \
                b'"device_uid":"ghost","firmware_version":"1","model":"m","interfaces":[]}'  # fmt: skip
     left.publish(f"{rig.base}/outgoing/mcu/ghost/describe", manifest, qos=1, retain=True)  # type: ignore[arg-type]
-    assert wait_for_payload(rig.world, "mcu/ghost/describe")
+    rig.described("ghost")
     left.close()
     rig.mcu(LAMP)
     rig.bridge()
-    assert wait_for_payload(rig.world, "mcu/lamp-1/describe")
+    rig.described("lamp-1")
     assert rig.world.retained("mcu/ghost/describe")
-    assert until(lambda: rig.world.retained("mcu/ghost/describe") == [], 8)
+    assert rig.cleared("mcu/ghost/describe")
     assert rig.world.retained("mcu/lamp-1/describe")
 
 
@@ -383,10 +337,10 @@ def test_invalid_messages_about_other_devices_do_not_stop_the_bridge(rig: Rig) -
           b'"profile":"imu.summary.v1","encoding":{"fields":5}}]}'  # fmt: skip
     stranger.publish(f"{rig.base}/outgoing/mcu/odd/describe", odd, qos=QoS.DELIVERED, retain=True)
     stranger.publish(f"{rig.base}/outgoing/mcu//describe", odd, qos=QoS.DELIVERED, retain=True)
-    assert wait_for_payload(rig.world, "mcu/odd/describe")
+    rig.described("odd")
     rig.mcu(LAMP)
     running = rig.bridge()
-    assert wait_for_payload(rig.world, "mcu/lamp-1/describe")
+    rig.described("lamp-1")
     stranger.publish(f"{rig.base}/incoming/mcu//describe", b'{"from": "x"}', qos=QoS.DELIVERED)
     stranger.publish(f"{rig.base}/incoming/mcu/lamp-1/describe", b'{"from": {"x": [1]}, "has": 3}', qos=QoS.DELIVERED)
     rig.world.command("mcu/lamp-1/lamp", {"level": 40, "on": True})
@@ -398,22 +352,18 @@ def test_invalid_messages_about_other_devices_do_not_stop_the_bridge(rig: Rig) -
 
 
 def test_garbage_on_the_line_does_not_stop_the_bridge(memory: Rig) -> None:
-    mcu = memory.mcu(LAMP)
-    running = memory.bridge()
-    assert wait_for_payload(memory.world, "mcu/lamp-1/describe")
+    mcu, running = memory.up(LAMP)
     mcu.send(b"Arduino says hello\r\n" * 50, b"\0", wire.frame(wire.HELLO, M(b"\xff").hello()))
     mcu.send(wire.frame(wire.DESCRIBE, b"\xff" * 40), wire.frame(wire.STATE, b"\x0b", 2)[:-3], b"\0")
     mcu.send(wire.frame(wire.STATE, b"\x0b", 2))
-    assert wait_for_payload(memory.world, "mcu/lamp-1/lamp")
+    assert memory.got("mcu/lamp-1/lamp")
     counters = running.service.counters
     assert (counters["hello"], counters["describe"]) == (1, 1)
     assert counters["stuffing"] + counters["crc"] >= 1
 
 
 def test_thousands_of_hostile_frames_do_not_stop_the_bridge(memory: Rig) -> None:
-    mcu = memory.mcu(STATION)
-    running = memory.bridge()
-    assert wait_for_payload(memory.world, "mcu/hs105-sta/describe")
+    mcu, running = memory.up(STATION)
     chance = random.Random(8)
     for _ in range(cases(40, 200)):
         mcu.pour(b"".join(chance.choice(ATTACKS)(chance) for _ in range(100)))
@@ -436,7 +386,7 @@ def test_a_silent_inertial_sensor_ends_the_process(memory: Rig) -> None:
     mcu = memory.mcu(IMU)
     running = memory.bridge(health={"imu_sample_timeout_seconds": 1.0}, log_level="INFO")
     mcu.stream(100, motion())
-    assert wait_for_payload(memory.world, "sensors/imu-fast")
+    assert memory.got("sensors/imu-fast")
     time.sleep(1.2)
     assert running.alive
     mcu.silent = True
@@ -447,38 +397,26 @@ def test_a_silent_inertial_sensor_ends_the_process(memory: Rig) -> None:
     assert memory.world.retained("mcu/goob-imu-nano/describe") == []
 
 
-def test_other_devices_may_be_silent(memory: Rig) -> None:
-    memory.mcu(STATION)
-    running = memory.bridge()
-    assert wait_for_payload(memory.world, "mcu/hs105-sta/describe")
-    watchdog = running.service.watchdog  # type: ignore[attr-defined]
-    assert watchdog.timeout_s == 0
-    assert SILENCE_S > 5
-
-
-def test_an_inertial_sensor_has_five_seconds_unless_the_config_sets_another_timeout(memory: Rig) -> None:
-    memory.mcu(IMU)
-    running = memory.bridge()
-    assert wait_for_payload(memory.world, "mcu/goob-imu-nano/describe")
-    assert running.service.watchdog.timeout_s == 5  # type: ignore[attr-defined]
+@pytest.mark.parametrize(("manifest", "timeout_s"), [(STATION, 0), (IMU, 5)])
+def test_only_an_inertial_sensor_must_not_be_silent(memory: Rig, manifest: M, timeout_s: float) -> None:
+    _, running = memory.up(manifest)
+    assert running.service.watchdog.timeout_s == timeout_s < SILENCE_S  # type: ignore[attr-defined]
 
 
 def test_an_absent_sensor_is_waited_for(memory: Rig) -> None:
     mcu = memory.mcu(IMU)
     running = memory.bridge(health={"imu_sample_timeout_seconds": 0.5})
     mcu.stream(100, motion())
-    assert wait_for_payload(memory.world, "sensors/imu-fast")
+    assert memory.got("sensors/imu-fast")
     mcu.unplug()
     time.sleep(1.0)
     assert running.alive
     mcu.plug()
-    assert until(lambda: memory.world.retained("mcu/goob-imu-nano/describe"), 3)
+    memory.described("goob-imu-nano")
 
 
 def test_the_process_may_end_when_the_port_fails(memory: Rig) -> None:
-    mcu = memory.mcu(LAMP)
-    running = memory.bridge(health={"exit_on_serial_error": True})
-    assert wait_for_payload(memory.world, "mcu/lamp-1/describe")
+    mcu, running = memory.up(LAMP, health={"exit_on_serial_error": True})
     mcu.unplug()
     assert until(lambda: not running.alive, 3)
     assert running.error is not None
@@ -490,15 +428,11 @@ def test_a_refused_alias_is_logged_and_its_interface_still_works(memory: Rig, ca
         I(1, "drive", wire.IN, wire.KIND_COMMAND, (F("x", wire.I8),), "drive-values"),
         I(2, "reboot", wire.OUT, wire.KIND_STATE, (F("v", wire.U8),), "online", "", wire.RETAIN),
     ))  # fmt: skip
-    mcu = memory.mcu(rogue)
-    memory.bridge()
-    assert wait_for_payload(memory.world, "mcu/rogue/describe")
-    assert memory.claimed()
+    mcu, _ = memory.up(rogue)
     mcu.send(wire.frame(wire.STATE, b"\1", 2))
-    assert wait_for_payload(memory.world, "mcu/rogue/reboot")
+    assert memory.got("mcu/rogue/reboot")
     memory.world.command("drive-values", {"x": 1, "z": 0})
     memory.world.command("mcu/rogue/drive", {"x": 5})
-    assert until(mcu.commands)
-    assert [command.payload for command in mcu.commands()] == [b"\5"]
+    assert mcu.obeyed() == [(1, b"\5")]
     assert memory.world.on("online") == []
     assert "rogue: no alias for drive: incoming/drive-values: the channel is the robot's own" in caplog.text

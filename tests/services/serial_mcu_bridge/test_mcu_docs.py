@@ -37,10 +37,10 @@ def test_the_numbers_agree_with_the_code() -> None:
         (host.ASK_AFTER_OPENING_S, "{:g} s after opening the port"),
         (host.ASK_AFTER_HELLO_S, "{:g} s after a HELLO"),
         (host.ANSWER_S, "no answer within {:g} s"),
-        (host._WAITING, "Up to {} commands per interface"),
+        (host.WAITING, "Up to {} commands per interface"),
         (peers.CONFIRM_S, "counts as a claim for {:g} s"),
         (described_bridge.CLAIM_S, "only {:g} s after it has published"),
-        (manifest._MOST_INTERFACES, "fields of an interface; levels of a channel | {}; 64; 8"),
+        (manifest.MOST_INTERFACES, "fields of an interface; levels of a channel | {}; 64; 8"),
     ):
         assert sentence.format(number) in sentences, sentence
     assert uid_claim.ASK_S + described_bridge.CLAIM_S + described_bridge.DescribedBridge.retry_s < 1, (

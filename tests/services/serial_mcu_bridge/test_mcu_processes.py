@@ -2,11 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import signal
-import subprocess
-import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +13,11 @@ from pebble.services.serial_mcu_bridge.devices.described_bridge import Described
 from pebble.services.serial_mcu_bridge.serial_service import bridge_of
 from pebble.services.serial_mcu_bridge.text.imu_bridge import ImuBridge
 from pebble.services.serial_mcu_bridge.text.motor_bridge import MotorBridge
+from tests.kit.board import ScriptedMcu
+from tests.kit.robot import ProgramRobot
 from tests.services.serial_mcu_bridge import mcu_wire as wire
-from tests.services.serial_mcu_bridge.mcu_rig import BASE, Rig, wait_for_payload
 from tests.services.serial_mcu_bridge.mcu_wire import STATION
-from tests.support import ROOT, until
+from tests.support import Broker, until
 
 
 @pytest.mark.parametrize(
@@ -36,34 +32,15 @@ def test_a_protocol_has_its_service(protocol: str, service: type) -> None:
     assert bridge_of(view_of(config, "one")) is service
 
 
-@pytest.fixture
-def rig(tmp_path: Path) -> Iterator[Rig]:
-    rig = Rig("mqtt", tmp_path)
-    yield rig
-    rig.close()
-
-
-def test_a_terminated_process_withdraws_its_device(rig: Rig) -> None:
-    mcu = rig.mcu(STATION)
+def test_a_terminated_process_withdraws_its_device(local: Broker, tmp_path: Path) -> None:
+    mcu = ScriptedMcu(tmp_path / "port", STATION, sends_hello=True)
     line = {"enabled": True, "protocol": "pebble_serial_v1", "serial": {"port": str(mcu.link)}}
-    raw = {
-        "robot": {"id": BASE.split("/")[-1]},
-        "transport": {"kind": "mqtt", "run_dir": str(rig.folder / "run")},
-        "local_mqtt": rig.network.local_mqtt,
-        "services": {"serial_mcu_bridge": {"instances": {"sockets": line}}},
-    }
-    path = rig.folder / "robot.json"
-    path.write_text(json.dumps(raw))
-    command = [sys.executable, "-m", "pebble.services.serial_mcu_bridge", str(path), "sockets"]
-    with subprocess.Popen(command, cwd=ROOT) as process:
-        try:
-            assert wait_for_payload(rig.world, "mcu/hs105-sta/describe")
-            mcu.send(wire.frame(wire.STATE, b"\1\1\0", 2))
-            assert wait_for_payload(rig.world, "outlets/o1/status")
-            rig.world.command("outlets/o1/power", {"on": True})
-            assert until(mcu.commands)
-        finally:
-            process.send_signal(signal.SIGTERM)
-        assert process.wait(5) == 0
-    for metric in ("mcu/hs105-sta/describe", "outlets/o1/status", "mcu/hs105-sta/o1_state"):
-        assert until(lambda metric=metric: rig.world.retained(metric) == []), metric
+    with mcu, ProgramRobot("mqtt", local.port, {"serial_mcu_bridge": {"instances": {"sockets": line}}}) as robot:
+        process = robot.run("pebble.services.serial_mcu_bridge", "sockets")
+        robot.world.described("hs105-sta")
+        mcu.send(wire.frame(wire.STATE, b"\1\1\0", 2))
+        assert robot.world.got("outlets/o1/status")
+        robot.world.command("outlets/o1/power", {"on": True})
+        assert until(mcu.commands)
+        assert process.end() == 0
+        assert robot.world.cleared("mcu/hs105-sta/describe", "outlets/o1/status", "mcu/hs105-sta/o1_state")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, field
+from typing import Any
 
 import msgspec
 import pytest
@@ -10,7 +12,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from pebble.config import SerialBridge
-from pebble.contract import MCU_DESCRIBE, codec
+from pebble.config.tree import SerialHealth
+from pebble.contract import DRIVE, MCU_DESCRIBE, codec
 from pebble.contract.payloads import McuManifest
 from pebble.services.mqtt_bridge.private_topics import PrivateTopics
 from pebble.services.serial_mcu_bridge.devices.aliases import claims
@@ -26,53 +29,52 @@ from tests.support import cases
 # -- uids
 
 
-def test_a_uid_without_an_objection_is_acquired() -> None:
-    claim = UidClaim("a")
-    assert claim.request("u", 0.0) is Move.ASK
-    assert claim.tick(ASK_S - 0.01) is Move.NOTHING
+#: What a claim with this token is told and asked, one after the other, and what it does.
+CLAIMS: dict[str, tuple[str, list[tuple[Move, str, Any]]]] = {
+    "a uid without an objection is acquired": ("a", [
+        *((Move.ASK, "request", ("u", 0.0)), (Move.NOTHING, "tick", (ASK_S - 0.01,)), (Move.HOLD, "tick", (ASK_S,))),
+        *((Move.ANSWER, "on_question", ("u", "b", 1.0)), (Move.NOTHING, "on_question", ("other", "b", 1.0))),
+        (Move.NOTHING, "on_question", ("u", "a", 1.0)),  # its own question, echoed
+        (Move.INSIST, "on_manifest", ("u", 1.0)),  # its own manifest, echoed, or that of another holder
+    ]),
+    "a requester that is answered waits and asks again": ("z", [
+        *((Move.ASK, "request", ("u", 0.0)), (Move.NOTHING, "on_manifest", ("other", 0.1))),
+        *((Move.YIELD, "on_manifest", ("u", 0.1)), (Move.NOTHING, "on_question", ("u", "b", 1.0))),
+        *((Move.NOTHING, "tick", (0.09 + AGAIN_S,)), (Move.ASK, "tick", (0.1 + AGAIN_S,))),
+        *((Move.YIELD, "on_manifest", ("u", 6.0)), (Move.ASK, "on_withdrawal", ("u", 7.0))),
+        (Move.HOLD, "tick", (7.0 + ASK_S,)),
+    ]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("token", "history"), CLAIMS.values(), ids=CLAIMS)
+def test_how_a_uid_is_claimed(token: str, history: list[tuple[Move, str, Any]]) -> None:
+    claim = UidClaim(token)
+    for move, event, arguments in history:
+        assert getattr(claim, event)(*arguments) is move, (event, arguments)
+
+
+def holder(token: str) -> UidClaim:
+    claim = UidClaim(token)
+    claim.request("u", 0.0)
     assert claim.tick(ASK_S) is Move.HOLD
     assert claim.due is None
-    assert claim.on_question("u", "b", 1.0) is Move.ANSWER
-    assert claim.on_question("other", "b", 1.0) is Move.NOTHING
-    assert claim.on_question("u", "a", 1.0) is Move.NOTHING, "its own question, echoed"
-    assert claim.on_manifest("u", 1.0) is Move.INSIST, "its own manifest, echoed, or that of another holder"
+    return claim
 
 
-def test_of_two_holders_the_one_with_the_smaller_token_yields() -> None:
-    weak, strong = UidClaim("a"), UidClaim("b")
-    for claim in (weak, strong):
-        claim.request("u", 0.0)
-        assert claim.tick(ASK_S) is Move.HOLD
+def test_of_two_holders_the_one_with_the_smaller_token_yields_and_a_requester_always() -> None:
+    weak, strong, requester = holder("a"), holder("b"), UidClaim("z")
     assert strong.on_question("u", "a", 1.0, has=True) is Move.INSIST
     assert weak.on_question("u", "b", 1.0, has=True) is Move.YIELD
     assert weak.due == 1.0 + AGAIN_S
-
-
-def test_a_requester_yields_to_a_holder_whatever_the_tokens() -> None:
-    claim = UidClaim("z")
-    claim.request("u", 0.0)
-    assert claim.on_question("u", "a", 0.1, has=True) is Move.YIELD
-
-
-def test_a_requester_that_is_answered_waits_and_asks_again() -> None:
-    claim = UidClaim("z")
-    claim.request("u", 0.0)
-    assert claim.on_manifest("other", 0.1) is Move.NOTHING
-    assert claim.on_manifest("u", 0.1) is Move.YIELD
-    assert claim.due == 0.1 + AGAIN_S
-    assert claim.on_question("u", "b", 1.0) is Move.NOTHING
-    assert claim.tick(0.1 + AGAIN_S) is Move.ASK
-    assert claim.on_manifest("u", 6.0) is Move.YIELD
-    assert claim.on_withdrawal("u", 7.0) is Move.ASK
-    assert claim.tick(7.0 + ASK_S) is Move.HOLD
+    requester.request("u", 0.0)
+    assert requester.on_question("u", "a", 0.1, has=True) is Move.YIELD
 
 
 def test_a_released_uid_is_not_answered_for() -> None:
-    claim = UidClaim("a")
-    claim.request("u", 0.0)
+    claim = holder("a")
     claim.release()
-    assert claim.tick(10.0) is Move.NOTHING
-    assert claim.on_question("u", "b", 10.0) is Move.NOTHING
+    assert (claim.tick(10.0), claim.on_question("u", "b", 10.0)) == (Move.NOTHING, Move.NOTHING)
 
 
 @dataclass
@@ -108,13 +110,12 @@ class LocalNetwork:
                 self.act(token, claim.tick(now), now)
 
 
-@pytest.mark.parametrize("delay", [0.001, 0.02, 0.09])
-@pytest.mark.parametrize("later", [0.0, 0.001, 0.05, 0.15, 0.3, 3.0])
 @pytest.mark.parametrize("tokens", ["ab", "ba"])
-def test_of_two_exactly_one_has_it(delay: float, later: float, tokens: str) -> None:
-    network = LocalNetwork(delay)
-    network.run({tokens[0]: 0.0, tokens[1]: later}, 12.0)
-    assert len(network.holders) == 1
+def test_of_two_exactly_one_has_it(tokens: str) -> None:
+    for delay, later in itertools.product((0.001, 0.02, 0.09), (0.0, 0.001, 0.05, 0.15, 0.3, 3.0)):
+        network = LocalNetwork(delay)
+        network.run({tokens[0]: 0.0, tokens[1]: later}, 12.0)
+        assert len(network.holders) == 1, (delay, later)
 
 
 def test_of_five_at_once_exactly_one_has_it() -> None:
@@ -139,64 +140,55 @@ def command(name: str, channel: str, number: int = 1) -> I:
     return I(number, name, wire.IN, wire.KIND_COMMAND, (F("v", wire.U8),), channel)
 
 
-def test_the_devices_of_the_original_pebble_get_all_their_channels() -> None:
-    assert claims(published(IMU)).granted == {
-        "outgoing/sensors/imu-fast": "imu_fast",
-        "outgoing/sensors/imu": "imu",
-    }
+def granted(*interfaces: I) -> dict[str, str]:
+    return dict(claims(published(M("u", interfaces))).granted)
+
+
+def refused(interface: I) -> str:
+    return claims(published(M("u", (interface,)))).refused["a"]
+
+
+def test_which_channels_a_device_gets() -> None:
+    assert granted(*IMU.interfaces) == {"outgoing/sensors/imu-fast": "imu_fast", "outgoing/sensors/imu": "imu"}
     station = claims(published(STATION))
     assert not station.refused
     assert station.granted["incoming/outlets/o3/power"] == "o3_set"
     assert station.granted["outgoing/outlets/o3/status"] == "o3_state"
-
-
-def test_a_channel_outside_the_contract_is_free_in_both_directions() -> None:
-    both = M("u", (state("a", "lamp/one"), command("b", "lamp/one", 2)))
-    assert claims(published(both)).granted == {"outgoing/lamp/one": "a", "incoming/lamp/one": "b"}
-
-
-def test_the_second_of_a_device_is_refused() -> None:
+    both = granted(state("a", "lamp/one"), command("b", "lamp/one", 2))
+    assert both == {"outgoing/lamp/one": "a", "incoming/lamp/one": "b"}, "outside the contract it is free"
     twice = claims(published(M("u", (state("a", "lamp"), state("b", "lamp", 2)))))
-    assert twice.granted == {"outgoing/lamp": "a"}
-    assert twice.refused == {"b": "outgoing/lamp: a has it already"}
+    assert (twice.granted, twice.refused) == ({"outgoing/lamp": "a"}, {"b": "outgoing/lamp: a has it already"})
 
 
-@pytest.mark.parametrize("channel", [
+COMMANDS = [
     "drive-values", "lights-solid", "front-camera", "audio", "audio-stream", "soundboard-command", "autonomy-command",
     "flags/reboot", "flags/mqtt-video", "flags/anything", "flags", "mip-raw", "mcu/other/led", "mcu",
     "estop", "estop-reset", "estop/mcu", "estop-anything", "by", "by/anna/drive-values", "control",
-])  # fmt: skip
-def test_channels_that_command_the_robot_are_refused(channel: str) -> None:
-    assert "robot's own" in claims(published(M("u", (command("a", channel),)))).refused["a"]
-
-
-@pytest.mark.parametrize("channel", [
+]  # fmt: skip
+PUBLISHED = [
     "online", "heartbeat", "capabilities", "status", "logs", "charging-status", "charging-level", "touch-sensors",
     "front-camera", "audio", "wheel-odometry", "flags/mqtt-video", "mcu/other/describe", "bridge-probe",
     "estop", "estop/mcu", "estop/mcu/more", "estop-reset", "by/anna", "control", "control/lease",
-])  # fmt: skip
-def test_channels_the_robot_publishes_are_refused(channel: str) -> None:
-    assert "robot's own" in claims(published(M("u", (state("a", channel),)))).refused["a"]
+]  # fmt: skip
 
 
-@pytest.mark.parametrize("channel", ["sensors/imu", "sensors/imu-fast"])
-def test_an_inertial_channel_needs_its_profile_and_fields(channel: str) -> None:
-    for profile in ("", "imu.motion.v1", "imu.summary.v1"):
-        refused = claims(published(M("u", (state("a", channel, profile=profile),)))).refused
-        assert "it needs the profile imu." in refused["a"]
+def test_which_channels_are_refused_with_which_reason() -> None:
+    reasons = [refused(command("a", one)) for one in COMMANDS] + [refused(state("a", one)) for one in PUBLISHED]
+    assert [reason for reason in reasons if "robot's own" not in reason] == []
+    for channel in ("sensors/imu", "sensors/imu-fast"):
+        for profile in ("", "imu.motion.v1", "imu.summary.v1"):
+            assert "it needs the profile imu." in refused(state("a", channel, profile=profile))
 
 
 def test_a_local_only_interface_gets_no_public_channel_without_a_device_uid() -> None:
     """The bridge identifies local_only values by `device_uid`, which the body of sensors/imu does not have."""
     hidden = IMU.but(interfaces=tuple(I(**{**vars(one), "flags": wire.LOCAL_ONLY}) for one in IMU.interfaces))
-    hidden_claims = claims(published(hidden))
-    assert hidden_claims.granted == {"outgoing/sensors/imu-fast": "imu_fast"}
-    assert "it may leave the robot" in hidden_claims.refused["imu"]
+    found = claims(published(hidden))
+    assert found.granted == {"outgoing/sensors/imu-fast": "imu_fast"}
+    assert "it may leave the robot" in found.refused["imu"]
 
 
 def test_a_channel_that_the_config_renames_is_the_robots_own_too() -> None:
-    from pebble.contract import DRIVE
-
     taken = claims(published(M("u", (command("a", "elsewhere"),))), {"incoming/elsewhere": DRIVE}.get)
     assert "robot's own" in taken.refused["a"]
 
@@ -225,7 +217,7 @@ _ODD_INTERFACE = st.fixed_dictionaries({}, optional={
 })  # fmt: skip
 
 
-@settings(max_examples=cases(200, 1000))
+@settings(max_examples=cases(100, 1000))
 @given(st.lists(_ODD_INTERFACE, max_size=4))
 @example([{"channel": "sensors/imu", "profile": "imu.summary.v1", "encoding": {"fields": 5}}])
 def test_no_manifest_of_another_device_raises_anything(interfaces: list[dict[str, object]]) -> None:
@@ -286,8 +278,6 @@ def test_the_number_of_peer_devices_is_bounded() -> None:
     ],
 )
 def test_which_lines_have_a_timeout(section: dict[str, object], instance: str, expected: float) -> None:
-    from pebble.config.tree import SerialHealth
-
     health = SerialHealth(imu_sample_timeout_seconds=section.pop("timeout", None))  # type: ignore[arg-type]
     watchdog = ImuWatchdog(SerialBridge(health=health, **section), instance)  # type: ignore[arg-type]
     assert watchdog.timeout_s == expected

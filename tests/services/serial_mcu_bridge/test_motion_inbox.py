@@ -2,6 +2,8 @@
 
 import random
 
+import pytest
+
 from pebble.contract.payloads import Drive, EstopCommand, EstopReset
 from pebble.services.serial_mcu_bridge.motion.motion_inbox import MotionInbox
 
@@ -16,37 +18,28 @@ def drives(inbox: MotionInbox) -> list[Drive]:
     return [received.drive for received in inbox.take().drives]
 
 
-def test_only_the_newest_command_of_a_person_waits() -> None:
+ZERO, FINAL, JOY = Drive(), Drive(valid_ms=0), Drive(x=1, source="joystick")
+#: Drive commands in the order of their arrival, and what waits then.
+WAITING = {
+    "only the newest of a person": ([Drive(z=number / 10) for number in range(1, 11)], [Drive(z=1.0)]),
+    "a zero before what replaces it": ([Drive(z=1), ZERO, Drive(z=0.5), Drive(z=0.25)], [ZERO, Drive(z=0.25)]),
+    "several zeros as one that still bars": ([FINAL, ZERO], [FINAL]),
+    "the same in the other order": ([ZERO, FINAL], [FINAL]),
+    "also with commands between": ([FINAL, Drive(z=1), ZERO, Drive(z=0.5)], [FINAL, Drive(z=0.5)]),
+    "and in the other order": ([ZERO, Drive(z=1), FINAL, Drive(z=0.5)], [FINAL, Drive(z=0.5)]),
+    "a person and each run have their place": (
+        [script(1), Drive(z=1), script(2), script(1, 0.0), JOY], [script(2), script(1, 0.0), JOY],
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("arrived", "waiting"), WAITING.values(), ids=WAITING)
+def test_what_waits(arrived: list[Drive], waiting: list[Drive]) -> None:
     inbox = MotionInbox()
-    for number in range(1, 11):
-        inbox.put_drive(Drive(z=number / 10), 0.0)
-    assert drives(inbox) == [Drive(z=1.0)]
+    for drive in arrived:
+        inbox.put_drive(drive, 0.0)
+    assert drives(inbox) == waiting
     assert drives(inbox) == []
-
-
-def test_a_zero_waits_before_the_command_that_replaces_it() -> None:
-    inbox = MotionInbox()
-    for drive in (Drive(z=1), Drive(), Drive(z=0.5), Drive(z=0.25)):
-        inbox.put_drive(drive, 0.0)
-    assert drives(inbox) == [Drive(), Drive(z=0.25)]
-
-
-def test_several_zeros_become_one_that_still_bars_the_run() -> None:
-    for order in ((Drive(valid_ms=0), Drive()), (Drive(), Drive(valid_ms=0))):
-        inbox = MotionInbox()
-        for drive in order:
-            inbox.put_drive(drive, 0.0)
-        assert drives(inbox) == [Drive(valid_ms=0)]
-        for drive in (order[0], Drive(z=1), order[1], Drive(z=0.5)):
-            inbox.put_drive(drive, 0.0)
-        assert drives(inbox) == [Drive(valid_ms=0), Drive(z=0.5)]
-
-
-def test_a_person_and_each_run_have_a_place_of_their_own() -> None:
-    inbox = MotionInbox()
-    for drive in (script(1), Drive(z=1), script(2), script(1, 0.0), Drive(x=1, source="joystick")):
-        inbox.put_drive(drive, 0.0)
-    assert drives(inbox) == [script(2), script(1, 0.0), Drive(x=1, source="joystick")]
 
 
 def test_any_number_of_runs_never_displaces_the_person() -> None:

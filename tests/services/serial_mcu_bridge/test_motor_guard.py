@@ -5,6 +5,7 @@ import os
 import shutil
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import msgspec
@@ -63,17 +64,32 @@ class Rig:
         return self.guard.state()
 
 
+Make = Callable[..., Rig]
+
+
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
     return tmp_path / "state" / "estop-serial.json"
 
 
 @pytest.fixture
-def rig(path: Path) -> Iterator[Rig]:
-    rig = Rig(path)
+def make(path: Path) -> Iterator[Make]:
+    """A guard as the one of a process that starts now."""
+    with ExitStack() as ends:
+
+        def made(file: Path = path) -> Rig:
+            rig = Rig(file)
+            ends.callback(rig.close)
+            return rig
+
+        yield made
+
+
+@pytest.fixture
+def rig(make: Make) -> Rig:
+    rig = make()
     rig.advance(3)
-    yield rig
-    rig.close()
+    return rig
 
 
 def test_it_begins_free_and_publishes_that(rig: Rig) -> None:
@@ -84,16 +100,15 @@ def test_it_begins_free_and_publishes_that(rig: Rig) -> None:
 
 
 def test_a_zero_of_a_script_that_starts_with_the_robot_bars_older_runs_silently(
-    path: Path, caplog: pytest.LogCaptureFixture
+    path: Path, caplog: pytest.LogCaptureFixture, make: Make
 ) -> None:
     """A manager publishes it at its start, mostly before the motor owner admits scripts: its predecessor's may run."""
-    rig = Rig(path)
+    rig = make()
     assert rig.guard.judge(Drive(source="autonomy", run=8), rig.now) is None
     assert (rig.state.barred, caplog.text) == (7, "")
     rig.advance(3)
     assert rig.guard.judge(SCRIPT, rig.now) is None
     assert "refused a drive command: run 7 has ended" in caplog.text
-    rig.close()
 
 
 def test_a_zero_of_a_manager_that_starts_again_stops_the_script_of_its_predecessor(rig: Rig) -> None:
@@ -110,12 +125,9 @@ def test_a_stop_is_published_at_once_and_again_when_it_is_saved(rig: Rig, path: 
     assert json.loads(path.read_text())["latched"] is True
     assert rig.guard.judge(Drive(z=1), rig.now) is None
     assert rig.counters["latched"] == 1
-
-
-def test_a_stop_without_a_name_gets_one(rig: Rig) -> None:
     rig.guard.stop(EstopCommand(), rig.now)
     rig.guard.stop(EstopCommand(), rig.now)
-    assert len(set(rig.state.recent)) == rig.state.count == 2
+    assert len(set(rig.state.recent)) == rig.state.count == 3, "a stop without a name gets one"
 
 
 def test_at_most_four_states_a_second_and_the_last_one_is_published(rig: Rig) -> None:
@@ -130,27 +142,24 @@ def test_at_most_four_states_a_second_and_the_last_one_is_published(rig: Rig) ->
     assert rig.states[-1].recent[0] == f"{89:016x}"
 
 
-def test_repetitions_do_not_delay_the_state_that_confirms_a_stop(rig: Rig) -> None:
+def test_repetitions_get_the_state_again_and_do_not_delay_what_confirms_a_stop(rig: Rig) -> None:
     for _ in range(10):
         rig.stop(A)
         rig.advance(0.01)
     assert rig.written()
     assert (rig.states[-1].recent, rig.states[-1].persisted) == ([A], True)
+    rig.advance(1)
+    for repeat in (lambda: rig.stop(A), lambda: rig.guard.repeat_state(rig.now)):  # the latter for restored brokers
+        before = len(rig.states)
+        repeat()
+        assert rig.states[before:] == [rig.state]
+        rig.advance(5)
 
 
-def test_a_later_repetition_gets_the_state_again(rig: Rig) -> None:
-    rig.stop(A)
-    assert rig.written()
-    before = len(rig.states)
-    rig.advance(0.5)
-    rig.stop(A)
-    assert rig.states[before:] == [rig.state]
-
-
-def test_a_restart_begins_as_it_was(rig: Rig, path: Path) -> None:
+def test_a_restart_begins_as_it_was(rig: Rig, path: Path, make: Make) -> None:
     rig.stop(A, by="eve", why="a test")
     assert rig.written()
-    again = Rig(path)
+    again = make()
     assert (again.state.latched, again.state.recent, again.state.by, again.state.why) == (True, [A], "eve", "a test")
     assert again.state.boot != rig.state.boot
     assert again.state.persisted is False  # written again: who wrote it may have been killed before it was durable
@@ -161,26 +170,31 @@ def test_a_restart_begins_as_it_was(rig: Rig, path: Path) -> None:
     again.reset(again.state)
     assert not again.state.latched
     assert again.written()
-    free = Rig(path)
+    free = make()
     assert (free.state.latched, free.state.recent) == (False, [A])
     free.stop(A)
     assert not free.state.latched  # a repetition of the stop that was reset
-    again.file.close()
 
 
-@pytest.mark.parametrize("content", ["", "null", "[]", '{"latched": 1, "recent": []}', '{"latched": false}'])
-def test_a_file_that_is_none_of_ours_counts_as_a_stop(path: Path, content: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        *(
+            ("estop-serial.json", text)
+            for text in ("", "null", "[]", '{"latched": 1, "recent": []}', '{"latched": false}')
+        ),
+        *(("barred.json", text) for text in ("", "{", "[]", "-1", "true", "1.5", "1073741824")),
+    ],
+)
+def test_a_file_that_is_none_of_ours_counts_as_a_stop_and_bars_nothing(
+    path: Path, name: str, content: str, make: Make
+) -> None:
     path.parent.mkdir()
-    path.write_text(content)
-    rig = Rig(path)
-    assert rig.state.latched
-
-
-def test_where_nothing_can_be_saved_persisted_is_null(tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    rig = Rig(tmp_path / "file" / "estop.json")
-    rig.stop()
-    assert (rig.states[-1].latched, rig.states[-1].persisted) == (True, None)
+    path.with_name(name).write_text(content)
+    rig = make()
+    rig.advance(3)
+    assert rig.state.latched is (name != "barred.json")
+    assert rig.guard.judge(SCRIPT, rig.now) == (None if rig.state.latched else 0.75)
 
 
 def test_a_failed_write_is_published_and_repeated(rig: Rig, path: Path) -> None:
@@ -222,35 +236,19 @@ def test_a_reset_is_obeyed_only_for_the_newest_state_and_if_it_is_fresh(rig: Rig
     assert (rig.state.latched, rig.state.reset_refused) == (False, None)
 
 
-def test_a_barred_run_is_published(rig: Rig) -> None:
+def test_a_barred_run_is_published_and_stays_barred_after_a_restart(rig: Rig, path: Path, make: Make) -> None:
     assert rig.guard.judge(SCRIPT, rig.now) == 0.75
     assert rig.state.barred == 6
     assert rig.guard.judge(Drive(), rig.now) == 0
     assert rig.states[-1].barred == 7
     assert rig.guard.judge(SCRIPT, rig.now + 10) is None
     assert rig.counters["overruled"] == 1
-
-
-def test_a_run_stays_barred_when_the_process_is_killed_and_starts_again(rig: Rig, path: Path) -> None:
-    assert rig.guard.judge(SCRIPT, rig.now) == 0.75
-    assert rig.guard.judge(Drive(), rig.now) == 0
     rig.close()
-    again = Rig(path)
+    again = make()
     assert again.state.barred == 7
     again.advance(10)
     assert again.guard.judge(SCRIPT, again.now) is None
     assert again.guard.judge(structs.replace(SCRIPT, run=8), again.now) == 0.75
-    again.close()
-
-
-@pytest.mark.parametrize("content", ["", "{", "[]", "-1", "true", "1.5", "1073741824"])
-def test_a_file_of_barred_runs_that_is_none_of_ours_bars_nothing(path: Path, content: str) -> None:
-    path.parent.mkdir()
-    path.with_name("barred.json").write_text(content)
-    rig = Rig(path)
-    rig.advance(3)
-    assert rig.guard.judge(SCRIPT, rig.now) == 0.75
-    rig.close()
 
 
 def test_a_person_who_was_lost_bars_the_run_at_the_end_of_the_hold_without_any_further_command(rig: Rig) -> None:
@@ -274,20 +272,13 @@ def test_the_largest_state_has_400_bytes_at_most(rig: Rig) -> None:
     assert len(msgspec.json.encode(rig.state)) <= 400
 
 
-def test_a_state_can_be_repeated_for_brokers_that_have_an_older_one(rig: Rig) -> None:
-    rig.stop()
-    assert rig.written()
-    rig.advance(5)
-    before = len(rig.states)
-    rig.guard.repeat_state(rig.now)
-    assert rig.states[before:] == [rig.state]
-
-
 @pytest.mark.parametrize(
     "remove", [lambda folder: shutil.rmtree(folder), lambda folder: folder.rename(folder.with_name("moved"))]
 )
-def test_a_stop_whose_file_was_removed_is_written_again(tmp_path: Path, remove: Callable[[Path], object]) -> None:
-    rig = Rig(tmp_path / "state" / "estop.json")
+def test_a_stop_whose_file_was_removed_is_written_again(
+    tmp_path: Path, remove: Callable[[Path], object], make: Make
+) -> None:
+    rig = make(tmp_path / "state" / "estop.json")
     rig.stop()
     assert rig.written()
     rig.guard.save_again()
@@ -296,9 +287,8 @@ def test_a_stop_whose_file_was_removed_is_written_again(tmp_path: Path, remove: 
     rig.guard.save_again()
     assert rig.written()
     rig.close()
-    again = Rig(tmp_path / "state" / "estop.json")
+    again = make(tmp_path / "state" / "estop.json")
     assert again.state.latched
-    again.close()
 
 
 OLD = {"latched": True, "recent": [B], "by": "eve", "why": "before the power cut", "since": 1}
@@ -316,9 +306,11 @@ OLD = {"latched": True, "recent": [B], "by": "eve", "why": "before the power cut
         ("a stop", json.dumps(OLD), ""),  # stopped already
     ],
 )
-def test_a_stop_in_a_file_that_appears(tmp_path: Path, before: str, content: str | None, found: str) -> None:
+def test_a_stop_in_a_file_that_appears(
+    tmp_path: Path, before: str, content: str | None, found: str, make: Make
+) -> None:
     path = tmp_path / "state" / "estop.json"
-    rig = Rig(path)
+    rig = make(path)
     if before != "nothing":
         rig.stop(A)
     if before == "a reset":
@@ -342,19 +334,17 @@ def test_a_stop_in_a_file_that_appears(tmp_path: Path, before: str, content: str
         assert rig.written()
     assert rig.guard.appeared_stop() is None
     rig.close()
-    again = Rig(path)
+    again = make(path)
     assert again.state.latched == (bool(found) or before == "a stop")
-    again.close()
 
 
-def test_a_folder_that_can_be_written_later_gets_the_stop(tmp_path: Path) -> None:
+def test_where_nothing_can_be_saved_persisted_is_null_and_later_it_gets_the_stop(make: Make, tmp_path: Path) -> None:
     (tmp_path / "state").write_text("in the way")
-    rig = Rig(tmp_path / "state" / "estop.json")
+    rig = make(tmp_path / "state" / "estop.json")
     rig.stop()
     rig.guard.save_again()
-    assert rig.states[-1].persisted is None
+    assert (rig.states[-1].latched, rig.states[-1].persisted) == (True, None)
     (tmp_path / "state").unlink()
     rig.guard.save_again()
     assert rig.written()
     assert rig.state.persisted is True
-    rig.close()

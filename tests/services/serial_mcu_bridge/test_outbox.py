@@ -1,53 +1,36 @@
 """The newest line of a kind replaces older ones, and an expired drive line becomes the stop."""
 
+from typing import Any
+
+import pytest
+
 from pebble.services.serial_mcu_bridge.line.outbox import Outbox
 
+DRIVE = ("drive", b"drive", 10.0, 0.75)
+#: What is put in, when what is taken out, and the counters of expired and superseded lines then.
+HISTORIES: dict[str, tuple[list[tuple[Any, ...]], list[tuple[float, bytes | None]], tuple[int, int]]] = {
+    "only the newest of a kind is left, and driving goes first": (
+        [step for n in range(1000) for step in (("put", "lights", b"L%d" % n), ("drive", b"%d" % n, 0.0, 0.75))],
+        [(0.1, b"999"), (0.1, b"L999"), (0.1, None)], (0, 2 * 999),
+    ),
+    "a drive line that waited too long is a stop": ([DRIVE], [(10.76, b"stop"), (10.76, None)], (1, 0)),
+    "it may be valid for less than the timeout": ([("drive", b"drive", 10.0, 0.1)], [(10.11, b"stop")], (1, 0)),
+    "but not for longer": ([("drive", b"drive", 10.0, 5.0)], [(10.76, b"stop")], (1, 0)),
+    "the stop and the lights never expire": (
+        [DRIVE, ("halt",), ("put", "lights", b"lights")], [(1e9, b"stop"), (1e9, b"lights")], (0, 1),
+    ),
+    "a command after the stop counts": ([("halt",), DRIVE], [(10.0, b"drive")], (0, 1)),
+    "nothing is left once it was cleared": ([DRIVE, ("clear",)], [(10.0, None)], (0, 0)),
+}  # fmt: skip
 
-def test_only_the_newest_of_a_kind_is_left() -> None:
+
+@pytest.mark.parametrize(("steps", "taken", "counts"), HISTORIES.values(), ids=HISTORIES)
+def test_what_is_sent(
+    steps: list[tuple[Any, ...]], taken: list[tuple[float, bytes | None]], counts: tuple[int, int]
+) -> None:
     outbox = Outbox(b"stop", 0.75)
-    for number in range(1000):
-        outbox.drive(b"%d" % number, 0.0, 0.75)
-        outbox.put("lights", b"L%d" % number)
-    assert (outbox.take(0.1), outbox.take(0.1), outbox.take(0.1)) == (b"999", b"L999", None)
-    assert outbox.superseded == 2 * 999
-
-
-def test_driving_goes_first() -> None:
-    outbox = Outbox(b"stop", 0.75)
-    outbox.put("lights", b"lights")
-    outbox.drive(b"drive", 0.0, 0.75)
-    assert outbox.take(0.0) == b"drive"
-
-
-def test_a_drive_line_that_waited_too_long_is_a_stop() -> None:
-    outbox = Outbox(b"stop", 0.75)
-    outbox.drive(b"drive", 10.0, 0.75)
-    assert outbox.take(10.76) == b"stop"
-    assert outbox.expired == 1
+    for name, *arguments in steps:
+        getattr(outbox, name)(*arguments)
+    assert [(now, outbox.take(now)) for now, _ in taken] == taken
+    assert (outbox.expired, outbox.superseded) == counts
     assert not outbox.waiting
-
-
-def test_a_drive_line_may_be_valid_for_less_than_the_timeout_but_not_for_longer() -> None:
-    outbox = Outbox(b"stop", 0.75)
-    outbox.drive(b"drive", 10.0, 0.1)
-    assert outbox.take(10.11) == b"stop"
-    outbox.drive(b"drive", 10.0, 5.0)
-    assert outbox.take(10.76) == b"stop"
-
-
-def test_the_stop_and_the_lights_never_expire() -> None:
-    outbox = Outbox(b"stop", 0.75)
-    outbox.drive(b"drive", 0.0, 0.75)
-    outbox.halt()
-    outbox.put("lights", b"lights")
-    assert (outbox.take(1e9), outbox.take(1e9)) == (b"stop", b"lights")
-    assert outbox.expired == 0
-
-
-def test_a_command_after_the_stop_counts() -> None:
-    outbox = Outbox(b"stop", 0.75)
-    outbox.halt()
-    outbox.drive(b"drive", 0.0, 0.75)
-    assert outbox.take(0.0) == b"drive"
-    outbox.clear()
-    assert outbox.take(0.0) is None

@@ -1,4 +1,4 @@
-"""Two hundred thousand hostile frames: nothing is raised, and valid frames among them are still decoded."""
+"""Hostile frames: nothing is raised, and valid frames among them are still decoded."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tests.services.serial_mcu_bridge import mcu_wire as wire
 from tests.services.serial_mcu_bridge.mcu_wire import IMU, STATION, M
 from tests.support import cases
 
-FRAMES = cases(40_000, 200_000)
+FRAMES = cases(10_000, 200_000)
 GROUP = 500
 
 _BODIES = [

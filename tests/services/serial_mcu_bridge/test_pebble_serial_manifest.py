@@ -23,10 +23,7 @@ from pebble.services.serial_mcu_bridge.pebble_serial_v1.manifest import (
 from pebble.transports.memory import MemoryHub, MemoryTransport
 from tests.services.serial_mcu_bridge import mcu_wire as wire
 from tests.services.serial_mcu_bridge.mcu_wire import IMU, STATION, F, I, M
-
-
-def test_a_hello() -> None:
-    assert parse_hello(IMU.hello()) == Hello(1, 2, "goob-imu-v2", "goob-imu-nano", "2", "arduino-nano")
+from tests.support import cases
 
 
 def test_the_inertial_sensor_describes_itself() -> None:
@@ -105,8 +102,9 @@ def field(**changes: Any) -> bytes:
     return one(fields=(F(**{"name": "v", "type": wire.U8, **changes}),))
 
 
-def test_the_template_of_the_cases_below_is_good() -> None:
-    assert parse_describe(one()).interfaces[0].name == "a"
+BAD_NAMES: list[str] = ["", "a/b", "a#", "+", "$SYS", "a\nb", "{uid}", "n" * 65]
+BAD_CHANNELS = ["/a", "a//b", "a/", "a/#", "a/+/b", "$share/a", "a/b\0c"]
+SCALES: list[dict[str, float]] = [{"scale": 0.0}, {"scale": math.nan}, {"scale": math.inf}, {"offset": -math.inf}]
 
 
 @pytest.mark.parametrize(
@@ -118,22 +116,9 @@ def test_the_template_of_the_cases_below_is_good() -> None:
         (M("u", ()).describe()[:1] + b"\xff" + M("u", ()).describe()[2:], "255 interfaces, more than 64"),
         (one(name=b"\xff"), "is not UTF-8"),
         (one(channel=b"a/\xc3\x28"), "is not UTF-8"),
-        (one(name=""), "must be a topic level"),
-        (one(name="a/b"), "must be a topic level"),
-        (one(name="a#"), "must be a topic level"),
-        (one(name="+"), "must be a topic level"),
-        (one(name="$SYS"), "must be a topic level"),
-        (one(name="a\nb"), "must be a topic level"),
-        (one(name="{uid}"), "must be a topic level"),
-        (one(name="n" * 65), "must be a topic level"),
+        *((one(name=name), "must be a topic level") for name in BAD_NAMES),
         (one(name="describe"), '"describe" is taken'),
-        (one(channel="/a"), "in the channel"),
-        (one(channel="a//b"), "in the channel"),
-        (one(channel="a/"), "in the channel"),
-        (one(channel="a/#"), "in the channel"),
-        (one(channel="a/+/b"), "in the channel"),
-        (one(channel="$share/a"), "in the channel"),
-        (one(channel="a/b\0c"), "in the channel"),
+        *((one(channel=channel), "in the channel") for channel in BAD_CHANNELS),
         (one(channel="/".join("abcdefghi")), "9 levels, more than 8"),
         (one(id=0), "id 0 is the protocol's own"),
         (one(dir=3), "unknown direction 3"),
@@ -148,10 +133,7 @@ def test_the_template_of_the_cases_below_is_good() -> None:
         (field(type=9), "unknown type 9"),
         (field(name=""), "is no name of a field"),
         (field(name="\x07"), "is no name of a field"),
-        (field(scale=0.0), "make no number"),
-        (field(scale=math.nan), "make no number"),
-        (field(scale=math.inf), "make no number"),
-        (field(offset=-math.inf), "make no number"),
+        *((field(**changes), "make no number") for changes in SCALES),
         (M("").describe(), "device uid ''"),
         (M("a/b").describe(), "device uid 'a/b'"),
         (M(b"\xff\xfe").describe(), "is not UTF-8"),
@@ -167,26 +149,22 @@ def test_refused_with_its_reason(payload: bytes, reason: str) -> None:
     assert reason in str(caught.value)
 
 
-def test_a_command_and_what_reports_on_it_may_share_a_name() -> None:
+def test_what_is_understood_all_the_same() -> None:
+    """A command and its report may share a name, a boolean has no scale, and flags of the future are ignored."""
+    assert parse_describe(one()).interfaces[0].name == "a", "the template of the cases above is good"
     both = M("u", (I(1, "led", wire.IN, wire.KIND_COMMAND), I(2, "led", wire.OUT, wire.KIND_STATE)))
     assert len(parse_describe(both.describe()).interfaces) == 2
-
-
-def test_a_boolean_has_no_scale() -> None:
     described = parse_describe(field(type=wire.BOOL, scale=0.0, offset=math.nan)).interfaces[0].fields[0]
     assert (described.scale, described.offset) == (1.0, 0.0)
-
-
-def test_flags_of_the_future_are_ignored() -> None:
     interface = parse_describe(one(flags=0xFF)).interfaces[0]
-    assert interface.retain
-    assert interface.local_only
+    assert (interface.retain, interface.local_only) == (True, True)
 
 
-@pytest.mark.parametrize("payload", [b"", b"\1", IMU.hello()[:-1], IMU.hello() + b"\0", M(b"\xc0").hello()])
-def test_a_hello_is_exact(payload: bytes) -> None:
-    with pytest.raises(PayloadError):
-        parse_hello(payload)
+def test_a_hello_is_exact() -> None:
+    assert parse_hello(IMU.hello()) == Hello(1, 2, "goob-imu-v2", "goob-imu-nano", "2", "arduino-nano")
+    for payload in (b"", b"\1", IMU.hello()[:-1], IMU.hello() + b"\0", M(b"\xc0").hello()):
+        with pytest.raises(PayloadError):
+            parse_hello(payload)
 
 
 def test_every_beginning_of_a_manifest_is_refused_and_nothing_else_is_raised() -> None:
@@ -198,7 +176,7 @@ def test_every_beginning_of_a_manifest_is_refused_and_nothing_else_is_raised() -
 
 def test_random_damage_is_understood_or_refused() -> None:
     chance, understood = random.Random(3), 0
-    for _ in range(5000):
+    for _ in range(cases(1000, 5000)):
         damaged = bytearray(chance.choice((IMU, STATION)).describe())
         for _ in range(chance.randint(1, 3)):
             damaged[chance.randrange(len(damaged))] = chance.randrange(256)
@@ -208,4 +186,4 @@ def test_random_damage_is_understood_or_refused() -> None:
             assert str(error)  # noqa: PT017 - the error must be this one and have a message
         else:
             understood += 1
-    assert 0 < understood < 5000
+    assert 0 < understood < cases(1000, 5000)

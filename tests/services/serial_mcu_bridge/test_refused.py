@@ -13,7 +13,7 @@ import pytest
 
 from pebble.runtime.parent import NOTIFY_FD
 from pebble.transports import Message, MqttSettings, QoS, State, create
-from tests.services.serial_mcu_bridge.motor_rig import BASE, STOP, Bench, reset, state, stopped
+from tests.services.serial_mcu_bridge.motor_rig import BASE, STOP, STOPPED, Bench
 from tests.support import RefusingBroker, until
 
 ESTOP, ESTOP_RESET, DRIVE = (f"{BASE}/incoming/{metric}" for metric in ("estop", "estop-reset", "drive-values"))
@@ -60,40 +60,40 @@ def errors(caplog: pytest.LogCaptureFixture) -> list[str]:
     return [record.getMessage() for record in caplog.records if record.levelno == logging.ERROR]
 
 
-@pytest.mark.parametrize("refused", [(ESTOP,), (ESTOP_RESET,), (ESTOP, ESTOP_RESET)])
+BOTH = pytest.param((ESTOP, ESTOP_RESET), marks=pytest.mark.thorough)
+
+
+@pytest.mark.parametrize("refused", [(ESTOP,), (ESTOP_RESET,), BOTH])
 def test_without_both_subscriptions_there_is_no_emergency_stop(
     broker: RefusingBroker, start: Callable[[], Bench], caplog: pytest.LogCaptureFixture, refused: tuple[str, ...]
 ) -> None:
     broker.refuse(*refused)
     bench = start()
     assert until(lambda: errors(caplog))
-    assert until(lambda: retained(broker) == [])
+    assert until(lambda: retained(broker) == [], step=0.1)
     old = f"{BASE}/outgoing/estop/serial"  # as a broker has it that was restored from an older save
     assert bench.operator.publish(old, b'{"latched": false}', qos=QoS.DELIVERED, retain=True)
-    assert until(lambda: b'{"latched": false}' in [message.payload for message in bench.received])
+    assert until(lambda: b'{"latched": false}' in [message.payload for message in bench.world.received])
     bench.service.post(bench.service.repeat_state)
-    assert until(lambda: retained(broker) == [])
+    assert until(lambda: retained(broker) == [], step=0.1)
     assert f"refuses the subscription to {' and '.join(refused)}: this robot has no emergency stop" in errors(caplog)[0]
     assert f"to subscribe to both {ESTOP} and {ESTOP_RESET}" in errors(caplog)[0]
-    bench.send("incoming/drive-values", {"z": 0.5})
-    assert bench.line("M 0.500 0.500")
+    assert bench.moves(0.5)
     refuse(broker, bench, *refused)
-    assert until(lambda: retained(broker) == [])
+    assert until(lambda: retained(broker) == [], step=0.1)
     assert len(errors(caplog)) == 1, "one line, not one for each connection"
 
 
 def test_a_stop_that_could_not_be_reset_is_a_final_zero(broker: RefusingBroker, start: Callable[[], Bench]) -> None:
     broker.refuse(ESTOP_RESET)
     bench = start()
-    bench.send("incoming/drive-values", {"z": 0.125, "source": "autonomy", "run": 7})
-    bench.send("incoming/drive-values", {"z": 0.5})
-    assert bench.line("M 0.500 0.500")
-    bench.send("incoming/estop", STOP)
-    assert until(lambda: bench.mcu.trace.lines()[-1] == "M 0.000 0.000")
-    bench.send("incoming/drive-values", {"z": 0.25})
-    assert bench.line("M 0.250 0.250")
+    bench.send("drive-values", {"z": 0.125, "source": "autonomy", "run": 7})
+    assert bench.moves(0.5)
+    bench.send("estop", STOP)
+    assert until(lambda: bench.lines[-1] == STOPPED)
+    assert bench.moves(0.25)
     refuse(broker, bench)
-    assert until(lambda: retained(broker))
+    assert until(lambda: retained(broker), step=0.1)
     (granted,) = retained(broker)
     assert (granted["latched"], granted["count"], granted["recent"], granted["barred"]) == (False, 0, [], 7)
 
@@ -105,35 +105,33 @@ def test_what_waits_with_a_stop_does_not_move_the_motors_after_it(
     bench = start()
     with bench.occupied():
         received = bench.service.transport.counters["received"]
-        bench.send("incoming/drive-values", {"z": 0.25})
-        bench.send("incoming/estop", STOP)
-        bench.send("incoming/drive-values", {"z": 0.5})
+        bench.drive(0.25)
+        bench.send("estop", STOP)
+        bench.drive(0.5)
         assert until(lambda: bench.service.transport.counters["received"] == received + 3)
-    bench.send("incoming/lights-solid", {"r": 1})
-    assert bench.line("L 0.000 0.000 1.000")
-    assert set(bench.mcu.trace.lines()) == {"M 0.000 0.000", "L 0.000 0.000 1.000"}
+    assert bench.shines(r=1)
+    assert set(bench.lines) == {STOPPED, "L 0.000 0.000 1.000"}
 
 
 def test_a_stop_from_before_the_refusal_stays_and_is_back_when_all_is_granted(
     broker: RefusingBroker, start: Callable[[], Bench], caplog: pytest.LogCaptureFixture
 ) -> None:
     bench = start()
-    bench.send("incoming/estop", STOP)
-    assert stopped(bench)
-    before = state(bench)
+    bench.send("estop", STOP)
+    assert bench.stopped()
+    before = bench.state
     refuse(broker, bench, ESTOP)
     assert until(lambda: errors(caplog))
     assert "it stays stopped now" in errors(caplog)[0]
-    assert until(lambda: retained(broker) == [])
-    bench.send("incoming/drive-values", {"z": 0.25})
+    assert until(lambda: retained(broker) == [], step=0.1)
+    bench.drive(0.25)
     assert until(lambda: bench.service.counters["latched"] == 1)
-    assert "M 0.250 0.250" not in bench.mcu.trace.lines()
+    assert "M 0.250 0.250" not in bench.lines
     refuse(broker, bench)
-    assert until(lambda: retained(broker) == [before])
-    assert reset(bench)
-    bench.send("incoming/drive-values", {})
-    bench.send("incoming/drive-values", {"z": 0.125})
-    assert bench.line("M 0.125 0.125")
+    assert until(lambda: retained(broker) == [before], step=0.1)
+    assert bench.reset()
+    bench.send("drive-values", {})
+    assert bench.moves(0.125)
 
 
 def test_the_launcher_is_notified_however_busy_it_is(
@@ -169,6 +167,6 @@ def test_a_refused_drive_topic_ends_the_process_with_what_to_change(
 ) -> None:
     bench = start()
     broker.refuse(DRIVE)
-    assert until(lambda: bench.failure)
-    assert f"refuses the subscription to {DRIVE}: nothing can drive this robot" in str(bench.failure)
-    assert "local_mqtt" in str(bench.failure)
+    assert until(lambda: bench.running.error)
+    assert f"refuses the subscription to {DRIVE}: nothing can drive this robot" in str(bench.running.error)
+    assert "local_mqtt" in str(bench.running.error)

@@ -19,7 +19,7 @@ from pebble.services.serial_mcu_bridge.line.port import Port
 from pebble.services.serial_mcu_bridge.line.serial_line import LineState, SerialLine
 from pebble.services.serial_mcu_bridge.text.goob_base import STOP, drive_line, lights_line
 from pebble.simulation.pty import PtyMcu
-from tests.support import until
+from tests.support import cases, until
 
 STOPPED = "M 0.000 0.000"
 
@@ -84,7 +84,10 @@ def test_the_stop_is_sent_at_open_and_again_after_boot(mcu: PtyMcu, connect: Con
     first, second = (entry.ns for entry in mcu.trace.entries() if entry.event == "line")
     assert second - first >= 0.4e9  # the first one may be read late
     host.line.close()
+    host.line.close()
     assert host.states == [LineState.BOOTING, LineState.READY, LineState.CLOSED]
+    assert not host.line.drive(drive_line(1, 1))
+    SerialLine("/nothing", 115200, stop=STOP, on_bytes=lambda _chunk: None).close()
 
 
 @pytest.mark.parametrize("half", ["M 0.900", "M 0.400 0."])
@@ -108,20 +111,16 @@ def test_input_from_before_and_during_boot_is_thrown_away(mcu: PtyMcu, connect: 
     assert b"Done!" not in host.received
 
 
-def test_a_command_waits_for_the_boot_and_comes_after_the_stop(mcu: PtyMcu, connect: Connect) -> None:
-    host = connect(mcu.symlink, boot_s=0.3)
-    assert until(lambda: host.line.drive(drive_line(0.5, 0.5)))
-    assert traced(mcu, "M 0.500 0.500")
-    assert mcu.trace.lines() == [STOPPED, STOPPED, "M 0.500 0.500"]
-
-
-def test_a_command_too_old_after_the_boot_is_a_stop(mcu: PtyMcu, connect: Connect) -> None:
-    host = connect(mcu.symlink, boot_s=1.0)
+@pytest.mark.parametrize(("boot_s", "sent", "expired"), [(0.3, "M 0.500 0.500", 0), (1.0, STOPPED, 1)])
+def test_a_command_waits_for_the_boot_and_one_too_old_then_is_a_stop(
+    mcu: PtyMcu, connect: Connect, boot_s: float, sent: str, expired: int
+) -> None:
+    host = connect(mcu.symlink, boot_s=boot_s)
     assert until(lambda: host.line.drive(drive_line(0.5, 0.5)))
     assert until(host.is_ready)
     assert until(lambda: len(mcu.trace.lines()) == 3)
-    assert mcu.trace.lines() == [STOPPED] * 3
-    assert host.line.output.outbox.expired == 1
+    assert mcu.trace.lines() == [STOPPED, STOPPED, sent]
+    assert host.line.output.outbox.expired == expired
 
 
 def test_lines_go_down_and_answers_come_up(mcu: PtyMcu, host: Host) -> None:
@@ -142,13 +141,10 @@ def test_of_a_burst_the_last_command_is_sent_and_few_before_it(mcu: PtyMcu, host
     assert sent == sorted(sent)
     assert len(sent) < 500
     assert host.line.output.outbox.superseded == 1000 - len(sent)
-
-
-def test_a_burst_that_ends_in_a_stop_ends_stopped(mcu: PtyMcu, host: Host) -> None:
     for number in range(500):
         host.line.drive(drive_line(number / 1000, 1.0))
     host.line.halt()
-    assert until(lambda: mcu.trace.lines()[-1] == STOPPED and mcu.state().drive == (0.0, 0.0))
+    assert until(lambda: mcu.trace.lines()[-1] == STOPPED and mcu.state().drive == (0.0, 0.0)), "it ends in a stop"
 
 
 def test_the_stop_is_the_last_line_even_while_others_still_drive(mcu: PtyMcu, host: Host) -> None:
@@ -165,7 +161,7 @@ def test_the_stop_is_the_last_line_even_while_others_still_drive(mcu: PtyMcu, ho
 
 
 def test_a_burst_cut_off_by_the_end_ends_with_the_stop(mcu: PtyMcu, connect: Connect) -> None:
-    for round_ in range(1, 21):
+    for round_ in range(1, cases(5, 20) + 1):
         host = connect(mcu.symlink, boot_s=0.0, baud=4_000_000)
         assert until(host.is_ready, step=0.0005)
         for number in range(50):
@@ -173,13 +169,6 @@ def test_a_burst_cut_off_by_the_end_ends_with_the_stop(mcu: PtyMcu, connect: Con
         host.line.close()
         assert until(lambda n=round_: [entry.event for entry in mcu.trace.entries()].count("closed") == n)  # type: ignore[misc]
         assert mcu.trace.lines()[-1] == STOPPED
-
-
-def test_closing_twice_and_closing_what_never_opened(mcu: PtyMcu, host: Host, tmp_path: Path) -> None:
-    host.line.close()
-    host.line.close()
-    assert not host.line.drive(drive_line(1, 1))
-    SerialLine(str(tmp_path / "none"), 115200, stop=STOP, on_bytes=lambda _chunk: None).close()
 
 
 def test_after_a_replug_the_first_line_is_the_stop(mcu: PtyMcu, host: Host) -> None:
@@ -201,15 +190,6 @@ def test_after_a_replug_the_first_line_is_the_stop(mcu: PtyMcu, host: Host) -> N
     assert host.line.opened == 2
 
 
-def test_a_port_that_comes_late_is_found(mcu: PtyMcu, connect: Connect) -> None:
-    mcu.unplug()
-    host = connect(mcu.symlink)
-    assert until(lambda: host.line.state is LineState.ABSENT)
-    assert "No such file" in host.line.problem
-    mcu.replug()
-    assert until(host.is_ready)
-
-
 def test_a_path_that_leads_to_another_device_is_followed(tmp_path: Path, connect: Connect) -> None:
     with PtyMcu("goob", tmp_path / "old") as old, PtyMcu("goob", tmp_path / "new") as new:
         link = tmp_path / "by-id"
@@ -222,7 +202,14 @@ def test_a_path_that_leads_to_another_device_is_followed(tmp_path: Path, connect
         assert until(lambda: new.trace.lines() == [STOPPED] * 2)
 
 
-def test_a_port_in_use_is_refused_until_it_is_free(mcu: PtyMcu, connect: Connect) -> None:
+def test_a_port_that_comes_late_is_found_and_one_in_use_refused_until_it_is_free(mcu: PtyMcu, connect: Connect) -> None:
+    mcu.unplug()
+    host = connect(mcu.symlink)
+    assert until(lambda: host.line.state is LineState.ABSENT)
+    assert "No such file" in host.line.problem
+    mcu.replug()
+    assert until(host.is_ready)
+    host.line.close()
     other = Port(str(mcu.symlink), 460800)
     host = connect(mcu.symlink)
     assert until(lambda: "another program has it open" in host.line.problem)

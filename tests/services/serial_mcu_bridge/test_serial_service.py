@@ -14,7 +14,7 @@ from pebble.contract import DRIVE, ESTOP, ESTOP_RESET
 from pebble.contract.payloads import Drive
 from pebble.services.serial_mcu_bridge.text.motor_bridge import MotorBridge
 from pebble.transports.memory import MemoryHub, MemoryTransport
-from tests.services.serial_mcu_bridge.motor_rig import BASE, STOP, Bench, reset, send_reset, state, stopped
+from tests.services.serial_mcu_bridge.motor_rig import BASE, STOP, STOPPED, Bench
 from tests.support import until
 
 
@@ -43,21 +43,19 @@ RENAMED = (
 
 
 def test_the_first_and_the_last_line_are_the_stop(bench: Bench) -> None:
-    bench.send("incoming/drive-values", {"z": 0.5})
-    assert bench.line("M 0.500 0.500")
+    assert bench.moves(0.5)
     bench.service.quit()
     assert until(lambda: bench.mcu.trace.entries()[-1].event == "closed", 5)
-    lines = bench.mcu.trace.lines()
-    assert lines[0] == lines[1] == lines[-1] == "M 0.000 0.000"
+    lines = bench.lines
+    assert lines[0] == lines[1] == lines[-1] == STOPPED
 
 
 @pytest.mark.parametrize("bench", [("goob", {"safety": {"drive_timeout_seconds": 0.2}})], indirect=True)
 def test_the_configured_watchdog_stops_once(bench: Bench) -> None:
     sent = time.monotonic()
-    bench.send("incoming/drive-values", {"z": 0.5})
-    assert bench.line("M 0.500 0.500")
+    assert bench.moves(0.5)
     moved = next(entry for entry in bench.mcu.trace.entries() if entry.line == "M 0.500 0.500")
-    assert until(lambda: bench.mcu.trace.lines()[-1] == "M 0.000 0.000", 2)
+    assert until(lambda: bench.lines[-1] == STOPPED, 2)
     stopped = bench.mcu.trace.entries()[-1]
     assert stopped.ns / 1e9 - sent >= 0.2
     assert (stopped.ns - moved.ns) / 1e9 <= 0.5  # the default is 0.75
@@ -67,8 +65,7 @@ def test_the_configured_watchdog_stops_once(bench: Bench) -> None:
 
 def test_after_a_pause_of_the_process_the_stop_is_sent_before_the_next_command(bench: Bench) -> None:
     """The order is that after SIGSTOP and SIGCONT: the watchdog is overdue, and a command is handled first."""
-    bench.send("incoming/drive-values", {"z": 0.5})
-    assert bench.line("M 0.500 0.500")
+    assert bench.moves(0.5)
 
     def pause() -> None:
         time.sleep(0.9)
@@ -77,7 +74,7 @@ def test_after_a_pause_of_the_process_the_stop_is_sent_before_the_next_command(b
 
     bench.service.post(pause)
     assert bench.line("M 0.250 0.250")
-    assert bench.mcu.trace.lines()[-3:] == ["M 0.500 0.500", "M 0.000 0.000", "M 0.250 0.250"]
+    assert bench.lines[-3:] == ["M 0.500 0.500", STOPPED, "M 0.250 0.250"]
 
 
 @pytest.mark.parametrize("bench", [FRED], indirect=True)
@@ -106,19 +103,18 @@ def test_every_topic_can_be_renamed(bench: Bench) -> None:
     bench.operator.publish("elsewhere/flash", b'{"g": 0.5}')
     assert bench.line("F 0.000 0.500 0.000 2.000")
     assert until(lambda: bench.payloads("feelers") and bench.payloads("dock"), 5)
-    bench.send("incoming/drive-values", {"z": 1})
+    bench.drive(1)
     bench.operator.publish("elsewhere/solid", b'{"b": 1}')
     assert bench.line("L 1.000 0.000 0.000")
-    assert "M 1.000 1.000" not in bench.mcu.trace.lines()
+    assert "M 1.000 1.000" not in bench.lines
 
 
 def test_malformed_commands_are_counted(bench: Bench) -> None:
     for _ in range(50):
         bench.operator.publish(f"{BASE}/incoming/drive-values", b'{"z": NaN}')
-    bench.send("incoming/lights-solid", {"r": 1})
-    assert bench.line("L 0.000 0.000 1.000")
+    assert bench.shines(r=1)
     assert bench.service.counters["refused"] == 50
-    assert set(bench.mcu.trace.lines()) == {"M 0.000 0.000", "L 0.000 0.000 1.000"}
+    assert set(bench.lines) == {STOPPED, "L 0.000 0.000 1.000"}
 
 
 # -- emergency stops and scripts
@@ -127,19 +123,19 @@ def test_malformed_commands_are_counted(bench: Bench) -> None:
 @pytest.mark.parametrize(
     ("metric", "raw", "line"),
     [
-        ("drive-values", b'\xef\xbb\xbf{"x":0,"z":0}\r\n\0', "M 0.000 0.000"),
-        ("drive-values", b'{"z":"0","y":"abc"}', "M 0.000 0.000"),
-        ("drive-values", b'{"linear":{"x":0.5},"angular":{"z":0}}', "M 0.000 0.000"),
+        ("drive-values", b'\xef\xbb\xbf{"x":0,"z":0}\r\n\0', STOPPED),
+        ("drive-values", b'{"z":"0","y":"abc"}', STOPPED),
+        ("drive-values", b'{"linear":{"x":0.5},"angular":{"z":0}}', STOPPED),
         ("drive-values", b'{"z":" 2.5e-1 ","x":null}', "M 0.250 0.250"),
         ("lights-solid", b'{"value":{"b":-1,"g":2,"r":"0.5"}}\0', "L 0.000 1.000 0.500"),
         ("lights-flash", b'{"b":"1","g":"no","period":"0"}', "F 1.000 0.000 0.000 0.050"),
     ],
 )
 def test_commands_as_programs_of_other_languages_write_them(bench: Bench, metric: str, raw: bytes, line: str) -> None:
-    bench.send("incoming/drive-values", {"z": 0.5, "valid_ms": 60_000})
+    bench.drive(0.5, valid_ms=60_000)
     assert bench.line("M 0.500 0.500")
     bench.operator.publish(f"{BASE}/incoming/{metric}", raw)
-    assert until(lambda: bench.mcu.trace.lines()[-1] == line, 0.6)  # before the watchdog
+    assert until(lambda: bench.lines[-1] == line, 0.6)  # before the watchdog
 
 
 def test_a_command_with_nan_or_infinity_is_refused_whole(bench: Bench) -> None:
@@ -147,19 +143,18 @@ def test_a_command_with_nan_or_infinity_is_refused_whole(bench: Bench) -> None:
         for number in ('"NaN"', '"-inf"', "NaN", "1e999"):
             bench.operator.publish(f"{BASE}/incoming/{metric}", f"{{{first}:{number}}}".encode())
     assert until(lambda: bench.service.counters["refused"] == 8, 5)
-    assert bench.mcu.trace.lines() == ["M 0.000 0.000"] * 2
+    assert bench.lines == [STOPPED] * 2
 
 
 def test_a_drive_command_without_an_axis_is_logged_once_for_each_sender(
     bench: Bench, caplog: pytest.LogCaptureFixture
 ) -> None:
     for number in range(60):
-        bench.send("incoming/drive-values", {"linear": {"x": 1}, "source": f"s{number % 3}"})
-        bench.send("incoming/drive-values", {"X": number})
+        bench.send("drive-values", {"linear": {"x": 1}, "source": f"s{number % 3}"})
+        bench.send("drive-values", {"X": number})
     for number in range(1000):
-        bench.send("incoming/drive-values", {"Z": 1, "source": f"stranger {number}"})
-    bench.send("incoming/drive-values", {"z": 0.25})
-    assert bench.line("M 0.250 0.250")
+        bench.send("drive-values", {"Z": 1, "source": f"stranger {number}"})
+    assert bench.moves(0.25)
     lines = [record.getMessage() for record in caplog.records if "none of x, z and y" in record.getMessage()]
     assert [sum(f"from {name!r}" in line for line in lines) for name in ("s0", "s1", "s2")] == [1, 1, 1]
     assert sum("'X'" in line for line in lines) == 1
@@ -168,137 +163,108 @@ def test_a_drive_command_without_an_axis_is_logged_once_for_each_sender(
 
 
 def test_after_a_stop_nothing_moves_until_the_reset_also_after_a_restart(bench: Bench) -> None:
-    bench.send("incoming/drive-values", {"z": 0.5})
-    assert bench.line("M 0.500 0.500")
-    bench.send("incoming/estop", STOP)
-    assert stopped(bench)
-    lines = bench.mcu.trace.lines()
-    assert lines[-1] == "M 0.000 0.000"
+    assert bench.moves(0.5)
+    bench.send("estop", STOP)
+    assert bench.stopped()
+    lines = bench.lines
+    assert lines[-1] == STOPPED
     for _ in range(3):
-        bench.send("incoming/drive-values", {"z": 0.25})
-    bench.send("incoming/lights-solid", {"r": 1})
-    assert bench.line("L 0.000 0.000 1.000")  # only motors are stopped
-    boot = state(bench)["boot"]
-    bench.stop()
-    bench.start()
-    assert until(lambda: state(bench)["boot"] != boot, 5)
-    assert (state(bench)["latched"], state(bench)["count"]) == (True, 0)
-    assert state(bench)["recent"] == [STOP["stop"]]
-    bench.send("incoming/drive-values", {"z": 0.25})
-    bench.send("incoming/lights-solid", {"g": 1})
-    assert bench.line("L 0.000 1.000 0.000")
-    assert set(bench.mcu.trace.lines()) & {"M 0.250 0.250"} == set()
-    assert reset(bench)
-    bench.send("incoming/drive-values", {})
-    bench.send("incoming/drive-values", {"z": 0.125})
-    assert bench.line("M 0.125 0.125")
+        bench.drive(0.25)
+    assert bench.shines(r=1)  # only motors are stopped
+    bench.restart()
+    assert (bench.state["latched"], bench.state["count"]) == (True, 0)
+    assert bench.state["recent"] == [STOP["stop"]]
+    bench.drive(0.25)
+    assert bench.shines(g=1)
+    assert set(bench.lines) & {"M 0.250 0.250"} == set()
+    assert bench.reset()
+    bench.send("drive-values", {})
+    assert bench.moves(0.125)
 
 
 def test_after_a_reset_a_person_lets_go_first(bench: Bench) -> None:
-    bench.send("incoming/estop", STOP)
-    assert stopped(bench)
-    send_reset(bench)
-    bench.send("incoming/drive-values", {"z": 0.25})  # at once: after 0.5 s without a command it would be obeyed
+    bench.send("estop", STOP)
+    assert bench.stopped()
+    bench.send_reset()
+    bench.drive(0.25)  # at once: after 0.5 s without a command it would be obeyed
     assert until(lambda: bench.service.counters["overruled"] == 1)
-    bench.send("incoming/drive-values", {"z": 0})
-    bench.send("incoming/drive-values", {"z": 0.125})
-    assert bench.line("M 0.125 0.125")
-    assert "M 0.250 0.250" not in bench.mcu.trace.lines()
+    bench.drive(0)
+    assert bench.moves(0.125)
+    assert "M 0.250 0.250" not in bench.lines
 
 
 def test_a_retained_stop_and_a_retained_reset_do_nothing(bench: Bench) -> None:
     bench.operator.publish(f"{BASE}/incoming/estop", json.dumps(STOP).encode(), retain=True)
-    assert stopped(bench)  # asked to be retained, but live
-    assert reset(bench)
-    bench.stop()
-    bench.start()
+    assert bench.stopped()  # asked to be retained, but live
+    assert bench.reset()
+    bench.restart()
     assert until(lambda: bench.service.counters["stale"] == 1)
-    assert not state(bench)["latched"]
+    assert not bench.state["latched"]
 
 
 def test_what_waits_with_a_stop_does_not_move_the_motors_after_it(bench: Bench) -> None:
     """The service is busy while a drive command, a stop and another drive command arrive."""
     delivered = bench.service.transport.counters["delivered"]
     with bench.occupied():
-        bench.send("incoming/drive-values", {"z": 0.25})
-        bench.send("incoming/estop", STOP)
-        bench.send("incoming/drive-values", {"z": 0.5})
+        bench.drive(0.25)
+        bench.send("estop", STOP)
+        bench.drive(0.5)
         assert until(lambda: bench.service.transport.counters["delivered"] == delivered + 3)
-    assert stopped(bench)
-    bench.send("incoming/lights-solid", {"r": 1})
-    assert bench.line("L 0.000 0.000 1.000")
-    assert set(bench.mcu.trace.lines()) == {"M 0.000 0.000", "L 0.000 0.000 1.000"}
+    assert bench.stopped()
+    assert bench.shines(r=1)
+    assert set(bench.lines) == {STOPPED, "L 0.000 0.000 1.000"}
 
 
 def test_a_stop_does_not_wait_behind_a_full_inbox(bench: Bench) -> None:
     with bench.occupied():
         for _ in range(2000):
             bench.service.post(lambda: time.sleep(0.001))
-        bench.send("incoming/estop", STOP)
+        bench.send("estop", STOP)
         began = time.monotonic()
-    assert stopped(bench)
+    assert bench.stopped()
     assert time.monotonic() - began < 5
-    assert state(bench)["count"] == 1
+    assert bench.state["count"] == 1
 
 
 def test_a_command_that_waited_for_too_long_moves_nothing(bench: Bench) -> None:
     with bench.occupied():
-        bench.send("incoming/drive-values", {"z": 0.5})
+        bench.drive(0.5)
         time.sleep(0.6)
-    bench.send("incoming/lights-solid", {"r": 1})
-    assert bench.line("L 0.000 0.000 1.000")
+    assert bench.shines(r=1)
     assert bench.service.counters["late"] == 1
-    assert set(bench.mcu.trace.lines()) == {"M 0.000 0.000", "L 0.000 0.000 1.000"}
+    assert set(bench.lines) == {STOPPED, "L 0.000 0.000 1.000"}
 
 
 def test_a_command_is_valid_for_its_valid_ms(bench: Bench) -> None:
-    bench.send("incoming/drive-values", {"z": 0.5, "valid_ms": 100})
-    assert bench.line("M 0.500 0.500")
+    assert bench.moves(0.5, valid_ms=100)
     moved = next(entry for entry in bench.mcu.trace.entries() if entry.line == "M 0.500 0.500")
-    assert until(lambda: bench.mcu.trace.lines()[-1] == "M 0.000 0.000", 2)
+    assert until(lambda: bench.lines[-1] == STOPPED, 2)
     assert 0.08 <= (bench.mcu.trace.entries()[-1].ns - moved.ns) / 1e9 <= 0.3
-    bench.send("incoming/drive-values", {"z": 0.25, "valid_ms": 5000})  # never longer than the watchdog
-    bench.send("incoming/drive-values", {"z": 0.375, "valid_ms": 50})  # a later command may end earlier
+    bench.drive(0.25, valid_ms=5000)  # never longer than the watchdog
+    bench.drive(0.375, valid_ms=50)  # a later command may end earlier
     assert bench.line("M 0.375 0.375")
-    assert until(lambda: bench.mcu.trace.lines()[-1] == "M 0.000 0.000", 2)
+    assert until(lambda: bench.lines[-1] == STOPPED, 2)
 
 
-def test_people_go_before_scripts(bench: Bench) -> None:
-    script = {"z": 0.25, "source": "autonomy", "run": 7}
-    bench.send("incoming/drive-values", script)
-    assert until(lambda: bench.service.counters["overruled"] == 1)  # the owner has just started
-    time.sleep(2)
-    bench.send("incoming/drive-values", script)
-    assert bench.line("M 0.250 0.250")
-    bench.send("incoming/drive-values", {"z": 0.5})
-    bench.send("incoming/drive-values", {**script, "z": 0.75})
-    assert bench.line("M 0.500 0.500")
-    bench.send("incoming/drive-values", {"z": 0, "valid_ms": 0})
-    assert until(lambda: state(bench).get("barred") == 7, 5)
-    time.sleep(2.1)
-    bench.send("incoming/drive-values", {**script, "z": 0.75})
-    bench.send("incoming/drive-values", {**script, "z": 1, "run": 8})
-    assert bench.line("M 1.000 1.000")
-    assert "M 0.750 0.750" not in bench.mcu.trace.lines()
-
-
-def test_a_script_that_a_person_ended_does_not_move_the_motors_after_a_restart(bench: Bench) -> None:
+def test_a_script_waits_for_a_person_who_ends_it_and_moves_nothing_after_a_restart(bench: Bench) -> None:
     script = {"z": 0.25, "source": "autonomy", "run": 7}
     time.sleep(2)
-    bench.send("incoming/drive-values", script)
+    bench.send("drive-values", script)
     assert bench.line("M 0.250 0.250")
-    bench.send("incoming/drive-values", {"z": 0, "valid_ms": 0})
-    assert until(lambda: state(bench).get("barred") == 7, 5)
-    bench.stop()
-    bench.start()
-    before = len(bench.mcu.trace.lines())
+    assert bench.moves(0.5)
+    bench.send("drive-values", {**script, "z": 0.75})  # people go before scripts
+    bench.drive(0, valid_ms=0)
+    assert until(lambda: bench.state.get("barred") == 7, 5)
+    bench.restart()
+    before = len(bench.lines)
     end = time.monotonic() + 2.5
     while time.monotonic() < end:
-        bench.send("incoming/drive-values", script)
+        bench.send("drive-values", script)
         time.sleep(0.05)
-    bench.send("incoming/drive-values", {**script, "run": 8, "z": 0.5})
+    bench.send("drive-values", {**script, "run": 8, "z": 0.5})
     assert bench.line("M 0.500 0.500")
-    assert "M 0.250 0.250" not in bench.mcu.trace.lines()[before:]
+    assert "M 0.250 0.250" not in bench.lines[before:]
+    assert "M 0.750 0.750" not in bench.lines
 
 
 def test_stops_are_subscribed_to_before_drive_commands() -> None:

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from types import ModuleType
-
 import pytest
 
 from pebble.services.serial_mcu_bridge.line.serial_line import LineState
 from pebble.services.serial_mcu_bridge.line.silence import Silence
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.frame import Frame, Type, encode
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.host import Session
-from pebble.services.serial_mcu_bridge.text import goob_base, imu_mpu6050
-from pebble.services.serial_mcu_bridge.text.device_log import is_known
 
 #: Per second: r received at rest, d received while it was driven, . nothing, o opened again, x the device has gone.
 CASES = {
@@ -40,30 +36,6 @@ def test_silence(seconds: str, state: str, silent_ms: int | None) -> None:
         line = LineState.ABSENT if second == "x" else LineState.READY
         found = silence.check(line, opened, received, float(now), idle=second != "d")
     assert found == (state, silent_ms)
-
-
-#: Of each protocol what its board sends, and what else comes on a line: noise, echoes, other programs.
-KNOWN = {
-    goob_base: [b"T a0=1 a1=2 a2=3", b"T t0=1 t1=2 t2=3 chg=1", b"C chg=0 v=7.5", b"C v=7.5\r", b"OK M", b"WARN late",
-                b"ERR speed", b"Done!"],
-    imu_mpu6050: [b"I n=1 ms=2 ax=0 ay=0 az=1 gx=0 gy=0 gz=0 t=20 r=0 p=0"],
-}  # fmt: skip
-NOISE = [b"", b"\r", b" ", b"\0", b"\xff\xfe\x80", b"\x00\xf8\x00\xf8", b"~", b"M 0.000 0.000", b"L 0.000 0.000 0.000",
-         b"T", b"C", b"T a0=1", b"T a0=x a1=2 a2=3", b"C v=nan", b"C v=", b"TC v=7", b"OKAY", b"ok", b"Done", b"I n=1",
-         b">>> ", b"Traceback (most recent call last):", b"SyntaxError: invalid syntax", b"login:", b"garbage",
-         bytes(range(128, 256))]  # fmt: skip
-
-
-@pytest.mark.parametrize("protocol", KNOWN)
-def test_only_lines_of_the_protocol_count_as_received_from_its_board(protocol: ModuleType) -> None:
-    def understood(line: bytes) -> bool:
-        found = protocol.parse(line)
-        reports = found if isinstance(found, list) else [found] if found is not None else []
-        return any(map(is_known, reports))
-
-    assert [line for line in KNOWN[protocol] if not understood(line)] == []
-    others = [line for other, lines in KNOWN.items() for line in lines if other is not protocol]
-    assert [line for line in (*NOISE, *others) if understood(line)] == []
 
 
 ECHO = Frame(Type.PING, sequence=1)

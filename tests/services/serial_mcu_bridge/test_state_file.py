@@ -61,21 +61,19 @@ def test_closing_waits_for_the_newest_value(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "content", [b"", b"{", b"\xff", b'{"latched": tr', b"[" * 10_000, b"null", b'"' + b"x" * 20_000 + b'"']
+    "content", [b"", b"{", b"\xff", b'{"latched": tr', b"[" * 10_000, b"null", b'"' + b"x" * 20_000 + b'"', None]
 )
-def test_a_damaged_file_differs_from_none(tmp_path: Path, content: bytes) -> None:
+def test_a_damaged_file_differs_from_none(tmp_path: Path, content: bytes | None) -> None:
+    """A folder in its place is one, too, and a failed write."""
     path = tmp_path / "estop.json"
-    path.write_bytes(content)
-    assert isinstance(Saved(path).file.load(), Unreadable)
-
-
-def test_a_folder_in_its_place_is_a_damaged_file_and_a_failed_write(tmp_path: Path) -> None:
-    path = tmp_path / "estop.json"
-    path.mkdir()
+    if content is None:
+        path.mkdir()
+    else:
+        path.write_bytes(content)
     saved = Saved(path)
     assert isinstance(saved.file.load(), Unreadable)
     number = saved.file.save({})
-    assert until(lambda: saved.results == [(number, False)])
+    assert until(lambda: saved.results == [(number, content is not None)])
 
 
 @pytest.mark.timeout(10)

@@ -2,25 +2,17 @@
 
 from __future__ import annotations
 
-import json
-import shutil
 import subprocess
 import sys
-import tempfile
 import wave
-from contextlib import ExitStack
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
-import msgspec
 import numpy as np
 
-from pebble.config import load
 from pebble.media.pcm import Samples
-from pebble.runtime.connections import hub_settings, local_transport
 from pebble.simulation.loudspeaker import Playback, playbacks
-from pebble.transports import Message, QoS, State
+from tests.kit.robot import Program, ProgramRobot
 from tests.support import ROOT, Child, until
 
 RATE = 16_000
@@ -47,55 +39,49 @@ def write_wav(path: Path, samples: Samples, rate: int = RATE) -> Path:
     return path
 
 
-class Soundboard:
+class Soundboard(ProgramRobot):
     """``playback`` are keys of services.soundboard_handler.playback; the player records unless they name another."""
 
+    process: Program
+
     def __init__(self, kind: str, port: int, *, exclusive: bool = False, **playback: Any) -> None:
-        self._kind = kind
-        self._resources = ExitStack()
-        self.folder = Path(tempfile.mkdtemp(prefix="pbl")).resolve()  # short: it holds unix sockets
-        self._resources.callback(shutil.rmtree, self.folder, ignore_errors=True)
-        self.base = f"pebble/robots/{self.folder.name}"  # of its own: the broker retains what others published
+        super().__init__(kind, port, {})
         self.sounds, self.record = self.folder / "sounds", self.folder / "played"
         self.sounds.mkdir()
         self.player = [*LOUDSPEAKER, "--record", str(self.record), *["--exclusive"] * exclusive]
-        self._config_file = self._write_config(port, playback)
-        self.config = load(self._config_file)
-        self.statuses: list[dict[str, Any]] = []
-        self.catalogues: list[dict[str, Any]] = []
-        self.process: subprocess.Popen[bytes]
-
-    def __enter__(self) -> Self:
-        if self._kind == "zenoh":
-            self._start("pebble.runtime.hub", msgspec.json.encode(hub_settings(self.config), enc_hook=str).decode())
-        self.local = local_transport(self.config, "client").open(10)
-        self._resources.callback(self.local.close)
-        assert self.local.state is State.CONNECTED, self.local.problem
-        self.local.subscribe(f"{self.base}/outgoing/soundboard-status", _appends_to(self.statuses))
-        self.local.subscribe(f"{self.base}/outgoing/soundboard-files", _appends_to(self.catalogues))
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
-        self._resources.close()
+        options = {"directory": str(self.sounds), "player_command": self.player, "scan_interval": 1, **playback}
+        self.raw["services"] = {
+            "mqtt_bridge": {"media": {"audio_receiver": {"command": [*self.player, *RAW]}}},
+            "soundboard_handler": {"enabled": True, "playback": options},
+        }
+        self.config = self.write()
 
     def start(self) -> Self:
         """Start the service; returns once it has published what it is doing."""
         count = len(self.statuses), len(self.catalogues)
-        self.process = self._start("pebble.services.soundboard_handler", str(self._config_file))
+        self.process = self.run("pebble.services.soundboard_handler")
         assert until(lambda: len(self.statuses) > count[0] and len(self.catalogues) > count[1], 20)
         return self
 
+    def with_clip(self, name: str, seconds: float) -> Self:
+        """Put a tone into the folder, and start the service."""
+        write_wav(self.sounds / name, tone(seconds))
+        return self.start()
+
     def send(self, body: Any, *, retain: bool = False) -> None:
-        raw = json.dumps(body).encode()
-        topic = f"{self.base}/incoming/soundboard-command"
-        assert until(lambda: self.local.publish(topic, raw, qos=QoS.DELIVERED, retain=retain)), self.local.problem
+        self.world.command("soundboard-command", body, retain=retain)
 
     def play(self, file: str, **more: Any) -> None:
         self.send({"action": "play", "file": file, **more})
 
     def became(self, timeout: float = 15.0, **expected: Any) -> bool:
         """Wait until the newest status has these values."""
-        return until(lambda: expected.items() <= self.statuses[-1].items(), timeout)
+        return self.world.became("soundboard-status", timeout, **expected)
+
+    def plays(self, file: str, **more: Any) -> bool:
+        """Play a clip, and wait until it is over without an error."""
+        self.play(file, **more)
+        return self.became(playing=True, file=file, error=None) and self.became(playing=False, file=None, error=None)
 
     def refused(self, body: Any) -> str | None:
         """Send it to a soundboard that plays nothing; the error that it publishes."""
@@ -105,6 +91,14 @@ class Soundboard:
         assert not self.statuses[-1]["playing"], body
         error: str | None = self.statuses[-1]["error"]
         return error
+
+    @property
+    def statuses(self) -> list[dict[str, Any]]:
+        return self.world.payloads("soundboard-status")
+
+    @property
+    def catalogues(self) -> list[dict[str, Any]]:
+        return self.world.payloads("soundboard-files")
 
     @property
     def files(self) -> list[str]:
@@ -122,8 +116,8 @@ class Soundboard:
     def hold_loudspeaker(self, path: Path) -> subprocess.Popen[bytes]:
         """Another program plays ``path``."""
         process = Child([*self.player, str(path)], cwd=ROOT)
-        self._resources.callback(process.wait, 10)
-        self._resources.callback(process.kill)
+        self._ends.callback(process.wait, 10)
+        self._ends.callback(process.kill)
         assert until(lambda: len(self.played) == 1)
         return process
 
@@ -131,33 +125,3 @@ class Soundboard:
         """The processes that this service has started and that run."""
         children = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children").read_text().split()
         return [int(word) for word in children]
-
-    def _start(self, module: str, argument: str) -> subprocess.Popen[bytes]:
-        process = Child([sys.executable, "-m", module, argument], cwd=ROOT)
-        self._resources.callback(process.wait, 10)
-        self._resources.callback(process.terminate)
-        return process
-
-    def _write_config(self, port: int, playback: dict[str, Any]) -> Path:
-        (self.folder / "run").mkdir(mode=0o700)
-        broker = {"host": "127.0.0.1", "port": port}
-        options = {"directory": str(self.sounds), "player_command": self.player, "scan_interval": 1, **playback}
-        raw = {
-            "robot": {"id": self.folder.name},
-            "transport": {"kind": self._kind, "run_dir": str(self.folder / "run")},
-            "local_mqtt": broker,
-            "services": {
-                "mqtt_bridge": {"media": {"audio_receiver": {"command": [*self.player, *RAW]}}},
-                "soundboard_handler": {"enabled": True, "playback": options},
-            },
-        }
-        path = self.folder / "robot.json"
-        path.write_text(json.dumps(raw))
-        return path
-
-
-def _appends_to(received: list[dict[str, Any]]) -> Any:
-    def receive(message: Message) -> None:
-        received.append(json.loads(message.payload))
-
-    return receive

@@ -40,14 +40,9 @@ def test_what_leads_outside_is_neither_listed_nor_found(tmp_path: Path) -> None:
     (inside / "other").symlink_to(outside)
     clips = Clips(inside)
     assert clips.scan() == ["a.wav"]
-    for name in (
-        "b.wav",
-        "other/b.wav",
-        "../sounds-other/b.wav",
-        str(outside / "b.wav"),
-        "a.wav/../../sounds-other/b.wav",
-    ):
+    for name in ("b.wav", "other/b.wav", "../sounds-other/b.wav", "a.wav/../../sounds-other/b.wav"):
         assert clips.find(name) is None, name
+    assert clips.find(str(outside / "b.wav")) is None
 
 
 def test_the_folder_may_be_a_link(tmp_path: Path) -> None:

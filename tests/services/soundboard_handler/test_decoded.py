@@ -3,28 +3,21 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from tests.media.sound_files import encode
+from tests.services.soundboard_handler.conftest import Make
 from tests.services.soundboard_handler.soundboard_rig import LONG, Soundboard, tone, write_wav
-from tests.support import Broker, until
+from tests.support import until
 
 
 @pytest.fixture
-def board(local: Broker) -> Iterator[Soundboard]:
-    with Soundboard("mqtt", local.port) as board:
-        yield board
-
-
-@pytest.fixture
-def quiet(local: Broker) -> Iterator[Soundboard]:
+def quiet(make: Make) -> Soundboard:
     """It plays at a quarter of the volume."""
-    with Soundboard("mqtt", local.port, volume=0.25) as board:
-        yield board
+    return make(volume=0.25)
 
 
 def test_other_formats_are_decoded_and_played(board: Soundboard) -> None:
@@ -34,9 +27,7 @@ def test_other_formats_are_decoded_and_played(board: Soundboard) -> None:
     board.start()
     assert board.files == ["tone.flac", "tone.mp3", "tone.ogg"]
     for name in board.files:
-        board.play(name)
-        assert board.became(playing=True, file=name, error=None)
-        assert board.became(playing=False, error=None)
+        assert board.plays(name)
     assert [(one.file, one.rate, one.channels) for one in board.played] == [("-", 48_000, 2)] * 3
     assert np.array_equal(board.samples(0), sound), "flac loses nothing"
     for number in (1, 2):
@@ -49,9 +40,7 @@ def test_other_formats_are_decoded_and_played(board: Soundboard) -> None:
 def test_the_volume_of_a_wav_file(quiet: Soundboard) -> None:
     write_wav(quiet.sounds / "a.wav", tone(0.3))
     quiet.start()
-    quiet.play("a.wav")
-    assert quiet.became(playing=True, file="a.wav", error=None)
-    assert quiet.became(playing=False, error=None)
+    assert quiet.plays("a.wav")
     assert quiet.played[0].file == "-"
     assert np.array_equal(quiet.samples(), np.rint(0.25 * tone(0.3)).astype(np.int16))
 
@@ -62,9 +51,7 @@ def test_a_decoded_clip_is_stopped_replaced_and_repeated(quiet: Soundboard) -> N
     quiet.start()
     quiet.play("long.wav")
     assert until(lambda: len(quiet.played) == 1)
-    quiet.play("short.wav", repeat=2)
-    assert quiet.became(playing=True, file="short.wav", error=None)
-    assert quiet.became(playing=False, error=None)
+    assert quiet.plays("short.wav", repeat=2)
     assert [one.stopped for one in quiet.played] == [True, False, False]
     quiet.play("long.wav")
     quiet.send(False)
@@ -91,18 +78,18 @@ def test_what_cannot_be_decoded_is_reported(quiet: Soundboard, name: str, error:
     assert quiet.played == []
 
 
-def test_an_hour_of_sound_takes_little_memory(local: Broker) -> None:
+def test_an_hour_of_sound_takes_little_memory(make: Make) -> None:
     """The player reads only a little."""
-    with Soundboard("mqtt", local.port, volume=0.5, player_command=LONG) as board:
-        path = write_wav(board.sounds / "hour.wav", tone(0.1, 2))
-        with path.open("r+b") as file:
-            size = 3600 * 16_000 * 4
-            file.seek(40)
-            file.write(size.to_bytes(4, "little"))
-            file.truncate(44 + size)
-        board.start()
-        board.play("hour.wav")
-        assert board.became(playing=True, file="hour.wav", error=None)
-        assert until(lambda: board.played and board.played[0].frames())
-        peak_kb = int(re.search(r"VmHWM:\s+(\d+)", Path(f"/proc/{board.process.pid}/status").read_text())[1])
-        assert peak_kb < path.stat().st_size / 1024 / 2
+    board = make(volume=0.5, player_command=LONG)
+    path = write_wav(board.sounds / "hour.wav", tone(0.1, 2))
+    with path.open("r+b") as file:
+        size = 3600 * 16_000 * 4
+        file.seek(40)
+        file.write(size.to_bytes(4, "little"))
+        file.truncate(44 + size)
+    board.start()
+    board.play("hour.wav")
+    assert board.became(playing=True, file="hour.wav", error=None)
+    assert until(lambda: board.played and board.played[0].frames())
+    peak_kb = int(re.search(r"VmHWM:\s+(\d+)", Path(f"/proc/{board.process.pid}/status").read_text())[1])
+    assert peak_kb < path.stat().st_size / 1024 / 2

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pebble.services.autonomy_manager.gate.client_filter import ClientFilter, DriveCommand, Login, Output
+from pebble.services.autonomy_manager.gate.client_filter import ClientFilter, DriveCommand, Login
 from pebble.services.autonomy_manager.gate.packets import MAX_PACKET
 from pebble.services.autonomy_manager.gate.topics import TopicRules
 from tests.services.autonomy_manager.gate.mqtt_bytes import (
@@ -37,14 +39,11 @@ def connected() -> ClientFilter:
     return client
 
 
-def test_the_login_at_the_broker_is_the_robots() -> None:
+def test_the_login_at_the_broker_is_the_robots_or_none() -> None:
     client = new_filter(Login(b"robot", b"secret"))
     output = client.feed(connect(client_id="follow"))
     assert bytes(output.upstream) == connect("robot", "secret", client_id="follow")
     assert client.connected
-
-
-def test_without_a_login_of_the_robots_the_broker_gets_none() -> None:
     assert bytes(new_filter().feed(connect(client_id="follow")).upstream) == connect(None, None, client_id="follow")
 
 
@@ -57,6 +56,7 @@ def test_a_wrong_login_is_refused(user: str | None, password: str | None) -> Non
     assert bytes(output.answers) == b"\x20\x02\x00\x04"
     assert output.refusal is not None
     assert (bytes(output.upstream), output.drive, client.connected) == (b"", [], False)
+    assert new_filter().feed(publish(DRIVE, '{"z":1}')).refusal == "the first packet is no CONNECT"
 
 
 @pytest.mark.parametrize(
@@ -68,17 +68,11 @@ def test_other_versions_of_mqtt_get_their_own_refusal(level: int, answer: bytes)
     assert "only MQTT 3.1.1" in str(output.refusal)
 
 
-@pytest.mark.parametrize("topic", [DRIVE, RESET])
-def test_a_will_that_drives_is_left_out(topic: str) -> None:
-    client = new_filter()
-    output = client.feed(connect(will=(topic, '{"z":1}'), will_retain=True, client_id="c"))
-    assert bytes(output.upstream) == connect(None, None, client_id="c")
-
-
-def test_another_will_stays() -> None:
-    will = ("bye", "now")
-    output = new_filter().feed(connect(will=will, will_retain=True, client_id="c"))
-    assert bytes(output.upstream) == connect(None, None, will=will, will_retain=True, client_id="c")
+@pytest.mark.parametrize(("topic", "stays"), [(DRIVE, False), (RESET, False), ("bye", True)])
+def test_a_will_that_drives_is_left_out(topic: str, stays: bool) -> None:
+    output = new_filter().feed(connect(will=(topic, '{"z":1}'), will_retain=True, client_id="c"))
+    will: dict[str, Any] = {"will": (topic, '{"z":1}'), "will_retain": True} if stays else {}
+    assert bytes(output.upstream) == connect(None, None, client_id="c", **will)
 
 
 @pytest.mark.parametrize(("qos", "answer"), [(0, b""), (1, puback(7)), (2, pubrec(7))])
@@ -95,13 +89,9 @@ def test_qos_2_is_completed_without_the_broker_and_counts_once() -> None:
     assert (again.drive, bytes(again.answers)) == ([], pubrec(7))
     assert bytes(client.feed(pubrel(7)).answers) == pubcomp(7)
     assert bytes(client.feed(pubrel(7)).upstream) == pubrel(7), "the second one is the broker's"
-
-
-def test_a_release_of_what_the_broker_has_is_forwarded() -> None:
-    client = connected()
     sent = publish("other", "x", 2, 8) + pubrel(8)
     output = client.feed(sent)
-    assert (bytes(output.upstream), bytes(output.answers)) == (sent, b"")
+    assert (bytes(output.upstream), bytes(output.answers)) == (sent, b""), "of what the broker has"
 
 
 @pytest.mark.parametrize(
@@ -147,10 +137,6 @@ def test_what_is_malformed_ends_the_connection_after_what_came_before(malformed:
     assert bytes(output.upstream) == PINGREQ
 
 
-def test_the_first_packet_must_be_a_connect() -> None:
-    assert new_filter().feed(publish(DRIVE, '{"z":1}')).refusal == "the first packet is no CONNECT"
-
-
 @given(st.binary(max_size=200), st.booleans())
 def test_garbage_is_refused_or_forwarded_and_never_raises(garbage: bytes, logged_in: bool) -> None:
     client = connected() if logged_in else new_filter()
@@ -179,8 +165,4 @@ def test_fragments_of_any_size_give_the_same(packets: list[bytes], step: int) ->
     drives = [sent for sent in packets if DRIVE.encode() in sent]
     assert bytes(upstream) == b"".join(sent for sent in packets if sent not in drives) + DISCONNECT
     assert len(drive) <= len(drives)
-    assert _whole(stream).drive == drive
-
-
-def _whole(stream: bytes) -> Output:
-    return connected().feed(stream)
+    assert connected().feed(stream).drive == drive

@@ -2,37 +2,27 @@
 
 from __future__ import annotations
 
-import json
 import os
 import select
 import struct
 import threading
 import time
 import tty
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Callable
+from contextlib import ExitStack, suppress
 from itertools import count
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-import msgspec
-
-from pebble.config import Config, parse
-from pebble.errors import PebbleError
-from pebble.runtime.connections import local_transport
+from pebble.config import Config
 from pebble.runtime.process import view_of
-from pebble.service import Service
 from pebble.services.serial_mcu_bridge.serial_service import bridge_of
-from pebble.transports import Message, MqttSettings, QoS, State, Transport, ZenohSettings, create
-from pebble.transports.memory import MemoryHub, MemoryTransport
+from tests.kit.robot import ROBOT, Listener, LocalNetwork, Running
 from tests.services.serial_mcu_bridge import mcu_wire as wire
 from tests.services.serial_mcu_bridge.mcu_wire import M, Received
-from tests.support import Broker, until
-from tests.transports.zenoh_net import HubProcess
+from tests.support import until
 
-ROBOT = "rover"
-BASE = f"pebble/robots/{ROBOT}"
 _numbers = count()
 STEP_S = 0.002
 BOOT_S = 0.05  # before the HELLO: a host discards the input from before it opened the port
@@ -104,6 +94,11 @@ class ScriptedMcu:
     def commands(self) -> list[Received]:
         return [received for _, received in list(self.received) if received.kind == wire.CMD]
 
+    def obeyed(self, count: int = 1) -> list[tuple[int, bytes]]:
+        """Wait for so many commands; return the interface and the payload of each."""
+        assert until(lambda: len(self.commands()) >= count)
+        return [(command.interface, command.payload) for command in self.commands()]
+
     def asked(self) -> int:
         return sum(received.kind == wire.DESCRIBE_REQ for _, received in list(self.received))
 
@@ -167,119 +162,6 @@ class ScriptedMcu:
             os.write(self._master, data)
 
 
-class LocalNetwork:
-    """A robot's local transport of one kind: ``memory``, ``mqtt`` (a real mosquitto) or ``zenoh`` (our hub)."""
-
-    def __init__(self, kind: str, folder: Path) -> None:
-        self.kind, self._ends = kind, ExitStack()
-        self.transport: dict[str, Any] = {}
-        self.local_mqtt: dict[str, Any] = {}
-        if kind == "memory":
-            self._memory = MemoryHub()
-        elif kind == "mqtt":
-            broker = self._broker = Broker(folder)
-            self._ends.callback(broker.stop)
-            self.local_mqtt = {"host": "127.0.0.1", "port": broker.port}
-            self._mqtt = MqttSettings(host="127.0.0.1", port=broker.port)
-        else:
-            self._run_dir = folder / "run"
-            hub = HubProcess(self._run_dir).start()
-            self._ends.callback(hub.kill)
-            self.transport = {"kind": "zenoh", "run_dir": str(self._run_dir)}
-
-    def config(self, folder: Path, serial: dict[str, Any], *, robot: str = ROBOT, **services: Any) -> Config:
-        raw = {
-            "robot": {"id": robot},
-            "transport": {"kind": "mqtt", **self.transport, "state_dir": str(folder / "state")},
-            "local_mqtt": self.local_mqtt,
-            "services": {"serial_mcu_bridge": serial, **services},
-        }
-        return parse(raw, folder=folder, env={})
-
-    def robots_transport(self, config: Config, name: str, *, as_published: bool = False) -> Transport:
-        """Return the transport that a process of the robot would use."""
-        if self.kind == "memory":
-            return MemoryTransport(name, self._memory)
-        return local_transport(config, name, as_published=as_published)
-
-    def client(self, name: str) -> Transport:
-        if self.kind == "memory":
-            return MemoryTransport(name, self._memory)
-        if self.kind == "mqtt":
-            return create("mqtt", name, self._mqtt)
-        return create("zenoh", name, ZenohSettings(run_dir=self._run_dir, client=True))
-
-    @contextmanager
-    def outage(self) -> Iterator[None]:
-        """Stop the broker meanwhile. MQTT only: peers on Zenoh exchange messages without a hub."""
-        self._broker.kill()
-        yield
-        self._broker.start()
-
-    def close(self) -> None:
-        self._ends.close()
-
-
-class Listener:
-    """A client that subscribes to all outgoing topics of the robot and can send commands."""
-
-    def __init__(self, transport: Transport, base: str = BASE) -> None:
-        self.received: list[Message] = []
-        self.at: list[float] = []
-        self.base = base
-        self.transport = transport.open(10)
-        assert transport.state is State.CONNECTED, transport.problem
-        transport.subscribe(f"{base}/outgoing/#", self._receive, direct=True)
-
-    def _receive(self, message: Message) -> None:
-        self.at.append(time.monotonic())
-        self.received.append(message)
-
-    def on(self, metric: str) -> list[Message]:
-        return [message for message in list(self.received) if message.topic == f"{self.base}/outgoing/{metric}"]
-
-    def payloads(self, metric: str) -> list[Any]:
-        return [msgspec.json.decode(message.payload) for message in self.on(metric) if message.payload]
-
-    def first(self, metric: str) -> float:
-        """Return when the first message on this topic was received."""
-        pairs = zip(list(self.received), list(self.at), strict=False)
-        return next(at for message, at in pairs if message.topic == f"{self.base}/outgoing/{metric}")
-
-    def retained(self, metric: str) -> list[bytes]:
-        """Return the payload of the newest message on a topic; an empty list if that message cleared the topic."""
-        return [message.payload for message in self.on(metric)[-1:] if message.payload]
-
-    def command(self, metric: str, body: Any, *, retain: bool = False) -> None:
-        raw = body if isinstance(body, bytes) else json.dumps(body).encode()
-        assert self.transport.publish(f"{self.base}/incoming/{metric}", raw, qos=QoS.DELIVERED, retain=retain)
-
-
-class Running:
-    """Runs a service on a thread of its own, as its process would; ``error`` is what ended it."""
-
-    def __init__(self, service: Service) -> None:
-        self.service = service
-        self.error: PebbleError | None = None
-        self._thread = threading.Thread(target=self._run, daemon=True)
-        self._thread.start()
-
-    def _run(self) -> None:
-        try:
-            self.service.run()
-        except PebbleError as error:
-            self.error = error
-
-    @property
-    def alive(self) -> bool:
-        return self._thread.is_alive()
-
-    def stop(self) -> None:
-        self.service.quit()
-        self._thread.join(10)
-        assert not self._thread.is_alive(), "the service does not end"
-
-
 class Rig:
     """A local transport, a subscriber, and any number of serial lines with one MCU each, by instance name.
 
@@ -294,7 +176,8 @@ class Rig:
             network = LocalNetwork(kind, folder)
             self._ends.callback(network.close)
         self.network = network
-        self.world = self.listener("world")
+        self.world = world = self.listener("world")
+        self.described, self.got, self.cleared, self.values = world.described, world.got, world.cleared, world.values
         self._config: Config | None = None
         self.lines: dict[str, Running] = {}
         self.mcus: dict[str, ScriptedMcu] = {}
@@ -321,6 +204,13 @@ class Rig:
         self._ends.callback(running.stop)
         return running
 
+    def up(self, manifest: M, name: str = "one", **section: Any) -> tuple[ScriptedMcu, Running]:
+        """Plug an MCU in and start its bridge; returns once its manifest is published and its aliases are in use."""
+        mcu, running = self.mcu(manifest, name), self.bridge(name, **section)
+        self.described(manifest.uid)
+        assert self.claimed(name)
+        return mcu, running
+
     def claimed(self, name: str = "one") -> bool:
         """Wait until other devices have had time to object to the aliases, and those of commands are subscribed to."""
         service, done = self.lines[name].service, threading.Event()
@@ -340,7 +230,3 @@ def motion(ax: int = 9807) -> bytes:
 
 def summary() -> bytes:
     return struct.pack("<H3hIIH", 1001, 5, -6, 7, 1000, 2, 200)
-
-
-def wait_for_payload(listener: Listener, metric: str) -> bool:
-    return until(lambda: listener.payloads(metric), 5)

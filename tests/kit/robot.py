@@ -1,0 +1,251 @@
+"""A robot for tests of its programs: its local transport, a client that sees and sends, and programs as processes."""
+
+from __future__ import annotations
+
+import json
+import os
+import runpy
+import shutil
+import signal
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import msgspec
+
+from pebble.config import Config, load, parse
+from pebble.errors import PebbleError
+from pebble.runtime.connections import local_transport
+from pebble.service import Service
+from pebble.transports import Message, MqttSettings, QoS, State, Transport, ZenohSettings, create
+from pebble.transports.memory import MemoryHub, MemoryTransport
+from tests.support import Broker, until
+from tests.transports.forked import Forked
+from tests.transports.zenoh_net import HubProcess
+
+ROBOT = "rover"
+BASE = f"pebble/robots/{ROBOT}"
+SILENCE_S = 5.0  # a machine that does too much at once is not a broker that stopped answering
+
+
+class Listener:
+    """A client that subscribes to all outgoing topics of the robot and can send commands."""
+
+    def __init__(self, transport: Transport, base: str = BASE) -> None:
+        self.received: list[Message] = []
+        self.at: list[float] = []
+        self.base = base
+        self.transport = transport.open(10)
+        assert transport.state is State.CONNECTED, transport.problem
+        transport.subscribe(f"{base}/outgoing/#", self._receive, direct=True)
+
+    def _receive(self, message: Message) -> None:
+        self.at.append(time.monotonic())
+        self.received.append(message)
+
+    def on(self, metric: str) -> list[Message]:
+        return [message for message in list(self.received) if message.topic == f"{self.base}/outgoing/{metric}"]
+
+    def payloads(self, metric: str) -> list[Any]:
+        return [msgspec.json.decode(message.payload) for message in self.on(metric) if message.payload]
+
+    def newest(self, metric: str) -> Any:
+        """Return what was published last; an empty dict before that, and once it was cleared."""
+        return next((msgspec.json.decode(raw) for raw in self.retained(metric)), {})
+
+    def became(self, metric: str, timeout: float = 15.0, **fields: Any) -> bool:
+        """Wait until the newest message on a topic has these fields."""
+        return until(lambda: fields.items() <= self.newest(metric).items(), timeout)
+
+    def described(self, uid: str | bytes) -> None:
+        """Wait until this MCU's manifest is retained."""
+        assert until(lambda: self.retained(f"mcu/{uid!s}/describe"), 5), uid
+
+    def got(self, metric: str) -> bool:
+        """Wait for a payload on this topic."""
+        return until(lambda: self.payloads(metric), 5)
+
+    def cleared(self, *metrics: str, timeout: float = 3.0) -> bool:
+        """Wait until nothing is retained on these topics."""
+        return until(lambda: not any(self.retained(metric) for metric in metrics), timeout)
+
+    def values(self, metric: str) -> list[Any]:
+        """Return the ``value`` of each payload on this topic."""
+        return [body["value"] for body in self.payloads(metric)]
+
+    def first(self, metric: str) -> float:
+        """Return when the first message on this topic was received."""
+        pairs = zip(list(self.received), list(self.at), strict=False)
+        return next(at for message, at in pairs if message.topic == f"{self.base}/outgoing/{metric}")
+
+    def retained(self, metric: str) -> list[bytes]:
+        """Return the payload of the newest message on a topic; an empty list if that message cleared the topic."""
+        return [message.payload for message in self.on(metric)[-1:] if message.payload]
+
+    def command(self, metric: str, body: Any, *, retain: bool = False) -> None:
+        raw = body if isinstance(body, bytes) else json.dumps(body).encode()
+        topic = f"{self.base}/incoming/{metric}"
+        sent = until(lambda: self.transport.publish(topic, raw, qos=QoS.DELIVERED, retain=retain))
+        assert sent, self.transport.problem
+
+
+class LocalNetwork:
+    """A robot's local transport of one kind: ``memory``, ``mqtt`` (a real mosquitto) or ``zenoh`` (our hub)."""
+
+    def __init__(self, kind: str, folder: Path) -> None:
+        self.kind, self._ends = kind, ExitStack()
+        self.transport: dict[str, Any] = {}
+        self.local_mqtt: dict[str, Any] = {}
+        if kind == "memory":
+            self._memory = MemoryHub()
+        elif kind == "mqtt":
+            broker = self._broker = Broker(folder)
+            self._ends.callback(broker.stop)
+            self.local_mqtt = {"host": "127.0.0.1", "port": broker.port}
+            self._mqtt = MqttSettings(host="127.0.0.1", port=broker.port)
+        else:
+            self._run_dir = folder / "run"
+            hub = HubProcess(self._run_dir).start()
+            self._ends.callback(hub.kill)
+            self.transport = {"kind": "zenoh", "run_dir": str(self._run_dir)}
+
+    def config(self, folder: Path, serial: dict[str, Any], *, robot: str = ROBOT, **services: Any) -> Config:
+        raw = {
+            "robot": {"id": robot},
+            "transport": {"kind": "mqtt", **self.transport, "state_dir": str(folder / "state")},
+            "local_mqtt": self.local_mqtt,
+            "services": {"serial_mcu_bridge": serial, **services},
+        }
+        return parse(raw, folder=folder, env={})
+
+    def robots_transport(self, config: Config, name: str, *, as_published: bool = False) -> Transport:
+        """Return the transport that a process of the robot would use."""
+        if self.kind == "memory":
+            return MemoryTransport(name, self._memory)
+        return local_transport(config, name, as_published=as_published)
+
+    def client(self, name: str) -> Transport:
+        if self.kind == "memory":
+            return MemoryTransport(name, self._memory)
+        if self.kind == "mqtt":
+            return create("mqtt", name, self._mqtt)
+        return create("zenoh", name, ZenohSettings(run_dir=self._run_dir, client=True))
+
+    @contextmanager
+    def outage(self) -> Iterator[None]:
+        """Stop the broker meanwhile. MQTT only: peers on Zenoh exchange messages without a hub."""
+        self._broker.kill()
+        yield
+        self._broker.start()
+
+    def close(self) -> None:
+        self._ends.close()
+
+
+class Running:
+    """Runs a service on a thread of its own, as its process would; ``error`` is what ended it."""
+
+    def __init__(self, service: Service) -> None:
+        self.service = service
+        self.error: PebbleError | None = None
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        try:
+            self.service.run()
+        except PebbleError as error:
+            self.error = error
+
+    @property
+    def alive(self) -> bool:
+        return self._thread.is_alive()
+
+    def stop(self) -> None:
+        self.service.quit()
+        self._thread.join(10)
+        assert not self._thread.is_alive(), "the service does not end"
+
+
+def main(module: str, arguments: tuple[str, ...], environment: dict[str, str]) -> None:
+    """Become ``python -m module`` with these arguments, in a process that has imported most of what it needs."""
+    os.environ.clear()
+    os.environ.update(environment)
+    sys.argv = [module, *arguments]
+    runpy.run_module(module, run_name="__main__", alter_sys=True)
+
+
+class Program(Forked):
+    """``python -m module`` with these arguments and this process's environment; ended with what made it."""
+
+    def __init__(self, module: str, *arguments: str) -> None:
+        super().__init__("tests.kit.robot", module, arguments, dict(os.environ))
+
+    def send_signal(self, number: int) -> None:
+        os.kill(self.pid, number)
+
+    def terminate(self) -> None:
+        self.send_signal(signal.SIGTERM)
+
+    def end(self, number: int = signal.SIGTERM) -> int | None:
+        """Send a signal, and return the exit code."""
+        if self.poll() is None:
+            self.send_signal(number)
+        code = self.wait(10)
+        assert self.poll() is not None, "the program does not end"
+        return code
+
+
+class ProgramRobot:
+    """A robot whose programs are processes, with a client on its local transport (``world``).
+
+    A robot on MQTT uses the broker at ``port``; the hub of one on Zenoh is its own. Its id is that of its folder
+    unless ``robot`` names it, because a broker retains what others have published.
+    """
+
+    def __init__(
+        self, kind: str, port: int, services: dict[str, Any], *, robot: str = "", folder: Path | None = None
+    ) -> None:
+        self._ends = ExitStack()
+        if folder is None:
+            folder = Path(tempfile.mkdtemp(prefix="pbl")).resolve()  # short: it holds unix sockets
+            self._ends.callback(shutil.rmtree, folder, ignore_errors=True)
+        self.folder, self.path = folder, folder / "robot.json"
+        (folder / "run").mkdir(mode=0o700)
+        self.raw: dict[str, Any] = {
+            "robot": {"id": robot or folder.name},
+            "transport": {"kind": kind, "run_dir": str(folder / "run"), "state_dir": str(folder / "state")},
+            "local_mqtt": {"host": "127.0.0.1", "port": port, "silence_seconds": SILENCE_S},
+            "services": services,
+        }
+        self.config = self.write()
+        if kind == "zenoh":
+            self._ends.callback(HubProcess(self.config.run_dir()).start().kill)
+        self.world = Listener(local_transport(self.config, "world"), self.config.base)
+        self._ends.callback(self.world.transport.close)
+
+    def write(self) -> Config:
+        """Write the config anew, as ``raw`` is now, and return it."""
+        self.path.write_text(json.dumps(self.raw))
+        return load(self.path)
+
+    def run(self, module: str, *arguments: str) -> Program:
+        """Start a program with the config; it ends with the robot."""
+        program = Program(module, str(self.path), *arguments)
+        self._ends.callback(program.end)
+        return program
+
+    def close(self) -> None:
+        self._ends.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self.close()
