@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
+from pebble.config.visible import shown
 from pebble.recordings.files.mcap import FILE_TOPIC, Channel, Recorded, RecordingError, number_in
 from pebble.recordings.files.reader import DAMAGE, MISSING, Summary, mapped, metadata_of, read
 from pebble.recordings.files.rewrite import REWRITTEN
 from pebble.recordings.files.scan import Damage
-from pebble.recordings.library import ACTIVE, merged, robot_of
+from pebble.recordings.library import ACTIVE, channels_in, merged, robot_of
 from pebble.recordings.recorder.intake import EVENTS
 from pebble.transports.topics import matches
 
 _SHOWN_EVENTS: Final = frozenset({"gap", "clock", "dropped", "pruned", "recovered", "damaged", "removed", "late"})
+_LISTED: Final = 20  # names that a message lists
 
 
 @dataclass(slots=True)
@@ -119,6 +121,38 @@ class Query:
 
     def accepts(self, message: Recorded) -> bool:
         return self.text is None or self.text.encode() in message.payload
+
+
+def check_names(query: Query, paths: Iterable[Path], places: Iterable[Path]) -> None:
+    """Raises RecordingError if the recordings of ``places`` have no such robot or topic, which may be a mistake.
+
+    Where a file cannot be read completely, names are not known: it is the file's problem that is to be said.
+    """
+    if query.robot is None and not query.topics:
+        return
+    found: list[Channel] = []
+    for path in paths:
+        damage = Damage()
+        try:
+            found += channels_in(path, damage)
+        except RecordingError:
+            return
+        if damage.report(active=path.name.endswith(ACTIVE)):
+            return
+    check_name("robot", query.robot, {robot for one in found if (robot := robot_of(one))}, places)
+    topics = {one.topic for one in found if query.robot in (None, robot_of(one))}
+    for filter_ in query.topics:
+        if not any(_matches(filter_, topic) for topic in topics):
+            check_name("topic", filter_, {topic for topic in topics if not topic.startswith("$")}, places)
+
+
+def check_name(kind: str, name: str | None, known: Collection[str], places: Iterable[Path]) -> None:
+    """Raises RecordingError, which says what there is, if ``name`` is none of the ``known`` ones."""
+    if name is not None and name not in known:
+        listed = [shown(one) for one in sorted(known)[:_LISTED]] or ["none"]
+        more = f" and {len(known) - _LISTED} more" if len(known) > _LISTED else ""
+        where = ", ".join(map(str, places))
+        raise RecordingError(f"no {kind} {shown(name)} in {where}; there are: {', '.join(listed)}{more}")
 
 
 def _matches(filter_: str, topic: str) -> bool:

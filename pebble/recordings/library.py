@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -56,6 +56,23 @@ def span(path: Path, damage: Damage | None = None) -> Span | None:
             return None if first is None else Span(first.log_ns, FOREVER_NS)
         counted = summary.statistics
         return Span(counted.first_ns, counted.last_ns) if counted.messages else None
+
+
+def channels_in(path: Path, damage: Damage | None = None) -> Collection[Channel]:
+    """The channels of a file: from its summary, else by reading it. Raises RecordingError."""
+    with mapped(path) as data:
+        summary = Summary.of(data)
+        if summary is not None:
+            return summary.channels.values()
+        found: list[Channel] = []
+
+        def note(channel: Channel) -> bool:
+            found.append(channel)
+            return False
+
+        for _ in read(data, damage, chooses=note):
+            pass
+        return found
 
 
 def merged(

@@ -96,6 +96,12 @@ def test_what_a_recorder_uses_is_left_alone(folder: Path, run: Run) -> None:
     assert messages(folder) == 201
 
 
+READING = [
+    ("search", "{rec}"), *(("export", "{rec}", f"{{tmp}}/a.{end}") for end in ("jsonl", "bson", "mcap", "mkv", "wav")),
+]  # fmt: skip
+NO_ROBOT = f"no robot pebble/robots/nosuch in {{rec}}; there are: {FRED}, {GOOB}\n"
+
+
 @pytest.mark.parametrize(
     ("arguments", "problem"),
     [
@@ -104,6 +110,10 @@ def test_what_a_recorder_uses_is_left_alone(folder: Path, run: Run) -> None:
         (("list", "{tmp}/text"), "is not a recording (MCAP)"),
         (("export", "{rec}", "{tmp}/a.xyz"), "add --as"),
         (("export", "{rec}", "{tmp}/a.mkv"), "add --robot (pebble/robots/fred, pebble/robots/goob)"),
+        *(((*command, "-r", "nosuch"), NO_ROBOT) for command in READING),
+        (("rm", "{rec}", "--yes", "-r", "nosuch", "--since", "2000-01-01"), NO_ROBOT),
+        *(((*command, "-t", "outgoing/none"), "no topic outgoing/none in {rec}; there are: ") for command in READING),
+        (("search", "{rec}", "-r", "fred", "-t", "outgoing/logs"), f"; there are: {FRED}/outgoing/online\n"),
         (("rm", "{rec}"), "what to delete is missing"),
         (("search", "{rec}", "--since", "soon"), "--since"),
         (("compact", "{tmp}/none"), "there is no such folder"),
@@ -115,12 +125,14 @@ def test_mistakes_are_one_line(
     (tmp_path / "text").write_text("text")
     empty = tmp_path / "empty"
     empty.mkdir()
-    filled = [
-        one.replace("{tmp}/", f"{tmp_path}/").replace("{tmp}", str(empty)).replace("{rec}", str(folder))
-        for one in arguments
-    ]
-    assert run("recordings", *filled) != 0
-    assert problem in run.err
+
+    def filled(text: str) -> str:
+        return text.replace("{tmp}/", f"{tmp_path}/").replace("{tmp}", str(empty)).replace("{rec}", str(folder))
+
+    before = sorted(tmp_path.rglob("*"))
+    assert run("recordings", *map(filled, arguments)) != 0
+    assert filled(problem) in run.err
+    assert sorted(tmp_path.rglob("*")) == before
     assert len(run.err.strip().splitlines()) == 1
 
 

@@ -89,7 +89,8 @@ def test_a_file_of_another_program_is_read_in_the_order_of_time(tmp_path: Path, 
 @pytest.mark.parametrize("name", VALID)
 def test_only_what_is_named_is_deleted_of_it(tmp_path: Path, run: Run, name: str) -> None:
     path, is_private = stored(tmp_path, VALID[name]), "private" in name
-    assert run("recordings", "rm", tmp_path / "rec", "--robot", "nosuch", "--yes") == is_private
+    assert run("recordings", "rm", tmp_path / "rec", "--robot", "nosuch", "--yes") == 1
+    assert "there are: pebble/robots/fred, pebble/robots/goob\n" in run.err
     assert path.read_bytes() == VALID[name]
     assert run("recordings", "rm", tmp_path / "rec", "--robot", "fred", "--yes") == is_private
     assert contents(path) == (EXPECTED if is_private else OF_GOOB)

@@ -61,6 +61,7 @@ def analyse(
     from pebble.bench.engine import check_folder
     from pebble.client.names import base_of
     from pebble.config.visible import shown
+    from pebble.recordings.catalogue import check_name
     from pebble.recordings.period import parse_period
     from pebble.recordings.traffic.analysis import analyse as analyse_traffic
     from pebble.recordings.traffic.report import write_report
@@ -74,6 +75,8 @@ def analyse(
         found = sources(places, scratch, robots=bases, since_ns=since_ns, until_ns=until_ns, progress=progress)
         for line in found.unread:
             typer.echo(f"pebble: {shown(line)}", err=True)
+        for base in () if found.unread else bases:
+            check_name("robot", base, found.robots, places)
         traffic = analyse_traffic(
             found, scratch, since_ns=since_ns, until_ns=until_ns, overhead=overhead, progress=progress
         )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, BinaryIO
@@ -69,16 +70,16 @@ def export(
         raise PebbleError(f"{target}: what to write is not clear from this name: add --as lines, foxglove, mkv …")
     since_ns, until_ns = period(since, until)
     paths = files(places)
-    base = None if robot is None else base_of(robot)
-    if form in (Form.MKV, Form.MP4, Form.WAV):
-        base = base or _only_robot(paths)
-    query = Query(base, tuple(topic or ()))
+    query = Query(None if robot is None else base_of(robot), tuple(topic or ()))
+    catalogue.check_names(query, paths, places)
+    if query.robot is None and form in (Form.MKV, Form.MP4, Form.WAV):
+        query = replace(query, robot=_only_robot(paths))
     damages = Damages()
     beside = damages if query == Query() else ()  # those that were read
     try:
         with progress_of_time(paths, since_ns, until_ns) as on_time:
             messages = merged(paths, since_ns=since_ns, until_ns=until_ns, chooses=query.chooses, damages=damages)
-            typer.echo(_export(form, messages, target, base or "", on_time, beside))
+            typer.echo(_export(form, messages, target, query.robot or "", on_time, beside))
     finally:
         code = report_unread(problems(damages))
     return code

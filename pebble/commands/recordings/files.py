@@ -14,6 +14,7 @@ from pebble.commands.recordings.progress import progress
 from pebble.commands.recordings.report import report_left, report_unread
 from pebble.config.visible import shown
 from pebble.errors import PebbleError
+from pebble.recordings.catalogue import Query, check_names
 from pebble.recordings.files.finish import finish as finish_file
 from pebble.recordings.files.mcap import Recorded, RecordingError
 from pebble.recordings.files.rewrite import rewrite
@@ -114,7 +115,10 @@ def rm(
         raise PebbleError(f"{folder}: a recorder writes here, and would write retained values again: stop it first")
     entries = Folder(folder).entries()
     left = sum(report_left(f"{entry.path}: is not finished, or damaged") for entry in entries if not entry.is_finished)
-    due = [entry.path for entry in entries if entry.is_finished and _reaches_into(entry.path, since_ns, until_ns)]
+    finished = [entry.path for entry in entries if entry.is_finished]
+    if not left:
+        check_names(Query(base), finished, [folder])
+    due = [path for path in finished if _reaches_into(path, since_ns, until_ns)]
     what = f"{shown(base)} " if base else "everything "
     if not yes and not typer.confirm(f"Delete {what}from {len(due)} files in {folder}?"):
         return 1

@@ -91,8 +91,9 @@ def search(
     """Print the messages that match, in the order of time."""
     since_ns, until_ns = period(since, until)
     query = Query(None if robot is None else base_of(robot), tuple(topic or ()), text)
-    found, damages = 0, Damages()
-    for message in merged(files(places), since_ns=since_ns, until_ns=until_ns, chooses=query.chooses, damages=damages):
+    paths, found, damages = files(places), 0, Damages()
+    catalogue.check_names(query, paths, places)
+    for message in merged(paths, since_ns=since_ns, until_ns=until_ns, chooses=query.chooses, damages=damages):
         if not query.accepts(message):
             continue
         flag = " (retained)" if message.channel.metadata.get("retained") else ""

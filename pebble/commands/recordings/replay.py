@@ -25,7 +25,7 @@ from pebble.commands.recordings.report import report_unread
 from pebble.commands.terminal_loop import TerminalLoop
 from pebble.config.visible import shown
 from pebble.errors import PebbleError
-from pebble.recordings.catalogue import look_at
+from pebble.recordings.catalogue import check_name, look_at
 from pebble.recordings.library import files, problems
 from pebble.recordings.replay.pace import FASTEST, SLOWEST
 from pebble.recordings.replay.player import Player
@@ -33,6 +33,7 @@ from pebble.recordings.replay.robots import Make, ReplayedRobots
 from pebble.recordings.replay.rules import SYSTEM, Options, Rules
 from pebble.recordings.replay.source import ReplaySource
 from pebble.transports import Message, Transport, create
+from pebble.transports.topics import matches
 
 _KEYS = "Space pauses, ← and → go 10 s back and on, + and - change the speed, Ctrl-C ends."
 _STEP_NS = 10 * 10**9
@@ -157,7 +158,11 @@ def _read(recordings: list[Path], options: Options) -> tuple[ReplaySource, Rules
     """What is replayed. Raises PebbleError if that is nothing."""
     paths = files(recordings)
     source = ReplaySource(paths)
+    topics = {channel.topic for channel in source.channels if not channel.topic.startswith("$")}
     rules = Rules(options, source.channels)
+    for filter_ in () if problems(source.damages) else options.only:
+        if not any(matches(filter_, topic) for topic in topics):
+            check_name("topic", filter_, topics, recordings)
     if not rules.robots:
         report_unread(problems(source.damages))
         raise PebbleError("there is nothing to publish in this recording; see --only and --incoming")

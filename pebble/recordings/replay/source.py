@@ -8,9 +8,9 @@ from typing import Final
 
 from pebble.contract import HEARTBEAT, ONLINE, OUTGOING, Kind, channel_of
 from pebble.recordings.files.mcap import Channel, Recorded
-from pebble.recordings.files.reader import Chooses, Summary, mapped, read
+from pebble.recordings.files.reader import Chooses
 from pebble.recordings.files.scan import Damage
-from pebble.recordings.library import FOREVER_NS, Damages, Span, merged, span
+from pebble.recordings.library import FOREVER_NS, Damages, Span, channels_in, merged, span
 from pebble.recordings.stamps import is_keyframe, is_picture
 
 #: How far before a time its state and its last key frame are looked for. A file of states is then read from its begin.
@@ -33,7 +33,7 @@ class ReplaySource:
             if found is None:
                 self.damages[path] = damage
             else:
-                self._files.append((path, found, list(_channels(path))))
+                self._files.append((path, found, list(channels_in(path))))
 
     @property
     def channels(self) -> list[Channel]:
@@ -87,23 +87,6 @@ class ReplaySource:
 
 def _overlaps(covered: Span, since_ns: int, until_ns: int) -> bool:
     return covered.first_ns < until_ns and covered.last_ns >= since_ns
-
-
-def _channels(path: Path) -> Iterable[Channel]:
-    """The channels of a file: from its summary, else by reading it."""
-    with mapped(path) as data:
-        summary = Summary.of(data)
-        if summary is not None:
-            return summary.channels.values()
-        found: list[Channel] = []
-
-        def note(channel: Channel) -> bool:
-            found.append(channel)
-            return False
-
-        for _ in read(data, chooses=note):
-            pass
-        return found
 
 
 def _is_state(channel: Channel) -> bool:

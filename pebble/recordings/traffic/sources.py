@@ -28,6 +28,7 @@ class Sources(Struct):
     events: list[Path] = field(default_factory=list)
     recordings: int = 0
     missing: int = 0  # messages that damage has taken
+    robots: set[str] = field(default_factory=set)  # all in these recordings, also those that were not chosen
     unread: list[str] = field(default_factory=list)  # a line for each file that could not be read completely
 
     def add(self, index: Index, entry: Entry, chosen: Collection[str], days: tuple[str, str]) -> None:
@@ -35,7 +36,9 @@ class Sources(Struct):
         if entry.unread:
             self.unread.append(f"{entry.recording}: {entry.unread}")
         self.events += [index.folder / path for path in entry.events]
-        parts = [part for part in entry.parts if part.robot != NO_ROBOT and days[0] <= part.day <= days[1]]
+        of_robots = [part for part in entry.parts if part.robot != NO_ROBOT]
+        self.robots.update(part.robot for part in of_robots)
+        parts = [part for part in of_robots if days[0] <= part.day <= days[1]]
         parts = [part for part in parts if not chosen or part.robot in chosen]
         for part in parts:
             self.parts.setdefault(part.robot, []).append(index.folder / part.path)

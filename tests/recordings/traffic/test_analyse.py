@@ -70,7 +70,7 @@ def test_overhead(run, folder, tmp_path):
         (["recordings", "--since", "soon"], '--since "soon" is no time: write 10:00,'),
         (["recordings", "--since", "2030-01-01"], "no message of a robot in this period"),
         (["recordings", "--robot", "a/b"], 'give its id, or "system/type/id"'),
-        (["recordings", "--robot", "stranger"], "no message of a robot"),
+        (["recordings", "--robot", "stranger"], "no robot pebble/robots/stranger in recordings; there are: "),
         (["recordings", "--output", "recordings/a.state.mcap"], "recordings/a.state.mcap: File exists"),
     ],
 )
