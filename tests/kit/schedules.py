@@ -28,10 +28,7 @@ from tests.kit.mutations import Mutation, in_process
 ENGINES = {
     "motion": "tests.motion.histories",
     "lockstep": "tests.robot.lockstep.schedules",
-    "stop_schedules": "tests.robot.stop_schedules.performance",
-    "script_schedules": "tests.robot.script_schedules.world",
     "driving_lockstep": "tests.web.driving_lockstep.schedules",
-    "chromium_schedules": "tests.web.chromium_schedules.world",
 }
 
 Step = tuple[str, int, int]  # the world's method do_<action> is called with two small numbers
