@@ -123,8 +123,8 @@ floods: .venv/.ready-dev
 
 # The shortest schedule that violates a rule is printed.
 schedules: .venv/.ready-dev
-	@$(VENV) -m tests.robot.lockstep --schedules 10000
-	@$(VENV) -m tests.robot.lockstep --mutations --schedules 1000
+	@$(VENV) -m tests.kit.schedules lockstep --schedules 10000
+	@$(VENV) -m tests.kit.schedules lockstep --mutations --schedules 1000
 
 script-schedules: .venv/.ready-dev
 	@sh tools/debian-packages.sh mosquitto=mosquitto

@@ -2,97 +2,85 @@
 
 from __future__ import annotations
 
-import shutil
-from dataclasses import dataclass
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 from pebble.client import estop
 from pebble.simulation.micropython.loader import firmware_root
+from tests.kit.mutations import Mutation, in_copy
 from tests.motion import world
 
-_CORES = ("latch", "arbiter", "ticks")
+_LATCH, _ARBITER, _TICKS = _CORES = ("common/latch.py", "common/arbiter.py", "common/ticks.py")
 _MODULES = {"world": world.__file__, "estop": estop.__file__}
 
 
-@dataclass(frozen=True)
-class Mutation:
-    """``original`` in ``file``, a module of the firmware, the sender or world, is replaced by ``mutated``."""
-
-    file: str
-    original: str
-    mutated: str
-
-    def load(self, folder: Path) -> tuple[Any, Any]:
-        """The class World and the cores, one of them with the bug."""
-        (folder / "common").mkdir(parents=True)
-        for name in _CORES:
-            shutil.copy(firmware_root() / "common" / f"{name}.py", folder / "common")
-        source = Path(_MODULES.get(self.file) or folder / "common" / f"{self.file}.py")
-        text = source.read_text()
-        assert text.count(self.original) == 1, f"{self.file} has changed: adapt this mutation"
-        text = text.replace(self.original, self.mutated)
-        if self.file not in _MODULES:
-            source.write_text(text)
-            return world.World, world.load_cores(folder)
-        module = ModuleType(f"mutated_{self.file}")
-        exec(compile(text, str(source), "exec"), module.__dict__)
-        if self.file == "estop":
-            return world.World, world.load_cores(sender=module.StopSender)
-        return module.World, world.CORES
+@contextmanager
+def mutated(mutation: Mutation) -> Iterator[tuple[type[world.World], Any]]:
+    """Yields the class World and the cores; the bug is in a module of the firmware, the sender, or the world."""
+    if mutation.file not in _MODULES:
+        with in_copy(mutation, firmware_root(), *_CORES) as folder:
+            yield world.World, world.load_cores(folder)
+        return
+    path = Path(_MODULES[mutation.file])
+    module = ModuleType(f"mutated_{mutation.file}")
+    exec(compile(mutation.text(path), str(path), "exec"), module.__dict__)
+    if mutation.file == "estop":
+        yield world.World, world.load_cores(sender=module.StopSender)
+    else:
+        yield module.World, world.CORES
 
 
 MUTATIONS = {
-    "persons ignore the latch": Mutation(
-        "latch", "        if self.latched:\n", "        if self.latched and script:\n"
-    ),
-    "a reset of another life is obeyed": Mutation("latch", '"boot" if boot != self.boot else ', ""),
-    "a reset of an earlier count is obeyed": Mutation("latch", '"count" if count != self.count else ', ""),
-    "an old reset is obeyed": Mutation("latch", "_OLD_MS = 1000", "_OLD_MS = 2000"),
+    "persons ignore the latch": Mutation(_LATCH, "        if self.latched:\n", "        if self.latched and script:\n"),
+    "a reset of another life is obeyed": Mutation(_LATCH, '"boot" if boot != self.boot else ', ""),
+    "a reset of an earlier count is obeyed": Mutation(_LATCH, '"count" if count != self.count else ', ""),
+    "an old reset is obeyed": Mutation(_LATCH, "_OLD_MS = 1000", "_OLD_MS = 2000"),
     "a stop counts only while free": Mutation(
-        "latch",
+        _LATCH,
         "        self.latched = True\n        self.count += 1\n",
         "        self.count += not self.latched\n        self.latched = True\n",
     ),
     "the second stop of one name resets": Mutation(
-        "latch",
+        _LATCH,
         "            return False\n        self.recent",
         "            self.latched = False\n        self.recent",
     ),
-    "names are not restored": Mutation("latch", "if is_name(name)][: self._names]", "if not is_name(name)]"),
-    "one name is remembered": Mutation("latch", "+ self.recent)[: self._names]", "+ self.recent)[:1]"),
+    "names are not restored": Mutation(_LATCH, "if is_name(name)][: self._names]", "if not is_name(name)]"),
+    "one name is remembered": Mutation(_LATCH, "+ self.recent)[: self._names]", "+ self.recent)[:1]"),
     "a damaged file is free": Mutation(
-        "latch", "            self.latched = True\n", "            self.latched = False\n"
+        _LATCH, "            self.latched = True\n", "            self.latched = False\n"
     ),
-    "after a reset persons drive on": Mutation("latch", "self._waits = True", "self._waits = False"),
-    "after a reset persons let go too shortly": Mutation("latch", "_QUIET_MS = 500", "_QUIET_MS = 499"),
+    "after a reset persons drive on": Mutation(_LATCH, "self._waits = True", "self._waits = False"),
+    "after a reset persons let go too shortly": Mutation(_LATCH, "_QUIET_MS = 500", "_QUIET_MS = 499"),
     "commands do not prolong the wait after a reset": Mutation(
-        "latch", "        self._waits_from = now\n        return self._waits\n", "        return self._waits\n"
+        _LATCH, "        self._waits_from = now\n        return self._waits\n", "        return self._waits\n"
     ),
-    "a barred run moves": Mutation("arbiter", "not newer(run, self.barred))", "not newer(run, self.barred - 1))"),
-    "an older run moves": Mutation("arbiter", "            self.bar(run - 1 or LAST_RUN)\n", ""),
-    "the newest run may fall": Mutation("arbiter", "if newer(run, self.barred) and", "if run > 0 and"),
-    "a new run bars itself": Mutation("arbiter", "self.bar(run - 1 or LAST_RUN)", "self.bar(run)"),
-    "numbers of runs end": Mutation("arbiter", "0 < (run - than) & LAST_RUN < 1 << 29", "run > than"),
-    "the last run moves after run 1": Mutation("arbiter", "self.bar(run - 1 or LAST_RUN)", "self.bar(run - 1)"),
-    "a stop bars nothing": Mutation("arbiter", "        self.bar(self._newest)\n        self._scripted = False\n", ""),
-    "a run is not barred while latched": Mutation("arbiter", "            self.bar(run)\n", "            pass\n"),
-    "the hold is too short": Mutation("arbiter", "HOLD_MS = 2000", "HOLD_MS = 1999"),
-    "a start waits too shortly": Mutation("arbiter", "_START_MS = 2000", "_START_MS = 1999"),
+    "a barred run moves": Mutation(_ARBITER, "not newer(run, self.barred))", "not newer(run, self.barred - 1))"),
+    "an older run moves": Mutation(_ARBITER, "            self.bar(run - 1 or LAST_RUN)\n", ""),
+    "the newest run may fall": Mutation(_ARBITER, "if newer(run, self.barred) and", "if run > 0 and"),
+    "a new run bars itself": Mutation(_ARBITER, "self.bar(run - 1 or LAST_RUN)", "self.bar(run)"),
+    "numbers of runs end": Mutation(_ARBITER, "0 < (run - than) & LAST_RUN < 1 << 29", "run > than"),
+    "the last run moves after run 1": Mutation(_ARBITER, "self.bar(run - 1 or LAST_RUN)", "self.bar(run - 1)"),
+    "a stop bars nothing": Mutation(_ARBITER, "        self.bar(self._newest)\n        self._scripted = False\n", ""),
+    "a run is not barred while latched": Mutation(_ARBITER, "            self.bar(run)\n", "            pass\n"),
+    "the hold is too short": Mutation(_ARBITER, "HOLD_MS = 2000", "HOLD_MS = 1999"),
+    "a start waits too shortly": Mutation(_ARBITER, "_START_MS = 2000", "_START_MS = 1999"),
     "a script's zero takes the wheel from a person": Mutation(
-        "arbiter", "        if run == PERSON:\n", "        if run == PERSON or not moves:\n"
+        _ARBITER, "        if run == PERSON:\n", "        if run == PERSON or not moves:\n"
     ),
-    "a final zero lets the run resume": Mutation("arbiter", "(final or self._scripted)", "self._scripted"),
-    "a zero lets the run in effect resume": Mutation("arbiter", "(final or self._scripted)", "final"),
+    "a final zero lets the run resume": Mutation(_ARBITER, "(final or self._scripted)", "self._scripted"),
+    "a zero lets the run in effect resume": Mutation(_ARBITER, "(final or self._scripted)", "final"),
     "a lost connection lets the run resume": Mutation(
-        "arbiter", "self._resumes = not moves and not final", "self._resumes = True"
+        _ARBITER, "self._resumes = not moves and not final", "self._resumes = True"
     ),
-    "a release bars": Mutation("arbiter", "self._resumes = not moves and not final", "self._resumes = False"),
-    "valid_ms has no effect": Mutation("arbiter", "else int(valid_ms)", "else self._watchdog_ms"),
-    "valid_ms has no limit": Mutation("arbiter", "valid_ms < 0 or valid_ms > self._watchdog_ms", "valid_ms < 0"),
+    "a release bars": Mutation(_ARBITER, "self._resumes = not moves and not final", "self._resumes = False"),
+    "valid_ms has no effect": Mutation(_ARBITER, "else int(valid_ms)", "else self._watchdog_ms"),
+    "valid_ms has no limit": Mutation(_ARBITER, "valid_ms < 0 or valid_ms > self._watchdog_ms", "valid_ms < 0"),
     "times do not wrap": Mutation(
-        "ticks", "return ahead if ahead < _HALF else ahead - _HALF - _HALF", "return later - earlier"
+        _TICKS, "return ahead if ahead < _HALF else ahead - _HALF - _HALF", "return later - earlier"
     ),
     "a zero is lost when it is replaced": Mutation("world", "if old is not None and not old[4]:", "if False:"),
     "a stop leaves a command in the slot": Mutation(

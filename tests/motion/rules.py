@@ -26,6 +26,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from tests.kit.schedules import ViolatedError, check
+
 WATCHDOG_MS = 750
 HOLD_MS = 2000
 START_MS = 2000
@@ -38,10 +40,6 @@ PERSON, UNKNOWN_RUN, REFUSED = 0, -1, -1
 
 MISSING = "missing"  # in place of a file's content
 UNREADABLE = "unreadable"
-
-
-class ViolatedError(AssertionError):
-    """A history in which a rule does not hold."""
 
 
 class Rules:
@@ -206,9 +204,3 @@ class Rules:
     def file_removed(self, order: int) -> None:
         """Nothing is promised of the stops before."""
         self.ended = order
-
-
-def check(holds: bool, rule: str) -> None:
-    """Raise :class:`ViolatedError` unless ``holds``."""
-    if not holds:
-        raise ViolatedError(rule)

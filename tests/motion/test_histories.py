@@ -4,50 +4,46 @@ from __future__ import annotations
 
 import operator
 from itertools import product
-from pathlib import Path
 from typing import Any
 
 import pytest
 
-from tests.motion.histories import STEPS, generate, shortest, violation
-from tests.motion.mutations import MUTATIONS, Mutation
+from tests.kit.mutations import Mutation
+from tests.motion.histories import ENGINE, LENGTH
+from tests.motion.mutations import MUTATIONS, mutated
 from tests.motion.rules import PERSON, UNKNOWN_RUN
-from tests.motion.world import CORES
+from tests.motion.world import CORES, World
 from tests.support import cases, some
 
-HISTORIES = cases(80_000, 300_000) // STEPS
-WITH_BUG = 3_000_000 // STEPS  # at most, until it shows
+HISTORIES = cases(80_000, 300_000) // LENGTH
+WITH_BUG = 3_000_000 // LENGTH  # at most, until it shows
 
 
 def test_no_history_breaks_a_rule() -> None:
-    broken = [(number, rule) for number in range(HISTORIES) if (rule := violation(generate(0, number)))]
-    assert not broken, "python -m tests.motion.histories --seed 0 prints the shortest history"
+    broken = [one for one in ENGINE.run("", 0, range(HISTORIES)) if one.problems]
+    assert not broken, "python -m tests.kit.schedules motion --seed 0 prints the shortest history"
 
 
 @pytest.mark.parametrize("name", some(MUTATIONS, 4))
-def test_each_deliberate_bug_shows_in_a_short_history(tmp_path: Path, name: str) -> None:
-    with_bug, cores = MUTATIONS[name].load(tmp_path)
-    found = (
-        (history, rule)
-        for history in (generate(0, number) for number in range(WITH_BUG))
-        if (rule := violation(history, with_bug, cores))
-    )
-    history, rule = next(found)
-    layout, steps = shortest(history, rule, with_bug, cores)
+def test_each_deliberate_bug_shows_in_a_short_history(name: str) -> None:
+    found = ENGINE.find(name, 0, WITH_BUG)
+    assert found is not None
+    rule = found.problems[0]
     assert rule.startswith("ViolatedError"), rule
+    with mutated(MUTATIONS[name]) as bug:
+        layout, steps = ENGINE.shortest(ENGINE.draw("", 0, found.number), rule, bug=bug)
     assert len(steps) <= 20, steps
-    assert violation((layout, steps)) == "", "without the bug the rules hold"
+    assert ENGINE.violation((World, CORES), (layout, steps)) == "", "without the bug the rules hold"
 
 
-def test_scripts_are_refused_twice_while_latched(tmp_path: Path) -> None:
+def test_scripts_are_refused_twice_while_latched() -> None:
     """A latch that ignores scripts changes nothing, from any state: their runs are barred before it is asked."""
-    _, cores = Mutation("latch", "            return moves\n", "            return moves and not script\n").load(
-        tmp_path
-    )
+    ignoring = Mutation("common/latch.py", "            return moves\n", "            return moves and not script\n")
     commands = [(False, UNKNOWN_RUN), *product((False, True), (PERSON, 1, 2, 3))]
     flags = product((False, True), repeat=6)
-    for state in product(flags, (0, 1, 2, 3), (0, 1, 2, 3), commands, (-1, 0, 400), (0, 400, 5000)):
-        assert _judged(cores, *state) == _judged(CORES, *state), state
+    with mutated(ignoring) as (_, cores):
+        for state in product(flags, (0, 1, 2, 3), (0, 1, 2, 3), commands, (-1, 0, 400), (0, 400, 5000)):
+            assert _judged(cores, *state) == _judged(CORES, *state), state
 
 
 def _judged(cores: Any, flags: tuple[bool, ...], barred: int, newest: int, command: Any, valid: int, now: int) -> Any:

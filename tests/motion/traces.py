@@ -17,7 +17,7 @@ from typing import Any
 from pebble.flash.boards import FIRMWARE
 from pebble.motion.latch import is_name, reset_of, stop_of
 from tests.firmware.micropython import SCRIPTS, compile_module, run
-from tests.motion.histories import generate, violation
+from tests.motion.histories import ENGINE
 from tests.motion.world import CORES, World
 
 _BODIES: tuple[Any, ...] = (
@@ -40,7 +40,7 @@ def traces(seed: int, count: int) -> Iterator[str]:
     """One line for each history: calls as ``[object, method, arguments, result]``."""
     for number in range(count):
         calls: list[Any] = []
-        assert violation(generate(seed, number), World, _recording(calls)) == ""
+        assert ENGINE.violation((World, _recording(calls)), ENGINE.draw("", seed, number)) == ""
         yield json.dumps(calls, separators=(",", ":"))
 
 

@@ -16,6 +16,7 @@ from typing import Any
 from pebble.client.estop import StopSender
 from pebble.simulation.micropython.loader import FirmwareModules
 from pebble.transports import Message, QoS
+from tests.kit.schedules import Step, check
 from tests.motion.rules import (
     GIVE_UP_MS,
     MISSING,
@@ -26,12 +27,10 @@ from tests.motion.rules import (
     UNREADABLE,
     WATCHDOG_MS,
     Rules,
-    check,
 )
 
 BASE = "pebble/robots/goob"
 
-Step = tuple[str, int, int]
 Command = tuple[Any, ...]  # (what, owner, when it was sent, whether it is a retained copy, ...)
 
 
@@ -48,29 +47,9 @@ CORES = load_cores()
 LAYOUTS = ("L", "B", "N", "LL", "BL", "LN", "BB", "L", "B", "LB")
 
 WAITS = (
-    0,
-    1,
-    10,
-    49,
-    50,
-    100,
-    100,
-    250,
-    250,
-    499,
-    500,
-    501,
-    749,
-    750,
-    999,
-    1000,
-    1999,
-    2000,
-    2001,
-    5000,
-    60_000,
-    290_000,
-)
+    0, 1, 10, 49, 50, 100, 100, 250, 250, 499, 500, 501,
+    749, 750, 999, 1000, 1999, 2000, 2001, 5000, 60_000, 290_000,
+)  # fmt: skip
 VALID = (-1, -1, -1, 100, 400, 750, 751, 5000)
 STALE_MS = 2000  # a command that moves something and is older is dropped on its way
 INBOX_MS = 500

@@ -1,18 +1,17 @@
 """Random schedules of persons, scripts and faults in virtual time; deliberate bugs show in them.
 
-``python -m tests.robot.lockstep`` runs thousands.
+``python -m tests.kit.schedules lockstep`` runs thousands.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import pytest
 
-from tests.robot.lockstep.mutations import MUTATIONS
-from tests.robot.lockstep.schedules import first_violation, generate, violation
-from tests.robot.lockstep.world import Folder
+from tests.kit.mutations import in_process
+from tests.robot.lockstep.schedules import ENGINE
 from tests.support import cases, some
 
 SCHEDULES = cases(80, 150)
@@ -26,22 +25,25 @@ def quiet() -> Iterator[None]:
     logging.disable(logging.NOTSET)
 
 
+def _violations(seed: int, numbers: Iterable[int]) -> list[str]:
+    return [rule for one in ENGINE.run("", seed, numbers) for rule in one.problems]
+
+
 def test_no_schedule_violates_a_rule() -> None:
-    assert first_violation(0, SCHEDULES) is None, "python -m tests.robot.lockstep --seed 0 prints the shortest schedule"
+    found = _violations(0, range(SCHEDULES))
+    assert not found, "python -m tests.kit.schedules lockstep --seed 0 prints the shortest schedule"
 
 
-@pytest.mark.parametrize("name", some(MUTATIONS, 4))
+@pytest.mark.parametrize("name", some(ENGINE.mutations, 4))
 def test_each_deliberate_bug_shows(name: str) -> None:
-    with MUTATIONS[name].applied():
-        found = first_violation(1, 500, MUTATIONS[name].schedule)
+    found = ENGINE.find(name, 1, 500)
     assert found is not None
-    number, rule = found
-    assert rule.startswith("ViolatedError"), rule
-    assert violation(generate(1, number), Folder()) == "", "without the bug the rules hold"
+    assert found.problems[0].startswith("ViolatedError"), found.problems
+    assert not _violations(1, [found.number]), "without the bug the rules hold"
 
 
 def test_a_schedule_is_always_the_same() -> None:
-    with MUTATIONS["a zero waits for its turn"].applied():
-        found = [[violation(generate(1, number), Folder()) for number in range(10)] for _ in range(2)]
+    with in_process(ENGINE.mutations["a zero waits for its turn"]):
+        found = [_violations(1, range(10)) for _ in range(2)]
     assert found[0] == found[1]
     assert any(found[0])

@@ -1,80 +1,13 @@
-"""Deliberate bugs in the manager, the script API, the gate and the motor owner; schedules must show each of them.
-
-The code of the functions that a bug changes is replaced in this process.
-"""
+"""Deliberate bugs in the manager, the script API, the gate and the motor owner; schedules must show each of them."""
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
-from importlib import import_module
-from pathlib import Path
-from types import CodeType, FunctionType, ModuleType
-from typing import Any
+from tests.kit.mutations import Mutation
 
 _SERVICES = "pebble.services"
 _MANAGER, _GATE = f"{_SERVICES}.autonomy_manager", f"{_SERVICES}.autonomy_manager.gate"
 _MOTORS = f"{_SERVICES}.serial_mcu_bridge"
-_SERVICE = "pebble.runtime.service"
 _SENDER = "pebble.script.drive_sender"
-
-
-@dataclass(frozen=True)
-class Mutation:
-    """``original``, which is there once, is replaced by ``mutated`` in a module."""
-
-    module: str
-    original: str
-    mutated: str
-    schedule: int = 0  # of seed 1, one that shows it: to begin there saves time
-
-    @contextmanager
-    def applied(self) -> Iterator[None]:
-        module = import_module(self.module)
-        path = Path(inspect.getsourcefile(module) or "")
-        text = path.read_text()
-        assert text.count(self.original) == 1, f"{self.module} has changed: adapt this mutation"
-        codes = dict(_codes(compile(text.replace(self.original, self.mutated), str(path), "exec")))
-        functions = {name: function for name, function in _functions(module) if name in codes}
-        saved = {name: function.__code__ for name, function in functions.items()}
-        try:
-            for name, function in functions.items():
-                function.__code__ = codes[name]
-            yield
-        finally:
-            for name, function in functions.items():
-                function.__code__ = saved[name]
-
-
-def _codes(code: CodeType) -> Iterator[tuple[str, CodeType]]:
-    """Every function in it, by its qualified name."""
-    for constant in code.co_consts:
-        if isinstance(constant, CodeType):
-            yield constant.co_qualname, constant
-            yield from _codes(constant)
-
-
-def _functions(holder: ModuleType | type, module: str = "") -> Iterator[tuple[str, FunctionType]]:
-    module = module or holder.__name__
-    for value in list(vars(holder).values()):
-        yield from _function(value, module)
-
-
-def _function(value: Any, module: str) -> Iterator[tuple[str, FunctionType]]:
-    if isinstance(value, property):
-        value = value.fget
-    if isinstance(value, classmethod | staticmethod):
-        value = value.__func__
-    if getattr(value, "__module__", None) != module:
-        return
-    if isinstance(value, FunctionType) and "<" not in value.__qualname__:
-        if not (value.__closure__ or hasattr(value, "__wrapped__")):
-            yield value.__qualname__, value
-    elif isinstance(value, type):
-        yield from _functions(value, module)
-
 
 MUTATIONS = {
     # -- the motor owner

@@ -6,7 +6,7 @@ import heapq
 from collections.abc import Callable
 from itertools import count
 
-from tests.motion.rules import ViolatedError
+from tests.kit.schedules import ViolatedError
 
 
 class Scheduler:

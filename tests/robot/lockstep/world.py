@@ -1,7 +1,6 @@
 """A whole robot in virtual time: motor owner, manager of scripts, scripts, persons and the network between them.
 
-A step is ``(action, a, b)``: the method ``do_<action>`` with two small numbers. Every step is possible at any time, and
-does nothing where it has no meaning, so that steps can be left out of a schedule.
+Every step is possible at any time, and does nothing where it has no meaning, so steps can be left out of a schedule.
 """
 
 from __future__ import annotations
@@ -27,8 +26,6 @@ from tests.robot.lockstep.rules import WheelRules
 from tests.robot.lockstep.scheduler import Scheduler
 from tests.robot.lockstep.script_rules import ScriptRules
 from tests.robot.lockstep.scripts import OwnScript
-
-Step = tuple[str, int, int]
 
 STOP_TIMEOUT_S = 1.5
 WAITS_S = (0.0, 0.001, 0.005, 0.02, 0.05, 0.1, 0.1, 0.2, 0.3, 0.5, 0.7, 0.76, 1.0, 1.5, 1.99, 2.01, 2.1, 3.0)
@@ -93,10 +90,6 @@ class World:
         scheduler.run(0.1)
         announce(self.people[0])
         scheduler.run(2.2)
-
-    def perform(self, steps: list[Step]) -> None:
-        for action, a, b in steps:
-            getattr(self, "do_" + action)(a, b)
 
     def _arrived(self, process: Process, message: Message) -> None:
         if process is self.owner:

@@ -2,47 +2,29 @@
 
 from __future__ import annotations
 
-import shutil
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
-from tests.robot.lockstep import mutations
+from tests.kit.mutations import Mutation, in_copy, in_process
 from tests.web.driving_lockstep.pages import CORE
 
 
-@dataclass(frozen=True)
-class Mutation:
-    """``original``, which is there once in a file of the page or in a module of the server, is replaced."""
-
-    file: str
-    original: str
-    mutated: str
-    schedule: int = 0  # of seed 1, one that shows it: to begin there saves time
-
-    @contextmanager
-    def applied(self) -> Iterator[Path]:
-        """Yields the folder of the page's modules."""
-        if self.file.endswith(".js"):
-            with tempfile.TemporaryDirectory(prefix="pbl") as folder:
-                self._copy(Path(folder))
-                yield Path(folder)
-        else:
-            with mutations.Mutation(self.file, self.original, self.mutated).applied():
-                yield CORE
-
-    def _copy(self, folder: Path) -> None:
-        for path in CORE.glob("*.js"):
-            shutil.copy(path, folder)
-        shutil.copy(CORE.parent / "package.json", folder)
-        text = (folder / self.file).read_text()
-        assert text.count(self.original) == 1, f"{self.file} has changed: adapt this mutation"
-        (folder / self.file).write_text(text.replace(self.original, self.mutated))
+@contextmanager
+def mutated(mutation: Mutation) -> Iterator[Path]:
+    """Yields the folder of the page's modules; the bug is in one of them, or in a module of the server."""
+    if mutation.file.endswith(".js"):
+        with in_copy(mutation, CORE.parent, "package.json", CORE.name) as folder:
+            yield folder / CORE.name
+    else:
+        with in_process(mutation):
+            yield CORE
 
 
 _DRIVING, _CLOCK, _CONTROL = "pebble.web.driving", "pebble.web.page_clock", "pebble.web.control"
+_DRIVER, _INPUTS, _GESTURE, _REASONS, _SOCKET = (
+    f"core/{name}.js" for name in ("driver", "inputs", "gesture", "reasons", "control-socket")
+)
 
 MUTATIONS = {
     # -- the server
@@ -112,67 +94,65 @@ MUTATIONS = {
     ),
     # -- the page
     "keys stay down when the window loses the focus": Mutation(
-        "driver.js", "  leave() {\n    this.inputs.leave();\n    this.interrupt();\n", "  leave() {\n"
+        _DRIVER, "  leave() {\n    this.inputs.leave();\n    this.interrupt();\n", "  leave() {\n"
     ),
     "a hidden page goes on": Mutation(
-        "driver.js", "document.hidden && this.leave());", "document.hidden && this.changed());"
+        _DRIVER, "document.hidden && this.leave());", "document.hidden && this.changed());"
     ),
     "an interruption leaves the inputs as they are": Mutation(
-        "driver.js",
+        _DRIVER,
         "  interrupt() {\n    this.inputs.clear();\n    this.gesture.interrupt(performance.now());\n",
         "  interrupt() {\n    this.gesture.interrupt(performance.now());\n    this.gesture.mustRelease = false;\n",
     ),
-    "a repeated key is a pressed key": Mutation("inputs.js", "    if (!repeat) {\n", "    if (repeat || !repeat) {\n"),
+    "a repeated key is a pressed key": Mutation(_INPUTS, "    if (!repeat) {\n", "    if (repeat || !repeat) {\n"),
     "a gamepad needs no neutral": Mutation(
-        "inputs.js", "    this.pad = this.padArmed ? ", "    this.pad = this.padArmed || sample ? "
+        _INPUTS, "    this.pad = this.padArmed ? ", "    this.pad = this.padArmed || sample ? "
     ),
     "a refused gesture begins again": Mutation(
-        "gesture.js",
+        _GESTURE,
         "    this.active = false;\n    this.mustRelease = true;\n    this.last = ZERO;\n    return true;\n",
         "    this.active = false;\n    this.last = ZERO;\n    return true;\n",
     ),
     "the end of a gesture is not sent": Mutation(
-        "gesture.js", "    this.command(ZERO, now, final);\n    this.repeats = ", "    this.repeats = "
+        _GESTURE, "    this.command(ZERO, now, final);\n    this.repeats = ", "    this.repeats = "
     ),
     "a page that stood still goes on": Mutation(
-        "driver.js",
+        _DRIVER,
         "    if (now - this.updatedAt > STALL_MS) this.leave(); // the",
         "    this.gesture.updatedAt = now; // the",
     ),
-    "a suspended computer goes on": Mutation("driver.js", "    this.checkClock(now);\n", ""),
-    "old events count": Mutation("driver.js", "  return performance.now() - at > STALL_MS;\n", "  return false;\n"),
+    "a suspended computer goes on": Mutation(_DRIVER, "    this.checkClock(now);\n", ""),
+    "old events count": Mutation(_DRIVER, "  return performance.now() - at > STALL_MS;\n", "  return false;\n"),
     "releases that macOS hides are lost": Mutation(
-        "driver.js", '  return event.key === "Meta" || event.key === "OS";\n', "  return false;\n"
+        _DRIVER, '  return event.key === "Meta" || event.key === "OS";\n', "  return false;\n"
     ),
     "opposite keys are a release": Mutation(
-        "gesture.js",
+        _GESTURE,
         "    else if (neutral) this.mustRelease = false;\n",
         "    else if (!moving) this.mustRelease = false;\n",
     ),
-    "a frozen gamepad drives on": Mutation("inputs.js", "const FROZEN_MS = 3000;", "const FROZEN_MS = 300000;"),
+    "a frozen gamepad drives on": Mutation(_INPUTS, "const FROZEN_MS = 3000;", "const FROZEN_MS = 300000;"),
     "a gesture outlives its connection": Mutation(
-        "driver.js",
+        _DRIVER,
         "    this.inputs.clear();\n    this.gesture.reset();\n    this.changed();\n",
         "    this.changed();\n",
     ),
     "a dialog ends nothing": Mutation(
-        "reasons.js", '  if (s.dialog) return reason("dialog", "Close the panel first");\n', ""
+        _REASONS, '  if (s.dialog) return reason("dialog", "Close the panel first");\n', ""
     ),
     "a lost release blocks for good": Mutation(
-        "inputs.js",
+        _INPUTS,
         "    if (!this.keys.size) this.waiting.clear(); // the release of the others may have been lost\n",
         "",
     ),
     "a press right after a reset is lost without a word": Mutation(
-        "reasons.js", "const RESET_MS = 600;", "const RESET_MS = 0;"
+        _REASONS, "const RESET_MS = 600;", "const RESET_MS = 0;"
     ),
     "a lost connection is not made again": Mutation(
-        "control-socket.js", "    this.retry = setTimeout(() => this.connect(), delay);\n", ""
+        _SOCKET, "    this.retry = setTimeout(() => this.connect(), delay);\n", ""
     ),
     "two attempts make two connections": Mutation(
-        "control-socket.js", "    clearTimeout(this.retry); // two attempts would be two connections\n", ""
+        _SOCKET, "    clearTimeout(this.retry); // two attempts would be two connections\n", ""
     ),
-    "a silent connection is not given up": Mutation(
-        "control-socket.js", "    setInterval(() => this.check(), CHECK_MS);\n", ""
-    ),
+    "a silent connection is not given up": Mutation(_SOCKET, "    setInterval(() => this.check(), CHECK_MS);\n", ""),
 }

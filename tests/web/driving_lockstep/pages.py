@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import heapq
 import subprocess
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
 
+from tests.kit.schedules import ViolatedError
 from tests.robot.lockstep.scheduler import Scheduler
 
 CORE = Path(__file__).parents[3] / "pebble/web/static/core"
@@ -117,14 +119,10 @@ class PagesScheduler(Scheduler):
         self._raise()
 
     def _run_first(self) -> None:
-        import heapq
-
         self.now, _, job = heapq.heappop(self._heap)
         job()
         self._raise()
 
     def _raise(self) -> None:
-        from tests.motion.rules import ViolatedError
-
         if self._violated:
             raise ViolatedError(self._violated)

@@ -1,18 +1,13 @@
-"""Random schedules, whether one violates a rule, and the shortest one that does."""
+"""Random schedules of humans at pages in virtual time: ``python -m tests.kit.schedules driving_lockstep``."""
 
 from __future__ import annotations
 
-import random
-from itertools import accumulate
+import os
 
-from tests.motion.histories import shrink
+from tests.kit.schedules import Engine, Outcome, RandomSteps, Steps
+from tests.web.driving_lockstep.mutations import MUTATIONS, mutated
 from tests.web.driving_lockstep.rest import rest
-from tests.web.driving_lockstep.world import Rig, Step, World
-
-STEPS = 30  # of one schedule
-LAYOUTS = 84
-
-Schedule = tuple[int, list[Step]]
+from tests.web.driving_lockstep.world import CORE, Rig, World
 
 _HANDS = {
     "wait": 40, "press": 16, "release": 12, "tap": 6, "stick": 8, "cancel": 2, "hold": 2, "slide": 3, "pad": 8,
@@ -32,47 +27,29 @@ _LEASES = {
     "wait": 40, "press": 18, "release": 10, "tap": 4, "stick": 4, "space": 5, "take": 16, "give": 5, "other": 5,
     "select": 2, "reload": 4, "break": 3, "estop": 3, "reset": 5, "role": 2, "delay": 3, "block": 2, "blur": 2,
 }  # fmt: skip
-_MIXES = [(list(one), list(accumulate(one.values()))) for one in (_HANDS, _NET, _SERVERS, _LEASES)]
 
 
-def generate(seed: int, number: int) -> Schedule:
-    """Schedule ``number`` of ``seed``: the layout of its world, and the steps. Mostly it begins with a drive."""
-    chance = random.Random(seed << 40 | number)
-    names, totals = _MIXES[number % len(_MIXES)]
-    steps = [
-        (name, chance.randrange(8), chance.randrange(64)) for name in chance.choices(names, cum_weights=totals, k=STEPS)
-    ]
-    begin: list[Step] = [
-        ("take", 0, 0),
-        ("wait", 0, 5),
-        ("press", 0, chance.randrange(64)),
-        ("wait", 0, chance.randrange(64)),
-    ]
-    return chance.randrange(LAYOUTS), begin + steps if chance.random() < 0.8 else steps
-
-
-def violation(schedule: Schedule, rig: Rig) -> str:
-    """The rule that is violated in this schedule; empty if none is."""
+def _perform(rig: Rig, schedule: Steps) -> Outcome:
     layout, steps = schedule
-    world = None
+    world = World(layout, rig)
     try:
-        world = World(layout, rig)
         world.perform(steps)
         rest(world)
-    except Exception as error:
-        return f"{type(error).__name__}: {error}"
     finally:
-        if world is not None:
-            world.end()
-    return ""
+        world.end()
+    return Outcome(counts={"drives": world.rules.moves})
 
 
-def shortest(schedule: Schedule, broken: str, rig: Rig) -> Schedule:
-    """``schedule``, which violates the rule ``broken``, without what does not matter for it."""
-    return shrink(schedule, lambda shorter: violation(shorter, rig) == broken)
-
-
-def first_violation(seed: int, schedules: int, rig: Rig, first: int = 0) -> tuple[int, str] | None:
-    """The first of so many schedules that violates a rule, and the rule; ``first`` is tried before the others."""
-    found = ((number, violation(generate(seed, number), rig)) for number in (first, *range(schedules)))
-    return next(((number, rule) for number, rule in found if rule), None)
+ENGINE = Engine(
+    draw=RandomSteps(
+        *(_HANDS, _NET, _SERVERS, _LEASES),
+        length=30,
+        layouts=84,
+        begin=[("take", 0, 0), ("wait", 0, 5), ("press", 0, None), ("wait", 0, None)],
+    ),
+    world=lambda _kind, folder: Rig(folder or CORE),
+    perform=_perform,
+    jobs=os.cpu_count() or 1,
+    mutations=MUTATIONS,
+    bug=mutated,
+)

@@ -1,7 +1,7 @@
 """Humans at pages, the network, the server, the broker and a robot in virtual time.
 
-A step is ``(action, a, b)``: the method ``do_<action>`` with two small numbers. ``a`` chooses the page, mostly. Every
-step is possible at any time, and does nothing where it has no meaning, so steps can be left out of a schedule.
+Of a step's numbers ``a`` chooses the page, mostly. Every step is possible at any time, and does nothing where it has
+no meaning, so steps can be left out of a schedule.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from pebble.contract.payloads import Driving as DrivingPayload
 from pebble.fleet.roles import Role
 from pebble.transports import Message, QoS, State
 from pebble.web import messages as m
+from tests.kit.schedules import Step
 from tests.robot.lockstep.network import Network
 from tests.robot.lockstep.owner import Disk, Owner
 from tests.robot.lockstep.processes import Process
@@ -31,8 +32,6 @@ from tests.web.driving_lockstep.link import Link, Wire
 from tests.web.driving_lockstep.pages import CORE, EPOCH, Output, Pages, PagesScheduler
 from tests.web.driving_lockstep.rules import RecordedWheels, Rules
 from tests.web.driving_lockstep.web_server import BOOT_S, TIME, WebServer, virtual
-
-Step = tuple[str, int, int]
 
 BASE, OTHER_BASE = "pebble/robots/goob", "pebble/robots/fred"
 WAITS_S = (0.0, 0.004, 0.01, 0.03, 0.05, 0.08, 0.12, 0.16, 0.2, 0.26, 0.3, 0.35, 0.45, 0.6, 0.9, 1.6)
@@ -64,7 +63,6 @@ class Rig:
 
     def __init__(self, folder: Path = CORE) -> None:
         self.folder = folder
-        self.drives = 0  # how often wheels began to turn
 
     def __enter__(self) -> Self:
         self._stack = ExitStack()
@@ -129,7 +127,6 @@ class World:
             self.scheduler.flush()
 
     def end(self) -> None:
-        self.rig.drives += self.rules.moves
         self.server.leave()
         self.server.end()
 
