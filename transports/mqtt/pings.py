@@ -6,7 +6,7 @@ import random
 from math import inf
 
 from pebble.transports import clock
-from pebble.transports.mqtt.client import AnyClient
+from pebble.transports.mqtt.client_kinds import AnyClient
 from pebble.transports.mqtt.outgoing import InFlightTable, PendingAck, unconfirmed_bytes
 from pebble.transports.mqtt.read_age import ReadAge
 from pebble.transports.settings import MqttSettings

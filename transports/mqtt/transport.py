@@ -12,7 +12,8 @@ from math import ceil
 from pebble.errors import TransportError
 from pebble.transports import clock
 from pebble.transports.base import Message, Outgoing, QoS, State, Subscription, Transport
-from pebble.transports.mqtt.connection import Connection, client_class, ignore
+from pebble.transports.mqtt.client_kinds import client_class
+from pebble.transports.mqtt.connection import Connection, ignore
 from pebble.transports.mqtt.dialler import Dialler
 from pebble.transports.mqtt.ending import Lost, Silent
 from pebble.transports.mqtt.filters import BrokerFilters, OwnMessageFilter, overlap
