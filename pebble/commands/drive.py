@@ -13,9 +13,9 @@ import typer
 
 from pebble.client.connection import Target, connected, target_of
 from pebble.client.driver_lease import ANSWER_S, DriverLease
-from pebble.client.key_decoder import END
-from pebble.client.key_gesture import PERIOD_S, KeyGesture
-from pebble.client.terminal_driver import TerminalDriver
+from pebble.client.terminal.driver import TerminalDriver
+from pebble.client.terminal.key_decoder import END
+from pebble.client.terminal.key_gesture import PERIOD_S, KeyGesture
 from pebble.commands.estop import me
 from pebble.commands.options import with_target
 from pebble.commands.terminal_loop import TerminalLoop
@@ -61,7 +61,7 @@ def drive(
         pebble drive goob --url mqtt://127.0.0.1 --speed 0.3
         pebble drive goob.json --remote --take-over
     """
-    from pebble.client.terminal_keys import check_terminal, opened
+    from pebble.client.terminal.keys import check_terminal, opened
 
     check_terminal()
     target = target_of(robot, target)

@@ -16,8 +16,8 @@ from typing import Annotated
 import typer
 
 from pebble.client.connection import password
-from pebble.client.key_decoder import END, LEFT, RIGHT, SPACE
 from pebble.client.names import id_of
+from pebble.client.terminal.key_decoder import END, LEFT, RIGHT, SPACE
 from pebble.client.url import settings_of
 from pebble.commands.options import CaCert, PasswordFile
 from pebble.commands.recordings.options import Since, Until, period
@@ -241,7 +241,7 @@ class _Console:
 
     @contextmanager
     def keys(self) -> Iterator[None]:
-        from pebble.client.terminal_keys import opened
+        from pebble.client.terminal.keys import opened
 
         with opened() as terminal:
             self._loop = TerminalLoop(terminal, time.monotonic)

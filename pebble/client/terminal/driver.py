@@ -10,10 +10,10 @@ from collections.abc import Sequence
 from pebble.client.drive_reasons import SLOW_S, SLOW_SPEED, Code, Situation, first_reason
 from pebble.client.driver_lease import FILTER, LISTEN_S, DriverLease
 from pebble.client.estop import Progress, StopSender, new_name
-from pebble.client.key_decoder import ESCAPE, SPACE
-from pebble.client.key_gesture import KeyGesture
 from pebble.client.names import id_of
 from pebble.client.robot_view import RobotView
+from pebble.client.terminal.key_decoder import ESCAPE, SPACE
+from pebble.client.terminal.key_gesture import KeyGesture
 from pebble.contract import AUTONOMY_STATUS, CAPABILITIES, CHARGING_LEVEL, DRIVE, ESTOP_STATE, ONLINE, channel_of, codec
 from pebble.contract.payloads import Drive
 from pebble.transports import Message, QoS
