@@ -79,7 +79,6 @@ class Program:
         return self.code is not None
 
     def tail(self) -> str:
-        """The end of its log."""
         return self.log.read_text(errors="replace").strip()[-_TAIL:]
 
     def freeze(self) -> None:
@@ -270,7 +269,6 @@ class Processes:
 
 
 def python(module: str, *arguments: object) -> list[str]:
-    """The command that runs a module."""
     return [sys.executable, "-m", module, *map(str, arguments)]
 
 

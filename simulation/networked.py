@@ -127,7 +127,6 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def add_broker_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options that ``broker_address`` reads."""
     parser.add_argument("--broker", required=True, metavar="HOST[:PORT]")
     parser.add_argument("--username")
     parser.add_argument("--password-file", type=Path, help=f"by default the password is ${PASSWORD}")

@@ -74,7 +74,6 @@ class Scheduler:
         self._epoll.close()
 
     def _ready_boards(self) -> list[int]:
-        """The boards whose sockets are ready."""
         now = time.monotonic()
         wait = min(_LONGEST_S, max(0.0, self._due[0][0] - now)) if self._due else _LONGEST_S
         boards: dict[int, None] = {}

@@ -49,7 +49,6 @@ def _pair(tokens: list[str]) -> tuple[float, float] | None:
 
 
 def motors_entry(ns: int, motors: tuple[float, float]) -> Entry:
-    """Make the entry for a change of the motors."""
     left, right = (round(speed, 3) + 0.0 for speed in motors)  # + 0.0: no "-0.000"
     return Entry(ns, "motors", f"{left:.3f} {right:.3f}")
 

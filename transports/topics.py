@@ -83,7 +83,6 @@ def check_filter(filter_: str) -> str:
 
 
 def is_pattern(filter_: str) -> bool:
-    """Whether this filter has wildcards."""
     return "+" in filter_ or "#" in filter_
 
 

@@ -122,5 +122,4 @@ def _options(
         bool, typer.Option("--version", help="Print the version of Pebble.", callback=_print_version, is_eager=True)
     ] = False,
 ) -> None:
-    """Options before the command."""
     _ = version

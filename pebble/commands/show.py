@@ -199,7 +199,6 @@ def print_listing(listing: Listing, now: float, wall: float) -> None:
 
 
 def stopped_robots(listing: Listing, wall: float) -> list[str]:
-    """A line for each robot in the listing that is stopped."""
     discovery = Discovery()
     for record in listing.records.values():
         if record.last is not None:

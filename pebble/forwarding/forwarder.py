@@ -90,7 +90,6 @@ class Forwarder:
 
     @property
     def mirroring(self) -> bool:
-        """Whether remote-mirror is on."""
         return self._mirroring
 
     @mirroring.setter
@@ -145,7 +144,6 @@ class Forwarder:
         return True
 
     def receive(self, side: Side, message: Message) -> Routed:
-        """Forward ``message`` by the table."""
         subject, here = self._subjects[message.topic], self.sides[side]
         outcome = self._receive(here, subject, message)
         if isinstance(outcome, Drop):

@@ -193,7 +193,6 @@ class MediaFeed:
             tasks.create_task(self._conversion.run())
 
     def receive(self, payload: bytes) -> None:
-        """Take a payload of the robot."""
         known = self._take_picture(payload) if self._medium == "video" else payload.startswith(PBAT)
         if not known or len(payload) > MAX_PAYLOAD:
             self._refused += 1

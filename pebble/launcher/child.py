@@ -41,7 +41,6 @@ class Child:
         os.close(output_end)
 
     def terminate(self) -> None:
-        """Ask it to stop."""
         if not self._reaped:
             os.kill(self.pid, signal.SIGTERM)
 

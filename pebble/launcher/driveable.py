@@ -81,7 +81,6 @@ class Driveable:
         return True
 
     def ended(self, program: str) -> None:
-        """Forget a process that has ended."""
         for table in (self._mcus, self._connected, self._reached):
             table.pop(program, None)
 

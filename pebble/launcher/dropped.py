@@ -29,5 +29,4 @@ class Dropped:
         return True
 
     def ended(self, program: str) -> None:
-        """Forget a process that has ended."""
         self._counts.pop(program, None)

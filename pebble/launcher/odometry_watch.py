@@ -21,7 +21,6 @@ class OdometryWatch:
         self.received_at = float("-inf")  # on the clock
 
     def start(self, transport: Transport) -> None:
-        """Subscribe."""
         transport.subscribe(self._topic, self._receive, qos=QoS.LATEST, direct=True)
 
     def poll(self) -> None:

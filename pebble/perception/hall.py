@@ -175,7 +175,6 @@ class HallWheel:
 
     @property
     def steps(self) -> float:
-        """The steps in any direction."""
         return self._counts.rad_in_any_direction / math.pi
 
     @property

@@ -118,7 +118,6 @@ class Odometry:
         self._power.command(drive, now)
 
     def owner(self, state: EstopState) -> None:
-        """The motor owner's state."""
         self._power.owner(state)
 
     def imu(self, imu: ImuFast, now: float) -> None:

@@ -70,7 +70,6 @@ class Inbox:
         self._woken = False
 
     def __bool__(self) -> bool:
-        """Whether there is a job."""
         return bool(self._internal or self._jobs)
 
     def take(self, timeout: float | None = 0.0) -> Job | None:

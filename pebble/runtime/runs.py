@@ -37,7 +37,6 @@ def newest(runs: Iterable[int]) -> int:
 
 
 def following(run: int) -> int:
-    """The number after ``run``."""
     return run + 1 if run < LAST_RUN else 1
 
 

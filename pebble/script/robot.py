@@ -190,7 +190,6 @@ class Robot:
             pictures.close()
 
     def close(self) -> None:
-        """End, and disconnect."""
         if os.getpid() == self._pid:
             self.end("the script has finished")
             self._transport.close()

@@ -52,7 +52,6 @@ class Wheels:
 
     @property
     def run(self) -> int:
-        """The number of this run."""
         return self._sender.run
 
     def drive(self, wanted: Drive) -> bool:

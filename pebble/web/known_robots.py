@@ -40,7 +40,6 @@ class KnownRobots:
         return len(self._entries)
 
     def operated(self, ref: str, day: int) -> None:
-        """A person drives it."""
         self._note(ref, _Entry(operated=True, day=day))
 
     def seen(self, robot: RobotView, rank: Rank, day: int) -> None:

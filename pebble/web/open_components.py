@@ -75,18 +75,15 @@ class OpenComponents:
         broker.on_state(self._forget_flags)
 
     def __contains__(self, ref: object) -> bool:
-        """Whether a page has it open."""
         return ref in self._pages
 
     def open(self, ref: str) -> None:
-        """A page has opened this component."""
         self._pages[ref] += 1
         self._robots.logs.setdefault(ref, LogLines())
         self._robots.recent.open(ref)
         self.update(ref)
 
     def close(self, ref: str) -> None:
-        """A page has closed it."""
         self._broker.loop.call_later(_KEEP_S, self._closed, ref)
 
     def _closed(self, ref: str) -> None:

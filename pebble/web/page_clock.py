@@ -35,7 +35,6 @@ class PageClock:
         self._bounds: deque[tuple[float, float, float]] = deque(maxlen=_ANSWERS)  # of the offset, and the round trip
 
     def ping(self, now: float) -> int:
-        """The number of a ping that is sent now."""
         if len(self._sent) >= _UNANSWERED:
             del self._sent[next(iter(self._sent))]
         number = next(self._numbers)

@@ -71,7 +71,6 @@ def refusal(op: m.RobotOp, capabilities: dict[str, Any]) -> str:
 
 
 def publication(op: m.RobotOp, topic_of: TopicOf) -> Message:
-    """What to publish."""
     command = _command(op)
     channel = command.channel
     if isinstance(op, m.ActionOp):

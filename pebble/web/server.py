@@ -102,7 +102,6 @@ class Server:
     # -- from the broker
 
     def receive(self, message: Message, now: float) -> None:
-        """Take a message of a component."""
         address = parse_topic(message.topic)
         if address is None:
             return
@@ -256,7 +255,6 @@ class Server:
             self._show_stream_address(ref)
 
     def unwatch(self, ref: str) -> None:
-        """A page has closed it."""
         if _is_base(ref):
             self.open_components.close(ref)
 

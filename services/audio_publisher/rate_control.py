@@ -84,7 +84,6 @@ class RateController:
         self._in_flight.sent(size + _OVERHEAD, now)
 
     def connection_lost(self) -> None:
-        """The packets in flight are lost."""
         self._in_flight.clear()
 
 

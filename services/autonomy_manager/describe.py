@@ -199,7 +199,6 @@ class Descriptions:
         return str(answer[2]) if answer is not None and isinstance(answer[2], BrokenScriptError) else ""
 
     def retain_only(self, names: set[str]) -> None:
-        """Forget the others."""
         self._answers = {name: answer for name, answer in self._answers.items() if name in names}
 
 

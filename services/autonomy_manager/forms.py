@@ -51,7 +51,6 @@ class Setting(Struct, frozen=True, kw_only=True):
         return free_text and not _FILE_WORDS.isdisjoint(words)
 
     def entry(self) -> dict[str, Any]:
-        """The entry as published."""
         entry: dict[str, Any] = {
             "key": self.key,
             "label": self.label or self.key,

@@ -35,7 +35,6 @@ class Leftovers:
         return self._here is None
 
     def note_local(self, message: Message) -> None:
-        """The robot publishes ``message``."""
         here = self._here
         if here is not None and len(here) <= _TOPICS:
             (here.add if message.payload else here.discard)(message.topic)

@@ -30,7 +30,6 @@ class MotorOwners:
         self._messages = dict.fromkeys(self.topics, 0)
 
     def receive(self, topic: str) -> None:
-        """Note a message on one of ``topics``."""
         self._messages[topic] += 1
 
     def check(self, now: float) -> None:

@@ -86,7 +86,6 @@ class SameBrokerProbe:
         return True
 
     def is_request(self, message: Message) -> bool:
-        """Whether the mirror requests a probe."""
         return self.announces and message.payload == PROBE_REQUEST
 
 

@@ -29,7 +29,6 @@ class Feed:
         threading.Thread(target=self._run, name="pebble-feed", daemon=True).start()
 
     def write_to(self, pipe: IO[bytes]) -> None:
-        """Write everything to ``pipe``, and close it."""
         self._pipes.put(pipe)
 
     def cancel(self) -> None:

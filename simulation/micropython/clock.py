@@ -38,7 +38,6 @@ class VirtualClock:
         self._now += max(0.0, seconds)
 
     def until(self, moment: float) -> None:
-        """Advance to ``moment``, if it is in the future."""
         self._now = max(self._now, moment)
 
     def sleep(self, seconds: float) -> None:

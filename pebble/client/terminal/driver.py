@@ -61,7 +61,6 @@ class TerminalDriver:
 
     @property
     def filters(self) -> list[str]:
-        """What to subscribe to."""
         return [*(channel.filter(self.robot.base) for channel in _RECEIVED), FILTER]
 
     @property
@@ -72,7 +71,6 @@ class TerminalDriver:
     # -- what arrives
 
     def receive(self, message: Message, now: float, wall: float) -> None:
-        """Update from a message."""
         held = self.lease.held
         self.lease.receive(message, now)
         if held and not self.lease.held:
@@ -85,7 +83,6 @@ class TerminalDriver:
             self.stopping.receive(message, now)
 
     def press(self, keys: Sequence[str], now: float) -> None:
-        """The keys that were read."""
         for key in keys:
             twice = key == ESCAPE and now - self._escape_at <= TWICE_S
             if key == ESCAPE:

@@ -72,7 +72,6 @@ class Schemas:
             ) from None
 
     def make(self, schema: str, /, **fields: Any) -> Any:
-        """A message of ``schema``."""
         return getattr(importlib.import_module(f"foxglove_schemas_protobuf.{schema}_pb2"), schema)(**fields)
 
     def descriptors(self, message: Any) -> bytes:

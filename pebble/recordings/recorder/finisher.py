@@ -31,7 +31,6 @@ class Finisher:
         self._unfinished: set[Path] = set()
 
     def finish(self, file: OpenFile) -> None:
-        """Finish a file that is complete."""
         self._background.do(partial(self._finish, file))
 
     def mend(self, path: Path) -> None:

@@ -102,7 +102,6 @@ class Recorder:
 
     @property
     def alive(self) -> bool:
-        """Whether its threads run."""
         return self._thread.is_alive() and self._background.alive
 
     @property

@@ -101,7 +101,6 @@ class Rules:
             self._add(channel)
 
     def publishes(self, channel: Channel) -> bool:
-        """Whether messages of ``channel`` are published at all."""
         return self._listed(channel) is not None
 
     def outgoing(self, recorded: Recorded, by_ns: int) -> Outgoing | None:

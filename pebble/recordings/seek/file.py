@@ -221,7 +221,6 @@ class RecordingFile:
         return frozenset()
 
     def _declare(self, chunk: Chunk) -> None:
-        """Take the channels that a chunk declares."""
         try:
             records = self._unpack(chunk)
             for op, begin, end in mcap.records(records):

@@ -134,7 +134,6 @@ class SoundStream(MediaStream[SoundPage, SoundView]):
                 self._interrupt("The server cannot reach the broker")
 
     def end_talk(self, page: SoundPage, talk: int) -> None:
-        """The page ends this talk."""
         page.over = max(page.over, talk)
         if self._talk is not None and talk == self._talk.number:
             self._end_talk(page)
@@ -254,7 +253,6 @@ def rest() -> SoundView:
 
 
 def _encoding(payload: bytes) -> str:
-    """The encoding of a packet; "" if it is none."""
     if len(payload) > MAX_PAYLOAD:
         return ""
     try:

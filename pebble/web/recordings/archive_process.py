@@ -102,7 +102,6 @@ class Job:
         return not self._task.done()
 
     async def end(self) -> None:
-        """End it, if it still runs."""
         self._process.kill()
         await asyncio.gather(self._task, return_exceptions=True)
 
