@@ -70,13 +70,7 @@ def drive(
         lease = DriverLease(names.base, f"drive-{secrets.token_hex(4)}", by=me(), device=device)
         heartbeat = target.remote or str(target.url).startswith("mqtt")  # within a robot there is none
         driver = TerminalDriver(
-            names.base,
-            KeyGesture(speed, turn),
-            lease,
-            by=me(),
-            now=clock(),
-            take_over=take_over,
-            heartbeat=heartbeat,
+            names.base, KeyGesture(speed, turn), lease, by=me(), now=clock(), take_over=take_over, heartbeat=heartbeat
         )
         driving = _Driving(transport, driver)
         typer.echo(_KEYS)

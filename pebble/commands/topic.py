@@ -31,8 +31,7 @@ _REPORT_PERIOD_S = 1.0
 Name = Annotated[
     str,
     typer.Argument(
-        help="A metric (drive-values, outgoing/online) or a whole topic; + and # except with pub.",
-        show_default=False,
+        help="A metric (drive-values, outgoing/online) or a whole topic; + and # except with pub.", show_default=False
     ),
 ]
 SecondsOption = Annotated[float | None, typer.Option("--seconds", "-s", min=0.1, help="Stop after this long.")]
@@ -177,13 +176,7 @@ def pub(
 
 
 @with_target(robot=True)
-def hz(
-    topic: Name,
-    window: WindowOption = 100,
-    seconds: SecondsOption = None,
-    *,
-    target: Target,
-) -> int:
+def hz(topic: Name, window: WindowOption = 100, seconds: SecondsOption = None, *, target: Target) -> int:
     """Print once a second how often messages arrive. Retained messages do not count.
 
     \b
@@ -193,13 +186,7 @@ def hz(
 
 
 @with_target(robot=True)
-def bw(
-    topic: Name,
-    window: WindowOption = 100,
-    seconds: SecondsOption = None,
-    *,
-    target: Target,
-) -> int:
+def bw(topic: Name, window: WindowOption = 100, seconds: SecondsOption = None, *, target: Target) -> int:
     """Print once a second how many payload bytes arrive per second. Retained messages do not count.
 
     \b

@@ -27,8 +27,7 @@ RobotArgument = Annotated[
     str, typer.Argument(help="A robot's config file, or with --url its id.", metavar="ROBOT", show_default=False)
 ]
 UrlOption = Annotated[
-    str | None,
-    typer.Option(help="mqtt://[USER@]HOST[:PORT] or mqtts://… of the operators' broker.", metavar="URL"),
+    str | None, typer.Option(help="mqtt://[USER@]HOST[:PORT] or mqtts://… of the operators' broker.", metavar="URL")
 ]
 EncodingOption = Annotated[
     str | None, typer.Option("--encoding", "-e", help="json, pbvd, pbvz or h264. [default: the robot's]")

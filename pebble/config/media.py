@@ -42,8 +42,7 @@ class CameraCapture(Section, frozen=True, kw_only=True):
         doc("How the camera is reached; `synthetic` needs none."),
     ] = "v4l2"
     device: Annotated[
-        str,
-        doc("Device of a v4l2 camera, or a file or URL; of a synthetic one, `world.json#goob`: a simulated robot."),
+        str, doc("Device of a v4l2 camera, or a file or URL; of a synthetic one, `world.json#goob`: a simulated robot.")
     ] = "/dev/video0"
     capture_format: Annotated[str, doc("`auto`, `raw`, `mjpeg`, or a pixel format such as `yuyv`.")] = "auto"
     io_mode: Annotated[str | int, doc("Not used: OpenCV chooses by itself.")] = "auto"
@@ -140,8 +139,7 @@ class AudioReceiver(Section, frozen=True, kw_only=True):
     rate: Annotated[SampleRate, doc("Samples per second before the first packet.")] = 16000
     channels: Annotated[AudioChannels, doc("Channels before the first packet.")] = 1
     command: Annotated[
-        Command,
-        doc("Plays sound from its standard input; `{rate}`, `{channels}` and `{device}` are filled in."),
+        Command, doc("Plays sound from its standard input; `{rate}`, `{channels}` and `{device}` are filled in.")
     ] = ("aplay", "-q", "-t", "raw", "-f", "S16_LE", "-c", "{channels}", "-r", "{rate}", "-D", "{device}", "-")
     latency_ms: Annotated[
         int, Meta(ge=0, le=1000, description="Sound buffered against uneven arrival; increased when necessary.")

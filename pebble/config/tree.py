@@ -78,8 +78,7 @@ class Launcher(ServiceSection, frozen=True, kw_only=True):
 
     enabled: Annotated[bool, doc("Publish capabilities and logs.")] = True
     restart_delay_seconds: Annotated[
-        Seconds,
-        doc("Scales the waits between restarts: none, then a quarter of this, doubling up to 5 times it."),
+        Seconds, doc("Scales the waits between restarts: none, then a quarter of this, doubling up to 5 times it.")
     ] = 2.0
     shutdown_timeout_seconds: Annotated[
         Seconds, doc("How long the whole robot may take to stop; then the remaining processes are killed.")

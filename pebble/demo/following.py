@@ -82,9 +82,7 @@ def _driven(completed: CompletedFollow, drives: Sequence[tuple[float, Wheels]]) 
         return Check(name, "never", f"{FOLLOW} did not drive before the operator took over")
     took = first - completed.began
     return Check(
-        name,
-        f"{took:.2f} s after its start",
-        "" if took <= _STARTED_S else f"{FOLLOW} drove only after {took:.1f} s",
+        name, f"{took:.2f} s after its start", "" if took <= _STARTED_S else f"{FOLLOW} drove only after {took:.1f} s"
     )
 
 

@@ -7,14 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from msgspec import UNSET
 
-from pebble.contract.payloads import (
-    Corners,
-    OverlayLabel,
-    TagData,
-    TagDetection,
-    TagLocations,
-    VideoOverlays,
-)
+from pebble.contract.payloads import Corners, OverlayLabel, TagData, TagDetection, TagLocations, VideoOverlays
 from pebble.perception.tags import Tag, TagGeometry
 
 Size = tuple[int, int]  # width, height of the picture

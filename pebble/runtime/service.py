@@ -92,12 +92,7 @@ class Service:
     as_published: ClassVar[bool] = False  # how its transport is opened, where there is a choice (T7)
 
     def __init__(
-        self,
-        config: Config,
-        transport: Transport,
-        *,
-        instance: str = "",
-        clock: Callable[[], float] = time.monotonic,
+        self, config: Config, transport: Transport, *, instance: str = "", clock: Callable[[], float] = time.monotonic
     ) -> None:
         self.config, self.transport, self.instance, self.clock = config, transport, instance, clock
         self.addresses = Addresses(config)

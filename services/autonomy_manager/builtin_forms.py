@@ -88,5 +88,5 @@ DEPENDENCIES: dict[str, tuple[tuple[str, dict[str, Any]], ...]] = {
     "apriltag-odom-follow": (
         ("apriltag-locations", {"width": 1280, "height": 720, "fps": 15.0}),
         ("wheel-odometry", {"use_tune_state": False}),
-    ),
+    )
 }

@@ -24,13 +24,7 @@ from pebble.transports.mqtt.client import Opening
 from pebble.transports.mqtt.client_kinds import AnyClient, client_class
 from pebble.transports.mqtt.ending import Absent, Lost, Refused, Silent
 from pebble.transports.mqtt.incoming import OVERSLEPT_S, Incoming, Sink
-from pebble.transports.mqtt.outgoing import (
-    Backlog,
-    InFlightTable,
-    PendingAck,
-    shortest_round_trip_s,
-    unconfirmed_bytes,
-)
+from pebble.transports.mqtt.outgoing import Backlog, InFlightTable, PendingAck, shortest_round_trip_s, unconfirmed_bytes
 from pebble.transports.mqtt.packets import Filter
 from pebble.transports.mqtt.poll import SocketPoll
 from pebble.transports.mqtt.suspects import Written

@@ -354,11 +354,7 @@ class MqttTransport(Transport):
         return connection.takes(message) and self._refused.suspects.accepts(message)
 
     def _await(
-        self,
-        connection: Connection,
-        ack: PendingAck,
-        stopping: _Stop,
-        receive: Callable[[list[Message]], None],
+        self, connection: Connection, ack: PendingAck, stopping: _Stop, receive: Callable[[list[Message]], None]
     ) -> None:
         asked_at = clock.since_boot()
         while not ack.done:

@@ -40,8 +40,7 @@ _FASTER = 2.0
 _WITH_COMMANDS = 1.0  # the lowest speed: a drive command moves a robot until the next one
 
 RecordingsArgument = Annotated[
-    list[Path],
-    typer.Argument(help="Recordings, or folders of them.", metavar="FILE|FOLDER…", show_default=False),
+    list[Path], typer.Argument(help="Recordings, or folders of them.", metavar="FILE|FOLDER…", show_default=False)
 ]
 UrlOption = Annotated[
     str, typer.Option(help="mqtt://[USER@]HOST[:PORT], mqtts://… or zenoh:RUN_DIR.", metavar="URL", show_default=False)

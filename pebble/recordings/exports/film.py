@@ -80,12 +80,7 @@ def write_film(
 
 
 def write_wav(
-    messages: Iterable[Recorded],
-    target: Path,
-    robot: str,
-    *,
-    overwrite: bool = False,
-    on_time: Progress | None = None,
+    messages: Iterable[Recorded], target: Path, robot: str, *, overwrite: bool = False, on_time: Progress | None = None
 ) -> SoundResult:
     """Write the sound of ``robot`` (its base) to ``target``, from its first sample on. Raises RecordingError."""
     clock = FilmClock()

@@ -217,13 +217,7 @@ class SoundHub:
         self._streams = Streams(AUDIO, lambda ref: SoundStream(broker, robots, ref, self._show, note))
 
     async def serve(
-        self,
-        websocket: WebSocket,
-        ref: str,
-        can: frozenset[str],
-        session: Session,
-        device: str = "",
-        address: str = "",
+        self, websocket: WebSocket, ref: str, can: frozenset[str], session: Session, device: str = "", address: str = ""
     ) -> None:
         """Serve a page that plays ``can`` and may talk, until either end closes the socket."""
         page = SoundPage(can & frozenset(ENCODINGS), session, device, address)
