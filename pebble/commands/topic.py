@@ -110,7 +110,9 @@ def echo(
     """
     printed = 0
     with connected(target) as (transport, names):
-        _warn_of_stop(transport, names, topic)
+        robot = _estop(transport, names, topic)
+        if robot is not None and robot.stopped_by is not None:
+            typer.echo(f"pebble: {show.stopped_line(robot, time.time())}", err=True)
         listener = Listener(transport, names.filters(topic))
         end = _end(seconds)
         while time.monotonic() < end and printed != count:
@@ -239,12 +241,6 @@ def _refuse_stopped(robot: RobotEstop | None) -> None:
             f"{show.stopped_line(robot, time.time())}; it is not driven (--force publishes anyway). "
             f"To end the stop: pebble estop reset {shown(id_of(robot.base))}, with the same --url or --config"
         )
-
-
-def _warn_of_stop(transport: Transport, names: Names, topic: str) -> None:
-    robot = _estop(transport, names, topic)
-    if robot is not None and robot.stopped_by is not None:
-        typer.echo(f"pebble: {show.stopped_line(robot, time.time())}", err=True)
 
 
 def _estop(transport: Transport, names: Names, topic: str) -> RobotEstop | None:

@@ -142,14 +142,10 @@ def _config(raw: Any, path: Path | None, folder: Path, env: Mapping[str, str]) -
         path=path,
         folder=folder,
         warnings=reader.notes.warning_lines(),
-        run_folder=_run_folder(root, identity.base, env),
+        run_folder=root.transport.run_dir or default_run_folder(identity.base, env),
         state_folder=root.transport.state_dir or default_state_folder(identity.base, env),
         password_variables=tuple(reader.password_variables),
     )
-
-
-def _run_folder(root: Root, base: str, env: Mapping[str, str]) -> Path:
-    return root.transport.run_dir or default_run_folder(base, env)
 
 
 def default_run_folder(base: str, env: Mapping[str, str]) -> Path:

@@ -65,8 +65,9 @@ class Launcher:
 
         Raises PebbleError if the robot runs already or its run directory cannot be used. Main thread only.
         """
-        own_records = OwnRecords(self._logs, self._config.log_level_of("launcher"))
-        with own_records, _run_lock(self._config) as lock, self._signals:
+        config = self._config
+        own_records = OwnRecords(self._logs, config.log_level_of("launcher"))
+        with own_records, RunLock(config.run_dir(), config.base, config.path or config.folder) as lock, self._signals:
             try:
                 self._reactor.every(_RUN_DIR_S, lambda: self._keep(lock))
                 self._start()
@@ -213,10 +214,6 @@ def _check_runs_here(config: Config) -> None:
     if config.path is None:
         raise ConfigError("the robot's processes know its config by its file, and this one has none")
     check_connections(config)
-
-
-def _run_lock(config: Config) -> RunLock:
-    return RunLock(config.run_dir(), config.base, config.path or config.folder)
 
 
 def _running(supervisors: Sequence[ProcessSupervisor]) -> list[str]:

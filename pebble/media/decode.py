@@ -118,7 +118,9 @@ class VideoDecoder:
 
     def _decode(self, parsed: _Payload) -> Pixels:
         if parsed.encoding == "h264":
-            return self._decode_h264(parsed)
+            if self._h264 is None or self._last is None:
+                self._h264 = H264Decoder()
+            return self._h264.decode(parsed.body, keyframe=parsed.keyframe)
         pixels = decode_jpeg(parsed.body)
         if parsed.encoding == "jpeg":
             return pixels
@@ -129,11 +131,6 @@ class VideoDecoder:
         else:
             raise PayloadError("a difference of another size than the picture it builds on")
         return self._reference.copy()
-
-    def _decode_h264(self, parsed: _Payload) -> Pixels:
-        if self._h264 is None or self._last is None:
-            self._h264 = H264Decoder()
-        return self._h264.decode(parsed.body, keyframe=parsed.keyframe)
 
 
 def encoding_of(payload: bytes) -> str | None:

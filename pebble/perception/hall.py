@@ -105,7 +105,8 @@ class PhaseTracker:
         branches = (base, math.pi - base)
         phases = [predicted + math.remainder(branch - predicted, math.tau) for branch in branches]
         nearest = min(phases, key=lambda phase: abs(phase - predicted))
-        possible = [phase for phase in phases if not self._goes_back(phase)]
+        onwards = math.copysign(1.0, self._expected)
+        possible = [phase for phase in phases if (phase - self._farthest) * onwards >= -_NOISE_RAD]
         if nearest not in possible:
             self.rejected += 1
             turn = math.copysign(math.tau, self._expected)
@@ -130,9 +131,6 @@ class PhaseTracker:
             self._farthest = self.phase
         agrees = self._measured * self._expected > 0.0
         return (self._expected + self._measured) / 2 if agrees else self._expected
-
-    def _goes_back(self, phase: float) -> bool:
-        return (phase - self._farthest) * math.copysign(1.0, self._expected) < -_NOISE_RAD
 
     def _move_to(self, before: float, phase: float, power: float) -> float:
         added = phase - before

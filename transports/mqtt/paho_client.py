@@ -34,9 +34,6 @@ class _Paho(paho.Client):
     ahead = b""  # was taken out of the socket; `begin` of it was read
     begin = 0
 
-    def send_ping(self) -> None:
-        self._send_pingreq()
-
     @property
     def unwritten(self) -> int:
         return sum(packet["to_process"] for packet in self._out_packet)
@@ -210,7 +207,7 @@ class PahoClient:
         return sent[1] or 0  # 0: lost; no answer will have it
 
     def ping(self) -> None:
-        self._paho.send_ping()
+        self._paho._send_pingreq()
         self.write()
 
     def disconnect(self) -> None:

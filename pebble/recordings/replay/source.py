@@ -81,12 +81,8 @@ class ReplaySource:
         return [
             path
             for path, covered, channels in self._files
-            if _overlaps(covered, since_ns, until_ns) and any(map(chooses, channels))
+            if covered.first_ns < until_ns and covered.last_ns >= since_ns and any(map(chooses, channels))
         ]
-
-
-def _overlaps(covered: Span, since_ns: int, until_ns: int) -> bool:
-    return covered.first_ns < until_ns and covered.last_ns >= since_ns
 
 
 def _channels(path: Path) -> Iterable[Channel]:

@@ -283,13 +283,11 @@ class MotorBridge(SerialService):
                 if self._publishes_touch:
                     self.publish(TOUCH_SENSORS, TouchSensors(value=TouchValues(a0=a0, a1=a1, a2=a2)))
             case Charging(value):
-                self._publish_charging(ChargingStatus(value=value))
+                status = ChargingStatus(value=value)
+                if status != self._charging:
+                    self._charging = status
+                    self.publish(CHARGING_STATUS, status)
             case Level(volts):
                 self.publish(CHARGING_LEVEL, ChargingLevel(value=volts))
             case DeviceLogLine(level, text):
                 self.device_log.log(logging.getLevelName(level), level, "MCU: %s", text)
-
-    def _publish_charging(self, status: ChargingStatus) -> None:
-        if status != self._charging:
-            self._charging = status
-            self.publish(CHARGING_STATUS, status)
