@@ -5,10 +5,9 @@ from typing import Annotated, ClassVar, Literal
 from msgspec import Meta, field
 
 from pebble.config.autonomy import AutonomyManager
-from pebble.config.media import AvDaemon, Media, VideoStream
+from pebble.config.media import AvDaemon, Media, SoundboardHandler, VideoStream
 from pebble.config.planned import Ros1Bridge
 from pebble.config.recorder import Recorder
-from pebble.config.soundboard import SoundboardHandler
 from pebble.config.transport import Mqtt, RemoteConnection, RemoteMqtt, TransportSection
 from pebble.config.types import (
     EMPTY,

@@ -5,6 +5,8 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Collection, Sequence
+from contextlib import suppress
+from pathlib import Path
 
 from pebble.config import Config
 from pebble.errors import ConfigError, PebbleError
@@ -15,7 +17,6 @@ from pebble.launcher.dropped import Dropped
 from pebble.launcher.features import Features
 from pebble.launcher.log_forwarding import LogForwarder, OwnRecords
 from pebble.launcher.on_demand import OnDemand
-from pebble.launcher.orphans import reap
 from pebble.launcher.process_supervisor import ProcessSupervisor
 from pebble.launcher.programs import Program, Stage, preload, program_of, programs, shared_modules
 from pebble.launcher.reactor import Reactor, StopSignals
@@ -223,3 +224,18 @@ def _running(supervisors: Sequence[ProcessSupervisor]) -> list[str]:
 def _inherited_environment() -> dict[str, str]:
     """Without systemd's variables: children do not report to systemd."""
     return {name: value for name, value in os.environ.items() if name not in SystemdNotifier.VARIABLES}
+
+
+def reap(own: Collection[int]) -> int:
+    """Collect children that have ended, except those in ``own``: their supervisors do that. Returns how many.
+
+    The kernel gives process 1 whatever process loses its parent. Nothing else waits for these, and each would hold its
+    number until the container has none left.
+    """
+    collected = 0
+    with suppress(OSError):  # a kernel that lists no children
+        for pid in map(int, Path(f"/proc/self/task/{os.getpid()}/children").read_text(encoding="utf-8").split()):
+            if pid not in own:
+                with suppress(ChildProcessError):
+                    collected += os.waitpid(pid, os.WNOHANG)[0] == pid
+    return collected

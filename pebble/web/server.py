@@ -32,12 +32,12 @@ from pebble.web import messages as m
 from pebble.web import robot_commands
 from pebble.web.driven_here import DrivenHere
 from pebble.web.driving import Command, Driving
+from pebble.web.known_robots import SavedRobots
 from pebble.web.media.pictures import MediaHub
 from pebble.web.media.robot_streams import OwnHosts, origin
 from pebble.web.media.sound import SoundHub
 from pebble.web.open_components import OpenComponents
 from pebble.web.robots import Robots
-from pebble.web.saved_robots import SavedRobots
 from pebble.web.stops import Stops
 
 log = logging.getLogger(__name__)
