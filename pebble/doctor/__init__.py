@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
+from functools import partial
 
 
 class Level(Enum):
@@ -20,3 +21,6 @@ class Finding:
     what: str
     text: str
     fix: str = ""
+
+
+ok, warn, fail = (partial(Finding, level) for level in Level)
