@@ -11,7 +11,6 @@ from typing import Any, Final, NamedTuple
 
 from pebble.client.broker import Broker
 from pebble.client.media_request.offer import offered, refusal
-from pebble.client.media_request.picture_header import MAX_PAYLOAD, PictureSequence
 from pebble.client.media_request.request import MediaRequest
 from pebble.client.viewer import Medium
 from pebble.contract import AUDIO, CAMERA
@@ -19,6 +18,7 @@ from pebble.contract.packets import PBAT
 from pebble.errors import PebbleError
 from pebble.foxglove.server import MAX_BYTES, Server, protobuf_spec
 from pebble.media import pyav
+from pebble.media.picture_header import MAX_PAYLOAD, PictureSequence
 from pebble.recordings.exports.foxglove_messages import (
     IMAGE,
     SOUND,
