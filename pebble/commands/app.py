@@ -42,16 +42,7 @@ COMMANDS = {
 }
 
 #: What prints its help when nothing follows.
-_GROUPS: tuple[list[str], ...] = (
-    [],
-    ["topic"],
-    ["bench"],
-    ["sim"],
-    ["script"],
-    ["cert"],
-    ["recordings"],
-    ["web", "user"],
-)
+_GROUPS = [words.split() for words in ("", "topic", "bench", "sim", "script", "cert", "recordings", "web user")]
 
 _HELP = """Runs and inspects Pebble robots.
 
