@@ -1,7 +1,5 @@
 """Child processes, each with a log file and a deadline to end; the kernel ends them when this process dies."""
 
-from __future__ import annotations
-
 import json
 import os
 import queue

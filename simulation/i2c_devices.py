@@ -4,8 +4,6 @@ The MPU's registers, scales and reset values are those of InvenSense RM-MPU-6000
 data sheet.
 """
 
-from __future__ import annotations
-
 import math
 import random
 import struct

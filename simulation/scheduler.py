@@ -1,7 +1,5 @@
 """Runs many simulated boards on one thread: at once when a socket is ready, otherwise periodically."""
 
-from __future__ import annotations
-
 import heapq
 import select
 import socket

@@ -1,7 +1,5 @@
 """A record of a simulated MCU's input, motor changes and output, with their times."""
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What a transport carries."""
 
-from __future__ import annotations
-
 from enum import IntEnum
 
 import msgspec

@@ -1,7 +1,5 @@
 """The retained messages that one transport has published, to be sent again to a broker or hub that lacks them."""
 
-from __future__ import annotations
-
 from collections.abc import Collection
 
 from pebble.transports.bounds import BoundedTable

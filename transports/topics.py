@@ -1,7 +1,5 @@
 """Topics and filters as MQTT defines them, and the limits that hold on every transport (T1, T2)."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """A command's own short-lived connection to a robot's local transport or to a broker."""
 
-from __future__ import annotations
-
 import os
 import queue
 import time

@@ -3,8 +3,6 @@
 The robot remembers the stop; the sender repeats it until each motor owner has published that it is stopped.
 """
 
-from __future__ import annotations
-
 import secrets
 from collections.abc import Callable, Collection, Iterable
 from enum import Enum

@@ -1,7 +1,5 @@
 """Shapes and labels that scripts publish to be drawn over a robot's picture, in all forms that viewers accept. Pure."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Which topics of robots an operator's program subscribes to, and which of them capabilities may name. Pure."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from pebble import contract as c

@@ -1,7 +1,5 @@
 """The robot as an operator's program sees it: whether it is there, what it can do, and what holds it. Pure."""
 
-from __future__ import annotations
-
 from collections import deque
 from typing import Any
 

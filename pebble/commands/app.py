@@ -1,7 +1,5 @@
 """Builds the command line from the modules it needs, and runs it."""
 
-from __future__ import annotations
-
 import logging
 import sys
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """``pebble check``: all problems of a config at once, or a summary of it."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from pathlib import Path

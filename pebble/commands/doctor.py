@@ -1,7 +1,5 @@
 """``pebble doctor``: prints the findings of :mod:`pebble.doctor.checks`."""
 
-from __future__ import annotations
-
 import shutil
 import textwrap
 from pathlib import Path

@@ -1,7 +1,5 @@
 """``pebble drive``: drives a robot with the keys of a terminal."""
 
-from __future__ import annotations
-
 import secrets
 import socket
 import time

@@ -1,7 +1,5 @@
 """``pebble flash``: installs a robot's firmware on its board, step by step."""
 
-from __future__ import annotations
-
 import os
 import sys
 from importlib.resources import files

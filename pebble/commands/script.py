@@ -1,7 +1,5 @@
 """``pebble script``: writes a new script, and lists, starts and stops those of a robot."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """What ``pebble topic`` prints: messages, rates and lists of topics, without characters that control the terminal."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

@@ -1,7 +1,5 @@
 """``pebble topics``: the contract as a table, or as JSON."""
 
-from __future__ import annotations
-
 import json
 from typing import Annotated, Any
 

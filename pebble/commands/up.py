@@ -1,7 +1,5 @@
 """``pebble up`` with options, and its help; ``pebble.cli`` runs a plain ``pebble up CONFIG`` without this module."""
 
-from __future__ import annotations
-
 import typer
 
 from pebble.commands.options import ConfigArgument

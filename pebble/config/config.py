@@ -1,7 +1,5 @@
 """A whole config: read from its JSON file, checked, completed, and from then on typed and unchangeable."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import zlib

@@ -1,7 +1,5 @@
 """Writes docs/topics.md and docs/payloads.schema.json: ``python -m pebble.contract.docs [FOLDER]``."""
 
-from __future__ import annotations
-
 import inspect
 import json
 import re

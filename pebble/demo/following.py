@@ -1,7 +1,5 @@
 """Judges how Goob followed a tag by itself, by what its MCU received and where it arrived."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Output of the demo: a live table in a terminal, plain lines once a second elsewhere, and tables of results."""
 
-from __future__ import annotations
-
 import math
 import threading
 import time

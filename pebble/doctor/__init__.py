@@ -1,7 +1,5 @@
 """Checks whether a machine is ready for a robot; each problem that is found comes with the command that fixes it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import Enum
 from functools import partial

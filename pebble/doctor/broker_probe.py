@@ -1,7 +1,5 @@
 """Probes a broker with one MQTT login, without a client library: latency, accepted logins, certificate."""
 
-from __future__ import annotations
-
 import socket
 import ssl
 import time

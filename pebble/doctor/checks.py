@@ -1,7 +1,5 @@
 """Checks of a machine and of the robot on it. They change nothing, and return findings."""
 
-from __future__ import annotations
-
 import grp
 import ipaddress
 import os

@@ -1,7 +1,5 @@
 """Names of devices that stay: the number of ``ttyACM0`` or ``video0`` depends on the order of plugging in."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Checks the loudspeaker by playing silence: once, and by two programs at the same time."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal

@@ -1,7 +1,5 @@
 """Checks of camera, microphone and codecs."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Checks whether a broker that is meant for this machine alone also answers at its addresses on the network."""
 
-from __future__ import annotations
-
 import ipaddress
 import re
 import socket

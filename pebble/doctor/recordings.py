@@ -1,7 +1,5 @@
 """Checks of a robot's own recorder: does it run, did it miss anything, and for how long is there room?"""
 
-from __future__ import annotations
-
 import json
 import shutil
 import time

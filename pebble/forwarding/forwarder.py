@@ -9,8 +9,6 @@ arrive is worse than one that a later subscriber must recognise as old. What hap
 waited, in a process that was stopped or stuck, or at the broker; what only ends something never is.
 """
 
-from __future__ import annotations
-
 import itertools
 import logging
 import time

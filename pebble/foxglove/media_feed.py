@@ -1,7 +1,5 @@
 """One medium of one robot for Foxglove: requested while a client subscribes to its channels, converted, published."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import time

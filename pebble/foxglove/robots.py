@@ -1,7 +1,5 @@
 """Robots of a broker for Foxglove: their channels as they appear, and their telemetry."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import time

@@ -1,7 +1,5 @@
 """Serves robots to Foxglove until a signal ends it."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import signal

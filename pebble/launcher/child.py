@@ -1,7 +1,5 @@
 """One child process and the pipes to it."""
 
-from __future__ import annotations
-
 import os
 import signal
 from collections.abc import Callable, Mapping

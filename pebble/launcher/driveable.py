@@ -1,7 +1,5 @@
 """Whether drive commands, and stops, reach the robot's motors, as far as its processes can tell. Pure."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """Runs a robot: starts its processes in order, supervises them, and stops them in order."""
 
-from __future__ import annotations
-
 import logging
 import os
 from collections.abc import Collection, Sequence

@@ -1,7 +1,5 @@
 """Finds out whether wheel odometry is being published, by a script or any other program on the robot."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """Which processes a robot has: one table, in the order they start."""
 
-from __future__ import annotations
-
 import gc
 import logging
 import os

@@ -1,7 +1,5 @@
 """Publishes the robot's status, capabilities and logs through the announcer, and reports to systemd."""
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Sequence

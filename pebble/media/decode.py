@@ -1,7 +1,5 @@
 """Decodes video payloads of every encoding; a damaged picture is refused, and a key frame is wanted instead."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

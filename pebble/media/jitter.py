@@ -3,8 +3,6 @@
 Times are seconds on the caller's monotonic clock. One thread at a time may call a buffer.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

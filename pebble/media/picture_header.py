@@ -1,7 +1,5 @@
 """Reads what surrounds a picture on the wire, without decoding the picture. Pure; imports neither cv2 nor PyAV."""
 
-from __future__ import annotations
-
 from typing import Annotated, Final, NamedTuple
 
 import msgspec

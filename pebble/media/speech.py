@@ -3,8 +3,6 @@
 Syllables of voiced harmonics under three formants, some with a hiss before them, with pauses between words.
 """
 
-from __future__ import annotations
-
 from functools import lru_cache
 from typing import Final
 

@@ -1,7 +1,5 @@
 """Video encoders by name: a picture in, one MQTT payload out."""
 
-from __future__ import annotations
-
 import zlib
 from abc import ABC, abstractmethod
 from typing import Final, Protocol

@@ -5,8 +5,6 @@ millimetre. A single sensor does not show the direction: that is taken from the 
 quarter of a wave away shows it, and is used if it agrees with the commands.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import NamedTuple

@@ -5,8 +5,6 @@ millimetres as long as no wheel slips; heading is good to the difference of both
 an inertial sensor.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple

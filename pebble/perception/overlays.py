@@ -1,7 +1,5 @@
 """Tags as the contract's payloads: locations, the followed tag, and what is drawn over the picture."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

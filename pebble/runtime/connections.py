@@ -1,7 +1,5 @@
 """Makes a robot's transports from its config: the local transport and the connection to operators."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace as replace_settings
 from typing import Any

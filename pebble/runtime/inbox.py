@@ -1,7 +1,5 @@
 """The bounded queue of a service, in which a newer job can replace a waiting one of the same name."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import OrderedDict, deque

@@ -3,8 +3,6 @@
 Which of two is newer, :func:`pebble.motion.arbiter.newer` decides: the numbers have no end.
 """
 
-from __future__ import annotations
-
 import fcntl
 import logging
 import os

@@ -1,7 +1,5 @@
 """Publishes a script's drive commands on the robot's local transport, and knows whether they have an effect."""
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

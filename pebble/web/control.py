@@ -1,7 +1,5 @@
 """The control socket of one page: what it asks for, and the state that it is sent."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import secrets

@@ -1,7 +1,5 @@
 """The robots that were here before, so that those who invent others cannot push them out; kept in a database."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 from collections.abc import Coroutine, Iterator

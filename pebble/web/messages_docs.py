@@ -3,8 +3,6 @@
 Program: ``python -m pebble.web.messages_docs`` writes both; a test checks that they are current.
 """
 
-from __future__ import annotations
-
 import inspect
 import json
 from collections.abc import Iterator

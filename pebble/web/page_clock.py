@@ -4,8 +4,6 @@ The page's clock has an unknown offset. An echo carries the page's time of some 
 receiving the echo, which bounds the offset on both sides: so a delay that is always there counts as well.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from itertools import count
 

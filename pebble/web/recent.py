@@ -3,8 +3,6 @@
 Values are thinned to a rate; what is too old, too long or too much is left out.
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from typing import Final, NamedTuple

@@ -1,7 +1,5 @@
 """What a page asks of a robot, besides driving: which right it needs, and what is then published. Pure."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, NamedTuple
 

@@ -3,8 +3,6 @@
 No queue forms: a slow page receives the newest value less often. A page that connects again receives everything.
 """
 
-from __future__ import annotations
-
 import re
 import time
 from collections import deque

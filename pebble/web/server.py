@@ -1,7 +1,5 @@
 """Ties the parts of the server together: what arrives from the broker, what pages ask for, and what is due."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import secrets

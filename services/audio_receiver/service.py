@@ -1,7 +1,5 @@
 """Plays an operator's voice."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import deque

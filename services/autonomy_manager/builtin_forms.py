@@ -3,8 +3,6 @@
 Its names, options, defaults and limits, except `log_file`: a command must not choose a file to write.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 from pebble.services.autonomy_manager.forms import Setting

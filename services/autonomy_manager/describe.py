@@ -1,7 +1,5 @@
 """Asks a script what it is: its `script.json`, or the script itself with `--describe` if it is one of ours."""
 
-from __future__ import annotations
-
 import ast
 import logging
 import os

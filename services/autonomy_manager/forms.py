@@ -1,7 +1,5 @@
 """The settings of a script: what operators see of them, and which of their values are accepted. Pure."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Mapping, Sequence

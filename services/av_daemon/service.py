@@ -1,7 +1,5 @@
 """Owns camera and microphone, and publishes the status of everything that handles pictures and sound."""
 
-from __future__ import annotations
-
 import re
 import time
 from typing import Any, Final

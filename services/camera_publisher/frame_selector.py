@@ -1,7 +1,5 @@
 """Which of a camera's frames are sent, and which of them as full pictures. Pure: times are passed in."""
 
-from __future__ import annotations
-
 _EARLY = 0.25  # of a period: how far ahead of its turn a frame may be, because cameras have jitter
 _LATE = 1.0  # periods that may be made up for; a longer pause is not
 PERIOD_S = 1.0  # full pictures are large: one per second, however many receivers request one

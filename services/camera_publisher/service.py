@@ -1,7 +1,5 @@
 """Sends the camera's pictures to operators: at the configured rate, never old ones, over a connection of its own."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 

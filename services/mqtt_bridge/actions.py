@@ -1,7 +1,5 @@
 """System actions: reboot, service-restart and git-pull each run one command of the operating system."""
 
-from __future__ import annotations
-
 import logging
 import os
 import subprocess

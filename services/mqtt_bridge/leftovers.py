@@ -4,8 +4,6 @@ An earlier bridge process had forwarded it, so only the broker knows of it. Each
 retained topics that nobody but the robot publishes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 from pebble.contract import CHANNELS, MCU_DESCRIBE, MCU_VALUE, ONLINE, OUTGOING, Kind

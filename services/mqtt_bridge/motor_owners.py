@@ -1,7 +1,5 @@
 """Whether the robot's motor owners and this process reach each other: what it would send them passes the same way."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 from pebble.contract import ESTOP_STATE

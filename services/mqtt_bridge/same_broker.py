@@ -4,8 +4,6 @@ Then nothing may be mirrored: every message would come back and circulate for ev
 remote side and received on the local side proves it.
 """
 
-from __future__ import annotations
-
 import time
 from collections import deque
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """The bridge as a process: forwarding, heartbeat, same-broker probe, system actions and media requests."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from typing import Any

@@ -1,7 +1,5 @@
 """Decodes a clip on a thread of its own, and writes it to a player's standard input."""
 
-from __future__ import annotations
-
 import logging
 import threading
 from collections.abc import Callable

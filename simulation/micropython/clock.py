@@ -1,7 +1,5 @@
 """Clocks of a simulated board: the real one, or a virtual one that moves only when advanced."""
 
-from __future__ import annotations
-
 import time
 from typing import Protocol
 

@@ -3,8 +3,6 @@
 The same calls give the same bytes and pixels, on every run and however busy the machine is.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from typing import Final, NamedTuple
 

@@ -1,7 +1,5 @@
 """A simulated world as a program: the MCUs of its robots behind pseudo terminals, and their poses for their cameras."""
 
-from __future__ import annotations
-
 import argparse
 import math
 import os

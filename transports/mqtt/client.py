@@ -5,8 +5,6 @@ writes a message or all acknowledgements of what was read: a general client libr
 objects that nobody here looks at.
 """
 
-from __future__ import annotations
-
 import socket
 import ssl
 from collections import deque

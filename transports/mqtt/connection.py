@@ -5,8 +5,6 @@ It is discarded as a whole, so that nothing in a queue can outlive a disconnect 
 OpenSSL does not support reading and writing at once. It is not held while a handler runs.
 """
 
-from __future__ import annotations
-
 import socket
 import struct
 import threading

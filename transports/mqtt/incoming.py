@@ -1,7 +1,5 @@
 """What a broker sends on one MQTT connection: read in batches, and made into messages that have an age."""
 
-from __future__ import annotations
-
 import logging
 from typing import Protocol
 

@@ -3,8 +3,6 @@
 It costs about half as much again in processor time, and 5 MB.
 """
 
-from __future__ import annotations
-
 import socket
 import ssl
 from collections.abc import Iterable

@@ -1,7 +1,5 @@
 """The pings of one MQTT connection: answers show that the broker lives, how far it has read, and how late it is."""
 
-from __future__ import annotations
-
 import random
 from math import inf
 

@@ -6,8 +6,6 @@ starts with ``@`` is escaped, and a first level that starts with ``$`` *becomes*
 skip it. Ordinary topics map to themselves.
 """
 
-from __future__ import annotations
-
 import re
 
 from pebble.transports.topics import remembered

@@ -3,8 +3,6 @@
 The rules are those of the operator page: a reason against driving ends the gesture, and the keys must be released.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from pebble.client.drive_reasons import SLOW_S, SLOW_SPEED, Code, Situation, first_reason

@@ -5,8 +5,6 @@ until none is held. What interrupts a gesture ends it for good: keys that are st
 arrived for 0.4 s.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from pebble.client.terminal.key_decoder import DOWN, LEFT, RIGHT, UP

@@ -1,7 +1,5 @@
 """A terminal that passes on each key at once, and notices when it is lost. Linux and macOS only."""
 
-from __future__ import annotations
-
 import os
 import select
 import shutil

@@ -1,7 +1,5 @@
 """``pebble record``: records what robots and operators publish."""
 
-from __future__ import annotations
-
 import logging
 import re
 import sys

@@ -3,8 +3,6 @@
 All surfaces are upright and the camera is level, so what hides what is decided in the plan, seen from above.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any, Final, TypeAlias

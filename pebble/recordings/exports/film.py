@@ -1,7 +1,5 @@
 """One robot's pictures and sound as a film, or its sound alone: each where its capture stamp says, on one clock."""
 
-from __future__ import annotations
-
 import heapq
 import tempfile
 from collections.abc import Iterable, Iterator

@@ -1,7 +1,5 @@
 """Finishes files beside the writer: complete ones, and what a killed recorder or a full disk has left."""
 
-from __future__ import annotations
-
 import logging
 import subprocess
 import sys

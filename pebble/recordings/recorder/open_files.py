@@ -1,7 +1,5 @@
 """The files that a recorder writes at present: one for each lane."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Final

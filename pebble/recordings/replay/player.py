@@ -1,7 +1,5 @@
 """Publishes a recording again, in its order and at its pace. Pure: clocks, waiting and publishing are passed in."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from typing import Final
 

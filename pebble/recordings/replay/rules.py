@@ -5,8 +5,6 @@ for; nothing retained, unless asked for. Names of topics decide by the contract,
 of its direction.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache

@@ -1,7 +1,5 @@
 """One recording that is read in any place: where its chunks are, and which channels each holds."""
 
-from __future__ import annotations
-
 import os
 import tempfile
 from collections import OrderedDict

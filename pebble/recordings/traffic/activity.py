@@ -1,7 +1,5 @@
 """What a message shows about the use of a robot: it is driven, watched, plays a sound, runs a script. Pure."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from enum import IntEnum

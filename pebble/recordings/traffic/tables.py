@@ -1,7 +1,5 @@
 """The tables of an analysis, for its report and as CSV files. Times are UTC."""
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime

@@ -1,7 +1,5 @@
 """One robot's pictures on their way to the pages that show them."""
 
-from __future__ import annotations
-
 import asyncio
 import struct
 import time

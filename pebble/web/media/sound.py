@@ -1,7 +1,5 @@
 """Robots' sound for pages, and pages' voices for robots: one request per robot, however many pages listen."""
 
-from __future__ import annotations
-
 import asyncio
 import struct
 import time

@@ -1,7 +1,5 @@
 """One medium of each robot on its way to pages: the request while pages use it, and what is shown about it."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import logging

@@ -1,7 +1,5 @@
 """The processes that read recordings for pages: one that answers at once, and one for each long job."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import multiprocessing

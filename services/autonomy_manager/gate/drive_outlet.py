@@ -1,7 +1,5 @@
 """Publishes what the scripts of one run drive: signed, at a limited rate, and stopped when their connection ends."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Hashable
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Owns the serial line to a self-describing MCU (``pebble_serial_v1``), whose manifest defines its topics."""
 
-from __future__ import annotations
-
 import logging
 import secrets
 import time

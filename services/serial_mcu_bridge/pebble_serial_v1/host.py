@@ -3,8 +3,6 @@
 Pure: bytes and clock values in, events out; the bytes to send are events too. docs/mcu.md describes the wire.
 """
 
-from __future__ import annotations
-
 import logging
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping

@@ -4,8 +4,6 @@
 summary. All keys must be there; anything else is a log line.
 """
 
-from __future__ import annotations
-
 import logging
 import re
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ death of this process; it reaches the disk within about a second (``SYNC_S``), s
 file is rewritten when it has grown to several times the size of its current records, and after a failure of its disk.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import struct
