@@ -32,6 +32,7 @@ from pebble.recordings.replay.player import Player
 from pebble.recordings.replay.robots import Make, ReplayedRobots
 from pebble.recordings.replay.rules import SYSTEM, Options, Rules
 from pebble.recordings.replay.source import ReplaySource
+from pebble.runtime.signals import handled_by
 from pebble.transports import Message, Transport, create
 
 _KEYS = "Space pauses, ← and → go 10 s back and on, + and - change the speed, Ctrl-C ends."
@@ -169,7 +170,7 @@ def _play(console: _Console, make: Make, bases: list[str], make_player: Callable
     """Play to the end, for these robots. Raises ReplayError and TransportError."""
     terminal = _has_terminal()
     with ExitStack() as stack:
-        stack.enter_context(console.noting_signals())
+        stack.enter_context(handled_by(console.on_signal))
         robots = ReplayedRobots(make, bases, now=time.monotonic, wall_ms=_wall_ms, wait=console.listen)
         player = make_player(stack.enter_context(robots).publish)
         typer.echo(f"{', '.join(map(shown, bases))}{': ' + _KEYS if terminal else ''}")
@@ -228,17 +229,6 @@ class _Console:
             player.stop()
 
     @contextmanager
-    def noting_signals(self) -> Iterator[None]:
-        """Signals end the replay; until all is cleaned up no further one ends this process."""
-        numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-        before = {number: signal.signal(number, self._on_signal) for number in numbers}
-        try:
-            yield
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
-
-    @contextmanager
     def keys(self) -> Iterator[None]:
         from pebble.client.terminal.keys import opened
 
@@ -279,7 +269,8 @@ class _Console:
             self._problem = problem
             typer.echo(f"pebble: {shown(problem) or 'it goes on'}", err=True)
 
-    def _on_signal(self, number: int, _frame: object) -> None:
+    def on_signal(self, number: int, _frame: object) -> None:
+        """Signals end the replay; until all is cleaned up no further one ends this process."""
         self.ended = self.ended or signal.Signals(number).name
 
     def _press(self, key: str, player: Player) -> None:
