@@ -13,7 +13,7 @@ from pebble.config.secret_text import without_secrets
 from pebble.runtime.parent import MaskingFormatter
 from pebble.version import __version__
 
-#: Each command, and the module of this package that registers it.
+#: Each command, and the module of this package that has the function of its name, or registers what is below it.
 COMMANDS = {
     "up": "up",
     "check": "check",
@@ -39,6 +39,7 @@ COMMANDS = {
     "impair": "impair",
 }
 
+_REGISTERED = ("topic", "script", "sim", "web", "recordings", "cert", "bench", "impair")
 #: What prints its help when nothing follows.
 _GROUPS = [words.split() for words in ("", "topic", "bench", "sim", "script", "cert", "recordings", "web user")]
 
@@ -73,8 +74,12 @@ def _run(arguments: list[str]) -> int:
     wanted = [arguments[0]] if arguments and arguments[0] in COMMANDS else []
     app = typer.Typer(rich_markup_mode=None, add_completion=False)
     app.callback(help=_HELP)(_options)
-    for module in dict.fromkeys(COMMANDS[name] for name in wanted or COMMANDS):
-        import_module(f"pebble.commands.{module}").register(app)
+    for name in wanted or COMMANDS:
+        module = import_module(f"pebble.commands.{COMMANDS[name]}")
+        if name in _REGISTERED:
+            module.register(app)
+        else:
+            app.command(name)(getattr(module, name))
     line = [*arguments, "--help"] if arguments in _GROUPS else arguments
     try:
         code = typer.main.get_command(app).main(line, prog_name="pebble", standalone_mode=False)

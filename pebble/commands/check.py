@@ -44,10 +44,6 @@ def check(
     return 0 if all(good) else 1
 
 
-def register(app: typer.Typer) -> None:
-    app.command("check")(check)
-
-
 def _check(path: Path, *, as_json: bool, first: bool) -> bool:
     if path.name == SCHEMA:
         typer.echo(f"pebble: {path.name}: the JSON Schema of configs, not a config", err=True)

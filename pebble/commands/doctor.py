@@ -41,10 +41,6 @@ def doctor(
     return 1 if failed else 0
 
 
-def register(app: typer.Typer) -> None:
-    app.command("doctor")(doctor)
-
-
 def _print(finding: Finding) -> None:
     width = shutil.get_terminal_size().columns
     typer.secho(f"{finding.level.value:<4}  ", fg=_COLOURS[finding.level], nl=False)

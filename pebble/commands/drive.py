@@ -76,10 +76,6 @@ def drive(
             return driving.run(TerminalLoop(terminal, clock))
 
 
-def register(app: typer.Typer) -> None:
-    app.command("drive")(drive)
-
-
 class _Driving:
     """Passes keys and messages to the driver, and what it returns to the transport, every 50 ms."""
 

@@ -77,10 +77,6 @@ def flash(
     return 0
 
 
-def register(app: typer.Typer) -> None:
-    app.command("flash")(flash)
-
-
 def _target(robot: str, firmware: str | None) -> tuple[Firmware, Config | None]:
     """The firmware, and the config if there is one; robots with Wi-Fi need one."""
     if robot in FIRMWARE:

@@ -277,4 +277,3 @@ def register(app: typer.Typer) -> None:
     for command in (goob, fred, goob_imu, outlets, minilamp, benjr, fleet, world, loudspeaker):
         group.command(command.__name__)(command)
     app.add_typer(group, name="sim")
-    app.command("demo")(demo)

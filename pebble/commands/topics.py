@@ -37,10 +37,6 @@ def topics(
     return 0
 
 
-def register(app: typer.Typer) -> None:
-    app.command("topics")(topics)
-
-
 def _plain(channel: Channel, prefix: str) -> dict[str, Any]:
     override = channel.override
     return {

@@ -1,7 +1,5 @@
 """``pebble up`` with options, and its help; ``pebble.cli`` runs a plain ``pebble up CONFIG`` without this module."""
 
-import typer
-
 from pebble.commands.options import ConfigArgument
 
 
@@ -17,7 +15,3 @@ def up(config: ConfigArgument) -> int:
     from pebble.launcher.launcher import Launcher
 
     return Launcher(load(config)).run()
-
-
-def register(app: typer.Typer) -> None:
-    app.command("up")(up)

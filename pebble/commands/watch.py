@@ -131,8 +131,3 @@ def _target(robot: str, url: str | None, password_file: Path | None, ca_cert: Pa
     bridge = load(robot).services.mqtt_bridge
     remote = bool(bridge.remote_mqtt.host) or bridge.remote is not None
     return Target(config=Path(robot), remote=remote, program="watch")
-
-
-def register(app: typer.Typer) -> None:
-    app.command("watch")(watch)
-    app.command("snapshot")(snapshot)

@@ -28,10 +28,6 @@ Robots = Annotated[
 ]
 
 
-def register(app: typer.Typer) -> None:
-    app.command("analyse")(analyse)
-
-
 def analyse(
     places: Places,
     since: Since = None,

@@ -89,10 +89,6 @@ def record(
     return _run(into or Path("recordings"), options, [connection], length=length)
 
 
-def register(app: typer.Typer) -> None:
-    app.command("record")(record)
-
-
 _Connection = tuple[str, Any, tuple[str, ...], str, str]
 
 

@@ -131,10 +131,6 @@ def replay(
     return unread if console.ended in ("", "SIGINT", END) else 1
 
 
-def register(app: typer.Typer) -> None:
-    app.command("replay")(replay)
-
-
 def _check(options: Options, base: str | None, url: str, speed: float, *, paused: bool) -> None:
     same = options.system is None
     if same and base is not None:
