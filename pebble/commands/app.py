@@ -2,7 +2,7 @@
 
 import logging
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from importlib import import_module
 from typing import Annotated
@@ -70,16 +70,22 @@ def run(arguments: list[str]) -> int:
         return _run(arguments)
 
 
-def _run(arguments: list[str]) -> int:
-    wanted = [arguments[0]] if arguments and arguments[0] in COMMANDS else []
+def application(names: Iterable[str] = COMMANDS) -> typer.Typer:
+    """The command line with these commands."""
     app = typer.Typer(rich_markup_mode=None, add_completion=False)
     app.callback(help=_HELP)(_options)
-    for name in wanted or COMMANDS:
+    for name in names:
         module = import_module(f"pebble.commands.{COMMANDS[name]}")
         if name in _REGISTERED:
             module.register(app)
         else:
             app.command(name)(getattr(module, name))
+    return app
+
+
+def _run(arguments: list[str]) -> int:
+    wanted = [arguments[0]] if arguments and arguments[0] in COMMANDS else []
+    app = application(wanted or COMMANDS)
     line = [*arguments, "--help"] if arguments in _GROUPS else arguments
     try:
         code = typer.main.get_command(app).main(line, prog_name="pebble", standalone_mode=False)
