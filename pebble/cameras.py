@@ -69,13 +69,14 @@ class Camera:
         end = None if self._timeout is None else time.monotonic() + self._timeout
         while True:
             frame = self._reader.read(None if end is None else max(0.0, end - time.monotonic()))
+            if frame is None and self._reader.closed:
+                raise StopIteration
             if frame is None:
-                self._nothing_came()
-            else:
-                try:
-                    return self._picture(frame)
-                except PayloadError as error:
-                    log.warning("%s", error)
+                raise DeviceError(f"no picture for {self._timeout:g} s from the camera in {self._run_dir}")
+            try:
+                return self._picture(frame)
+            except PayloadError as error:
+                log.warning("%s", error)
 
     def newest(self) -> Picture | None:
         """The newest picture that was not returned before, or None. Does not wait."""
@@ -92,11 +93,6 @@ class Camera:
         picture = frame.picture(self._width)
         self.frame = frame
         return picture
-
-    def _nothing_came(self) -> None:
-        if self._reader.closed:
-            raise StopIteration
-        raise DeviceError(f"no picture for {self._timeout:g} s from the camera in {self._run_dir}")
 
     def close(self) -> None:
         """Ends the iteration, from any thread."""

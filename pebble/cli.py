@@ -3,8 +3,6 @@
 0: success. 1: failure, or no result. 2: the command line is wrong. 130: Ctrl-C.
 """
 
-from __future__ import annotations
-
 import errno
 import os
 import sys

@@ -1,7 +1,5 @@
 """Child processes, each with a log file and a deadline to end; the kernel ends them when this process dies."""
 
-from __future__ import annotations
-
 import json
 import os
 import queue
@@ -79,7 +77,6 @@ class Program:
         return self.code is not None
 
     def tail(self) -> str:
-        """The end of its log."""
         return self.log.read_text(errors="replace").strip()[-_TAIL:]
 
     def freeze(self) -> None:
@@ -270,7 +267,6 @@ class Processes:
 
 
 def python(module: str, *arguments: object) -> list[str]:
-    """The command that runs a module."""
     return [sys.executable, "-m", module, *map(str, arguments)]
 
 

@@ -3,8 +3,6 @@
 docs/bridge.md explains when it forwards, and when it refuses to.
 """
 
-from __future__ import annotations
-
 import sys
 import time
 from functools import partial

@@ -1,7 +1,5 @@
 """Records the robot on the robot: ``python -m pebble.services.recorder CONFIG``."""
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Runs a foreign streaming program while video is requested: ``python -m pebble.services.video_stream CONFIG``."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -3,8 +3,6 @@
 They run the firmware of the real boards (``firmware/``) on simulated pins, whose outputs move a simulated body.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final

@@ -1,7 +1,5 @@
 """The robots around simulated boards: motors, wheels, battery, sensors, lights and I2C devices."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -85,7 +85,6 @@ class _Summary:
             self._console.print(self.line(), highlight=False)
 
     def line(self) -> str:
-        """The status in one line."""
         self._measure(time.monotonic())
         online, moving = _count(self._fleet, None)
         cpu, turns = self._rates

@@ -4,8 +4,6 @@ The MPU's registers, scales and reset values are those of InvenSense RM-MPU-6000
 data sheet.
 """
 
-from __future__ import annotations
-
 import math
 import random
 import struct
@@ -14,7 +12,7 @@ from typing import Final
 
 from pebble.simulation.motion import TRACK_MM, RobotMotion
 
-_SMPLRT_DIV, _CONFIG, _GYRO_CONFIG, _ACCEL_CONFIG = 0x19, 0x1A, 0x1B, 0x1C
+_SMPLRT_DIV, _GYRO_CONFIG, _ACCEL_CONFIG = 0x19, 0x1B, 0x1C
 _INT_STATUS, _ACCEL_XOUT_H, _PWR_MGMT_1, _WHO_AM_I = 0x3A, 0x3B, 0x6B, 0x75
 _SLEEP, _RESET, _DATA_READY = 0x40, 0x80, 0x01
 _G_MM_S2: Final = 9806.65

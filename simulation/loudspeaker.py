@@ -4,8 +4,6 @@
 comes from standard input. Each playback adds a ``begin`` and an ``end`` to FOLDER/events.jsonl, and a WAV file.
 """
 
-from __future__ import annotations
-
 import argparse
 import fcntl
 import os

@@ -1,7 +1,5 @@
 """A simulated serial MCU as a program: ``python -m pebble.simulation.mcu --kind goob --link /tmp/goob``."""
 
-from __future__ import annotations
-
 import argparse
 import os
 import signal

@@ -1,7 +1,5 @@
 """The physics of a robot on two driven wheels: motion and pose, hall sensors, and battery."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Protocol

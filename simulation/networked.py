@@ -13,7 +13,7 @@ from pathlib import Path
 import msgspec
 
 from pebble.config.hosts import HostError, split
-from pebble.config.text_files import read_password
+from pebble.config.text_files import PASSWORD, password
 from pebble.contract.identity import Identity
 from pebble.errors import ConfigError, PebbleError
 from pebble.simulation.fleet import ConnectionReporter, Fleet
@@ -21,7 +21,6 @@ from pebble.simulation.mcu import Snapshot
 from pebble.simulation.trace import Trace, motors_entry
 from pebble.simulation.wireless import KINDS, BrokerAddress, Motors, WirelessRobot
 
-PASSWORD = "PEBBLE_PASSWORD"  # noqa: S105 - the name of an environment variable
 _MOVING_S = 0.01  # period of turns while motors run and sockets are idle
 _PORT, _TLS_PORT = 1883, 8883
 
@@ -90,16 +89,10 @@ def broker_address(options: argparse.Namespace) -> BrokerAddress:
         host=named.host,
         port=named.port or (_TLS_PORT if tls else _PORT),
         username=options.username,
-        password=_password(options.password_file) if options.username else None,
+        password=password(options.password_file) if options.username else None,
         tls=tls,
         ca=options.ca,
     )
-
-
-def _password(file: Path | None) -> str | None:
-    if file is None:
-        return os.environ.get(PASSWORD)
-    return read_password(file, "--password-file")
 
 
 def _recorder(trace: Trace) -> Callable[[float, Motors], None]:
@@ -127,7 +120,6 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def add_broker_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options that ``broker_address`` reads."""
     parser.add_argument("--broker", required=True, metavar="HOST[:PORT]")
     parser.add_argument("--username")
     parser.add_argument("--password-file", type=Path, help=f"by default the password is ${PASSWORD}")

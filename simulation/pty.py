@@ -1,7 +1,5 @@
 """A simulated MCU behind a real pseudo terminal, which the host uses as a serial port."""
 
-from __future__ import annotations
-
 import errno
 import logging
 import os

@@ -1,7 +1,5 @@
 """Runs many simulated boards on one thread: at once when a socket is ready, otherwise periodically."""
 
-from __future__ import annotations
-
 import heapq
 import select
 import socket
@@ -74,7 +72,6 @@ class Scheduler:
         self._epoll.close()
 
     def _ready_boards(self) -> list[int]:
-        """The boards whose sockets are ready."""
         now = time.monotonic()
         wait = min(_LONGEST_S, max(0.0, self._due[0][0] - now)) if self._due else _LONGEST_S
         boards: dict[int, None] = {}

@@ -1,7 +1,5 @@
 """A record of a simulated MCU's input, motor changes and output, with their times."""
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
@@ -49,7 +47,6 @@ def _pair(tokens: list[str]) -> tuple[float, float] | None:
 
 
 def motors_entry(ns: int, motors: tuple[float, float]) -> Entry:
-    """Make the entry for a change of the motors."""
     left, right = (round(speed, 3) + 0.0 for speed in motors)  # + 0.0: no "-0.000"
     return Entry(ns, "motors", f"{left:.3f} {right:.3f}")
 

@@ -1,7 +1,5 @@
 """A simulated MiniLAMP or BenJr: its board, its body, and a real connection to a broker."""
 
-from __future__ import annotations
-
 import hashlib
 import secrets
 from collections.abc import Callable

@@ -8,7 +8,6 @@ import shlex
 import subprocess
 import sys
 import tomllib
-from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from typing import Any
 import pytest
 import typer
 
-from pebble.commands.app import COMMANDS
+from pebble.commands.app import application
 from tests.support import ROOT
 
 GENERATED = ("topics.md", "configuration.md", "web-messages.md")
@@ -94,11 +93,7 @@ WRITTEN = sorted({line for path in DOCUMENTS for line in COMMAND.findall(path.re
 
 @pytest.fixture(scope="module")
 def pebble() -> Any:
-    app = typer.Typer()
-    app.callback()(lambda: None)
-    for module in dict.fromkeys(COMMANDS.values()):
-        import_module(f"pebble.commands.{module}").register(app)
-    return typer.main.get_command(app)
+    return typer.main.get_command(application())
 
 
 @pytest.mark.parametrize("line", WRITTEN)

@@ -9,26 +9,25 @@ import logging
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
-from enum import Enum, IntEnum
+from enum import Enum
 from types import TracebackType
 from typing import Self
 
-import msgspec
-
 from pebble.errors import TransportError
-from pebble.transports import clock
 from pebble.transports.bounds import BoundedQueue, BoundedTable
 from pebble.transports.counters import Counters
+from pebble.transports.message import Message as Message
+from pebble.transports.message import QoS as QoS
 from pebble.transports.own_retained import OwnRetained
-from pebble.transports.subscriptions import Subscriptions
-from pebble.transports.topics import check_filter, check_topic
+from pebble.transports.topics import REMEMBERED_LENGTH, check_filter, check_topic, matches
 
 log = logging.getLogger(__name__)
 
 QUEUE_LIMIT = 1000  # messages waiting for a slow handler before the oldest is dropped
 QUEUE_BYTES = 16 << 20  # the same, for their topics and payloads
+_MATCHED = 512  # topics whose subscriptions are remembered
 _DELIVERED_TOPICS_LIMIT = 65_536  # topics a subscription remembers as delivered, per connection
 _DELIVERED_TOPICS_BYTES = 4 << 20
 _HANDLER_END_S = 1.0  # how long closing waits for handlers that are running
@@ -36,40 +35,10 @@ _TURN_S = 0.02  # how soon the end of a turn is noticed
 _WARNING_PERIOD_S = 5.0  # between two log lines about the same overflowing subscription
 
 
-class QoS(IntEnum):
-    """The two delivery qualities (T3); the numbers are MQTT's."""
-
-    LATEST = 0  # freshness first, may be dropped
-    DELIVERED = 1  # arrives at least once while connected
-
-
 class State(Enum):
     CLOSED = "closed"
     CONNECTING = "connecting"
     CONNECTED = "connected"
-
-
-class Message(msgspec.Struct, frozen=True):
-    """One message, published or received.
-
-    Published: ``retain`` asks the broker to retain it. Received: ``retain`` marks a retained message, an old value; on
-    a connection opened ``as_published`` it means "retained, or published with retain". ``retain_requested`` says
-    whether the publisher of a live message set ``retain``; None where the broker hides it (T5, T7).
-    ``waiting_since``, by :func:`clock.since_boot`, is the earliest moment from which it may have waited for this
-    process, in a socket or a queue (T19); None: published here, or unknown.
-    """
-
-    topic: str
-    payload: bytes
-    qos: QoS = QoS.LATEST
-    retain: bool = False
-    retain_requested: bool | None = None
-    waiting_since: float | None = None
-
-    @property
-    def waited_s(self) -> float:
-        """Seconds for which it has waited at most, until now; 0 where that is unknown."""
-        return 0.0 if self.waiting_since is None else max(0.0, clock.since_boot() - self.waiting_since)
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,6 +147,52 @@ class Subscription:
     def _join(self, timeout: float) -> None:
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join(timeout)
+
+
+class Subscriptions:
+    """The subscriptions of one transport; any thread may use it, and ask which of them match a topic."""
+
+    def __init__(self) -> None:
+        self.lock = threading.RLock()
+        self.matched: dict[str, tuple[Subscription, ...]] = {}  # by topic; empty after each change
+        self._all: list[Subscription] = []
+
+    def __iter__(self) -> Iterator[Subscription]:
+        """Those of this moment."""
+        with self.lock:
+            return iter(list(self._all))
+
+    def add(self, subscription: Subscription) -> None:
+        with self.lock:
+            self._all.append(subscription)
+            self.matched.clear()
+
+    def remove(self, subscription: Subscription) -> bool:
+        """Whether it was one of them."""
+        with self.lock:
+            if subscription not in self._all:
+                return False
+            self._all.remove(subscription)
+            self.matched.clear()
+            return True
+
+    def remove_all(self) -> list[Subscription]:
+        with self.lock:
+            removed, self._all = self._all, []
+            self.matched.clear()
+            return removed
+
+    def matching(self, topic: str) -> tuple[Subscription, ...]:
+        """Remembered by topic: matching takes longer than everything else that happens to a message here."""
+        with self.lock:
+            found = self.matched.get(topic)
+            if found is None:
+                found = tuple(one for one in self._all if matches(one.filter, topic))
+                if len(self.matched) >= _MATCHED:
+                    self.matched.clear()
+                if len(topic) <= REMEMBERED_LENGTH:
+                    self.matched[topic] = found
+            return found
 
 
 class Transport(ABC):

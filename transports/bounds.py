@@ -1,7 +1,5 @@
 """Containers whose memory is bounded, in number and in bytes: other programs choose topics and payloads."""
 
-from __future__ import annotations
-
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, MutableMapping

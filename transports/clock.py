@@ -1,7 +1,5 @@
 """The clock by which messages age: it goes on while the machine is suspended, and cannot be set."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from functools import partial

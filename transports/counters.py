@@ -1,7 +1,5 @@
 """Named counters of a transport or service."""
 
-from __future__ import annotations
-
 import itertools
 import threading
 from collections import Counter

@@ -1,7 +1,5 @@
 """What a connection to a broker presents, and whom it trusts: as the files say when it is made."""
 
-from __future__ import annotations
-
 import ssl
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Every address of a broker's name gets its turn, whatever way the one before failed."""
 
-from __future__ import annotations
-
 import socket
 from collections.abc import Callable
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """Whether a file that a process has made, or reads, is still the one at its path."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

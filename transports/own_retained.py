@@ -1,21 +1,16 @@
 """The retained messages that one transport has published, to be sent again to a broker or hub that lacks them."""
 
-from __future__ import annotations
-
 from collections.abc import Collection
-from typing import TYPE_CHECKING
 
 from pebble.transports.bounds import BoundedTable
 from pebble.transports.counters import Counters
-
-if TYPE_CHECKING:
-    from pebble.transports.base import Message
+from pebble.transports.message import Message
 
 LIMIT = 10_000  # retained topics a transport can send again; the names of topics may come from other programs
 BYTES = 16 << 20  # the same, with their payloads
 
 
-class OwnRetained(BoundedTable["Message"]):
+class OwnRetained(BoundedTable[Message]):
     """The newest one by topic; empty payloads included. The transport's lock of publishing guards the rest."""
 
     def __init__(self, counters: Counters) -> None:

@@ -1,7 +1,5 @@
 """What is made from files that others replace while this process runs: certificates, keys, passwords."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Iterable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Zenoh's shared memory segments: files in /dev/shm, locked by each process that uses them."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 import time

@@ -1,7 +1,5 @@
 """The connection settings of the backends: plain data, so that reading a config imports no client library."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from pathlib import Path
 

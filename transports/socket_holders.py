@@ -1,7 +1,5 @@
 """Which processes hold a socket, as far as this user may look: into those of the same user, as root into all."""
 
-from __future__ import annotations
-
 import errno
 from collections.abc import Collection, Iterator
 from contextlib import suppress

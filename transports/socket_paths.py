@@ -1,7 +1,5 @@
 """How long the path of a unix socket in a run directory may be."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Makes the TLS context of a connection to a broker from its settings, with errors that name the file."""
 
-from __future__ import annotations
-
 import ssl
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Topics and filters as MQTT defines them, and the limits that hold on every transport (T1, T2)."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 
@@ -83,7 +81,6 @@ def check_filter(filter_: str) -> str:
 
 
 def is_pattern(filter_: str) -> bool:
-    """Whether this filter has wildcards."""
     return "+" in filter_ or "#" in filter_
 
 

@@ -1,7 +1,5 @@
 """An event that wakes the one thread waiting for new work."""
 
-from __future__ import annotations
-
 import threading
 import time
 

@@ -1,7 +1,5 @@
 """Messages on their way from the transport's thread to the event loop. Neither locks nor waits."""
 
-from __future__ import annotations
-
 import logging
 from collections import deque
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """A command's own short-lived connection to a robot's local transport or to a broker."""
 
-from __future__ import annotations
-
 import os
 import queue
 import time
@@ -14,14 +12,13 @@ from typing import Any
 from pebble.client.names import ANY_ROBOT, Names, base_of
 from pebble.client.url import settings_of
 from pebble.config import Config, load
-from pebble.config.text_files import read_password
+from pebble.config.text_files import password as password
 from pebble.errors import ConfigError, PebbleError, TransportError
 from pebble.runtime.addresses import Addresses
 from pebble.runtime.connections import REMOTE_RECONNECT_S, local_settings, mqtt_settings, zenoh_settings
 from pebble.runtime.robot_estop import RobotEstop
 from pebble.transports import Message, QoS, State, Transport, create
 
-PASSWORD = "PEBBLE_PASSWORD"  # noqa: S105 - the name of an environment variable
 _LATE_S = 0.25  # some brokers send what is retained so long after they have acknowledged a subscription
 _OPEN_TIMEOUT_S = 3.0
 _WAITING = 10_000  # messages that wait to be printed before new ones are dropped
@@ -100,13 +97,6 @@ def _remote(config: Config, program: str) -> tuple[str, Any]:
     if not bridge.remote_mqtt.host:
         raise ConfigError("services.mqtt_bridge.remote_mqtt.host: is not set, so there is no remote side")
     return "mqtt", mqtt_settings(bridge.remote_mqtt, reconnect_max_s=REMOTE_RECONNECT_S, program=program)
-
-
-def password(file: Path | None) -> str | None:
-    """The password in the file, else in the environment. Raises PebbleError."""
-    if file is None:
-        return os.environ.get(PASSWORD)
-    return read_password(file, "--password-file")
 
 
 class Listener:

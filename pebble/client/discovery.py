@@ -1,7 +1,5 @@
 """Discovers robots by their outgoing topics."""
 
-from __future__ import annotations
-
 from pebble.client.robot_view import RobotView
 from pebble.contract import OUTGOING, channel_of
 from pebble.contract.identity import parse_topic

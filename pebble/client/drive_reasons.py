@@ -3,8 +3,6 @@
 The page's own reasons are in ``web/static/core/reasons.js``; ``tests/vectors/drive_reasons.json`` is run by both.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from enum import StrEnum
 from typing import NamedTuple

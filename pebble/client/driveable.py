@@ -1,7 +1,5 @@
 """What a robot's status says of whether it can be driven, and stopped. Pure."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 from pebble.contract import STATUS, codec

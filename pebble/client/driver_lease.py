@@ -3,8 +3,6 @@
 The newest of several wins, so that a take-over ends what was before it. Robots do not know of it.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 from pebble.contract import DRIVING, codec

@@ -3,8 +3,6 @@
 The robot remembers the stop; the sender repeats it until each motor owner has published that it is stopped.
 """
 
-from __future__ import annotations
-
 import secrets
 from collections.abc import Callable, Collection, Iterable
 from enum import Enum
@@ -29,7 +27,6 @@ _END_SCRIPT = codec.encode(AUTONOMY_COMMAND, AutonomyCommand(action="stop"))
 
 
 def new_name() -> str:
-    """The name of a new stop."""
     return secrets.token_hex(8)
 
 
@@ -111,7 +108,6 @@ class RobotStop:
         return not self._given_up and self.progress in (Progress.WAITING, Progress.OLD)
 
     def receive(self, message: Message, now: float) -> None:
-        """Update from a message of this robot."""
         if not (self.live or message.retain):
             self.live, self.rank = True, self.rank._replace(live=True)
         if message.topic == self._status_topic:
@@ -135,7 +131,6 @@ class RobotStop:
             self.next = max(now, self._sent_at + REPEAT_S)
 
     def tick(self, now: float) -> list[Message]:
-        """What to publish now."""
         if not self.sending or now < self.next:
             return []
         self._sent_at, self.next = now, now + REPEAT_S

@@ -1,7 +1,5 @@
 """The emergency stop of a robot as the robot publishes it, and resets of what was read there. Pure."""
 
-from __future__ import annotations
-
 from pebble.contract import ESTOP_RESET, codec
 from pebble.contract.payloads import EstopReset
 from pebble.motion.latch import stop_of

@@ -1,7 +1,5 @@
 """Receives the pictures of a robot on this machine through shared memory, in place of an operators' broker."""
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Receives one robot's pictures, overlays and sound, measures their rate and age, and whether the robot is stopped."""
 
-from __future__ import annotations
-
 import time
 from collections import deque
 

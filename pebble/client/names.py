@@ -1,7 +1,5 @@
 """Resolves what a user types (``drive-values``, ``outgoing/online``, a whole topic) to topics and channels."""
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Iterator
 

@@ -1,7 +1,5 @@
 """Shapes and labels that scripts publish to be drawn over a robot's picture, in all forms that viewers accept. Pure."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -102,13 +100,13 @@ def _overlays(tags: list[_Tag], shapes: list[list[Point]], labels: list[_Label])
     tags = [tag for tag in tags if tag.detected and tag.corners_norm]
     outlines = [*shapes, *(tag.corners_norm or [] for tag in tags)]
     named = [Label(str(label.marker_id), _inside(label.center_norm)) for label in labels]
-    named += [Label(str(tag.marker_id), _inside(_centre(tag))) for tag in tags if tag.marker_id is not None]
+    named += [
+        Label(str(tag.marker_id), _inside(tag.center_norm or _mean(tag.corners_norm or [])))
+        for tag in tags
+        if tag.marker_id is not None
+    ]
     drawn = [tuple(map(_inside, outline[:_POINTS])) for outline in outlines if len(outline) >= 2]
     return Overlays(tuple(drawn[:_SHAPES]), tuple(named[:_SHAPES]))
-
-
-def _centre(tag: _Tag) -> Point:
-    return tag.center_norm or _mean(tag.corners_norm or [])
 
 
 def _mean(points: Iterable[Point]) -> Point:

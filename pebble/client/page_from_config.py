@@ -1,7 +1,5 @@
 """The settings of an operator page from a robot's config, for ``pebble web CONFIG`` and for the robot's own service."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from pebble.client.page_settings import WebSettings

@@ -1,7 +1,5 @@
 """Whether the packages of the operator page are installed: they are an extra, which few machines need."""
 
-from __future__ import annotations
-
 from importlib.util import find_spec
 
 from pebble.errors import PebbleError

@@ -1,7 +1,5 @@
 """How one server of the operator page is set up: plain data."""
 
-from __future__ import annotations
-
 import socket
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,45 +1,37 @@
 """Which topics of robots an operator's program subscribes to, and which of them capabilities may name. Pure."""
 
-from __future__ import annotations
-
 from typing import Any
 
-from pebble.contract import (
-    AUTONOMY_STATUS,
-    CAPABILITIES,
-    CHANNELS,
-    CHARGING_LEVEL,
-    CHARGING_STATUS,
-    ESTOP_STATE,
-    MEDIA_STATUS,
-    MQTT_AUDIO,
-    MQTT_VIDEO,
-    ONLINE,
-    REMOTE_MIRROR,
-    STATUS,
-    Channel,
-    Kind,
-    channel_of,
-)
+from pebble import contract as c
+from pebble.contract import channel_of
 from pebble.contract.identity import Direction, parse_topic
 from pebble.errors import TransportError
 from pebble.transports.topics import check_topic
 
 #: What is shown of every component, and what only of one that is open.
-FLEET = (ONLINE, CAPABILITIES, STATUS, ESTOP_STATE, CHARGING_STATUS, CHARGING_LEVEL, AUTONOMY_STATUS, MEDIA_STATUS)
-SYNONYMS = tuple(channel for channel in CHANNELS if channel.synonym_of is not None)
+FLEET = (
+    c.ONLINE,
+    c.CAPABILITIES,
+    c.STATUS,
+    c.ESTOP_STATE,
+    c.CHARGING_STATUS,
+    c.CHARGING_LEVEL,
+    c.AUTONOMY_STATUS,
+    c.MEDIA_STATUS,
+)
+SYNONYMS = tuple(channel for channel in c.CHANNELS if channel.synonym_of is not None)
 WATCHED = tuple(
     channel
-    for channel in CHANNELS
+    for channel in c.CHANNELS
     if channel.direction == Direction.OUTGOING
     and channel.payload is not bytes
     and channel.remote
     and channel not in FLEET
     and channel not in SYNONYMS
-    and channel.kind is not Kind.EVENT
+    and channel.kind is not c.Kind.EVENT
 )
 #: Flags, by the section of the capabilities whose ``flag_topic`` may name another topic for it.
-FLAGS = {"": REMOTE_MIRROR, "audio": MQTT_AUDIO, "video": MQTT_VIDEO}
+FLAGS = {"": c.REMOTE_MIRROR, "audio": c.MQTT_AUDIO, "video": c.MQTT_VIDEO}
 
 
 def section_of(capabilities: dict[str, Any], name: str) -> dict[str, Any]:
@@ -60,7 +52,7 @@ def own_topic(ref: str, topic: object, direction: str) -> bool:
         return False
 
 
-def names(ref: str, topic: object, channel: Channel) -> bool:
+def names(ref: str, topic: object, channel: c.Channel) -> bool:
     """Whether capabilities may name this topic for the channel: the component's own, and no other channel's."""
     if not own_topic(ref, topic, channel.direction):
         return False

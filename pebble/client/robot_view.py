@@ -1,25 +1,13 @@
 """The robot as an operator's program sees it: whether it is there, what it can do, and what holds it. Pure."""
 
-from __future__ import annotations
-
 from collections import deque
 from typing import Any
 
+from pebble import contract as c
 from pebble.client.drive_reasons import SILENT_S, Situation
 from pebble.client.driveable import Driveable, driveable_of
 from pebble.client.robot_topics import section_of
-from pebble.contract import (
-    AUTONOMY_STATUS,
-    CAPABILITIES,
-    CHARGING_LEVEL,
-    CHARGING_STATUS,
-    ESTOP_STATE,
-    IMU,
-    ONLINE,
-    STATUS,
-    Channel,
-    codec,
-)
+from pebble.contract import codec
 from pebble.contract.identity import is_of_another
 from pebble.contract.payloads import AutonomyStatus, EstopState, Heartbeat, Orientation
 from pebble.errors import PayloadError
@@ -102,16 +90,16 @@ class RobotView:
 
     # -- what arrives
 
-    def receive(self, channel: Channel | None, message: Message, now: float, wall: float) -> None:
+    def receive(self, channel: c.Channel | None, message: Message, now: float, wall: float) -> None:
         """Take a message of it that arrived at ``now`` (monotonic) and ``wall`` (epoch seconds).
 
         What it says is known from ``channel``. A malformed one changes nothing: the last valid state stays.
         """
-        if channel is ONLINE:
+        if channel is c.ONLINE:
             self.heartbeat(message, now, wall)
-        elif channel in (CAPABILITIES, ESTOP_STATE):
+        elif channel in (c.CAPABILITIES, c.ESTOP_STATE):
             self.receive_stop(channel, message, now)
-        elif channel is STATUS:
+        elif channel is c.STATUS:
             self.driveable = driveable_of(message.payload)
         elif channel in _TELEMETRY:
             try:
@@ -124,36 +112,39 @@ class RobotView:
         if message.retain:
             return None
         try:
-            payload: Heartbeat = codec.decode(ONLINE, message.payload)
+            payload: Heartbeat = codec.decode(c.ONLINE, message.payload)
         except PayloadError:
             return None
         self.liveness.heartbeat(now, wall - payload.t / 1000, online=payload.online is not False)
         return payload
 
-    def receive_stop(self, channel: Channel | None, message: Message, now: float) -> bool:
+    def receive_stop(self, channel: c.Channel | None, message: Message, now: float) -> bool:
         """Take capabilities, or the state of a motor owner; whether they say something of its emergency stop."""
         latched = self.latched
         changed = self.estop.receive(message)
         if latched and not self.latched:
             self.reset_at = now
-        if channel is CAPABILITIES:
+        if channel is c.CAPABILITIES:
             try:
-                self.capabilities = codec.decode(CAPABILITIES, message.payload).value
+                self.capabilities = codec.decode(c.CAPABILITIES, message.payload).value
             except PayloadError:
                 return changed
         return changed
 
     def remember(self, message: Message) -> None:
         """Keep it for an emergency stop that begins later; invented owners keep no capabilities out."""
-        if len(self.remembered) < MAX_REMEMBERED or message.topic in (*self.remembered, CAPABILITIES.topic(self.base)):
+        if len(self.remembered) < MAX_REMEMBERED or message.topic in (
+            *self.remembered,
+            c.CAPABILITIES.topic(self.base),
+        ):
             self.remembered[message.topic] = message
 
-    def _receive_telemetry(self, channel: Channel, payload: Any) -> None:
-        if channel is CHARGING_LEVEL:
+    def _receive_telemetry(self, channel: c.Channel, payload: Any) -> None:
+        if channel is c.CHARGING_LEVEL:
             self.volts = payload.value
-        elif channel is CHARGING_STATUS:
+        elif channel is c.CHARGING_STATUS:
             self.charging = payload.value
-        elif channel is IMU:
+        elif channel is c.IMU:
             self.attitude = payload.value.orientation_deg
         else:
             self.autonomy = payload
@@ -223,4 +214,4 @@ class RobotView:
         return topic if isinstance(topic, str) and not is_of_another(topic, self.base) else None
 
 
-_TELEMETRY = (CHARGING_LEVEL, CHARGING_STATUS, IMU, AUTONOMY_STATUS)
+_TELEMETRY = (c.CHARGING_LEVEL, c.CHARGING_STATUS, c.IMU, c.AUTONOMY_STATUS)

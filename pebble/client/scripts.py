@@ -1,7 +1,5 @@
 """The scripts of a robot as its autonomy_manager publishes them, and commands that start and stop them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any

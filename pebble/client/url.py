@@ -1,7 +1,5 @@
 """Parses the address of a connection: ``mqtt://host:port``, ``mqtts://host:port`` or ``zenoh:<run_dir>``."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,10 +1,8 @@
 """Builds the command line from the modules it needs, and runs it."""
 
-from __future__ import annotations
-
 import logging
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from importlib import import_module
 from typing import Annotated
@@ -15,7 +13,7 @@ from pebble.config.secret_text import without_secrets
 from pebble.runtime.parent import MaskingFormatter
 from pebble.version import __version__
 
-#: Each command, and the module of this package that registers it.
+#: Each command, and the module of this package that has the function of its name, or registers what is below it.
 COMMANDS = {
     "up": "up",
     "check": "check",
@@ -41,17 +39,9 @@ COMMANDS = {
     "impair": "impair",
 }
 
+_REGISTERED = ("topic", "script", "sim", "web", "recordings", "cert", "bench", "impair")
 #: What prints its help when nothing follows.
-_GROUPS: tuple[list[str], ...] = (
-    [],
-    ["topic"],
-    ["bench"],
-    ["sim"],
-    ["script"],
-    ["cert"],
-    ["recordings"],
-    ["web", "user"],
-)
+_GROUPS = [words.split() for words in ("", "topic", "bench", "sim", "script", "cert", "recordings", "web user")]
 
 _HELP = """Runs and inspects Pebble robots.
 
@@ -80,12 +70,22 @@ def run(arguments: list[str]) -> int:
         return _run(arguments)
 
 
-def _run(arguments: list[str]) -> int:
-    wanted = [arguments[0]] if arguments and arguments[0] in COMMANDS else []
+def application(names: Iterable[str] = COMMANDS) -> typer.Typer:
+    """The command line with these commands."""
     app = typer.Typer(rich_markup_mode=None, add_completion=False)
     app.callback(help=_HELP)(_options)
-    for module in dict.fromkeys(COMMANDS[name] for name in wanted or COMMANDS):
-        import_module(f"pebble.commands.{module}").register(app)
+    for name in names:
+        module = import_module(f"pebble.commands.{COMMANDS[name]}")
+        if name in _REGISTERED:
+            module.register(app)
+        else:
+            app.command(name)(getattr(module, name))
+    return app
+
+
+def _run(arguments: list[str]) -> int:
+    wanted = [arguments[0]] if arguments and arguments[0] in COMMANDS else []
+    app = application(wanted or COMMANDS)
     line = [*arguments, "--help"] if arguments in _GROUPS else arguments
     try:
         code = typer.main.get_command(app).main(line, prog_name="pebble", standalone_mode=False)
@@ -122,5 +122,4 @@ def _options(
         bool, typer.Option("--version", help="Print the version of Pebble.", callback=_print_version, is_eager=True)
     ] = False,
 ) -> None:
-    """Options before the command."""
     _ = version

@@ -1,7 +1,5 @@
 """``pebble cert``: certificates of one's own for the operator page."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

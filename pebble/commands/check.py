@@ -1,7 +1,5 @@
 """``pebble check``: all problems of a config at once, or a summary of it."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,7 +7,7 @@ from typing import Annotated, NamedTuple
 
 import typer
 
-from pebble.config import Config, Mqtt, RemoteConnection, load, resolved
+from pebble.config import Config, Mqtt, load, resolved
 from pebble.config.secret_text import shown_user, without_secrets
 from pebble.config.web import is_loopback
 from pebble.contract import CHANNELS, MEDIA_STATUS, STATUS, TOUCH_SENSORS, Channel
@@ -44,10 +42,6 @@ def check(
     """
     good = [_check(path, as_json=as_json, first=path is configs[0]) for path in configs]
     return 0 if all(good) else 1
-
-
-def register(app: typer.Typer) -> None:
-    app.command("check")(check)
 
 
 def _check(path: Path, *, as_json: bool, first: bool) -> bool:
@@ -208,7 +202,8 @@ def _transport(config: Config) -> str:
 def _uplink(config: Config) -> str:
     bridge = config.services.mqtt_bridge
     if bridge.remote is not None and bridge.remote.kind != "mqtt":
-        return _remote_connection(bridge.remote)
+        ways = [f"listens on {one}" for one in bridge.remote.listen]
+        return ", ".join([bridge.remote.kind, *ways, *(f"connects to {one}" for one in bridge.remote.connect)])
     return f"mqtt, {_mqtt(bridge.remote_mqtt)}"
 
 
@@ -226,11 +221,6 @@ def _scripts(config: Config) -> list[tuple[str, str]]:
 
 def _place(mqtt: Mqtt) -> tuple[str, int]:
     return "" if is_loopback(mqtt.host) else mqtt.host, mqtt.port
-
-
-def _remote_connection(remote: RemoteConnection) -> str:
-    ways = [f"listens on {one}" for one in remote.listen] + [f"connects to {one}" for one in remote.connect]
-    return ", ".join([remote.kind, *ways])
 
 
 def _mqtt(mqtt: Mqtt) -> str:

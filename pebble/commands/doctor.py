@@ -1,7 +1,5 @@
 """``pebble doctor``: prints the findings of :mod:`pebble.doctor.checks`."""
 
-from __future__ import annotations
-
 import shutil
 import textwrap
 from pathlib import Path
@@ -41,10 +39,6 @@ def doctor(
     failed, warned = counts[Level.FAIL], counts[Level.WARN]
     typer.echo(f"checks: {sum(counts.values())}, warnings: {warned}, failures: {failed}")
     return 1 if failed else 0
-
-
-def register(app: typer.Typer) -> None:
-    app.command("doctor")(doctor)
 
 
 def _print(finding: Finding) -> None:

@@ -1,7 +1,5 @@
 """A message to be published by hand, completed and checked by the contract."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """``pebble drive``: drives a robot with the keys of a terminal."""
 
-from __future__ import annotations
-
 import secrets
 import socket
 import time
@@ -13,9 +11,9 @@ import typer
 
 from pebble.client.connection import Target, connected, target_of
 from pebble.client.driver_lease import ANSWER_S, DriverLease
-from pebble.client.key_decoder import END
-from pebble.client.key_gesture import PERIOD_S, KeyGesture
-from pebble.client.terminal_driver import TerminalDriver
+from pebble.client.terminal.driver import TerminalDriver
+from pebble.client.terminal.key_decoder import END
+from pebble.client.terminal.key_gesture import PERIOD_S, KeyGesture
 from pebble.commands.estop import me
 from pebble.commands.options import with_target
 from pebble.commands.terminal_loop import TerminalLoop
@@ -61,7 +59,7 @@ def drive(
         pebble drive goob --url mqtt://127.0.0.1 --speed 0.3
         pebble drive goob.json --remote --take-over
     """
-    from pebble.client.terminal_keys import check_terminal, opened
+    from pebble.client.terminal.keys import check_terminal, opened
 
     check_terminal()
     target = target_of(robot, target)
@@ -70,22 +68,12 @@ def drive(
         lease = DriverLease(names.base, f"drive-{secrets.token_hex(4)}", by=me(), device=device)
         heartbeat = target.remote or str(target.url).startswith("mqtt")  # within a robot there is none
         driver = TerminalDriver(
-            names.base,
-            KeyGesture(speed, turn),
-            lease,
-            by=me(),
-            now=clock(),
-            take_over=take_over,
-            heartbeat=heartbeat,
+            names.base, KeyGesture(speed, turn), lease, by=me(), now=clock(), take_over=take_over, heartbeat=heartbeat
         )
         driving = _Driving(transport, driver)
         typer.echo(_KEYS)
         with opened() as terminal:
             return driving.run(TerminalLoop(terminal, clock))
-
-
-def register(app: typer.Typer) -> None:
-    app.command("drive")(drive)
 
 
 class _Driving:

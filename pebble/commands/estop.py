@@ -88,10 +88,6 @@ def estop(
     return _stop(target, why, every=all_, hold=hold)
 
 
-def register(app: typer.Typer) -> None:
-    app.command("estop")(estop)
-
-
 def _parse(words: list[str]) -> tuple[str, str | None]:
     """``("reset", "goob.json")``; the verb is empty for a stop. A robot called reset is given as system/type/id."""
     verb = words[0] if words and words[0] in _VERBS else ""

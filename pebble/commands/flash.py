@@ -1,7 +1,5 @@
 """``pebble flash``: installs a robot's firmware on its board, step by step."""
 
-from __future__ import annotations
-
 import os
 import sys
 from importlib.resources import files
@@ -77,10 +75,6 @@ def flash(
     execute(options, Tools(), typer.echo)
     typer.echo(f"{robot}: done")
     return 0
-
-
-def register(app: typer.Typer) -> None:
-    app.command("flash")(flash)
 
 
 def _target(robot: str, firmware: str | None) -> tuple[Firmware, Config | None]:

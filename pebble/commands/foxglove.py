@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from pebble.foxglove.run import Settings, Summary
 
 
-def serve(
+def foxglove(
     config: Annotated[
         Path | None, typer.Argument(help="A robot's config file: show this robot.", show_default=False)
     ] = None,
@@ -65,10 +65,6 @@ def serve(
     )
     _print_end(run(_settings(target, host, port), _print_ready))
     return 0
-
-
-def register(app: typer.Typer) -> None:
-    app.command("foxglove")(serve)
 
 
 def _settings(target: Target, host: str, port: int) -> Settings:

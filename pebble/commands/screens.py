@@ -1,7 +1,5 @@
 """Outputs for pictures and sound: a window where there is a screen, files where there is none."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

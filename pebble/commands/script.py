@@ -1,7 +1,5 @@
 """``pebble script``: writes a new script, and lists, starts and stops those of a robot."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -142,7 +140,6 @@ def _scripts(robot: str, target: Target) -> Iterator[tuple[Transport, RobotScrip
 
 
 def _answered(before: AutonomyStatus | None, now: AutonomyStatus | None, file: str, elapsed: float) -> bool:
-    """Whether this status answers the command."""
     if now is None or _runs(before, now, file):
         return now is not None
     return bool(now.error) and (before is None or now.error != before.error or elapsed > _SAME_ERROR_S)

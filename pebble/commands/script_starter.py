@@ -1,7 +1,5 @@
 """Writes a first script: one that follows a tag, its test, and a robot in a simulated room."""
 
-from __future__ import annotations
-
 import re
 import tempfile
 from collections.abc import Iterator

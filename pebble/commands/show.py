@@ -1,7 +1,5 @@
 """What ``pebble topic`` prints: messages, rates and lists of topics, without characters that control the terminal."""
 
-from __future__ import annotations
-
 import json
 import math
 import os
@@ -199,7 +197,6 @@ def print_listing(listing: Listing, now: float, wall: float) -> None:
 
 
 def stopped_robots(listing: Listing, wall: float) -> list[str]:
-    """A line for each robot in the listing that is stopped."""
     discovery = Discovery()
     for record in listing.records.values():
         if record.last is not None:

@@ -32,8 +32,7 @@ A loudspeaker that records what is played stands in for aplay.
 _BROKER_HELP = "mqtt://[USER@]HOST[:PORT], mqtts://… or a robot's config file."
 
 _Link = Annotated[
-    Path | None,
-    typer.Option("--link", help="Path of the serial port. [default: /tmp/pebble-…]", metavar="PATH"),
+    Path | None, typer.Option("--link", help="Path of the serial port. [default: /tmp/pebble-…]", metavar="PATH")
 ]
 _Charging = Annotated[bool, typer.Option("--charging", help="Start with the charger connected.")]
 _Broker = Annotated[str, typer.Option("--broker", "-b", help=_BROKER_HELP, metavar="URL", show_default=False)]
@@ -198,8 +197,7 @@ def world(
 
 def demo(
     seconds: Annotated[
-        float | None,
-        typer.Option("--seconds", "-s", min=1, help="End after this long of driving.", show_default=False),
+        float | None, typer.Option("--seconds", "-s", min=1, help="End after this long of driving.", show_default=False)
     ] = None,
 ) -> int:
     """Four simulated robots, driven by a scripted operator through one broker, until Ctrl-C.
@@ -279,4 +277,3 @@ def register(app: typer.Typer) -> None:
     for command in (goob, fred, goob_imu, outlets, minilamp, benjr, fleet, world, loudspeaker):
         group.command(command.__name__)(command)
     app.add_typer(group, name="sim")
-    app.command("demo")(demo)

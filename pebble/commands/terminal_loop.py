@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from pebble.client.key_decoder import END, KeyDecoder
+from pebble.client.terminal.key_decoder import END, KeyDecoder
 from pebble.config.visible import shown
 
 if TYPE_CHECKING:
-    from pebble.client.terminal_keys import Terminal
+    from pebble.client.terminal.keys import Terminal
 
 _SHOW_PERIOD_S = 0.1
 

@@ -31,8 +31,7 @@ _REPORT_PERIOD_S = 1.0
 Name = Annotated[
     str,
     typer.Argument(
-        help="A metric (drive-values, outgoing/online) or a whole topic; + and # except with pub.",
-        show_default=False,
+        help="A metric (drive-values, outgoing/online) or a whole topic; + and # except with pub.", show_default=False
     ),
 ]
 SecondsOption = Annotated[float | None, typer.Option("--seconds", "-s", min=0.1, help="Stop after this long.")]
@@ -111,7 +110,9 @@ def echo(
     """
     printed = 0
     with connected(target) as (transport, names):
-        _warn_of_stop(transport, names, topic)
+        robot = _estop(transport, names, topic)
+        if robot is not None and robot.stopped_by is not None:
+            typer.echo(f"pebble: {show.stopped_line(robot, time.time())}", err=True)
         listener = Listener(transport, names.filters(topic))
         end = _end(seconds)
         while time.monotonic() < end and printed != count:
@@ -177,13 +178,7 @@ def pub(
 
 
 @with_target(robot=True)
-def hz(
-    topic: Name,
-    window: WindowOption = 100,
-    seconds: SecondsOption = None,
-    *,
-    target: Target,
-) -> int:
+def hz(topic: Name, window: WindowOption = 100, seconds: SecondsOption = None, *, target: Target) -> int:
     """Print once a second how often messages arrive. Retained messages do not count.
 
     \b
@@ -193,13 +188,7 @@ def hz(
 
 
 @with_target(robot=True)
-def bw(
-    topic: Name,
-    window: WindowOption = 100,
-    seconds: SecondsOption = None,
-    *,
-    target: Target,
-) -> int:
+def bw(topic: Name, window: WindowOption = 100, seconds: SecondsOption = None, *, target: Target) -> int:
     """Print once a second how many payload bytes arrive per second. Retained messages do not count.
 
     \b
@@ -252,12 +241,6 @@ def _refuse_stopped(robot: RobotEstop | None) -> None:
             f"{show.stopped_line(robot, time.time())}; it is not driven (--force publishes anyway). "
             f"To end the stop: pebble estop reset {shown(id_of(robot.base))}, with the same --url or --config"
         )
-
-
-def _warn_of_stop(transport: Transport, names: Names, topic: str) -> None:
-    robot = _estop(transport, names, topic)
-    if robot is not None and robot.stopped_by is not None:
-        typer.echo(f"pebble: {show.stopped_line(robot, time.time())}", err=True)
 
 
 def _estop(transport: Transport, names: Names, topic: str) -> RobotEstop | None:

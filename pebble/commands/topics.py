@@ -1,7 +1,5 @@
 """``pebble topics``: the contract as a table, or as JSON."""
 
-from __future__ import annotations
-
 import json
 from typing import Annotated, Any
 
@@ -37,10 +35,6 @@ def topics(
     else:
         _print_table(prefix)
     return 0
-
-
-def register(app: typer.Typer) -> None:
-    app.command("topics")(topics)
 
 
 def _plain(channel: Channel, prefix: str) -> dict[str, Any]:

@@ -1,9 +1,5 @@
 """``pebble up`` with options, and its help; ``pebble.cli`` runs a plain ``pebble up CONFIG`` without this module."""
 
-from __future__ import annotations
-
-import typer
-
 from pebble.commands.options import ConfigArgument
 
 
@@ -19,7 +15,3 @@ def up(config: ConfigArgument) -> int:
     from pebble.launcher.launcher import Launcher
 
     return Launcher(load(config)).run()
-
-
-def register(app: typer.Typer) -> None:
-    app.command("up")(up)

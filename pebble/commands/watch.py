@@ -27,8 +27,7 @@ RobotArgument = Annotated[
     str, typer.Argument(help="A robot's config file, or with --url its id.", metavar="ROBOT", show_default=False)
 ]
 UrlOption = Annotated[
-    str | None,
-    typer.Option(help="mqtt://[USER@]HOST[:PORT] or mqtts://… of the operators' broker.", metavar="URL"),
+    str | None, typer.Option(help="mqtt://[USER@]HOST[:PORT] or mqtts://… of the operators' broker.", metavar="URL")
 ]
 EncodingOption = Annotated[
     str | None, typer.Option("--encoding", "-e", help="json, pbvd, pbvz or h264. [default: the robot's]")
@@ -132,8 +131,3 @@ def _target(robot: str, url: str | None, password_file: Path | None, ca_cert: Pa
     bridge = load(robot).services.mqtt_bridge
     remote = bool(bridge.remote_mqtt.host) or bridge.remote is not None
     return Target(config=Path(robot), remote=remote, program="watch")
-
-
-def register(app: typer.Typer) -> None:
-    app.command("watch")(watch)
-    app.command("snapshot")(snapshot)

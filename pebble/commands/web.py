@@ -80,7 +80,7 @@ def serve(
         raise PebbleError("which robots is missing: name either a robot's config file or --url mqtt://BROKER")
     require_packages()
     folder = None if tls is None else tls.absolute()
-    empty = folder is not None and not _has_certificate(folder)
+    empty = folder is not None and not all((folder / file).is_file() for file in (SERVER_CERT, SERVER_KEY))
     if recordings is not None and not recordings.is_dir():
         raise PebbleError(f"--recordings {recordings}: there is no such folder")
     options = {
@@ -166,10 +166,6 @@ def _of_config(file: Path, options: dict[str, Any], folder: Path | None) -> tupl
     if settings.login and web.people is None and not _has_user(settings.people) and _has_user(shared):
         settings = replace(settings, people=shared)
     return settings, web.plain_http
-
-
-def _has_certificate(folder: Path) -> bool:
-    return all((folder / file).is_file() for file in (SERVER_CERT, SERVER_KEY))
 
 
 def _default_tls_folder(host: str) -> Path | None:

@@ -1,7 +1,5 @@
 """``pebble web user`` and ``pebble web audit``: who may use the operator page, and who did what."""
 
-from __future__ import annotations
-
 import os
 import sys
 import time

@@ -38,8 +38,7 @@ class Script(Section, frozen=True, kw_only=True):
     entrypoint: Annotated[str, doc("File to run.")] = "run.py"
     python: Annotated[str | None, doc("Interpreter of a Python entry point; unset: the one that runs Pebble.")] = None
     arbitrate: Annotated[
-        bool,
-        doc("Sign the drive commands of a script that does not sign them itself, so that people go first."),
+        bool, doc("Sign the drive commands of a script that does not sign them itself, so that people go first.")
     ] = True
     cwd: Annotated[File | None, doc("Folder to run it in; unset: its own.")] = None
     env: Annotated[Variables, doc("Environment variables to add.")] = EMPTY
@@ -51,8 +50,7 @@ class AutonomyManager(ServiceSection, frozen=True, kw_only=True):
     """Runs one autonomy script at a time."""
 
     autonomy_root: Annotated[
-        str,
-        doc("Folder of scripts. Relative: seen from the config's folder, and Pebble's own are offered, too."),
+        str, doc("Folder of scripts. Relative: seen from the config's folder, and Pebble's own are offered, too.")
     ] = "autonomy"
     scan_interval_seconds: Annotated[Interval, doc("Seconds between scans of the folder.")] = 5.0
     stop_timeout_seconds: Annotated[Seconds, doc("How long a script may take to stop before it is killed.")] = 8.0

@@ -1,7 +1,5 @@
 """A whole config: read from its JSON file, checked, completed, and from then on typed and unchangeable."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import zlib
@@ -142,14 +140,10 @@ def _config(raw: Any, path: Path | None, folder: Path, env: Mapping[str, str]) -
         path=path,
         folder=folder,
         warnings=reader.notes.warning_lines(),
-        run_folder=_run_folder(root, identity.base, env),
+        run_folder=root.transport.run_dir or default_run_folder(identity.base, env),
         state_folder=root.transport.state_dir or default_state_folder(identity.base, env),
         password_variables=tuple(reader.password_variables),
     )
-
-
-def _run_folder(root: Root, base: str, env: Mapping[str, str]) -> Path:
-    return root.transport.run_dir or default_run_folder(base, env)
 
 
 def default_run_folder(base: str, env: Mapping[str, str]) -> Path:

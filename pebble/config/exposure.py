@@ -1,7 +1,5 @@
 """Warns of what in a config lets others read or overhear a secret."""
 
-from __future__ import annotations
-
 import os
 import stat
 from collections.abc import Iterator

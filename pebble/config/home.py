@@ -1,7 +1,5 @@
 """Paths in a home folder, which a user of a container or of a service may not have."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from pebble.errors import ConfigError

@@ -1,7 +1,5 @@
 """Finds and hides what is secret in a config: by its keys, and in its texts as secret_text does."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

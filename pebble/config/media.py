@@ -12,6 +12,7 @@ from pebble.config.types import (
     Count,
     File,
     FramesPerSecond,
+    HandlerTopics,
     Pixels,
     Qos,
     Rotation,
@@ -42,8 +43,7 @@ class CameraCapture(Section, frozen=True, kw_only=True):
         doc("How the camera is reached; `synthetic` needs none."),
     ] = "v4l2"
     device: Annotated[
-        str,
-        doc("Device of a v4l2 camera, or a file or URL; of a synthetic one, `world.json#goob`: a simulated robot."),
+        str, doc("Device of a v4l2 camera, or a file or URL; of a synthetic one, `world.json#goob`: a simulated robot.")
     ] = "/dev/video0"
     capture_format: Annotated[str, doc("`auto`, `raw`, `mjpeg`, or a pixel format such as `yuyv`.")] = "auto"
     io_mode: Annotated[str | int, doc("Not used: OpenCV chooses by itself.")] = "auto"
@@ -140,8 +140,7 @@ class AudioReceiver(Section, frozen=True, kw_only=True):
     rate: Annotated[SampleRate, doc("Samples per second before the first packet.")] = 16000
     channels: Annotated[AudioChannels, doc("Channels before the first packet.")] = 1
     command: Annotated[
-        Command,
-        doc("Plays sound from its standard input; `{rate}`, `{channels}` and `{device}` are filled in."),
+        Command, doc("Plays sound from its standard input; `{rate}`, `{channels}` and `{device}` are filled in.")
     ] = ("aplay", "-q", "-t", "raw", "-f", "S16_LE", "-c", "{channels}", "-r", "{rate}", "-D", "{device}", "-")
     latency_ms: Annotated[
         int, Meta(ge=0, le=1000, description="Sound buffered against uneven arrival; increased when necessary.")
@@ -157,3 +156,24 @@ class Media(Section, frozen=True, kw_only=True):
     video_publisher: Annotated[VideoPublisher, doc("Pictures out.")] = VideoPublisher()
     audio_publisher: Annotated[AudioPublisher, doc("Sound out.")] = AudioPublisher()
     audio_receiver: Annotated[AudioReceiver, doc("Sound in.")] = AudioReceiver()
+
+
+class Playback(Section, frozen=True, kw_only=True):
+    """Where sounds are and what plays them; decoded ones are played by the audio receiver's command."""
+
+    directory: Annotated[File | None, doc("Folder of the sounds; unset: `~/sounds`.")] = None
+    player_command: Annotated[Command, doc("Plays wav files; `{file}` stands for the sound, else it comes last.")] = (
+        "aplay",
+    )
+    stop_timeout: Annotated[Seconds, doc("How long the player may take to stop before it is killed.")] = 5.0
+    scan_interval: Annotated[float, Meta(ge=1, le=86_400, description="Seconds between scans of the folder.")] = 10.0
+    cwd: Annotated[File | None, doc("Folder to run the player in.")] = None
+    env: Annotated[Variables, doc("Environment variables to add.")] = EMPTY
+    volume: Annotated[float, Meta(ge=0, le=1, description="1: as recorded; less: wav files are decoded, too.")] = 1.0
+
+
+class SoundboardHandler(ServiceSection, frozen=True, kw_only=True):
+    """Plays sounds on the robot."""
+
+    topics: Annotated[HandlerTopics, doc("Other names for topics.")] = HandlerTopics()
+    playback: Annotated[Playback, doc("Sounds and player.")] = Playback()

@@ -15,10 +15,10 @@ from msgspec.structs import FieldInfo, fields
 from pebble.config.reader import expected, unwrap
 from pebble.config.tree import Root
 from pebble.config.types import Section
+from pebble.contract.docs import filled
 
 SCHEMA_FILE = Path("configs", "schema.json")
 DOCS_FILE = Path("docs", "configuration.md")
-_BEGIN, _END = "<!-- generated: keys -->\n", "<!-- end of generated: keys -->\n"
 
 
 def schema_text() -> str:
@@ -64,9 +64,7 @@ def _subclasses(kind: type[Section]) -> Iterator[type[Section]]:
 
 def docs_text(current: str) -> str:
     """``current`` with its generated part replaced."""
-    before, _, rest = current.partition(_BEGIN)
-    _, _, after = rest.partition(_END)
-    return f"{before}{_BEGIN}\n{''.join(_chapters(Root, '', {}))}{_END}{after}"
+    return filled(current, {"keys": "".join(_chapters(Root, "", {}))})
 
 
 def _chapters(kind: type[Section], path: str, places: dict[type[Section], str]) -> Iterator[str]:

@@ -1,7 +1,5 @@
 """Hides in texts what is secret: logins in addresses, passwords and tokens."""
 
-from __future__ import annotations
-
 import re
 
 HIDDEN = "***"

@@ -1,7 +1,5 @@
 """Finds the keys of a config that give a channel the topic of another one."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from functools import reduce
 from typing import Any

@@ -1,10 +1,12 @@
 """Reads the text files that people write, on every system and in every locale as UTF-8."""
 
 import codecs
+import os
 from pathlib import Path
 
 from pebble.errors import PebbleError
 
+PASSWORD = "PEBBLE_PASSWORD"  # noqa: S105 - the name of an environment variable
 _WIDE = (
     (codecs.BOM_UTF32_LE, "UTF-32"),
     (codecs.BOM_UTF32_BE, "UTF-32"),
@@ -34,6 +36,11 @@ def read_password(file: Path, option: str) -> str:
         raise PebbleError(f"{option}: {error.strerror}: name a file with the password in it") from None
     except NotTextError as error:
         raise PebbleError(f"{option}: the file {error}") from None
+
+
+def password(file: Path | None) -> str | None:
+    """The broker's password in the file, else in the environment. Raises PebbleError."""
+    return os.environ.get(PASSWORD) if file is None else read_password(file, "--password-file")
 
 
 def text_of(data: bytes) -> str:

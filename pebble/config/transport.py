@@ -4,18 +4,7 @@ from typing import Annotated, Any, Literal
 
 from msgspec import Meta, field
 
-from pebble.config.types import (
-    BrokerHost,
-    ClientId,
-    CommonName,
-    Endpoint,
-    File,
-    Password,
-    Port,
-    Section,
-    Silence,
-    doc,
-)
+from pebble.config.types import BrokerHost, ClientId, CommonName, Endpoint, File, Password, Port, Section, Silence, doc
 
 
 class Tls(Section, frozen=True, kw_only=True):

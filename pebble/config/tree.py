@@ -5,10 +5,9 @@ from typing import Annotated, ClassVar, Literal
 from msgspec import Meta, field
 
 from pebble.config.autonomy import AutonomyManager
-from pebble.config.media import AvDaemon, Media, VideoStream
+from pebble.config.media import AvDaemon, Media, SoundboardHandler, VideoStream
 from pebble.config.planned import Ros1Bridge
 from pebble.config.recorder import Recorder
-from pebble.config.soundboard import SoundboardHandler
 from pebble.config.transport import Mqtt, RemoteConnection, RemoteMqtt, TransportSection
 from pebble.config.types import (
     EMPTY,
@@ -78,8 +77,7 @@ class Launcher(ServiceSection, frozen=True, kw_only=True):
 
     enabled: Annotated[bool, doc("Publish capabilities and logs.")] = True
     restart_delay_seconds: Annotated[
-        Seconds,
-        doc("Scales the waits between restarts: none, then a quarter of this, doubling up to 5 times it."),
+        Seconds, doc("Scales the waits between restarts: none, then a quarter of this, doubling up to 5 times it.")
     ] = 2.0
     shutdown_timeout_seconds: Annotated[
         Seconds, doc("How long the whole robot may take to stop; then the remaining processes are killed.")

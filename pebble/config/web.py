@@ -66,8 +66,7 @@ class WebInterface(Section, frozen=True, kw_only=True):
 
     log_level: Annotated[LogLevel, doc("Log level of `pebble web`; the root's log_level unless set.")] = "INFO"
     host: Annotated[
-        Host,
-        doc("Address to listen on; one that other machines reach needs tls and a user (`pebble web user add`)."),
+        Host, doc("Address to listen on; one that other machines reach needs tls and a user (`pebble web user add`).")
     ] = "127.0.0.1"
     port: Annotated[Port, doc("TCP port to listen on.")] = 8080
     names: Annotated[tuple[NameOfPage, ...], doc("Further host names and addresses that browsers may use for it.")] = ()

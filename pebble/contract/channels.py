@@ -4,8 +4,6 @@ Topics, delivery rules, bridge routing, capabilities, docs/topics.md and the JSO
 and written nowhere else. Sources: paper Tables 3.1 and A.2 to A.6.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from enum import Enum

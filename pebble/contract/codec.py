@@ -1,7 +1,5 @@
 """Encodes and decodes payloads: JSON within limits, and the wrappers the contract accepts (paper A.4.5, A.8.2)."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable

@@ -1,12 +1,10 @@
 """Writes docs/topics.md and docs/payloads.schema.json: ``python -m pebble.contract.docs [FOLDER]``."""
 
-from __future__ import annotations
-
 import inspect
 import json
 import re
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
@@ -20,51 +18,26 @@ from pebble.contract.schemas import schemas
 
 TOPICS, SCHEMAS = "topics.md", "payloads.schema.json"
 
-_INTRO = """\
-# Topics
-
-Generated from `pebble/contract/channels.py` by `python -m pebble.contract.docs`; edit the contract, not this file.
-
-A topic is `{system}/{type}/{id}/{direction}/{metric}`, for example `pebble/robots/goob/incoming/drive-values`.
-Direction is seen from the robot: it subscribes to `incoming` and publishes `outgoing`. Payloads are UTF-8 JSON
-unless they are called binary. Stamps are `t` in epoch milliseconds or `timestamp` in epoch seconds.
-The same as JSON Schema, for programs in other languages: `payloads.schema.json`.
-"""
-
-_ACCEPTED = """\
-## What is accepted
-
-* A command may be bare or wrapped: `{"x": 0.2, "z": 0.5}` and `{"value": {"x": 0.2, "z": 0.5}}` mean the same.
-* A boolean is `true`, `{"value": true}` or `{"enabled": true}`; numbers, strings and null switch nothing.
-* Numbers of drive and light commands may be text: `"0.5"`, `" -1e-1 "`. One that is missing, `null` or no number is 0
-  (a `period`: 2); everything is clamped. NaN or infinity, as a number or as text (`"nan"`, `"-inf"`, `"1e999"`),
-  refuses the whole command: the wheels do what they did until their deadline.
-* A drive command without `x`, `z` and `y` is a stop. The motor owner's log names its keys, once a minute for each
-  `source`; boards have no log.
-* Bytes of UTF-8 around a payload that are not printable ASCII change nothing: a byte order mark, white space, a C
-  string's NUL and what is after it. An empty payload still removes what was retained; white space alone is a bridge's
-  probe, and ignored.
-* Refused, counted and logged: NaN and infinities in any spelling, wrong types, bytes that are not UTF-8 (so also
-  UTF-16), JSON nested deeper than 32 levels, commands larger than 64 KB. But on `estop` what cannot be read stops.
-* Unknown fields are ignored. A retained command or action is stale: it is neither executed nor forwarded.
-"""
-
+_DOCS = Path(__file__).resolve().parents[2] / "docs"
+_GENERATED = re.compile(r"(<!-- generated: (\w+) -->\n?).*?(<!-- end of generated: \2 -->)", re.DOTALL)
 _JSON_TYPES = {Any: "any", NoneType: "null", bool: "boolean", int: "integer", float: "number", str: "string"}
+
+
+def filled(document: str, parts: Mapping[str, str]) -> str:
+    """``document`` with these parts, by name, between its marks."""
+    text = _GENERATED.sub(lambda found: f"{found[1]}\n{parts[found[2]]}\n{found[3]}", document)
+    return re.sub(r"\n{3,}", "\n\n", text)
 
 
 def topics_document() -> str:
     """The whole of docs/topics.md."""
-    return "\n".join(
-        [
-            _INTRO,
-            "## Kinds\n",
-            _table(("kind", "direction", "QoS", "retained", "meaning"), map(_kind_row, Kind)),
-            *(section for direction in (INCOMING, OUTGOING) for section in _direction(direction)),
-            _ACCEPTED,
-            "## Payloads\n",
-            *map(_payload, _structs()),
-        ]
-    )
+    kinds = _table(("kind", "direction", "QoS", "retained", "meaning"), map(_kind_row, Kind))
+    channels = (section for direction in (INCOMING, OUTGOING) for section in _direction(direction))
+    parts = {
+        "channels": "\n".join(["## Kinds\n", kinds, *channels]),
+        "payloads": "\n".join(["## Payloads\n", *map(_payload, _structs())]),
+    }
+    return filled((_DOCS / TOPICS).read_text(encoding="utf-8"), parts)
 
 
 def travels(channel: Channel) -> str:
@@ -214,7 +187,7 @@ def documents() -> dict[str, str]:
 
 def main(arguments: list[str]) -> None:
     """Write both files into the given folder, or into docs/ of this checkout."""
-    folder = Path(arguments[0]) if arguments else Path(__file__).resolve().parents[2] / "docs"
+    folder = Path(arguments[0]) if arguments else _DOCS
     for name, text in documents().items():
         (folder / name).write_text(text, encoding="utf-8")
 

@@ -1,7 +1,5 @@
 """The encodings of pictures and sound, by the names that requests, capabilities and configs use."""
 
-from __future__ import annotations
-
 from typing import Final, Literal, TypeAlias, get_args
 
 VideoEncoding: TypeAlias = Literal["json", "pbvd", "pbvz", "h264"]

@@ -1,7 +1,5 @@
 """The identity of a component, three levels of a topic, and how topics are built and parsed."""
 
-from __future__ import annotations
-
 import re
 from enum import StrEnum
 from functools import lru_cache

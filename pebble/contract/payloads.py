@@ -4,8 +4,6 @@ Unknown fields are tolerated, wrong types are not. Numbers are finite: NaN and i
 Values that the contract clamps are clamped when the struct is made, so no value is out of range.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Annotated, Any, Literal
 

@@ -1,7 +1,5 @@
 """A channel under another topic, which an option of a script chooses: ``--topic`` and the like (paper Table A.6)."""
 
-from __future__ import annotations
-
 from msgspec.structs import replace
 
 from pebble.contract.channels import CHANNELS, OUTGOING, Channel

@@ -4,8 +4,6 @@ They define what to *send*; Pebble reads more leniently (a bare boolean for soun
 Numbers of drive and light commands may be sent as text, as forms of web pages do; Pebble itself sends numbers.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import msgspec

@@ -3,8 +3,6 @@
 ``python -m pebble.demo.brokers PORT`` runs amqtt on loopback.
 """
 
-from __future__ import annotations
-
 import asyncio
 import sys
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Judges how Goob followed a tag by itself, by what its MCU received and where it arrived."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -82,9 +80,7 @@ def _driven(completed: CompletedFollow, drives: Sequence[tuple[float, Wheels]]) 
         return Check(name, "never", f"{FOLLOW} did not drive before the operator took over")
     took = first - completed.began
     return Check(
-        name,
-        f"{took:.2f} s after its start",
-        "" if took <= _STARTED_S else f"{FOLLOW} drove only after {took:.1f} s",
+        name, f"{took:.2f} s after its start", "" if took <= _STARTED_S else f"{FOLLOW} drove only after {took:.1f} s"
     )
 
 

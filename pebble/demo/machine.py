@@ -4,8 +4,6 @@ A real motor MCU has a processor of its own, so what a simulated one does late o
 about robots.
 """
 
-from __future__ import annotations
-
 import time
 from collections import deque
 from dataclasses import dataclass

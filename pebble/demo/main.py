@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import signal
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -40,6 +39,7 @@ from pebble.demo.steps import assess
 from pebble.demo.view import View, show_media_results, show_results
 from pebble.errors import PebbleError
 from pebble.rig.testbed import ROBOTS, PageServer, RoomRobot, Testbed
+from pebble.runtime.signals import handled_by
 
 SHORTEST_S = ROUND_S + EMERGENCY_S + TAKEOVER_S
 _DISCOVERY_S = 30.0  # until all robots can be driven, on the smallest machine
@@ -245,9 +245,5 @@ def _ending_on_signals() -> Iterator[threading.Event]:
         # In another thread: the signal may have interrupted this one inside ending.wait(), where it holds the lock.
         threading.Thread(target=ending.set, name="ending", daemon=True).start()
 
-    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
-    try:
+    with handled_by(ask):
         yield ending
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

@@ -3,8 +3,6 @@
 A robot has one encoding for everybody: while a person watches or listens to it, it is left as that person chose.
 """
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import deque

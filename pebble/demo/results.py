@@ -1,7 +1,5 @@
 """What the demo retains of many rounds. Pure."""
 
-from __future__ import annotations
-
 from typing import TypeAlias
 
 from pebble.demo.emergency import StopResult

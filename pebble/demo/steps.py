@@ -1,7 +1,5 @@
 """Judges each step that the demo has driven by what the MCU measured, not by telemetry. Pure."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Output of the demo: a live table in a terminal, plain lines once a second elsewhere, and tables of results."""
 
-from __future__ import annotations
-
 import math
 import threading
 import time
@@ -105,7 +103,8 @@ class View:
         row |= _truth(robot)
         row["battery"] = _battery(seen)
         if robot.has_imu:
-            row["attitude"] = _attitude(seen)
+            at = seen.attitude
+            row["attitude"] = "unknown" if at is None else f"roll {at.roll:+.1f}° pitch {at.pitch:+.1f}°"
         if robot.has_scripts:
             row["script"] = _script(seen)
         if robot.has_media:
@@ -230,11 +229,6 @@ def _script(seen: RobotView) -> str:
     if status is None or not status.running:
         return "none runs"
     return f"{status.file}{', overruled' if status.overridden is True else ''}"
-
-
-def _attitude(seen: RobotView) -> str:
-    attitude = seen.attitude
-    return "unknown" if attitude is None else f"roll {attitude.roll:+.1f}° pitch {attitude.pitch:+.1f}°"
 
 
 def _battery(seen: RobotView) -> str:

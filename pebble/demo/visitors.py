@@ -1,7 +1,5 @@
 """Which robots people have taken from the demo's operator: driven from a page, or stopped. Pure."""
 
-from __future__ import annotations
-
 import math
 from contextlib import suppress
 

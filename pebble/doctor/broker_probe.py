@@ -1,7 +1,5 @@
 """Probes a broker with one MQTT login, without a client library: latency, accepted logins, certificate."""
 
-from __future__ import annotations
-
 import socket
 import ssl
 import time
@@ -9,13 +7,12 @@ from dataclasses import dataclass, replace
 
 from pebble.errors import TransportError
 from pebble.transports.hosts import Address, addresses_of, described, dial
-from pebble.transports.mqtt import client_ids
+from pebble.transports.mqtt import client_ids, packets
 from pebble.transports.settings import MqttSettings
 from pebble.transports.tls import make_context
 
-_CLEAN, _PASSWORD, _USER = 0x02, 0x40, 0x80
 _KEEPALIVE_S = 10
-_CONNACK, _DISCONNECT = 0x20, b"\xe0\x00"
+_CONNACK = 0x20
 REFUSED_ID = 2
 #: Return codes of CONNACK (MQTT 3.1.1, table 3.1) that concern the login.
 REFUSED_LOGINS = {4: "user name or password is wrong", 5: "not authorised"}
@@ -83,36 +80,17 @@ def _log_in(connection: socket.socket, settings: MqttSettings, login: bool) -> i
         answer += part
     if answer[0] != _CONNACK:
         raise ConnectionError("it does not speak MQTT")
-    connection.sendall(_DISCONNECT)
+    connection.sendall(packets.DISCONNECT)
     return answer[3]
 
 
 def connect_packet(settings: MqttSettings, *, login: bool) -> bytes:
-    """A CONNECT of MQTT 3.1.1 (section 3.1) with a clean session and no will."""
-    flags, fields = _CLEAN, [settings.client_id or client_ids.unique("pebble-doctor")]
-    if login and settings.username is not None:
-        flags |= _USER
-        fields.append(settings.username)
-        if settings.password is not None:
-            flags |= _PASSWORD
-            fields.append(settings.password)
-    body = _text("MQTT") + bytes((4, flags)) + _KEEPALIVE_S.to_bytes(2, "big") + b"".join(map(_text, fields))
-    return b"\x10" + _length(len(body)) + body
-
-
-def _text(value: str) -> bytes:
-    raw = value.encode()
-    return len(raw).to_bytes(2, "big") + raw
-
-
-def _length(count: int) -> bytes:
-    """Seven bits per byte, the lowest first (section 2.2.3)."""
-    raw = bytearray()
-    while True:
-        count, digit = divmod(count, 128)
-        raw.append(digit | 0x80 if count else digit)
-        if not count:
-            return bytes(raw)
+    """A CONNECT of MQTT 3.1.1 with a clean session and no will."""
+    client_id = settings.client_id or client_ids.unique("pebble-doctor")
+    username, password = (settings.username, settings.password) if login else (None, None)
+    return packets.connect(
+        client_id, modern=False, bridge=False, keepalive_s=_KEEPALIVE_S, will=None, username=username, password=password
+    )
 
 
 def _expiry(connection: ssl.SSLSocket) -> float | None:

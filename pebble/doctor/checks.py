@@ -1,7 +1,5 @@
 """Checks of a machine and of the robot on it. They change nothing, and return findings."""
 
-from __future__ import annotations
-
 import grp
 import ipaddress
 import os
@@ -21,7 +19,7 @@ from pebble.client.page_from_config import settings_of
 from pebble.client.page_packages import require_packages
 from pebble.config import Config, Mqtt
 from pebble.config.secret_text import shown_user
-from pebble.doctor import Finding, Level, device_names
+from pebble.doctor import Finding, Level, device_names, fail, ok, warn
 from pebble.doctor.broker_probe import REFUSED_ID, REFUSED_LOGINS, ProbeResult, probe
 from pebble.doctor.driving import driving
 from pebble.doctor.loudspeaker import loudspeaker
@@ -50,7 +48,7 @@ def run_checks(config: Config | None) -> Iterator[Finding]:
     yield leftover_segments(Path("/dev/shm"), Path("/proc"))  # noqa: S108 - where Zenoh puts them
     if config is None:
         return
-    yield from (Finding(Level.WARN, "config", warning) for warning in config.warnings)
+    yield from (warn("config", warning) for warning in config.warnings)
     if config.robot.platform == "linux":
         yield from _robot(config)
 
@@ -86,12 +84,12 @@ def operator_page(config: Config) -> Iterator[Finding]:
         settings = settings_of(config)
         require_packages()
     except PebbleError as error:
-        yield Finding(Level.FAIL, "operator page", str(error))  # which says what to do
+        yield fail("operator page", str(error))  # which says what to do
         return
     if settings.login and settings.certificate is None:
-        yield Finding(Level.WARN, "operator page", "is not encrypted: passwords can be read", "pebble cert init")
+        yield warn("operator page", "is not encrypted: passwords can be read", "pebble cert init")
     else:
-        yield Finding(Level.OK, "operator page", f"port {settings.port} of {settings.host}")
+        yield ok("operator page", f"port {settings.port} of {settings.host}")
 
 
 def _brokers(config: Config) -> Iterator[tuple[str, Mqtt]]:
@@ -110,23 +108,22 @@ def _brokers(config: Config) -> Iterator[tuple[str, Mqtt]]:
 def python_version(version: tuple[int, ...]) -> Finding:
     text = ".".join(map(str, version))
     if version < (3, 11):
-        return Finding(Level.FAIL, "python", f"{text} is too old, 3.11 is needed", "sudo apt install python3.11")
-    return Finding(Level.OK, "python", text)
+        return fail("python", f"{text} is too old, 3.11 is needed", "sudo apt install python3.11")
+    return ok("python", text)
 
 
 def installed(package: str) -> Finding:
     try:
-        return Finding(Level.OK, package, metadata.version(package))
+        return ok(package, metadata.version(package))
     except metadata.PackageNotFoundError:
-        return Finding(Level.FAIL, package, "is not installed", f"{sys.executable} -m pip install {package}")
+        return fail(package, "is not installed", f"{sys.executable} -m pip install {package}")
 
 
 def memory_lock(limit: int, *, root: bool) -> Finding:
     """``limit`` in bytes, or RLIM_INFINITY. A reader that cannot lock a shared segment loses every frame silently."""
     if limit == resource.RLIM_INFINITY or limit >= _ENOUGH_LOCKED or root:
-        return Finding(Level.OK, "memory lock", "no limit that matters")
-    return Finding(
-        Level.WARN,
+        return ok("memory lock", "no limit that matters")
+    return warn(
         "memory lock",
         f"limited to {limit // 1024} kB: too little for shared camera frames",
         "LimitMEMLOCK=infinity in the systemd unit, or `ulimit -l unlimited` in a root shell",
@@ -137,12 +134,10 @@ def clock(now: float, synchronised: bool | None) -> Finding:
     """``now`` in epoch seconds; ``synchronised`` None if unknown."""
     if now < _BUILT:
         year = time.gmtime(now).tm_year
-        return Finding(Level.FAIL, "clock", f"is set to {year}: stamps will be wrong", "sudo timedatectl set-ntp true")
+        return fail("clock", f"is set to {year}: stamps will be wrong", "sudo timedatectl set-ntp true")
     if synchronised is False:
-        return Finding(
-            Level.WARN, "clock", "is not synchronised: latencies will be wrong", "sudo timedatectl set-ntp true"
-        )
-    return Finding(Level.OK, "clock", "synchronised" if synchronised else "plausible; not known to be synchronised")
+        return warn("clock", "is not synchronised: latencies will be wrong", "sudo timedatectl set-ntp true")
+    return ok("clock", "synchronised" if synchronised else "plausible; not known to be synchronised")
 
 
 def synchronised() -> bool | None:
@@ -166,13 +161,12 @@ def leftover_segments(shm: Path, proc: Path) -> Finding:
     """Finds Zenoh's shared memory of this user that no process has mapped."""
     mine = {path for path in shm.glob("*.zenoh") if _owner(path) == os.geteuid()}
     if not mine:
-        return Finding(Level.OK, "shared memory", "no segments left over")
+        return ok("shared memory", "no segments left over")
     unused = sorted(mine - _mapped(proc, mine))
     if not unused:
-        return Finding(Level.OK, "shared memory", f"segments in use: {len(mine)}")
+        return ok("shared memory", f"segments in use: {len(mine)}")
     megabytes = sum(path.stat().st_size for path in unused if path.exists()) / 1e6
-    return Finding(
-        Level.WARN,
+    return warn(
         "shared memory",
         f"left over from processes that are gone: {len(unused)} ({megabytes:.1f} MB)",
         "rm " + " ".join(map(str, unused)),
@@ -203,31 +197,25 @@ def _owner(path: Path) -> int | None:
 def run_directory(path: Path, uid: int) -> Finding:
     what = "run directory"
     if not fits_socket(path / FRAMES_SOCKET):
-        return Finding(
-            Level.FAIL, what, f"{path} is too long for unix sockets", "set transport.run_dir to a shorter path"
-        )
+        return fail(what, f"{path} is too long for unix sockets", "set transport.run_dir to a shorter path")
     if not path.exists():
         return _missing_run_directory(path)
     found = path.lstat()
     if not stat.S_ISDIR(found.st_mode):
-        return Finding(Level.FAIL, what, f"{path} is not a directory", f"rm {path}")
+        return fail(what, f"{path} is not a directory", f"rm {path}")
     if found.st_uid != uid:
-        return Finding(
-            Level.FAIL, what, f"{path} belongs to {_user(found.st_uid)}, not to you", f"sudo chown {_user(uid)} {path}"
-        )
+        return fail(what, f"{path} belongs to {_user(found.st_uid)}, not to you", f"sudo chown {_user(uid)} {path}")
     if found.st_mode & 0o077:
-        return Finding(Level.WARN, what, f"{path} is open to other users", f"chmod 700 {path}")
-    return Finding(Level.OK, what, str(path))
+        return warn(what, f"{path} is open to other users", f"chmod 700 {path}")
+    return ok(what, str(path))
 
 
 def _missing_run_directory(path: Path) -> Finding:
     parent = next(folder for folder in path.parents if folder.exists())
     if not os.access(parent, os.W_OK | os.X_OK):
         owner = _user(os.geteuid())
-        return Finding(
-            Level.FAIL, "run directory", f"{path} cannot be created", f"sudo install -d -m 700 -o {owner} {path}"
-        )
-    return Finding(Level.OK, "run directory", f"{path} will be created")
+        return fail("run directory", f"{path} cannot be created", f"sudo install -d -m 700 -o {owner} {path}")
+    return ok("run directory", f"{path} will be created")
 
 
 def state_directory(path: Path) -> Finding:
@@ -235,13 +223,12 @@ def state_directory(path: Path) -> Finding:
     what = "state directory"
     existing = next(folder for folder in (path, *path.parents) if os.access(folder, os.F_OK))
     if not existing.is_dir() or not os.access(existing, os.W_OK | os.X_OK):
-        return Finding(
-            Level.WARN,
+        return warn(
             what,
             f"{path} cannot be written: an emergency stop ends with a power cut",
             f"sudo install -d -m 700 -o {_user(os.geteuid())} {path}, or set transport.state_dir",
         )
-    return Finding(Level.OK, what, str(path) if existing == path else f"{path} will be created")
+    return ok(what, str(path) if existing == path else f"{path} will be created")
 
 
 def leftover_sockets(run_dir: Path, answers: Callable[[Path], bool]) -> Finding:
@@ -249,13 +236,8 @@ def leftover_sockets(run_dir: Path, answers: Callable[[Path], bool]) -> Finding:
     sockets = sorted(run_dir.glob("*.sock")) if os.access(run_dir, os.R_OK) else []
     dead = [path for path in sockets if not answers(path)]
     if dead:
-        return Finding(
-            Level.WARN,
-            "sockets",
-            f"left over from processes that are gone: {len(dead)}",
-            "rm " + " ".join(map(str, dead)),
-        )
-    return Finding(Level.OK, "sockets", f"{len(sockets)} in use" if sockets else "none: the robot is not up")
+        return warn("sockets", f"left over from processes that are gone: {len(dead)}", "rm " + " ".join(map(str, dead)))
+    return ok("sockets", f"{len(sockets)} in use" if sockets else "none: the robot is not up")
 
 
 def is_listening(path: Path) -> bool:
@@ -279,14 +261,11 @@ def serial_port(path: Path, name: str = "", names: Path = Path("/dev/serial")) -
     except OSError:
         return device_names.missing(what, "does not exist: is the MCU plugged in?", key, names)
     if not stat.S_ISCHR(found.st_mode):
-        return Finding(Level.FAIL, what, "is not a device", f"correct {key}")
+        return fail(what, "is not a device", f"correct {key}")
     if not os.access(path, os.R_OK | os.W_OK):
         group = _group(found.st_gid)
-        return Finding(
-            Level.FAIL,
-            what,
-            f"may only be used by {group}",
-            f"sudo usermod -aG {group} {_user(os.geteuid())}, then log in again",
+        return fail(
+            what, f"may only be used by {group}", f"sudo usermod -aG {group} {_user(os.geteuid())}, then log in again"
         )
     return device_names.usable(what, path, "readable and writable", key, names)
 
@@ -311,12 +290,11 @@ def broker(
             if is_loopback(settings.host)
             else f"nc -vz {settings.host} {settings.port}"
         )
-        yield Finding(Level.FAIL, what, f"cannot be reached: {own.problem}", start)
+        yield fail(what, f"cannot be reached: {own.problem}", start)
         return
     yield _login(what, settings, own)
     if own.problem and not is_loopback(settings.host):
-        yield Finding(
-            Level.WARN,
+        yield warn(
             what,
             f"has addresses that do not answer: {own.problem}",
             f"correct the addresses of {settings.host} in your DNS, or start the brokers there",
@@ -328,15 +306,14 @@ def broker(
 
 def _login(what: str, settings: MqttSettings, answer: ProbeResult) -> Finding:
     if answer.code == 0:
-        return Finding(Level.OK, what, f"answers, connected in {answer.connect_ms:.1f} ms")
+        return ok(what, f"answers, connected in {answer.connect_ms:.1f} ms")
     if answer.code == REFUSED_ID:
         fix = "let it admit any client id, or set remote_mqtt.client_id to one that it knows"
-        return Finding(Level.FAIL, what, "refuses the client id", fix)
+        return fail(what, "refuses the client id", fix)
     why = REFUSED_LOGINS.get(answer.code or 0, f"code {answer.code}")
     if settings.username is None:
-        return Finding(Level.FAIL, what, f"refuses the login: {why}", "set username and password_file of this broker")
-    return Finding(
-        Level.FAIL,
+        return fail(what, f"refuses the login: {why}", "set username and password_file of this broker")
+    return fail(
         what,
         f"refuses user {(user := shown_user(settings.username))}: {why}",
         f"on the broker: sudo mosquitto_passwd /etc/mosquitto/passwd {user}",
@@ -345,11 +322,10 @@ def _login(what: str, settings: MqttSettings, answer: ProbeResult) -> Finding:
 
 def _anonymous_logins(what: str, settings: MqttSettings, answer: ProbeResult) -> Finding:
     if answer.code != 0:
-        return Finding(Level.OK, what, "refuses anonymous logins")
+        return ok(what, "refuses anonymous logins")
     if is_loopback(settings.host):
-        return Finding(Level.OK, what, "accepts anonymous logins: every program on this machine can drive the robot")
-    return Finding(
-        Level.WARN,
+        return ok(what, "accepts anonymous logins: every program on this machine can drive the robot")
+    return warn(
         what,
         "accepts anonymous logins: every client that reaches it can drive the robot",
         "in mosquitto.conf: allow_anonymous false, password_file /etc/mosquitto/passwd",
@@ -359,23 +335,16 @@ def _anonymous_logins(what: str, settings: MqttSettings, answer: ProbeResult) ->
 def _encryption(what: str, settings: MqttSettings, answer: ProbeResult, now: float) -> Finding:
     if settings.tls is None:
         if is_loopback(settings.host):
-            return Finding(Level.OK, what, "not encrypted, which is fine on this machine")
-        return Finding(
-            Level.WARN,
-            what,
-            "is not encrypted: commands and passwords can be read on the network",
-            "set tls.enabled to true",
+            return ok(what, "not encrypted, which is fine on this machine")
+        return warn(
+            what, "is not encrypted: commands and passwords can be read on the network", "set tls.enabled to true"
         )
     if answer.expires is not None and answer.expires - now < _SOON_S:
         days = (answer.expires - now) / 86400
-        return Finding(
-            Level.WARN, what, f"its certificate expires in {days:.0f} days", "renew the broker's certificate"
-        )
+        return warn(what, f"its certificate expires in {days:.0f} days", "renew the broker's certificate")
     if settings.tls.insecure:
-        return Finding(
-            Level.WARN, what, "encrypted, but the name in its certificate is not checked", "set tls.insecure to false"
-        )
-    return Finding(Level.OK, what, "encrypted")
+        return warn(what, "encrypted, but the name in its certificate is not checked", "set tls.insecure to false")
+    return ok(what, "encrypted")
 
 
 def is_loopback(host: str) -> bool:

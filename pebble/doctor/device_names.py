@@ -1,11 +1,9 @@
 """Names of devices that stay: the number of ``ttyACM0`` or ``video0`` depends on the order of plugging in."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 
-from pebble.doctor import Finding, Level
+from pebble.doctor import Finding, fail, ok, warn
 
 _NUMBERED = re.compile(r"(ttyACM|ttyUSB|video)[0-9]+")
 
@@ -14,7 +12,7 @@ def missing(what: str, text: str, key: str, names: Path) -> Finding:
     """The device of config key ``key`` does not exist. ``names``: the folder with links such as by-id/."""
     there = sorted(str(link) for link in names.glob("by-id/*") if not _is_part(link))
     fix = f"ls -l {names / 'by-id'}/" if len(there) != 1 else f"set {key} to {there[0]}"
-    return Finding(Level.FAIL, what, text, fix)
+    return fail(what, text, fix)
 
 
 def usable(what: str, path: Path, text: str, key: str, names: Path) -> Finding:
@@ -24,8 +22,8 @@ def usable(what: str, path: Path, text: str, key: str, names: Path) -> Finding:
             for link in sorted(names.glob(f"{kind}/*")):
                 if link.exists() and link.samefile(path):
                     why = f"{text}, but its number depends on the order of plugging in"
-                    return Finding(Level.WARN, what, why, f"set {key} to {link}")
-    return Finding(Level.OK, what, text)
+                    return warn(what, why, f"set {key} to {link}")
+    return ok(what, text)
 
 
 def _is_part(link: Path) -> bool:

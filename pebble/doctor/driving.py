@@ -8,7 +8,7 @@ from pebble.client.connection import Target, connected
 from pebble.client.driveable import Driveable, driveable_of
 from pebble.config import Config
 from pebble.contract import STATUS
-from pebble.doctor import Finding, Level
+from pebble.doctor import Finding, Level, fail, warn
 from pebble.errors import PebbleError
 from pebble.runtime.parent import launcher_runs
 from pebble.transports import Message
@@ -33,9 +33,9 @@ def driving(config: Config) -> Finding | None:
             while not found and time.monotonic() < end:
                 time.sleep(0.01)
     except PebbleError as error:
-        return Finding(Level.FAIL, "driving", f"nothing reaches the running robot: {error}")
+        return fail("driving", f"nothing reaches the running robot: {error}")
     if not found or found[-1] is None:
-        return Finding(Level.WARN, "driving", "the running robot does not say whether it can be driven")
+        return warn("driving", "the running robot does not say whether it can be driven")
     state, why = found[-1]
     text = "commands reach the motors" if state == "yes" else f"{'not possible' if state == 'no' else state}: {why}"
     return Finding(_LEVELS[state], "driving", text)

@@ -1,7 +1,5 @@
 """Checks the loudspeaker by playing silence: once, and by two programs at the same time."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal
@@ -12,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from pebble.config import Config
-from pebble.doctor import Finding, Level
+from pebble.doctor import Finding, ok, warn
 from pebble.media.sound_file import write_wav
 from pebble.services.soundboard_handler.playback import Players
 
@@ -31,7 +29,7 @@ def loudspeaker(config: Config, silence_s: float = SILENCE_S) -> Iterator[Findin
     names = dict.fromkeys(words[0] for words in commands)
     missing = [name for name in names if "/" not in name and shutil.which(name) is None]
     for name in missing:
-        yield Finding(Level.WARN, _WHAT, f"{name} is not installed: nothing can be played", _installation(name))
+        yield warn(_WHAT, f"{name} is not installed: nothing can be played", _installation(name))
     if commands and not missing:
         with tempfile.TemporaryDirectory(prefix="pebble-doctor-") as folder:
             wav = Path(folder) / "silence.wav"
@@ -52,19 +50,17 @@ def _played(players: Players, wav: Path | None, silence_s: float) -> Finding:
             running.append(_start(players, words, b"" if wav is not None else _silence(silence_s)))
         problems = [problem for process in running if (problem := _problem(process, silence_s))]
     except OSError as error:
-        return Finding(Level.WARN, _WHAT, f"{words[0]} cannot be started: {error}", "correct the player's command")
+        return warn(_WHAT, f"{words[0]} cannot be started: {error}", "correct the player's command")
     finally:
         for process in running:
             _end(process)
     name = Path(words[0]).name
     if not problems:
-        return Finding(Level.OK, _WHAT, f"{name} plays, for two programs at the same time, too")
+        return ok(_WHAT, f"{name} plays, for two programs at the same time, too")
     if len(problems) == 1:
         text = f"{name} plays for one program at a time ({problems[0]}): sounds and talk-back exclude each other"
-        return Finding(Level.WARN, _WHAT, text, _DMIX)
-    return Finding(
-        Level.WARN, _WHAT, f"{name} cannot play: {problems[0]}", "aplay -l; is it in use by another program?"
-    )
+        return warn(_WHAT, text, _DMIX)
+    return warn(_WHAT, f"{name} cannot play: {problems[0]}", "aplay -l; is it in use by another program?")
 
 
 def _start(players: Players, words: list[str], sound: bytes) -> subprocess.Popen[bytes]:

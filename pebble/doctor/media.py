@@ -1,7 +1,5 @@
 """Checks of camera, microphone and codecs."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from collections.abc import Callable, Iterator
@@ -9,7 +7,7 @@ from pathlib import Path
 
 from pebble.config import Config
 from pebble.contract.encodings import NEED_PYAV
-from pebble.doctor import Finding, Level, device_names
+from pebble.doctor import Finding, device_names, fail, ok
 from pebble.media import pyav
 
 _DEVICE = "services.av_daemon.video.device"
@@ -32,19 +30,17 @@ def media(config: Config, devices: Path, which: Which = shutil.which) -> Iterato
 
 def camera(backend: str, device: str, devices: Path, which: Which) -> Finding:
     if backend == "synthetic":
-        return Finding(Level.OK, "camera", "synthetic: needs no device")
+        return ok("camera", "synthetic: needs no device")
     if backend != "v4l2":
         return program("camera", _LIBCAMERA, "sudo apt install rpicam-apps", which)
     names = devices / "v4l"
     path = devices / f"video{device}" if device.isdecimal() else Path(device)
     if "://" in device:
-        return Finding(Level.OK, "camera", "on the network: not checked")
+        return ok("camera", "on the network: not checked")
     if not path.exists():
         return device_names.missing("camera", f"{path} does not exist: is it plugged in?", _DEVICE, names)
     if not os.access(path, os.R_OK | os.W_OK):
-        return Finding(
-            Level.FAIL, "camera", f"{path} is not accessible to this user", "sudo usermod -aG video $USER, log in again"
-        )
+        return fail("camera", f"{path} is not accessible to this user", "sudo usermod -aG video $USER, log in again")
     return device_names.usable("camera", path, f"{path} readable and writable", _DEVICE, names)
 
 
@@ -52,8 +48,8 @@ def program(what: str, names: tuple[str, ...], fix: str, which: Which) -> Findin
     """One of ``names`` must be installed."""
     found = next((name for name in names if which(name) is not None), None)
     if found is None:
-        return Finding(Level.FAIL, what, f"{' or '.join(names)} is not installed", fix)
-    return Finding(Level.OK, what, f"uses {found}")
+        return fail(what, f"{' or '.join(names)} is not installed", fix)
+    return ok(what, f"uses {found}")
 
 
 def codecs(config: Config, *, installed: bool) -> Finding:
@@ -61,8 +57,8 @@ def codecs(config: Config, *, installed: bool) -> Finding:
     sent = config.services.mqtt_bridge.media
     asked = [name for name in (sent.video_publisher.encoding, sent.audio_publisher.encoding) if name in NEED_PYAV]
     if installed:
-        return Finding(Level.OK, "codecs", "H.264 and Opus are available")
+        return ok("codecs", "H.264 and Opus are available")
     fix = "pip install 'pebble-robot[media]'"
     if asked:
-        return Finding(Level.FAIL, "codecs", f"PyAV is not installed, so there is no {' and no '.join(asked)}", fix)
-    return Finding(Level.OK, "codecs", f"PyAV is not installed: no H.264, no Opus ({fix})")
+        return fail("codecs", f"PyAV is not installed, so there is no {' and no '.join(asked)}", fix)
+    return ok("codecs", f"PyAV is not installed: no H.264, no Opus ({fix})")

@@ -7,7 +7,7 @@ import time
 from contextlib import closing
 
 from pebble.contract import BRIDGE_PROBE
-from pebble.doctor import Finding, Level
+from pebble.doctor import Finding, fail, ok, warn
 from pebble.forwarding.probes import new_probe
 from pebble.transports import Message, MqttSettings, QoS, State
 from pebble.transports.mqtt.transport import MqttTransport
@@ -30,7 +30,7 @@ def publishing(what: str, settings: MqttSettings, base: str) -> Finding:
     with closing(client):
         client.open(_OPEN_S)
         if client.state is not State.CONNECTED:
-            return Finding(Level.WARN, what, f"cannot be published to: {client.problem}")
+            return warn(what, f"cannot be published to: {client.problem}")
         client.subscribe(topic, note)
         client.publish(topic, payload, qos=QoS.DELIVERED)
         deadline = time.monotonic() + _ANSWER_S
@@ -40,10 +40,10 @@ def publishing(what: str, settings: MqttSettings, base: str) -> Finding:
             if client.state is not State.CONNECTED or client.counters["connected"] > 1:
                 return _refused(what, topic, "the broker hangs up on it")
     if came_back.is_set() or settings.protocol == "5":  # which says what it refuses
-        return Finding(Level.OK, what, "accepts what this account publishes")
+        return ok(what, "accepts what this account publishes")
     return _refused(what, topic, "it does not come back (or may this account not read it?)")
 
 
 def _refused(what: str, topic: str, why: str) -> Finding:
     fix = f"allow it to write and read {topic.rpartition('/')[0]}/# on the broker"
-    return Finding(Level.FAIL, what, f"this account may not publish to {topic}: {why}", fix)
+    return fail(what, f"this account may not publish to {topic}: {why}", fix)

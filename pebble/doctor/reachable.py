@@ -1,7 +1,5 @@
 """Checks whether a broker that is meant for this machine alone also answers at its addresses on the network."""
 
-from __future__ import annotations
-
 import ipaddress
 import re
 import socket
@@ -9,7 +7,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from pebble.doctor import Finding, Level
+from pebble.doctor import Finding, ok, warn
 from pebble.doctor.broker_probe import probe
 from pebble.transports.settings import MqttSettings
 
@@ -29,16 +27,15 @@ def beyond_loopback(name: str, settings: MqttSettings, addresses: Iterable[str])
         return
     answers = [address for address, code in found.items() if code is not None]
     if open_ := [address for address, code in found.items() if code == 0]:
-        yield Finding(
-            Level.WARN,
+        yield warn(
             what,
             f"also answers at {', '.join(open_)} and accepts anonymous logins: the network can drive the robot",
             f"in mosquitto.conf: listener {settings.port} 127.0.0.1, or allow_anonymous false and a password_file",
         )
     elif answers:
-        yield Finding(Level.OK, what, f"also answers at {', '.join(answers)}, and refuses anonymous logins there")
+        yield ok(what, f"also answers at {', '.join(answers)}, and refuses anonymous logins there")
     else:
-        yield Finding(Level.OK, what, f"does not answer at {', '.join(found)}")
+        yield ok(what, f"does not answer at {', '.join(found)}")
 
 
 def own_addresses(proc: Path = Path("/proc")) -> list[str]:

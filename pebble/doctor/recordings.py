@@ -1,7 +1,5 @@
 """Checks of a robot's own recorder: does it run, did it miss anything, and for how long is there room?"""
 
-from __future__ import annotations
-
 import json
 import shutil
 import time
@@ -10,7 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from pebble.config import Config
-from pebble.doctor import Finding, Level
+from pebble.doctor import Finding, fail, ok, warn
 from pebble.errors import PebbleError
 from pebble.recordings import catalogue
 from pebble.recordings.recorder.folder import Entry, Folder
@@ -30,7 +28,7 @@ def recorder(config: Config, now: float | None = None) -> Iterator[Finding]:
         return
     now, folder = time.time() if now is None else now, section.place
     if not folder.is_dir():
-        yield Finding(Level.OK, _WHAT, f"{folder} is not there yet: it has not recorded anything")
+        yield ok(_WHAT, f"{folder} is not there yet: it has not recorded anything")
         return
     try:
         entries = Folder(folder).entries()
@@ -38,7 +36,7 @@ def recorder(config: Config, now: float | None = None) -> Iterator[Finding]:
         yield from _missed(entries, now)
         yield _room(folder, entries, section.keep_bytes, section.free_bytes)
     except (PebbleError, OSError) as error:
-        yield Finding(Level.FAIL, _WHAT, f"{folder} cannot be read: {error}")
+        yield fail(_WHAT, f"{folder} cannot be read: {error}")
 
 
 def _running(folder: Path, now: float, entries: list[Entry]) -> Finding:
@@ -46,17 +44,17 @@ def _running(folder: Path, now: float, entries: list[Entry]) -> Finding:
         left = sum(entry.is_active for entry in entries)
         if left:
             text = f"does not run, and {left} files in {folder} are not finished"
-            return Finding(Level.WARN, _WHAT, text, f"pebble recordings finish {folder}")
-        return Finding(Level.OK, _WHAT, "does not run now")
+            return warn(_WHAT, text, f"pebble recordings finish {folder}")
+        return ok(_WHAT, "does not run now")
     status = _status(folder)
     silent_s = now - float(status.get("at", 0.0))
     if silent_s > _SILENT_S:
-        return Finding(Level.WARN, _WHAT, f"has stood still for {silent_s:.0f} s", "pebble up")
+        return warn(_WHAT, f"has stood still for {silent_s:.0f} s", "pebble up")
     if status.get("blocked"):
-        return Finding(Level.FAIL, _WHAT, f"writes nothing: {status['blocked']}", f"make room on the disk of {folder}")
+        return fail(_WHAT, f"writes nothing: {status['blocked']}", f"make room on the disk of {folder}")
     if status.get("dropped"):
-        return Finding(Level.WARN, _WHAT, f"runs, and has dropped {status['dropped']} messages: the disk is too slow")
-    return Finding(Level.OK, _WHAT, f"runs, {status.get('messages', 0)} messages into {folder}")
+        return warn(_WHAT, f"runs, and has dropped {status['dropped']} messages: the disk is too slow")
+    return ok(_WHAT, f"runs, {status.get('messages', 0)} messages into {folder}")
 
 
 def _status(folder: Path) -> dict[str, Any]:
@@ -78,15 +76,15 @@ def _missed(entries: list[Entry], now: float) -> Iterator[Finding]:
     ]
     if gaps:
         why = str(gaps[-1].get("why", "unknown"))[:100]
-        yield Finding(Level.WARN, _WHAT, f"{len(gaps)} gaps in the last hour, the last one because of: {why}")
+        yield warn(_WHAT, f"{len(gaps)} gaps in the last hour, the last one because of: {why}")
     damaged = [entry for entry in entries if not (entry.is_finished or entry.is_active)]
     if damaged:
         text = f"{len(damaged)} files could not be finished, and are kept: {damaged[0].path}"
-        yield Finding(Level.WARN, _WHAT, text, "pebble recordings recover FILE OUT, or pebble recordings rm FILE")
+        yield warn(_WHAT, text, "pebble recordings recover FILE OUT, or pebble recordings rm FILE")
     finished = [entry for entry in entries if entry.is_finished and now - entry.ended <= _DAY_S]
     missing = sum(catalogue.look_at(entry.path).missing for entry in finished)
     if missing:
-        yield Finding(Level.WARN, _WHAT, f"{missing} messages of the last day are missing: files were damaged")
+        yield warn(_WHAT, f"{missing} messages of the last day are missing: files were damaged")
 
 
 def _room(folder: Path, entries: list[Entry], keep_bytes: int, free_bytes: int) -> Finding:
@@ -94,15 +92,15 @@ def _room(folder: Path, entries: list[Entry], keep_bytes: int, free_bytes: int) 
     span_s, size = _rate(entries)
     room = max(0, shutil.disk_usage(folder).free - free_bytes)
     if span_s < _SHORTEST_S or not size:
-        return Finding(Level.OK, f"{_WHAT}'s room", f"{room / 1e9:.1f} GB; how long that lasts is not known yet")
+        return ok(f"{_WHAT}'s room", f"{room / 1e9:.1f} GB; how long that lasts is not known yet")
     rate = size / span_s
     if keep_bytes and keep_bytes < room + sum(entry.size for entry in entries):
-        return Finding(Level.OK, f"{_WHAT}'s room", f"the last {keep_bytes / rate / _HOUR_S:.1f} hours are kept")
+        return ok(f"{_WHAT}'s room", f"the last {keep_bytes / rate / _HOUR_S:.1f} hours are kept")
     lasts_s = room / rate
     if lasts_s < _LITTLE_S and not keep_bytes:
         text = f"for {lasts_s / _HOUR_S:.1f} hours at this rate; then the oldest are deleted"
-        return Finding(Level.WARN, f"{_WHAT}'s room", text, "services.recorder.keep_media_days, or a larger disk")
-    return Finding(Level.OK, f"{_WHAT}'s room", f"for {lasts_s / _DAY_S:.1f} days at this rate")
+        return warn(f"{_WHAT}'s room", text, "services.recorder.keep_media_days, or a larger disk")
+    return ok(f"{_WHAT}'s room", f"for {lasts_s / _DAY_S:.1f} days at this rate")
 
 
 def _rate(entries: list[Entry]) -> tuple[float, int]:

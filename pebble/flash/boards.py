@@ -1,7 +1,5 @@
 """The boards that firmware exists for, and which robot is built on which."""
 
-from __future__ import annotations
-
 from binascii import crc_hqx
 from collections.abc import Callable
 from dataclasses import dataclass

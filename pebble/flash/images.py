@@ -1,7 +1,5 @@
 """Checks the header of a MicroPython image against the board, before the board is erased."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Scripts that run on a board's MicroPython, and the interpretation of their output."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 

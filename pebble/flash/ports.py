@@ -1,7 +1,5 @@
 """Lists and checks this machine's serial ports, and interrupts the program that runs on a board."""
 
-from __future__ import annotations
-
 import os
 import stat
 import time

@@ -1,7 +1,5 @@
 """private_config.json: a board's identity, Wi-Fi and broker, made from the robot's config and read by the firmware."""
 
-from __future__ import annotations
-
 import ipaddress
 import json
 import ssl

@@ -1,7 +1,5 @@
 """Collects the files of firmware/ that a robot needs, and the command that compiles each."""
 
-from __future__ import annotations
-
 import ast
 from collections.abc import Iterator
 from importlib.resources import files

@@ -74,7 +74,7 @@ class Steps:
     def all(self) -> list[Step]:
         return [
             self._check_tools(),
-            self._check_port(),
+            Step(title=f"port: {self._options.port}", act=lambda: ports.check(self._options.port)),
             self._compile(),
             *(self._micropython() if self._options.micropython else ()),
             *self._check_board(),
@@ -90,9 +90,6 @@ class Steps:
         if self._options.micropython and self._board.chip:
             names.insert(0, "esptool")
         return Step(title=f"tools: {', '.join(names)}", act=lambda: self._tools.check(names))
-
-    def _check_port(self) -> Step:
-        return Step(title=f"port: {self._options.port}", act=lambda: ports.check(self._options.port))
 
     # -- MicroPython itself
 

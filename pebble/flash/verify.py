@@ -1,7 +1,5 @@
 """Verifies a flashed robot: waits for its first heartbeat at the broker, or its first report on the serial line."""
 
-from __future__ import annotations
-
 import json
 import queue
 import time

@@ -1,7 +1,5 @@
 """The audit log: who did what to which robot, written by a thread of its own."""
 
-from __future__ import annotations
-
 import logging
 import sqlite3
 import threading

@@ -1,7 +1,5 @@
 """Rows of the audit before they are stored: repeated ones merged, and a quota for each person and kind. Pure."""
 
-from __future__ import annotations
-
 from collections import Counter, defaultdict
 from dataclasses import dataclass
 

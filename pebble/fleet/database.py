@@ -1,7 +1,5 @@
 """The SQLite file of people, sessions and the audit log: opened, and followed while others replace it."""
 
-from __future__ import annotations
-
 import os
 import sqlite3
 from collections.abc import Callable, Iterator, Sequence

@@ -1,7 +1,5 @@
 """People who may use the operator page, their sessions, and settings of the server: one SQLite file."""
 
-from __future__ import annotations
-
 import hashlib
 import hmac
 import logging

@@ -1,7 +1,5 @@
 """What a person may do: roles, the rights of each, and sessions. Every role may stop a robot."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import StrEnum
 

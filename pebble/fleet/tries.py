@@ -1,7 +1,5 @@
 """Counts password tries, so that guessing takes years."""
 
-from __future__ import annotations
-
 import ipaddress
 import threading
 from collections import OrderedDict, deque

@@ -1,7 +1,5 @@
 """What a robot takes: how much from outside, where everybody may send it anything, and how late."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 

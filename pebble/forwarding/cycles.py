@@ -6,8 +6,6 @@ may carry no other. Its payload is white space that encodes a random number, so 
 happens once it is nothing else, which no parser accepts; otherwise it follows the topic's value, and changes none.
 """
 
-from __future__ import annotations
-
 import logging
 import secrets
 import threading

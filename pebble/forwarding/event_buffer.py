@@ -1,7 +1,5 @@
 """Buffers events (QoS 1, not retained) during an outage, a bounded number of them."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import deque

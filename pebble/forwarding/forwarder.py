@@ -9,8 +9,6 @@ arrive is worse than one that a later subscriber must recognise as old. What hap
 waited, in a process that was stopped or stuck, or at the broker; what only ends something never is.
 """
 
-from __future__ import annotations
-
 import itertools
 import logging
 import time
@@ -90,7 +88,6 @@ class Forwarder:
 
     @property
     def mirroring(self) -> bool:
-        """Whether remote-mirror is on."""
         return self._mirroring
 
     @mirroring.setter
@@ -145,7 +142,6 @@ class Forwarder:
         return True
 
     def receive(self, side: Side, message: Message) -> Routed:
-        """Forward ``message`` by the table."""
         subject, here = self._subjects[message.topic], self.sides[side]
         outcome = self._receive(here, subject, message)
         if isinstance(outcome, Drop):

@@ -1,7 +1,5 @@
 """Recognises our own messages that come back: from a broker without bridge mode, or by way of something else."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import deque

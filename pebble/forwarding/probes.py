@@ -5,8 +5,6 @@ where clients of the mirrored broker can neither read nor publish it. So a probe
 the bridge's, and anything else on that topic is not.
 """
 
-from __future__ import annotations
-
 import secrets
 import threading
 from collections import deque

@@ -1,7 +1,5 @@
 """Publishes on either side of a forwarder, and recognises what of it comes back."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable
 

@@ -43,7 +43,6 @@ class LastValue:
     earlier: tuple[int, ...] = ()  # hashes of the values before it
 
     def then(self, payload: bytes, side: Side) -> LastValue:
-        """The value after this one."""
         if payload == self.payload:
             return LastValue(payload, side, self.earlier)
         return LastValue(payload, side, (*self.earlier, hash(self.payload))[-_EARLIER:])

@@ -1,7 +1,5 @@
 """Passes retained messages under one lock, because both sides may change the same flag at once."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 

@@ -3,8 +3,6 @@
 Where a connection marks live messages with the flag, too, only the time since the subscription distinguishes the two.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 from pebble.transports import Message, Transport

@@ -1,7 +1,5 @@
 """What a forwarder knows of each of its two sides, and whether anything passes between them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from enum import Enum
 

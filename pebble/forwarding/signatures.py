@@ -4,8 +4,6 @@ A signature names the run that may drive, so it counts only from programs on the
 that moves anything does not pass, and a signed zero stops the motors as a person's.
 """
 
-from __future__ import annotations
-
 from msgspec import UNSET
 from msgspec.structs import replace
 

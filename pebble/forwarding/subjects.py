@@ -1,7 +1,5 @@
 """What a topic means to one robot: its channel, renamed or not, or the family of an unknown metric."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cache, cached_property
 from math import inf

@@ -1,7 +1,5 @@
 """The JSON channels of robots as Foxglove understands them: JSON Schema in the part that its parser reads."""
 
-from __future__ import annotations
-
 from functools import cache
 from typing import Any, Final
 

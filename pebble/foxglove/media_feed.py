@@ -1,7 +1,5 @@
 """One medium of one robot for Foxglove: requested while a client subscribes to its channels, converted, published."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import time
@@ -11,7 +9,6 @@ from typing import Any, Final, NamedTuple
 
 from pebble.client.broker import Broker
 from pebble.client.media_request.offer import offered, refusal
-from pebble.client.media_request.picture_header import MAX_PAYLOAD, PictureSequence
 from pebble.client.media_request.request import MediaRequest
 from pebble.client.viewer import Medium
 from pebble.contract import AUDIO, CAMERA
@@ -19,6 +16,7 @@ from pebble.contract.packets import PBAT
 from pebble.errors import PebbleError
 from pebble.foxglove.server import MAX_BYTES, Server, protobuf_spec
 from pebble.media import pyav
+from pebble.media.picture_header import MAX_PAYLOAD, PictureSequence
 from pebble.recordings.exports.foxglove_messages import (
     IMAGE,
     SOUND,
@@ -193,7 +191,6 @@ class MediaFeed:
             tasks.create_task(self._conversion.run())
 
     def receive(self, payload: bytes) -> None:
-        """Take a payload of the robot."""
         known = self._take_picture(payload) if self._medium == "video" else payload.startswith(PBAT)
         if not known or len(payload) > MAX_PAYLOAD:
             self._refused += 1

@@ -1,7 +1,5 @@
 """Robots of a broker for Foxglove: their channels as they appear, and their telemetry."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import time
@@ -17,14 +15,7 @@ from pebble.errors import PayloadError
 from pebble.foxglove.json_channels import json_spec
 from pebble.foxglove.media_feed import MediaFeed
 from pebble.foxglove.server import Server, protobuf_spec
-from pebble.recordings.exports.foxglove_messages import (
-    Converted,
-    Schemas,
-    Telemetry,
-    as_object,
-    stamped,
-    time_of,
-)
+from pebble.recordings.exports.foxglove_messages import Converted, Schemas, Telemetry, as_object, stamped, time_of
 from pebble.runtime.by_name import ByName
 from pebble.transports import Message
 from pebble.transports.topics import matches

@@ -1,22 +1,19 @@
 """Serves robots to Foxglove until a signal ends it."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
-import signal
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 from pebble.client.broker import Broker
 from pebble.errors import TransportError
 from pebble.foxglove.robots import Robots, filters
 from pebble.foxglove.server import Server
 from pebble.recordings.exports.foxglove_messages import Schemas
+from pebble.runtime.signals import handled_by
 from pebble.transports import MqttSettings
 
-_SIGNALS: Final = ("SIGINT", "SIGTERM", "SIGHUP")  # the last one is unknown to Windows
 _WITHDRAW_S, _CLOSE_S = 1.0, 0.5
 
 
@@ -85,13 +82,8 @@ async def _show(settings: Settings, broker: Broker, robots: Robots, on_ready: Ca
 def _signalled() -> Iterator[asyncio.Event]:
     """Is set by the signals that end a program. Not all platforms let a loop handle signals."""
     loop, event = asyncio.get_running_loop(), asyncio.Event()
-    numbers = [getattr(signal, name) for name in _SIGNALS if hasattr(signal, name)]
-    before = {number: signal.signal(number, lambda *_: loop.call_soon_threadsafe(event.set)) for number in numbers}
-    try:
+    with handled_by(lambda *_: loop.call_soon_threadsafe(event.set)):
         yield event
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def _call(loop: asyncio.AbstractEventLoop, robots: Robots, topic: str, on: bool) -> None:

@@ -1,7 +1,5 @@
 """Messages from the launcher to its announcer process, over a socket pair on which neither side waits."""
 
-from __future__ import annotations
-
 import os
 import socket
 from typing import Literal

@@ -1,7 +1,5 @@
 """One child process and the pipes to it."""
 
-from __future__ import annotations
-
 import os
 import signal
 from collections.abc import Callable, Mapping
@@ -41,7 +39,6 @@ class Child:
         os.close(output_end)
 
     def terminate(self) -> None:
-        """Ask it to stop."""
         if not self._reaped:
             os.kill(self.pid, signal.SIGTERM)
 

@@ -1,7 +1,5 @@
 """Warns when the config file no longer says what the robot runs with."""
 
-from __future__ import annotations
-
 import logging
 from pathlib import Path
 

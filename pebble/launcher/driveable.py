@@ -1,7 +1,5 @@
 """Whether drive commands, and stops, reach the robot's motors, as far as its processes can tell. Pure."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
@@ -81,7 +79,6 @@ class Driveable:
         return True
 
     def ended(self, program: str) -> None:
-        """Forget a process that has ended."""
         for table in (self._mcus, self._connected, self._reached):
             table.pop(program, None)
 

@@ -1,7 +1,5 @@
 """How many messages the robot's processes have dropped because a bound was reached, as they report it. Pure."""
 
-from __future__ import annotations
-
 import re
 
 _MOST = 16  # reasons of one process
@@ -29,5 +27,4 @@ class Dropped:
         return True
 
     def ended(self, program: str) -> None:
-        """Forget a process that has ended."""
         self._counts.pop(program, None)

@@ -1,7 +1,5 @@
 """What the robot offers at present, as its processes report it: capabilities follow. Pure."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 

@@ -1,10 +1,10 @@
 """Runs a robot: starts its processes in order, supervises them, and stops them in order."""
 
-from __future__ import annotations
-
 import logging
 import os
 from collections.abc import Collection, Sequence
+from contextlib import suppress
+from pathlib import Path
 
 from pebble.config import Config
 from pebble.errors import ConfigError, PebbleError
@@ -15,7 +15,6 @@ from pebble.launcher.dropped import Dropped
 from pebble.launcher.features import Features
 from pebble.launcher.log_forwarding import LogForwarder, OwnRecords
 from pebble.launcher.on_demand import OnDemand
-from pebble.launcher.orphans import reap
 from pebble.launcher.process_supervisor import ProcessSupervisor
 from pebble.launcher.programs import Program, Stage, preload, program_of, programs, shared_modules
 from pebble.launcher.reactor import Reactor, StopSignals
@@ -65,8 +64,9 @@ class Launcher:
 
         Raises PebbleError if the robot runs already or its run directory cannot be used. Main thread only.
         """
-        own_records = OwnRecords(self._logs, self._config.log_level_of("launcher"))
-        with own_records, _run_lock(self._config) as lock, self._signals:
+        config = self._config
+        own_records = OwnRecords(self._logs, config.log_level_of("launcher"))
+        with own_records, RunLock(config.run_dir(), config.base, config.path or config.folder) as lock, self._signals:
             try:
                 self._reactor.every(_RUN_DIR_S, lambda: self._keep(lock))
                 self._start()
@@ -215,10 +215,6 @@ def _check_runs_here(config: Config) -> None:
     check_connections(config)
 
 
-def _run_lock(config: Config) -> RunLock:
-    return RunLock(config.run_dir(), config.base, config.path or config.folder)
-
-
 def _running(supervisors: Sequence[ProcessSupervisor]) -> list[str]:
     return [supervisor.program.name for supervisor in supervisors if supervisor.running]
 
@@ -226,3 +222,18 @@ def _running(supervisors: Sequence[ProcessSupervisor]) -> list[str]:
 def _inherited_environment() -> dict[str, str]:
     """Without systemd's variables: children do not report to systemd."""
     return {name: value for name, value in os.environ.items() if name not in SystemdNotifier.VARIABLES}
+
+
+def reap(own: Collection[int]) -> int:
+    """Collect children that have ended, except those in ``own``: their supervisors do that. Returns how many.
+
+    The kernel gives process 1 whatever process loses its parent. Nothing else waits for these, and each would hold its
+    number until the container has none left.
+    """
+    collected = 0
+    with suppress(OSError):  # a kernel that lists no children
+        for pid in map(int, Path(f"/proc/self/task/{os.getpid()}/children").read_text(encoding="utf-8").split()):
+            if pid not in own:
+                with suppress(ChildProcessError):
+                    collected += os.waitpid(pid, os.WNOHANG)[0] == pid
+    return collected

@@ -1,7 +1,5 @@
 """Where log lines go: the launcher's own stderr, and as records to the robot's log topic (paper A.8.7)."""
 
-from __future__ import annotations
-
 import logging
 import os
 import re

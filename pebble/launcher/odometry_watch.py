@@ -1,7 +1,5 @@
 """Finds out whether wheel odometry is being published, by a script or any other program on the robot."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 
@@ -21,7 +19,6 @@ class OdometryWatch:
         self.received_at = float("-inf")  # on the clock
 
     def start(self, transport: Transport) -> None:
-        """Subscribe."""
         transport.subscribe(self._topic, self._receive, qos=QoS.LATEST, direct=True)
 
     def poll(self) -> None:

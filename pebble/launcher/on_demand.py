@@ -1,7 +1,5 @@
 """Programs that run only while they are requested: which program may request them, and what follows from its exit."""
 
-from __future__ import annotations
-
 import logging
 import re
 from collections.abc import Iterable

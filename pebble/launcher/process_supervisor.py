@@ -1,7 +1,5 @@
 """Supervises one program of the robot: starts it, reads its pipes, restarts it and stops it."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """Which processes a robot has: one table, in the order they start."""
 
-from __future__ import annotations
-
 import gc
 import logging
 import os
@@ -133,12 +131,7 @@ def _web_handler(config: Config) -> Program:
     """The operator page; its module is above the launcher, which only starts it, and may miss what it imports."""
     arguments, environment = (str(config.path),), config.services.web_handler.env
     return Program(
-        "web_handler",
-        "pebble.web.robot_service",
-        arguments,
-        Stage.CONNECTION,
-        preloaded=False,
-        environment=environment,
+        "web_handler", "pebble.web.robot_service", arguments, Stage.CONNECTION, preloaded=False, environment=environment
     )
 
 

@@ -1,7 +1,5 @@
 """One thread that waits for file descriptors, timers and stop signals at once."""
 
-from __future__ import annotations
-
 import selectors
 import signal
 import socket

@@ -1,7 +1,5 @@
 """When a program is started again, and when it counts as stuck: the record of one program across its restarts. Pure."""
 
-from __future__ import annotations
-
 from collections import deque
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """One launcher per robot: the run directory with the lock file in it, and a name that other launchers find."""
 
-from __future__ import annotations
-
 import logging
 import os
 from pathlib import Path

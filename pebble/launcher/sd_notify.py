@@ -1,7 +1,5 @@
 """Reports to systemd: sd_notify(3) in pure Python; does nothing where systemd does not listen."""
 
-from __future__ import annotations
-
 import logging
 import os
 import socket

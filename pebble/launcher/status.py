@@ -1,7 +1,5 @@
 """Publishes the robot's status, capabilities and logs through the announcer, and reports to systemd."""
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Sequence
@@ -110,7 +108,9 @@ class StatusPublisher:
         relevant = {s.program.name: self._state(s) for s in shown if not _rests(s)}
         self._systemd.status(_summary(relevant))
         states = {supervisor.program.name: self._state(supervisor) for supervisor in shown}
-        self._publish_state(STATUS, self._status(states, self._driveable.mcus, self._webrtc_url()))
+        stream = self._config.services.video_stream
+        url = stream.webrtc_url if stream.enabled else None
+        self._publish_state(STATUS, self._status(states, self._driveable.mcus, url))
 
     def _status(
         self, states: dict[str, ServiceState], mcus: dict[str, Any] | None = None, webrtc_url: str | None = None
@@ -134,10 +134,6 @@ class StatusPublisher:
 
     def _publish_state(self, channel: Channel, value: Any) -> None:
         self._pipe.state(self._message(channel, value))
-
-    def _webrtc_url(self) -> str | None:
-        stream = self._config.services.video_stream
-        return stream.webrtc_url if stream.enabled else None
 
     def _will(self) -> Message:
         """Every service is stopped: children die with the launcher, whose end is what triggers the will."""

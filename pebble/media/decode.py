@@ -1,9 +1,7 @@
 """Decodes video payloads of every encoding; a damaged picture is refused, and a key frame is wanted instead."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Final
 
 from pebble.contract.packets import KEY_FRAME, PBVD, Picture, PictureKind
 from pebble.errors import PayloadError, PebbleError
@@ -11,19 +9,10 @@ from pebble.media import pyav
 from pebble.media.h264 import H264Decoder
 from pebble.media.jpeg import MAX_BYTES, SOI, Pixels, decode_jpeg
 from pebble.media.jpeg_delta import add
-from pebble.media.json_video import JsonPicture, inflate, plausible
+from pebble.media.json_video import JsonPicture, inflate
+from pebble.media.picture_header import KINDS, PictureHeader, follows, plausible
 
 MAX_PAYLOAD: Final = MAX_BYTES * 3 // 2  # base64 takes a third more
-_FRAME_LIMIT: Final = 1 << 32
-#: With more time between two pictures, or less than none, the sender may have restarted and the number fits by chance.
-_LONGEST_STEP_MS: Final = 5000
-
-_KINDS: Final = {
-    PictureKind.JPEG: ("pbvd", True),
-    PictureKind.DELTA_JPEG: ("pbvd", False),
-    PictureKind.ZLIB_JPEG: ("pbvz", True),
-    PictureKind.ZLIB_DELTA_JPEG: ("pbvz", False),
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,14 +36,6 @@ class DecodeCounters:
     gaps: int = 0  # times that the numbering was broken
 
 
-class _Payload(NamedTuple):
-    encoding: str
-    keyframe: bool
-    frame: int | None
-    captured_ms: int | None
-    body: bytes
-
-
 class VideoDecoder:
     """Decodes the payloads of one topic: json, pbvd, pbvz, h264 and raw JPEG, in any order.
 
@@ -66,41 +47,33 @@ class VideoDecoder:
         self.counters = DecodeCounters()
         self.wants_keyframe = False  # request one, at most once a second
         self.problem = ""  # why the last payload was refused, for display
-        self._last: _Payload | None = None  # without its body; None: the next difference builds on nothing
+        self._last: PictureHeader | None = None  # None: the next difference builds on nothing
         self._reference: Pixels | None = None
         self._h264: H264Decoder | None = None
 
     def feed(self, payload: bytes) -> Decoded | None:
         """The picture of this payload; None if it is refused or waits for a key frame. Never raises for a payload."""
         try:
-            parsed = _read(payload)
-            if not parsed.keyframe and not self._follows(parsed):
+            header, body = _read(payload)
+            if not follows(self._last, header):
                 self._wait()
                 return None
-            self._count_gap(parsed)
-            picture = self._decode(parsed)
+            self._count_gap(header)
+            picture = self._decode(header, body)
         except PebbleError as error:
             self._refuse(str(error))
             self.wants_keyframe = isinstance(error, PayloadError)  # against a missing library a key frame does not help
             return None
-        self._last = parsed._replace(body=b"")
+        self._last = header
         self.wants_keyframe = False
         self.counters.pictures += 1
-        return Decoded(picture, parsed.captured_ms, parsed.frame, parsed.keyframe, parsed.encoding)
+        return Decoded(picture, header.captured_ms, header.frame, header.keyframe, header.encoding)
 
-    def _follows(self, parsed: _Payload) -> bool:
-        last = self._last
-        if last is None or last.encoding != parsed.encoding or parsed.frame != _after(last):
-            return False
-        if last.captured_ms is None or parsed.captured_ms is None:
-            return last.captured_ms == parsed.captured_ms
-        return 0 <= parsed.captured_ms - last.captured_ms <= _LONGEST_STEP_MS
-
-    def _count_gap(self, parsed: _Payload) -> None:
+    def _count_gap(self, header: PictureHeader) -> None:
         """A key frame needs nothing before it, yet frames before it may be lost. (Numbers that fall: a new sender.)"""
         last = self._last
-        if last is not None and last.encoding == parsed.encoding and last.frame is not None and parsed.frame:
-            self.counters.gaps += parsed.frame > last.frame + 1
+        if last is not None and last.encoding == header.encoding and last.frame is not None and header.frame:
+            self.counters.gaps += header.frame > last.frame + 1
 
     def _wait(self) -> None:
         self.counters.waiting += 1
@@ -116,24 +89,21 @@ class VideoDecoder:
         self._last = self._reference = None
         self.wants_keyframe = True
 
-    def _decode(self, parsed: _Payload) -> Pixels:
-        if parsed.encoding == "h264":
-            return self._decode_h264(parsed)
-        pixels = decode_jpeg(parsed.body)
-        if parsed.encoding == "jpeg":
+    def _decode(self, header: PictureHeader, body: bytes) -> Pixels:
+        if header.encoding == "h264":
+            if self._h264 is None or self._last is None:
+                self._h264 = H264Decoder()
+            return self._h264.decode(body, keyframe=header.keyframe)
+        pixels = decode_jpeg(body)
+        if header.encoding == "jpeg":
             return pixels
-        if parsed.keyframe or self._reference is None:
+        if header.keyframe or self._reference is None:
             self._reference = pixels
         elif pixels.shape == self._reference.shape:
             add(self._reference, pixels, self._reference)
         else:
             raise PayloadError("a difference of another size than the picture it builds on")
         return self._reference.copy()
-
-    def _decode_h264(self, parsed: _Payload) -> Pixels:
-        if self._h264 is None or self._last is None:
-            self._h264 = H264Decoder()
-        return self._h264.decode(parsed.body, keyframe=parsed.keyframe)
 
 
 def encoding_of(payload: bytes) -> str | None:
@@ -144,37 +114,31 @@ def encoding_of(payload: bytes) -> str | None:
         kind = Picture.unpack(payload).kind
     except PayloadError:
         return None
-    return "h264" if kind == PictureKind.H264 else _KINDS[PictureKind(kind)][0] if kind in _KINDS else None
+    return "h264" if kind == PictureKind.H264 else KINDS[PictureKind(kind)][0] if kind in KINDS else None
 
 
-def _after(last: _Payload) -> int | None:
-    if last.frame is None:
-        return None
-    return last.frame + 1 if last.encoding == "json" else (last.frame + 1) % _FRAME_LIMIT
-
-
-def _read(payload: bytes) -> _Payload:
+def _read(payload: bytes) -> tuple[PictureHeader, bytes]:
     """The encodings differ in their first bytes. Raises PayloadError for everything else."""
     if len(payload) > MAX_PAYLOAD:
         raise PayloadError(f"{len(payload)} bytes, more than {MAX_PAYLOAD}")
     if payload.startswith(PBVD):
         return _read_pbvd(Picture.unpack(payload))
     if payload.startswith(SOI):
-        return _Payload("jpeg", True, None, None, payload)
+        return PictureHeader("jpeg", True, None, None), payload
     if payload[:1] in (b"{", b" ", b"\t", b"\r", b"\n"):
         message = JsonPicture.unpack(payload)
-        return _Payload("json", message.keyframe, message.frame, message.captured_ms, message.jpeg)
+        return PictureHeader("json", message.keyframe, message.frame, message.captured_ms), message.jpeg
     raise PayloadError("none of the forms of a picture")
 
 
-def _read_pbvd(packet: Picture) -> _Payload:
+def _read_pbvd(packet: Picture) -> tuple[PictureHeader, bytes]:
     captured_ms = plausible(packet.captured_ms)
     if packet.kind == PictureKind.H264:
         if not pyav.installed():
             raise PebbleError(f"h264 {pyav.INSTALL}")
-        return _Payload("h264", bool(packet.flags & KEY_FRAME), packet.frame, captured_ms, packet.body)
-    if packet.kind not in _KINDS:
+        return PictureHeader("h264", bool(packet.flags & KEY_FRAME), packet.frame, captured_ms), packet.body
+    if packet.kind not in KINDS:
         raise PayloadError(f"PBVD: kind {packet.kind} is unknown")
-    encoding, keyframe = _KINDS[PictureKind(packet.kind)]
+    encoding, keyframe = KINDS[PictureKind(packet.kind)]
     body = inflate(packet.body, MAX_BYTES) if encoding == "pbvz" else packet.body
-    return _Payload(encoding, keyframe, packet.frame, captured_ms, body)
+    return PictureHeader(encoding, keyframe, packet.frame, captured_ms), body

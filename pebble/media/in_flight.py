@@ -1,7 +1,5 @@
 """What a connection has accepted and the other side has not acknowledged, by byte counts alone. Pure: times come in."""
 
-from __future__ import annotations
-
 from collections import deque
 from typing import NamedTuple
 

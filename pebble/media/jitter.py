@@ -3,8 +3,6 @@
 Times are seconds on the caller's monotonic clock. One thread at a time may call a buffer.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 
@@ -119,7 +117,6 @@ class JitterBuffer:
 
     @property
     def waiting_s(self) -> float:
-        """Seconds of sound that wait."""
         return sum(sound.samples / sound.rate for sound in self._waiting.values())
 
     # -- in
@@ -168,7 +165,6 @@ class JitterBuffer:
                 self._expected = self._first()  # left out on purpose: not a gap
 
     def _first(self) -> int:
-        """The first of the waiting numbers."""
         base = next(iter(self._waiting)) if self._expected is None else self._expected
         return min(self._waiting, key=lambda number: ahead(number, base))
 
@@ -181,7 +177,6 @@ class JitterBuffer:
         return max(0.0, self._due - now)
 
     def take(self, now: float) -> Chunk | None:
-        """The next chunk if it is due."""
         if not self._playing and not self._begin(now):
             return None
         if now < self._due:

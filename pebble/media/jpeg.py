@@ -1,7 +1,5 @@
 """Checks a JPEG before it is decoded, so that half a picture is never shown as a whole one."""
 
-from __future__ import annotations
-
 import re
 from typing import Final, TypeAlias, cast
 

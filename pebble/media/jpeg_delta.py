@@ -1,7 +1,5 @@
 """Video as JPEGs: full pictures, and between them differences from what the receiver has decoded (paper 8.8)."""
 
-from __future__ import annotations
-
 from typing import Final, NamedTuple, cast
 
 import cv2

@@ -10,9 +10,8 @@ import msgspec
 
 from pebble.errors import PayloadError
 from pebble.media.jpeg import MAX_BYTES
+from pebble.media.picture_header import milliseconds
 
-_MILLISECONDS_FROM: Final = 1e11  # a timestamp as large as this is in milliseconds
-_LATEST_MS: Final = 253_402_300_800_000  # the year 10000
 _MAX_TEXT: Final = MAX_BYTES * 4 // 3 + 1024
 
 
@@ -51,7 +50,7 @@ class JsonPicture:
         except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError, ValueError) as error:
             raise PayloadError(f"JSON picture: {error}") from None
         jpeg = inflate(message.data, MAX_BYTES)
-        return cls(message.id, message.keyframe, _milliseconds(message.timestamp), jpeg)
+        return cls(message.id, message.keyframe, milliseconds(message.timestamp), jpeg)
 
 
 def inflate(packed: bytes, limit: int) -> bytes:
@@ -73,14 +72,3 @@ def inflate(packed: bytes, limit: int) -> bytes:
     if unpacker.unused_data:
         raise PayloadError("zlib: something follows the stream")
     return plain
-
-
-def _milliseconds(stamp: float | None) -> int | None:
-    if stamp is None or not 0 < stamp < _LATEST_MS:  # nor NaN: then neither is true
-        return None
-    return plausible(round(stamp if stamp >= _MILLISECONDS_FROM else stamp * 1000))
-
-
-def plausible(captured_ms: int) -> int | None:
-    """A moment that can be written as a date, or None."""
-    return captured_ms if 0 < captured_ms < _LATEST_MS else None

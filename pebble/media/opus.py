@@ -9,8 +9,6 @@ decoder to conceal one). FFmpeg's decoder always yields 48 kHz and offers no oth
 to the next packet only decoders with an own libopus make use of.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Iterator
 from typing import Any, Final

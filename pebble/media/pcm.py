@@ -1,7 +1,5 @@
 """Samples as arrays: other rates, other numbers of channels. Pure."""
 
-from __future__ import annotations
-
 from math import ceil, gcd
 from typing import Any
 

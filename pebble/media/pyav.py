@@ -1,7 +1,5 @@
 """PyAV, which H.264 and Opus need: imported only where it is used, because that costs some 20 MB and 100 ms."""
 
-from __future__ import annotations
-
 from importlib.util import find_spec
 from typing import Any, Final
 

@@ -1,7 +1,5 @@
 """How many messages come per second, how many bits, and how old they are. Pure: times are passed in."""
 
-from __future__ import annotations
-
 import statistics
 from collections import deque
 from typing import Final, NamedTuple

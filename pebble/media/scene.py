@@ -3,8 +3,6 @@
 The counter in it can be read back from what is left of a picture after lossy encoding and resizing.
 """
 
-from __future__ import annotations
-
 from binascii import crc_hqx
 from typing import Final, TypeAlias
 

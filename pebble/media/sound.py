@@ -1,7 +1,5 @@
 """Sound to PBAT packets and back. Order and timing of playback are the jitter buffer's."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final, Protocol

@@ -3,8 +3,6 @@
 Syllables of voiced harmonics under three formants, some with a hiss before them, with pauses between words.
 """
 
-from __future__ import annotations
-
 from functools import lru_cache
 from typing import Final
 
@@ -51,7 +49,9 @@ def _period(rate: int) -> NDArray[np.int16]:
             0.5 + 0.5 * loud
         )
         if hissing > 0.5:
-            _add_hiss(part[: int(_HISS_S * rate)], number)
+            begin = part[: int(_HISS_S * rate)]
+            hiss = np.diff(noise(1000 + number, len(begin) + 1))  # the difference takes the low tones away
+            begin += (hiss * np.hanning(len(begin)) * 0.3).astype(np.float32)
     loudest = float(np.abs(sound).max())
     period = np.asarray(sound * (_PEAK / loudest), np.int16)
     period.flags.writeable = False
@@ -75,8 +75,3 @@ def _loudness(frequency: float, formants: tuple[int, ...]) -> float:
     """How strongly the mouth passes a frequency on: resonances above a slope of 6 dB per octave."""
     resonance = sum(1 / (1 + ((frequency - formant) / _FORMANT_WIDTH_HZ) ** 2) for formant in formants)
     return float((0.05 + resonance) * 100 / frequency)
-
-
-def _add_hiss(part: NDArray[np.float32], seed: int) -> None:
-    hiss = np.diff(noise(1000 + seed, len(part) + 1))  # the difference takes the low tones away
-    part += (hiss * np.hanning(len(part)) * 0.3).astype(np.float32)

@@ -1,13 +1,11 @@
 """Video encoders by name: a picture in, one MQTT payload out."""
 
-from __future__ import annotations
-
 import zlib
 from abc import ABC, abstractmethod
 from typing import Final, Protocol
 
 from pebble.contract.encodings import ALL_VIDEO
-from pebble.contract.packets import KEY_FRAME, Picture, PictureKind
+from pebble.contract.packets import KEY_FRAME, SEQUENCE_LIMIT, Picture, PictureKind
 from pebble.errors import ConfigError
 from pebble.media import pyav
 from pebble.media.h264 import H264Encoder
@@ -19,7 +17,6 @@ from pebble.media.json_video import JsonPicture
 VIDEO_ENCODINGS: Final = pyav.available(ALL_VIDEO)
 
 DEFAULT_QUALITY: Final = 10
-_FRAME_LIMIT: Final = 1 << 32
 _H264_INTERVAL_S: Final = 4.0  # a receiver that misses a frame requests a key frame; this is for receivers that cannot
 
 
@@ -92,7 +89,7 @@ class _JpegEncoder(ABC):
         coded = self._delta.code(picture, keyframe=keyframe)
         self.last_was_keyframe = coded.keyframe
         frame = self._frame
-        self._frame = (frame + 1) % _FRAME_LIMIT
+        self._frame = (frame + 1) % SEQUENCE_LIMIT
         return self._pack(coded.jpeg, coded.keyframe, frame, captured_ms)
 
     @abstractmethod
@@ -158,6 +155,6 @@ class H264VideoEncoder:
         unit = self._codec.encode(picture, keyframe=keyframe)
         self.last_was_keyframe = self._codec.keyframe
         frame = self._frame
-        self._frame = (frame + 1) % _FRAME_LIMIT
+        self._frame = (frame + 1) % SEQUENCE_LIMIT
         flags = KEY_FRAME if self.last_was_keyframe else 0
         return _packet(PictureKind.H264, frame, captured_ms, unit, flags)

@@ -5,8 +5,6 @@ picture, and a late one. Inside the cone the robot drives and steers. A lost tag
 direction in which it was last seen. The settings are the original's, by its names.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

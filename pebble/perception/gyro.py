@@ -1,7 +1,5 @@
 """Heading from the inertial sensor: the rate about the vertical axis, without its bias, as long as it is plausible."""
 
-from __future__ import annotations
-
 import logging
 import math
 

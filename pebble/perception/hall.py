@@ -5,8 +5,6 @@ millimetre. A single sensor does not show the direction: that is taken from the 
 quarter of a wave away shows it, and is used if it agrees with the commands.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -105,7 +103,8 @@ class PhaseTracker:
         branches = (base, math.pi - base)
         phases = [predicted + math.remainder(branch - predicted, math.tau) for branch in branches]
         nearest = min(phases, key=lambda phase: abs(phase - predicted))
-        possible = [phase for phase in phases if not self._goes_back(phase)]
+        onwards = math.copysign(1.0, self._expected)
+        possible = [phase for phase in phases if (phase - self._farthest) * onwards >= -_NOISE_RAD]
         if nearest not in possible:
             self.rejected += 1
             turn = math.copysign(math.tau, self._expected)
@@ -130,9 +129,6 @@ class PhaseTracker:
             self._farthest = self.phase
         agrees = self._measured * self._expected > 0.0
         return (self._expected + self._measured) / 2 if agrees else self._expected
-
-    def _goes_back(self, phase: float) -> bool:
-        return (phase - self._farthest) * math.copysign(1.0, self._expected) < -_NOISE_RAD
 
     def _move_to(self, before: float, phase: float, power: float) -> float:
         added = phase - before
@@ -175,7 +171,6 @@ class HallWheel:
 
     @property
     def steps(self) -> float:
-        """The steps in any direction."""
         return self._counts.rad_in_any_direction / math.pi
 
     @property

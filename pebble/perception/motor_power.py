@@ -1,7 +1,5 @@
 """What the wheels were commanded to do, by the rules of the motor owner, for a sensor that cannot see the direction."""
 
-from __future__ import annotations
-
 import operator
 
 from pebble.contract.payloads import Drive, EstopState

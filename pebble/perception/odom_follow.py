@@ -1,7 +1,5 @@
 """Follows a tag, and drives on without seeing it: to where it was, by the wheels' odometry, for a bounded time."""
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 

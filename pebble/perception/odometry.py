@@ -5,8 +5,6 @@ millimetres as long as no wheel slips; heading is good to the difference of both
 an inertial sensor.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -118,7 +116,6 @@ class Odometry:
         self._power.command(drive, now)
 
     def owner(self, state: EstopState) -> None:
-        """The motor owner's state."""
         self._power.owner(state)
 
     def imu(self, imu: ImuFast, now: float) -> None:

@@ -1,20 +1,11 @@
 """Tags as the contract's payloads: locations, the followed tag, and what is drawn over the picture."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
 from msgspec import UNSET
 
-from pebble.contract.payloads import (
-    Corners,
-    OverlayLabel,
-    TagData,
-    TagDetection,
-    TagLocations,
-    VideoOverlays,
-)
+from pebble.contract.payloads import Corners, OverlayLabel, TagData, TagDetection, TagLocations, VideoOverlays
 from pebble.perception.tags import Tag, TagGeometry
 
 Size = tuple[int, int]  # width, height of the picture

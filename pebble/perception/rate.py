@@ -1,7 +1,5 @@
 """A steady rate made of events that come at another one, such as 10 commands a second from 15 pictures."""
 
-from __future__ import annotations
-
 
 class Rate:
     """Call ``due`` at every event. What is late is not repeated."""

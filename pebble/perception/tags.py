@@ -1,7 +1,5 @@
 """AprilTags in a picture, with OpenCV: which they are, how far away, and in which direction."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """What recordings hold, without reading all of them where their summaries say it."""
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator

@@ -1,7 +1,5 @@
 """Recordings as one stream of messages in the order of time, however many files they are in."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial

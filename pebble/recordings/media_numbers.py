@@ -3,8 +3,6 @@
 Pictures as JSON have ``id`` and ``keyframe`` (paper 8.8), PBVD and PBAT have headers (``pebble.contract.packets``).
 """
 
-from __future__ import annotations
-
 import re
 import struct
 from typing import Final, NamedTuple

@@ -1,7 +1,5 @@
 """Periods that a user types: ``--since 10:00 --until +5m``. Pure."""
 
-from __future__ import annotations
-
 import re
 from datetime import UTC, date, datetime, time, timedelta
 from typing import Final, NoReturn

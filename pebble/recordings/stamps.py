@@ -4,8 +4,6 @@ Stamps of JSON are ``t`` in milliseconds or ``timestamp`` in seconds (paper A.4.
 (``pebble.contract.packets``).
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from typing import Final

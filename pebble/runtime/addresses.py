@@ -1,7 +1,5 @@
 """The topic, QoS and retain flag that one robot uses for each channel, after its config (paper Table A.6)."""
 
-from __future__ import annotations
-
 from functools import reduce
 from typing import Any, NamedTuple
 

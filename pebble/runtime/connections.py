@@ -1,28 +1,13 @@
 """Makes a robot's transports from its config: the local transport and the connection to operators."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace as replace_settings
 from typing import Any
 
 from msgspec.structs import replace
 
+from pebble import contract as c
 from pebble.config import Config, Mqtt, RemoteConnection, RemoteMqtt, SerialBridges, Tls
-from pebble.contract import (
-    CAPABILITIES,
-    CHANNELS,
-    DRIVE,
-    ESTOP,
-    ESTOP_RESET,
-    ESTOP_STATE,
-    HEARTBEAT,
-    INCOMING,
-    ONLINE,
-    OUTGOING,
-    Channel,
-    Kind,
-)
 from pebble.errors import ConfigError, TransportError
 from pebble.runtime.addresses import Addresses
 from pebble.transports import Message, MqttSettings, TlsSettings, Transport, ZenohSettings, check_kind, create
@@ -30,8 +15,11 @@ from pebble.transports.socket_paths import FRAMES_SOCKET, PEER_SOCKET, fits_sock
 
 _ANY = "+/+/+"  # the levels of any robot
 #: Topics of the robot's states, and of all commands, that are published even to a broker that hangs up on them.
-_VITAL_STATES = (*(one.filter(_ANY) for one in (ONLINE, HEARTBEAT, CAPABILITIES, ESTOP_STATE)), f"{_ANY}/+/control/#")
-_ALL_VITAL = (*_VITAL_STATES, f"{_ANY}/{INCOMING}/#")
+_VITAL_STATES = (
+    *(one.filter(_ANY) for one in (c.ONLINE, c.HEARTBEAT, c.CAPABILITIES, c.ESTOP_STATE)),
+    f"{_ANY}/+/control/#",
+)
+_ALL_VITAL = (*_VITAL_STATES, f"{_ANY}/{c.INCOMING}/#")
 
 LOCAL_RECONNECT_S, REMOTE_RECONNECT_S = 0.5, 2.0
 _BRIDGE = "remote-bridge"
@@ -134,7 +122,7 @@ def hub_settings(config: Config) -> ZenohSettings:
         allowed_names=transport.allowed_names,
         lease_ms=transport.lease_ms,
         journal=transport.journal,
-        reserved=(f"{config.base}/{OUTGOING}",),
+        reserved=(f"{config.base}/{c.OUTGOING}",),
         wills=tuple(dict.fromkeys(_renamed_wills(config))),
     )
 
@@ -142,22 +130,22 @@ def hub_settings(config: Config) -> ZenohSettings:
 def _renamed_wills(config: Config) -> Iterator[tuple[str, bool]]:
     """Whether the hub takes wills on the topics that this config renames."""
     for channel, topic in _renamed(config):
-        if channel.direction == INCOMING:
-            yield topic, channel.kind is Kind.FLAG
+        if channel.direction == c.INCOMING:
+            yield topic, channel.kind is c.Kind.FLAG
 
 
 def _renamed_vital(config: Config) -> tuple[str, ...]:
-    vital = (ONLINE, CAPABILITIES, DRIVE, ESTOP, ESTOP_RESET)
+    vital = (c.ONLINE, c.CAPABILITIES, c.DRIVE, c.ESTOP, c.ESTOP_RESET)
     return tuple(dict.fromkeys(topic for channel, topic in _renamed(config) if channel in vital))
 
 
-def _renamed(config: Config) -> Iterator[tuple[Channel, str]]:
+def _renamed(config: Config) -> Iterator[tuple[c.Channel, str]]:
     """The channels that this config renames, and their topics, those of every serial line included."""
     own = config.services.serial_mcu_bridge  # in the process of one line: that one
     lines = config.serial_instances().values() if isinstance(own, SerialBridges) else ()
     for line in (own, *lines):
         addresses = Addresses(replace(config, services=replace(config.services, serial_mcu_bridge=line)))
-        for channel in CHANNELS:
+        for channel in c.CHANNELS:
             topic = addresses[channel].topic
             if topic != channel.filter(config.base):
                 yield channel, topic

@@ -1,7 +1,5 @@
 """The environment variables of the programs that a service starts."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterable, Mapping
 

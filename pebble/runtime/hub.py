@@ -5,8 +5,6 @@ starts the hub of a robot with this command; on another machine a hub runs the s
 pebble.runtime.process, which would be a good part of this small process.
 """
 
-from __future__ import annotations
-
 import logging
 import signal
 import sys

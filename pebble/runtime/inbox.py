@@ -1,7 +1,5 @@
 """The bounded queue of a service, in which a newer job can replace a waiting one of the same name."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import OrderedDict, deque
@@ -70,7 +68,6 @@ class Inbox:
         self._woken = False
 
     def __bool__(self) -> bool:
-        """Whether there is a job."""
         return bool(self._internal or self._jobs)
 
     def take(self, timeout: float | None = 0.0) -> Job | None:

@@ -1,7 +1,5 @@
 """Split a stream of bytes into lines, or frames, of limited length."""
 
-from __future__ import annotations
-
 LINE_LIMIT = 256  # bytes; the longest line of any text protocol of an MCU is under 150
 
 

@@ -1,7 +1,5 @@
 """What a process owes the launcher that started it: end with it, notify it, and log in the format it reads."""
 
-from __future__ import annotations
-
 import ctypes
 import errno
 import logging

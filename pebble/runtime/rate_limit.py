@@ -1,7 +1,5 @@
 """Limits the rate of log lines about events that may happen a thousand times a second."""
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

@@ -3,8 +3,6 @@
 Which of two is newer, :func:`pebble.motion.arbiter.newer` decides: the numbers have no end.
 """
 
-from __future__ import annotations
-
 import fcntl
 import logging
 import os
@@ -37,7 +35,6 @@ def newest(runs: Iterable[int]) -> int:
 
 
 def following(run: int) -> int:
-    """The number after ``run``."""
     return run + 1 if run < LAST_RUN else 1
 
 

@@ -92,12 +92,7 @@ class Service:
     as_published: ClassVar[bool] = False  # how its transport is opened, where there is a choice (T7)
 
     def __init__(
-        self,
-        config: Config,
-        transport: Transport,
-        *,
-        instance: str = "",
-        clock: Callable[[], float] = time.monotonic,
+        self, config: Config, transport: Transport, *, instance: str = "", clock: Callable[[], float] = time.monotonic
     ) -> None:
         self.config, self.transport, self.instance, self.clock = config, transport, instance, clock
         self.addresses = Addresses(config)
@@ -267,7 +262,9 @@ class Service:
             with self._on_stop:
                 self.stop()
         finally:
-            self._log_totals()
+            totals, dropped = self.log_limited.totals(), self._inbox.dropped
+            if totals or dropped:
+                self.log.info("refused in all: %s; dropped from the inbox: %d", totals or "nothing", dropped)
             self.transport.close()
 
     def _set_timers(self) -> None:
@@ -294,11 +291,6 @@ class Service:
     def _send(self, channel: Channel, topic: str, raw: bytes) -> bool:
         address = self.addresses[channel]
         return self.transport.publish(topic, raw, qos=_QOS[address.qos], retain=address.retain)
-
-    def _log_totals(self) -> None:
-        totals = self.log_limited.totals()
-        if totals or self._inbox.dropped:
-            self.log.info("refused in all: %s; dropped from the inbox: %d", totals or "nothing", self._inbox.dropped)
 
     def _handle(self, channel: Channel, method: Callable[[], None], arrived: float) -> None:
         """Call the handler, unless the command has waited so long, in a hung or suspended process, that it is stale.

@@ -1,26 +1,32 @@
-"""Turns stop signals into KeyboardInterrupt, so that a command cleans up."""
-
-from __future__ import annotations
+"""The signals that end a program: handled in a ``with`` block, or turned into KeyboardInterrupt."""
 
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
+from typing import Any
 
 _NAMES = ("SIGINT", "SIGTERM", "SIGHUP")  # the last one is unknown to Windows
 
 
 @contextmanager
+def handled_by(handler: Callable[[int, FrameType | None], Any], *more: int) -> Iterator[None]:
+    """Call ``handler`` for what ends a program, and for ``more``, inside the block. Main thread only."""
+    numbers = [getattr(signal, name) for name in _NAMES if hasattr(signal, name)]
+    before = {number: signal.signal(number, handler) for number in (*numbers, *more)}
+    try:
+        yield
+    finally:
+        for number, old in before.items():
+            signal.signal(number, old)
+
+
+@contextmanager
 def interrupted_by_signals() -> Iterator[None]:
-    """SIGTERM and a closed terminal raise KeyboardInterrupt in the main thread, as Ctrl-C does."""
+    """SIGTERM and a closed terminal raise KeyboardInterrupt in the main thread, as Ctrl-C does; a command cleans up."""
 
     def interrupt(_signal: int, _frame: FrameType | None) -> None:
         raise KeyboardInterrupt
 
-    numbers = [getattr(signal, name) for name in _NAMES if hasattr(signal, name)]
-    before = {number: signal.signal(number, interrupt) for number in numbers}
-    try:
+    with handled_by(interrupt):
         yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

@@ -1,7 +1,5 @@
 """Timers of a single thread, on the monotonic clock."""
 
-from __future__ import annotations
-
 import heapq
 from collections.abc import Callable
 from itertools import count

@@ -1,7 +1,5 @@
 """A pipe that wakes a thread which polls file descriptors."""
 
-from __future__ import annotations
-
 import os
 from contextlib import suppress
 

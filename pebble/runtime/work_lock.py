@@ -1,7 +1,5 @@
 """The lock under which a service works: its own thread, or a thread that brings work and finds it idle."""
 
-from __future__ import annotations
-
 import threading
 from math import inf
 from types import TracebackType

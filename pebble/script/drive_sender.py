@@ -4,8 +4,6 @@ The wheels belong to the motor owner, whose arbiter decides. This only knows wha
 published, so that a script learns that its commands have no effect, and that others are not disturbed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 
 from msgspec.structs import replace

@@ -1,7 +1,5 @@
 """Ends a script on a signal, whatever its main thread does: asleep, busy, or blocked in C code."""
 
-from __future__ import annotations
-
 import os
 import select
 import signal

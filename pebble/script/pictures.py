@@ -6,13 +6,14 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from pebble.cameras import Camera, Picture, camera
+if TYPE_CHECKING:
+    from pebble.cameras import Camera, Picture
 
 
 class Pictures:
-    """Opens the camera when it is first used. One thread reads; any may close."""
+    """Opens the camera when it is first used, and imports what that needs. One thread reads; any may close."""
 
     def __init__(self, run_dir: Path) -> None:
         self._run_dir = run_dir
@@ -51,6 +52,8 @@ class Pictures:
             view.close()
 
     def _open(self, **options: Any) -> Camera:
+        from pebble.cameras import camera
+
         view = camera(self._run_dir, **options)
         with self._changing:
             self._cameras.append(view)

@@ -1,7 +1,5 @@
 """Makes a program of a function that gets a robot and its options: ``run(main)``."""
 
-from __future__ import annotations
-
 import inspect
 import logging
 import os

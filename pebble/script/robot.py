@@ -16,6 +16,7 @@ from pebble.errors import PebbleError
 from pebble.runtime.addresses import Addresses
 from pebble.runtime.rate_limit import RateLimitedLog
 from pebble.runtime.receive import Refusals
+from pebble.script.pictures import Pictures
 from pebble.script.wheels import Wheels
 from pebble.transports import QoS, Transport
 from pebble.transports.counters import Counters
@@ -23,7 +24,6 @@ from pebble.transports.topics import matches
 
 if TYPE_CHECKING:
     from pebble.cameras import Picture
-    from pebble.script.pictures import Pictures
 
 #: What no script publishes, and why; the gate of `autonomy_manager` drops the same from scripts of others.
 _REFUSED = {
@@ -71,8 +71,7 @@ class Robot:
         self._latest: dict[str, _Arrived] = {}
         self._subscribed: set[str] = set()
         self._last_values: dict[Channel, Callable[[], Any]] = {}
-        self._pictures: Pictures | None = None
-        self._opening = threading.Lock()
+        self._pictures = Pictures(config.run_dir())
         self._publishing = threading.RLock()  # the last values are published after all others, before disconnecting
         self._stopped = threading.Event()
         self._exit_code = 0
@@ -89,7 +88,7 @@ class Robot:
         See `pebble.camera` for the options, and for what is raised.
         """
         self._check()
-        for picture in self._seen().every(width=width, views=views, timeout=timeout):
+        for picture in self._pictures.every(width=width, views=views, timeout=timeout):
             self._check()
             yield picture
         self._check()
@@ -97,7 +96,7 @@ class Robot:
     def picture(self, max_age: float = 0.5) -> Picture | None:
         """The newest picture captured within the last ``max_age`` seconds, or None. Does not wait."""
         self._check()
-        return self._seen().newest(max_age)
+        return self._pictures.newest(max_age)
 
     def latest(self, channel: Channel, max_age: float = 1.0) -> Any:
         """The newest payload of ``channel`` that arrived within the last ``max_age`` seconds, or None. Does not wait.
@@ -184,13 +183,9 @@ class Robot:
         finally:
             if locked:
                 self._publishing.release()
-        with self._opening:
-            pictures = self._pictures
-        if pictures is not None:
-            pictures.close()
+        self._pictures.close()
 
     def close(self) -> None:
-        """End, and disconnect."""
         if os.getpid() == self._pid:
             self.end("the script has finished")
             self._transport.close()
@@ -215,14 +210,6 @@ class Robot:
             raise PebbleError("a fork of a script has no robot: use a thread, or start a program with subprocess")
         if self._stopped.is_set():
             raise Stopped(self._exit_code)
-
-    def _seen(self) -> Pictures:
-        from pebble.script.pictures import Pictures
-
-        with self._opening:
-            if self._pictures is None:
-                self._pictures = Pictures(self.config.run_dir())
-            return self._pictures
 
     def _subscribe(self, channel: Channel, handler: Callable[..., None]) -> None:
         receive = self._refusals.reader(channel, lambda _message, value, names: handler(value, **names))

@@ -1,7 +1,5 @@
 """Publishes a script's drive commands on the robot's local transport, and knows whether they have an effect."""
 
-from __future__ import annotations
-
 import logging
 import threading
 import time
@@ -52,7 +50,6 @@ class Wheels:
 
     @property
     def run(self) -> int:
-        """The number of this run."""
         return self._sender.run
 
     def drive(self, wanted: Drive) -> bool:

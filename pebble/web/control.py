@@ -1,7 +1,5 @@
 """The control socket of one page: what it asks for, and the state that it is sent."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import secrets
@@ -200,7 +198,8 @@ class Control:
                 if op.series:
                     self._series = deque(self._server.robots.recent.metrics(op.ref))
             case m.ReadLogs():
-                self._read_logs(op)
+                if op.ref == self._interest.watched:
+                    self._logs.begin(op.origin, op.after, on=op.on)
             case m.Lease():
                 self._lease(op)
             case m.EncodingOp():
@@ -298,10 +297,6 @@ class Control:
             self._server.watch(ref)
         if before:
             self._server.unwatch(before)
-
-    def _read_logs(self, op: m.ReadLogs) -> None:
-        if op.ref == self._interest.watched:
-            self._logs.begin(op.origin, op.after, on=op.on)
 
     def _lease(self, op: m.Lease) -> None:
         server = self._server

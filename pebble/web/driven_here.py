@@ -1,7 +1,5 @@
 """Which robots are driven from one server, as it tells others, and what others tell it. Pure."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 from pebble.contract import DRIVING, codec

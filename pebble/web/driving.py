@@ -4,8 +4,6 @@ Motion belongs to a numbered gesture: from the moment the inputs leave neutral u
 a gesture ends it for good, so a key that is held down never moves anything again before it was released.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import NamedTuple

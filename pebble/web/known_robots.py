@@ -1,16 +1,21 @@
-"""The robots that were here before, so that those who invent others cannot push them out. Pure."""
+"""The robots that were here before, so that those who invent others cannot push them out; kept in a database."""
 
-from __future__ import annotations
-
-from collections.abc import Iterator
-from typing import NamedTuple
+import asyncio
+import logging
+from collections.abc import Coroutine, Iterator
+from typing import Any, NamedTuple
 
 from pebble.client.rank import Rank
 from pebble.client.robot_view import RobotView
+from pebble.fleet.database import DatabaseError
+from pebble.fleet.people import People
+
+log = logging.getLogger(__name__)
 
 MAX_KNOWN = 256
 _REMEMBERED_DAYS = 30  # without a sign of it, after which one that only was there gives way to another
 _OPERATED, _SEEN = "operated", "seen"
+_KEY = "known "  # what a setting of the server begins with; then the robot
 
 
 class _Entry(NamedTuple):
@@ -40,7 +45,6 @@ class KnownRobots:
         return len(self._entries)
 
     def operated(self, ref: str, day: int) -> None:
-        """A person drives it."""
         self._note(ref, _Entry(operated=True, day=day))
 
     def seen(self, robot: RobotView, rank: Rank, day: int) -> None:
@@ -74,3 +78,29 @@ class KnownRobots:
 def _parsed(text: str) -> _Entry | None:
     how, _, day = text.partition(" ")
     return _Entry(how == _OPERATED, int(day)) if how in (_OPERATED, _SEEN) and day.isdecimal() else None
+
+
+class SavedRobots:
+    """Keeps the robots that were here before in the server's database; ``robots`` are those that are known."""
+
+    def __init__(self, people: People) -> None:
+        self.robots = KnownRobots(people.all(_KEY))
+        self._people = people
+        self._saving = False
+
+    def save(self) -> Coroutine[Any, Any, None] | None:
+        """The work of saving what has changed, to be awaited; None: nothing has, or it goes on."""
+        if self._saving or not (changes := self.robots.changes()):
+            return None
+        self._saving = True
+        return self._save(changes)
+
+    async def _save(self, changes: dict[str, str | None]) -> None:
+        """On a thread: another process may be writing to the file."""
+        try:
+            for ref, value in changes.items():
+                await asyncio.to_thread(self._people.set, _KEY + ref, value)
+        except DatabaseError as error:
+            log.warning("which robots are known is not saved: %s", error)
+        finally:
+            self._saving = False

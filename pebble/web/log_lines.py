@@ -1,7 +1,5 @@
 """The newest log lines of one component, numbered, so that a page sees which are missing. Pure."""
 
-from __future__ import annotations
-
 import secrets
 from collections import deque
 from typing import Final, NamedTuple

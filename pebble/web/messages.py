@@ -5,8 +5,6 @@ milliseconds of ``performance.now()``; server stamps (``now``) are epoch millise
 page's ``messages.d.ts`` are generated from these structs.
 """
 
-from __future__ import annotations
-
 from typing import Annotated, Any, Literal, TypeAlias
 
 from msgspec import Meta, Struct

@@ -10,24 +10,10 @@ from typing import Any
 
 from msgspec.structs import replace
 
+from pebble import contract as c
 from pebble.client.broker import Broker
 from pebble.client.robot_topics import FLAGS, WATCHED, names, section_of
-from pebble.contract import (
-    AUTONOMY_FILES,
-    AUTONOMY_STATUS,
-    CHARGING_LEVEL,
-    CHARGING_STATUS,
-    IMU,
-    LOGS,
-    SOUNDBOARD_FILES,
-    SOUNDBOARD_STATUS,
-    TOUCH_SENSORS,
-    VIDEO_OVERLAYS,
-    WHEEL_ODOMETRY,
-    Channel,
-    Kind,
-    codec,
-)
+from pebble.contract import codec
 from pebble.contract.identity import Direction
 from pebble.contract.payloads import AnyObject
 from pebble.errors import PayloadError, PebbleError
@@ -43,19 +29,19 @@ _FLAGS_METRIC = "web/flags"
 STEP_S = 1.0  # between two changes of what is received of one component: capabilities may change without end
 
 #: The component and channel of what a topic carries, where its own name does not tell them.
-_Carried = tuple[str, Channel] | None
+_Carried = tuple[str, c.Channel] | None
 
 #: Channels whose topic capabilities may name, by its section and key there.
-_NAMED: dict[tuple[str, str], Channel] = {
-    ("telemetry", "touch_topic"): TOUCH_SENSORS,
-    ("telemetry", "charging_topic"): CHARGING_STATUS,
-    ("telemetry", "charging_level_topic"): CHARGING_LEVEL,
-    ("telemetry", "wheel_odometry_topic"): WHEEL_ODOMETRY,
-    ("telemetry", "imu_topic"): IMU,
-    ("soundboard", "files_topic"): SOUNDBOARD_FILES,
-    ("soundboard", "status_topic"): SOUNDBOARD_STATUS,
-    ("autonomy", "files_topic"): AUTONOMY_FILES,
-    ("autonomy", "status_topic"): AUTONOMY_STATUS,
+_NAMED: dict[tuple[str, str], c.Channel] = {
+    ("telemetry", "touch_topic"): c.TOUCH_SENSORS,
+    ("telemetry", "charging_topic"): c.CHARGING_STATUS,
+    ("telemetry", "charging_level_topic"): c.CHARGING_LEVEL,
+    ("telemetry", "wheel_odometry_topic"): c.WHEEL_ODOMETRY,
+    ("telemetry", "imu_topic"): c.IMU,
+    ("soundboard", "files_topic"): c.SOUNDBOARD_FILES,
+    ("soundboard", "status_topic"): c.SOUNDBOARD_STATUS,
+    ("autonomy", "files_topic"): c.AUTONOMY_FILES,
+    ("autonomy", "status_topic"): c.AUTONOMY_STATUS,
 }
 #: Fields of FlagsView.
 _FLAG_FIELDS = {flag: flag.metric.removeprefix("flags/").replace("-", "_") for flag in FLAGS.values()}
@@ -89,18 +75,15 @@ class OpenComponents:
         return {*self._pages, *self._subscriptions, *self._wanted, *self._flags}
 
     def __contains__(self, ref: object) -> bool:
-        """Whether a page has it open."""
         return ref in self._pages
 
     def open(self, ref: str) -> None:
-        """A page has opened this component."""
         self._pages[ref] += 1
         self._robots.logs.setdefault(ref, LogLines())
         self._robots.recent.open(ref)
         self.update(ref)
 
     def close(self, ref: str) -> None:
-        """A page has closed it."""
         self._broker.loop.call_later(self._keep_s, self._closed, ref)
 
     def _closed(self, ref: str) -> None:
@@ -160,7 +143,7 @@ class OpenComponents:
 
     async def _subscribe(self, ref: str, filter_: str) -> Subscription:
         receiver = self._receiver(ref, filter_)
-        if filter_ != LOGS.topic(ref):
+        if filter_ != c.LOGS.topic(ref):
             return await self._broker.subscribe(filter_, receiver)
 
         def count() -> None:
@@ -176,7 +159,7 @@ class OpenComponents:
             before = self._robots.aliases(ref)
             if carried is None:
                 self._robots.receive(message, now)
-            elif carried[1].kind is Kind.FLAG:
+            elif carried[1].kind is c.Kind.FLAG:
                 self._receive_flag(ref, carried[1], message)
             else:
                 self._robots.receive_as(carried[0], carried[1].metric, message, now, carried[1])
@@ -185,7 +168,7 @@ class OpenComponents:
 
         return take
 
-    def _receive_flag(self, ref: str, channel: Channel, message: Message) -> None:
+    def _receive_flag(self, ref: str, channel: c.Channel, message: Message) -> None:
         """Its newest value; an empty message removes what was retained."""
         try:
             value = codec.decode(channel, message.payload) if message.payload else None
@@ -218,16 +201,16 @@ class OpenComponents:
         for (section, key), channel in _NAMED.items():
             self._add(filters, ref, section, key, channel)
         for metric in self._robots.aliases(ref):
-            alias = Channel(metric=metric, kind=Kind.STREAM, payload=AnyObject)
+            alias = c.Channel(metric=metric, kind=c.Kind.STREAM, payload=AnyObject)
             filters.setdefault(f"{ref}/{Direction.OUTGOING}/{metric}", (ref, alias))
         for section, flag in FLAGS.items():
             filters[self._robots.topic(ref, section, "flag_topic", flag)] = (ref, flag)
         source = self._robots.sources.get(ref, ref)
-        filters.setdefault(VIDEO_OVERLAYS.filter(source), None)
-        self._add(filters, source, "video", "overlays_topic", VIDEO_OVERLAYS)
+        filters.setdefault(c.VIDEO_OVERLAYS.filter(source), None)
+        self._add(filters, source, "video", "overlays_topic", c.VIDEO_OVERLAYS)
         return filters
 
-    def _add(self, filters: dict[str, _Carried], ref: str, section: str, key: str, channel: Channel) -> None:
+    def _add(self, filters: dict[str, _Carried], ref: str, section: str, key: str, channel: c.Channel) -> None:
         """The topic that the capabilities name, if they may."""
         topic = section_of(self._robots.capabilities(ref), section).get(key)
         if names(ref, topic, channel) and topic != channel.topic(ref):

@@ -1,7 +1,5 @@
 """Bounds the work that one page can ask of the server: a page beyond it is read more slowly. Pure."""
 
-from __future__ import annotations
-
 PER_S = 100.0  # a page that drives sends 25 messages a second
 BURST = 200.0
 

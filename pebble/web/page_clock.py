@@ -4,8 +4,6 @@ The page's clock has an unknown offset. An echo carries the page's time of some 
 receiving the echo, which bounds the offset on both sides: so a delay that is always there counts as well.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from itertools import count
 
@@ -35,7 +33,6 @@ class PageClock:
         self._bounds: deque[tuple[float, float, float]] = deque(maxlen=_ANSWERS)  # of the offset, and the round trip
 
     def ping(self, now: float) -> int:
-        """The number of a ping that is sent now."""
         if len(self._sent) >= _UNANSWERED:
             del self._sent[next(iter(self._sent))]
         number = next(self._numbers)

@@ -3,8 +3,6 @@
 Prints one line of JSON, ``{"url": …}``, once the page can be opened, and serves it until SIGTERM or SIGINT.
 """
 
-from __future__ import annotations
-
 import logging
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The settings of an operator page that people can use: where a login is needed, there is a user."""
 
-from __future__ import annotations
-
 from pebble.client.page_from_config import has_login, people_of, settings_of
 from pebble.client.page_settings import WebSettings
 from pebble.config import Config

@@ -3,8 +3,6 @@
 Values are thinned to a rate; what is too old, too long or too much is left out.
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from typing import Final, NamedTuple
@@ -46,7 +44,6 @@ class Recent:
         self._rings: dict[tuple[str, str], _Ring] = {}
 
     def open(self, ref: str) -> None:
-        """A page has opened this component."""
         self._open.add(ref)
 
     def close(self, ref: str) -> None:
@@ -57,7 +54,6 @@ class Recent:
                 self._remove(ref, metric)
 
     def forget(self, ref: str) -> None:
-        """The component was removed."""
         for metric in LIMITS:
             self._remove(ref, metric)
 
@@ -78,7 +74,6 @@ class Recent:
         self.bytes += ring.bytes - before
 
     def metrics(self, ref: str) -> list[str]:
-        """The metrics of which there is anything."""
         return [metric for metric in LIMITS if (ref, metric) in self._rings]
 
     def points(self, ref: str, metric: str, now: float) -> tuple[Point, ...]:

@@ -1,7 +1,5 @@
 """When the services of a component were seen to restart: robots count restarts, but do not date them. Pure."""
 
-from __future__ import annotations
-
 from collections import deque
 from typing import Any, Final
 

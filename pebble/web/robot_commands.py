@@ -1,7 +1,5 @@
 """What a page asks of a robot, besides driving: which right it needs, and what is then published. Pure."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -71,7 +69,6 @@ def refusal(op: m.RobotOp, capabilities: dict[str, Any]) -> str:
 
 
 def publication(op: m.RobotOp, topic_of: TopicOf) -> Message:
-    """What to publish."""
     command = _command(op)
     channel = command.channel
     if isinstance(op, m.ActionOp):

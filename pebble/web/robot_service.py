@@ -1,7 +1,5 @@
 """The operator page as a process of the robot: ``python -m pebble.web.robot_service CONFIG``."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import signal

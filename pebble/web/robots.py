@@ -3,8 +3,6 @@
 No queue forms: a slow page receives the newest value less often. A page that connects again receives everything.
 """
 
-from __future__ import annotations
-
 import re
 import time
 from collections import deque
@@ -14,23 +12,11 @@ from typing import Any, NamedTuple
 
 import msgspec
 
+from pebble import contract as c
 from pebble.client.rank import Rank, RankedTable
 from pebble.client.robot_topics import FLEET, SYNONYMS, names, section_of
 from pebble.client.robot_view import RobotView
-from pebble.contract import (
-    CAPABILITIES,
-    ESTOP_STATE,
-    LOGS,
-    MCU_DESCRIBE,
-    ONLINE,
-    SOUNDBOARD_FILES,
-    STATUS,
-    VIDEO_OVERLAYS,
-    Channel,
-    channel_of,
-    codec,
-    is_reserved,
-)
+from pebble.contract import channel_of, codec, is_reserved
 from pebble.contract.identity import LEVEL, Direction, parse_topic
 from pebble.errors import PayloadError
 from pebble.transports import Message
@@ -102,7 +88,7 @@ class Component:
 
     def lists(self, metric: str) -> bool:
         """Whether this is the state of a motor owner that its capabilities list."""
-        return metric in [ESTOP_STATE.metric.format(owner=owner) for owner in self.robot.estop.owners]
+        return metric in [c.ESTOP_STATE.metric.format(owner=owner) for owner in self.robot.estop.owners]
 
 
 def _ms(seconds: float | None) -> float | None:
@@ -142,7 +128,7 @@ class Robots:
         component = self.components.get(ref)
         return {} if component is None else component.robot.capabilities
 
-    def topic(self, ref: str, section: str, key: str, channel: Channel) -> str:
+    def topic(self, ref: str, section: str, key: str, channel: c.Channel) -> str:
         """The topic that the capabilities name, if they may; else the channel's own."""
         topic = str(section_of(self.capabilities(ref), section).get(key))
         return topic if names(ref, topic, channel) else channel.topic(ref)
@@ -200,7 +186,7 @@ class Robots:
     def leave(self, interest: Interest) -> None:
         self.interests.discard(interest)
 
-    def _all(self, channels: Collection[Channel | None]) -> Iterator[tuple[str, str]]:
+    def _all(self, channels: Collection[c.Channel | None]) -> Iterator[tuple[str, str]]:
         for ref, component in self.components.items():
             for metric in component.values:
                 if _channel(metric) in channels:
@@ -227,7 +213,7 @@ class Robots:
             return
         self.receive_as(address.identity.base, address.metric, message, now)
 
-    def receive_as(self, ref: str, metric: str, message: Message, now: float, channel: Channel | None = None) -> None:
+    def receive_as(self, ref: str, metric: str, message: Message, now: float, channel: c.Channel | None = None) -> None:
         """Take a message as the metric that it carries, whatever its topic is called.
 
         ``channel``: how it is read, if the contract does not have it.
@@ -236,7 +222,7 @@ class Robots:
         channel = channel or _channel(metric)
         if component is None or channel is None:
             return
-        if channel is LOGS:
+        if channel is c.LOGS:
             self._log(component, message)
         elif not message.payload:
             self._remove_value(component, metric, message, now)
@@ -279,8 +265,8 @@ class Robots:
         component.sent_online, component.refreshed_at = component.robot.online(now), now
         component.update_rank(known=self._is_known(component.ref))
         self.set_server_metric(component.ref, "web/liveness", component.view(now))
-        if ONLINE.metric in component.values:
-            self._mark(component.ref, ONLINE.metric)
+        if c.ONLINE.metric in component.values:
+            self._mark(component.ref, c.ONLINE.metric)
 
     def _is_known(self, ref: str) -> bool:
         """From before, or to a person who has it open."""
@@ -297,7 +283,7 @@ class Robots:
         component = self.components[ref] = Component(ref, rank)
         return component
 
-    def _has_room(self, component: Component, metric: str, channel: Channel, grows: int) -> bool:
+    def _has_room(self, component: Component, metric: str, channel: c.Channel, grows: int) -> bool:
         """Whether there is room for a value, if necessary after removing components of a lower rank."""
         is_new = metric not in component.values
         if is_new and len(component.values) >= MAX_METRICS and channel.is_pattern and not component.lists(metric):
@@ -312,12 +298,12 @@ class Robots:
             self.omitted += 1
         return True
 
-    def _store(self, component: Component, metric: str, channel: Channel, message: Message, now: float) -> bool:
+    def _store(self, component: Component, metric: str, channel: c.Channel, message: Message, now: float) -> bool:
         """Check and store the value; False if it is refused."""
         old = component.values.get(metric)
         size = len(message.payload)
         grows = size - (0 if old is None else len(bytes(old.raw)))
-        too_large = size > (_MAX_CLIPS_BYTES if channel is SOUNDBOARD_FILES else MAX_VALUE_BYTES)
+        too_large = size > (_MAX_CLIPS_BYTES if channel is c.SOUNDBOARD_FILES else MAX_VALUE_BYTES)
         if too_large or not self._has_room(component, metric, channel, grows):
             self.omitted += 1
             return False
@@ -328,7 +314,7 @@ class Robots:
         self._bytes += grows
         component.bytes += grows
         component.values[metric] = _Value(msgspec.Raw(message.payload), now)
-        if channel is not ONLINE:
+        if channel is not c.ONLINE:
             self._mark(component.ref, metric)
         return True
 
@@ -343,22 +329,22 @@ class Robots:
         component.robot.remembered.pop(message.topic, None)
         component.robot.receive_stop(None, message, now)
 
-    def _interpret(self, component: Component, metric: str, channel: Channel, message: Message, now: float) -> None:
+    def _interpret(self, component: Component, metric: str, channel: c.Channel, message: Message, now: float) -> None:
         robot = component.robot
-        if channel in (CAPABILITIES, ESTOP_STATE, ONLINE):
+        if channel in (c.CAPABILITIES, c.ESTOP_STATE, c.ONLINE):
             robot.remembered[message.topic] = message  # the table of values bounds how many
-        if channel in (CAPABILITIES, ESTOP_STATE):
+        if channel in (c.CAPABILITIES, c.ESTOP_STATE):
             before = robot.capabilities
             if robot.receive_stop(channel, message, now):
                 component.update_rank(known=self._is_known(component.ref))
             robot.capabilities = robot.capabilities or before  # empty ones take nothing away
-        elif channel is MCU_DESCRIBE:
+        elif channel is c.MCU_DESCRIBE:
             component.aliases[metric] = _aliases(message.payload)
-        elif channel is ONLINE or channel in SYNONYMS:
+        elif channel is c.ONLINE or channel in SYNONYMS:
             arrived = time.time() - (time.monotonic() - now)
             if component.take_heartbeat(message, now, arrived) and component.sent_online is not False:
                 self._refresh(component, now)  # it may be back before the next round
-        elif channel is STATUS and component.restarts.receive(
+        elif channel is c.STATUS and component.restarts.receive(
             message.payload, int(1000 * time.time()), dated=not message.retain
         ):
             self.set_server_metric(component.ref, "web/restarts", component.restarts.view())
@@ -376,19 +362,19 @@ class Robots:
         channel = _channel(metric)
         everybody = everybody or channel in FLEET
         for interest in self.interests:
-            drawn = channel is VIDEO_OVERLAYS and self.sources.get(interest.watched) == ref
+            drawn = channel is c.VIDEO_OVERLAYS and self.sources.get(interest.watched) == ref
             if everybody or drawn or interest.watched == ref:
                 interest.dirty.add((ref, metric))
                 interest.notify()
 
 
-def _channel(metric: str) -> Channel | None:
+def _channel(metric: str) -> c.Channel | None:
     return channel_of(f"{Direction.OUTGOING}/{metric}")
 
 
 def _aliases(payload: bytes) -> tuple[str, ...]:
     """What a manifest declares besides the contract's metrics, however strange the rest of it is."""
-    manifest = codec.plain(MCU_DESCRIBE, payload)
+    manifest = codec.plain(c.MCU_DESCRIBE, payload)
     interfaces = manifest.get("interfaces") if isinstance(manifest, dict) else None
     outgoing = [
         str(one.get("channel"))

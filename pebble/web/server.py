@@ -1,7 +1,5 @@
 """Ties the parts of the server together: what arrives from the broker, what pages ask for, and what is due."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import secrets
@@ -32,12 +30,12 @@ from pebble.web import messages as m
 from pebble.web import robot_commands
 from pebble.web.driven_here import DrivenHere
 from pebble.web.driving import Command, Driving
+from pebble.web.known_robots import SavedRobots
 from pebble.web.media.pictures import MediaHub
 from pebble.web.media.robot_streams import OwnHosts, origin
 from pebble.web.media.sound import SoundHub
 from pebble.web.open_components import OpenComponents
 from pebble.web.robots import Robots
-from pebble.web.saved_robots import SavedRobots
 from pebble.web.stops import Stops
 
 log = logging.getLogger(__name__)
@@ -102,7 +100,6 @@ class Server:
     # -- from the broker
 
     def receive(self, message: Message, now: float) -> None:
-        """Take a message of a component."""
         address = parse_topic(message.topic)
         if address is None:
             return
@@ -256,7 +253,6 @@ class Server:
             self._show_stream_address(ref)
 
     def unwatch(self, ref: str) -> None:
-        """A page has closed it."""
         if _is_base(ref):
             self.open_components.close(ref)
 

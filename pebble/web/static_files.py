@@ -1,7 +1,5 @@
 """The files of the page, read once: what is not among them cannot be requested."""
 
-from __future__ import annotations
-
 import gzip
 import hashlib
 import posixpath

@@ -3,8 +3,6 @@
 The robot remembers the stop; see docs/emergency-stop.md.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable
 
 from pebble.client.estop import COLLECT_S, Progress, RobotStop, StopSender

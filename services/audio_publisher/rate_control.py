@@ -1,7 +1,5 @@
 """What is reduced when the connection is slow: first headers, then bits. Pure: times are passed in."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
@@ -84,7 +82,6 @@ class RateController:
         self._in_flight.sent(size + _OVERHEAD, now)
 
     def connection_lost(self) -> None:
-        """The packets in flight are lost."""
         self._in_flight.clear()
 
 

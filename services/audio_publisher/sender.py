@@ -1,7 +1,5 @@
 """From chunks of the microphone to packets on the wire, as few late ones as possible."""
 
-from __future__ import annotations
-
 import logging
 
 from pebble.config.media import AudioPublisher as Options

@@ -1,7 +1,5 @@
 """Sends the microphone's sound to operators."""
 
-from __future__ import annotations
-
 import threading
 from typing import Any
 

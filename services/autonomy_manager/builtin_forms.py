@@ -3,8 +3,6 @@
 Its names, options, defaults and limits, except `log_file`: a command must not choose a file to write.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 from pebble.services.autonomy_manager.forms import Setting
@@ -88,5 +86,5 @@ DEPENDENCIES: dict[str, tuple[tuple[str, dict[str, Any]], ...]] = {
     "apriltag-odom-follow": (
         ("apriltag-locations", {"width": 1280, "height": 720, "fps": 15.0}),
         ("wheel-odometry", {"use_tune_state": False}),
-    ),
+    )
 }

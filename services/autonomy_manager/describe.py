@@ -1,7 +1,5 @@
 """Asks a script what it is: its `script.json`, or the script itself with `--describe` if it is one of ours."""
 
-from __future__ import annotations
-
 import ast
 import logging
 import os
@@ -199,7 +197,6 @@ class Descriptions:
         return str(answer[2]) if answer is not None and isinstance(answer[2], BrokenScriptError) else ""
 
     def retain_only(self, names: set[str]) -> None:
-        """Forget the others."""
         self._answers = {name: answer for name, answer in self._answers.items() if name in names}
 
 

@@ -1,7 +1,5 @@
 """The environment variables of a script."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 from pebble.config import Config

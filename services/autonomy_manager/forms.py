@@ -1,7 +1,5 @@
 """The settings of a script: what operators see of them, and which of their values are accepted. Pure."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -51,7 +49,6 @@ class Setting(Struct, frozen=True, kw_only=True):
         return free_text and not _FILE_WORDS.isdisjoint(words)
 
     def entry(self) -> dict[str, Any]:
-        """The entry as published."""
         entry: dict[str, Any] = {
             "key": self.key,
             "label": self.label or self.key,

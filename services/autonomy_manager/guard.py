@@ -1,7 +1,5 @@
 """Ends all processes of all scripts when this process has ended, however it ended, before the next one begins."""
 
-from __future__ import annotations
-
 import fcntl
 import logging
 import os

@@ -1,7 +1,5 @@
 """What the motor owners publish: whether a script may start, and why one that runs has to end. Pure."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator
 
 from pebble.contract.payloads import LAST_RUN, EstopState

@@ -1,7 +1,5 @@
 """The output of a script as lines for the robot's log: bounded in length and in number."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 from pebble.runtime.lines import LineSplitter

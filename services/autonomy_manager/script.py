@@ -1,7 +1,5 @@
 """What is known of one script, and how it is started."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Microphones, through ALSA's own recorder, ``arecord``."""
 
-from __future__ import annotations
-
 import shutil
 import time
 

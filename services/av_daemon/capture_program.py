@@ -1,7 +1,5 @@
 """A program that captures pictures or sound and writes them to its standard output; it ends with this process."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 import select

@@ -1,7 +1,5 @@
 """The thread of one device: opens it while its stream has readers, delivers its frames, and retries after failures."""
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

@@ -1,7 +1,5 @@
 """The health of one device: written by its thread, reported by the service. Times are passed in."""
 
-from __future__ import annotations
-
 import threading
 
 from msgspec.structs import replace

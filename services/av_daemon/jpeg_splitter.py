@@ -1,7 +1,5 @@
 """Cuts a stream of JPEG pictures into pictures. Bytes in, bytes out."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Final
 

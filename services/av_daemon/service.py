@@ -1,10 +1,8 @@
 """Owns camera and microphone, and publishes the status of everything that handles pictures and sound."""
 
-from __future__ import annotations
-
 import re
 import time
-from typing import Any
+from typing import Any, Final
 
 from msgspec.structs import replace
 
@@ -13,13 +11,33 @@ from pebble.contract.payloads import MediaReport, MediaStatus
 from pebble.errors import DeviceError
 from pebble.runtime.service import Service, every, on
 from pebble.services.av_daemon import sources
-from pebble.services.av_daemon.reports import Reports
 from pebble.services.av_daemon.stream import Stream
 from pebble.transports.frames import FrameWriter
 
 CAMERA, MICROPHONE = "camera", "microphone"  # the names of the streams
 _NUMBERS_S = 5.0  # between messages that differ in numbers alone: once a second they filled a tenth of a 64 kbit/s link
 _NUMBER = re.compile(r"[0-9.]+")
+SILENCE_S: Final = 5.0  # after which a program that has reported has ended
+_PROGRAM_LIMIT = 32
+
+
+class Reports:
+    """The latest report of every media program, by its name, without those that stopped reporting. Pure."""
+
+    def __init__(self) -> None:
+        self._reports: dict[str, tuple[float, MediaReport]] = {}
+        self.refused = 0  # reports of more programs than any robot has
+
+    def put(self, program: str, report: MediaReport, now: float) -> None:
+        if program not in self._reports and len(self.current(now)) >= _PROGRAM_LIMIT:
+            self.refused += 1
+            return
+        self._reports[program] = (now, report)
+
+    def current(self, now: float) -> dict[str, MediaReport]:
+        """The reports of the last SILENCE_S seconds, by program name."""
+        self._reports = {name: (at, report) for name, (at, report) in self._reports.items() if now - at < SILENCE_S}
+        return {name: self._reports[name][1] for name in sorted(self._reports)}
 
 
 class AvDaemon(Service):

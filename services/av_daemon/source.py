@@ -1,7 +1,5 @@
 """The interface of an open camera or microphone, and the frames it returns."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeAlias

@@ -36,14 +36,12 @@ def camera(options: AvDaemon, start: float) -> Opener:
 
 
 def microphone(options: AvDaemon, start: float) -> Opener:
-    """A function that opens the microphone."""
     if options.audio.source == "synthetic":
         return lambda: SyntheticMicrophone(options.audio, start)
     return lambda: AlsaMicrophone(options)
 
 
 def picture_bytes(options: AvDaemon) -> int:
-    """The size of the largest picture."""
     video = options.video
     pixels = video.width * video.height
     compressed = video.backend in _LIBCAMERA and video.capture_format in ("auto", "mjpeg") and not video.rotate_degrees

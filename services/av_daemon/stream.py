@@ -1,7 +1,5 @@
 """One stream: a device and its writer; a device that hangs is abandoned and opened again."""
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Cameras of the Linux kernel (V4L2), and files and network streams in place of a camera, through OpenCV."""
 
-from __future__ import annotations
-
 import logging
 import os
 import time

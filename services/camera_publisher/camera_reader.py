@@ -1,7 +1,5 @@
 """Reads the camera's frames on a thread of its own and holds the newest one for the service."""
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

@@ -1,9 +1,8 @@
-"""Which of a camera's frames are sent, so that the configured rate is what arrives. Pure: times are passed in."""
-
-from __future__ import annotations
+"""Which of a camera's frames are sent, and which of them as full pictures. Pure: times are passed in."""
 
 _EARLY = 0.25  # of a period: how far ahead of its turn a frame may be, because cameras have jitter
 _LATE = 1.0  # periods that may be made up for; a longer pause is not
+PERIOD_S = 1.0  # full pictures are large: one per second, however many receivers request one
 
 
 class FrameSelector:
@@ -41,3 +40,28 @@ class FrameSelector:
         missed = max(0.0, (captured_s - turn) / self._period - _LATE)
         self._turn = turn + (1.0 + missed) * self._period
         return missed
+
+
+class KeyframeRequests:
+    """The requests since the last full picture; the next one answers all of them."""
+
+    def __init__(self) -> None:
+        self._requested = self._required = False
+        self._sent_at = float("-inf")
+
+    def request(self) -> None:
+        """A receiver cannot decode the differences."""
+        self._requested = True
+
+    def require(self) -> None:
+        """The next picture cannot build upon the last one: send a full one at once."""
+        self._required = True
+
+    def due(self, now: float) -> bool:
+        """Has the next picture to be a full one?"""
+        return self._required or (self._requested and now - self._sent_at >= PERIOD_S)
+
+    def sent(self, now: float) -> None:
+        """A full picture was sent, for whatever reason."""
+        self._requested = self._required = False
+        self._sent_at = now

@@ -85,7 +85,6 @@ class RateController:
         return self.step if changed else None
 
     def connection_lost(self) -> None:
-        """The pictures in flight are lost."""
         self._window.clear()
 
     def _update(self, now: float) -> float:

@@ -1,7 +1,5 @@
 """How many frames may be in flight, and how long the connection was busy with each. Pure: times and bytes come in."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from pebble.media.in_flight import InFlight

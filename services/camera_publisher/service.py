@@ -1,7 +1,5 @@
 """Sends the camera's pictures to operators: at the configured rate, never old ones, over a connection of its own."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 
@@ -14,7 +12,7 @@ from pebble.runtime.connections import remote_transport
 from pebble.runtime.parent import requested_encoding
 from pebble.runtime.service import Service, every, on
 from pebble.services.camera_publisher.camera_reader import CameraReader
-from pebble.services.camera_publisher.keyframes import KeyframeRequests
+from pebble.services.camera_publisher.frame_selector import KeyframeRequests
 from pebble.services.camera_publisher.rate_control import RateController, wire_size
 from pebble.services.camera_publisher.shape import Pixels, Shape
 from pebble.transports import QoS, State

@@ -1,7 +1,5 @@
 """From a frame as the camera gives it to the picture that is sent: decoded, as large as wanted, and turned."""
 
-from __future__ import annotations
-
 from fractions import Fraction
 from typing import Any, Final
 

@@ -1,7 +1,5 @@
 """System actions: reboot, service-restart and git-pull each run one command of the operating system."""
 
-from __future__ import annotations
-
 import logging
 import os
 import subprocess
@@ -63,7 +61,9 @@ class Action:
     def request(self) -> bool:
         """Run the command; False, with a log line, if that is refused."""
         if not self.control.command:
-            self._warn_of_missing_command()
+            if not self._warned:
+                self._warned = True
+                log.warning("%s refused: services.mqtt_bridge has no command for it", self.name)
             return False
         if self.running:
             self._log.warning("refused", "%s refused: it is still running", self.name)
@@ -107,11 +107,6 @@ class Action:
         code = process.wait()
         level = logging.INFO if code == 0 else logging.ERROR
         self._log.log("ended", level, "%s ended with exit code %d, its output %s", self.name, code, where)
-
-    def _warn_of_missing_command(self) -> None:
-        if not self._warned:
-            self._warned = True
-            log.warning("%s refused: services.mqtt_bridge has no command for it", self.name)
 
 
 class SystemActions:

@@ -1,7 +1,5 @@
 """The robot's heartbeat towards operators, and the will that marks it as offline."""
 
-from __future__ import annotations
-
 from collections import deque
 
 from pebble.contract import ONLINE, codec

@@ -4,8 +4,6 @@ An earlier bridge process had forwarded it, so only the broker knows of it. Each
 retained topics that nobody but the robot publishes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 from pebble.contract import CHANNELS, MCU_DESCRIBE, MCU_VALUE, ONLINE, OUTGOING, Kind
@@ -35,7 +33,6 @@ class Leftovers:
         return self._here is None
 
     def note_local(self, message: Message) -> None:
-        """The robot publishes ``message``."""
         here = self._here
         if here is not None and len(here) <= _TOPICS:
             (here.add if message.payload else here.discard)(message.topic)

@@ -1,7 +1,5 @@
 """Which media programs are to run: a flag of the operators allows them, a request starts and stops them. Pure."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from typing import Final

@@ -1,7 +1,5 @@
 """Whether the robot's motor owners and this process reach each other: what it would send them passes the same way."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 from pebble.contract import ESTOP_STATE
@@ -30,7 +28,6 @@ class MotorOwners:
         self._messages = dict.fromkeys(self.topics, 0)
 
     def receive(self, topic: str) -> None:
-        """Note a message on one of ``topics``."""
         self._messages[topic] += 1
 
     def check(self, now: float) -> None:

@@ -6,8 +6,6 @@ manifest that allows it. Each interface is read by itself, whatever the rest of 
 interfaces cannot be read nothing passes.
 """
 
-from __future__ import annotations
-
 import re
 import threading
 from collections.abc import Iterator

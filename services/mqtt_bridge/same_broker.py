@@ -4,8 +4,6 @@ Then nothing may be mirrored: every message would come back and circulate for ev
 remote side and received on the local side proves it.
 """
 
-from __future__ import annotations
-
 import time
 from collections import deque
 from collections.abc import Callable
@@ -86,7 +84,6 @@ class SameBrokerProbe:
         return True
 
     def is_request(self, message: Message) -> bool:
-        """Whether the mirror requests a probe."""
         return self.announces and message.payload == PROBE_REQUEST
 
 

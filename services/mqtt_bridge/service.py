@@ -1,7 +1,5 @@
 """The bridge as a process: forwarding, heartbeat, same-broker probe, system actions and media requests."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -119,7 +117,8 @@ class MqttBridge(ForwardingService):
             return
         gone = self._leftovers.remove(partial(self.forwarder.retained.remove, Side.REMOTE))
         if gone:
-            self.log.info("removed %d retained topics that the robot no longer has: %s", len(gone), _few(gone))
+            few = ", ".join(topic[:_LOGGED] for topic in gone[:3]) + (", …" if len(gone) > 3 else "")
+            self.log.info("removed %d retained topics that the robot no longer has: %s", len(gone), few)
 
     def connected(self, side: Side, epoch: int) -> None:
         if side is Side.REMOTE:
@@ -278,7 +277,3 @@ class MqttBridge(ForwardingService):
         except PayloadError as error:
             self.refusals.malformed(channel, error)
             return False
-
-
-def _few(topics: list[str]) -> str:
-    return ", ".join(topic[:_LOGGED] for topic in topics[:3]) + (", …" if len(topics) > 3 else "")

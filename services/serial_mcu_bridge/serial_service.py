@@ -1,7 +1,5 @@
 """The base of all bridges: it owns the serial line and passes received bytes to the service's thread."""
 
-from __future__ import annotations
-
 import threading
 import time
 from abc import ABC, abstractmethod

@@ -1,7 +1,5 @@
 """Decodes a clip on a thread of its own, and writes it to a player's standard input."""
 
-from __future__ import annotations
-
 import logging
 import threading
 from collections.abc import Callable
@@ -29,7 +27,6 @@ class Feed:
         threading.Thread(target=self._run, name="pebble-feed", daemon=True).start()
 
     def write_to(self, pipe: IO[bytes]) -> None:
-        """Write everything to ``pipe``, and close it."""
         self._pipes.put(pipe)
 
     def cancel(self) -> None:

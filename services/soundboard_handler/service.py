@@ -1,7 +1,5 @@
 """Plays the clips of a folder when commands name them (paper A.8.10)."""
 
-from __future__ import annotations
-
 import math
 import time
 from typing import Any

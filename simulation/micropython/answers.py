@@ -1,7 +1,5 @@
 """Answers of a DNS server and an SNTP server to the packets of a board. Pure: bytes in, bytes out."""
 
-from __future__ import annotations
-
 import socket
 import struct
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """A simulated MicroPython board: the real firmware files on simulated pins, bus, console and clock."""
 
-from __future__ import annotations
-
 import array
 import binascii
 import collections

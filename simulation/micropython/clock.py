@@ -1,7 +1,5 @@
 """Clocks of a simulated board: the real one, or a virtual one that moves only when advanced."""
 
-from __future__ import annotations
-
 import time
 from typing import Protocol
 
@@ -38,7 +36,6 @@ class VirtualClock:
         self._now += max(0.0, seconds)
 
     def until(self, moment: float) -> None:
-        """Advance to ``moment``, if it is in the future."""
         self._now = max(self._now, moment)
 
     def sleep(self, seconds: float) -> None:

@@ -1,7 +1,5 @@
 """Standard input and output of a simulated board, which are its USB serial port on a real one."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

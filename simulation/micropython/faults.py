@@ -1,7 +1,5 @@
 """The errors of a simulated board: those that its firmware receives, and those that report a bug in it."""
 
-from __future__ import annotations
-
 import os
 
 

@@ -1,7 +1,5 @@
 """The file system of a simulated board, which survives resets and power cuts."""
 
-from __future__ import annotations
-
 import errno
 import io
 from collections.abc import Callable

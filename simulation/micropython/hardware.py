@@ -1,7 +1,5 @@
 """The hardware of a simulated board, as the firmware's modules and the tests reach it: pins, bus, console, timers."""
 
-from __future__ import annotations
-
 import random
 from typing import Any, Final
 

@@ -1,7 +1,5 @@
 """A simulated I2C bus, whose devices answer, are absent, or fail."""
 
-from __future__ import annotations
-
 import errno
 from typing import Protocol
 

@@ -1,6 +1,5 @@
 """Loads firmware files into isolated modules: two boards in one process share nothing."""
 
-from __future__ import annotations
 import __future__
 
 import builtins

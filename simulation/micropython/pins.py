@@ -1,7 +1,5 @@
 """The pins of a simulated board, seen from outside: outputs of the firmware, and levels and voltages at inputs."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 PinName = str | int

@@ -1,7 +1,5 @@
 """Differences between MicroPython's ports that matter to our firmware."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Final

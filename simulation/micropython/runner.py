@@ -1,7 +1,5 @@
 """Runs a robot's firmware on its simulated board, as common/run.py does on a real one."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable
 from typing import Any

@@ -3,8 +3,6 @@
 From MicroPython's ports/samd: boards/SEEED_XIAO_SAMD21/pins.csv, mcu/samd21/pin-af-table.csv and pin_af.c.
 """
 
-from __future__ import annotations
-
 from typing import Final
 
 from pebble.simulation.micropython.faults import SharedPwm

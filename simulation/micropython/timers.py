@@ -1,7 +1,5 @@
 """The watchdog and the software timers of a simulated board."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any

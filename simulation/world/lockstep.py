@@ -3,8 +3,6 @@
 The same calls give the same bytes and pixels, on every run and however busy the machine is.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from typing import Final, NamedTuple
 
@@ -73,7 +71,6 @@ class LockstepWorld:
             self._sample()
 
     def run(self, seconds: float) -> None:
-        """Advance by at least ``seconds``."""
         end = self.now() + seconds - STEP_S / 1000
         while self.now() < end:
             self.step()
@@ -104,7 +101,6 @@ class LockstepRobot:
 
     @property
     def pose(self) -> RobotPose:
-        """Where the robot really is."""
         self.mcu.body.advance()
         pose = self.motion.pose
         return RobotPose(pose.x_mm / 1000, pose.y_mm / 1000, pose.heading_rad)

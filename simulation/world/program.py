@@ -1,7 +1,5 @@
 """A simulated world as a program: the MCUs of its robots behind pseudo terminals, and their poses for their cameras."""
 
-from __future__ import annotations
-
 import argparse
 import math
 import os
@@ -99,7 +97,8 @@ def _run(options: argparse.Namespace, end: EndRequest) -> int:
     with ExitStack() as stack:
         page = _page(path, world)
         stack.callback(page.close)
-        motions = _motions(world)
+        floor = Floor(world)
+        motions = {name: RobotMotion(start_pose(world, name), floor.mover(name)) for name in world.robots}
         mcus = {name: stack.enter_context(mcu) for name, mcu in _mcus(world, motions, folder, options).items()}
         imus = {name: stack.enter_context(imu) for name, imu in _imus(world, motions, folder).items()}
         if not options.report:
@@ -125,11 +124,6 @@ def _page(path: Path, world: World) -> PosePage:
         return PosePage(page_path(path), world.robots)
     except DeviceError as error:
         raise DeviceError(f"{path}: {error}") from None
-
-
-def _motions(world: World) -> dict[str, RobotMotion]:
-    floor = Floor(world)
-    return {name: RobotMotion(start_pose(world, name), floor.mover(name)) for name in world.robots}
 
 
 def _mcus(world: World, motions: Mapping[str, RobotMotion], folder: Path, options: argparse.Namespace) -> Mcus:
@@ -162,7 +156,8 @@ def _publish_poses(page: PosePage, mcus: Mcus, end: EndRequest, *, report: bool)
         due = max(due + PERIOD_S, time.monotonic())
         states = {name: mcu.state() for name, mcu in mcus.items()}
         ns = time.monotonic_ns()
-        page.write(ns, [_in_metres(state.pose) for state in states.values()])
+        poses = (state.pose for state in states.values())
+        page.write(ns, [RobotPose(pose.x_mm / 1000, pose.y_mm / 1000, pose.heading_rad) for pose in poses])
         count += 1
         if (
             report
@@ -170,10 +165,6 @@ def _publish_poses(page: PosePage, mcus: Mcus, end: EndRequest, *, report: bool)
             and not _write(msgspec.json.encode(Snapshot(ns, states)) + b"\n")
         ):
             return
-
-
-def _in_metres(pose: Pose) -> RobotPose:
-    return RobotPose(pose.x_mm / 1000, pose.y_mm / 1000, pose.heading_rad)
 
 
 def _introduction(path: Path, mcus: Mcus, imus: Mcus) -> bytes:

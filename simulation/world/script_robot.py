@@ -1,7 +1,5 @@
 """The robot of a script in a lockstep world: ``main(robot, options)`` runs in it as it is, on a virtual clock."""
 
-from __future__ import annotations
-
 import importlib.util
 import logging
 import math

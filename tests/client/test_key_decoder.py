@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from pebble.client.key_decoder import ALONE_S, KeyDecoder
+from pebble.client.terminal.key_decoder import ALONE_S, KeyDecoder
 
 
 @pytest.mark.parametrize(

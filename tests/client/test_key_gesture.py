@@ -6,7 +6,7 @@ import itertools
 
 import pytest
 
-from pebble.client.key_gesture import BURST, HELD_S, PERIOD_S, KeyGesture, mixed
+from pebble.client.terminal.key_gesture import BURST, HELD_S, PERIOD_S, KeyGesture, mixed
 from pebble.contract.payloads import Drive
 
 FORWARD, ZERO, FINAL = Drive(z=0.6, valid_ms=400), Drive(), Drive(valid_ms=0)

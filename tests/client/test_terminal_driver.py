@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from pebble.client.driver_lease import DriverLease
-from pebble.client.key_gesture import KeyGesture
-from pebble.client.terminal_driver import TerminalDriver
+from pebble.client.terminal.driver import TerminalDriver
+from pebble.client.terminal.key_gesture import KeyGesture
 from pebble.transports import Message
 from tests.client.estop_robot import Robot, outgoing
 

@@ -88,7 +88,7 @@ def test_process_1_collects_what_others_leave_to_it(config: Path) -> None:
     script = config.parent / "leave.py"
     script.write_text(
         "import os, subprocess, time\n"
-        "from pebble.launcher.orphans import reap\n"
+        "from pebble.launcher.launcher import reap\n"
         "subprocess.run(['sh', '-c', 'for i in 1 2 3; do (sleep 0.2 &); done'])\n"
         "own = subprocess.Popen(['true'])\n"
         "end, collected = time.monotonic() + 10, 0\n"

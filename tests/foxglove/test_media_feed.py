@@ -8,10 +8,10 @@ import sys
 import numpy as np
 import pytest
 
-from pebble.client.media_request.picture_header import MAX_PAYLOAD
 from pebble.contract.packets import PBAT
 from pebble.foxglove.media_feed import MAX_WAITING, MAX_WAITING_BYTES, MediaFeed
 from pebble.foxglove.server import MAX_BYTES, ChannelSpec, Server
+from pebble.media.picture_header import MAX_PAYLOAD
 from pebble.media.scene import Scene
 from pebble.media.video import make_encoder
 from pebble.recordings.exports.foxglove_messages import Schemas

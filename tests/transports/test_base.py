@@ -8,8 +8,8 @@ import tracemalloc
 import pytest
 
 from pebble.transports import Message, QoS, base, own_retained
+from pebble.transports.base import Subscriptions
 from pebble.transports.memory import MemoryHub, MemoryTransport
-from pebble.transports.subscriptions import Subscriptions
 from pebble.transports.topics import check_topic
 from pebble.transports.zenoh.keymap import key_to_topic, topic_to_key
 from tests.support import until

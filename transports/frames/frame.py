@@ -1,7 +1,5 @@
 """One frame: its bytes, the metadata beside them, and the picture decoded from them."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import msgspec

@@ -335,5 +335,4 @@ class _LatestFrames(Generic[_T]):
 
 
 def _copy(data: bytes) -> np.ndarray[Any, np.dtype[np.uint8]]:
-    """A writable copy."""
     return np.frombuffer(data, np.uint8).copy()

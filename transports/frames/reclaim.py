@@ -9,8 +9,6 @@ Zenoh's own 1.3 MB per writer process are not reclaimed: their segment's number 
 would sooner or later get the same one.
 """
 
-from __future__ import annotations
-
 import collections
 import ctypes
 import logging

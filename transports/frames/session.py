@@ -3,8 +3,6 @@
 It is the same on robots of every transport, and has no hub: docs/decisions/0007.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

@@ -102,7 +102,7 @@ def lockable(size: int) -> bool:
     Zenoh locks what it shares; a reader that may not lock loses every shared frame without an error.
     """
     if not hasattr(_libc, "mlock2"):
-        return _unlimited()
+        return resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] == resource.RLIM_INFINITY
     with mmap.mmap(-1, size) as memory:
         probe = ctypes.c_char.from_buffer(memory)
         address = ctypes.c_void_p(ctypes.addressof(probe))
@@ -119,7 +119,3 @@ def memlock_problem(size: int, what: str) -> str:
         f"{what} cannot use shared memory, frames are sent as bytes: this process may lock {limit >> 10} KiB "
         f"and needs {size >> 10} KiB more; set LimitMEMLOCK=infinity in its systemd unit, or `ulimit -l unlimited`"
     )
-
-
-def _unlimited() -> bool:
-    return resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] == resource.RLIM_INFINITY

@@ -5,8 +5,6 @@ that word lies is known for certain versions, and is found again in every proces
 If anything differs from what is known, `why_unavailable` explains it, and frames are copied instead.
 """
 
-from __future__ import annotations
-
 import ctypes
 import logging
 import re

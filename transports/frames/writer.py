@@ -189,7 +189,6 @@ class FrameWriter:
 
     @property
     def wanted(self) -> bool:
-        """Whether there are readers."""
         return bool(self._readers)
 
     @property

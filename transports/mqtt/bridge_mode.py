@@ -4,8 +4,6 @@ A broker without it answers CONNECT with return code 1, or hangs up. So does a p
 counts only if the same broker accepts a plain CONNECT, and then hangs up once more.
 """
 
-from __future__ import annotations
-
 from enum import Enum
 
 

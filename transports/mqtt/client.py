@@ -5,25 +5,18 @@ writes a message or all acknowledgements of what was read: a general client libr
 objects that nobody here looks at.
 """
 
-from __future__ import annotations
-
 import socket
 import ssl
 from collections import deque
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import NamedTuple
 
 from pebble.transports.base import Message
 from pebble.transports.hosts import Address, dial
 from pebble.transports.mqtt import packets
 from pebble.transports.mqtt.packets import Filter, Listener, Reader
 from pebble.transports.settings import MqttSettings
-
-if TYPE_CHECKING:
-    from pebble.transports.mqtt.paho_client import PahoClient
-
-AnyClient: TypeAlias = "Client | PahoClient"
 
 SEND_BUFFER = 64 * 1024  # bytes in the kernel for a slow connection: with its default a stream would lag by minutes
 _PIECE = 64 * 1024  # bytes that are read at once

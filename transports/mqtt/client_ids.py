@@ -1,7 +1,5 @@
 """Client ids: what names the connection of a program at a broker. Pure but for random digits."""
 
-from __future__ import annotations
-
 import re
 import secrets
 from hashlib import sha256

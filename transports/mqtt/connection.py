@@ -5,8 +5,6 @@ It is discarded as a whole, so that nothing in a queue can outlive a disconnect 
 OpenSSL does not support reading and writing at once. It is not held while a handler runs.
 """
 
-from __future__ import annotations
-
 import socket
 import struct
 import threading
@@ -15,22 +13,16 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from typing import Protocol
 
-from pebble.errors import TransportError
 from pebble.transports import clock, hosts
 from pebble.transports.base import Message, Outgoing, QoS
 from pebble.transports.counters import Counters
 from pebble.transports.mqtt.bridge_mode import Result
 from pebble.transports.mqtt.broker_limits import EVERYTHING, Limits
-from pebble.transports.mqtt.client import AnyClient, Client, Opening
+from pebble.transports.mqtt.client import Opening
+from pebble.transports.mqtt.client_kinds import AnyClient, client_class
 from pebble.transports.mqtt.ending import Absent, Lost, Refused, Silent
 from pebble.transports.mqtt.incoming import OVERSLEPT_S, Incoming, Sink
-from pebble.transports.mqtt.outgoing import (
-    Backlog,
-    InFlightTable,
-    PendingAck,
-    shortest_round_trip_s,
-    unconfirmed_bytes,
-)
+from pebble.transports.mqtt.outgoing import Backlog, InFlightTable, PendingAck, shortest_round_trip_s, unconfirmed_bytes
 from pebble.transports.mqtt.packets import Filter
 from pebble.transports.mqtt.poll import SocketPoll
 from pebble.transports.mqtt.suspects import Written
@@ -376,18 +368,3 @@ class Connection:
             if not (ending.may_concern_message or (self._client.hung_up and not ending.reason)):
                 return None
             return self._in_flight.first_written(clock.since_boot())
-
-
-def client_class(name: str) -> type[AnyClient]:
-    """The client of this name in the settings. Raises TransportError."""
-    if name == "pebble":
-        return Client
-    if name != "paho":
-        raise TransportError(f'client must be "pebble" or "paho", not "{name}"')
-    try:
-        from pebble.transports.mqtt.paho_client import PahoClient
-    except ModuleNotFoundError as error:
-        raise TransportError(
-            f'"client": "paho" needs a package that is missing ({error}): pip install paho-mqtt, or leave out "client"'
-        ) from None
-    return PahoClient

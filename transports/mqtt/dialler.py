@@ -1,7 +1,5 @@
 """Makes the connections to one broker: at the address whose turn it is, in a way that this broker accepts."""
 
-from __future__ import annotations
-
 import threading
 import time
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Why a connection to an MQTT broker is not made, or ends."""
 
-from __future__ import annotations
-
 from pebble.transports.mqtt import reasons
 from pebble.transports.mqtt.bridge_mode import Result
 from pebble.transports.settings import MqttSettings

@@ -5,8 +5,6 @@ bridge mode does for retained messages only. Overlapping filters are therefore m
 messages that it matches in excess are sorted out by exact matching on arrival.
 """
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterable, Iterator
 from hashlib import blake2b

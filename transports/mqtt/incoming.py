@@ -1,7 +1,5 @@
 """What a broker sends on one MQTT connection: read in batches, and made into messages that have an age."""
 
-from __future__ import annotations
-
 import logging
 from typing import Protocol
 
@@ -9,7 +7,7 @@ from pebble.transports import clock
 from pebble.transports.base import Message, QoS
 from pebble.transports.counters import Counters
 from pebble.transports.mqtt import reasons
-from pebble.transports.mqtt.client import AnyClient
+from pebble.transports.mqtt.client_kinds import AnyClient
 from pebble.transports.mqtt.ending import Ending, Lost, Silent
 from pebble.transports.mqtt.outgoing import InFlightTable
 from pebble.transports.mqtt.packets import ANY_QOS, RETAIN, Accepted, MalformedError

@@ -3,8 +3,6 @@
 Neither class is locked: their connection is.
 """
 
-from __future__ import annotations
-
 import itertools
 import socket
 import struct

@@ -3,8 +3,6 @@
 Sources are MQTT 3.1.1 and MQTT 5.0 (OASIS), chapters 2 and 3 of each. ``modern`` is version 5.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Iterable
 from dataclasses import dataclass

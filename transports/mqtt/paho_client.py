@@ -3,8 +3,6 @@
 It costs about half as much again in processor time, and 5 MB.
 """
 
-from __future__ import annotations
-
 import socket
 import ssl
 from collections.abc import Iterable
@@ -33,9 +31,6 @@ class _Paho(paho.Client):
     address: Address
     ahead = b""  # was taken out of the socket; `begin` of it was read
     begin = 0
-
-    def send_ping(self) -> None:
-        self._send_pingreq()
 
     @property
     def unwritten(self) -> int:
@@ -210,7 +205,7 @@ class PahoClient:
         return sent[1] or 0  # 0: lost; no answer will have it
 
     def ping(self) -> None:
-        self._paho.send_ping()
+        self._paho._send_pingreq()
         self.write()
 
     def disconnect(self) -> None:

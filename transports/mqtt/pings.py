@@ -1,12 +1,10 @@
 """The pings of one MQTT connection: answers show that the broker lives, how far it has read, and how late it is."""
 
-from __future__ import annotations
-
 import random
 from math import inf
 
 from pebble.transports import clock
-from pebble.transports.mqtt.client import AnyClient
+from pebble.transports.mqtt.client_kinds import AnyClient
 from pebble.transports.mqtt.outgoing import InFlightTable, PendingAck, unconfirmed_bytes
 from pebble.transports.mqtt.read_age import ReadAge
 from pebble.transports.settings import MqttSettings

@@ -1,7 +1,5 @@
 """Waiting for a socket, from which other threads can wake the one that waits."""
 
-from __future__ import annotations
-
 import select
 import socket
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """Since when what is read may have waited (T19): in the kernel, which does not say when it came, or at the broker."""
 
-from __future__ import annotations
-
 import socket
 import sys
 from collections import deque

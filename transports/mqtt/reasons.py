@@ -1,7 +1,5 @@
 """The reason codes of MQTT in words (MQTT 3.1.1, 3.2.2.3; MQTT 5.0, 2.4)."""
 
-from __future__ import annotations
-
 from typing import Final
 
 FAILURE: Final = 0x80  # MQTT 5: this code and those above are errors

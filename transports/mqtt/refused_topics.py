@@ -1,7 +1,5 @@
 """Topics on which a broker takes no messages: it says so, or it hangs up on them."""
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Iterator, Mapping

@@ -1,7 +1,5 @@
 """Asks a broker once which of our own retained messages it has: nothing else shows what it silently drops."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection
 from math import inf
 

@@ -5,8 +5,6 @@ reason. Links lose connections as well. So a topic is withheld only after severa
 written, and is given up only when its next message, alone and on a connection that has held without it, ends that too.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from enum import Enum

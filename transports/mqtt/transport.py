@@ -12,7 +12,8 @@ from math import ceil
 from pebble.errors import TransportError
 from pebble.transports import clock
 from pebble.transports.base import Message, Outgoing, QoS, State, Subscription, Transport
-from pebble.transports.mqtt.connection import Connection, client_class, ignore
+from pebble.transports.mqtt.client_kinds import client_class
+from pebble.transports.mqtt.connection import Connection, ignore
 from pebble.transports.mqtt.dialler import Dialler
 from pebble.transports.mqtt.ending import Lost, Silent
 from pebble.transports.mqtt.filters import BrokerFilters, OwnMessageFilter, overlap
@@ -353,11 +354,7 @@ class MqttTransport(Transport):
         return connection.takes(message) and self._refused.suspects.accepts(message)
 
     def _await(
-        self,
-        connection: Connection,
-        ack: PendingAck,
-        stopping: _Stop,
-        receive: Callable[[list[Message]], None],
+        self, connection: Connection, ack: PendingAck, stopping: _Stop, receive: Callable[[list[Message]], None]
     ) -> None:
         asked_at = clock.since_boot()
         while not ack.done:

@@ -4,8 +4,6 @@ Processes that share a boot share a clock that counts since that boot. Of anothe
 fastest recent message took almost no time, so a message that took longer has waited somewhere.
 """
 
-from __future__ import annotations
-
 import threading
 from dataclasses import dataclass
 

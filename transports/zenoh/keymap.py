@@ -6,8 +6,6 @@ starts with ``@`` is escaped, and a first level that starts with ``$`` *becomes*
 skip it. Ordinary topics map to themselves.
 """
 
-from __future__ import annotations
-
 import re
 
 from pebble.transports.topics import remembered
@@ -33,7 +31,8 @@ def filter_to_key(filter_: str) -> str:
 @remembered
 def key_to_topic(key: str) -> str:
     """The topic that ``topic_to_key`` made ``key`` from."""
-    return "/".join("" if chunk == _EMPTY else _unescape(chunk) for chunk in key.removeprefix("@").split("/"))
+    chunks = ("" if chunk == _EMPTY else chunk for chunk in key.removeprefix("@").split("/"))
+    return "/".join(_ESCAPE.sub(lambda found: chr(int(found.group(1), 16)), chunk) for chunk in chunks)
 
 
 def _join(levels: list[str]) -> str:
@@ -47,7 +46,3 @@ def _level(level: str) -> str:
         return _EMPTY
     escaped = _FORBIDDEN.sub(lambda found: f"%{ord(found.group()):02X}", level)
     return "%40" + escaped[1:] if escaped.startswith("@") else escaped
-
-
-def _unescape(chunk: str) -> str:
-    return _ESCAPE.sub(lambda found: chr(int(found.group(1), 16)), chunk)

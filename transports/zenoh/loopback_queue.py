@@ -1,7 +1,5 @@
 """A transport's own messages on the way to its own direct handlers."""
 
-from __future__ import annotations
-
 import threading
 
 from pebble.transports.base import QUEUE_BYTES, QUEUE_LIMIT, Message, Subscription

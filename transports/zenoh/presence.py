@@ -168,7 +168,6 @@ class Siblings:
         self._expected: Callable[[], dict[str, str]] = dict
 
     def register(self, owner: str) -> PresenceLock:
-        """Add this process."""
         return self._registry.register(owner)
 
     def sockets(self, *, but: str) -> list[Path]:

@@ -1,7 +1,5 @@
 """Sends the live messages of one client."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from typing import TypeVar

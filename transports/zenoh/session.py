@@ -4,8 +4,6 @@ Zenoh's defaults are not used: they listen on all interfaces and join multicast 
 docs/transports.md.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -121,7 +121,8 @@ class ZenohTransport(Transport):
                 session = open_session(config)
             except zenoh.ZError as error:
                 log.debug("%s: %s", self.client_id, error)
-                self.problem = f"no hub answers at {_hub_addresses(self.settings)}"
+                hubs = ", ".join(self.settings.connect) or self.settings.run_dir / HUB_SOCKET
+                self.problem = f"no hub answers at {hubs}"
                 self._hub.watch.wait_closed(_RETRY_S)
                 continue
             if self._begin(session, new_name()):
@@ -382,11 +383,6 @@ class ZenohTransport(Transport):
         self.counters.add("late")
         log.debug("%s: a message of %s was %.1f s late and is dropped", self.client_id, sample.key_expr, age_s)
         return True
-
-
-def _hub_addresses(settings: ZenohSettings) -> str:
-    """The addresses of a client's hub, for error texts."""
-    return ", ".join(settings.connect) or str(settings.run_dir / HUB_SOCKET)
 
 
 TRANSPORT = ZenohTransport

@@ -1,7 +1,5 @@
 """Which encoding a robot is requested to send, one for all its viewers. Pure: times are passed in."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Sequence
 from typing import Final
 

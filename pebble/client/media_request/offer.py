@@ -1,7 +1,5 @@
 """What of a robot's pictures and sound may be requested, by its capabilities. Pure."""
 
-from __future__ import annotations
-
 from typing import Any, Final, NamedTuple
 
 from pebble.client.robot_topics import FLAGS, names

@@ -5,8 +5,6 @@ connection shows what happened seconds ago. A difference is of no use without al
 so where one is left out, all are until the next key frame.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Collection
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """One robot's pictures or sound, requested while they are wanted and a while longer, however many want them."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import logging

@@ -24,13 +24,8 @@ _QUIET_S: Final = 2.0  # before progress is shown
 
 Places = Annotated[list[Path], typer.Argument(help="Recordings, or folders of them.", metavar="DIR|FILE")]
 Robots = Annotated[
-    list[str] | None,
-    typer.Option("--robot", "-r", help="Only this one; may be repeated.", metavar="[SYSTEM/TYPE/]ID"),
+    list[str] | None, typer.Option("--robot", "-r", help="Only this one; may be repeated.", metavar="[SYSTEM/TYPE/]ID")
 ]
-
-
-def register(app: typer.Typer) -> None:
-    app.command("analyse")(analyse)
 
 
 def analyse(

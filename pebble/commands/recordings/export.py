@@ -1,7 +1,5 @@
 """``pebble recordings`` export and import: recordings in the formats of other programs."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """``pebble recordings``: lists, searches, mends, exports and deletes recordings."""
 
-from __future__ import annotations
-
 import typer
 
 from pebble.commands.recordings.export import export, import_

@@ -1,7 +1,5 @@
 """``pebble recordings`` list, info and search: what there is, and what was recorded."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from pathlib import Path

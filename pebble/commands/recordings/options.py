@@ -1,7 +1,5 @@
 """Arguments and options that commands for recordings share."""
 
-from __future__ import annotations
-
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated

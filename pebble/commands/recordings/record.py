@@ -1,14 +1,13 @@
 """``pebble record``: records what robots and operators publish."""
 
-from __future__ import annotations
-
 import logging
+import re
 import sys
 import time
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 import typer
 
@@ -22,7 +21,6 @@ from pebble.recordings.recorder import metrics
 from pebble.recordings.recorder.recorder import Recorder
 from pebble.recordings.recorder.settings import EVERYTHING, Connection, Options, Settings, load
 from pebble.recordings.recorder.source import Source
-from pebble.recordings.units import seconds, size
 from pebble.runtime.signals import interrupted_by_signals
 from pebble.transports import MqttSettings
 from pebble.transports.topics import check_filter
@@ -30,6 +28,9 @@ from pebble.transports.topics import check_filter
 _TURN_S = 0.25
 _LINE_S = 1.0
 _METRICS_S = 10.0
+_SECONDS: Final = {"": 1, "s": 1, "min": 60, "m": 60, "h": 3600, "d": 86_400}
+_BYTES: Final = {"": 1, "k": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
+_NUMBER: Final = re.compile(r"(\d+(?:\.\d+)?)\s*([A-Za-z]*)")
 
 
 @with_target(program="record")
@@ -86,10 +87,6 @@ def record(
         check_filter(filter_)
     connection = (kind, _modern(transport, protocol), chosen, "", where)
     return _run(into or Path("recordings"), options, [connection], length=length)
-
-
-def register(app: typer.Typer) -> None:
-    app.command("record")(record)
 
 
 _Connection = tuple[str, Any, tuple[str, ...], str, str]
@@ -206,3 +203,21 @@ def _print_end(recorder: Recorder, into: Path) -> None:
         f"{len(recorder.robots)} robots{lost}; `pebble recordings info {into}` shows them",
         err=True,
     )
+
+
+def seconds(text: str) -> float:
+    """Raises PebbleError."""
+    return _value(text, _SECONDS, "a duration: 30s, 10min, 1h or 7d")
+
+
+def size(text: str) -> int:
+    """The size in bytes. Raises PebbleError."""
+    return int(_value(text.removesuffix("B"), _BYTES, "a size: 64M, 2G or 1T"))
+
+
+def _value(text: str, units: dict[str, int], form: str) -> float:
+    match = _NUMBER.fullmatch(text.strip())
+    unit = units.get(match[2]) if match else None
+    if match is None or unit is None:
+        raise PebbleError(f'"{text}" is not {form}')
+    return float(match[1]) * unit

@@ -16,8 +16,8 @@ from typing import Annotated
 import typer
 
 from pebble.client.connection import password
-from pebble.client.key_decoder import END, LEFT, RIGHT, SPACE
 from pebble.client.names import id_of
+from pebble.client.terminal.key_decoder import END, LEFT, RIGHT, SPACE
 from pebble.client.url import settings_of
 from pebble.commands.options import CaCert, PasswordFile
 from pebble.commands.recordings.options import Since, Until, period
@@ -32,6 +32,7 @@ from pebble.recordings.replay.player import Player
 from pebble.recordings.replay.robots import Make, ReplayedRobots
 from pebble.recordings.replay.rules import SYSTEM, Options, Rules
 from pebble.recordings.replay.source import ReplaySource
+from pebble.runtime.signals import handled_by
 from pebble.transports import Message, Transport, create
 from pebble.transports.topics import matches
 
@@ -41,8 +42,7 @@ _FASTER = 2.0
 _WITH_COMMANDS = 1.0  # the lowest speed: a drive command moves a robot until the next one
 
 RecordingsArgument = Annotated[
-    list[Path],
-    typer.Argument(help="Recordings, or folders of them.", metavar="FILE|FOLDER…", show_default=False),
+    list[Path], typer.Argument(help="Recordings, or folders of them.", metavar="FILE|FOLDER…", show_default=False)
 ]
 UrlOption = Annotated[
     str, typer.Option(help="mqtt://[USER@]HOST[:PORT], mqtts://… or zenoh:RUN_DIR.", metavar="URL", show_default=False)
@@ -132,10 +132,6 @@ def replay(
     return unread if console.ended in ("", "SIGINT", END) else 1
 
 
-def register(app: typer.Typer) -> None:
-    app.command("replay")(replay)
-
-
 def _check(options: Options, base: str | None, url: str, speed: float, *, paused: bool) -> None:
     same = options.system is None
     if same and base is not None:
@@ -175,7 +171,7 @@ def _play(console: _Console, make: Make, bases: list[str], make_player: Callable
     """Play to the end, for these robots. Raises ReplayError and TransportError."""
     terminal = _has_terminal()
     with ExitStack() as stack:
-        stack.enter_context(console.noting_signals())
+        stack.enter_context(handled_by(console.on_signal))
         robots = ReplayedRobots(make, bases, now=time.monotonic, wall_ms=_wall_ms, wait=console.listen)
         player = make_player(stack.enter_context(robots).publish)
         typer.echo(f"{', '.join(map(shown, bases))}{': ' + _KEYS if terminal else ''}")
@@ -234,19 +230,8 @@ class _Console:
             player.stop()
 
     @contextmanager
-    def noting_signals(self) -> Iterator[None]:
-        """Signals end the replay; until all is cleaned up no further one ends this process."""
-        numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-        before = {number: signal.signal(number, self._on_signal) for number in numbers}
-        try:
-            yield
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
-
-    @contextmanager
     def keys(self) -> Iterator[None]:
-        from pebble.client.terminal_keys import opened
+        from pebble.client.terminal.keys import opened
 
         with opened() as terminal:
             self._loop = TerminalLoop(terminal, time.monotonic)
@@ -285,7 +270,8 @@ class _Console:
             self._problem = problem
             typer.echo(f"pebble: {shown(problem) or 'it goes on'}", err=True)
 
-    def _on_signal(self, number: int, _frame: object) -> None:
+    def on_signal(self, number: int, _frame: object) -> None:
+        """Signals end the replay; until all is cleaned up no further one ends this process."""
         self.ended = self.ended or signal.Signals(number).name
 
     def _press(self, key: str, player: Player) -> None:

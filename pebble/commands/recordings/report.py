@@ -1,7 +1,5 @@
 """Lines that commands for recordings print: times, what could not be read, and what was left as it is."""
 
-from __future__ import annotations
-
 from datetime import UTC, datetime
 
 import typer

@@ -4,8 +4,6 @@ Each robot has a ring of samples. A sample has a checksum: whatever a reader cat
 the oldest of the ring. So readers never wait, and nothing depends on the order in which a CPU makes writes visible.
 """
 
-from __future__ import annotations
-
 import fcntl
 import hashlib
 import mmap

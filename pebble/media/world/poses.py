@@ -1,7 +1,5 @@
 """Where a robot was during the last second, and at any moment in between."""
 
-from __future__ import annotations
-
 import math
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence

@@ -3,8 +3,6 @@
 All surfaces are upright and the camera is level, so what hides what is decided in the plan, seen from above.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any, Final, TypeAlias
@@ -147,7 +145,9 @@ class Renderer:
         if x0 >= x1 or y0 >= y1:
             return
         area = (columns[1] - columns[0]) * (rows[:, 1] - rows[:, 0]).mean()
-        texture = _sized(surface.textures, area * self._share(surface, plan))
+        area *= self._share(surface, plan)
+        fine = [texture for texture in surface.textures if texture.shape[0] * texture.shape[1] >= area]
+        texture = fine[-1] if fine else surface.textures[0]  # the smallest that is not enlarged
         size = len(texture)
         whole = self._to_camera(np.array((surface.left, surface.right)), me)
         (ahead, beside), (ahead2, beside2) = whole
@@ -224,12 +224,6 @@ def _covers(plan: _Floats, layers: NDArray[np.int_], columns: _Floats) -> NDArra
     covers = (sure & ~sure.T) | (one_plane & one_plane.T & (layers[:, None] > layers))
     overlap = (columns[:, None, 0] < columns[:, 1]) & (columns[:, 0] < columns[:, None, 1])
     return np.asarray(covers & overlap & ~np.eye(len(plan), dtype=bool))
-
-
-def _sized(textures: tuple[Image, ...], area_px: float) -> Image:
-    """The smallest texture that is not enlarged."""
-    fine = [texture for texture in textures if texture.shape[0] * texture.shape[1] >= area_px]
-    return fine[-1] if fine else textures[0]
 
 
 def _floor(world: World) -> tuple[Image, _Floats]:

@@ -1,7 +1,5 @@
 """The upright surfaces of a world: walls, tags and robots, as the renderer draws them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Any, Final, NamedTuple, TypeAlias

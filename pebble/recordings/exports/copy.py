@@ -1,7 +1,5 @@
 """Exports a stretch as a recording of its own."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import BinaryIO, Final

@@ -1,7 +1,5 @@
 """One robot's pictures and sound as a film, or its sound alone: each where its capture stamp says, on one clock."""
 
-from __future__ import annotations
-
 import heapq
 import tempfile
 from collections.abc import Iterable, Iterator
@@ -80,12 +78,7 @@ def write_film(
 
 
 def write_wav(
-    messages: Iterable[Recorded],
-    target: Path,
-    robot: str,
-    *,
-    overwrite: bool = False,
-    on_time: Progress | None = None,
+    messages: Iterable[Recorded], target: Path, robot: str, *, overwrite: bool = False, on_time: Progress | None = None
 ) -> SoundResult:
     """Write the sound of ``robot`` (its base) to ``target``, from its first sample on. Raises RecordingError."""
     clock = FilmClock()

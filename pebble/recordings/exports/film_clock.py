@@ -1,7 +1,5 @@
 """When a picture or a piece of sound belongs into a film, by its capture stamp."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final

@@ -3,8 +3,6 @@
 ``foxglove_messages`` says what becomes of which topic; other JSON stays on its topic as it is.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path

@@ -13,18 +13,8 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import msgspec
 
-from pebble.contract import (
-    APRILTAG_DATA,
-    APRILTAG_LOCATIONS,
-    INCOMING,
-    LOCALIZATION_POSE,
-    LOGS,
-    OUTGOING,
-    VIDEO_OVERLAYS,
-    WHEEL_ODOMETRY,
-    Channel,
-    codec,
-)
+from pebble import contract as c
+from pebble.contract import codec
 from pebble.contract.channels import channel_of
 from pebble.contract.packets import PBAT, PBVD, Picture, PictureKind
 from pebble.contract.payloads import Corners, LogRecord, TagData, TagLocations, VideoOverlays
@@ -72,7 +62,6 @@ class Schemas:
             ) from None
 
     def make(self, schema: str, /, **fields: Any) -> Any:
-        """A message of ``schema``."""
         return getattr(importlib.import_module(f"foxglove_schemas_protobuf.{schema}_pb2"), schema)(**fields)
 
     def descriptors(self, message: Any) -> bytes:
@@ -159,19 +148,19 @@ class Telemetry:
 
     def __init__(self, schemas: Schemas) -> None:
         self._make = schemas.make
-        self._converters: dict[Channel, Callable[[str, bytes], Converted | None]] = {
-            LOGS: self._log,
-            WHEEL_ODOMETRY: self._odometry,
-            LOCALIZATION_POSE: self._localization,
-            APRILTAG_LOCATIONS: self._tags,
-            APRILTAG_DATA: self._followed,
-            VIDEO_OVERLAYS: self._overlays,
+        self._converters: dict[c.Channel, Callable[[str, bytes], Converted | None]] = {
+            c.LOGS: self._log,
+            c.WHEEL_ODOMETRY: self._odometry,
+            c.LOCALIZATION_POSE: self._localization,
+            c.APRILTAG_LOCATIONS: self._tags,
+            c.APRILTAG_DATA: self._followed,
+            c.VIDEO_OVERLAYS: self._overlays,
         }
 
     def convert(self, topic: str, payload: bytes) -> Converted | None:
         """None for a payload that is to stay as it is, also if it is not what its channel has."""
         levels = topic.split("/", 3)
-        channel = channel_of(levels[3]) if len(levels) == 4 and levels[3].startswith((INCOMING, OUTGOING)) else None
+        channel = channel_of(levels[3]) if len(levels) == 4 and levels[3].startswith((c.INCOMING, c.OUTGOING)) else None
         convert = None if channel is None else self._converters.get(channel)
         if convert is None:
             return None
@@ -181,13 +170,13 @@ class Telemetry:
             return None
 
     def _log(self, _topic: str, payload: bytes) -> Converted:
-        record: LogRecord = codec.decode(LOGS, payload)
+        record: LogRecord = codec.decode(c.LOGS, payload)
         level = _LEVELS.get(record.level.upper(), 0)
         return Converted(self._make("Log", level=level, message=record.message, name=record.service), "log")
 
     def _odometry(self, topic: str, payload: bytes) -> Converted | None:
         """Some robots have metres, and other names (paper A.8.12)."""
-        odometry = codec.decode(WHEEL_ODOMETRY, payload)
+        odometry = codec.decode(c.WHEEL_ODOMETRY, payload)
         value, per_metre = odometry.value, 1.0 if odometry.unit == "m" else _MILLIMETRES
         x, y = (_number(value, f"{axis}_mm", axis) for axis in "xy")
         if x is None or y is None:
@@ -198,7 +187,7 @@ class Telemetry:
 
     def _localization(self, _topic: str, payload: bytes) -> Converted | None:
         """The pose of a ROS robot: metres and radians in the frame that it names."""
-        pose = codec.plain(LOCALIZATION_POSE, payload)
+        pose = codec.plain(c.LOCALIZATION_POSE, payload)
         value = pose.get("value", pose) if isinstance(pose, dict) else None
         if not isinstance(value, dict):
             return None
@@ -216,7 +205,7 @@ class Telemetry:
         return pose
 
     def _tags(self, _topic: str, payload: bytes) -> Converted:
-        tags: TagLocations = codec.decode(APRILTAG_LOCATIONS, payload)
+        tags: TagLocations = codec.decode(c.APRILTAG_LOCATIONS, payload)
         drawn = _Drawing(self._make("ImageAnnotations"), tags.frame_width, tags.frame_height)
         for tag in tags.detections:
             drawn.outline(tag.corners_norm, _LINE_LOOP)
@@ -225,7 +214,7 @@ class Telemetry:
 
     def _followed(self, topic: str, payload: bytes) -> Converted:
         """The tag that is followed, as a box around the robot: x ahead, y to the left. Empty while it is not seen."""
-        tag: TagData = codec.decode(APRILTAG_DATA, payload)
+        tag: TagData = codec.decode(c.APRILTAG_DATA, payload)
         scene = self._make("SceneUpdate")
         if tag.detected and tag.distance_m is not None and tag.angle_rad is not None:
             x, y = tag.distance_m * math.cos(tag.angle_rad), -tag.distance_m * math.sin(tag.angle_rad)
@@ -241,7 +230,7 @@ class Telemetry:
         return Converted(scene, "scene", beside=True)
 
     def _overlays(self, _topic: str, payload: bytes) -> Converted:
-        overlays: VideoOverlays = codec.decode(VIDEO_OVERLAYS, payload)
+        overlays: VideoOverlays = codec.decode(c.VIDEO_OVERLAYS, payload)
         drawn = _Drawing(self._make("ImageAnnotations"), overlays.frame_width, overlays.frame_height)
         for shape in overlays.shapes:
             drawn.outline(shape, _LINE_STRIP)

@@ -6,8 +6,6 @@ cuts payloads at 8192 bytes unless asked otherwise. We add ``retained``: the log
 messages that are from before them only, ours as they were published.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from datetime import UTC, datetime, timedelta
 from decimal import Decimal

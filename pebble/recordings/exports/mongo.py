@@ -5,8 +5,6 @@ stores a message as ``{ts, topic, qos, retain, payload, payload_size, payload_tr
 payload; ``retained`` is ours, see ``pebble.recordings.exports.lines``. A date of BSON has milliseconds.
 """
 
-from __future__ import annotations
-
 import gzip
 import importlib
 import struct

@@ -1,7 +1,5 @@
 """A file that is there when it is whole."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager

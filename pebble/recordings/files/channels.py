@@ -1,7 +1,5 @@
 """The channels of a file, bounded: a stranger may invent topics."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Hashable, Mapping
 from typing import Final

@@ -331,7 +331,6 @@ def summary_of(data: Any) -> tuple[int, bytes] | None:
 
 
 def chunk(records: bytes, start_ns: int, end_ns: int, packer: Packer) -> bytes:
-    """A chunk of records."""
     packed = packer.pack(records)
     head = CHUNK.pack(start_ns, end_ns, len(records), zlib.crc32(records))
     return record(Op.CHUNK, head + _text(packer.name) + _U64.pack(len(packed)) + packed)

@@ -3,8 +3,6 @@
 Readers of files that are not finished share a lock; finishing waits for them.
 """
 
-from __future__ import annotations
-
 import errno
 import time
 from pathlib import Path

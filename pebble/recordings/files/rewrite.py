@@ -1,7 +1,5 @@
 """Copies recordings: what can be read of a damaged one, in larger chunks, or without some of the messages."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from collections.abc import Callable, Container

@@ -1,7 +1,5 @@
 """Finds the records of a file in any state: cut off, with damaged bytes or zeros anywhere. Pure."""
 
-from __future__ import annotations
-
 import re
 import zlib
 from collections.abc import Iterator

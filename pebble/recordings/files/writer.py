@@ -1,7 +1,5 @@
 """Writes an MCAP file so that a process that is killed loses what it has not flushed, and nothing else. Pure."""
 
-from __future__ import annotations
-
 import secrets
 import zlib
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """What a recorder does beside writing: makes files durable, and finishes them."""
 
-from __future__ import annotations
-
 import logging
 import os
 import threading

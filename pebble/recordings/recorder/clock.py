@@ -1,7 +1,5 @@
 """Times of received messages: wall time that follows jumps of the clock only where the recorder says so. Pure."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Final
 

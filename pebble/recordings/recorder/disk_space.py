@@ -1,7 +1,5 @@
 """Which recordings make room for new ones. Pure."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 

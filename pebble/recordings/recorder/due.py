@@ -1,7 +1,5 @@
 """What is to be done again after some time. Pure."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 

@@ -1,7 +1,5 @@
 """Writes down what happens to the recording itself, between the messages that are recorded."""
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Finishes files beside the writer: complete ones, and what a killed recorder or a full disk has left."""
 
-from __future__ import annotations
-
 import logging
 import subprocess
 import sys
@@ -31,7 +29,6 @@ class Finisher:
         self._unfinished: set[Path] = set()
 
     def finish(self, file: OpenFile) -> None:
-        """Finish a file that is complete."""
         self._background.do(partial(self._finish, file))
 
     def mend(self, path: Path) -> None:

@@ -1,7 +1,5 @@
 """The folder of recordings: names and numbers of its files, its lock, and what may be deleted. One recorder uses it."""
 
-from __future__ import annotations
-
 import errno
 import os
 import re

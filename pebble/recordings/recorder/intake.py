@@ -1,7 +1,5 @@
 """What waits to be written into files."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import Counter, deque

@@ -1,7 +1,5 @@
 """One row of files: the state of all robots, or the pictures and sound of one."""
 
-from __future__ import annotations
-
 import os
 import re
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """What a recorder does, as numbers: for node_exporter's textfile collector, and for ``pebble recordings list``."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,18 +1,47 @@
 """The files that a recorder writes at present: one for each lane."""
 
-from __future__ import annotations
-
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Final
 
 from pebble.recordings.files.mcap import Packer
 from pebble.recordings.recorder.folder import STATE, Folder
-from pebble.recordings.recorder.lane import OTHER_MEDIA, Item, OpenFile, lane_of
-from pebble.recordings.recorder.retained import RetainedValues
+from pebble.recordings.recorder.lane import CARRIED, OTHER_MEDIA, Item, OpenFile, lane_of
 from pebble.recordings.stamps import is_media
+from pebble.transports.bounds import BoundedTable
 
 _MOST_MEDIA: Final = 32  # lanes
+_TOPICS, _BYTES = 10_000, 16 << 20
+
+
+class RetainedValues:
+    """The retained values at this moment, by connection and topic: a new file begins with them."""
+
+    def __init__(self) -> None:
+        self._values = BoundedTable[Item](_TOPICS, _BYTES, lambda item: len(item.payload))
+
+    def note(self, item: Item) -> None:
+        """A message. Where the broker hides how it was published, a topic that is known to be retained stays so."""
+        key = f"{item.source} {item.topic}"
+        known = self._values.get(key)
+        if item.retained and known is not None and not known.retained:
+            return  # fetched by another connection, while a newer one had come
+        if not item.retain and not (item.retain is None and known is not None):
+            return
+        if item.payload:
+            self._values[key] = item._replace(retain=True)
+        else:
+            self._values.pop(key, None)
+
+    def forget(self, source: str) -> None:
+        """They are fetched anew."""
+        for key in [key for key in self._values if key.startswith(f"{source} ")]:
+            del self._values[key]
+
+    def carried(self) -> Iterator[Item]:
+        """What a new file begins with."""
+        for item in list(self._values.values()):
+            yield item._replace(retained=CARRIED)
 
 
 class OpenFiles:

@@ -4,8 +4,6 @@ Whatever happens to the disk, nothing here waits for it but those two threads: t
 sound before state, and every message that is lost is counted, and written down as soon as there is room.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import threading
@@ -102,7 +100,6 @@ class Recorder:
 
     @property
     def alive(self) -> bool:
-        """Whether its threads run."""
         return self._thread.is_alive() and self._background.alive
 
     @property

@@ -1,7 +1,5 @@
 """What a recorder records, and how: from the command line, or from a file of its own."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Any, Literal
 

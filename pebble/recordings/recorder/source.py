@@ -1,7 +1,5 @@
 """Where a recorder's messages come from: a broker, or a robot's local transport."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """What the recorder's writer thread does: messages into files, room for them, and what happens when there is none."""
 
-from __future__ import annotations
-
 import errno
 import logging
 import os

@@ -1,7 +1,5 @@
 """Notices a live robot that has the name of a replayed one, among the replay's own messages."""
 
-from __future__ import annotations
-
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from typing import Final

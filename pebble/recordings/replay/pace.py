@@ -1,7 +1,5 @@
 """The position in a recording that is played at some speed. Pure: the clock is passed in."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 SLOWEST, FASTEST = 0.1, 100.0

@@ -1,16 +1,12 @@
 """Publishes a recording again, in its order and at its pace. Pure: clocks, waiting and publishing are passed in."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Final
 
 from pebble.recordings.files.mcap import Recorded
 from pebble.recordings.library import FOREVER_NS
-from pebble.recordings.replay.output import Output
 from pebble.recordings.replay.pace import SLOWEST, Pace
-from pebble.recordings.replay.reading import Reading
-from pebble.recordings.replay.rules import Rules
+from pebble.recordings.replay.rules import Rules, zero
 from pebble.recordings.replay.source import ReplaySource
 from pebble.transports import Message
 
@@ -20,6 +16,68 @@ _RETRY_S: Final = 0.01  # after a message that was refused
 _TRIES: Final = 50  # for the last zero
 #: Later than this is made up by no burst of old messages: the recording goes on from where it is.
 _LATE_S: Final = 0.5
+
+
+class Output:
+    """Publishes recorded messages again, and a zero after those that move something.
+
+    ``publish`` returns False for what it cannot take now; ``wall_ns`` is the time since 1970.
+    """
+
+    def __init__(self, rules: Rules, publish: Callable[[Message], bool], wall_ns: Callable[[], int]) -> None:
+        self.sent = self.skipped = 0
+        self._rules, self._publish, self._wall_ns = rules, publish, wall_ns
+        self._moved: dict[str, None] = {}  # topics of drive commands without a zero after them
+
+    @property
+    def moves(self) -> bool:
+        """Whether something may be moving because of what was published."""
+        return bool(self._moved)
+
+    def send(self, message: Recorded, position_ns: int) -> bool:
+        """Whether it is done; a stamp was ``position_ns`` - stamp old then, and is as old now."""
+        found = self._rules.outgoing(message, self._wall_ns() - position_ns)
+        if found is None:
+            self.skipped += 1
+            return True
+        if not self._publish(found.message):
+            return False
+        self.sent += 1
+        if found.moves is not None:
+            self._moved.pop(found.message.topic, None)
+            if found.moves:
+                self._moved[found.message.topic] = None
+        return True
+
+    def halt(self) -> None:
+        """A zero after each drive command that moves. Without a connection the robot's own deadline has to do."""
+        self._moved = {topic: None for topic in self._moved if not self._publish(zero(topic))}
+
+
+class Reading:
+    """Where a replay is in its recording, in what is published; ``skipped`` counts the messages between."""
+
+    def __init__(self, source: ReplaySource, rules: Rules, until_ns: int) -> None:
+        self.next: Recorded | None = None
+        self.state: list[Recorded] = []  # to be sent before the next message, the last one first
+        self.skipped = 0
+        self._source, self._rules, self._until_ns = source, rules, until_ns
+        self._messages: Iterator[Recorded] = iter(())
+
+    def open(self, since_ns: int) -> None:
+        """Go on from another time, with the state and the pictures that a decoder needs by then."""
+        self._messages = self._source.messages(since_ns, self._until_ns)
+        self.state = self._source.state_before(since_ns, self._rules.publishes)[::-1] if since_ns else []
+        self.advance()
+
+    def advance(self) -> None:
+        """Find the next message that is published; those between take no time."""
+        for message in self._messages:
+            if self._rules.publishes(message.channel):
+                self.next = message
+                return
+            self.skipped += 1
+        self.next = None
 
 
 class Player:

@@ -5,8 +5,6 @@ for; nothing retained, unless asked for. Names of topics decide by the contract,
 of its direction.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
@@ -14,22 +12,9 @@ from typing import Any, Final, NamedTuple
 
 import msgspec
 
-from pebble.contract import (
-    AUDIO_STREAM,
-    BRIDGE_PROBE,
-    CAPABILITIES,
-    DRIVE,
-    HEARTBEAT,
-    INCOMING,
-    LIGHTS_FLASH,
-    LIGHTS_SOLID,
-    MCU_DESCRIBE,
-    ONLINE,
-    SOUNDBOARD_COMMAND,
-    channel_of,
-    codec,
-)
+from pebble import contract as c
 from pebble.contract import Channel as Declared
+from pebble.contract import channel_of, codec
 from pebble.contract.channels import is_reserved
 from pebble.contract.identity import Identity, ParsedTopic, parse_topic
 from pebble.contract.payloads import Drive
@@ -43,11 +28,11 @@ SYSTEM: Final = "replay"  # the first level of replayed topics, unless another o
 
 #: Commands whose effect ends by itself, or is visible at once. All others, and all that the contract does not know,
 #: are actions: they switch on cameras, mains and scripts, or move what no zero stops.
-_MILD: Final = frozenset({DRIVE, LIGHTS_SOLID, LIGHTS_FLASH, AUDIO_STREAM, SOUNDBOARD_COMMAND})
-_HEARTBEATS: Final = frozenset({ONLINE, HEARTBEAT})
+_MILD: Final = frozenset({c.DRIVE, c.LIGHTS_SOLID, c.LIGHTS_FLASH, c.AUDIO_STREAM, c.SOUNDBOARD_COMMAND})
+_HEARTBEATS: Final = frozenset({c.ONLINE, c.HEARTBEAT})
 _PROBE: Final = 24  # bytes of white space at the end of a payload by which bridges look for cycles
 _WATCHED: Final = frozenset({"video", "audio"})  # sections of capabilities that a viewer has to request
-_ZERO: Final = codec.encode(DRIVE, Drive(valid_ms=0))  # final: no script resumes after it
+_ZERO: Final = codec.encode(c.DRIVE, Drive(valid_ms=0))  # final: no script resumes after it
 
 
 class ReplayError(PebbleError):
@@ -101,7 +86,6 @@ class Rules:
             self._add(channel)
 
     def publishes(self, channel: Channel) -> bool:
-        """Whether messages of ``channel`` are published at all."""
         return self._listed(channel) is not None
 
     def outgoing(self, recorded: Recorded, by_ns: int) -> Outgoing | None:
@@ -110,11 +94,11 @@ class Rules:
         if address is None or _is_probe(recorded.payload):
             return None
         payload, moves = recorded.payload, None
-        if address.declared is DRIVE:
+        if address.declared is c.DRIVE:
             moves = self._moves(payload)
             if moves is None:
                 return None
-        if address.declared is CAPABILITIES and payload:
+        if address.declared is c.CAPABILITIES and payload:
             payload = self._capabilities(payload, address)
             if not payload:
                 return None
@@ -149,7 +133,7 @@ class Rules:
             check_topic(new)
         except TransportError:  # no transport of ours can have recorded it
             return None
-        keeps = self._options.retain and parsed.direction != INCOMING and declared not in _HEARTBEATS
+        keeps = self._options.retain and parsed.direction != c.INCOMING and declared not in _HEARTBEATS
         quality = QoS.LATEST if qos == "0" else QoS.DELIVERED
         return _Address(parsed.identity, identity.base, new, declared, quality, keeps and (retain or retained))
 
@@ -158,22 +142,22 @@ class Rules:
         return not only or any(matches(filter_, topic) for filter_ in only)
 
     def _allowed(self, parsed: ParsedTopic, declared: Declared | None, retained: bool) -> bool:
-        if parsed.direction != INCOMING:
+        if parsed.direction != c.INCOMING:
             return self._allowed_outgoing(parsed.metric, declared, retained)
         if retained or is_reserved(parsed.metric):  # stale; or who may stop and drive the robot, and who resets it
             return False
         return self._options.incoming and (self._options.actions or declared in _MILD)
 
     def _allowed_outgoing(self, metric: str, declared: Declared | None, retained: bool) -> bool:
-        if declared is BRIDGE_PROBE or (retained and declared in _HEARTBEATS):
+        if declared is c.BRIDGE_PROBE or (retained and declared in _HEARTBEATS):
             return False
         # In its own name a robot that is away must not appear free or stopped, nor claim a device.
-        return self._options.system is not None or not (is_reserved(metric) or declared is MCU_DESCRIBE)
+        return self._options.system is not None or not (is_reserved(metric) or declared is c.MCU_DESCRIBE)
 
     def _moves(self, payload: bytes) -> bool | None:
         """None for a command that is not to be sent: one that cannot be read, or a script's."""
         try:
-            command: Drive = codec.decode(DRIVE, payload)
+            command: Drive = codec.decode(c.DRIVE, payload)
         except PayloadError:
             return None
         # A script's number would bar the runs of the robot's own scripts.
@@ -185,7 +169,7 @@ class Rules:
         Pages publish to the topics that they find here: unchanged, they would drive the real robot.
         """
         try:
-            plain = codec.plain(CAPABILITIES, payload)
+            plain = codec.plain(c.CAPABILITIES, payload)
         except PayloadError:
             return b""
         if not isinstance(plain, dict) or not isinstance(plain.get("value"), dict):

@@ -81,7 +81,7 @@ class ReplaySource:
         return [
             path
             for path, covered, channels in self._files
-            if _overlaps(covered, since_ns, until_ns) and any(map(chooses, channels))
+            if covered.first_ns < until_ns and covered.last_ns >= since_ns and any(map(chooses, channels))
         ]
 
 

@@ -1,7 +1,5 @@
 """A folder of recordings, asked about one robot at one time: what was, what came, which picture was seen."""
 
-from __future__ import annotations
-
 import re
 import time
 from collections.abc import Iterator

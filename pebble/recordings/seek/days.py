@@ -1,7 +1,5 @@
 """The days of an archive, and what each holds, by the summaries of its files."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from contextlib import suppress

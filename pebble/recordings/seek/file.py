@@ -1,7 +1,5 @@
 """One recording that is read in any place: where its chunks are, and which channels each holds."""
 
-from __future__ import annotations
-
 import os
 import tempfile
 from collections import OrderedDict
@@ -221,7 +219,6 @@ class RecordingFile:
         return frozenset()
 
     def _declare(self, chunk: Chunk) -> None:
-        """Take the channels that a chunk declares."""
         try:
             records = self._unpack(chunk)
             for op, begin, end in mcap.records(records):

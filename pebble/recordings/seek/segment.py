@@ -1,7 +1,5 @@
 """A few seconds of one robot as bytes for a page: docs/web-messages.md, "Recordings"."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Iterable
 from enum import IntFlag

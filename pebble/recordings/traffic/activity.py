@@ -1,25 +1,12 @@
 """What a message shows about the use of a robot: it is driven, watched, plays a sound, runs a script. Pure."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from enum import IntEnum
 from typing import Final
 
+from pebble.contract import channels as c
 from pebble.contract import codec
-from pebble.contract.channels import (
-    AUDIO_CONTROL,
-    AUTONOMY_COMMAND,
-    DRIVE,
-    LIGHTS_FLASH,
-    LIGHTS_SOLID,
-    LOGS,
-    MQTT_AUDIO,
-    MQTT_VIDEO,
-    SOUNDBOARD_COMMAND,
-    VIDEO_CONTROL,
-)
 from pebble.errors import PayloadError
 
 
@@ -41,22 +28,22 @@ SESSION: Final = range(Activity.DRIVE, Activity.WARNING)
 _RESTING: Final = 0.02  # a stick that is let go shows up to this
 _WARNING: Final = re.compile(rb'"level"\s*:\s*"(?:WARN|ERR|CRIT)', re.IGNORECASE)
 _BY_SUFFIX: Final = {
-    LIGHTS_SOLID.suffix: Activity.LIGHTS,
-    LIGHTS_FLASH.suffix: Activity.LIGHTS,
-    VIDEO_CONTROL.suffix: Activity.MEDIA_REQUEST,
-    AUDIO_CONTROL.suffix: Activity.MEDIA_REQUEST,
-    MQTT_VIDEO.suffix: Activity.MEDIA_REQUEST,
-    MQTT_AUDIO.suffix: Activity.MEDIA_REQUEST,
-    SOUNDBOARD_COMMAND.suffix: Activity.SOUND,
-    AUTONOMY_COMMAND.suffix: Activity.AUTONOMY,
+    c.LIGHTS_SOLID.suffix: Activity.LIGHTS,
+    c.LIGHTS_FLASH.suffix: Activity.LIGHTS,
+    c.VIDEO_CONTROL.suffix: Activity.MEDIA_REQUEST,
+    c.AUDIO_CONTROL.suffix: Activity.MEDIA_REQUEST,
+    c.MQTT_VIDEO.suffix: Activity.MEDIA_REQUEST,
+    c.MQTT_AUDIO.suffix: Activity.MEDIA_REQUEST,
+    c.SOUNDBOARD_COMMAND.suffix: Activity.SOUND,
+    c.AUTONOMY_COMMAND.suffix: Activity.AUTONOMY,
 }
 
 
 def activity_of(suffix: str) -> Callable[[bytes], Activity]:
     """What the payloads of a topic show, by its part below the base (``incoming/drive-values``). Not for media."""
-    if suffix == DRIVE.suffix:
+    if suffix == c.DRIVE.suffix:
         return _drive
-    if suffix == LOGS.suffix:
+    if suffix == c.LOGS.suffix:
         return _log
     activity = _BY_SUFFIX.get(suffix, Activity.NONE)
     return lambda _payload: activity
@@ -64,7 +51,7 @@ def activity_of(suffix: str) -> Callable[[bytes], Activity]:
 
 def _drive(payload: bytes) -> Activity:
     try:
-        wanted = codec.decode(DRIVE, payload)
+        wanted = codec.decode(c.DRIVE, payload)
     except PayloadError:
         return Activity.NONE
     moves = max(abs(wanted.x), abs(wanted.y), abs(wanted.z)) > _RESTING

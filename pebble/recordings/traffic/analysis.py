@@ -1,7 +1,5 @@
 """Analyses the traffic of recordings by their index, one robot after the other."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final

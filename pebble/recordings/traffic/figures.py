@@ -76,7 +76,8 @@ def draw_outages(axes: Axes, robot: RobotTraffic) -> None:
     }
     used = [(cause, label, colour) for cause, label, colour in _CAUSES if lengths[cause]]
     if not used:
-        _draw_nothing(axes, "no outage")
+        axes.set_axis_off()
+        axes.text(0.5, 0.5, "no outage", ha="center", va="center", transform=axes.transAxes, color="#555")
         return
     counts = axes.hist(
         [lengths[cause] for cause, _, _ in used], bins=edges, stacked=True, color=[colour for _, _, colour in used],
@@ -163,11 +164,6 @@ def draw_bandwidth(axes: Axes, shown: Sequence[Bandwidth]) -> None:
 def _legend(axes: Axes) -> None:
     """Above the drawing, where it hides nothing."""
     axes.legend(frameon=False, fontsize=8, loc="lower left", bbox_to_anchor=(0, 1), ncols=2, borderaxespad=0.2)
-
-
-def _draw_nothing(axes: Axes, text: str) -> None:
-    axes.set_axis_off()
-    axes.text(0.5, 0.5, text, ha="center", va="center", transform=axes.transAxes, color="#555")
 
 
 def _scale_counts(axes: Axes, counts: Sequence[float]) -> None:

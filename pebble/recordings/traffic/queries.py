@@ -7,37 +7,12 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from pebble.contract.channels import (
-    AUDIO,
-    AUTONOMY_FILES,
-    CAMERA,
-    DRIVE,
-    HEARTBEAT,
-    LOGS,
-    MEDIA_STATUS,
-    ONLINE,
-    OUTGOING,
-    SOUNDBOARD_FILES,
-)
+from pebble.contract import channels as c
 from pebble.recordings import media_numbers
 from pebble.recordings.library import FOREVER_NS
 from pebble.recordings.traffic import results as traffic
 from pebble.recordings.traffic.activity import SESSION, Activity
 from pebble.recordings.traffic.duck import parquet
-from pebble.recordings.traffic.results import (
-    LARGEST_LATENCY_S,
-    OFFLINE_AFTER_S,
-    OUTAGE_FACTOR,
-    SESSION_GAP_S,
-    SESSION_MARGIN_S,
-    Bandwidth,
-    Histogram,
-    Intervals,
-    Latency,
-    Outage,
-    Session,
-    Stream,
-)
 
 if TYPE_CHECKING:
     from duckdb import DuckDBPyConnection
@@ -45,7 +20,7 @@ if TYPE_CHECKING:
 _BINS, _FINEST_MS = 60, 0.5  # of histograms
 _LARGEST_STEP: Final = 1000  # a larger one is no loss but another beginning
 _WRAP: Final = media_numbers.LIMIT
-_LINUX_ONLY: Final = tuple(one.metric for one in (LOGS, MEDIA_STATUS, SOUNDBOARD_FILES, AUTONOMY_FILES))
+_LINUX_ONLY: Final = tuple(one.metric for one in (c.LOGS, c.MEDIA_STATUS, c.SOUNDBOARD_FILES, c.AUTONOMY_FILES))
 #: What a message takes on the wire beside its payload: its topic, MQTT's own bytes (up to 16 kB), and headers of TCP/IP
 #: without options for each segment of at most 1460 bytes.
 _MQTT_BYTES, _TCP_BYTES, _SEGMENT_BYTES = 4, 40, 1460
@@ -69,12 +44,13 @@ def _percentile(value: str, share: float) -> str:
 
 _VIDEO, _AUDIO = _numbers(media_numbers.VIDEO), _numbers(media_numbers.AUDIO)
 _FAMILY: Final = f"""CASE
-    WHEN direction = '{OUTGOING}' AND (kind IN ({_VIDEO}) OR metric = '{CAMERA.metric}') THEN '{traffic.VIDEO}'
-    WHEN direction = '{OUTGOING}' AND (kind IN ({_AUDIO}) OR metric = '{AUDIO.metric}') THEN '{traffic.AUDIO}'
-    WHEN direction = '{OUTGOING}' AND metric IN ('{ONLINE.metric}', '{HEARTBEAT.metric}') THEN '{traffic.HEARTBEATS}'
-    WHEN direction = '{OUTGOING}' THEN '{traffic.TELEMETRY}'
+    WHEN direction = '{c.OUTGOING}' AND (kind IN ({_VIDEO}) OR metric = '{c.CAMERA.metric}') THEN '{traffic.VIDEO}'
+    WHEN direction = '{c.OUTGOING}' AND (kind IN ({_AUDIO}) OR metric = '{c.AUDIO.metric}') THEN '{traffic.AUDIO}'
+    WHEN direction = '{c.OUTGOING}' AND metric IN ('{c.ONLINE.metric}', '{c.HEARTBEAT.metric}')
+        THEN '{traffic.HEARTBEATS}'
+    WHEN direction = '{c.OUTGOING}' THEN '{traffic.TELEMETRY}'
     WHEN kind IN ({_AUDIO}) THEN '{traffic.VOICE}'
-    WHEN metric = '{DRIVE.metric}' THEN '{traffic.DRIVING}'
+    WHEN metric = '{c.DRIVE.metric}' THEN '{traffic.DRIVING}'
     ELSE '{traffic.CONTROL}' END"""
 _SECONDS: Final = f"""
     CREATE OR REPLACE TEMP TABLE seconds AS
@@ -87,7 +63,7 @@ _HEARTBEATS: Final = f"""
     WITH received AS (
         SELECT epoch_ns(ts) AS ns, epoch_ns(stamp) AS stamp_ns,
                epoch_ns(ts) - lag(epoch_ns(ts)) OVER (ORDER BY ts) AS before
-        FROM messages WHERE direction = '{OUTGOING}' AND metric = ? AND online IS NOT FALSE
+        FROM messages WHERE direction = '{c.OUTGOING}' AND metric = ? AND online IS NOT FALSE
     )
     SELECT ns, (ns - stamp_ns) / 1e6 AS latency_ms, stamp_ns % 1000000000 = 0 AS whole,
            if(EXISTS (FROM breaks WHERE breaks.until_ns > ns - before AND breaks.since_ns < ns), NULL, before)
@@ -97,8 +73,8 @@ _HEARTBEATS: Final = f"""
 _ONLINE: Final = f"""
     CREATE OR REPLACE TEMP TABLE online AS
     WITH numbered AS (
-        SELECT ns, sum((interval_ns IS NULL OR interval_ns > {OFFLINE_AFTER_S}e9)::INT) OVER (ORDER BY ns) AS number
-        FROM heartbeats
+        SELECT ns, sum((interval_ns IS NULL OR interval_ns > {traffic.OFFLINE_AFTER_S}e9)::INT)
+            OVER (ORDER BY ns) AS number FROM heartbeats
     )
     SELECT min(ns) // 1000000000 AS since, max(ns) // 1000000000 + 1 AS until
     FROM numbered GROUP BY number ORDER BY since
@@ -106,9 +82,9 @@ _ONLINE: Final = f"""
 _SESSIONS: Final = f"""
     CREATE OR REPLACE TEMP TABLE sessions AS
     WITH active AS (SELECT second, bit_or(used) AS used FROM seconds WHERE used > 0 GROUP BY second),
-    begun AS (SELECT *, second - lag(second) OVER (ORDER BY second) > {SESSION_GAP_S} AS new FROM active),
+    begun AS (SELECT *, second - lag(second) OVER (ORDER BY second) > {traffic.SESSION_GAP_S} AS new FROM active),
     numbered AS (SELECT *, sum(coalesce(new, true)::INT) OVER (ORDER BY second) AS number FROM begun)
-    SELECT min(second) - {SESSION_MARGIN_S} AS since, max(second) + 1 + {SESSION_MARGIN_S} AS until,
+    SELECT min(second) - {traffic.SESSION_MARGIN_S} AS since, max(second) + 1 + {traffic.SESSION_MARGIN_S} AS until,
            bit_or(used) AS used
     FROM numbered GROUP BY number ORDER BY since
 """
@@ -144,18 +120,19 @@ _INTERVALS: Final = f"""
     WITH ranked AS (
         SELECT interval_ns / 1e6 AS ms, row_number() OVER (ORDER BY interval_ns) - 1 AS place,
                count(*) OVER () - 1 AS last
-        FROM heartbeats WHERE interval_ns <= {OFFLINE_AFTER_S}e9
+        FROM heartbeats WHERE interval_ns <= {traffic.OFFLINE_AFTER_S}e9
     )
     SELECT count(*), {_percentile("ms", 0.5)}, {_percentile("ms", 0.95)}, {_percentile("ms", 0.99)}, max(ms) FROM ranked
 """
 _OUTAGES: Final = f"""
     SELECT ns - interval_ns, interval_ns / 1e6 - $median FROM heartbeats
-    WHERE interval_ns / 1e6 > {OUTAGE_FACTOR} * $median AND interval_ns <= {OFFLINE_AFTER_S}e9 ORDER BY ns
+    WHERE interval_ns / 1e6 > {traffic.OUTAGE_FACTOR} * $median AND interval_ns <= {traffic.OFFLINE_AFTER_S}e9
+    ORDER BY ns
 """
 _OFFLINE: Final = f"""
-    SELECT count(*), coalesce(sum(interval_ns), 0) / 1e9 FROM heartbeats WHERE interval_ns > {OFFLINE_AFTER_S}e9
+    SELECT count(*), coalesce(sum(interval_ns), 0) / 1e9 FROM heartbeats WHERE interval_ns > {traffic.OFFLINE_AFTER_S}e9
 """
-_PLAUSIBLE: Final = f"abs(latency_ms) <= {LARGEST_LATENCY_S}e3"
+_PLAUSIBLE: Final = f"abs(latency_ms) <= {traffic.LARGEST_LATENCY_S}e3"
 _LATENCY: Final = f"""
     WITH ranked AS (
         SELECT latency_ms AS ms, whole, row_number() OVER (ORDER BY latency_ms) - 1 AS place,
@@ -177,7 +154,7 @@ _STREAMS: Final = f"""
                     ELSE (kind + 1) // 2 END AS encoding, lag(encoding) OVER before AS encoding_before,
                epoch_ns(ts) - lag(epoch_ns(ts)) OVER before AS received,
                epoch_ns(stamp) - lag(epoch_ns(stamp)) OVER before AS captured
-        FROM messages WHERE direction = '{OUTGOING}' AND number IS NOT NULL
+        FROM messages WHERE direction = '{c.OUTGOING}' AND number IS NOT NULL
         WINDOW before AS (PARTITION BY metric ORDER BY ts)
     ), stepped AS (
         SELECT *, CASE WHEN encoding <> encoding_before THEN 0
@@ -197,8 +174,8 @@ _STREAMS: Final = f"""
     FROM ranked GROUP BY metric ORDER BY metric
 """
 _ABOUT: Final = f"""
-    SELECT bool_or(direction = '{OUTGOING}' AND (metric IN ({_names(_LINUX_ONLY)}) OR kind IS NOT NULL)),
-           bool_or(metric = '{ONLINE.metric}'), bool_or(metric IN ('{ONLINE.metric}', '{HEARTBEAT.metric}'))
+    SELECT bool_or(direction = '{c.OUTGOING}' AND (metric IN ({_names(_LINUX_ONLY)}) OR kind IS NOT NULL)),
+           bool_or(metric = '{c.ONLINE.metric}'), bool_or(metric IN ('{c.ONLINE.metric}', '{c.HEARTBEAT.metric}'))
     FROM indexed
 """
 _TOTALS: Final = """
@@ -232,7 +209,7 @@ class RobotQueries:
         linux, has_online, has_heartbeats = self._row(_ABOUT)
         self.machine = traffic.LINUX if linux else traffic.MCU if has_heartbeats else traffic.COMPONENT
         self._connection.execute(_SECONDS.format(size=self._size))
-        self._connection.execute(_HEARTBEATS, [ONLINE.metric if has_online else HEARTBEAT.metric])
+        self._connection.execute(_HEARTBEATS, [c.ONLINE.metric if has_online else c.HEARTBEAT.metric])
         self._connection.execute(_ONLINE)
         self._connection.execute(_SESSIONS)
 
@@ -251,36 +228,37 @@ class RobotQueries:
         times, seconds = self._row(_OFFLINE)
         return times, seconds
 
-    def bandwidth(self) -> list[Bandwidth]:
-        found = [Bandwidth(*row) for row in self._rows(_BANDWIDTH)]
+    def bandwidth(self) -> list[traffic.Bandwidth]:
+        found = [traffic.Bandwidth(*row) for row in self._rows(_BANDWIDTH)]
         order = {name: number for number, name in enumerate((*traffic.FAMILIES, *traffic.TIMES))}
         known = [one for one in found if one.time in order]
         return sorted(known, key=lambda one: (order[one.family], order[one.time]))
 
-    def sessions(self) -> list[Session]:
+    def sessions(self) -> list[traffic.Session]:
         rows = self._rows("FROM sessions")
         return [
-            Session(since, until, [_word(one) for one in SESSION if used >> one & 1]) for since, until, used in rows
+            traffic.Session(since, until, [_word(one) for one in SESSION if used >> one & 1])
+            for since, until, used in rows
         ]
 
     def online(self) -> list[tuple[int, int]]:
         """Seconds since 1970 between which heartbeats came."""
         return [(since, until) for since, until in self._rows("FROM online")]
 
-    def intervals(self) -> Intervals | None:
+    def intervals(self) -> traffic.Intervals | None:
         row = self._row(_INTERVALS)
-        return Intervals(*row) if row[0] else None
+        return traffic.Intervals(*row) if row[0] else None
 
-    def outages(self, median_ms: float) -> list[Outage]:
-        return [Outage(*row) for row in self._rows(_OUTAGES, {"median": median_ms})]
+    def outages(self, median_ms: float) -> list[traffic.Outage]:
+        return [traffic.Outage(*row) for row in self._rows(_OUTAGES, {"median": median_ms})]
 
-    def latency(self) -> Latency | None:
+    def latency(self) -> traffic.Latency | None:
         count, floor, median, p95, p99, whole = self._row(_LATENCY)
         if not count:
             return None
-        return Latency(count, floor, median, p95, p99, whole, self._histogram(floor, p99))
+        return traffic.Latency(count, floor, median, p95, p99, whole, self._histogram(floor, p99))
 
-    def _histogram(self, floor_ms: float, p99_ms: float) -> Histogram:
+    def _histogram(self, floor_ms: float, p99_ms: float) -> traffic.Histogram:
         """From 0, or from below if the robot's clock is ahead, to a little above the 99th percentile."""
         margin = 0.1 * (p99_ms - floor_ms)
         low, high = min(0.0, floor_ms - margin), p99_ms + margin
@@ -289,11 +267,11 @@ class RobotQueries:
         counts = [0] * _BINS
         for place, count in self._rows(_LATENCIES, {"low": low, "width": width}):
             counts[place] = count
-        return Histogram(low, width, counts)
+        return traffic.Histogram(low, width, counts)
 
-    def streams(self) -> list[Stream]:
+    def streams(self) -> list[traffic.Stream]:
         rows = self._rows(_STREAMS)
-        return [Stream(metric, traffic.encoding_names(kinds), *rest) for metric, kinds, *rest in rows]
+        return [traffic.Stream(metric, traffic.encoding_names(kinds), *rest) for metric, kinds, *rest in rows]
 
     def _rows(self, query: str, parameters: Any = None) -> list[Any]:
         return self._connection.execute(query, parameters).fetchall()

@@ -1,7 +1,5 @@
 """The report of an analysis: one HTML file that needs no other, and its tables as CSV."""
 
-from __future__ import annotations
-
 import html
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path

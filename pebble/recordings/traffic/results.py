@@ -12,8 +12,6 @@ Definitions, all of payload bytes and of the time of receiving, without retained
   then its cause was the network, the broker or the recorder's machine.
 """
 
-from __future__ import annotations
-
 from typing import Final
 
 from msgspec import Struct, field

@@ -1,7 +1,5 @@
 """Which outages several robots had at the same moment: the network's or the recorder's, not a robot's. Pure."""
 
-from __future__ import annotations
-
 from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
 from typing import Final

@@ -1,7 +1,5 @@
 """Finds the index of recordings for an analysis, and makes what is missing of it."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Collection, Iterable
 from datetime import UTC, datetime

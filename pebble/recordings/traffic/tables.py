@@ -1,7 +1,5 @@
 """The tables of an analysis, for its report and as CSV files. Times are UTC."""
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
@@ -27,27 +25,16 @@ class Table(Struct, frozen=True):
 
 def tables(traffic: Traffic) -> list[Table]:
     """All tables; those of media and gaps may have no rows."""
-    return [
-        media_bandwidth(traffic),
-        _bandwidth(traffic),
-        _sessions(traffic),
-        _heartbeats(traffic),
-        _latency(traffic),
-        _streams(traffic),
-        _outages(traffic),
-        _gaps(traffic),
-    ]
+    makers = (media_bandwidth, _bandwidth, _sessions, _heartbeats, _latency, _streams, _outages, _gaps)
+    return [make(traffic) for make in makers]
 
 
 def media_bandwidth(traffic: Traffic) -> Table:
     """Table 4.1 of the paper."""
     columns = [
-        ("robot", "robot"),
-        ("video_median_kbps", "video, median kbit/s"),
-        ("video_p95_kbps", "video, p95"),
-        ("audio_median_kbps", "audio, median kbit/s"),
-        ("audio_p95_kbps", "audio, p95"),
-    ]
+        ("robot", "robot"), ("video_median_kbps", "video, median kbit/s"), ("video_p95_kbps", "video, p95"),
+        ("audio_median_kbps", "audio, median kbit/s"), ("audio_p95_kbps", "audio, p95"),
+    ]  # fmt: skip
     rows = []
     for robot in traffic.robots:
         both = robot.of(VIDEO), robot.of(AUDIO)
@@ -59,16 +46,10 @@ def media_bandwidth(traffic: Traffic) -> Table:
 
 def _bandwidth(traffic: Traffic) -> Table:
     columns = [
-        ("robot", "robot"),
-        ("machine", "machine"),
-        ("family", "kind of message"),
-        ("time", "time"),
-        ("active_seconds", "active seconds"),
-        ("median_kbps", "median kbit/s"),
-        ("p95_kbps", "p95 kbit/s"),
-        ("messages", "messages"),
-        ("bytes", "bytes"),
-    ]
+        ("robot", "robot"), ("machine", "machine"), ("family", "kind of message"), ("time", "time"),
+        ("active_seconds", "active seconds"), ("median_kbps", "median kbit/s"), ("p95_kbps", "p95 kbit/s"),
+        ("messages", "messages"), ("bytes", "bytes"),
+    ]  # fmt: skip
     rows = [
         [
             robot.robot, robot.machine, one.family, one.time, one.seconds, one.median_kbps, one.p95_kbps, one.messages,
@@ -82,12 +63,9 @@ def _bandwidth(traffic: Traffic) -> Table:
 
 def _sessions(traffic: Traffic) -> Table:
     columns = [
-        ("robot", "robot"),
-        ("since", "from"),
-        ("until", "until"),
-        ("seconds", "seconds"),
+        ("robot", "robot"), ("since", "from"), ("until", "until"), ("seconds", "seconds"),
         ("activities", "what happened"),
-    ]
+    ]  # fmt: skip
     rows = [
         [robot.robot, moment(one.since_s), moment(one.until_s), one.length_s, ", ".join(one.activities)]
         for robot in traffic.robots
@@ -98,20 +76,12 @@ def _sessions(traffic: Traffic) -> Table:
 
 def _heartbeats(traffic: Traffic) -> Table:
     columns = [
-        ("robot", "robot"),
-        ("intervals", "intervals"),
-        ("interval_median_ms", "median ms"),
-        ("interval_p95_ms", "p95 ms"),
-        ("interval_p99_ms", "p99 ms"),
-        ("outages", "outages"),
-        ("outage_median_ms", "outage, median ms"),
-        ("outage_longest_ms", "longest ms"),
-        ("outages_below_300_ms", "below 300 ms"),
-        ("outages_shared", "shared"),
-        ("outages_recorder_late", "recorder late"),
-        ("offline", "offline, times"),
-        ("offline_s", "offline, seconds"),
-    ]
+        ("robot", "robot"), ("intervals", "intervals"), ("interval_median_ms", "median ms"),
+        ("interval_p95_ms", "p95 ms"), ("interval_p99_ms", "p99 ms"), ("outages", "outages"),
+        ("outage_median_ms", "outage, median ms"), ("outage_longest_ms", "longest ms"),
+        ("outages_below_300_ms", "below 300 ms"), ("outages_shared", "shared"),
+        ("outages_recorder_late", "recorder late"), ("offline", "offline, times"), ("offline_s", "offline, seconds"),
+    ]  # fmt: skip
     return Table("heartbeats", "Heartbeats and outages", columns, list(_heartbeat_rows(traffic.robots)))
 
 
@@ -131,29 +101,17 @@ def _heartbeat_rows(robots: Sequence[RobotTraffic]) -> Iterator[list[Any]]:
 
 def _latency(traffic: Traffic) -> Table:
     columns = [
-        ("robot", "robot"),
-        ("heartbeats", "heartbeats"),
-        ("floor_ms", "floor (p1) ms"),
-        ("median_ms", "median ms"),
-        ("p95_ms", "p95 ms"),
-        ("p99_ms", "p99 ms"),
-        ("whole_second_share", "whole-second stamps"),
-        ("note", "note"),
-    ]
+        ("robot", "robot"), ("heartbeats", "heartbeats"), ("floor_ms", "floor (p1) ms"), ("median_ms", "median ms"),
+        ("p95_ms", "p95 ms"), ("p99_ms", "p99 ms"), ("whole_second_share", "whole-second stamps"), ("note", "note"),
+    ]  # fmt: skip
     rows = [
         [
-            robot.robot,
-            one.count,
-            one.floor_ms,
-            one.median_ms,
-            one.p95_ms,
-            one.p99_ms,
-            one.whole_share,
+            robot.robot, one.count, one.floor_ms, one.median_ms, one.p95_ms, one.p99_ms, one.whole_share,
             latency_note(robot),
         ]
         for robot in traffic.robots
         if (one := robot.latency) is not None
-    ]
+    ]  # fmt: skip
     return Table("latency", "Latency of heartbeats", columns, rows)
 
 
@@ -169,16 +127,10 @@ def latency_note(robot: RobotTraffic) -> str:
 
 def _streams(traffic: Traffic) -> Table:
     columns = [
-        ("robot", "robot"),
-        ("metric", "topic"),
-        ("encodings", "encodings"),
-        ("messages", "messages"),
-        ("lost", "lost"),
-        ("lost_share", "share lost"),
-        ("restarts", "restarts"),
-        ("jitter_median_ms", "jitter, median ms"),
+        ("robot", "robot"), ("metric", "topic"), ("encodings", "encodings"), ("messages", "messages"), ("lost", "lost"),
+        ("lost_share", "share lost"), ("restarts", "restarts"), ("jitter_median_ms", "jitter, median ms"),
         ("jitter_p95_ms", "p95 ms"),
-    ]
+    ]  # fmt: skip
     rows = [
         [
             robot.robot, one.metric, ", ".join(one.encodings), one.messages, one.lost, one.lost_share, one.restarts,

@@ -1,8 +1,6 @@
 """One day of one robot, in steps: what it was used for, its bandwidth, its sessions, outages and gaps."""
 # ruff: noqa: S608  (what is put into queries are constants of this project and numbers)
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any, Final
 

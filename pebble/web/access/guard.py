@@ -112,13 +112,10 @@ def host_names(settings: WebSettings) -> frozenset[str]:
     names: set[str] = {"127.0.0.1", "::1", "localhost", *settings.names}
     if not is_loopback(settings.host):
         names.add(settings.host)
-        names |= _of_machine() if settings.certificate is None else {*certificates.show(settings.certificate).names}
+        own = socket.gethostname()
+        of_machine = (own, f"{own.partition('.')[0]}.local")
+        names |= {*(of_machine if settings.certificate is None else certificates.show(settings.certificate).names)}
     return frozenset(map(canonical, names))
-
-
-def _of_machine() -> set[str]:
-    name = socket.gethostname()
-    return {name, f"{name.partition('.')[0]}.local"}
 
 
 def is_loopback(host: str) -> bool:

@@ -1,7 +1,5 @@
 """Log in, log out, and the session of a request."""
 
-from __future__ import annotations
-
 import asyncio
 import dataclasses
 import html

@@ -1,7 +1,5 @@
 """One robot's pictures on their way to the pages that show them."""
 
-from __future__ import annotations
-
 import asyncio
 import struct
 import time
@@ -11,8 +9,8 @@ from typing import Final
 from pebble.client.broker import Broker
 from pebble.client.media_request.encoding_choice import BEST_FIRST, EncodingChoice
 from pebble.client.media_request.offer import offered
-from pebble.client.media_request.picture_header import PictureHeader, PictureSequence
 from pebble.client.media_request.queue import NO_FRAME, Frame, ViewerQueue, assess
+from pebble.media.picture_header import PictureHeader, PictureSequence
 from pebble.web.media import rescue
 from pebble.web.media.rescue import FULL, SMALL, Form, RescuedPicture, RescueStream
 from pebble.web.media.stream import MediaStream

@@ -1,7 +1,5 @@
 """Robots' pictures for pages: one request per robot, however many pages show it."""
 
-from __future__ import annotations
-
 import asyncio
 import struct
 import time

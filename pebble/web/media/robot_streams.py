@@ -3,8 +3,6 @@
 They decide which origins the page may show in a frame.
 """
 
-from __future__ import annotations
-
 import ipaddress
 import re
 import socket

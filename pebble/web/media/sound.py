@@ -1,7 +1,5 @@
 """Robots' sound for pages, and pages' voices for robots: one request per robot, however many pages listen."""
 
-from __future__ import annotations
-
 import asyncio
 import struct
 import time
@@ -134,7 +132,6 @@ class SoundStream(MediaStream[SoundPage, SoundView]):
                 self._interrupt("The server cannot reach the broker")
 
     def end_talk(self, page: SoundPage, talk: int) -> None:
-        """The page ends this talk."""
         page.over = max(page.over, talk)
         if self._talk is not None and talk == self._talk.number:
             self._end_talk(page)
@@ -218,13 +215,7 @@ class SoundHub:
         self._streams = Streams(AUDIO, lambda ref: SoundStream(broker, robots, ref, self._show, note))
 
     async def serve(
-        self,
-        websocket: WebSocket,
-        ref: str,
-        can: frozenset[str],
-        session: Session,
-        device: str = "",
-        address: str = "",
+        self, websocket: WebSocket, ref: str, can: frozenset[str], session: Session, device: str = "", address: str = ""
     ) -> None:
         """Serve a page that plays ``can`` and may talk, until either end closes the socket."""
         page = SoundPage(can & frozenset(ENCODINGS), session, device, address)
@@ -254,7 +245,6 @@ def rest() -> SoundView:
 
 
 def _encoding(payload: bytes) -> str:
-    """The encoding of a packet; "" if it is none."""
     if len(payload) > MAX_PAYLOAD:
         return ""
     try:

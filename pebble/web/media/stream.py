@@ -1,7 +1,5 @@
 """One medium of each robot on its way to pages: the request while pages use it, and what is shown about it."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import logging
@@ -175,11 +173,7 @@ class Streams(Generic[StreamT]):
         return self._streams.get(ref)
 
     async def serve(
-        self,
-        websocket: WebSocket,
-        ref: str,
-        viewer: Any,
-        *work: Callable[[StreamT], Coroutine[Any, Any, None]],
+        self, websocket: WebSocket, ref: str, viewer: Any, *work: Callable[[StreamT], Coroutine[Any, Any, None]]
     ) -> None:
         """Let the page view that robot until one part of the ``work`` for its socket ends; close the socket."""
         if self._closed or not own_topic(ref, self._channel.topic(ref), Direction.OUTGOING):

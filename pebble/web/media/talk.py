@@ -1,7 +1,5 @@
 """A person's voice on its way to a robot: one talk at a time, nothing that is old, and the robot's packets. Pure."""
 
-from __future__ import annotations
-
 from typing import Final
 
 from pebble.contract.packets import SEQUENCE_LIMIT, Codec, Sound

@@ -1,7 +1,5 @@
 """The processes that read recordings for pages: one that answers at once, and one for each long job."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import multiprocessing
@@ -107,7 +105,6 @@ class Job:
         return not self._task.done()
 
     async def end(self) -> None:
-        """End it, if it still runs."""
         self._process.kill()
         await asyncio.gather(self._task, return_exceptions=True)
 

@@ -61,7 +61,6 @@ class _Timeline:
     made: bytes | None = None
 
     def take(self) -> bytes | None:
-        """The newest there is."""
         if self.job.ready and self.target.exists():
             self.made = self.target.read_bytes()
             self.target.unlink()

@@ -1,7 +1,5 @@
 """Inserts the gate's answers into what the broker sends to a client, between two packets. Pure."""
 
-from __future__ import annotations
-
 from pebble.services.autonomy_manager.gate.packets import PacketError, packet_size
 
 _MOST_WAITING = 64 * 1024  # bytes; each answer has four

@@ -1,7 +1,5 @@
 """What one client of the gate sends: bytes in; bytes for the broker, answers and drive commands out. Pure."""
 
-from __future__ import annotations
-
 import hmac
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Writes the config that a script gets: a copy of the robot's, in which the broker is the gate."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """A broker for the scripts of one run: opened before they start, closed after they have ended."""
 
-from __future__ import annotations
-
 import secrets
 import socket
 import threading

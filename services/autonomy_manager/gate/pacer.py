@@ -1,7 +1,5 @@
 """Decides when the drive commands of a run are published: at most 50 a second, but a zero at once. Pure."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 PERIOD_S = 0.02  # between two commands, unless the second one stops what moves

@@ -1,7 +1,5 @@
 """MQTT 3.1.1 packets as bytes: cuts a stream into packets, reads and writes the few kinds that the gate handles."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from enum import IntEnum
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Serves the gate's clients on a loopback socket, all on one thread."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import logging

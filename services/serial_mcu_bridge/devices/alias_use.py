@@ -1,7 +1,5 @@
 """The aliases of a device that are in use: those that no other device claims."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable
 

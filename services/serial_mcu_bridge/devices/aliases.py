@@ -1,7 +1,5 @@
 """Which channels a self-describing MCU may use besides its own generic topics. Pure."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Owns the serial line to a self-describing MCU (``pebble_serial_v1``), whose manifest defines its topics."""
 
-from __future__ import annotations
-
 import logging
 import secrets
 import time
@@ -228,7 +226,9 @@ class DescribedBridge(SerialService):
         if any(route.interface.profile.startswith(FAMILY) for route in device.routes.values()):
             self.watchdog.found_imu()
         self._peers.forget(device.uid)
-        self._close_generic()
+        subscriptions, self._generic = self._generic, []
+        for subscription in subscriptions:
+            subscription.close()
         self._listen_generic(device, private=False)  # a reader of the manifest may send commands at once
         self.publish(MCU_DESCRIBE, device.payload, uid=device.uid)  # then the MQTT bridge knows what is private
         self._listen_generic(device, private=True)
@@ -261,11 +261,6 @@ class DescribedBridge(SerialService):
             for route in device.routes.values()
             if route.interface.direction is Direction.IN and route.interface.local_only is private
         ]
-
-    def _close_generic(self) -> None:
-        subscriptions, self._generic = self._generic, []
-        for subscription in subscriptions:
-            subscription.close()
 
     # -- commands
 

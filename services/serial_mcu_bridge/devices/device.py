@@ -1,7 +1,5 @@
 """A described MCU on this robot: the channel and the payloads of each of its interfaces."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Inertial sensors: from values to the payloads of ``sensors/imu*``, and a watchdog for missing samples. Pure."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping
 from typing import Any, Final
 

@@ -1,7 +1,5 @@
 """The other self-describing MCUs of this robot and the channels that their manifests claim. Pure."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 #: A retained manifest may have outlived its device. We ask; if its bridge does not publish it again within 5 s, it is

@@ -1,7 +1,5 @@
 """What comes from a serial device: how much, when last, and whether the device may have stopped reading."""
 
-from __future__ import annotations
-
 UNREAD_S = 1.0  # without a report, from a board that reports at rest
 
 

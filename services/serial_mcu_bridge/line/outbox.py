@@ -1,7 +1,5 @@
 """The lines that wait to be sent: only the newest of each kind."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 _DRIVE = "drive"

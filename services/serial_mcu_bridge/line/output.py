@@ -1,7 +1,5 @@
 """What is sent to an open serial device: the bytes being written, and after them the lines that wait."""
 
-from __future__ import annotations
-
 from pebble.errors import DeviceError
 from pebble.services.serial_mcu_bridge.line.outbox import Outbox
 from pebble.services.serial_mcu_bridge.line.port import Port

@@ -1,7 +1,5 @@
 """An open serial device and its non-blocking system calls."""
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import os

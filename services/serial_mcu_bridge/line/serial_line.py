@@ -1,7 +1,5 @@
 """The serial line to an MCU: reopens after an unplug, sends without blocking, and sends the stop first and last."""
 
-from __future__ import annotations
-
 import logging
 import select
 import threading

@@ -1,7 +1,5 @@
 """Whether the board on a serial line is heard, and whether its silence means anything. Pure."""
 
-from __future__ import annotations
-
 from pebble.services.serial_mcu_bridge.line.serial_line import LineState
 
 CHECK_S = 1.0

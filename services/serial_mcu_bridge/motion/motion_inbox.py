@@ -1,7 +1,5 @@
 """What waits to be judged before it reaches the motors: stops, resets and drive commands."""
 
-from __future__ import annotations
-
 import threading
 from itertools import chain
 

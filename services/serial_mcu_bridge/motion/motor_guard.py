@@ -1,7 +1,5 @@
 """Decides for one motor owner which drive commands move its motors, and stops them: latch, arbiter and deadline."""
 
-from __future__ import annotations
-
 import logging
 import operator
 import secrets

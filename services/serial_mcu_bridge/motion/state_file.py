@@ -1,7 +1,5 @@
 """A small file that survives a power cut, written by a thread of its own: a disk may take seconds."""
 
-from __future__ import annotations
-
 import json
 import logging
 import os

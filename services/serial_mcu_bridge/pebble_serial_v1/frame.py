@@ -1,7 +1,5 @@
 """One frame of ``pebble_serial_v1``: COBS(body, CRC-16), ended by a zero. Bytes in and out, no I/O."""
 
-from __future__ import annotations
-
 import binascii
 import struct
 from dataclasses import dataclass

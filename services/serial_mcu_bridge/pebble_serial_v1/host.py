@@ -3,8 +3,6 @@
 Pure: bytes and clock values in, events out; the bytes to send are events too. docs/mcu.md describes the wire.
 """
 
-from __future__ import annotations
-
 import logging
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping
@@ -155,7 +153,9 @@ class Session:
     def feed(self, chunk: bytes, now: float) -> list[Event]:
         """Return the events of the frames that ``chunk`` completes. Never raises."""
         events = [event for stuffed in self._splitter.feed(chunk) if stuffed for event in self._receive(stuffed, now)]
-        return events + self._count_too_long()
+        more = self._splitter.discarded_lines - self._too_long
+        self._too_long += more
+        return events + [RefusedInput("too long", f"a frame of more than {FRAME_LIMIT} bytes")] * more
 
     def tick(self, now: float, wall_ms: int) -> list[Event]:
         """Request the manifest, send pings and end timeouts, each when it is due."""
@@ -278,11 +278,6 @@ class Session:
             return []
         self.manifest, self._by_id = None, {}
         return [Gone(why)]
-
-    def _count_too_long(self) -> list[Event]:
-        more = self._splitter.discarded_lines - self._too_long
-        self._too_long += more
-        return [RefusedInput("too long", f"a frame of more than {FRAME_LIMIT} bytes")] * more
 
     def _frame(self, kind: Type, wall_ms: int, interface: int = 0, payload: bytes = b"") -> bytes:
         self._sequence = self._sequence % _U32 + 1

@@ -1,7 +1,5 @@
 """Parses and checks the two messages in which an MCU describes itself: HELLO and DESCRIBE."""
 
-from __future__ import annotations
-
 import math
 import re
 import struct

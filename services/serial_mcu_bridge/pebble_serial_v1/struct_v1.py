@@ -1,7 +1,5 @@
 """The encoding ``struct_v1``: an interface's fields as packed little-endian numbers, and as JSON's, both ways."""
 
-from __future__ import annotations
-
 import math
 import struct
 from collections.abc import Mapping, Sequence

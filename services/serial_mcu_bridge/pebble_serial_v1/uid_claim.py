@@ -5,8 +5,6 @@ one with the greater token wins. If two hold it (they were disconnected when the
 A process may receive its own question; it recognises its token.
 """
 
-from __future__ import annotations
-
 from enum import Enum
 
 ASK_S = 0.2  # to wait for an answer; processes of one robot answer within milliseconds

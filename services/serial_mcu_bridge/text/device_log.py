@@ -1,7 +1,5 @@
 """Log lines of an MCU, made printable."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 LIMIT = 200  # characters

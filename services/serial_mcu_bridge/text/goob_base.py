@@ -5,8 +5,6 @@ Host to MCU: ``M <left> <right>``, ``L <b> <g> <r>``, ``F <b> <g> <r> <period>``
 A line ends with LF, a CR before it is ignored.
 """
 
-from __future__ import annotations
-
 import logging
 import re
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Owns the serial line to an inertial sensor with ``imu_mpu6050_v1``: publishes its samples on ``sensors/imu*``."""
 
-from __future__ import annotations
-
 import logging
 import time
 from typing import Any

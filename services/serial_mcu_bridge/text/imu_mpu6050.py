@@ -4,8 +4,6 @@
 summary. All keys must be there; anything else is a log line.
 """
 
-from __future__ import annotations
-
 import logging
 import re
 from dataclasses import dataclass
@@ -19,12 +17,7 @@ _DECIMAL = re.compile(rb"[+-]?[0-9]{1,9}(?:\.[0-9]{0,9})?\Z")  # never nan or in
 #: Key of a line to field of the profile (imu.py).
 _MOTION = {key.encode(): key for key in ("ax", "ay", "az", "gx", "gy", "gz")}
 _MOTION |= {b"t": "temp_c", b"r": "roll_deg", b"p": "pitch_deg"}
-_SUMMARY = {
-    b"an": "accel_norm_g",
-    b"gbx": "gyro_bias_x_dps",
-    b"gby": "gyro_bias_y_dps",
-    b"gbz": "gyro_bias_z_dps",
-}
+_SUMMARY = {b"an": "accel_norm_g", b"gbx": "gyro_bias_x_dps", b"gby": "gyro_bias_y_dps", b"gbz": "gyro_bias_z_dps"}
 _ATTITUDE = {b"r": "roll_deg", b"p": "pitch_deg", b"t": "temp_c"}  # a summary repeats them
 _COUNTS = {b"ok": "samples_ok", b"err": "samples_error", b"cal": "calibration_samples"}
 

@@ -5,17 +5,7 @@ from __future__ import annotations
 import logging
 from typing import Any, ClassVar, Protocol
 
-from pebble.contract import (
-    CHARGING_LEVEL,
-    CHARGING_STATUS,
-    DRIVE,
-    ESTOP,
-    ESTOP_RESET,
-    ESTOP_STATE,
-    LIGHTS_FLASH,
-    LIGHTS_SOLID,
-    TOUCH_SENSORS,
-)
+from pebble import contract as c
 from pebble.contract.payloads import (
     ChargingLevel,
     ChargingStatus,
@@ -66,7 +56,7 @@ class MotorBridge(SerialService):
     A bridge of another text protocol sets ``protocol`` and ``stop_line``.
     """
 
-    publishes = (ESTOP_STATE, TOUCH_SENSORS, CHARGING_STATUS, CHARGING_LEVEL)
+    publishes = (c.ESTOP_STATE, c.TOUCH_SENSORS, c.CHARGING_STATUS, c.CHARGING_LEVEL)
     protocol: ClassVar[MotorProtocol] = goob_base
     stop_line = goob_base.STOP
 
@@ -99,15 +89,15 @@ class MotorBridge(SerialService):
 
     # -- on the transport's threads; the stop is subscribed to before the drive commands
 
-    @on(ESTOP, direct=True)
+    @on(c.ESTOP, direct=True)
     def receive_stop(self, stop: EstopCommand, _arrived: float) -> None:
         self._judge_soon(self._waiting.put_stop(stop))
 
-    @on(ESTOP_RESET, direct=True)
+    @on(c.ESTOP_RESET, direct=True)
     def receive_reset(self, reset: EstopReset, arrived: float) -> None:
         self._judge_soon(self._waiting.put_reset(reset, arrived))
 
-    @on(DRIVE, direct=True)
+    @on(c.DRIVE, direct=True)
     def receive_drive(self, drive: Drive, arrived: float) -> None:
         self._judge_soon(self._waiting.put_drive(drive, arrived))
 
@@ -147,7 +137,7 @@ class MotorBridge(SerialService):
     def _drive(self, received: ReceivedDrive) -> None:
         now, drive = self.clock(), received.drive
         if drive.moves and now - received.at > WAIT_LIMIT_S:
-            self.count_late(DRIVE)
+            self.count_late(c.DRIVE)
             return
         valid_s = self._guard.judge(drive, now)
         if valid_s is None:
@@ -175,7 +165,7 @@ class MotorBridge(SerialService):
     @property
     def _latches(self) -> bool:
         """Whether a stop latches. Without the resets it would have no end, and without the stops it is no promise."""
-        return not (self.refused(ESTOP) or self.refused(ESTOP_RESET))
+        return not (self.refused(c.ESTOP) or self.refused(c.ESTOP_RESET))
 
     def on_connected(self) -> None:
         self.check_subscriptions()
@@ -183,9 +173,9 @@ class MotorBridge(SerialService):
     @every(_CHECK_S)
     def check_subscriptions(self) -> None:
         """Withdraw the emergency stop while its topics are refused. Raises TransportError if the drive topic is."""
-        if self.refused(DRIVE):
+        if self.refused(c.DRIVE):
             raise TransportError(
-                f"the broker refuses the subscription to {self.addresses[DRIVE].topic}: nothing can drive this robot."
+                f"the broker refuses the subscription to {self.addresses[c.DRIVE].topic}: nothing can drive this robot."
                 " Permit the user in local_mqtt to subscribe to it"
             )
         if self._latches is not self.announced:
@@ -199,16 +189,16 @@ class MotorBridge(SerialService):
             self.log.warning("the subscriptions to the emergency stop are granted again: a stop latches")
             self.repeat_state()
             return
-        topics = [self.addresses[channel].topic for channel in (ESTOP, ESTOP_RESET) if self.refused(channel)]
+        topics = [self.addresses[channel].topic for channel in (c.ESTOP, c.ESTOP_RESET) if self.refused(channel)]
         self.log.error(
             "the broker refuses the subscription to %s: this robot has no emergency stop, a stop only halts it%s."
             " Permit the user in local_mqtt to subscribe to both %s and %s",
             " and ".join(topics),
             ", and it stays stopped now" if self._guard.latched else "",
-            self.addresses[ESTOP].topic,
-            self.addresses[ESTOP_RESET].topic,
+            self.addresses[c.ESTOP].topic,
+            self.addresses[c.ESTOP_RESET].topic,
         )
-        self.retract(ESTOP_STATE, owner=self._owner)
+        self.retract(c.ESTOP_STATE, owner=self._owner)
 
     # -- the guard
 
@@ -241,9 +231,9 @@ class MotorBridge(SerialService):
     def _publish_state(self, state: EstopState) -> None:
         """While a stop does not latch, remove it instead, again and again: a bridge may have missed the first time."""
         if self._latches:
-            self.publish(ESTOP_STATE, state, owner=self._owner)
+            self.publish(c.ESTOP_STATE, state, owner=self._owner)
         else:
-            self.clear(ESTOP_STATE, owner=self._owner)
+            self.clear(c.ESTOP_STATE, owner=self._owner)
 
     def _on_saved(self, number: int, succeeded: bool) -> None:
         """On the file's thread."""
@@ -256,11 +246,11 @@ class MotorBridge(SerialService):
 
     # -- lights
 
-    @on(LIGHTS_SOLID)
+    @on(c.LIGHTS_SOLID)
     def lights_solid(self, colour: LightsSolid) -> None:
         self.line.send(_LIGHTS, self.protocol.lights_line(colour.b, colour.g, colour.r))
 
-    @on(LIGHTS_FLASH)
+    @on(c.LIGHTS_FLASH)
     def lights_flash(self, colour: LightsFlash) -> None:
         self.line.send(_LIGHTS, self.protocol.flash_line(colour.b, colour.g, colour.r, colour.period))
 
@@ -281,15 +271,13 @@ class MotorBridge(SerialService):
         match report:
             case Touch(a0, a1, a2):
                 if self._publishes_touch:
-                    self.publish(TOUCH_SENSORS, TouchSensors(value=TouchValues(a0=a0, a1=a1, a2=a2)))
+                    self.publish(c.TOUCH_SENSORS, TouchSensors(value=TouchValues(a0=a0, a1=a1, a2=a2)))
             case Charging(value):
-                self._publish_charging(ChargingStatus(value=value))
+                status = ChargingStatus(value=value)
+                if status != self._charging:
+                    self._charging = status
+                    self.publish(c.CHARGING_STATUS, status)
             case Level(volts):
-                self.publish(CHARGING_LEVEL, ChargingLevel(value=volts))
+                self.publish(c.CHARGING_LEVEL, ChargingLevel(value=volts))
             case DeviceLogLine(level, text):
                 self.device_log.log(logging.getLevelName(level), level, "MCU: %s", text)
-
-    def _publish_charging(self, status: ChargingStatus) -> None:
-        if status != self._charging:
-            self._charging = status
-            self.publish(CHARGING_STATUS, status)

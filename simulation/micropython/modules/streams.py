@@ -1,7 +1,5 @@
 """Non-blocking reads and writes of MicroPython's stream objects, over two primitives."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from typing import Any
 

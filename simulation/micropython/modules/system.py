@@ -50,12 +50,7 @@ def _nothing(*_arguments: Any) -> int:
 
 #: Without effect: memory is measured on MicroPython itself
 GC: Final = SimpleNamespace(
-    collect=_nothing,
-    enable=_nothing,
-    disable=_nothing,
-    threshold=_nothing,
-    mem_free=_nothing,
-    mem_alloc=_nothing,
+    collect=_nothing, enable=_nothing, disable=_nothing, threshold=_nothing, mem_free=_nothing, mem_alloc=_nothing
 )
 
 

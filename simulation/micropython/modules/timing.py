@@ -1,7 +1,5 @@
 """The ``time`` module of a simulated board."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """The ``ssl`` module of a simulated board: CPython's TLS behind MicroPython's interface, non-blocking."""
 
-from __future__ import annotations
-
 import ssl
 from pathlib import Path
 from types import SimpleNamespace

@@ -16,7 +16,7 @@ from pebble.errors import DeviceError
 from pebble.media.scene import read_counter
 from pebble.services.av_daemon import health, sources
 from pebble.services.av_daemon.health import Health
-from pebble.services.av_daemon.reports import Reports
+from pebble.services.av_daemon.service import Reports
 from pebble.services.av_daemon.source import Capture, Source
 from pebble.services.av_daemon.stream import Stream
 from pebble.transports.frames import FrameInfo

@@ -18,7 +18,7 @@ from pebble.errors import PayloadError, PebbleError
 from pebble.media.decode import VideoDecoder
 from pebble.media.video import make_encoder
 from pebble.services.camera_publisher import service as module
-from pebble.services.camera_publisher.keyframes import KeyframeRequests
+from pebble.services.camera_publisher.frame_selector import KeyframeRequests
 from pebble.services.camera_publisher.rate_control import RateController, wire_size
 from pebble.services.camera_publisher.service import CameraPublisher
 from pebble.services.camera_publisher.shape import Shape

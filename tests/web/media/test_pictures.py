@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 import pytest
 
-from pebble.client.media_request.picture_header import follows, read_header
 from pebble.client.media_request.queue import NO_FRAME
 from pebble.media.decode import VideoDecoder, encoding_of
+from pebble.media.picture_header import follows, read_header
 from pebble.media.scene import read_counter
 from pebble.media.video import make_encoder
 from pebble.transports import QoS

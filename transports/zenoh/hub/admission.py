@@ -1,7 +1,5 @@
 """Which wills a hub takes: a command that was left as a will would be published as a fresh one, any time later."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Sequence
 

@@ -5,8 +5,6 @@ death of this process; it reaches the disk within about a second (``SYNC_S``), s
 file is rewritten when it has grown to several times the size of its current records, and after a failure of its disk.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import struct
@@ -122,7 +120,9 @@ class Journal:
         if self._failing:
             self._failing = False
             log.info("journal %s is written again", self.path)
-        self._start_syncer()
+        if self._syncer is None:
+            self._syncer = threading.Thread(target=self._sync, name="pebble-journal", daemon=True)
+            self._syncer.start()
 
     def _replaced_by(self, data: bytes) -> int:
         fresh = self.path.with_name(self.path.name + ".new")
@@ -172,11 +172,6 @@ class Journal:
                 error.strerror,
                 RETRY_S,
             )
-
-    def _start_syncer(self) -> None:
-        if self._syncer is None:
-            self._syncer = threading.Thread(target=self._sync, name="pebble-journal", daemon=True)
-            self._syncer.start()
 
     def _sync(self) -> None:
         """Sync to disk on a thread of its own: a slow SD card must not delay ``append``."""

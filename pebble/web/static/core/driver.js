@@ -37,7 +37,7 @@ export class Driver {
     this.onSpace = null;
     /** @type {import("./actions.js").Actions | null} which keys and buttons these are; fetched later */
     this.actions = null;
-    /** @type {import("./pad-input.js").PadInput | null} fetched later; until then gamepads only stop */
+    /** @type {{read: (shown: any, now: number) => void, [part: string]: any} | null} a PadInput, fetched later; until then gamepads only stop */
     this.pads = null;
     this.padLatches = this.padStops = 0; // gamepads that press it
     this.mine = false;

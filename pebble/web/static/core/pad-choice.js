@@ -10,6 +10,7 @@ const WORN_MS = 2000; // people do not hold STOP for so long
 
 /** @typedef {import("./inputs.js").Pad} Pad */
 /** @typedef {(id: string) => import("./inputs.js").Mapping} MappingOf */
+/** @typedef {"axes"|"stop-held"|"focus"|"off-centre"|"release"|"held"|"copy"|"other"} PadCode */
 
 /** What is known of one gamepad. */
 class Known {
@@ -137,7 +138,7 @@ export class PadChoice {
    * Why gamepads are ignored, wholly or in part.
    * @param {number} now @param {boolean} focused
    * @param {boolean} armed whether the one that drives was seen in neutral since it was interrupted
-   * @returns {{pad: Pad, key: string, code: import("./pad-input.js").PadCode, buttons: number[]}[]}
+   * @returns {{pad: Pad, key: string, code: PadCode, buttons: number[]}[]}
    */
   ignored(now, focused, armed) {
     return this.here.flatMap(([key, one]) => {
@@ -148,7 +149,7 @@ export class PadChoice {
   }
 }
 
-/** @param {Known} one @returns {import("./pad-input.js").PadCode | ""} */
+/** @param {Known} one @returns {PadCode | ""} */
 function why(one, now, focused, isOff, other) {
   if (Number.isNaN(one.far)) return "axes";
   if (one.latched && now - one.latchedAt > WORN_MS) return "stop-held";

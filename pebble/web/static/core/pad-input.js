@@ -4,8 +4,6 @@ import { attempt } from "./browser.js";
 import { PadChoice } from "./pad-choice.js";
 import { reason } from "./reasons.js";
 
-/** @typedef {"axes"|"stop-held"|"focus"|"off-centre"|"release"|"held"|"copy"|"other"} PadCode */
-
 const PAD_TEXTS = {
   axes: "is ignored: it has no stick",
   "stop-held": "stops no more: its STOP is pressed all the time",
@@ -19,7 +17,7 @@ const PAD_TEXTS = {
 
 /**
  * Why a gamepad is ignored, or some of its buttons are.
- * @param {{pad: {id: string, index: number}, code: PadCode, buttons: number[]}} ignored @returns {import("./reasons.js").Reason}
+ * @param {{pad: {id: string, index: number}, code: import("./pad-choice.js").PadCode, buttons: number[]}} ignored @returns {import("./reasons.js").Reason}
  */
 export function padReason({ pad, code, buttons }) {
   const name = pad.id.split(" (")[0].slice(0, 24).trim(); // without its numbers and its layout

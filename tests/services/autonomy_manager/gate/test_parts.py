@@ -16,10 +16,9 @@ from pebble.config import parse
 from pebble.errors import PayloadError
 from pebble.services.autonomy_manager.gate.answers import AnswerMerger
 from pebble.services.autonomy_manager.gate.client_filter import DriveCommand
-from pebble.services.autonomy_manager.gate.drive_outlet import DriveOutlet
+from pebble.services.autonomy_manager.gate.drive_outlet import DriveOutlet, sign
 from pebble.services.autonomy_manager.gate.pacer import PERIOD_S, Pacer
 from pebble.services.autonomy_manager.gate.packets import PacketError
-from pebble.services.autonomy_manager.gate.signature import sign
 from pebble.services.autonomy_manager.gate.topics import TopicRules
 from pebble.transports.counters import Counters
 from tests.services.autonomy_manager.gate.mqtt_bytes import BASE, CONNACK, DRIVE, puback, publish

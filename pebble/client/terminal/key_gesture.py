@@ -5,11 +5,9 @@ until none is held. What interrupts a gesture ends it for good: keys that are st
 arrived for 0.4 s.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
-from pebble.client.key_decoder import DOWN, LEFT, RIGHT, UP
+from pebble.client.terminal.key_decoder import DOWN, LEFT, RIGHT, UP
 from pebble.contract.payloads import Drive
 
 PERIOD_S = 0.05  # between two commands

@@ -1,7 +1,5 @@
 """Turns the bytes of a terminal into the names of keys. Pure: times are passed in."""
 
-from __future__ import annotations
-
 ESCAPE, SPACE, END = "escape", "space", "end"
 UP, DOWN, LEFT, RIGHT = "up", "down", "left", "right"
 

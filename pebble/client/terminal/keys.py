@@ -1,7 +1,5 @@
 """A terminal that passes on each key at once, and notices when it is lost. Linux and macOS only."""
 
-from __future__ import annotations
-
 import os
 import select
 import shutil
@@ -14,6 +12,7 @@ from types import FrameType
 from typing import Any, TextIO
 
 from pebble.errors import PebbleError
+from pebble.runtime.signals import handled_by
 
 _READ = 4096
 _HIDE_CURSOR, _SHOW_CURSOR, _ERASE_REST = b"\x1b[?25l", b"\x1b[?25h", b"\x1b[K"
@@ -93,16 +92,12 @@ class Terminal:
     @contextmanager
     def signals(self) -> Iterator[None]:
         """Note signals, and wake :meth:`read` up."""
-        ending = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
-        numbers = (*ending, signal.SIGTSTP, signal.SIGCONT)
-        before = {number: signal.signal(number, self._on_signal) for number in numbers}
-        waker = signal.set_wakeup_fd(self._waker, warn_on_full_buffer=False)
-        try:
-            yield
-        finally:
-            signal.set_wakeup_fd(waker)
-            for number, handler in before.items():
-                signal.signal(number, handler)
+        with handled_by(self._on_signal, signal.SIGQUIT, signal.SIGTSTP, signal.SIGCONT):
+            waker = signal.set_wakeup_fd(self._waker, warn_on_full_buffer=False)
+            try:
+                yield
+            finally:
+                signal.set_wakeup_fd(waker)
 
     def _on_signal(self, number: int, _frame: FrameType | None) -> None:
         if number == signal.SIGTSTP:

@@ -1,7 +1,5 @@
 """Reads what surrounds a picture on the wire, without decoding the picture. Pure; imports neither cv2 nor PyAV."""
 
-from __future__ import annotations
-
 from typing import Annotated, Final, NamedTuple
 
 import msgspec
@@ -12,11 +10,12 @@ from pebble.errors import PayloadError
 MAX_PAYLOAD: Final = 4 << 20
 _HEADER_BYTES: Final = 19
 _SOI: Final = b"\xff\xd8"
-_LONGEST_STEP_MS: Final = 5000  # as pebble.media.decode: with more time in between, the number fits by chance
-_MILLISECONDS_FROM: Final = 1e11
-_LATEST_MS: Final = 253_402_300_800_000
+#: With more time between two pictures, or less than none, the sender may have restarted and the number fits by chance.
+_LONGEST_STEP_MS: Final = 5000
+_MILLISECONDS_FROM: Final = 1e11  # a timestamp as large as this is in milliseconds
+_LATEST_MS: Final = 253_402_300_800_000  # the year 10000
 
-_KINDS: Final = {
+KINDS: Final = {
     PictureKind.JPEG: ("pbvd", True),
     PictureKind.DELTA_JPEG: ("pbvd", False),
     PictureKind.ZLIB_JPEG: ("pbvz", True),
@@ -52,7 +51,7 @@ def read_header(payload: bytes) -> PictureHeader | None:
 
 
 def follows(last: PictureHeader | None, header: PictureHeader) -> bool:
-    """Whether a receiver that has decoded ``last`` can decode this one: the rules of pebble.media.decode."""
+    """Whether a receiver that has decoded ``last`` can decode this one."""
     if header.keyframe:
         return True
     if last is None or last.encoding != header.encoding or header.frame != _after(last):
@@ -92,12 +91,12 @@ def _read_pbvd(payload: bytes) -> PictureHeader | None:
         head = Picture.unpack(payload[:_HEADER_BYTES])
     except PayloadError:
         return None
-    captured_ms = _plausible(head.captured_ms)
+    captured_ms = plausible(head.captured_ms)
     if head.kind == PictureKind.H264:
         return PictureHeader("h264", bool(head.flags & KEY_FRAME), head.frame, captured_ms)
-    if head.kind not in _KINDS:
+    if head.kind not in KINDS:
         return None
-    encoding, keyframe = _KINDS[PictureKind(head.kind)]
+    encoding, keyframe = KINDS[PictureKind(head.kind)]
     return PictureHeader(encoding, keyframe, head.frame, captured_ms)
 
 
@@ -106,14 +105,15 @@ def _read_json(payload: bytes) -> PictureHeader | None:
         head = _json.decode(payload)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError, ValueError):
         return None
-    return PictureHeader("json", head.keyframe, head.id, _milliseconds(head.timestamp))
+    return PictureHeader("json", head.keyframe, head.id, milliseconds(head.timestamp))
 
 
-def _milliseconds(stamp: float | None) -> int | None:
-    if stamp is None or not 0 < stamp < _LATEST_MS:
+def milliseconds(stamp: float | None) -> int | None:
+    if stamp is None or not 0 < stamp < _LATEST_MS:  # nor NaN: then neither is true
         return None
-    return _plausible(round(stamp if stamp >= _MILLISECONDS_FROM else stamp * 1000))
+    return plausible(round(stamp if stamp >= _MILLISECONDS_FROM else stamp * 1000))
 
 
-def _plausible(captured_ms: int) -> int | None:
+def plausible(captured_ms: int) -> int | None:
+    """A moment that can be written as a date, or None."""
     return captured_ms if 0 < captured_ms < _LATEST_MS else None

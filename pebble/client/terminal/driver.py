@@ -3,17 +3,15 @@
 The rules are those of the operator page: a reason against driving ends the gesture, and the keys must be released.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from pebble.client.drive_reasons import SLOW_S, SLOW_SPEED, Code, Situation, first_reason
 from pebble.client.driver_lease import FILTER, LISTEN_S, DriverLease
 from pebble.client.estop import Progress, StopSender, new_name
-from pebble.client.key_decoder import ESCAPE, SPACE
-from pebble.client.key_gesture import KeyGesture
 from pebble.client.names import id_of
 from pebble.client.robot_view import RobotView
+from pebble.client.terminal.key_decoder import ESCAPE, SPACE
+from pebble.client.terminal.key_gesture import KeyGesture
 from pebble.contract import AUTONOMY_STATUS, CAPABILITIES, CHARGING_LEVEL, DRIVE, ESTOP_STATE, ONLINE, channel_of, codec
 from pebble.contract.payloads import Drive
 from pebble.transports import Message, QoS
@@ -61,7 +59,6 @@ class TerminalDriver:
 
     @property
     def filters(self) -> list[str]:
-        """What to subscribe to."""
         return [*(channel.filter(self.robot.base) for channel in _RECEIVED), FILTER]
 
     @property
@@ -72,7 +69,6 @@ class TerminalDriver:
     # -- what arrives
 
     def receive(self, message: Message, now: float, wall: float) -> None:
-        """Update from a message."""
         held = self.lease.held
         self.lease.receive(message, now)
         if held and not self.lease.held:
@@ -85,7 +81,6 @@ class TerminalDriver:
             self.stopping.receive(message, now)
 
     def press(self, keys: Sequence[str], now: float) -> None:
-        """The keys that were read."""
         for key in keys:
             twice = key == ESCAPE and now - self._escape_at <= TWICE_S
             if key == ESCAPE:

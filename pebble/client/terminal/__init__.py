@@ -1,0 +1,1 @@
+"""Drives one robot with the keys of a terminal."""
