@@ -51,7 +51,8 @@ def client(port: int, name: str = "robot") -> Transport:
 
 
 def recorded(root: Path) -> list[Recorded]:
-    return list(library.merged(library.files([root])))
+    """What is in the files so far; a recorder that runs has none before its first write."""
+    return list(library.merged(library.files([root]))) if any(root.rglob("*.mcap*")) else []
 
 
 def of(messages: list[Recorded], topic: str) -> list[bytes]:
