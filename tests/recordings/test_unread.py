@@ -148,7 +148,7 @@ READERS = [
     ["export", "{out}.wav", "-r", "goob"], ["index"], ["analyse", "--output", "{out}"],
 ]  # fmt: skip
 WRITERS = [
-    ["rm", "--robot", "nosuch", "--yes"], ["rm", "--robot", "fred", "--yes"], ["rm", "--since", "2000-01-01", "--yes"],
+    ["rm", "--robot", "fred", "--yes"], ["rm", "--since", "2000-01-01", "--yes"],
     ["compact"],
 ]  # fmt: skip
 

@@ -49,6 +49,7 @@ class Link:
             self.other, _ = server.accept()
         self.other.settimeout(5)
         assert self.other.recv(4096).startswith(b"\x10")
+        assert until(lambda: not self.connection.dialling)  # from then on it waits for the answer
         self.now += round_trip_s
         self.other.sendall(b"\x20\2\0\0")
         connecting.join(5)

@@ -93,8 +93,8 @@ class Connection:
         except (OSError, ValueError) as error:
             kind = Absent if isinstance(error, ConnectionRefusedError) else Lost
             raise kind(f"{self.where} cannot be reached: {error}") from None
-        self.dialling = False
         self.incoming.answered_at = began = clock.since_boot()
+        self.dialling = False
         deadline = time.monotonic() + hosts.CONNECT_TIMEOUT_S
         try:
             while (accepted := self.incoming.accepted) is None:

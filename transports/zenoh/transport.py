@@ -283,9 +283,9 @@ class ZenohTransport(Transport):
         return False
 
     def _send_lacking(self, session: zenoh.Session, lacking: set[str]) -> bool:
-        """Send the hub, and only the hub, what is pending and what it lacks; False if that is nothing.
+        """Send the hub what is pending and what it lacks; False if that is nothing.
 
-        Running peers have received these messages live.
+        Others receive of it what is news to them.
         """
         with self._publishing:
             owed = bool(self._own.pending or lacking)
@@ -315,12 +315,16 @@ class ZenohTransport(Transport):
         try:
             if message.retain:
                 self._hub.put(session, message, again=self._syncing)
-            if not self._syncing:
+            if not self._syncing or self._is_news(message):
                 self._publishers.put(session, message, urgent)
         except zenoh.ZError as error:
             log.debug("%s could not send: %s", self.client_id, error)
             return False
         return True
+
+    def _is_news(self, message: Message) -> bool:
+        """Whether others have not received a retained message live: a client reaches them through its hub only."""
+        return self.settings.client and message.topic in self._own.pending
 
     # -- receiving
 
