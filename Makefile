@@ -5,7 +5,7 @@ VENV := .venv/bin/python
 
 .DEFAULT_GOAL := help
 unexport PYTHONDONTWRITEBYTECODE  # every test starts programs: compiling them each time would cost a third of the time
-.PHONY: help demo test quick thorough stops soak floods schedules script-schedules page-schedules page-tests brokers check firmware report clean lock audit sbom check-types check-names check-collection test-running test-robots test-pages test-computing
+.PHONY: help demo test quick thorough stops soak floods schedules script-schedules page-schedules page-tests brokers check firmware report clean lock audit sbom check-types check-names check-collection test-running test-further test-robots test-pages test-computing
 
 help:
 	@echo "make demo             four simulated robots, on Zenoh, on MQTT and on MCUs, driven through a broker; Ctrl-C ends it"
@@ -42,6 +42,8 @@ COMPUTING := tests/config tests/contract tests/media tests/motion tests/percepti
 	$(addprefix tests/firmware/test_,compile.py deadman_virtual.py golden.py heap.py motor_boards.py outlets.py) \
 	$(addprefix tests/firmware/test_,types.py vm.py) \
 	$(addprefix tests/web/,modules $(addprefix test_,driving_lockstep.py log_lines.py page_clock.py recent.py types.py))
+# What takes longest of the others.
+FIRST := $(addprefix tests/,web services recordings transports robot forwarding commands)
 # Files with tests of whole robots, to collect no others; those that take longest come first.
 ALONE = $(shell grep --recursive --files-with-matches --include=test_*.py 'mark\.alone' \
 	tests/services tests/robot/test_faults.py tests | grep --invert-match tests/test_demo.py | awk '!seen[$$0]++')
@@ -61,22 +63,28 @@ quick: .venv/.ready-dev
 	@$(VENV) tools/run_tests.py -k "drive_forms or silence" tests/robot/test_robot.py
 	@$(SHOW_TIMES)
 
-# What only computes, as little as possible in the way, uses what the others leave, from the beginning to the end.
-test: check
+# What only computes, as little as possible in the way, uses what the others leave, from the beginning to the end. The
+# others run in two parts, because every process collects all tests of its part: 10 s of a processor for all there are.
+test: .venv/.ready-dev
+	@$(MAKE) --no-print-directory --jobs=2 --output-sync check-types check-names
 	@sh tools/debian-packages.sh mosquitto=mosquitto mosquitto_pub=mosquitto-clients chromium=chromium node=nodejs ip=iproute2 tc=iproute2 nft=nftables systemd-analyze=systemd
 	@rm -f $(TIMES)
-	@$(MAKE) --no-print-directory --jobs=2 test-computing test-running
+	@echo "pebble: tests"
+	@$(MAKE) --no-print-directory --jobs=3 test-computing test-running test-further
+	@echo "pebble: whole robots and serial lines, two at a time because these tests check deadlines, beside them one with a page"
+	@$(MAKE) --no-print-directory --jobs=2 test-robots test-pages
 	@echo "pebble: the demo, whose robots need all processors"
 	@$(VENV) tools/run_tests.py $(if $(PEBBLE_THOROUGH),,-m "not thorough") tests/test_demo.py
 	@$(SHOW_TIMES)
 	@$(VENV) tools/tree_growth.py
 
 test-running:
-	@echo "pebble: tests"
-	@$(TESTS) --numprocesses 6 -m "not alone and not page$(LESS)" $(addprefix --ignore=,$(COMPUTING)) \
-		$(addprefix tests/,web transports services commands scripts script robot launcher) tests
-	@echo "pebble: whole robots and serial lines, two at a time because these tests check deadlines, beside them one with a page"
-	@$(MAKE) --no-print-directory --jobs=2 test-robots test-pages
+	@$(TESTS) --numprocesses 4 -m "not alone and not page$(LESS)" $(addprefix --ignore=,$(COMPUTING)) $(FIRST)
+
+test-further:
+	@$(TESTS) --numprocesses 2 -m "not alone and not page$(LESS)" $(addprefix --ignore=,$(COMPUTING) $(FIRST)) tests \
+		>.venv/further.log 2>&1 || { cat .venv/further.log; exit 1; }
+	@echo "pebble: further ones: $$(tail -n 1 .venv/further.log)"
 
 test-robots:
 	@$(TESTS) --numprocesses 2 -m "alone and not page$(LESS)" $(filter-out $(PAGES),$(ALONE))

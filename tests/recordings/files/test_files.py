@@ -9,6 +9,7 @@ import random
 import subprocess
 import sys
 from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 from typing import BinaryIO
 
@@ -21,7 +22,7 @@ from pebble.recordings.files.scan import Damage, blocks
 from pebble.recordings.files.writer import McapWriter
 from tests.recordings.files.other_readers import Counted, by_mcap, by_mcap_core
 from tests.recordings.messages import START_NS, STEP_NS, contents, is_part_of, write
-from tests.support import cases
+from tests.support import cases, some
 
 MESSAGES = 2000
 #: How many times as many files are damaged as usual.
@@ -101,9 +102,7 @@ def _indexes(data: bytes) -> list[int]:
 
 
 class TestDamaged:
-    @pytest.mark.parametrize("level", [0, 3])
-    @pytest.mark.parametrize("finished", [False, True])
-    @pytest.mark.parametrize("damage", DAMAGES)
+    @pytest.mark.parametrize(("damage", "finished", "level"), some(product(DAMAGES, [False, True], [0, 3]), 3))
     def test_all_that_is_left_is_read_and_what_is_missing_is_known(
         self, tmp_path: Path, damage: Callable[[bytearray, random.Random], None], finished: bool, level: int
     ) -> None:
@@ -177,7 +176,7 @@ class TestDamaged:
                 path.write_bytes(raw)
                 assert len(contents(path)) >= len(written) - 100, at
 
-    @pytest.mark.parametrize("damage", DAMAGES)
+    @pytest.mark.parametrize("damage", some(DAMAGES, 2))
     def test_finishing_may_be_killed_at_any_byte(
         self, tmp_path: Path, damage: Callable[[bytearray, random.Random], None]
     ) -> None:
