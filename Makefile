@@ -38,7 +38,7 @@ TESTS := $(VENV) tools/run_tests.py --dist loadscope --no-loadscope-reorder
 LESS := $(if $(PEBBLE_THOROUGH),, and not thorough)
 # What checks no times: it uses what whole robots leave of the processors.
 COMPUTING := tests/config tests/contract tests/media tests/motion tests/perception tests/robot/test_lockstep.py \
-	$(addprefix tests/bench/test_,compare.py plots.py ratios.py report.py results.py) \
+	$(addprefix tests/bench/,judging $(addprefix test_,plots.py report.py results.py)) \
 	$(addprefix tests/firmware/test_,compile.py deadman_virtual.py golden.py heap.py motor_boards.py outlets.py) \
 	$(addprefix tests/firmware/test_,types.py vm.py) \
 	$(addprefix tests/web/,modules $(addprefix test_,driving_lockstep.py log_lines.py page_clock.py recent.py types.py))

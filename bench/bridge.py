@@ -14,7 +14,6 @@ from itertools import pairwise
 from statistics import fmean
 from typing import Any
 
-from pebble.bench.aims import RatioAim
 from pebble.bench.bridge_operator import ALL, HOP, STAND_IN, Arrived, DrivenRobot, Turn, Wheels, driven_robot, wheels_of
 from pebble.bench.clients import RATE_HZ
 from pebble.bench.comparison import (
@@ -31,6 +30,7 @@ from pebble.bench.comparison import (
     seconds,
     variants,
 )
+from pebble.bench.judging.aims import RatioAim
 from pebble.bench.pictures import bars, ecdf, null_ratios, ratios
 from pebble.bench.results import Cell, grouped
 from pebble.bench.tables import COUNT, LOST, SPREAD, Claims, Grid, percentile_column, single_column

@@ -23,7 +23,7 @@ from paho.mqtt.client import MQTTMessage
 
 from pebble import contract
 from pebble.bench.clients import RATE_HZ, RobotSubscriber, StockClient, axes_of
-from pebble.bench.null import spin
+from pebble.bench.judging.null import spin
 from pebble.bench.usage import cpu_s
 from pebble.errors import PebbleError
 from pebble.rig.processes import python

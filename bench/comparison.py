@@ -19,7 +19,7 @@ from typing import Any, Final
 from rich.console import Console
 from rich.table import Table
 
-from pebble.bench import null
+from pebble.bench.judging import null
 from pebble.bench.results import LONGEST_S, Cell, Judged, Results, Value
 from pebble.errors import PebbleError
 
@@ -182,7 +182,7 @@ class Comparison:
     variants: Sequence[str] = ()  # measured in turn; the option of this name chooses some
     references: Sequence[str] = ()  # more of them, which are always measured
     conditions: Callable[[Run], Sequence[Params]] = unconditional
-    is_null: bool = False  # one variant in three roles: see pebble.bench.null
+    is_null: bool = False  # one variant in three roles: see pebble.bench.judging.null
     modes: Mapping[str, Comparison] = field(default_factory=dict)  # what is run instead if this option is given
 
     measuring: Measuring = Measuring()
@@ -191,7 +191,7 @@ class Comparison:
     def null_test(
         self, what: str, *, report: dict[str, Any], measuring: dict[str, Any] | None = None, **changes: Any
     ) -> Comparison:
-        """The mode of ``--null``: one variant against itself, as it is and slowed down. See pebble.bench.null.
+        """The mode of ``--null``: one variant against itself, as it is and slowed down. See pebble.bench.judging.null.
 
         ``report`` and ``measuring`` are what is different in these parts.
         """

@@ -13,8 +13,6 @@ from typing import Any, NamedTuple
 import msgspec
 
 from pebble.bench import control_far as far
-from pebble.bench import null
-from pebble.bench.aims import outcome, rounds_with_lost
 from pebble.bench.comparison import (
     Budget,
     Case,
@@ -30,8 +28,10 @@ from pebble.bench.comparison import (
 )
 from pebble.bench.control_worker import ONE_WAY, ROUND_TRIP, SMALLEST, Slice, SliceSpec, condition
 from pebble.bench.engine import roles_of
+from pebble.bench.judging import null
+from pebble.bench.judging.aims import outcome, rounds_with_lost
+from pebble.bench.judging.ratios import Interval, paired
 from pebble.bench.pictures import ecdf, null_ratios, ratios
-from pebble.bench.ratios import Interval, paired
 from pebble.bench.results import Cell, Judged, Value, percentile, rounded
 from pebble.bench.tables import Column, Grid, percentile_column, single_column
 from pebble.bench.usage import wake_ups

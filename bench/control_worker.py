@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgspec
 
-from pebble.bench.null import spin
+from pebble.bench.judging.null import spin
 from pebble.contract import DRIVE
 from pebble.errors import PebbleError
 from pebble.rig.worker_end import answer, serve, serve_on_thread

@@ -19,9 +19,9 @@ from rich.markup import escape
 from rich.measure import Measurement
 from rich.table import Table
 
-from pebble.bench import null
 from pebble.bench.comparison import Combine, Comparison, Round, Run
-from pebble.bench.ratios import LEAST_ROUNDS
+from pebble.bench.judging import null
+from pebble.bench.judging.ratios import LEAST_ROUNDS
 from pebble.bench.results import OVER_TIME, Cell, Judged, Value, begin, grouped, named, percentile
 from pebble.errors import PebbleError
 from pebble.runtime.signals import interrupted_by_signals

@@ -14,9 +14,9 @@ from functools import partial
 from typing import Any
 
 from pebble.bench import clients
-from pebble.bench.aims import Aim, single, with_lost
 from pebble.bench.comparison import Budget, Case, Comparison, Measuring, Report, Round, rounds
 from pebble.bench.fleet import read_moves
+from pebble.bench.judging.aims import Aim, single, with_lost
 from pebble.bench.pictures import ecdf
 from pebble.bench.results import Cell
 from pebble.bench.tables import COUNT, Claims, Grid, percentile_column

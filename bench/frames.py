@@ -9,7 +9,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from pebble.bench import null
 from pebble.bench.comparison import (
     Budget,
     Case,
@@ -23,8 +22,9 @@ from pebble.bench.comparison import (
     seconds,
     variants,
 )
+from pebble.bench.judging import null
+from pebble.bench.judging.ratios import LEAST_ROUNDS, paired
 from pebble.bench.pictures import ecdf, null_ratios, tails
-from pebble.bench.ratios import LEAST_ROUNDS, paired
 from pebble.bench.results import Cell, Value
 from pebble.bench.tables import COUNT, LOST, Column, Grid, percentile_column
 from pebble.bench.usage import cpu_s, pss_mb

@@ -73,7 +73,7 @@ def write(writer: Writer, size: int, slower_us: float) -> None:
         stamps.append(time.monotonic_ns())
         struct.pack_into("<q", frame.data, 0, stamps[-1])
         end = time.perf_counter_ns() + int(1000 * slower_us)
-        while time.perf_counter_ns() < end:  # as pebble.bench.null.spin, which the system's Python cannot import
+        while time.perf_counter_ns() < end:  # as judging.null.spin, which the system's Python cannot import
             pass
 
     window = Window(lambda: {"sent": sum(one in window.ns for one in stamps), "fallbacks": writer.fallbacks})

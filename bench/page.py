@@ -19,10 +19,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import urlencode, urlsplit
 
-from pebble.bench.aims import outcome
 from pebble.bench.clients import driving as others_drive
 from pebble.bench.comparison import Budget, Case, Comparison, Measuring, Option, Report, rounds
 from pebble.bench.impair.conditions import Condition, Shape
+from pebble.bench.judging.aims import outcome
 from pebble.bench.page_rig import HELD_S, KEY, ROBOT, Rig, linked, monotonic, rig
 from pebble.bench.results import Cell, Judged, percentile
 from pebble.bench.tables import figure

@@ -15,10 +15,11 @@ from pkgutil import resolve_name
 from statistics import median
 from typing import TYPE_CHECKING, cast
 
-from pebble.bench import null, plots
+from pebble.bench import plots
 from pebble.bench.comparison import find
+from pebble.bench.judging import null
+from pebble.bench.judging.ratios import LEAST_ROUNDS, Interval, paired
 from pebble.bench.plots import Picture, Style, finite, short, unique
-from pebble.bench.ratios import LEAST_ROUNDS, Interval, paired
 from pebble.bench.results import Cell, Results, grouped, percentile
 from pebble.bench.tables import base_of, medians
 from pebble.bench.tables import figure as digits

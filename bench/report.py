@@ -12,9 +12,9 @@ from pathlib import Path
 
 from rich.console import Console
 
-from pebble.bench.aims import MISSED
 from pebble.bench.comparison import Comparison, reported
 from pebble.bench.engine import check_folder
+from pebble.bench.judging.aims import MISSED
 from pebble.bench.results import Results, load, named, pack
 from pebble.errors import PebbleError
 from pebble.rig.processes import Program, end_all, python

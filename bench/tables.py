@@ -10,7 +10,7 @@ from statistics import median
 from rich import box
 from rich.table import Table
 
-from pebble.bench.ratios import LEAST_ROUNDS, LEVEL, paired
+from pebble.bench.judging.ratios import LEAST_ROUNDS, LEVEL, paired
 from pebble.bench.results import Cell, grouped, percentile
 
 

@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 from rich.table import Table
 
-from pebble.bench.aims import outcome
 from pebble.bench.clients import driving
 from pebble.bench.comparison import Budget, Case, Comparison, Measuring, Report, Run
+from pebble.bench.judging.aims import outcome
 from pebble.bench.pictures import Drawn
 from pebble.bench.results import Cell, Judged, Results, Value
 from pebble.bench.tables import plain_table

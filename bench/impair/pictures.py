@@ -14,8 +14,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from pebble.bench.aims import single, with_lost
 from pebble.bench.impair import trials
+from pebble.bench.judging.aims import single, with_lost
 from pebble.bench.plots import Picture, Style, around, finite, guide, legend, log_axis, panels, short, styles, unique
 from pebble.bench.results import OVER_TIME, Cell, Results, grouped
 

@@ -13,15 +13,15 @@ from pathlib import Path
 
 import msgspec
 
-from pebble.bench.aims import Aim, outcome, single, with_lost
 from pebble.bench.comparison import Budget, Comparison, Measuring, Option, Report, Round, Run
 from pebble.bench.impair import metrics
 from pebble.bench.impair.conditions import CONDITIONS, Condition
 from pebble.bench.impair.metrics import OperatorReport, Plan, Trial, cells_of, over_time
 from pebble.bench.impair.network import REMOTE_HOST, NamespaceNetwork, Traffic, require_namespaces
 from pebble.bench.impair.operator import CLIP
+from pebble.bench.judging.aims import Aim, outcome, single, with_lost
+from pebble.bench.judging.ratios import paired
 from pebble.bench.pictures import Drawn
-from pebble.bench.ratios import paired
 from pebble.bench.results import LONGEST_S, Cell, Judged, grouped
 from pebble.bench.tables import Column, Grid, figure
 from pebble.config.raw import deep_merge

@@ -8,8 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from pebble.bench.aims import Aim, single
 from pebble.bench.comparison import Budget, Case, Comparison, Measuring, Report
+from pebble.bench.judging.aims import Aim, single
 from pebble.bench.pictures import bars
 from pebble.bench.results import Cell, Value
 from pebble.bench.tables import Grid, percentile_column, single_column

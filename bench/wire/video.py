@@ -9,8 +9,8 @@ from functools import lru_cache
 from statistics import fmean
 from typing import Any, Final
 
-from pebble.bench.aims import Aim
 from pebble.bench.comparison import Budget, Case, Comparison, Measuring, Report, seconds
+from pebble.bench.judging.aims import Aim
 from pebble.bench.pictures import bars
 from pebble.bench.results import Cell
 from pebble.bench.tables import Grid, percentile_column, single_column

@@ -35,7 +35,7 @@ def compare(
 
     Both files come from the same comparison, if possible on the same machine with the same options.
     """
-    from pebble.bench.compare import run
+    from pebble.bench.judging.compare import run
 
     return run(a, b, everything=everything)
 

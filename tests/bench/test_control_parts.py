@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Self
 import pytest
 from rich.console import Console
 
-from pebble.bench import control, engine, null
+from pebble.bench import control, engine
 from pebble.bench.comparison import Case, Comparison
 from pebble.bench.control import CONTROL, CONTROL_NULL, VARIANTS, assessment
 from pebble.bench.control_worker import (
@@ -29,6 +29,7 @@ from pebble.bench.control_worker import (
     condition,
     echo,
 )
+from pebble.bench.judging import null
 from pebble.bench.results import Cell, load
 from pebble.errors import PebbleError
 from pebble.rig import processes

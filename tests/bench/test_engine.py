@@ -13,8 +13,7 @@ import pytest
 import typer
 from rich.console import Console
 
-from pebble.bench import engine, null
-from pebble.bench.aims import Aim, single, with_lost
+from pebble.bench import engine
 from pebble.bench.comparison import (
     MODULES,
     Budget,
@@ -31,6 +30,8 @@ from pebble.bench.comparison import (
     seconds,
     variants,
 )
+from pebble.bench.judging import null
+from pebble.bench.judging.aims import Aim, single, with_lost
 from pebble.bench.results import OVER_TIME, Cell, Judged, Results, load
 from pebble.bench.tables import COUNT, Claims, Grid, percentile_column
 from pebble.commands.bench import command_of

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from pebble.bench.compare import compare
 from pebble.bench.engine import check_folder
+from pebble.bench.judging.compare import compare
 from pebble.bench.results import (
     FORMAT,
     OVER_TIME,

@@ -9,8 +9,8 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 
-from pebble.bench.aims import outcome
-from pebble.bench.ratios import Interval, paired
+from pebble.bench.judging.aims import outcome
+from pebble.bench.judging.ratios import Interval, paired
 from pebble.bench.results import Cell, Judged
 from pebble.bench.tables import base_of
 

@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from pebble.bench import ratios
-from pebble.bench.ratios import LEAST_ROUNDS, Interval, paired, unpaired
+from pebble.bench.judging import ratios
+from pebble.bench.judging.ratios import LEAST_ROUNDS, Interval, paired, unpaired
 
 Rounds = list[list[float]]
 RUNS = 300

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from pebble.bench.ratios import LEAST_ROUNDS, LEVEL, Interval, student, unpaired
+from pebble.bench.judging.ratios import LEAST_ROUNDS, LEVEL, Interval, student, unpaired
 from pebble.bench.results import OVER_TIME, Cell, Results, load, percentile
 from pebble.bench.tables import figure, plain_table
 from pebble.errors import PebbleError

@@ -9,8 +9,8 @@ import pytest
 from rich.console import Console
 
 from pebble import cli
-from pebble.bench import ratios
-from pebble.bench.compare import CHANCE, Kind, certainty, compare, differences, run, summary
+from pebble.bench.judging import ratios
+from pebble.bench.judging.compare import CHANCE, Kind, certainty, compare, differences, run, summary
 from pebble.bench.results import Cell, Results
 from pebble.errors import PebbleError
 

@@ -8,10 +8,11 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from pebble.bench import engine, null
+from pebble.bench import engine
 from pebble.bench.comparison import Case
 from pebble.bench.frames import FRAMES_NULL
 from pebble.bench.frames_worker import RATE_HZ
+from pebble.bench.judging import null
 from pebble.bench.pictures import LEAST
 from pebble.bench.results import Cell, load
 from pebble.errors import PebbleError

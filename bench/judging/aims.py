@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
-from pebble.bench.ratios import LEAST_ROUNDS, paired
+from pebble.bench.judging.ratios import LEAST_ROUNDS, paired
 from pebble.bench.results import Cell, Judged, percentile
 from pebble.bench.tables import base_of, figure
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from pebble.bench.aims import Aim, with_lost
+from pebble.bench.judging.aims import Aim, with_lost
 from pebble.bench.results import Cell
 
 SLOWEST = Aim(

@@ -1,0 +1,1 @@
+"""What two results differ by, and whether that is more than noise."""
