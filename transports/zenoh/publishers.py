@@ -39,6 +39,13 @@ class Publishers:
         finally:
             self.thread = 0
 
+    def put_late(self, session: zenoh.Session, message: Message) -> None:
+        """Send a retained message that others have missed; this client itself finds it at the hub."""
+        treatment = wire.TREATMENTS[message.qos, self._urgent.get(message.topic, False)]
+        stamp = wire.pack_live(message.qos, retain_requested=message.retain)
+        key, others = topic_to_key(message.topic), zenoh.Locality.REMOTE
+        session.put(key, message.payload, attachment=stamp, allowed_destination=others, **treatment)
+
     def _declare(self, session: zenoh.Session, message: Message, urgent: bool) -> zenoh.Publisher | None:
         """Declare a publisher, which sends to subscribers only; without it the hub gets a copy of every message.
 

@@ -315,16 +315,14 @@ class ZenohTransport(Transport):
         try:
             if message.retain:
                 self._hub.put(session, message, again=self._syncing)
-            if not self._syncing or self._is_due_live(message):
+            if not self._syncing:
                 self._publishers.put(session, message, urgent)
+            elif self.settings.client and message.topic in self._own.pending:  # others hear it through the hub only
+                self._publishers.put_late(session, message)
         except zenoh.ZError as error:
             log.debug("%s could not send: %s", self.client_id, error)
             return False
         return True
-
-    def _is_due_live(self, message: Message) -> bool:
-        """Whether others have not received a retained message live: a client reaches them through its hub only."""
-        return self.settings.client and message.topic in self._own.pending
 
     # -- receiving
 
