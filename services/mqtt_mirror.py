@@ -51,7 +51,7 @@ class MqttMirror(ForwardingService):
         self._probes = Probes()
         self._announced = False  # the bridge has sent a probe since the newest check began
         self._requested_at = float("-inf")
-        self._is_remote = False  # the newest result about the broker
+        self._is_operators = False  # by the newest check the broker is the operators', not one of the robot's
         self._refused = ""  # why nothing is mirrored, as logged
 
     def make_remote(self) -> Transport:
@@ -96,10 +96,10 @@ class MqttMirror(ForwardingService):
     def _begin(self, epoch: int) -> None:
         if epoch != self.epoch or self.forwarder.gate is not Gate.WAITING:
             return
-        if self._is_remote and not self._announced:  # the bridge is away: nothing has disproven it
+        if self._is_operators and not self._announced:  # the bridge has sent no probe since: it may still be theirs
             self._refuse(self._refused)
             return
-        self._is_remote, self._refused = False, ""
+        self._is_operators, self._refused = False, ""
         self.log.info("offering the robot's topics on its MQTT broker")
         self.forwarder.open()
         self.subscribe_remote()
@@ -118,13 +118,13 @@ class MqttMirror(ForwardingService):
         if self.clock() - self._requested_at >= _REQUEST_PERIOD_S:
             self._request_probe()
 
-    def disable(self) -> None:
-        self._is_remote = True
+    def found_one_broker(self) -> None:
+        self._is_operators = True
         self._refuse("is the remote one, which the bridge serves already")
 
     def _refuse(self, why: str) -> None:
-        """Mirror nothing until the next check: the address may lead to another broker by then."""
-        super().disable()
+        """Forward nothing until the next check: the address may lead to another broker by then."""
+        self.forward_nothing()
         if why != self._refused:
             self._refused = why
             address = f"{self._broker.host}:{self._broker.port}"
@@ -143,6 +143,7 @@ class MqttMirror(ForwardingService):
             self._announced = True
             if self._probes.announce(message.payload):
                 self.shut()
+        # else a heartbeat: only the bridge publishes it; one from the broker is a reason to request a probe
 
     def receive_remote(self, epoch: int, message: Message) -> None:
         if message.topic in self._watched:

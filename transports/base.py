@@ -321,12 +321,13 @@ class Transport(ABC):
     ) -> bool:
         """Publish one message; return whether it was accepted.
 
-        A live message is refused while there is no connection, and never delivered late. A retained one is accepted
-        unless the transport is closed: its newest value is stored, for at most 10,000 topics and 16 MB, and sent when
-        the connection is back (T4). ``remember`` False: it is not stored here, because others change it as well;
-        without a connection it is refused. ``shared``: others change it as well, so after an outage another value there
-        counts as newer than ours, and is left alone (T9). ``urgent`` gives commands and flags priority where the
-        backend can. Raises TransportError for a topic that is not allowed.
+        A live message is refused while there is no connection (on Zenoh: to other processes; CONNECTING only means that
+        the hub is away), and never delivered late. A retained one is accepted unless the transport is closed: its
+        newest value is stored, for at most 10,000 topics and 16 MB, and sent when the connection is back (T4).
+        ``remember`` False: it is not stored here, because others change it as well; without a connection it is refused.
+        ``shared``: others change it as well, so after an outage another value there counts as newer than ours, and is
+        left alone (T9). ``urgent`` gives commands and flags priority where the backend can. Raises TransportError for a
+        topic that is not allowed.
         """
         check_topic(topic)
         if not isinstance(payload, bytes):
@@ -426,8 +427,8 @@ class Transport(ABC):
     def _initial_sync(self, known: Collection[str]) -> None:
         """Finish a new connection that has its subscriptions: send the retained messages it lacks, and be connected.
 
-        Until then a backend's ``_send`` accepts messages only while ``_syncing``: retained messages published
-        meanwhile are pending, and sent last.
+        Until then the ``_send`` of a backend that calls this accepts messages only while ``_syncing``: retained ones
+        that are published meanwhile are pending, and sent last.
         """
         self._sync_retained(known)
         self._set_state(State.CONNECTED)
@@ -439,7 +440,7 @@ class Transport(ABC):
 
     @abstractmethod
     def _open(self, timeout: float) -> None:
-        """Start connecting; call ``_initial_sync`` once subscriptions are in place."""
+        """Start connecting. Once subscriptions are in place, call ``_initial_sync``, or do the same (as Zenoh does)."""
 
     @abstractmethod
     def _close(self, will: Message | None) -> None:

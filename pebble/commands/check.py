@@ -151,7 +151,20 @@ def facts(config: Config) -> list[tuple[str, str]]:
     table = programs(config)
     found.append(("processes", ", ".join([_LAUNCHER, *(program.name for program in table if not program.on_demand)])))
     on_request = ", ".join(program.name for program in table if program.on_demand)
-    return [*found, ("on request", on_request)] if on_request else found
+    off = ", ".join(_off(config))
+    return [*found, *((name, line) for name, line in (("on request", on_request), ("off", off)) if line)]
+
+
+def _off(config: Config) -> Iterator[str]:
+    """The services that have settings, but are not enabled."""
+    own = config.services.serial_mcu_bridge
+    for name, line in {"": own, **own.instances}.items():
+        if not line.enabled and line.serial.port is not None:
+            yield f"serial_mcu_bridge{name and ':'}{name} (its section has a port)"
+    for name in config.services.__struct_fields__:
+        section = getattr(config.services, name)
+        if name != "serial_mcu_bridge" and not getattr(section, "enabled", True) and section != type(section)():
+            yield f"{name} (its section has settings)"
 
 
 def topics_of(config: Config) -> Iterator[tuple[str, list[TopicLine]]]:

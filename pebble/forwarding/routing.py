@@ -18,7 +18,7 @@ URGENT: Final = frozenset({Kind.COMMAND, Kind.ACTION, Kind.FLAG})
 
 class Side(Enum):
     LOCAL = "local"  # the robot's own transport
-    REMOTE = "remote"  # the other one
+    REMOTE = "remote"  # the other one: for the bridge the operators', for the mirror the broker on the robot
 
     other: Side
     __hash__ = object.__hash__  # of C's, not of Python's: a side is looked up ten times for each message

@@ -25,10 +25,10 @@ class Status(Struct, frozen=True):
     """What a forwarding service does now, for tools and tests."""
 
     gate: Gate
-    mirroring: bool
+    mirroring: bool  # by the flag remote-mirror, which does not concern the service mqtt_mirror
     synchronized: frozenset[Side]  # whose retained messages have arrived
     circulating: frozenset[tuple[Side, str]]  # topics that something else brings back to the side they came from
-    epoch: int  # lost connections of the remote side
+    epoch: int  # grows whenever the remote side is not connected
     subscribed: frozenset[Side]
     counts: dict[str, int]  # messages, by side and what became of them
 
@@ -58,7 +58,7 @@ class ForwardingService(Service, ABC):
             on_value=self.on_value,
             clock=self.clock,
         )
-        self.epoch = 0  # counts lost connections of the remote side
+        self.epoch = 0  # grows whenever the remote side is not connected: what carries an older one is dropped
         self.subscriptions: dict[Side, list[Subscription]] = {side: [] for side in Side}
 
     @property
@@ -85,7 +85,7 @@ class ForwardingService(Service, ABC):
 
     @abstractmethod
     def connected(self, side: Side, epoch: int) -> None:
-        """React to a connection of ``side``, made after ``epoch`` lost ones of the remote side."""
+        """React to a connection of ``side``; ``epoch`` was the current one when it was made."""
 
     def disconnected(self, side: Side) -> None:
         """React to a lost connection."""
@@ -170,8 +170,12 @@ class ForwardingService(Service, ABC):
     def _probe_again(self) -> None:
         self.forwarder.publisher.probe_again(self.probed_sides, self.forwarder.retained.value)
 
-    def disable(self) -> None:
-        """Forward nothing until a check finds that the two sides are two brokers."""
+    def found_one_broker(self) -> None:
+        """React to the finding that the two sides are, or may be, one broker."""
+        self.forward_nothing()
+
+    def forward_nothing(self) -> None:
+        """Forward nothing until the next check: at a reconnect, or in 30 s."""
         self.forwarder.shut()  # again: it may just have been opened
         self.unsubscribe(Side.REMOTE)
         self.check_later()
@@ -198,4 +202,4 @@ class ForwardingService(Service, ABC):
         """The two sides may be one broker: forward nothing from now on, and do the rest on the service's thread."""
         if self.forwarder.gate is not Gate.SHUT:
             self.forwarder.shut()
-            self.post_message(BRIDGE_PROBE, self.disable)
+            self.post_message(BRIDGE_PROBE, self.found_one_broker)

@@ -69,10 +69,12 @@ def _marked(cls: type, mark: str) -> list[str]:
 class Service:
     """One process of a robot. Handlers and timers run one at a time, on the thread that called :meth:`run`: no locks.
 
-    Only what is given to :meth:`run_if_idle` may run on another thread, while that one has nothing to do.
+    Only two things run on other threads: what is given to :meth:`run_if_idle`, while that one has nothing to do; and
+    handlers marked ``direct``, at any time.
 
     A subclass gives ``name`` and ``publishes``, marks methods with ``@on`` and ``@every``, opens its device in
-    ``start`` and leaves it safe in ``stop``. A reader thread of a blocking device only ever calls ``post``.
+    ``start`` and leaves it safe in ``stop``. A reader thread of a blocking device only ever calls ``post`` or
+    ``run_if_idle``.
     Every attribute is set in ``__init__``; what ``start`` opens is closed by :meth:`on_stop`::
 
         def __init__(self, *arguments: Any, **options: Any) -> None:

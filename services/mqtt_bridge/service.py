@@ -172,8 +172,8 @@ class MqttBridge(ForwardingService):
         self.subscribe_remote()
         self.log.info("forwarding between the robot and its remote side")
 
-    def disable(self) -> None:
-        super().disable()
+    def found_one_broker(self) -> None:
+        self.forward_nothing()
         self.log.info(
             "the local and the remote side are one broker, or something else forwards outgoing/# to the local one: "
             "nothing is mirrored"

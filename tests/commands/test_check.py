@@ -10,6 +10,9 @@ import pytest
 from tests.commands.command_line import Run, config_file
 from tests.support import ROOT
 
+MINIMAL = json.loads((ROOT / "configs" / "minimal.json").read_text())
+SERIAL = {"enabled": True, "serial": {"port": "/dev/a"}}
+
 
 @pytest.mark.parametrize("path", sorted((ROOT / "configs").glob("[!s]*.json")), ids=lambda path: path.stem)
 def test_every_config_we_ship_is_right(run: Run, path: Path) -> None:
@@ -117,6 +120,24 @@ def test_check_shows_what_runs_on_request(run: Run, tmp_path: Path) -> None:
     assert "on request camera_publisher, audio_publisher, audio_receiver" in lines
     for expected in ("camera_publisher publishes outgoing/front-camera", "audio_receiver subscribes else/where"):
         assert any(line.startswith(expected) for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("services", "line"),
+    [
+        (MINIMAL["services"], "serial_mcu_bridge (its section has a port)"),
+        ({"serial_mcu_bridge": {**SERIAL, "instances": {"imu": {"enabled": False, "serial": {"port": "/dev/b"}}}}},
+         "serial_mcu_bridge:imu (its section has a port)"),
+        ({"av_daemon": {"video": {"fps": 12}}, "recorder": {"enabled": False}}, "av_daemon (its section has settings)"),
+        ({"soundboard_handler": {"enabled": True}}, None),
+    ],
+)  # fmt: skip
+def test_check_names_services_that_have_settings_but_are_off(
+    run: Run, tmp_path: Path, services: dict[str, object], line: str | None
+) -> None:
+    assert run("check", config_file(tmp_path, services=services), columns=120) == 0
+    rows = [" ".join(row.split()) for row in run.out.splitlines()]
+    assert [row for row in rows if row.startswith("off ")] == ([] if line is None else [f"off {line}"])
 
 
 def test_check_reports_every_problem_of_every_file(run: Run, tmp_path: Path) -> None:

@@ -162,7 +162,7 @@ class ScriptedMcu:
             os.write(self._master, data)
 
 
-class Rig:
+class SerialRig:
     """A local transport, a subscriber, and any number of serial lines with one MCU each, by instance name.
 
     On a ``network`` that it shares with others its robot has a name of its own.

@@ -30,7 +30,7 @@ from tests.transports.forked import Forked
 from tests.transports.zenoh_net import HubProcess
 
 ROBOT = "rover"
-BASE = f"pebble/robots/{ROBOT}"
+BASE = f"pebble/robots/{ROBOT}"  # of a rig with a network of its own; of others: rig.base
 SILENCE_S = 5.0  # a machine that does too much at once is not a broker that stopped answering
 
 
@@ -57,23 +57,23 @@ class Listener:
 
     def newest(self, metric: str) -> Any:
         """Return what was published last; an empty dict before that, and once it was cleared."""
-        return next((msgspec.json.decode(raw) for raw in self.retained(metric)), {})
+        return next((msgspec.json.decode(raw) for raw in self.newest_raw(metric)), {})
 
     def became(self, metric: str, timeout: float = 15.0, **fields: Any) -> bool:
         """Wait until the newest message on a topic has these fields."""
         return until(lambda: fields.items() <= self.newest(metric).items(), timeout)
 
     def described(self, uid: str | bytes) -> None:
-        """Wait until this MCU's manifest is retained."""
-        assert until(lambda: self.retained(f"mcu/{uid!s}/describe"), 5), uid
+        """Wait for this MCU's manifest."""
+        assert until(lambda: self.newest_raw(f"mcu/{uid!s}/describe"), 5), uid
 
     def got(self, metric: str) -> bool:
         """Wait for a payload on this topic."""
         return until(lambda: self.payloads(metric), 5)
 
     def cleared(self, *metrics: str, timeout: float = 3.0) -> bool:
-        """Wait until nothing is retained on these topics."""
-        return until(lambda: not any(self.retained(metric) for metric in metrics), timeout)
+        """Wait until the newest message on each topic is empty. True if there was none: wait for a value first."""
+        return until(lambda: not any(self.newest_raw(metric) for metric in metrics), timeout)
 
     def values(self, metric: str) -> list[Any]:
         """Return the ``value`` of each payload on this topic."""
@@ -84,7 +84,7 @@ class Listener:
         pairs = zip(list(self.received), list(self.at), strict=False)
         return next(at for message, at in pairs if message.topic == f"{self.base}/outgoing/{metric}")
 
-    def retained(self, metric: str) -> list[bytes]:
+    def newest_raw(self, metric: str) -> list[bytes]:
         """Return the payload of the newest message on a topic; an empty list if that message cleared the topic."""
         return [message.payload for message in self.on(metric)[-1:] if message.payload]
 

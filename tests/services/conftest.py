@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.kit.board import Rig
+from tests.kit.board import SerialRig
 from tests.kit.robot import LocalNetwork
 from tests.support import Broker
 
@@ -37,15 +37,15 @@ def network(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
 
 
 @pytest.fixture
-def rig(network: LocalNetwork, tmp_path: Path) -> Iterator[Rig]:
+def rig(network: LocalNetwork, tmp_path: Path) -> Iterator[SerialRig]:
     """MCUs and their bridges, on each transport."""
-    rig = Rig(network.kind, tmp_path, network)
+    rig = SerialRig(network.kind, tmp_path, network)
     yield rig
     rig.close()
 
 
 @pytest.fixture
-def memory(tmp_path: Path) -> Iterator[Rig]:
-    rig = Rig("memory", tmp_path)
+def memory_rig(tmp_path: Path) -> Iterator[SerialRig]:
+    rig = SerialRig("memory", tmp_path)
     yield rig
     rig.close()

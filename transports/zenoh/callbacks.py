@@ -1,4 +1,6 @@
-"""Runs callbacks on the threads on which Zenoh receives: the fastest way, if two things about them are looked after.
+"""Makes a Zenoh callback of a function by ``direct(f)``: it runs on the thread that receives, which is the fastest way.
+
+Two things about these threads are looked after.
 
 They keep Python's state. Zenoh's threads are Rust's. For each callback Python makes such a thread a state, with memory
 of its own from the kernel, and frees it afterwards: an mmap, an munmap and the faults of new pages for each message

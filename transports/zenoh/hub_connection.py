@@ -34,7 +34,7 @@ class HubConnection:
         self.name = ""
         self.watch = HubWatch()
         self.lock = threading.Lock()  # no answer of a connection is offered after the next one began
-        self._number = 0
+        self._connection = 0
 
     def open(self) -> None:
         """The client opens, once more perhaps."""
@@ -42,7 +42,7 @@ class HubConnection:
 
     def renew(self) -> None:
         """A new connection begins: no answer to an older query is offered any more. The lock is held."""
-        self._number += 1
+        self._connection += 1
 
     # -- sending
 
@@ -59,8 +59,8 @@ class HubConnection:
             remember_first(self._removed, message.topic, None)
         self._put(session, message, 0 if again else self.retained_count)
 
-    def _put(self, session: zenoh.Session, message: Message, number: int) -> None:
-        stamp = wire.Stamp(message.qos, number, self.name)
+    def _put(self, session: zenoh.Session, message: Message, retained_count: int) -> None:
+        stamp = wire.Stamp(message.qos, retained_count, self.name)
         session.put(wire.RETAINED + topic_to_key(message.topic), message.payload, attachment=stamp.pack(), **wire.BLOCK)
 
     def put_removals(self, session: zenoh.Session, topics: Iterable[str]) -> None:
@@ -99,17 +99,17 @@ class HubConnection:
         )
         return [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]
 
-    def fetch(self, session: zenoh.Session, subscriptions: Iterable[Subscription], numbers: dict[str, int]) -> None:
+    def fetch(self, session: zenoh.Session, subscriptions: Iterable[Subscription], counts: dict[str, int]) -> None:
         """Query retained messages and wait for them, so that none comes among messages published after we returned.
 
-        ``numbers``: how many retained messages each sibling has sent; the hub answers once it has received those.
+        ``counts``: how many retained messages each sibling has sent; the hub answers once it has received those.
         """
         end = time.monotonic() + FETCH_S
-        for answered in [self._query(session, subscription, numbers) for subscription in subscriptions]:
+        for answered in [self._query(session, subscription, counts) for subscription in subscriptions]:
             answered.wait(max(0.0, end - time.monotonic()))
 
-    def _query(self, session: zenoh.Session, subscription: Subscription, numbers: dict[str, int]) -> threading.Event:
-        connection, answered = self._number, threading.Event()
+    def _query(self, session: zenoh.Session, subscription: Subscription, counts: dict[str, int]) -> threading.Event:
+        connection, answered = self._connection, threading.Event()
 
         def take(reply: zenoh.Reply) -> None:
             sample = reply.ok
@@ -123,7 +123,7 @@ class HubConnection:
             qos = min(stamp.qos, subscription.qos)
             message = Message(topic, sample.payload.to_bytes(), qos, retain=True, retain_requested=True)
             with self.lock:
-                if connection == self._number:
+                if connection == self._connection:
                     subscription.offer(message)
 
         session.get(
@@ -132,7 +132,7 @@ class HubConnection:
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
             timeout=RETAINED_ANSWER_S,
-            payload=wire.encode({name: number for name, number in numbers.items() if number}),
+            payload=wire.encode({name: count for name, count in counts.items() if count}),
             **wire.BLOCK,
         )
         return answered

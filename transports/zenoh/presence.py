@@ -14,7 +14,7 @@ import zenoh
 from pebble.transports.peers import PeerRegistry, PresenceLock
 from pebble.transports.settings import ZenohSettings
 from pebble.transports.zenoh.callbacks import direct
-from pebble.transports.zenoh.wire import LIVE, SYNC, UP, pack_number, unpack_number
+from pebble.transports.zenoh.wire import LIVE, SYNC, UP, pack_count, unpack_count
 
 log = logging.getLogger(__name__)
 
@@ -101,11 +101,11 @@ class Barrier:
 
     A query is answered only after the declarations sent before it on the same connection have been processed, in both
     directions. So a sibling that has answered ``@sync/<name>`` will send us what we subscribed to, and receive what we
-    publish. The answer carries ``number()``. Siblings know this session by its token.
+    publish. The answer carries ``retained_count()``. Siblings know this session by its token.
     """
 
-    def __init__(self, session: zenoh.Session, name: str, number: Callable[[], int]) -> None:
-        self._session, self._name, self._number = session, name, number
+    def __init__(self, session: zenoh.Session, name: str, retained_count: Callable[[], int]) -> None:
+        self._session, self._name, self._retained_count = session, name, retained_count
         self._silent: set[str] = set()  # hung or stopped: not waited for again until they answer
         session.declare_queryable(SYNC + name, direct(self._answer))
         self._token = session.liveliness().declare_token(LIVE + name)
@@ -113,7 +113,7 @@ class Barrier:
     def synchronize(self, expected: Callable[[], dict[str, str]], timeout: float) -> dict[str, int]:
         """Wait up to ``timeout`` seconds for all ``expected`` siblings (name to a description for logs).
 
-        Returns the numbers they answered, by name.
+        Returns how many retained messages each of them has sent, by name.
         """
         end = time.monotonic() + timeout
         pause, longest = _PAUSE_S
@@ -139,7 +139,7 @@ class Barrier:
 
         def take(reply: zenoh.Reply) -> None:
             if reply.ok is not None:
-                answers[str(reply.ok.key_expr).removeprefix(SYNC)] = unpack_number(reply.ok.payload.to_bytes())
+                answers[str(reply.ok.key_expr).removeprefix(SYNC)] = unpack_count(reply.ok.payload.to_bytes())
                 if wanted <= set(answers):
                     done.set()
 
@@ -155,7 +155,7 @@ class Barrier:
 
     def _answer(self, query: zenoh.Query) -> None:
         with query:
-            query.reply(SYNC + self._name, pack_number(self._number()))
+            query.reply(SYNC + self._name, pack_count(self._retained_count()))
 
 
 class Siblings:
@@ -173,16 +173,16 @@ class Siblings:
     def sockets(self, *, but: str) -> list[Path]:
         return self._registry.sockets(but=but)
 
-    def begin(self, session: zenoh.Session, name: str, hub: HubWatch, number: Callable[[], int]) -> None:
-        """There is a new session of this process, called ``name``, and with ``number()`` retained messages."""
+    def begin(self, session: zenoh.Session, name: str, hub: HubWatch, retained_count: Callable[[], int]) -> None:
+        """There is a new session of this process, called ``name``, and with ``retained_count()`` retained messages."""
 
         def expected() -> dict[str, str]:
             remote = self._settings.client and self._settings.connect
             siblings = {} if remote else self._registry.ready(but=name)
             return siblings | dict.fromkeys(hub.hubs, "the hub")
 
-        self._expected, self._barrier = expected, Barrier(session, name, number)
+        self._expected, self._barrier = expected, Barrier(session, name, retained_count)
 
     def synchronize(self, timeout: float) -> dict[str, int]:
-        """Wait until all that run surely know our declarations; returns the numbers they answered."""
+        """Wait until all that run surely know our declarations; returns how many retained messages each has sent."""
         return {} if self._barrier is None else self._barrier.synchronize(self._expected, timeout)

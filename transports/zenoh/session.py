@@ -19,9 +19,9 @@ from pebble.transports.settings import TlsSettings, ZenohSettings
 from pebble.transports.zenoh import callbacks, wire
 
 # By default connections are accepted, opened and read on separate runtimes: a received message wakes a thread that only
-# wakes another one. Measured with 1.10.2 (40 B at 200 Hz, round trip, two cores): 9.6 wake-ups instead of 14, and 0.9
-# of the time. Sending has its own runtime, because a callback may send. There are more threads than connections, so
-# that one is left to wait for the sockets when all others are in callbacks that wait (.callbacks); each takes 15 KB.
+# wakes another one; docs/transports.md has what that costs. Sending has its own runtime, because a callback may send.
+# There are more threads than connections, so that one is left to wait for the sockets when all others are in callbacks
+# that wait (.callbacks); each takes 15 KB.
 _RUNTIME = "(acc: (handover: rx), net: (handover: rx), rx: (worker_threads: 16))"
 
 HUB_SOCKET = "hub.sock"

@@ -1,7 +1,8 @@
 """The Zenoh transport: processes exchange messages directly, and a hub stores retained messages and wills.
 
 Every process is a peer connected to every sibling process, so that live messages do not need the hub
-(docs/transports.md).
+(docs/transports.md). A *client* is one ZenohTransport, of either mode: a peer, or with ``settings.client`` a session in
+Zenoh's client mode, which reaches others only through the hub. *Siblings* are the other peers of the run directory.
 """
 
 from __future__ import annotations
@@ -174,9 +175,9 @@ class ZenohTransport(Transport):
     def _run(self) -> None:
         if self.settings.client and not self._start_client():
             return
-        seen = linked = 0
+        seen, linked = 0, 0  # version of the newest view handled; its connection that works, 0: none
         look_s = None if self._presence is None else _LOOK_S
-        self._initial_synchronization()
+        self._wait_for_siblings_once()
         watch = self._hub.watch
         while (view := watch.wait(seen, _RETRY_S if watch.hubs and not linked else look_s)) is not None:
             try:
@@ -213,7 +214,7 @@ class ZenohTransport(Transport):
             return True
         self._lost = ""
         log.warning("%s: its socket was removed from %s, it has made a new one", self.client_id, self.settings.run_dir)
-        self._initial_synchronization()
+        self._wait_for_siblings_once()
         return True
 
     def _end_session(self) -> None:
@@ -236,7 +237,7 @@ class ZenohTransport(Transport):
             self._lost = problem
             log.error("%s: its socket was removed, and it cannot make a new one: %s", self.client_id, problem)
 
-    def _initial_synchronization(self) -> None:
+    def _wait_for_siblings_once(self) -> None:
         try:
             self._siblings.synchronize(OPEN_SYNC_S)
         except zenoh.ZError as error:  # closed meanwhile
@@ -244,7 +245,7 @@ class ZenohTransport(Transport):
         self._opened.set()
 
     def _follow(self, view: HubView, seen: int, linked: int) -> int:
-        """Process a change; return the number of the working connection to a hub, 0 for none."""
+        """Process a change; return the connection to a hub that works now, 0 for none."""
         if not view.hubs:
             self.problem = f"the hub of {self.settings.run_dir} is away"
             self._set_state(State.CONNECTING)
@@ -301,8 +302,8 @@ class ZenohTransport(Transport):
             with self._hub.lock:
                 self._hub.renew()
                 self._renew()
-            numbers = self._siblings.synchronize(SYNC_S)  # after _renew: messages received live meanwhile are newer
-            self._hub.fetch(self._session, list(self._subscribers), numbers)
+            counts = self._siblings.synchronize(SYNC_S)  # after _renew: messages received live meanwhile are newer
+            self._hub.fetch(self._session, list(self._subscribers), counts)
 
     # -- sending
 
@@ -334,9 +335,9 @@ class ZenohTransport(Transport):
                 return  # it is declared when there is a session
             with contextlib.suppress(zenoh.ZError):  # closed meanwhile: then nothing is received any more
                 self._start(session, subscription)
-                numbers = self._siblings.synchronize(SYNC_S)
+                counts = self._siblings.synchronize(SYNC_S)
                 if self._state is State.CONNECTED:
-                    self._hub.fetch(session, [subscription], numbers)
+                    self._hub.fetch(session, [subscription], counts)
 
     def _undeclare(self, subscription: Subscription) -> None:
         subscriber = self._subscribers.pop(subscription, None)

@@ -1,8 +1,8 @@
 """The protocol between a robot's Zenoh sessions besides payloads: keys, stamps and the queries to the hub.
 
 A live message carries its quality, whether it was published with retain, and when it was sent. A retained message is
-sent under ``@retain/`` with the name of the session that wrote it and that session's running number. ``@`` chunks match
-no wildcard, so no ordinary subscription receives these.
+sent under ``@retain/`` with the name of the session that wrote it, and how many such it had sent by then. ``@`` chunks
+match no wildcard, so no ordinary subscription receives these.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _QUALITIES = (QoS.LATEST, QoS.DELIVERED)
 
 _LIVE = struct.Struct(">BIQ")  # quality and retain, boot, ns since it
 _RETAINED = struct.Struct(">BQ")
-_NUMBER = struct.Struct(">Q")
+_COUNT = struct.Struct(">Q")
 
 BOOT = crc32(Path("/proc/sys/kernel/random/boot_id").read_bytes())  # shared by all containers of a machine
 
@@ -79,23 +79,23 @@ def read_live(attachment: zenoh.ZBytes | None) -> LiveStamp:
 
 
 class Stamp(msgspec.Struct, frozen=True):
-    """The origin of a retained message. ``number`` 0: it was sent again, or made by the hub."""
+    """The origin of a retained message. ``retained_count`` 0: it was sent again, or made by the hub."""
 
     qos: QoS
-    number: int
+    retained_count: int
     origin: str
 
     def pack(self) -> bytes:
-        return _RETAINED.pack(self.qos, self.number) + self.origin.encode()
+        return _RETAINED.pack(self.qos, self.retained_count) + self.origin.encode()
 
     @classmethod
     def unpack(cls, data: bytes) -> Stamp:
         """Raises ValueError for anything that ``pack`` did not make."""
         try:
-            qos, number = _RETAINED.unpack_from(data)
+            qos, retained_count = _RETAINED.unpack_from(data)
         except struct.error as error:
             raise ValueError(str(error)) from None
-        return cls(QoS(qos), number, data[_RETAINED.size :].decode())
+        return cls(QoS(qos), retained_count, data[_RETAINED.size :].decode())
 
 
 class Will(msgspec.Struct, frozen=True, array_like=True):
@@ -116,7 +116,7 @@ class Hello(msgspec.Struct, frozen=True, array_like=True):
     """``own`` has a digest for each retained key of this client, None for one it has removed."""
 
     name: str
-    number: int
+    retained_count: int
     will: Will | None
     own: dict[str, int | None]
 
@@ -126,13 +126,13 @@ encode = msgspec.msgpack.encode
 decode_hello = msgspec.msgpack.Decoder(Hello).decode
 decode_name = msgspec.msgpack.Decoder(str).decode
 decode_keys = msgspec.msgpack.Decoder(list[str]).decode
-decode_numbers = msgspec.msgpack.Decoder(dict[str, int]).decode
+decode_counts = msgspec.msgpack.Decoder(dict[str, int]).decode
 
 
-def pack_number(number: int) -> bytes:
-    return _NUMBER.pack(number)
+def pack_count(count: int) -> bytes:
+    return _COUNT.pack(count)
 
 
-def unpack_number(data: bytes) -> int:
-    (number,) = _NUMBER.unpack(data)
-    return int(number)
+def unpack_count(data: bytes) -> int:
+    (count,) = _COUNT.unpack(data)
+    return int(count)

@@ -459,7 +459,7 @@ class TestBridge:
         rig.local.publish(MIRROR_FLAG, TRUE, retain=True)
         assert until(lambda: rig.local.on(STOP) and bridge.status.mirroring)
         bridge.forwarder.shut()
-        bridge.post(bridge.disable)
+        bridge.post(bridge.found_one_broker)
         bridge.post(partial(bridge.check_again, bridge.status.epoch))
         assert until(lambda: rig.gate is Gate.OPEN and REMOTE in bridge.status.subscribed)
         rig.after_all(REMOTE)

@@ -81,7 +81,7 @@ class Bench:
         transport = network.robots_transport(config, "autonomy")
         self.service = AutonomyManager(config, transport, clock=self.clock, spawn=self.children, scripts=scripts)
         self.running = Running(self.service)
-        assert until(lambda: self.drives and self.world.retained("autonomy-status"))
+        assert until(lambda: self.drives and self.world.newest_raw("autonomy-status"))
 
     @property
     def status(self) -> dict[str, Any]:

@@ -119,7 +119,7 @@ def test_a_report_of_no_program_ends_nothing(running: Robot) -> None:
 def test_a_late_subscriber_receives_the_status(running: Robot) -> None:
     assert until(lambda: running.status)
     late = Listener(local_transport(running.config, "late"), running.config.base)
-    assert until(lambda: late.retained("media-status"))
+    assert until(lambda: late.newest_raw("media-status"))
     late.transport.close()
 
 

@@ -15,7 +15,7 @@ from pebble.services.serial_mcu_bridge.devices import peers
 from pebble.services.serial_mcu_bridge.pebble_serial_v1 import host
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.host import SILENCE_S
 from pebble.transports import QoS
-from tests.kit.board import Rig, motion, summary
+from tests.kit.board import SerialRig, motion, summary
 from tests.services.serial_mcu_bridge import mcu_wire as wire
 from tests.services.serial_mcu_bridge.mcu_wire import IMU, LAMP, STATION, F, I, M
 from tests.services.serial_mcu_bridge.test_pebble_serial_hostile import ATTACKS
@@ -25,13 +25,13 @@ STATE = b"\1\0\1"
 
 
 def test_the_launcher_is_notified_of_outlets_while_they_are_in_use(
-    memory: Rig, monkeypatch: pytest.MonkeyPatch
+    memory_rig: SerialRig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     notes, end = os.pipe()
     monkeypatch.setenv(NOTIFY_FD, str(end))
     os.set_blocking(notes, False)
-    mcu, written = memory.mcu(STATION), bytearray()
-    memory.bridge()
+    mcu, written = memory_rig.mcu(STATION), bytearray()
+    memory_rig.bridge()
     features = sorted(f"outlets/o{number}/{what}" for number in range(1, 5) for what in ("status", "power"))
 
     def notified(word: str) -> bool:
@@ -44,13 +44,13 @@ def test_the_launcher_is_notified_of_outlets_while_they_are_in_use(
     written.clear()
     mcu.unplug()
     assert until(lambda: notified("LACKS"))
-    memory.close()
+    memory_rig.close()
     os.close(notes)
     os.close(end)
 
 
 @pytest.mark.alone
-def test_it_is_found_within_two_seconds_and_publishes_its_manifest(rig: Rig) -> None:
+def test_it_is_found_within_two_seconds_and_publishes_its_manifest(rig: SerialRig) -> None:
     mcu = rig.mcu(IMU, plugged=False, sends_hello=False)
     rig.bridge()
     time.sleep(0.5)  # the port is absent at first
@@ -70,7 +70,7 @@ def test_it_is_found_within_two_seconds_and_publishes_its_manifest(rig: Rig) -> 
 
 
 @pytest.mark.alone
-def test_a_hundred_samples_a_second_without_loss(rig: Rig) -> None:
+def test_a_hundred_samples_a_second_without_loss(rig: SerialRig) -> None:
     mcu, _ = rig.up(IMU)
     mcu.stream(100, motion())
     seconds = cases(2, 5)
@@ -82,13 +82,13 @@ def test_a_hundred_samples_a_second_without_loss(rig: Rig) -> None:
         assert [body["seq"] for body in rig.world.payloads(metric)] == list(range(1, mcu.samples_sent + 1))
 
 
-def test_the_bodies_of_an_inertial_sensor(memory: Rig) -> None:
-    mcu, _ = memory.up(IMU)
+def test_the_bodies_of_an_inertial_sensor(memory_rig: SerialRig) -> None:
+    mcu, _ = memory_rig.up(IMU)
     began = time.time_ns() // 1_000_000
     mcu.send(wire.frame(wire.STATE, summary(), 2, 7, 700))  # a summary before the first motion is not published
     mcu.send(wire.frame(wire.SAMPLE, motion(), 1, 8, 800), wire.frame(wire.STATE, summary(), 2, 9, 900))
-    assert memory.got("sensors/imu")
-    (fast,), (slow,) = memory.world.payloads("sensors/imu-fast"), memory.world.payloads("sensors/imu")
+    assert memory_rig.got("sensors/imu")
+    (fast,), (slow,) = memory_rig.world.payloads("sensors/imu-fast"), memory_rig.world.payloads("sensors/imu")
     assert list(fast) == ["t", "seq", "mcu_ms", "value"]
     assert (fast["seq"], fast["mcu_ms"]) == (8, 800)
     assert 0 <= fast["t"] - began < 5000
@@ -104,7 +104,7 @@ def test_the_bodies_of_an_inertial_sensor(memory: Rig) -> None:
         "accel_norm_g": 1.001,
         "gyro_bias_dps": {"x": 0.05, "y": -0.06, "z": 0.07},
         "health": {
-            "device": str(memory.folder / "one"),
+            "device": str(memory_rig.folder / "one"),
             "protocol": "pebble_serial_v1",
             "instance": "one",
             "samples_ok": 1000,
@@ -112,22 +112,22 @@ def test_the_bodies_of_an_inertial_sensor(memory: Rig) -> None:
             "calibration_samples": 200,
         },
     }
-    first, second = memory.world.payloads("mcu/goob-imu-nano/imu")
+    first, second = memory_rig.world.payloads("mcu/goob-imu-nano/imu")
     assert (first["seq"], second["seq"]) == (7, 9)
-    generic = memory.world.payloads("mcu/goob-imu-nano/imu_fast")[0]
+    generic = memory_rig.world.payloads("mcu/goob-imu-nano/imu_fast")[0]
     assert list(generic) == ["t", "seq", "mcu_ms", "device_uid", "interface", "profile", "value"]
     assert (generic["device_uid"], generic["interface"], generic["profile"]) == (
         "goob-imu-nano", "imu_fast", "imu.motion.v1",
     )  # fmt: skip
     assert generic["value"]["ax"] == 9.807
-    out = f"{memory.base}/outgoing/"
-    qos = {m.topic.removeprefix(out): (int(m.qos), m.retain_requested) for m in memory.world.received}
+    out = f"{memory_rig.base}/outgoing/"
+    qos = {m.topic.removeprefix(out): (int(m.qos), m.retain_requested) for m in memory_rig.world.received}
     assert qos["mcu/goob-imu-nano/imu_fast"] == qos["sensors/imu-fast"] == (0, False)
     assert qos["mcu/goob-imu-nano/imu"] == qos["sensors/imu"] == (1, False)
     assert qos["mcu/goob-imu-nano/describe"] == (1, True)
 
 
-def test_qos_and_retain_follow_the_interface(rig: Rig) -> None:
+def test_qos_and_retain_follow_the_interface(rig: SerialRig) -> None:
     mcu, _ = rig.up(LAMP)
     mcu.send(wire.frame(wire.STATE, b"\x0b", 2), wire.frame(wire.STATE, b"\1", 3), wire.frame(wire.SAMPLE, bytes(4), 4))
     assert rig.got("mcu/lamp-1/glow")
@@ -142,7 +142,7 @@ def test_qos_and_retain_follow_the_interface(rig: Rig) -> None:
     assert {int(m.qos) for m in rig.world.on("mcu/lamp-1/glow")} == {0}
 
 
-def test_a_state_that_is_sent_only_once_is_not_lost(rig: Rig) -> None:
+def test_a_state_that_is_sent_only_once_is_not_lost(rig: SerialRig) -> None:
     """A state right after the manifest arrives before the uid and the alias are known to be free."""
     mcu = rig.mcu(LAMP, plugged=False)
     mcu.after_describing = wire.frame(wire.STATE, b"\x0a", 2) + wire.frame(wire.STATE, b"\x0b", 2)
@@ -156,7 +156,7 @@ def test_a_state_that_is_sent_only_once_is_not_lost(rig: Rig) -> None:
 # -- commands
 
 
-def test_a_command_reaches_the_mcu(rig: Rig) -> None:
+def test_a_command_reaches_the_mcu(rig: SerialRig) -> None:
     mcu, _ = rig.up(LAMP)
     rig.world.command("mcu/lamp-1/lamp", {"level": 40, "on": True})
     rig.world.command("lights/lamp", {"value": {"level": 40, "on": True}})
@@ -166,20 +166,20 @@ def test_a_command_reaches_the_mcu(rig: Rig) -> None:
         assert command.ms == pytest.approx(time.time() * 1000 % 2**32, abs=5000)
 
 
-def test_what_does_not_fit_never_reaches_the_mcu(memory: Rig, caplog: pytest.LogCaptureFixture) -> None:
-    mcu, running = memory.up(LAMP)
+def test_what_does_not_fit_never_reaches_the_mcu(memory_rig: SerialRig, caplog: pytest.LogCaptureFixture) -> None:
+    mcu, running = memory_rig.up(LAMP)
     caplog.set_level(logging.WARNING)
     bad = [{"level": 10}, {"level": 200, "on": True}, {"level": 1, "on": "false"}, {"level": 1, "on": 1},
            {"level": "5", "on": True}, [], 5, None, True, b"\xff", b"{", b"[" * 40_000]  # fmt: skip
     for body in bad:
-        memory.world.command("mcu/lamp-1/lamp", body)
-    memory.world.command("mcu/lamp-1/lamp", {"level": 0, "on": False})
+        memory_rig.world.command("mcu/lamp-1/lamp", body)
+    memory_rig.world.command("mcu/lamp-1/lamp", {"level": 0, "on": False})
     assert mcu.obeyed() == [(1, b"\0\0")]
     assert running.service.counters["refused"] == len(bad)
     assert "lamp: on is missing" in caplog.text
 
 
-def test_a_retained_command_is_refused(rig: Rig) -> None:
+def test_a_retained_command_is_refused(rig: SerialRig) -> None:
     mcu = rig.mcu(LAMP)
     rig.world.command("mcu/lamp-1/lamp", {"level": 40, "on": True}, retain=True)
     rig.world.command("lights/lamp", {"level": 40, "on": True}, retain=True)
@@ -190,23 +190,23 @@ def test_a_retained_command_is_refused(rig: Rig) -> None:
     assert mcu.obeyed() == [(1, b"\2\0")]
 
 
-def test_answers_are_logged(memory: Rig, caplog: pytest.LogCaptureFixture) -> None:
+def test_answers_are_logged(memory_rig: SerialRig, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.DEBUG)
-    mcu, _ = memory.up(STATION)
-    memory.world.command("mcu/hs105-sta/o1_set", {"on": True})
+    mcu, _ = memory_rig.up(STATION)
+    memory_rig.world.command("mcu/hs105-sta/o1_set", {"on": True})
     assert until(lambda: "o1_set: command 2 accepted" in caplog.text)
     mcu.answers = lambda received: wire.frame(wire.NACK, b"slot_unconfigured", received.interface, received.sequence)
-    memory.world.command("mcu/hs105-sta/o4_set", {"on": True})
+    memory_rig.world.command("mcu/hs105-sta/o4_set", {"on": True})
     assert until(lambda: "o4_set: the MCU refuses command 3: slot_unconfigured" in caplog.text)
     (warning,) = [record for record in caplog.records if "refuses" in record.getMessage()]
     assert warning.levelno == logging.WARNING
 
 
-def test_many_commands_at_once_all_arrive_unless_they_are_far_too_many(memory: Rig) -> None:
-    mcu, _ = memory.up(STATION)
+def test_many_commands_at_once_all_arrive_unless_they_are_far_too_many(memory_rig: SerialRig) -> None:
+    mcu, _ = memory_rig.up(STATION)
     for number in range(4):
-        memory.world.command(f"mcu/hs105-sta/o{number + 1}_set", {"on": True})
-        memory.world.command(f"mcu/hs105-sta/o{number + 1}_set", {"on": False})
+        memory_rig.world.command(f"mcu/hs105-sta/o{number + 1}_set", {"on": True})
+        memory_rig.world.command(f"mcu/hs105-sta/o{number + 1}_set", {"on": False})
     assert mcu.obeyed(8) == [(interface, payload) for interface in (1, 3, 5, 7) for payload in (b"\1", b"\0")]
 
 
@@ -214,7 +214,7 @@ def test_many_commands_at_once_all_arrive_unless_they_are_far_too_many(memory: R
 
 
 @pytest.mark.alone
-def test_an_unplugged_device_is_cleared_and_a_replugged_one_is_requested_again(rig: Rig) -> None:
+def test_an_unplugged_device_is_cleared_and_a_replugged_one_is_requested_again(rig: SerialRig) -> None:
     mcu = rig.mcu(LAMP, sends_hello=False)
     running = rig.bridge()
     rig.described("lamp-1")
@@ -238,47 +238,47 @@ def test_an_unplugged_device_is_cleared_and_a_replugged_one_is_requested_again(r
     assert len(mcu.obeyed()) == 1, "the command sent while it was unplugged was dropped"
 
 
-def test_a_known_device_is_usable_after_its_hello(memory: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_known_device_is_usable_after_its_hello(memory_rig: SerialRig, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(host, "ASK_AFTER_OPENING_S", 60.0)  # until then only a HELLO causes a request
-    mcu, _ = memory.up(LAMP)
+    mcu, _ = memory_rig.up(LAMP)
     asked = mcu.asked()
     mcu.unplug()
-    assert memory.cleared("mcu/lamp-1/describe")
+    assert memory_rig.cleared("mcu/lamp-1/describe")
     mcu.plug()
-    memory.described("lamp-1")
+    memory_rig.described("lamp-1")
     assert mcu.asked() == asked
 
 
 def test_a_partial_frame_of_an_earlier_host_does_not_damage_the_first_command(
-    memory: Rig, monkeypatch: pytest.MonkeyPatch
+    memory_rig: SerialRig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    mcu, running = memory.up(LAMP)
+    mcu, running = memory_rig.up(LAMP)
     mcu.unplug()
-    assert memory.cleared("mcu/lamp-1/describe")
+    assert memory_rig.cleared("mcu/lamp-1/describe")
     monkeypatch.setattr(host, "ASK_AFTER_OPENING_S", 60.0)  # the command is the first frame after opening
     mcu.half = wire.frame(wire.CMD, b"\x50\x01", 1, 7)[:9]
     mcu.plug()
-    memory.described("lamp-1")
+    memory_rig.described("lamp-1")
     asked = mcu.asked()
-    memory.world.command("mcu/lamp-1/lamp", {"level": 40, "on": True})
+    memory_rig.world.command("mcu/lamp-1/lamp", {"level": 40, "on": True})
     assert mcu.obeyed()
     assert mcu.asked() == asked
     assert running.service.counters["unanswered"] == 0
 
 
-def test_another_device_at_the_same_line(memory: Rig) -> None:
-    mcu, _ = memory.up(LAMP)
+def test_another_device_at_the_same_line(memory_rig: SerialRig) -> None:
+    mcu, _ = memory_rig.up(LAMP)
     mcu.unplug()
     mcu.manifest = LAMP.but(uid="lamp-2", hash="other")
     mcu.plug()
-    memory.described("lamp-2")
-    assert memory.world.retained("mcu/lamp-1/describe") == []
-    memory.world.command("mcu/lamp-1/lamp", {"level": 40, "on": True})
-    memory.world.command("mcu/lamp-2/lamp", {"level": 1, "on": True})
+    memory_rig.described("lamp-2")
+    assert memory_rig.world.newest_raw("mcu/lamp-1/describe") == []
+    memory_rig.world.command("mcu/lamp-1/lamp", {"level": 40, "on": True})
+    memory_rig.world.command("mcu/lamp-2/lamp", {"level": 1, "on": True})
     assert mcu.obeyed() == [(1, b"\2\1")]
 
 
-def test_new_firmware_while_it_runs(rig: Rig) -> None:
+def test_new_firmware_while_it_runs(rig: SerialRig) -> None:
     mcu, _ = rig.up(LAMP)
     mcu.send(wire.frame(wire.STATE, b"\x0b", 2))
     assert rig.got("lights/lamp")
@@ -296,16 +296,16 @@ def test_new_firmware_while_it_runs(rig: Rig) -> None:
     assert rig.world.payloads("mcu/lamp-1/lamp")[-1]["value"] == {"level": 6.5}
 
 
-def test_an_inertial_channel_configured_as_retained_is_cleared(memory: Rig) -> None:
-    mcu, _ = memory.up(IMU, publish={"low_rate_retain": True})
+def test_an_inertial_channel_configured_as_retained_is_cleared(memory_rig: SerialRig) -> None:
+    mcu, _ = memory_rig.up(IMU, publish={"low_rate_retain": True})
     mcu.send(wire.frame(wire.SAMPLE, motion(), 1), wire.frame(wire.STATE, summary(), 2))
-    assert memory.got("sensors/imu")
-    assert memory.world.on("sensors/imu")[0].retain_requested
+    assert memory_rig.got("sensors/imu")
+    assert memory_rig.world.on("sensors/imu")[0].retain_requested
     mcu.unplug()
-    assert memory.cleared("sensors/imu")
+    assert memory_rig.cleared("sensors/imu")
 
 
-def test_a_stopping_bridge_clears_its_retained_messages(rig: Rig) -> None:
+def test_a_stopping_bridge_clears_its_retained_messages(rig: SerialRig) -> None:
     mcu, running = rig.up(LAMP)
     mcu.send(wire.frame(wire.STATE, b"\x0b", 2))
     assert rig.got("mcu/lamp-1/lamp")
@@ -313,7 +313,9 @@ def test_a_stopping_bridge_clears_its_retained_messages(rig: Rig) -> None:
     assert rig.cleared("mcu/lamp-1/describe", "mcu/lamp-1/lamp")
 
 
-def test_a_stale_manifest_of_a_killed_bridge_is_cleared_by_the_next(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stale_manifest_of_a_killed_bridge_is_cleared_by_the_next(
+    rig: SerialRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The device was removed while no bridge was running."""
     monkeypatch.setattr(peers, "CONFIRM_S", 1.5)
     left = rig.network.client("killed").open(10)
@@ -325,12 +327,12 @@ def test_a_stale_manifest_of_a_killed_bridge_is_cleared_by_the_next(rig: Rig, mo
     rig.mcu(LAMP)
     rig.bridge()
     rig.described("lamp-1")
-    assert rig.world.retained("mcu/ghost/describe")
+    assert rig.world.newest_raw("mcu/ghost/describe")
     assert rig.cleared("mcu/ghost/describe")
-    assert rig.world.retained("mcu/lamp-1/describe")
+    assert rig.world.newest_raw("mcu/lamp-1/describe")
 
 
-def test_invalid_messages_about_other_devices_do_not_stop_the_bridge(rig: Rig) -> None:
+def test_invalid_messages_about_other_devices_do_not_stop_the_bridge(rig: SerialRig) -> None:
     stranger = rig.network.client("stranger").open(10)
     odd = b'{"protocol":"pebble_serial_v1","schema_version":1,"interface_count":1,"schema_hash":"h",' \
           b'"device_uid":"odd","firmware_version":"1","model":"m","interfaces":[{"name":"a","channel":"sensors/imu",' \
@@ -351,27 +353,27 @@ def test_invalid_messages_about_other_devices_do_not_stop_the_bridge(rig: Rig) -
     stranger.close()
 
 
-def test_garbage_on_the_line_does_not_stop_the_bridge(memory: Rig) -> None:
-    mcu, running = memory.up(LAMP)
+def test_garbage_on_the_line_does_not_stop_the_bridge(memory_rig: SerialRig) -> None:
+    mcu, running = memory_rig.up(LAMP)
     mcu.send(b"Arduino says hello\r\n" * 50, b"\0", wire.frame(wire.HELLO, M(b"\xff").hello()))
     mcu.send(wire.frame(wire.DESCRIBE, b"\xff" * 40), wire.frame(wire.STATE, b"\x0b", 2)[:-3], b"\0")
     mcu.send(wire.frame(wire.STATE, b"\x0b", 2))
-    assert memory.got("mcu/lamp-1/lamp")
+    assert memory_rig.got("mcu/lamp-1/lamp")
     counters = running.service.counters
     assert (counters["hello"], counters["describe"]) == (1, 1)
     assert counters["stuffing"] + counters["crc"] >= 1
 
 
-def test_thousands_of_hostile_frames_do_not_stop_the_bridge(memory: Rig) -> None:
-    mcu, running = memory.up(STATION)
+def test_thousands_of_hostile_frames_do_not_stop_the_bridge(memory_rig: SerialRig) -> None:
+    mcu, running = memory_rig.up(STATION)
     chance = random.Random(8)
     for _ in range(cases(40, 200)):
         mcu.pour(b"".join(chance.choice(ATTACKS)(chance) for _ in range(100)))
-    before = len(memory.world.on("mcu/hs105-sta/o1_state"))
+    before = len(memory_rig.world.on("mcu/hs105-sta/o1_state"))
 
     def understood() -> bool:
         mcu.pour(b"\0" + wire.frame(wire.DESCRIBE, STATION.describe()) + wire.frame(wire.STATE, b"\1\0\1", 2))
-        return len(memory.world.on("mcu/hs105-sta/o1_state")) > before
+        return len(memory_rig.world.on("mcu/hs105-sta/o1_state")) > before
 
     assert until(understood, 10, step=0.1)
     assert running.alive
@@ -382,11 +384,11 @@ def test_thousands_of_hostile_frames_do_not_stop_the_bridge(memory: Rig) -> None
 
 
 @pytest.mark.alone
-def test_a_silent_inertial_sensor_ends_the_process(memory: Rig) -> None:
-    mcu = memory.mcu(IMU)
-    running = memory.bridge(health={"imu_sample_timeout_seconds": 1.0}, log_level="INFO")
+def test_a_silent_inertial_sensor_ends_the_process(memory_rig: SerialRig) -> None:
+    mcu = memory_rig.mcu(IMU)
+    running = memory_rig.bridge(health={"imu_sample_timeout_seconds": 1.0}, log_level="INFO")
     mcu.stream(100, motion())
-    assert memory.got("sensors/imu-fast")
+    assert memory_rig.got("sensors/imu-fast")
     time.sleep(1.2)
     assert running.alive
     mcu.silent = True
@@ -394,45 +396,47 @@ def test_a_silent_inertial_sensor_ends_the_process(memory: Rig) -> None:
     assert until(lambda: not running.alive, 5)
     assert 0.9 < time.monotonic() - stopped < 2.5
     assert str(running.error) == "no sample for 1 s"
-    assert memory.world.retained("mcu/goob-imu-nano/describe") == []
+    assert memory_rig.world.newest_raw("mcu/goob-imu-nano/describe") == []
 
 
 @pytest.mark.parametrize(("manifest", "timeout_s"), [(STATION, 0), (IMU, 5)])
-def test_only_an_inertial_sensor_must_not_be_silent(memory: Rig, manifest: M, timeout_s: float) -> None:
-    _, running = memory.up(manifest)
+def test_only_an_inertial_sensor_must_not_be_silent(memory_rig: SerialRig, manifest: M, timeout_s: float) -> None:
+    _, running = memory_rig.up(manifest)
     assert running.service.watchdog.timeout_s == timeout_s < SILENCE_S  # type: ignore[attr-defined]
 
 
-def test_an_absent_sensor_is_waited_for(memory: Rig) -> None:
-    mcu = memory.mcu(IMU)
-    running = memory.bridge(health={"imu_sample_timeout_seconds": 0.5})
+def test_an_absent_sensor_is_waited_for(memory_rig: SerialRig) -> None:
+    mcu = memory_rig.mcu(IMU)
+    running = memory_rig.bridge(health={"imu_sample_timeout_seconds": 0.5})
     mcu.stream(100, motion())
-    assert memory.got("sensors/imu-fast")
+    assert memory_rig.got("sensors/imu-fast")
     mcu.unplug()
     time.sleep(1.0)
     assert running.alive
     mcu.plug()
-    memory.described("goob-imu-nano")
+    memory_rig.described("goob-imu-nano")
 
 
-def test_the_process_may_end_when_the_port_fails(memory: Rig) -> None:
-    mcu, running = memory.up(LAMP, health={"exit_on_serial_error": True})
+def test_the_process_may_end_when_the_port_fails(memory_rig: SerialRig) -> None:
+    mcu, running = memory_rig.up(LAMP, health={"exit_on_serial_error": True})
     mcu.unplug()
     assert until(lambda: not running.alive, 3)
     assert running.error is not None
-    assert memory.world.retained("mcu/lamp-1/describe") == []
+    assert memory_rig.world.newest_raw("mcu/lamp-1/describe") == []
 
 
-def test_a_refused_alias_is_logged_and_its_interface_still_works(memory: Rig, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_refused_alias_is_logged_and_its_interface_still_works(
+    memory_rig: SerialRig, caplog: pytest.LogCaptureFixture
+) -> None:
     rogue = M("rogue", (
         I(1, "drive", wire.IN, wire.KIND_COMMAND, (F("x", wire.I8),), "drive-values"),
         I(2, "reboot", wire.OUT, wire.KIND_STATE, (F("v", wire.U8),), "online", "", wire.RETAIN),
     ))  # fmt: skip
-    mcu, _ = memory.up(rogue)
+    mcu, _ = memory_rig.up(rogue)
     mcu.send(wire.frame(wire.STATE, b"\1", 2))
-    assert memory.got("mcu/rogue/reboot")
-    memory.world.command("drive-values", {"x": 1, "z": 0})
-    memory.world.command("mcu/rogue/drive", {"x": 5})
+    assert memory_rig.got("mcu/rogue/reboot")
+    memory_rig.world.command("drive-values", {"x": 1, "z": 0})
+    memory_rig.world.command("mcu/rogue/drive", {"x": 5})
     assert mcu.obeyed() == [(1, b"\5")]
-    assert memory.world.on("online") == []
+    assert memory_rig.world.on("online") == []
     assert "rogue: no alias for drive: incoming/drive-values: the channel is the robot's own" in caplog.text

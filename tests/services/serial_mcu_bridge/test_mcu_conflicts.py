@@ -12,7 +12,7 @@ import pytest
 
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.manifest import parse_describe
 from pebble.transports import QoS, State
-from tests.kit.board import Rig, motion
+from tests.kit.board import SerialRig, motion
 from tests.services.serial_mcu_bridge import mcu_wire as wire
 from tests.services.serial_mcu_bridge.mcu_wire import IMU, LAMP, M, Received
 from tests.support import until
@@ -22,7 +22,7 @@ def imu(uid: str) -> M:
     return IMU.but(uid=uid)
 
 
-def test_a_channel_that_two_claim_is_unused_until_one_leaves(rig: Rig, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_channel_that_two_claim_is_unused_until_one_leaves(rig: SerialRig, caplog: pytest.LogCaptureFixture) -> None:
     one, two = rig.mcu(imu("imu-1"), "one"), rig.mcu(imu("imu-2"), "two", plugged=False)
     rig.bridge("one")
     rig.bridge("two")
@@ -51,7 +51,7 @@ def test_a_channel_that_two_claim_is_unused_until_one_leaves(rig: Rig, caplog: p
     assert "imu-2: outgoing/sensors/imu-fast is in use again" in caplog.text
 
 
-def test_of_two_that_start_together_neither_publishes_under_the_alias(rig: Rig) -> None:
+def test_of_two_that_start_together_neither_publishes_under_the_alias(rig: SerialRig) -> None:
     one, two = rig.mcu(imu("imu-1"), "one"), rig.mcu(imu("imu-2"), "two")
     rig.bridge("one")
     rig.bridge("two")
@@ -63,7 +63,7 @@ def test_of_two_that_start_together_neither_publishes_under_the_alias(rig: Rig) 
     assert rig.world.on("sensors/imu-fast") == []
 
 
-def test_a_contested_state_is_not_retained_and_a_contested_command_moves_nothing(rig: Rig) -> None:
+def test_a_contested_state_is_not_retained_and_a_contested_command_moves_nothing(rig: SerialRig) -> None:
     one, two = rig.mcu(LAMP, "one"), rig.mcu(LAMP.but(uid="lamp-2"), "two", plugged=False)
     rig.bridge("one")
     second = rig.bridge("two")
@@ -73,7 +73,7 @@ def test_a_contested_state_is_not_retained_and_a_contested_command_moves_nothing
     assert rig.got("lights/lamp")
     two.plug()
     assert rig.cleared("lights/lamp")
-    assert rig.world.retained("mcu/lamp-1/lamp")
+    assert rig.world.newest_raw("mcu/lamp-1/lamp")
     rig.world.command("lights/lamp", {"level": 40, "on": True})
     rig.world.command("mcu/lamp-2/lamp", {"level": 1, "on": True})
     assert until(two.commands)
@@ -88,7 +88,7 @@ def test_a_contested_state_is_not_retained_and_a_contested_command_moves_nothing
     assert until(obeys, step=0.1)
 
 
-def test_the_first_of_two_devices_with_one_uid_gets_it(rig: Rig, caplog: pytest.LogCaptureFixture) -> None:
+def test_the_first_of_two_devices_with_one_uid_gets_it(rig: SerialRig, caplog: pytest.LogCaptureFixture) -> None:
     one, two = rig.mcu(IMU, "one"), rig.mcu(IMU, "two")
     one.stream(50, motion(1000))
     two.stream(50, motion(2000))
@@ -109,7 +109,7 @@ def test_the_first_of_two_devices_with_one_uid_gets_it(rig: Rig, caplog: pytest.
 
 def test_one_uid_twice_while_the_broker_is_down(tmp_path: Path) -> None:
     """Without a broker both acquire the uid. Afterwards one releases it, and the other's messages are retained."""
-    with closing(Rig("mqtt", tmp_path)) as rig:
+    with closing(SerialRig("mqtt", tmp_path)) as rig:
         lines = {}
         for name, level in (("one", b"\x0a"), ("two", b"\x14")):
             rig.mcu(LAMP, name, plugged=False).after_describing = wire.frame(wire.STATE, level, 2)
@@ -119,7 +119,7 @@ def test_one_uid_twice_while_the_broker_is_down(tmp_path: Path) -> None:
             return [level for level, service in lines.items() if service.device is not None]  # type: ignore[attr-defined]
 
         def retained(metric: str) -> list[float]:
-            return [msgspec.json.decode(raw)["value"]["level"] for raw in rig.world.retained(metric)]
+            return [msgspec.json.decode(raw)["value"]["level"] for raw in rig.world.newest_raw(metric)]
 
         assert until(lambda: all(service.transport.state is State.CONNECTED for service in lines.values()))
         with rig.network.outage():
@@ -127,11 +127,11 @@ def test_one_uid_twice_while_the_broker_is_down(tmp_path: Path) -> None:
                 rig.mcus[name].plug()
             assert until(lambda: len(holders()) == 2)
         assert until(lambda: len(holders()) == 1, 15)
-        assert until(lambda: rig.world.retained("mcu/lamp-1/describe"), 10)
+        assert until(lambda: rig.world.newest_raw("mcu/lamp-1/describe"), 10)
         assert until(lambda: retained("mcu/lamp-1/lamp") == retained("lights/lamp") == holders(), 10)
 
 
-def test_a_manifest_cleared_by_another_is_published_again(rig: Rig) -> None:
+def test_a_manifest_cleared_by_another_is_published_again(rig: SerialRig) -> None:
     rig.mcu(LAMP)
     rig.bridge()
     rig.described("lamp-1")
@@ -141,32 +141,34 @@ def test_a_manifest_cleared_by_another_is_published_again(rig: Rig) -> None:
     rig.listener("late").described("lamp-1")
 
 
-def test_checking_a_retained_manifest_does_not_request_its_uid(memory: Rig) -> None:
+def test_checking_a_retained_manifest_does_not_request_its_uid(memory_rig: SerialRig) -> None:
     """A check must not delay a device with this uid that is being plugged in."""
     asked: list[bytes] = []
-    questions = f"{memory.base}/incoming/mcu/+/describe"
-    memory.world.transport.subscribe(questions, lambda message: asked.append(message.payload))
+    questions = f"{memory_rig.base}/incoming/mcu/+/describe"
+    memory_rig.world.transport.subscribe(questions, lambda message: asked.append(message.payload))
     ghost = parse_describe(LAMP.but(uid="ghost").describe()).payload()
     body = msgspec.json.encode(ghost)
-    memory.world.transport.publish(f"{memory.base}/outgoing/mcu/ghost/describe", body, qos=QoS.DELIVERED, retain=True)
-    memory.mcu(LAMP, plugged=False)
-    memory.bridge()
+    memory_rig.world.transport.publish(
+        f"{memory_rig.base}/outgoing/mcu/ghost/describe", body, qos=QoS.DELIVERED, retain=True
+    )
+    memory_rig.mcu(LAMP, plugged=False)
+    memory_rig.bridge()
     assert until(lambda: asked)
     assert [msgspec.json.decode(question)["from"] for question in asked] == [""]
 
 
-def test_a_line_that_renames_its_channels_leaves_them_to_the_other(memory: Rig) -> None:
-    out = f"{memory.base}/outgoing/sensors"
+def test_a_line_that_renames_its_channels_leaves_them_to_the_other(memory_rig: SerialRig) -> None:
+    out = f"{memory_rig.base}/outgoing/sensors"
     rear = {"high_rate": f"{out}/rear-fast", "low_rate": f"{out}/rear"}
-    one, two = memory.mcu(imu("imu-1"), "one"), memory.mcu(imu("imu-2"), "two")
-    memory.bridge("one")
-    memory.bridge("two", topics=rear)
+    one, two = memory_rig.mcu(imu("imu-1"), "one"), memory_rig.mcu(imu("imu-2"), "two")
+    memory_rig.bridge("one")
+    memory_rig.bridge("two", topics=rear)
     one.stream(50, motion(1000))
     two.stream(50, motion(2000))
-    assert memory.got("sensors/imu-fast")
-    assert memory.got("sensors/rear-fast")
+    assert memory_rig.got("sensors/imu-fast")
+    assert memory_rig.got("sensors/rear-fast")
     time.sleep(0.5)
     for metric, expected in (("sensors/imu-fast", 1.0), ("sensors/rear-fast", 2.0)):
-        assert {body["value"]["accel_mps2"]["x"] for body in memory.world.payloads(metric)} == {expected}
-    interfaces = memory.world.payloads("mcu/imu-2/describe")[-1]["interfaces"]
+        assert {body["value"]["accel_mps2"]["x"] for body in memory_rig.world.payloads(metric)} == {expected}
+    interfaces = memory_rig.world.payloads("mcu/imu-2/describe")[-1]["interfaces"]
     assert [interface["channel"] for interface in interfaces] == ["sensors/rear-fast", "sensors/rear"]

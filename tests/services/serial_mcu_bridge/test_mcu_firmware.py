@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from pebble.simulation.pty import PtyMcu
-from tests.kit.board import Rig, motion
+from tests.kit.board import SerialRig, motion
 from tests.services.serial_mcu_bridge import mcu_wire as wire
 from tests.services.serial_mcu_bridge.mcu_wire import IMU
 from tests.support import cases, until
@@ -19,26 +19,26 @@ PLUGGED_IN_S = 2.0
 
 
 @pytest.fixture(params=[pytest.param("mqtt", marks=pytest.mark.thorough), "zenoh"])
-def rig(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Rig]:
-    rig = Rig(request.param, tmp_path)
+def rig(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[SerialRig]:
+    rig = SerialRig(request.param, tmp_path)
     yield rig
     rig.close()
 
 
 @pytest.fixture
-def board(rig: Rig) -> Iterator[PtyMcu]:
+def board(rig: SerialRig) -> Iterator[PtyMcu]:
     with PtyMcu("goob_imu", rig.folder / "imu") as board:
         yield board
 
 
-def uid_of(rig: Rig) -> str:
+def uid_of(rig: SerialRig) -> str:
     """Wait for the manifest of the board, and return its uid."""
     assert until(lambda: any(message.topic.endswith("/describe") for message in list(rig.world.received)), 5)
     described = next(message for message in rig.world.received if message.topic.endswith("/describe"))
     return described.topic.split("/")[-2]
 
 
-def numbers(rig: Rig, since: int = 0) -> list[int]:
+def numbers(rig: SerialRig, since: int = 0) -> list[int]:
     """The numbers of the samples that have come; each is one more than the one before."""
     found = [body["seq"] for body in rig.world.payloads(FAST)[since:]]
     assert found == list(range(found[0], found[0] + len(found)))
@@ -47,7 +47,7 @@ def numbers(rig: Rig, since: int = 0) -> list[int]:
 
 @pytest.mark.alone
 def test_found_within_two_seconds_and_again_when_plugged_in_again_and_every_sample_arrives(
-    rig: Rig, board: PtyMcu
+    rig: SerialRig, board: PtyMcu
 ) -> None:
     board.unplug()
     running = rig.bridge("imu")
@@ -76,7 +76,7 @@ def test_found_within_two_seconds_and_again_when_plugged_in_again_and_every_samp
 
 
 def test_a_second_sensor_claims_the_same_channels_and_the_board_refuses_what_it_does_not_support(
-    rig: Rig, board: PtyMcu
+    rig: SerialRig, board: PtyMcu
 ) -> None:
     """It still answers and sends samples after garbage and a command for an unknown interface."""
     other, running = rig.mcu(IMU.but(uid="imu-2"), "other", plugged=False), rig.bridge("imu")

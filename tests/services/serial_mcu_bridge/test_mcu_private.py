@@ -19,7 +19,7 @@ from pebble.services.mqtt_bridge.private_topics import PrivateTopics
 from pebble.services.mqtt_bridge.service import MqttBridge
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.manifest import parse_describe
 from pebble.transports import Message, MqttSettings, create
-from tests.kit.board import Rig, motion
+from tests.kit.board import SerialRig, motion
 from tests.kit.robot import BASE, Listener, Running
 from tests.services.mqtt_bridge.bridge_rig import gate_of
 from tests.services.serial_mcu_bridge import mcu_wire as wire
@@ -334,8 +334,8 @@ def ways(one: dict[str, Any]) -> tuple[str, ...]:
 
 
 @pytest.fixture(params=["mqtt", "zenoh"])
-def rig(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Rig]:
-    rig = Rig(request.param, tmp_path)
+def rig(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[SerialRig]:
+    rig = SerialRig(request.param, tmp_path)
     yield rig
     rig.close()
 
@@ -343,7 +343,7 @@ def rig(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Rig]:
 class World:
     """A remote broker, an operator that subscribes to everything there, and a bridge that can be restarted."""
 
-    def __init__(self, rig: Rig) -> None:
+    def __init__(self, rig: SerialRig) -> None:
         self.rig = rig
         self.broker = Broker(rig.folder)
         self.operator = Listener(create("mqtt", "operator", MqttSettings(host="127.0.0.1", port=self.broker.port)))
@@ -368,13 +368,13 @@ class World:
 
 
 @pytest.fixture
-def world(rig: Rig) -> Iterator[World]:
+def world(rig: SerialRig) -> Iterator[World]:
     world = World(rig)
     yield world
     world.close()
 
 
-def test_nothing_private_leaves_the_robot_in_any_start_order(rig: Rig, world: World) -> None:
+def test_nothing_private_leaves_the_robot_in_any_start_order(rig: SerialRig, world: World) -> None:
     world.start()  # the first time before the MCU is known
     mcu = rig.mcu(SPY)
     line = rig.bridge()
@@ -402,7 +402,7 @@ def test_nothing_private_leaves_the_robot_in_any_start_order(rig: Rig, world: Wo
     assert {"mcu/spy-1/slow", "lab/slow", "mcu/spy-1/describe"} <= received
 
 
-def test_private_commands_are_for_the_robot_only(rig: Rig, world: World) -> None:
+def test_private_commands_are_for_the_robot_only(rig: SerialRig, world: World) -> None:
     mcu = rig.mcu(SPY)
     rig.bridge()
     world.start()

@@ -288,13 +288,13 @@ class HubWorker:
             raise ValueError(f"{sample.key_expr} has no stamp")
         stamp = wire.Stamp.unpack(sample.attachment.to_bytes())
         self._apply(Retained(str(sample.key_expr).removeprefix(wire.RETAINED), sample.payload.to_bytes(), stamp))
-        if stamp.number and stamp.origin in self._received:
-            self._received[stamp.origin] = max(stamp.number, self._received[stamp.origin])
+        if stamp.retained_count and stamp.origin in self._received:
+            self._received[stamp.origin] = max(stamp.retained_count, self._received[stamp.origin])
 
     def _query(self, query: zenoh.Query) -> None:
         """Queue a subscriber's query, which names the messages that the answer must include."""
         try:
-            needs = wire.decode_numbers(_payload(query))
+            needs = wire.decode_counts(_payload(query))
         except (ValueError, msgspec.DecodeError):
             query.drop()  # type: ignore[no-untyped-call]
             raise
@@ -306,7 +306,7 @@ class HubWorker:
         now = time.monotonic()
         waiting, self._waiting_queries = self._waiting_queries, []
         for until, needs, query in waiting:
-            if now >= until or all(self._received.get(name, -1) >= number for name, number in needs.items()):
+            if now >= until or all(self._received.get(name, -1) >= count for name, count in needs.items()):
                 self._do(lambda query=query: self._answer(query))  # type: ignore[misc]
             else:
                 self._waiting_queries.append((until, needs, query))
@@ -339,7 +339,7 @@ class HubWorker:
             if lacking:
                 self._received.pop(hello.name, None)
             else:
-                self._received[hello.name] = hello.number
+                self._received[hello.name] = hello.retained_count
             query.reply(wire.HELLO, wire.encode(lacking))
 
     def _end_predecessor(self, hello: wire.Hello) -> None:

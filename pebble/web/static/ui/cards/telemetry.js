@@ -9,6 +9,10 @@ import { battery, inner, isObject, number, roughly, span } from "../parts/words.
 const STREAM_MS = 1000;
 const SERVICES = styled(async () => (await import("./services.js")).Services, "system.css");
 
+/**
+ * ``at``: the component ("pebble/robots/goob"), ``ref`` in the hooks; ``view``: which cards are open.
+ * @param {{at: string, view: any}} props
+ */
 export function Telemetry({ at, view }) {
   const online = useOnline(at);
   return html`<dl class="values">
@@ -21,11 +25,14 @@ export function Telemetry({ at, view }) {
     <${Row} at=${at} metric="touch-sensors" name="Touch" online=${online} streams>${touch}<//>
     <${Row} at=${at} metric="wheel-odometry" name="Odometry" online=${online} streams>${odometry}<//>
     <${Media} at=${at} online=${online} />
-    <${Services} at=${at} view=${view} />
+    <${ServicesRow} at=${at} view=${view} />
   </dl>`;
 }
 
-/** ``streams``: it comes several times a second, so a single one is old after ten seconds, too. */
+/**
+ * ``streams``: it comes several times a second. Its period is unknown (0) until four values came, and a value without one
+ * is never gone: until then a second is assumed.
+ */
 function Row({ at, metric, name, online, streams = false, children: words }) {
   const received = useMetric(at, metric);
   if (!received) return null;
@@ -39,21 +46,21 @@ function Row({ at, metric, name, online, streams = false, children: words }) {
 function Heartbeat({ at }) {
   useTick(500);
   const entry = useMetric(at, "web/liveness");
-  const view = entry?.value;
-  if (!view) return null;
-  const age = view.silent_s === null ? null : 1000 * view.silent_s + entry.age;
+  const liveness = entry?.value;
+  if (!liveness) return null;
+  const age = liveness.silent_s === null ? null : 1000 * liveness.silent_s + entry.age; // ms: at the server, and since
   const ago = age < 1500 ? "within the last second" : `${roughly(age)} ago`;
-  const every = view.interval_ms ? `, every ${span(view.interval_ms)}` : "";
+  const every = liveness.interval_ms ? `, every ${span(liveness.interval_ms)}` : "";
   const seen = age === null ? "none since the server started" : `${ago}${every}`;
-  const average = view.average_latency_ms ?? null;
-  const late = view.whole_seconds
+  const average = liveness.average_latency_ms ?? null;
+  const late = liveness.whole_seconds
     ? "unknown: its clock counts whole seconds"
-    : view.latency_ms === null
+    : liveness.latency_ms === null
       ? "–"
-      : `${span(view.latency_ms)}${average === null ? "" : `, on average ${span(average)}`}`;
+      : `${span(liveness.latency_ms)}${average === null ? "" : `, on average ${span(average)}`}`;
   return html`<div>
       <dt>Heartbeat</dt>
-      <dd class=${view.online === false ? "bad" : ""}>${seen}</dd>
+      <dd class=${liveness.online === false ? "bad" : ""}>${seen}</dd>
     </div>
     <div>
       <dt>Latency</dt>
@@ -104,7 +111,7 @@ function mediaWords(report) {
   return report.running ? plain(report.doing ?? "running") : "rests";
 }
 
-function Services({ at, view }) {
+function ServicesRow({ at, view }) {
   if (!isObject(inner(useValue(at, "status"))?.services)) return null;
   return html`<div class="services">
     <dt>Services</dt>
