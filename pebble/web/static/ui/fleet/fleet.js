@@ -57,12 +57,10 @@ export function Fleet() {
   const stopped = connection.isOpen ? present.filter((ref) => store.get(ref, "web/estop")?.value.latched) : [];
   const dense = total >= DENSE;
   const needing = useNeeding(store, dense ? shown : []);
-  const groups = dense
-    ? [
-        ["Need a look", shown.filter((ref) => needing.has(ref))],
-        ["Online", shown.filter((ref) => !needing.has(ref))],
-      ].filter(([, list]) => list.length)
-    : [["", shown]];
+  const groups = [
+    { title: dense ? "Need a look" : "", list: shown.filter((ref) => !dense || needing.has(ref)) },
+    { title: "Online", list: shown.filter((ref) => dense && !needing.has(ref)) },
+  ].filter(({ list }) => list.length);
   return html`<div class="fleet">
     <div class="fleet-head">
       <h1>
@@ -82,7 +80,7 @@ export function Fleet() {
     ${total === 0 && html`<${Empty} />`}
     ${total > 0 && !shown.length && !shownAway.length && html`<p class="empty">Nothing matches “${filter}”.</p>`}
     ${groups.map(
-      ([title, list]) => html`<section key=${title} aria-label=${title || "Robots"}>
+      ({ title, list }) => html`<section key=${title} aria-label=${title || "Robots"}>
         ${title && html`<h2 class="fleet-group">${title}</h2>`}
         <ul class=${`fleet-cards ${dense ? "dense" : ""}`}>
           ${list.map((ref) => cards.get(ref))}

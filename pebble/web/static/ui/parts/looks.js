@@ -36,11 +36,12 @@ export function looksOf(ref, capabilities) {
   const value = inner(capabilities);
   const identity = isObject(value) && isObject(value.identity) ? value.identity : {};
   const id = nameOf(ref);
-  const picture = Object.hasOwn(PICTURES, identity.picture) ? identity.picture : assumed(id, isObject(value) ? value : {});
+  const body = Object.hasOwn(BODIES, id) ? BODIES[id] : id;
+  const picture = Object.hasOwn(PICTURES, identity.picture) ? identity.picture : assumed(body, isObject(value) ? value : {});
   return {
     name: text(identity.name, 32) || visible(id),
     description: text(identity.description, 60) || PICTURES[picture],
-    colour: TINTS.includes(identity.colour) ? identity.colour : (COLOURS[BODIES[id] ?? id] ?? TINTS[hash(id) % TINTS.length]),
+    colour: TINTS.includes(identity.colour) ? identity.colour : Object.hasOwn(COLOURS, body) ? COLOURS[body] : TINTS[hash(id) % TINTS.length],
     picture,
     cells: Number.isInteger(identity.battery_cells) && identity.battery_cells > 0 ? identity.battery_cells : 0,
   };
@@ -52,8 +53,7 @@ export const drawing = (picture) => `${FACES}#face-${picture}`;
 /** @param {string} ref @returns {boolean} whether it has a face: towers and others have the icon of their type */
 export const hasFace = (ref) => typeOf(ref) === "robots";
 
-function assumed(id, value) {
-  const body = BODIES[id] ?? id;
+function assumed(body, value) {
   if (Object.hasOwn(PICTURES, body)) return body;
   if (value.drive?.available) return "wheeled";
   return value.outlets?.available ? "outlets" : "unknown";
