@@ -33,7 +33,6 @@ def driving(made: Rig) -> bytes:
 def fleet(made: Rig) -> bytes:
     """A picture of all robots of the broker, with small pictures of those that have a camera."""
     page = made.page()
-    page.locator(".check").first.click()
     made.pause(page, SMALL_PICTURES_S)
     return page.screenshot(clip=CARDS)
 

@@ -11,15 +11,20 @@ from pebble.config.recorder import Recorder
 from pebble.config.transport import Mqtt, RemoteConnection, RemoteMqtt, TransportSection
 from pebble.config.types import (
     EMPTY,
+    Body,
+    Cells,
+    Colour,
     Command,
     Device,
     File,
     Interval,
+    Label,
     Level,
     LogLevel,
     Qos,
     Seconds,
     Section,
+    Sentence,
     ServiceSection,
     Topic,
     Variables,
@@ -39,6 +44,13 @@ class Robot(Section, frozen=True, kw_only=True):
         Literal["linux", "esp32", "esp8266"],
         doc("What it runs on. The MCU platforms run their own firmware: `pebble up` does not start them."),
     ] = "linux"
+    name: Annotated[Label | None, doc("What people call it; its id unless set.")] = None
+    description: Annotated[Sentence | None, doc("What it is, for the operator page.")] = None
+    colour: Annotated[Colour | None, doc("Its colour on the operator page; by its id unless set.")] = None
+    picture: Annotated[Body | None, doc("The drawing that stands for it on the operator page.")] = None
+    battery_cells: Annotated[
+        Cells | None, doc("Lithium cells in series: with it the operator page shows percent, not volts.")
+    ] = None
 
 
 class Defaults(Section, frozen=True, kw_only=True):

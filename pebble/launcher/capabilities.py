@@ -23,7 +23,7 @@ def capabilities(
     ``lacking`` and ``found`` are what its processes report at present (pebble.launcher.features).
     """
     return {
-        "identity": {"system": config.robot.system, "type": config.robot.type, "id": config.robot.id},
+        "identity": _identity(config),
         "transport": {"kind": config.transport.kind},
         "video": _video(config, addresses),
         "audio": _audio(config, addresses),
@@ -39,6 +39,14 @@ def capabilities(
         **_motor(config, addresses, lacking, found),
         "outlets": _outlets(config, found),
     }
+
+
+def _identity(config: Config) -> dict[str, Any]:
+    """Who it is, and how people shall see it: only what its config says, programs have their own defaults."""
+    robot = config.robot
+    looks = {key: getattr(robot, key) for key in ("name", "description", "colour", "picture", "battery_cells")}
+    said = {key: value for key, value in looks.items() if value is not None}
+    return {"system": robot.system, "type": robot.type, "id": robot.id, **said}
 
 
 def _video(config: Config, addresses: Addresses) -> dict[str, Any]:

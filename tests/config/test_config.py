@@ -373,6 +373,11 @@ class TestMistakes:
         ("path", "value", "expected"),
         [
             ("robot.system", "a/b", "must be a topic level"),
+            ("robot.name", "x" * 33, "must be a name in one line, 32 characters at most"),
+            ("robot.description", "x" * 61, "must be one line, 60 characters at most"),
+            ("robot.colour", "red", 'must be "blue", "amber", '),
+            ("robot.picture", "me.png", 'must be "goob", "fred", '),
+            ("robot.battery_cells", 0, "must be a whole number from 1 to 14"),
             ("robot", [], "must be an object {…}, not a list"),
             ("log_level", "LOUD", 'must be "DEBUG", "INFO", "WARNING", "ERROR" or "CRITICAL"'),
             ("local_mqtt.port", 0, "must be a whole number from 1 to 65535, not 0"),

@@ -20,6 +20,17 @@ def of(kind: str = "mqtt", **services: Any) -> dict[str, Any]:
     return capabilities(config, Addresses(config))
 
 
+def test_people_see_it_as_its_config_says() -> None:
+    looks = {"name": "Goob", "description": "Rover", "colour": "blue", "picture": "goob", "battery_cells": 2}
+    config = parse({"robot": {"id": "rover", **looks}}, folder=Path("/robots"), env={})
+    assert capabilities(config, Addresses(config))["identity"] == {
+        "system": "pebble",
+        "type": "robots",
+        "id": "rover",
+        **looks,
+    }
+
+
 def test_a_robot_without_services_still_lists_everything() -> None:
     assert of() == {
         "identity": {"system": "pebble", "type": "robots", "id": "rover"},

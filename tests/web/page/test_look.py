@@ -203,7 +203,7 @@ SCREENS = [
     Screen("listening-now", "listening", _listen),
     Screen("sound", "no-sound", _press("[data-test=tab-sound]"), ("phone",)),
     Screen("driving-now", "driving", sizes=("desktop",), hold=_drive),
-    Screen("thumbnails", "fleet", _press(".check")),
+    Screen("fleet-more", "fleet", _press("[data-test=fleet-more]")),
     Screen("settings", "driving", _press(".me"), ("desktop",)),
     Screen("help", "driving", _do("pebble.panels.show('help')")),
     Screen("gamepad", "driving", _do(_PAD)),

@@ -17,12 +17,17 @@ import {
   useValue,
 } from "../parts/hooks.js";
 import { Offers, Route, WATCHES } from "../parts/models.js";
-import { charging, plain, shortTime } from "../parts/more-words.js";
+import { charge, drawing, hasFace, looksOf } from "../parts/looks.js";
+import { plain, shortTime } from "../parts/more-words.js";
 import { Icon, Live, RouteLink, StopButton } from "../parts/parts.js";
 import { RecordingsLink } from "./recordings-link.js";
-import { battery, clockTime, driverName, inner, isObject, kindOf, nameOf, roughly, typeOf, visible } from "../parts/words.js";
+import { battery, driverName, inner, isObject, kindOf, nameOf, roughly, typeOf, visible } from "../parts/words.js";
 
-const THUMBNAIL_MS = 1000;
+const THUMBNAIL_MS = 10_000;
+const LIVE_MS = 12_000; // a thumbnail that young is of now
+const DENSE = 13; // so many components are shown in small cards, and by what they need
+const NEEDS_MS = 10_000; // so long a card stays among those that need a look
+const LOW_PERCENT = 20;
 const SORTS = { name: "name", type: "type", battery: "battery" };
 
 export function Fleet() {
@@ -33,7 +38,7 @@ export function Fleet() {
   const refs = useRefs();
   const omitted = useValue("", "web/broker")?.robots_omitted ?? 0;
   const [filter, setFilter] = useState("");
-  const cards = useNodes(
+  const nodes = useNodes(
     (ref) => html`<li key=${ref}><${Boundary} what=${nameOf(ref)}><${FleetCard} at=${ref} /><//></li>`,
   );
   const online = refs.filter((ref) => isPresent(store, ref));
@@ -43,11 +48,19 @@ export function Fleet() {
   }, [online.join()]);
   const matches = (ref) => ref.toLowerCase().includes(filter.trim().toLowerCase());
   const shown = sorted(store, online.filter(matches), settings.sort);
+  const cards = nodes(shown);
   const shownAway = away.filter(matches).sort();
   const total = online.length + away.length;
   const robots = refs.filter((ref) => typeOf(ref) === "robots" && (online.includes(ref) || away.includes(ref)));
   const present = robots.filter((ref) => online.includes(ref));
   const others = total - robots.length;
+  const stopped = connection.isOpen ? present.filter((ref) => store.get(ref, "web/estop")?.value.latched) : [];
+  const dense = total >= DENSE;
+  const needing = useNeeding(store, dense ? shown : []);
+  const groups = [
+    { title: dense ? "Need a look" : "", list: shown.filter((ref) => !dense || needing.has(ref)) },
+    { title: "Online", list: shown.filter((ref) => dense && !needing.has(ref)) },
+  ].filter(({ list }) => list.length);
   return html`<div class="fleet">
     <div class="fleet-head">
       <h1>
@@ -55,6 +68,7 @@ export function Fleet() {
           ? "Robots"
           : `${robots.length} ${robots.length === 1 ? "robot" : "robots"}${connection.isOpen ? `, ${present.length} online` : ""}`}
         ${others > 0 && html`<span class="dim"> and ${others} ${others === 1 ? "other" : "others"}</span>`}
+        ${stopped.length > 0 && html` <span class="chip stopped" data-test="stopped">${stopped.length} stopped</span>`}
       </h1>
       ${total > 0 ? html`<${FleetTools} filter=${filter} onFilter=${setFilter} />` : html`<${RecordingsLink} />`}
     </div>
@@ -65,9 +79,15 @@ export function Fleet() {
     </p>`}
     ${total === 0 && html`<${Empty} />`}
     ${total > 0 && !shown.length && !shownAway.length && html`<p class="empty">Nothing matches “${filter}”.</p>`}
-    <ul class="fleet-cards">
-      ${cards(shown)}
-    </ul>
+    ${groups.map(
+      ({ title, list }) => html`<section key=${title} aria-label=${title || "Robots"}>
+        ${title && html`<h2 class="fleet-group">${title}</h2>`}
+        <ul class=${`fleet-cards ${dense ? "dense" : ""}`}>
+          ${list.map((ref) => cards.get(ref))}
+        </ul>
+      </section>`,
+    )}
+    ${total > 0 && !dense && !WATCHES && html`<${FirstTime} refs=${present} />`}
     ${shownAway.length > 0 &&
     html`<section class="away" aria-labelledby="away-title">
       <h2 id="away-title">Offline</h2>
@@ -96,6 +116,25 @@ function sorted(store, refs, by) {
   return [...refs].sort((a, b) => (key(a) < key(b) ? -1 : key(a) > key(b) ? 1 : a < b ? -1 : 1));
 }
 
+/** Those which somebody should look at: at once, and for a while after the reason is gone. @returns {Set<string>} */
+function useNeeding(store, refs) {
+  const since = useRef(new Map());
+  const now = performance.now();
+  for (const ref of refs) if (needs(store, ref)) since.current.set(ref, now);
+  return new Set(refs.filter((ref) => now - (since.current.get(ref) ?? -Infinity) < NEEDS_MS));
+}
+
+function needs(store, ref) {
+  const { cells } = looksOf(ref, store.get(ref, "capabilities")?.value);
+  const percent = charge(store.get(ref, "charging-level")?.value, cells);
+  const charges = store.get(ref, "charging-status")?.value?.value === true;
+  return (
+    store.get(ref, "web/estop")?.value.latched === true ||
+    doubtOf(store.get(ref, "status")?.value).no ||
+    (percent !== null && percent < LOW_PERCENT && !charges)
+  );
+}
+
 function FleetTools({ filter, onFilter }) {
   const { panels, settings } = usePage();
   return html`<div class="fleet-tools">
@@ -107,32 +146,86 @@ function FleetTools({ filter, onFilter }) {
       value=${filter}
       onInput=${(event) => onFilter(event.currentTarget.value)}
     />
-    <label class="field"
-      ><span>Sort by</span>
-      <select
-        data-test="sort"
-        aria-label="Sort by"
-        value=${settings.sort}
-        onChange=${(event) => settings.set("sort", event.currentTarget.value)}
-      >
-        ${Object.entries(SORTS).map(([value, text]) => html`<option key=${value} value=${value}>${text}</option>`)}
-      </select></label
-    >
-    ${!WATCHES &&
-    html`<label class="check"
-      ><input
-        type="checkbox"
-        data-test="thumbnails"
-        checked=${settings.thumbnails}
-        onChange=${(event) => settings.set("thumbnails", event.currentTarget.checked)}
-      /><span>Thumbnails</span></label
-    >`}
-    <a class="button" data-test="watch" href=${Route.path("", !WATCHES)}>${WATCHES ? "Show all controls" : "Only watch"}</a>
     <${RecordingsLink} />
     <button type="button" class="to-phone" data-test="phone" onClick=${() => panels.show("phone")}>
       <${Icon} name="phone" />Open on a phone
     </button>
+    <details class="fleet-more" onKeyDown=${closeByEscape} onFocusOut=${closeWhenLeft}>
+      <summary class="button" data-test="fleet-more">More</summary>
+      <div class="fleet-more-list">
+        <label class="field"
+          ><span>Sort by</span>
+          <select
+            data-test="sort"
+            aria-label="Sort by"
+            value=${settings.sort}
+            onChange=${(event) => settings.set("sort", event.currentTarget.value)}
+          >
+            ${Object.entries(SORTS).map(([value, words]) => html`<option key=${value} value=${value}>${words}</option>`)}
+          </select></label
+        >
+        ${!WATCHES &&
+        html`<label class="check"
+          ><input
+            type="checkbox"
+            data-test="thumbnails"
+            checked=${settings.thumbnails}
+            onChange=${(event) => settings.set("thumbnails", event.currentTarget.checked)}
+          /><span>Thumbnails</span></label
+        >`}
+        <a class="button" data-test="watch" href=${Route.path("", !WATCHES)}
+          >${WATCHES ? "Show all controls" : "Only watch"}</a
+        >
+      </div>
+    </details>
   </div>`;
+}
+
+function closeByEscape(event) {
+  if (event.key === "Escape") event.currentTarget.open = false;
+}
+
+function closeWhenLeft(event) {
+  if (event.relatedTarget && !event.currentTarget.contains(event.relatedTarget)) event.currentTarget.open = false;
+}
+
+/** What one can do in the first minutes; each is ticked when it was begun. */
+function FirstTime({ refs }) {
+  const { connection, panels, settings, store } = usePage();
+  useModel(settings);
+  useModel(connection, (one) => one.you);
+  if (settings.begun.includes("hidden")) return null;
+  const offers = (ref) => new Offers(ref, store.get(ref, "capabilities")?.value);
+  const named = (ref) => looksOf(ref, store.get(ref, "capabilities")?.value).name;
+  const drives = refs.find((ref) => offers(ref).drives);
+  const scripts = refs.find((ref) => offers(ref).section("autonomy").available);
+  if (!drives) return null;
+  const items = [
+    ["drive", `Drive ${named(drives)}`, "Take control, then W A S D", { to: drives }],
+    scripts && ["script", `Let ${named(scripts)} drive itself`, "Scripts, Start", { to: scripts }],
+    connection.you?.recordings && ["recordings", "Watch what just happened", "Recordings", { path: `${ROOT}replay` }],
+  ].filter(Boolean);
+  const number = (name, at) => html`<span class=${`step ${settings.begun.includes(name) ? "done" : ""}`}
+    >${settings.begun.includes(name) ? html`<${Icon} name="check" />` : at}</span
+  >`;
+  return html`<section class="first-time" aria-labelledby="first-time" data-test="first-time">
+    <div class="first-time-head">
+      <h2 id="first-time">First time here?</h2>
+      <button type="button" class="quiet" data-test="hide-first-time" onClick=${() => settings.begin("hidden")}>Hide</button>
+    </div>
+    <ul>
+      ${items.map(
+        ([name, title, how, target], at) => html`<li key=${name} onClick=${() => settings.begin(name)}>
+          <${RouteLink} ...${target} className="try">${number(name, at + 1)}<span><b>${title}</b><small>${how}</small></span><//>
+        </li>`,
+      )}
+      <li>
+        <button type="button" class="try" onClick=${() => (settings.begin("phone"), panels.show("phone"))}>
+          ${number("phone", items.length + 1)}<span><b>Open it on your phone</b><small>Scan one code</small></span>
+        </button>
+      </li>
+    </ul>
+  </section>`;
 }
 
 function Empty() {
@@ -151,8 +244,6 @@ const ICONS = { robots: "robot", towers: "tower", satellites: "satellite", peopl
 
 /** @param {string} ref @returns {string} the icon of its type */
 export const iconOf = (ref) => ICONS[typeOf(ref)] ?? "thing";
-
-const TRANSPORTS = { mqtt: "MQTT", zenoh: "Zenoh", mcu: "MCU" };
 
 /** A service that is not well: its page has the rest. */
 function ServiceFact({ at }) {
@@ -178,64 +269,70 @@ function FleetCard({ at }) {
   const { commands, settings, connection } = usePage();
   useModel(settings);
   useModel(connection, (one) => one.state);
-  const offers = new Offers(at, useValue(at, "capabilities"));
+  const capabilities = useValue(at, "capabilities");
+  const offers = new Offers(at, capabilities);
+  const looks = looksOf(at, capabilities);
   const estop = useValue(at, "web/estop");
-  const picture = useValue(at, "web/picture");
-  const kind = TRANSPORTS[offers.transport] ?? offers.transport;
-  const name = nameOf(at);
+  const id = nameOf(at);
+  const called = looks.name.toLowerCase() === id.toLowerCase() ? "" : visible(id);
+  const what = hasFace(at) ? looks.description : kindOf(at);
   return html`<article
-    class=${`fleet-card ${estop?.latched ? "is-stopped" : ""}`}
-    data-test=${`card-${name}`}
-    aria-label=${name}
+    class=${`fleet-card tint-${looks.colour} ${estop?.latched ? "is-stopped" : ""}`}
+    data-test=${`card-${id}`}
+    aria-label=${looks.name}
   >
+    ${(settings.thumbnails || WATCHES) && hasFace(at) && html`<${Thumbnail} at=${at} has=${offers.hasVideo} looks=${looks} />`}
+    ${estop?.latched &&
+    html`<p class="stripe">
+      <b>Stopped</b>${estop.by ? ` by ${estop.by}` : ""}${estop.since > 0 ? `, ${shortTime(estop.since)}` : ""}
+    </p>`}
     <div class="fleet-card-head">
-      <span class="badge"><${Icon} name=${iconOf(at)} /></span>
-      <div class="fleet-card-name">
-        <h2>${name}</h2>
-        <span class="dim">${[kindOf(at), kind].filter(Boolean).join(" · ")}</span>
-      </div>
+      <${Badge} at=${at} looks=${looks} />
+      <${RouteLink} to=${at} className="fleet-card-link">
+        <h2>${looks.name}</h2>
+        <span class="dim">${[called, what].filter(Boolean).join(" · ")}</span>
+      <//>
       <${Liveness} at=${at} />
     </div>
-    ${(settings.thumbnails || WATCHES) &&
-    (offers.hasVideo
-      ? html`<${Thumbnail} at=${at} picture=${picture} />`
-      : typeOf(at) === "robots" && html`<div class="thumbnail">no camera</div>`)}
-    <ul class="facts">
-      <${BatteryFact} at=${at} online=${connection.isOpen} />
-      ${connection.isOpen && html`<${DoubtFact} at=${at} />`}
-      <${DriverFact} at=${at} offers=${offers} online=${connection.isOpen} stopped=${estop?.latched} />
-      <${ScriptFact} at=${at} online=${connection.isOpen} />
-      ${typeOf(at) !== "robots" ? html`<${StatusFact} at=${at} />` : html`<${ServiceFact} at=${at} />`}
-      ${estop?.latched &&
-      html`<li class="fact bad">
-        <span aria-hidden="true">■</span><b>STOPPED</b>${estop.by ? ` by ${estop.by}` : ""}
-        ${estop.since > 0 ? ` ${clockTime(estop.since)}` : ""}
-      </li>`}
-    </ul>
-    <div class="fleet-card-actions">
-      <${RouteLink} to=${at} className="button primary" label=${`Open ${name}`}>Open<//>
-      ${offers.stops &&
-      html`<${StopButton}
-        test=${`stop-${name}`}
-        onStop=${() => commands.stop(at)}
-        label=${`Stop: emergency stop of ${name}`}
-        className="stop-small"
-      >
-        <${Icon} name="stop" />Stop
-      <//>`}
+    <div class="fleet-card-foot">
+      <ul class="facts">
+        <${BatteryFact} at=${at} cells=${looks.cells} online=${connection.isOpen} />
+        ${connection.isOpen && html`<${DoubtFact} at=${at} />`}
+        <${DriverFact} at=${at} offers=${offers} online=${connection.isOpen} stopped=${estop?.latched} />
+        <${ScriptFact} at=${at} online=${connection.isOpen} />
+        ${typeOf(at) !== "robots" ? html`<${StatusFact} at=${at} />` : html`<${ServiceFact} at=${at} />`}
+      </ul>
+      ${estop?.latched
+        ? html`<${RouteLink} to=${at} className="button stop-small to-reset" label=${`Open to reset ${looks.name}`}>Open to reset<//>`
+        : offers.stops &&
+          html`<${StopButton}
+            test=${`stop-${id}`}
+            onStop=${() => commands.stop(at)}
+            label=${`Stop: emergency stop of ${looks.name}`}
+            className="stop-small"
+          >
+            <${Icon} name="stop" />Stop
+          <//>`}
     </div>
   </article>`;
 }
 
-function BatteryFact({ at, online }) {
+/** The face of a robot, or the icon of what is none. */
+const Badge = ({ at, looks }) => html`<span class="badge"
+  >${hasFace(at) ? html`<${Drawing} picture=${looks.picture} />` : html`<${Icon} name=${iconOf(at)} />`}</span
+>`;
+
+const Drawing = ({ picture }) => html`<svg class="drawing" viewBox="0 0 48 48" aria-hidden="true"><use href=${drawing(picture)} /></svg>`;
+
+function BatteryFact({ at, cells, online }) {
   const level = useMetric(at, "charging-level");
-  const status = useValue(at, "charging-status");
-  if (!level && !status) return null;
-  const isCharging = status?.value === true;
+  const charges = useValue(at, "charging-status")?.value === true;
+  if (!level && !charges) return null;
+  const percent = level && charge(level.value, cells);
   return html`<li class="fact">
-    <${Icon} name=${isCharging ? "charging" : "battery"} />
-    ${level && html`<${Live} entry=${level} online=${online}>${battery(level.value)}<//>`}
-    ${status && html`<span class="dim">${charging(status)}</span>`}
+    <${Icon} name=${charges ? "charging" : "battery"} />
+    ${level && html`<${Live} entry=${level} online=${online}>${percent === null ? battery(level.value) : `${percent} %`}<//>`}
+    ${charges && html`<span class="dim">charging</span>`}
   </li>`;
 }
 
@@ -245,7 +342,7 @@ function DriverFact({ at, offers, online, stopped }) {
   if (!online) return null;
   if (!offers.known && !offers.drives) return null;
   if (!offers.drives) return html`<li class="fact dim"><${Icon} name="wheel" />does not drive</li>`;
-  if (!view?.by) return stopped || doubt ? null : html`<li class="fact dim"><${Icon} name="wheel" />free to drive</li>`;
+  if (!view?.by) return stopped || doubt ? null : html`<li class="fact dim"><${Icon} name="wheel" />nobody drives</li>`;
   return html`<li class="fact">
     <${Icon} name="wheel" />${view.you ? html`<b>driven by you</b>` : `driven by ${driverName(view)}`}
   </li>`;
@@ -264,20 +361,33 @@ function StatusFact({ at }) {
   return html`<li class="fact dim">${plain(Object.fromEntries(Object.entries(status).slice(0, 3)))}</li>`;
 }
 
-/** One picture a second of what flows anyway: this never starts a camera. */
-function Thumbnail({ at, picture }) {
-  const flowing = picture?.state === "flowing";
+/**
+ * The last picture, renewed while pictures flow anyway: this never starts a camera. Without one, the robot's face.
+ * ``has``: it has a camera.
+ */
+function Thumbnail({ at, has, looks }) {
+  const flowing = useValue(at, "web/picture")?.state === "flowing";
   const [count, setCount] = useState(0);
+  const [takenAt, setTakenAt] = useState(0); // 0: there is no picture
+  useTick(takenAt ? 1000 : 0);
   useEffect(() => {
     if (!flowing) return undefined;
+    setCount((n) => n + 1);
     const timer = setInterval(() => document.hidden || setCount((n) => n + 1), THUMBNAIL_MS);
     return () => clearInterval(timer);
   }, [flowing]);
-  if (!flowing) {
-    return html`<div class="thumbnail"><${Icon} name="camera" />camera rests</div>`;
-  }
-  return html`<div class="thumbnail">
-    <img alt=${`What ${visible(nameOf(at))} sees`} src=${`${ROOT}api/snapshot.jpg?ref=${encodeURIComponent(at)}&n=${count}`} />
+  const age = performance.now() - takenAt;
+  const words = !has ? "no camera" : !takenAt ? "camera rests" : flowing && age < LIVE_MS ? "live" : `${roughly(age)} ago`;
+  return html`<div class=${`thumbnail ${takenAt ? "" : "faced"}`}>
+    ${count > 0 &&
+    html`<img
+      hidden=${!takenAt}
+      alt=${`What ${visible(nameOf(at))} sees`}
+      src=${`${ROOT}api/snapshot.jpg?ref=${encodeURIComponent(at)}&n=${count}`}
+      onLoad=${() => setTakenAt(performance.now())}
+    />`}
+    ${!takenAt && html`<${Drawing} picture=${looks.picture} />`}
+    <span class=${`tag ${words === "live" ? "live" : ""}`}>${words}</span>
   </div>`;
 }
 
@@ -286,6 +396,7 @@ function AwayRow({ at }) {
   const liveness = useMetric(at, "web/liveness");
   const heartbeat = useValue(at, "online");
   const level = useMetric(at, "charging-level");
+  const looks = looksOf(at, useValue(at, "capabilities"));
   const silent = liveness?.value?.silent_s;
   const seen =
     typeof silent === "number"
@@ -294,10 +405,10 @@ function AwayRow({ at }) {
         ? heartbeat.t
         : null;
   const since = seen === null ? "never seen" : `last seen ${shortTime(seen)} (${roughly(store.now() - seen)} ago)`;
-  return html`<li class="away-row">
-    <span class="badge dim"><${Icon} name=${iconOf(at)} /></span>
+  return html`<li class=${`away-row tint-${looks.colour}`}>
+    <${Badge} at=${at} looks=${looks} />
     <span class="away-name"
-      ><${RouteLink} to=${at}>${nameOf(at)}<//> <span class="dim">${since}</span> ${level &&
+      ><${RouteLink} to=${at}>${looks.name}<//> <span class="dim">${since}</span> ${level &&
       html`<span class="dim">${battery(level.value)} then</span>`}</span
     >
     <button
@@ -314,13 +425,13 @@ function AwayRow({ at }) {
 /**
  * Draw each item again only when it changes by itself: Preact passes over a node that it has drawn before. ``draw`` may
  * use nothing but its argument.
- * @param {(ref: string) => any} draw @returns {(refs: string[]) => any[]}
+ * @param {(ref: string) => any} draw @returns {(refs: string[]) => Map<string, any>}
  */
 function useNodes(draw) {
   const nodes = useRef(new Map());
   return (refs) => {
     const old = nodes.current;
     nodes.current = new Map(refs.map((ref) => [ref, old.get(ref) ?? draw(ref)]));
-    return [...nodes.current.values()];
+    return nodes.current;
   };
 }

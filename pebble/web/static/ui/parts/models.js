@@ -127,7 +127,8 @@ export class Settings extends Model {
   constructor() {
     super();
     this.theme = read("theme", "auto");
-    this.thumbnails = read("thumbnails", false) === true;
+    this.thumbnails = read("thumbnails", true) === true;
+    this.begun = list(read("begun", [])); // of what is shown to who is here for the first time
     this.sort = read("sort", "name");
     this.name = read("name", "");
     this.side = read("side", "right"); // of the stick, on a phone
@@ -156,6 +157,13 @@ export class Settings extends Model {
     if (forgotten) this.forgotten.add(ref);
     else this.forgotten.delete(ref);
     write("forgotten", [...this.forgotten]);
+    this.changed();
+  }
+
+  /** @param {string} what of the first time was begun, or "hidden" */
+  begin(what) {
+    this.begun = [...new Set([...this.begun, what])];
+    write("begun", this.begun);
     this.changed();
   }
 
