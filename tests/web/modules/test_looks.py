@@ -20,7 +20,7 @@ looks = Script(
 )
 
 
-def said(**identity: Any) -> str:
+def stated(**identity: Any) -> str:
     return json.dumps({"value": {"identity": identity, "drive": {"available": True}}})
 
 
@@ -28,18 +28,18 @@ def said(**identity: Any) -> str:
 WHOLE = {"name": "Otto", "description": "A boat", "colour": "rose", "picture": "boat"}
 FACES: Rows = {
     "it looks as it says": (
-        f"result = look('r7', {said(**WHOLE, battery_cells=2)});", {**WHOLE, "cells": 2}),
+        f"result = look('r7', {stated(**WHOLE, battery_cells=2)});", {**WHOLE, "cells": 2}),
     "the original's robots are known": (
         "result = ['goob', 'bumperbot'].map((id) => look(id)).map((one) => [one.colour, one.picture]);",
         [["blue", "goob"], ["green", "benjr"]]),
-    "what drives has wheels": (f"result = look('r7', {said()}).picture;", "wheeled"),
+    "what drives has wheels": (f"result = look('r7', {stated()}).picture;", "wheeled"),
     "an outlet is one": ("result = look('r7', { value: { outlets: { available: true } } }).picture;", "outlets"),
     "another is unknown, and has a colour": ("result = brief(look('r7', null));", ["r7", "unknown", "string", 0]),
     "what is no look is not used": (
-        f"result = brief(look('constructor', {said(name=7, colour='url(x)', picture='__proto__', battery_cells=-1)}));",
+        f"result = brief(look('constructor', {stated(name=7, colour='url(x)', picture='__proto__', battery_cells=-1)}));",
         ["constructor", "wheeled", "string", 0]),
-    "a long name is cut": (f"result = look('r7', {said(name='x' * 40)}).name.length;", 32),
-    "a name steers nothing": (f"result = look('r7', {said(name=chr(0x202E) + 'x')}).name;", "\\u202ex"),
+    "a long name is cut": (f"result = look('r7', {stated(name='x' * 40)}).name.length;", 32),
+    "a name steers nothing": (f"result = look('r7', {stated(name=chr(0x202E) + 'x')}).name;", "\\u202ex"),
     "a battery is in percent where its cells are known": (
         "result = [[8.4, 2], [6, 2], [7.64, 2], [9, 2], [8, 0]].map(([value, cells]) => percent(value, 'V', cells));",
         [100, 0, 50, 100, None]),
