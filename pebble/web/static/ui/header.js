@@ -41,7 +41,7 @@ export function Header({ at, layout, panel, onPanel, drawer, onDrawer }) {
       >
         <${Icon} name="small" />
       </button>`}`}
-    ${(wide || !at) && html`<${Me} panel=${panel} onPanel=${onPanel} wide=${wide} />`}
+    ${(wide || !at) && html`<${Me} at=${at} panel=${panel} onPanel=${onPanel} wide=${wide} />`}
     ${at &&
     html`<${StopButton}
       test="stop-one"
@@ -176,10 +176,10 @@ const BELL = styled(async () => (await import("./fleet/notices.js")).Bell, "noti
 /** Fetched later. Where there is little room only their number is shown, with the settings. */
 function Notices(props) {
   const { body } = usePart(BELL);
-  return body ? html`<${body} ...${props} />` : null;
+  return body ? html`<${body} ...${props} />` : props.wide && html`<span class="bell-place"></span>`;
 }
 
-function Me({ panel, onPanel, wide }) {
+function Me({ at, panel, onPanel, wide }) {
   const { connection } = usePage();
   useModel(connection);
   const { you } = connection;
@@ -193,7 +193,7 @@ function Me({ panel, onPanel, wide }) {
     aria-label=${text}
     onClick=${onPanel}
   >
-    <${Icon} name=${you?.login ? "person" : "settings"} />${wide && you?.login && html`<span>${you.user}</span>`}
+    <${Icon} name=${you?.login ? "person" : "settings"} />${wide && !at && you?.login && html`<span>${you.user}</span>`}
     ${!wide && connection.unread > 0 && html`<b class="unread" aria-hidden="true">${connection.unread}</b>`}
   </button>`;
 }

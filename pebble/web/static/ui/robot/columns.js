@@ -79,7 +79,11 @@ class Columns {
     if (count !== this.count) {
       const side = hasSide && count > 1 ? ` ${SIDE}px` : "";
       grid.style.gridTemplateColumns = `repeat(${side ? count - 1 : count}, minmax(0, 1fr))${side}`;
-      grid.dataset.columns = String(count);
+      for (const card of cards) {
+        const { span, at } = card.dataset; // as wide as it will be, else its height would be another one
+        const wide = span === "all" ? count : Math.max(1, count - Number(hasSide));
+        card.style.gridArea = `auto / ${at === "side" ? count : 1} / auto / span ${span ? wide : 1}`;
+      }
     }
     Object.assign(this, { count, arranged: view.arranged });
     const known = cards.map((card) => {

@@ -3,7 +3,7 @@
 import * as browser from "../../core/browser.js";
 import { Bands } from "../banner.js";
 import { EXTRAS, PICTURE, SOUND_FACTS, VOICE } from "../cards/cards.js";
-import { Boundary, html, useEffect, useModel, usePage, useRef, useState, useTick, useValue } from "../parts/hooks.js";
+import { Boundary, html, useEffect, useLayoutEffect, useModel, usePage, useRef, useState, useTick, useValue } from "../parts/hooks.js";
 import { Extra, Face, Icon, Part, useName } from "../parts/parts.js";
 import { nameOf, span } from "../parts/words.js";
 
@@ -35,7 +35,7 @@ export function Stage({ at, video: control, source, offers, view, layout }) {
   useModel(video);
   useTick(200);
   const place = useRef(null);
-  useEffect(() => {
+  useLayoutEffect(() => {
     const { current } = place;
     current.append(video.canvas);
     return () => {
