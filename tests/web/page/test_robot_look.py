@@ -22,7 +22,7 @@ FREE = replace(STATES["free"], repeated={**STATES["free"].repeated})
 #: Places of all that drives and stops a robot, and of the buttons beside them, by what they are called.
 PLACES = """() => Object.fromEntries([...document.querySelectorAll(
   ".stick, input[type=range], button, select, summary")]
-  .filter((one) => one.closest("header, .stage, .drive, .phone-drive, .float-pad, .tabs"))
+  .filter((one) => one.closest(".top, .stage, .drive, .phone-drive, .float-pad, .tabs"))
   .filter((one) => one.checkVisibility() && !one.closest(".banners, .slot, .why-actions"))
   .map((one, n) => [`${n} ${one.dataset.test ?? one.textContent.trim()}`, one.getBoundingClientRect().toJSON()])
   .map(([name, { x, y, width, height }]) => [name, [x, y, width, height].map(Math.round)]))"""
@@ -93,7 +93,7 @@ def test_trouble_moves_nothing_that_works_a_robot(show: Show, size: Size, what: 
             assert opened.page.evaluate(COVERED) == []
 
 
-def test_a_stopped_robot_is_never_said_to_be_driven(show: Show) -> None:
+def test_a_stopped_robot_is_not_driven(show: Show) -> None:
     for size in ("desktop", "phone"):
         with show(STATES["stopped"], size) as opened:
             opened.test("reset").wait_for()
@@ -144,7 +144,7 @@ def test_each_card_has_one_bold_button_at_most(show: Show, state: str) -> None:
 # -- without control
 
 
-def test_a_key_without_control_says_how_to_get_it_and_enter_takes_it(show: Show, server: CannedServer) -> None:
+def test_a_key_without_control_is_answered_and_enter_takes_control(show: Show, server: CannedServer) -> None:
     with show(FREE) as opened:
         _ready(opened)
         page = opened.page
@@ -304,7 +304,7 @@ def test_cards_for_engineers_are_closed_until_they_are_opened(show: Show, server
 # -- small and full screens
 
 
-def test_a_phone_has_a_bell_and_stops_all_in_its_last_tab(show: Show, server: CannedServer) -> None:
+def test_a_phone_has_notices_and_stop_all(show: Show, server: CannedServer) -> None:
     with show(STATES["driving"], "phone") as opened:
         _ready(opened)
         opened.test("bell").tap()
