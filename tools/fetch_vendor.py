@@ -1,7 +1,7 @@
-"""Vendored JavaScript of the operator page: ``--check`` its hashes offline, or ``--update NAME VERSION`` from npm.
+"""Vendored files of the operator page: ``--check`` its hashes offline, or ``--update NAME VERSION`` from npm.
 
 ``vendor.json`` lists every file: package, version, npm's integrity of the tarball, path inside, and the file's own
-sha256.
+sha256. A file that is made of npm's has the commands that make it, in ``made``.
 """
 
 from __future__ import annotations
@@ -45,6 +45,8 @@ def update(name: str, version: str, folder: Path = VENDOR) -> None:
     meta = json.loads(fetch(f"{npm.registry()}/{name}/{version}"))
     integrity = meta["dist"]["integrity"]
     content = npm.tarball(name, version, integrity.removeprefix("sha512-"))
+    if made := [command for entry in entries if entry["name"] == name for command in entry.get("made", ())]:
+        sys.exit("it is made by hand, then its hash and licence are entered:\n" + "\n".join(made))
     for entry in entries:
         if entry["name"] == name:
             inside = _rewritten(_member(content, entry["path"]))

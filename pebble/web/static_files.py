@@ -20,7 +20,9 @@ _TYPES = {
     "mjs": "text/javascript; charset=utf-8",
     "svg": "image/svg+xml",
     "webmanifest": "application/manifest+json",
+    "woff2": "font/woff2",
 }
+_PACKED = {"woff2"}  # compressed already
 _VERSION = b"{version}"  # in the pages, replaced by that of the files
 _ROOT = b"{root}"  # replaced by root_of(): a proxy may show the server below a path that only browsers know
 _MODULES = b"{modules}"  # replaced by links to all that is imported: browsers need not discover them one by one
@@ -54,7 +56,7 @@ class StaticFiles:
         for name in self.files:
             if name.endswith(".html"):
                 self.files[name] = self.files[name].replace(_VERSION, self.version.encode())
-        self._packed = {name: gzip.compress(content, 9, mtime=0) for name, content in self.files.items()}
+        self._packed = {name: _packed(name, content) for name, content in self.files.items()}
 
     def _imported(self, *names: str) -> list[str]:
         """What these modules import before they run, and what that imports."""
@@ -71,7 +73,7 @@ class StaticFiles:
         """The operator page; which screen it shows is up to its address."""
         name = "robot.html" if request.url.path.startswith("/r/") else "fleet.html"
         content = self.files[name].replace(_ROOT, root_of(request).encode())
-        return _response(request, name, content, gzip.compress(content, 9), headers)
+        return _response(request, name, content, _packed(name, content), headers)
 
     def answer(self, request: Request, name: str, headers: dict[str, str]) -> Response:
         """The file ``name``, compressed if the browser takes that; 404 if there is none."""
@@ -86,9 +88,13 @@ def root_of(request: Request) -> str:
     return "../" * (path.count(b"/") - 1) or "./"
 
 
-def _response(request: Request, name: str, content: bytes, packed: bytes, headers: dict[str, str]) -> Response:
+def _packed(name: str, content: bytes) -> bytes | None:
+    return None if name.rpartition(".")[2] in _PACKED else gzip.compress(content, 9, mtime=0)
+
+
+def _response(request: Request, name: str, content: bytes, packed: bytes | None, headers: dict[str, str]) -> Response:
     headers = {**headers, "vary": "accept-encoding"}
-    if "gzip" in request.headers.get("accept-encoding", ""):
+    if packed is not None and "gzip" in request.headers.get("accept-encoding", ""):
         content, headers["content-encoding"] = packed, "gzip"
     return Response(content, media_type=_TYPES[name.rpartition(".")[2]], headers=headers)
 
@@ -104,7 +110,7 @@ def _read(folder: Traversable, path: str) -> Iterator[tuple[str, bytes]]:
             yield from _read(entry, f"{path}{entry.name}/")
         elif suffix in _TYPES:
             content = entry.read_bytes()
-            yield path + entry.name, stripped(content, suffix)
+            yield path + entry.name, content if suffix in _PACKED else stripped(content, suffix)
 
 
 def stripped(source: bytes, suffix: str) -> bytes:

@@ -27,6 +27,9 @@ SIZES: dict[Size, tuple[int, int]] = {
     "small": (320, 640),
 }
 _OPEN_S = 40.0
+_COVERS = (
+    ".tabs button:visible, [data-test=gear][aria-expanded=false]:visible, details.folded:not([open]) > summary:visible"
+)
 _LOOK_MS = 20  # between two looks: each costs three programs a millisecond
 _VIOLATIONS = """addEventListener("securitypolicyviolation", (event) =>
   pebbleViolation(`${event.violatedDirective} ${event.blockedURI}`))"""
@@ -37,6 +40,13 @@ PIXELS = """const pixelsOf = (canvas) => {
   copy.drawImage(canvas, 0, 0);
   return copy.getImageData(0, 0, width, height).data;
 };"""
+#: As if somebody had opened the cards for engineers, and all plots: most tests look at one of them.
+_ENGINEERS = """try {
+  const key = `pebble cards ${decodeURIComponent(location.pathname.split("/r/")[1])}`;
+  const opened = ["services", "mcus", "logs", "values", "system"];
+  localStorage.setItem("pebble plots all", "true");
+  if (!localStorage.getItem(key)) localStorage.setItem(key, JSON.stringify({ opened }));
+} catch {}"""
 _HIDE = """(hidden) => {
   Object.defineProperty(document, "hidden", { configurable: true, get: () => hidden });
   const state = hidden ? "hidden" : "visible";
@@ -77,14 +87,18 @@ class Tab:
         return True
 
     def uncover(self, name: str, within: float = 20.0) -> Locator:
-        """The control of this name, once it is shown; on a phone it is behind one of the tabs."""
+        """The control of this name, once it is shown; it may be behind a tab of a phone, or folded."""
         found, end = self.page.locator(f'[data-test="{name}"]:visible'), time.monotonic() + within
         while time.monotonic() < end:
-            for press in (lambda: None, *(one.click for one in self.page.locator(".tabs button:visible").all())):
+            for press in (lambda: None, *(one.click for one in self.page.locator(_COVERS).all())):
                 press()
                 if self.until(lambda: found.count(), 0.3):
                     return found
         raise AssertionError(f"the page shows no {name}")
+
+    def gear(self) -> None:
+        """Open the settings of the picture; on a phone they are a card."""
+        self.test("gear").click()
 
     def test(self, name: str) -> Any:
         """The locator of the elements with this ``data-test``."""
@@ -130,10 +144,13 @@ def tab(
     theme: Theme = "light",
     *,
     script: str = "",
+    engineers: bool = True,
     routes: Mapping[Any, Callable[[Route], object]] | None = None,
     **options: Any,
 ) -> Iterator[Tab]:
     """Open ``url`` in a context of its own; ``script`` runs before the page's; ``options`` are those of a context.
+
+    ``engineers``: the cards for engineers are open, and all plots are shown.
 
     ``routes`` answer requests instead of the server, by what their addresses match.
     """
@@ -144,7 +161,7 @@ def tab(
     try:
         for pattern, answer in (routes or {}).items():
             context.route(pattern, answer)
-        opened = _prepared(context, script)
+        opened = _prepared(context, (_ENGINEERS if engineers else "") + script)
         opened.page.goto(url, timeout=1000 * _OPEN_S, wait_until="domcontentloaded")
         yield opened
     finally:

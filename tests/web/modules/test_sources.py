@@ -13,6 +13,7 @@ from importlib.resources import files
 from pathlib import Path
 
 import pytest
+from starlette.requests import Request
 
 import pebble.web
 from pebble.web.static_files import StaticFiles, stripped
@@ -25,7 +26,8 @@ OURS = [
 ]
 SUFFIXES = (".js", ".mjs", ".css", ".html", ".svg", ".webmanifest")
 SERVED = [path for path in sorted(STATIC.rglob("*")) if path.suffix in SUFFIXES]
-MOST_KB = 90  # compressed, for all that one load of the page fetches until it shows pictures
+MOST_KB = 90  # compressed, for all that one load of the page fetches until it shows pictures, with its font
+FONT = "vendor/figtree.woff2"
 PRINT = ["--allowJs", "--removeComments", "--noCheck", "--noLib", "--noResolve"]
 
 HTML_FROM_TEXT = r"innerHTML|outerHTML|insertAdjacentHTML|document\.write|\beval\(|new Function\(|srcdoc|setHTML"
@@ -104,10 +106,23 @@ def test_a_load_of_the_page_is_small(screen: str) -> None:
     served = StaticFiles(files("pebble.web") / "static").files
     modules = [STATIC / name for name in ("main.js", f"ui/{screen}/{screen}.js", "media/video-worker.js")]
     names = {str(path.relative_to(STATIC.resolve())) for one in modules for path in _imported(one.resolve())}
-    names |= {f"{screen}.html", "app.css", "icons.svg", "faces.svg", "manifest.webmanifest"}
-    names |= {f"{screen}.css"} & set(served)
+    names |= {f"{screen}.html", "app.css", "icons.svg", "manifest.webmanifest", FONT}
+    names |= {f"{screen}.css", "faces.svg"} & set(served)
     size = sum(len(gzip.compress(served[name].replace(b"{root}", b"../../../../"), 9)) for name in names)
     assert size <= 1000 * MOST_KB, f"{size} bytes in {len(names)} files"
+
+
+def test_the_font_is_sent_as_it_is_and_early() -> None:
+    static = StaticFiles(files("pebble.web") / "static")
+    assert static.files[FONT] == (STATIC / FONT).read_bytes()
+    assert len(static.files[FONT]) < 40_000
+    request = Request({"type": "http", "headers": [(b"accept-encoding", b"gzip")]})
+    answer = static.answer(request, FONT, {})
+    assert (answer.headers["content-type"], answer.headers.get("content-encoding")) == ("font/woff2", None)
+    preloaded = rb'rel="preload" as="font" type="font/woff2" crossorigin href="[^"]*figtree'
+    for page in ("fleet.html", "robot.html"):
+        assert re.search(preloaded, static.files[page])
+    assert f'url("{FONT}")' in (STATIC / "app.css").read_text()
 
 
 def test_markup_has_no_script_and_no_style_of_its_own() -> None:

@@ -1,4 +1,4 @@
-"""The cards of the fleet: what a press opens, many robots in groups, and the steps of who is here for the first time."""
+"""The cards of the fleet: what a press opens, many robots in groups, and the first steps of a newcomer."""
 
 import pytest
 

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -146,7 +147,7 @@ def _listen(page: Page) -> None:
     if tab_of_sound.count():
         tab_of_sound.click()
     page.locator("[data-test=listen]").click()
-    page.locator("[data-test=sound-state]", has_text="buffered").wait_for()
+    page.locator("[data-test=listen]", has_text=re.compile("Silence|Stop listening")).wait_for()
 
 
 class Screen(NamedTuple):
@@ -171,7 +172,7 @@ WHEN = {
     "fleet-lost": "No connection to the server since",
     "lost": "No connection to the server since",
     "free": "Take control",
-    "taken": "Take over from bob",
+    "taken": "Hold to take over",
     "viewer": "Log in as driver",
     "stopped": "Also stopped",
     "stop-sent": "NOT CONFIRMED by goob, and sent again",
@@ -183,7 +184,7 @@ WHEN = {
     "no-picture": "There is no picture yet",
     "old-page": "older than the server",
     "plain-http": "not encrypted",
-    "tower": "pbvz 640×360",
+    "tower": "live",
     "other-camera": "seen from tower-1",
     "script-drives": "Stop apriltag-follow",
 }
@@ -199,7 +200,8 @@ SCREENS = [
     Screen("plots", "odometry", hold=_show_card("plots"), sizes=("desktop",)),
     Screen("plots", "odometry", _press(".tabs button:nth-child(2)"), ("phone",), hold=_show_card("plots")),
     Screen("map", "odometry", _press(".tabs button:nth-child(2)"), ("phone",), hold=_show_card("map")),
-    Screen("stream-open", "own-stream", _press("[data-test=open-stream]")),
+    Screen("stream-open", "own-stream", _press("[data-test=gear]", "[data-test=open-stream]")),
+    Screen("gear", "driving", _press("[data-test=gear]"), ("desktop",)),
     Screen("listening-now", "listening", _listen),
     Screen("sound", "no-sound", _press("[data-test=tab-sound]"), ("phone",)),
     Screen("driving-now", "driving", sizes=("desktop",), hold=_drive),

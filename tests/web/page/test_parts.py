@@ -139,7 +139,8 @@ DRAWN = [".knob", ".stick-arrow.n", ".stick-arrow.e", ".stick-arrow.s", ".stick-
 #: How many texts say that a part loads; how many of them lie over a control, and how many leave their card.
 COVERED = """(() => {
   const place = (one) => one.getBoundingClientRect();
-  const texts = [...document.querySelectorAll(".loading")].filter((one) => place(one).height > 0);
+  const texts = [...document.querySelectorAll(".loading")]
+    .filter((one) => one.checkVisibility() && place(one).height > 0);
   const controls = [...document.querySelectorAll("button, a, input, select, .stick")]
     .filter((one) => !one.closest(".tabs, header, .skip")); // the page scrolls below these
   const wide = (a, b) => Math.min(a.right, b.right) - Math.max(a.left, b.left);

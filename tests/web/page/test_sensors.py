@@ -160,7 +160,8 @@ def test_a_pause_and_a_closed_card_draw_nothing(sensors: Tab) -> None:
     sensors.page.wait_for_timeout(150)
     assert drawings(sensors, "plots", 700) == 0
     sensors.test("plots-pause").click()
-    sensors.page.get_by_label("Close Plots").click()
+    sensors.test("menu-plots").click()
+    sensors.page.get_by_text("Close Plots").click()
     assert sensors.until("!document.querySelector('.plot-lines')")
     assert drawings(sensors, "plots", 400) == 0
     sensors.page.get_by_label("Open Plots").click()
@@ -398,9 +399,11 @@ def test_overlays_in_full_screen_where_stop_and_the_reason_remain_and_overlays_t
         opened.test("stop-one").click()
         assert opened.until(lambda: server.sent("estop"))
         opened.page.get_by_label("Leave full screen").click()
+        opened.gear()
         opened.test("overlays").click()
         assert opened.until("!document.querySelector('[data-test=overlays-canvas]')")
         opened.page.reload()
+        opened.gear()
         opened.test("overlays").wait_for()  # they stay so
         assert not opened.test("overlays").is_checked()
         assert opened.page.evaluate("!document.querySelector('[data-test=overlays-canvas]')")
@@ -440,6 +443,7 @@ def test_a_robots_own_stream_is_shown_in_a_frame_and_never_called_live(show: Sho
     reason = "pebble.driver.reason()?.code ?? ''"
     with show(OWN) as opened:
         assert opened.until(f"{reason} === ''")
+        opened.gear()
         opened.test("open-stream").click()
         frame = opened.test("stream")
         assert frame.get_attribute("sandbox") == "allow-scripts allow-same-origin"
@@ -465,11 +469,14 @@ def test_a_robots_own_stream_is_shown_in_a_frame_and_never_called_live(show: Sho
 
 def test_an_address_that_is_newer_than_the_page_needs_a_reload(show: Show, server: CannedServer) -> None:
     with show(replace(OWN, frames="")) as opened:
+        opened.gear()
         opened.test("open-stream").click()
         opened.test("reload-stream").wait_for()
         assert opened.test("stream").count() == 0
         server.show(OWN)
         opened.test("reload-stream").click()
+        opened.page.wait_for_load_state()
+        opened.gear()
         opened.test("open-stream").click()
         assert "own stream" in opened.page.frame_locator("[data-test=stream]").locator("body").inner_text(timeout=5000)
 
@@ -482,6 +489,7 @@ NOT_SHOWN = ["javascript:parent.ran = 1", "data:text/html,x", "http://user:secre
 def test_what_may_not_be_shown_is_not(show: Show, address: str) -> None:
     frames = f"{STREAM} http://127.0.0.1:{{port}}"
     with show(replace(OWN, values=changed(fleet, MINE, with_stream(address)), frames=frames)) as opened:
+        opened.gear()
         assert opened.test("open-stream").is_disabled()
         assert opened.page.locator("#why-stream").inner_text()
         assert opened.page.evaluate("document.querySelectorAll('iframe').length") == 0
@@ -500,6 +508,7 @@ ENTERED = with_stream("http://other.local/"), at(GOOB, "web/stream-address", {"u
 def test_another_stream_is_shown_instead(show: Show, values: tuple[Any, ...], title: str) -> None:
     """One whose address was entered, or of the component whose picture is shown."""
     with show(replace(OWN, values=changed(fleet, MINE, *values))) as opened:
+        opened.gear()
         opened.test("open-stream").click()
         assert opened.test("stream").get_attribute("title") == title
         assert "own stream" in opened.page.frame_locator("[data-test=stream]").locator("body").inner_text(timeout=5000)
@@ -508,12 +517,14 @@ def test_another_stream_is_shown_instead(show: Show, values: tuple[Any, ...], ti
 def test_an_address_is_entered_and_taken_back(show: Show, server: CannedServer) -> None:
     url, maintainer = "http://camera.local:8889/cam", {"role": "maintainer", "rights": ["drive", "reset", "system"]}
     with show(STATES["driving"]) as opened:
+        opened.gear()
         opened.test("stream-address").click()
         opened.test("stream-url").fill(url)
         assert opened.test("set-stream").is_disabled()
         assert "maintainer" in opened.page.locator("#why-stream-address").inner_text()
     state = replace(STATES["driving"], welcome={"user": "max", **maintainer})
     with show(state) as opened:
+        opened.gear()
         opened.test("stream-address").click()
         use, address = opened.test("set-stream"), opened.test("stream-url")
         assert use.is_disabled()
@@ -526,6 +537,7 @@ def test_an_address_is_entered_and_taken_back(show: Show, server: CannedServer) 
         entered = at(GOOB, "web/stream-address", {"url": url})
         server.show(replace(state, values=changed(fleet, MINE, entered)))
         opened.page.reload()
+        opened.gear()
         opened.test("stream-address").click()
         opened.test("unset-stream").click()
         assert opened.until(lambda: server.sent("stream-address")[-1]["url"] == "")

@@ -62,7 +62,7 @@ def test_the_extra_axis_has_keys_and_buttons(at_lamp: Console, wire: Wire, key: 
     assert at_lamp.persists(lambda: at_lamp.down(key), lambda: newest() == y, at_lamp.let_go)
     at_lamp.let_go()
     assert at_lamp.tab.until(lambda: newest() == 0, 2)
-    at_lamp.test(button).hover()
+    at_lamp.uncover(button).hover()
     mouse = at_lamp.page.mouse
     assert at_lamp.persists(mouse.down, lambda: newest() == y, mouse.up)
     mouse.up()
@@ -87,7 +87,7 @@ SLIDERS = {"speed": "60", "turn": "60", "balance": "0"}
 def test_a_slider_scales_what_the_wheels_do(
     at_benjr: Console, slider: str, value: str, key: str, speeds: tuple[float, float]
 ) -> None:
-    at_benjr.test(slider).fill(value)
+    at_benjr.uncover(slider).fill(value)
     assert at_benjr.drive(key, wheels=KEYS[key])
     assert at_benjr.tab.until(lambda: at_benjr.speeds == pytest.approx(speeds, abs=0.01), 1), at_benjr.speeds
     at_benjr.let_go()

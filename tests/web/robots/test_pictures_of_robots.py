@@ -52,6 +52,7 @@ def test_the_fleet_never_starts_a_camera(browser: Browser, stage: Stage, wire: W
 def test_the_camera_runs_while_its_picture_is_shown(browser: Browser, stage: Stage, wire: Wire) -> None:
     with console(browser, stage, "fred") as robot, used(robot):
         assert robot.tab.until(lambda: wire.camera("fred"), 5)
+        robot.tab.gear()
         robot.test("encoding").select_option("json")
         assert robot.tab.until(
             lambda: wire.last("fred/incoming/front-camera") == {"enabled": True, "encoding": "json"}, 5
@@ -86,6 +87,7 @@ def test_a_robot_shows_the_picture_of_another_which_must_be_new(at_lamp: Console
     assert at_lamp.press_anew()
     wire.publish("goob/incoming/flags/mqtt-video", {"value": True}, retain=True)
     assert at_lamp.tab.until("window.pebble.video.age().ms < 1000")
+    at_lamp.tab.gear()
     at_lamp.test("picture-from").select_option(stage.ref("fred"))
     assert at_lamp.tab.until(lambda: at_lamp.page.evaluate("window.pebble.video.ref") == stage.ref("fred"), 3)
     assert at_lamp.tab.until("window.pebble.video.info !== null")

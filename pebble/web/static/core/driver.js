@@ -49,6 +49,8 @@ export class Driver {
     /** @type {Set<string>} parts of the page that do not work */
     this.failed = new Set();
     this.refusal = ""; // why the server has ended the last gesture
+    this.hintedAt = -Infinity; // when somebody without control last tried to drive
+    this.tried = false;
     /** @type {import("./reasons.js").Reason|null} why nothing moves it, whatever is sent; found by what is fetched later */
     this.doubt = null;
     this.clockBase = Date.now() - performance.now();
@@ -252,6 +254,9 @@ export class Driver {
       } else if (!button || !event.repeat) this.space(); // a button that is held by it stays held
     } else if (event.ctrlKey || event.altKey || event.metaKey) {
       // a shortcut of the browser
+    } else if (event.code === "Enter" && !event.repeat && !event.target.matches?.(PRESSED) && this.isFree()) {
+      event.preventDefault();
+      this.take();
     } else if (DRIVE_KEYS.has(event.code) && this.ref && !isOwn(event)) {
       if (document.querySelector("dialog[open]")) return;
       event.preventDefault();
@@ -262,6 +267,18 @@ export class Driver {
 
   latch(why) {
     this.stopped(() => this.estop.press(this.ref, why)); // without an open component: all
+  }
+
+  /** @returns {boolean} whether all that is missing to drive is control, which anybody may take */
+  isFree() {
+    return this.ref !== "" && !document.querySelector("dialog[open]") && this.reason()?.action?.kind === "take";
+  }
+
+  /** Somebody tries to drive: without control it is said how to get it. */
+  hint() {
+    if (!this.isFree()) return;
+    this.hintedAt = performance.now();
+    this.changed();
   }
 
   /** A stop is sent, whatever else fails. @param {() => void} send */
@@ -342,6 +359,9 @@ export class Driver {
     const slow = this.socket.roundTripMs >= SLOW_MS ? SLOW_SPEED : 1;
     const vector = this.inputs.vector({ ...this.sliders, speed: Math.min(this.sliders.speed, slow) });
     const { neutral, waiting } = this.inputs;
+    const tries = vector.x !== 0 || vector.z !== 0 || vector.y !== 0;
+    if (tries && !this.tried) this.hint();
+    this.tried = tries;
     const { active } = this.gesture;
     this.gesture.update(vector, situation !== null && why === null, now, neutral, waiting.size > 0);
     if (active && this.gesture.mustRelease) this.letGo();
@@ -356,7 +376,7 @@ export class Driver {
     const { x, z, y } = this.output;
     const { ref, pads, sliders, inSight, typing } = this;
     const pad = pads && [pads.choice.key, pads.reasons()];
-    const shown = JSON.stringify([ref, this.reason(), x, z, y, pad, sliders, inSight, typing]);
+    const shown = JSON.stringify([ref, this.reason(), x, z, y, pad, sliders, inSight, typing, this.hintedAt]);
     if (shown === this.shown) return;
     this.shown = shown;
     callAll(this.watchers);

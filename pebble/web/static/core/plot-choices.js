@@ -9,14 +9,14 @@ const MINUTES = 60_000;
 
 /**
  * ``fields``: names within the metric's numbers; null: all of them, up to six. ``least``: the smallest range of values
- * that is shown.
+ * that is shown. ``first``: it is shown before somebody asks for all of them.
  * @typedef {{id: string, title: string, metric: string, fields: string[] | null, digits?: number, unit?: string,
- *   least?: number}} Plot
+ *   least?: number, first?: boolean}} Plot
  */
 
 /** @type {Plot[]} */
 export const USUAL = [
-  { id: "battery", title: "Battery", metric: "charging-level", fields: ["value"], digits: 2, least: 0.2 },
+  { id: "battery", title: "Battery", metric: "charging-level", fields: ["value"], digits: 2, least: 0.2, first: true },
   { id: "touch", title: "Touch", metric: "touch-sensors", fields: null, digits: 0, least: 20 },
   {
     id: "attitude",
@@ -35,6 +35,7 @@ export const USUAL = [
     digits: 1,
     unit: "°/s",
     least: 2,
+    first: true,
   },
   {
     id: "acceleration",

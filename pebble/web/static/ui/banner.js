@@ -1,26 +1,59 @@
-// What must not be overlooked, below the header: stops, lost connections, and what was not done.
+// What must not be overlooked, over the picture or on top of a screen: stops, lost connections, and what was not done.
 
-import { html, useEffect, useMetric, useModel, usePage, useRefs, useState, useTick, useValue } from "./parts/hooks.js";
-import { HoldButton, Icon, RouteLink, Why } from "./parts/parts.js";
+import {
+  html, useEffect, useLater, useLayoutEffect, useMetric, useModel, usePage, useRefs, useState, useTick, useValue,
+} from "./parts/hooks.js";
+import { Model } from "./parts/models.js";
+import { HoldButton, Icon, RouteLink, Why, useName } from "./parts/parts.js";
 import { clockTime, nameOf, roughly } from "./parts/words.js";
 
 const NOTICE_MS = 6000;
 const NO_ANSWER_MS = 1500;
+const MOST_ALSO = 3; // others that are named
+const HINT_MS = 3000;
 const SHOWN_MS = 60_000; // a finished stop
 
+/** Whether the screen has a place of its own for them: then it is not said twice. */
+const places = new (class extends Model {
+  count = 0;
+
+  add(change) {
+    this.count += change;
+    this.changed();
+  }
+})();
+
+/** On top of a screen that has no place for them, and while the screen is not here, or has failed. */
 export function Banners({ at }) {
+  useModel(places);
+  return at && places.count ? null : html`<${All} at=${at} />`;
+}
+
+/** Over the picture, or what is in its place: nothing on the page moves. */
+export function Bands({ at }) {
+  useLayoutEffect(() => {
+    places.add(1);
+    return () => places.add(-1);
+  }, []);
+  return html`<${All} at=${at} />`;
+}
+
+/** A stop first. */
+function All({ at }) {
   const { connection } = usePage();
   useModel(connection);
   return html`<section class="banners" aria-label="What to know now">
-    <div role="alert"><${ServerBanner} />${at && html`<${SilentBanner} at=${at} />`}</div>
     <${StopBanners} at=${at} />
     <${PressBanner} />
+    <div role="alert"><${ServerBanner} />${at && html`<${SilentBanner} at=${at} />`}</div>
+    ${at && html`<${AlsoStopped} at=${at} />`}
     <${Notice} />
+    ${at && html`<${ControlHint} />`}
   </section>`;
 }
 
-const Banner = ({ kind, icon, children }) => html`<div class=${`banner ${kind}`}>
-  <span class="banner-icon" aria-hidden="true">${icon}</span>
+const Banner = ({ kind, icon = "warning", children }) => html`<div class=${`banner ${kind}`}>
+  <${Icon} name=${icon} />
   <div class="banner-text">${children}</div>
 </div>`;
 
@@ -30,25 +63,25 @@ function ServerBanner() {
   const broker = useValue("", "web/broker");
   const { bye, you } = connection;
   if (bye) {
-    return html`<${Banner} kind="bad" icon="✖">
+    return html`<${Banner} kind="bad">
       <p><b>The server has ended this connection:</b> ${bye.why}</p>
-      <button type="button" onClick=${() => location.reload()}>Connect again</button>
+      <div class="banner-actions"><button type="button" onClick=${() => location.reload()}>Connect again</button></div>
     <//>`;
   }
   if (connection.state === "lost") return html`<${LostBanner} />`;
   if (connection.isOld) {
-    return html`<${Banner} kind="bad" icon="✖">
+    return html`<${Banner} kind="bad">
       <p><b>This page is older than the server.</b> Driving is off until it is loaded again.</p>
-      <button type="button" onClick=${() => location.reload()}>Reload</button>
+      <div class="banner-actions"><button type="button" onClick=${() => location.reload()}>Reload</button></div>
     <//>`;
   }
   if (broker && !broker.connected) {
-    return html`<${Banner} kind="bad" icon="✖">
+    return html`<${Banner} kind="bad">
       <p><b>The server cannot reach the broker:</b> ${broker.problem || "no reason is known"}</p>
     <//>`;
   }
   if (you && !you.drives) {
-    return html`<${Banner} kind="warn" icon="▲">
+    return html`<${Banner} kind="warn">
       <p><b>This connection is not encrypted.</b> Driving is switched off; stopping works.</p>
     <//>`;
   }
@@ -59,7 +92,7 @@ function LostBanner() {
   const { connection } = usePage();
   useTick(1000);
   const { lostAt, attempts } = connection.socket;
-  return html`<${Banner} kind="bad" icon="✖">
+  return html`<${Banner} kind="bad">
     <p>
       <b>No connection to the server since ${clockTime(lostAt)}.</b> What you drove stops by itself.
       <span aria-hidden="true"> Retrying${attempts > 1 ? ` (${attempts})` : ""}…</span>
@@ -76,7 +109,7 @@ function SilentBanner({ at }) {
   const { silent_s: silent } = entry.value;
   const ms = silent === null ? null : 1000 * silent + entry.age;
   const since = ms !== null ? store.now() - ms : Number.isFinite(heartbeat?.t) ? heartbeat.t : null;
-  return html`<${Banner} kind="bad" icon="✖">
+  return html`<${Banner} kind="bad">
     <p>
       <b>${nameOf(at)} is ${silent === null ? "offline" : "silent"}${since ? ` since ${clockTime(since)}` : ""}.</b>
       ${ms !== null && html`<span aria-hidden="true"> Last heartbeat ${roughly(ms)} ago.</span>`}
@@ -84,13 +117,11 @@ function SilentBanner({ at }) {
   <//>`;
 }
 
-/** One banner for the open component and a line for all others; on the fleet's screen one for each. */
+/** One for the open component; on the fleet's screen one for each. */
 function StopBanners({ at }) {
   const refs = useRefs().sort();
-  const others = refs.filter((ref) => ref !== at);
   return html`<div class="stop-banners">
-    ${at && html`<${StopBanner} key=${at} at=${at} />`}
-    ${at ? html`<${AlsoStopped} refs=${others} />` : others.map((ref) => html`<${StopBanner} key=${ref} at=${ref} />`)}
+    ${(at ? [at] : refs).map((ref) => html`<${StopBanner} key=${ref} at=${ref} />`)}
   </div>`;
 }
 
@@ -100,26 +131,29 @@ function StopBanner({ at }) {
   useTick(500);
   const entry = useMetric(at, "web/estop");
   const view = entry?.value;
+  const name = useName(at);
   const [asked, ask] = useState(false);
   const latched = view?.latched === true;
   useEffect(() => {
     if (!latched) ask(false);
   }, [latched]);
   if (!view) return null;
-  const progress = stopProgress(view, nameOf(at), entry.age);
+  const progress = stopProgress(view, name, entry.age);
   if (!latched && !progress) return null;
   const refused = (view.owners ?? []).map((one) => one.reset_refused).find(Boolean);
   const why = resetReason(connection);
   const id = `reset-${at}`;
+  const asks = latched && asked;
   return html`<div class=${`banner ${latched || progress?.kind === "bad" ? "stopped" : "warn"}`}>
-    <span class="banner-icon" aria-hidden="true">■</span>
+    <${Icon} name="stop" />
     <div class="banner-text">
       <div role="alert">
-        ${latched && html`<p><b>${nameOf(at)} is stopped</b>${stopWords(view)}.</p>`}
-        ${progress && html`<p class="banner-more">${progress.text}</p>`}
-        ${latched && refused && html`<p class="banner-more"><b>Not reset:</b> ${refusedWords(refused)}.</p>`}
+        ${latched && !asks && html`<p><b>${name} is stopped</b>${!progress && html` <span>${stopWords(view)}</span>`}</p>`}
+        ${progress && !asks && html`<p class="banner-more">${progress.text}</p>`}
+        ${latched && refused && !asks && html`<p class="banner-more"><b>Not reset:</b> ${refusedWords(refused)}.</p>`}
       </div>
-      ${asked && html`<p>Reset ${nameOf(at)}? Look at the robot: is everybody clear?</p>`}
+      ${asks &&
+      html`<p><b>Look at ${name}: is everybody clear?</b> <span>It moves again only when somebody drives it.</span></p>`}
       ${why && latched && html`<${Why} id=${id}>${why}<//>`}
     </div>
     <div class="banner-actions">
@@ -130,14 +164,14 @@ function StopBanner({ at }) {
         data-test="reset"
         disabled=${Boolean(why)}
         aria-describedby=${why ? id : undefined}
+        aria-label=${`Reset ${name}…`}
         onClick=${() => ask(true)}
       >
-        Reset ${nameOf(at)}…
+        Reset…
       </button>`}
-      ${latched &&
-      asked &&
+      ${asks &&
       html`<${HoldButton} test="reset-hold" disabled=${Boolean(why)} onHeld=${() => commands.reset(at, view.owners)}
-          >Hold 1 s to reset<//
+          >Hold to reset<//
         >
         <button type="button" data-test="leave-stopped" onClick=${() => ask(false)}>Leave stopped</button>`}
       ${view.sending === "old" &&
@@ -150,9 +184,8 @@ function StopBanner({ at }) {
 }
 
 function stopWords(view) {
-  const by = view.by ? ` by ${view.by}` : "";
-  const since = view.since > 0 ? `, ${clockTime(view.since)}` : "";
-  return `${by}${since}${view.why ? ` (${view.why})` : ""}`;
+  const how = view.why && view.why !== "button" ? ` (${view.why})` : "";
+  return `by ${view.by || "somebody"}${view.since > 0 ? `, at ${clockTime(view.since)}` : ""}${how}`;
 }
 
 /** What became of the stop that is, or was, sent. @returns {{kind: string, text: string} | null} */
@@ -189,15 +222,16 @@ function resetReason(connection) {
   return connection.may("reset") ? "" : "Log in as driver to reset";
 }
 
-function AlsoStopped({ refs }) {
-  const stopped = useStopped(refs);
+/** Others than the open one. */
+function AlsoStopped({ at }) {
+  const stopped = useStopped(useRefs().filter((ref) => ref !== at)).sort();
   if (!stopped.length) return null;
-  return html`<div class="banner also">
-    <span class="banner-icon" aria-hidden="true">■</span>
-    <div class="banner-text links">
-      Also stopped: ${stopped.map((ref) => html`<${RouteLink} key=${ref} to=${ref}>${nameOf(ref)}<//>`)}
-    </div>
-  </div>`;
+  return html`<p class="also links">
+    <${Icon} name="stop" /><span>Also stopped:</span> ${stopped.slice(0, MOST_ALSO).map(
+      (ref) => html`<${RouteLink} key=${ref} to=${ref}>${nameOf(ref)}<//>`,
+    )}
+    ${stopped.length > MOST_ALSO && html`<${RouteLink} to="">${stopped.length - MOST_ALSO} more<//>`}
+  </p>`;
 }
 
 function useStopped(refs) {
@@ -225,22 +259,22 @@ function PressBanner() {
   if (known && connection.isOpen) return null;
   const whom = pressed.ref ? nameOf(pressed.ref) : "all robots";
   if (age < NO_ANSWER_MS) {
-    return html`<${Banner} kind="warn" icon="■"><p role="alert">STOP of ${whom}: sent…</p><//>`;
+    return html`<${Banner} kind="warn" icon="stop"><p role="alert">STOP of ${whom}: sent…</p><//>`;
   }
   if (!pressed.reached) {
-    return html`<${Banner} kind="bad" icon="✖">
+    return html`<${Banner} kind="bad">
       <p role="alert">
         <b>STOP of ${whom} DID NOT REACH the server.</b> Go to the robot, or use another way to stop it.
       </p>
     <//>`;
   }
   if (!connection.isOpen) {
-    return html`<${Banner} kind="warn" icon="■">
+    return html`<${Banner} kind="warn" icon="stop">
       <p role="alert">STOP of ${whom} reached the server. Whether it has stopped cannot be seen from here.</p>
     <//>`;
   }
   if (age > 10_000) return null;
-  return html`<${Banner} kind="bad" icon="■">
+  return html`<${Banner} kind="bad" icon="stop">
     <p role="alert"><b>STOP of ${whom} is NOT CONFIRMED.</b> ${pressed.ref ? "" : "No robot has answered."}</p>
   <//>`;
 }
@@ -249,9 +283,17 @@ function Notice() {
   const { connection } = usePage();
   const { notice } = connection;
   const shown = notice && performance.now() - notice.at < NOTICE_MS;
-  return html`<div role="status">
-    ${shown &&
-    html`<div class="banner note"><${Icon} name="info" /><div class="banner-text">${notice.text}</div></div>`}
-  </div>`;
+  return html`<div role="status" class="pill-place">${shown && html`<p class="pill">${notice.text}</p>`}</div>`;
 }
 
+/** What somebody who tries to drive without control has to do first. */
+function ControlHint() {
+  const { driver } = usePage();
+  useModel(driver);
+  const since = performance.now() - driver.hintedAt;
+  const shown = since < HINT_MS && driver.reason()?.action?.kind === "take";
+  useLater(shown ? HINT_MS - since : Infinity);
+  return html`<div role="status" class="pill-place">
+    ${shown && html`<p class="pill" data-test="hint">Take control first<kbd>Enter</kbd></p>`}
+  </div>`;
+}

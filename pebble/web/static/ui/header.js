@@ -2,8 +2,10 @@
 
 import * as browser from "../core/browser.js";
 import { Boundary, html, styled, useMetric, useModel, useOnline, usePage, usePart, useRefs, useTick, useValue } from "./parts/hooks.js";
-import { Icon, Live, RouteLink, StopButton } from "./parts/parts.js";
-import { battery, driverName, kindOf, nameOf, roughly, span, typeOf } from "./parts/words.js";
+import { Charge, Face, Icon, RouteLink, StopButton, useName } from "./parts/parts.js";
+import { driverName, kindOf, nameOf, roughly, span, typeOf } from "./parts/words.js";
+
+const LATE_MS = 300; // of the way to the server and back
 
 export function Header({ at, layout, panel, onPanel, drawer, onDrawer }) {
   const { commands, driver, route } = usePage();
@@ -16,7 +18,9 @@ export function Header({ at, layout, panel, onPanel, drawer, onDrawer }) {
     ${at && wide && html`<${Vital} at=${at} />`}
     <div class="top-space"></div>
     ${wide && html`<${ConnectionState} />`}
-    <${Boundary} what="Notices"><${Notices} at=${at} wide=${wide} /><//>
+    ${wide && at && html`<${AllButton} outlined /><span class="rule"></span>`}
+    ${wide && at && html`<${HelpButton} />`}
+    <${Boundary} what="Notices"><${Notices} at=${at} wide=${wide || (layout === "portrait" && at !== "")} room=${wide} /><//>
     ${layout === "immersive" &&
     html`<button
         type="button"
@@ -37,7 +41,7 @@ export function Header({ at, layout, panel, onPanel, drawer, onDrawer }) {
       >
         <${Icon} name="small" />
       </button>`}`}
-    ${(wide || !at) && html`<${Me} panel=${panel} onPanel=${onPanel} wide=${wide} />`}
+    ${(wide || !at) && html`<${Me} at=${at} panel=${panel} onPanel=${onPanel} wide=${wide} />`}
     ${at &&
     html`<${StopButton}
       test="stop-one"
@@ -47,16 +51,34 @@ export function Header({ at, layout, panel, onPanel, drawer, onDrawer }) {
     >
       <${Icon} name="stop" />STOP
     <//>`}
-    ${(wide || !at) &&
-    html`<${StopButton}
-      test="stop-all"
-      onStop=${() => commands.stop("")}
-      label="STOP ALL: emergency stop of all robots"
-      className="stop-all"
-    >
-      <${Icon} name="stop" />STOP ALL
-    <//>`}
+    ${!at && html`<${AllButton} />`}
   </header>`;
+}
+
+/** ``outlined``: beside the filled one for the open robot. */
+function AllButton({ outlined = false }) {
+  const { commands } = usePage();
+  return html`<${StopButton}
+    test="stop-all"
+    onStop=${() => commands.stop("")}
+    label="STOP ALL: emergency stop of all robots"
+    className=${outlined ? "stop-all outlined" : "stop-all"}
+  >
+    <${Icon} name="stop" />${outlined ? "Stop all" : "STOP ALL"}
+  <//>`;
+}
+
+function HelpButton() {
+  const { panels } = usePage();
+  return html`<button
+    type="button"
+    class="quiet round-icon"
+    aria-label="Keys, and how stopping works"
+    data-test="open-help"
+    onClick=${() => panels.toggle("help")}
+  >
+    <${Icon} name="help" />
+  </button>`;
 }
 
 const Brand = () => html`<span class="brand"><${Icon} name="logo" /><span>Pebble</span></span>`;
@@ -69,8 +91,9 @@ function Picker({ at }) {
   const { route } = usePage();
   const refs = [...new Set([at, ...useRefs()])].sort();
   return html`<label class="picker">
-    <span class="picker-name"><b>${nameOf(at)}</b><${Icon} name="down" /></span>
-    <span class="picker-state"><${Liveness} at=${at} /><${Volts} at=${at} /></span>
+    <${Face} at=${at} />
+    <span class="picker-name"><b>${useName(at)}</b><${Icon} name="down" /></span>
+    <span class="picker-state"><${IsStopped} at=${at} /><${Liveness} at=${at} /><${Volts} at=${at} /></span>
     <select
       data-test="picker"
       aria-label="Choose a robot"
@@ -86,10 +109,16 @@ function Picker({ at }) {
   </label>`;
 }
 
+/** Where there are no chips. */
+function IsStopped({ at }) {
+  const stopped = useValue(at, "web/estop")?.latched === true && usePage().connection.isOpen;
+  return stopped && html`<b class="is-stopped">Stopped</b>`;
+}
+
 function Volts({ at }) {
   const level = useMetric(at, "charging-level");
   const online = useOnline(at);
-  return level ? html`<span class="volts"><${Live} entry=${level} online=${online}>${battery(level.value)}<//></span>` : null;
+  return level ? html`<span class="volts"><${Charge} at=${at} level=${level} online=${online} /></span>` : null;
 }
 
 /** Whether a component is there, and how late its heartbeats are. @param {{at: string}} props */
@@ -99,17 +128,14 @@ export function Liveness({ at }) {
   const entry = useMetric(at, "web/liveness");
   const view = entry?.value;
   useTick(view?.online === false ? 1000 : 0);
-  if (!connection.isOpen) return html`<span class="state unknown"><i>○</i> unknown</span>`;
-  if (!view || view.online === null) return html`<span class="state unknown"><i>○</i> waiting</span>`;
+  if (!connection.isOpen) return html`<span class="state unknown">not connected</span>`;
+  if (!view || view.online === null) return html`<span class="state unknown">waiting</span>`;
   if (view.online === false) {
     const silent = view.silent_s === null ? "" : ` ${roughly(1000 * view.silent_s + entry.age)}`;
-    return html`<span class="state bad"><i>✖</i> ${view.silent_s === null ? "offline" : `silent${silent}`}</span>`;
+    return html`<span class="state bad">${view.silent_s === null ? "offline" : `silent for${silent}`}</span>`;
   }
-  const latency = view.whole_seconds || view.latency_ms === null ? "? ms" : span(view.latency_ms);
-  const why = view.whole_seconds ? "Its clock counts whole seconds: how late its heartbeats are is unknown" : undefined;
-  return html`<span class="state ok" title=${why}
-    ><i>●</i> <span class="sr">online, heartbeats late by </span>${latency}</span
-  >`;
+  const late = view.whole_seconds || view.latency_ms === null ? "unknown" : span(view.latency_ms);
+  return html`<span class="state ok" title=${`Its heartbeats are late by ${late}`}>online</span>`;
 }
 
 function Vital({ at }) {
@@ -119,17 +145,18 @@ function Vital({ at }) {
   const level = useMetric(at, "charging-level");
   const charging = useValue(at, "charging-status");
   const view = useValue(at, "web/driver");
+  const stopped = useValue(at, "web/estop")?.latched === true;
   const online = useOnline(at);
   return html`<div class="vital">
     ${level &&
     html`<span class="chip"
-      ><${Icon} name=${charging?.value === true ? "charging" : "battery"} /><${Live} entry=${level} online=${online}
-        >${battery(level.value)}<//
-      ></span
+      ><${Icon} name=${charging?.value === true ? "charging" : "battery"} /><${Charge} at=${at} level=${level} online=${online} /></span
     >`}
+    ${connection.isOpen && stopped && html`<span class="chip stopped"><${Icon} name="stop" />Stopped</span>`}
     ${connection.isOpen &&
+    !stopped &&
     view?.by &&
-    html`<span class=${`chip ${view.you ? (rests ? "bad" : "mine") : ""}`}><${Icon} name="wheel" />${view.you ? (rests ? "Not driving" : "You drive") : `${driverName(view)} drives`}</span>`}
+    html`<span class=${`chip ${view.you ? (rests ? "bad" : "mine") : "others"}`}><${Icon} name="wheel" />${view.you ? (rests ? "Not driving" : "You drive") : `${driverName(view)} drives`}</span>`}
   </div>`;
 }
 
@@ -138,9 +165,8 @@ function ConnectionState() {
   useModel(connection);
   const { socket, state } = connection;
   if (state === "connecting") return html`<span class="chip plain">connecting…</span>`;
-  if (state === "lost") return html`<span class="chip plain bad">✖ no connection</span>`;
-  const round = socket.roundTripMs >= 0 ? ` · ${span(socket.roundTripMs)}` : "";
-  return html`<span class=${`chip plain ${socket.roundTripMs > 300 ? "late" : ""}`}>connected${round}</span>`;
+  if (state === "lost") return html`<span class="chip plain bad">not connected</span>`;
+  return socket.roundTripMs > LATE_MS ? html`<span class="chip plain late">slow: ${span(socket.roundTripMs)}</span>` : null;
 }
 
 const BELL = styled(async () => (await import("./fleet/notices.js")).Bell, "notices.css", "panels.css");
@@ -148,10 +174,10 @@ const BELL = styled(async () => (await import("./fleet/notices.js")).Bell, "noti
 /** Fetched later. Where there is little room only their number is shown, with the settings. */
 function Notices(props) {
   const { body } = usePart(BELL);
-  return body ? html`<${body} ...${props} />` : null;
+  return body ? html`<${body} ...${props} />` : props.wide && html`<span class="bell-place"></span>`;
 }
 
-function Me({ panel, onPanel, wide }) {
+function Me({ at, panel, onPanel, wide }) {
   const { connection } = usePage();
   useModel(connection);
   const { you } = connection;
@@ -165,7 +191,7 @@ function Me({ panel, onPanel, wide }) {
     aria-label=${text}
     onClick=${onPanel}
   >
-    <${Icon} name=${you?.login ? "person" : "settings"} />${wide && html`<span>${text}</span>`}
+    <${Icon} name=${you?.login ? "person" : "settings"} />${wide && !at && you?.login && html`<span>${you.user}</span>`}
     ${!wide && connection.unread > 0 && html`<b class="unread" aria-hidden="true">${connection.unread}</b>`}
   </button>`;
 }

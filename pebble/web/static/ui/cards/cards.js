@@ -1,13 +1,15 @@
-// Which cards there are, in their fixed order. A new one is a line here, and a module that is fetched when it is shown.
+// Which cards there are, in the order of their importance. A new one is a line here, and a module that is fetched when it
+// is shown.
 
 import { styled } from "../parts/hooks.js";
 
 /**
  * ``tab``: where it is on a phone. ``wants``: whether this component has it. ``part``: fetches what draws it; a
- * component with ``at`` and ``offers``. ``right``: in the right one of a desktop's columns; ``wide``: below both.
- * ``sends``: it is for commands only, so screens that only watch are without it.
+ * component with ``at`` and ``offers``. ``engineers``: below all others, and closed until it is opened. ``height``: px
+ * that are kept free for it until it is here. ``sends``: it is for commands only, so screens that only watch are
+ * without it.
  * @typedef {{id: string, title: string, icon: string, tab: string, wants: (offers: any) => boolean,
- *   part: () => Promise<any>, right?: boolean, wide?: boolean, sends?: boolean}} CardKind
+ *   part: () => Promise<any>, engineers?: boolean, height?: number, sends?: boolean}} CardKind
  */
 
 /** Which keys drive. */
@@ -25,86 +27,106 @@ export const NO_CAMERA = styled(async () => (await import("../robot/picture-sett
 /** Listening and talking; a desktop has them below the picture. */
 export const VOICE = styled(async () => (await import("../robot/sound.js")).SoundControls, "sound.css");
 
+/** How the sound comes. */
+export const SOUND_FACTS = styled(async () => (await import("../robot/sound.js")).SoundFacts, "sound.css");
+
+/** What lies over a picture that is the whole page. */
+export const HUD = styled(async () => (await import("../robot/hud.js")).Hud, "picture.css", "map.css");
+
 /** What belongs to a picture besides it. */
 export const EXTRAS = styled(() => import("../robot/picture-extras.js"), "picture.css");
 
 /** @type {CardKind[]} */
 export const CARDS = [
   {
-    id: "telemetry",
-    title: "Telemetry",
-    icon: "gauge",
-    tab: "sensors",
-    wants: () => true,
-    part: async () => (await import("./telemetry.js")).Telemetry,
-  },
-  {
-    id: "lights",
-    sends: true,
-    right: true,
-    title: "Lights",
-    icon: "light",
-    tab: "more",
-    wants: (offers) => offers.hasLights,
-    part: styled(async () => (await import("./lights.js")).Lights, "commands.css"),
-  },
-  {
-    id: "voice",
-    title: "Listen and talk",
-    icon: "mic",
-    tab: "sound",
-    wants: (offers) => offers.has("audio"),
-    part: VOICE,
-  },
-  {
-    id: "sounds",
-    sends: true,
-    right: true,
-    title: "Sounds",
-    icon: "sound",
-    tab: "sound",
-    wants: (offers) => offers.has("soundboard"),
-    part: styled(async () => (await import("./sounds.js")).Sounds, "commands.css"),
-  },
-  {
     id: "autonomy",
     sends: true,
-    right: true,
-    title: "Autonomy",
+    title: "Scripts",
     icon: "script",
     tab: "more",
+    height: 260,
     wants: (offers) => offers.has("autonomy"),
     part: styled(async () => (await import("./autonomy.js")).Autonomy, "commands.css"),
   },
   {
-    id: "outlets",
-    sends: true,
-    right: true,
-    title: "Outlets",
-    icon: "plug",
-    tab: "more",
-    wants: (offers) => offers.section("outlets").available === true || offers.received("outlets/"),
-    part: styled(async () => (await import("./outlets.js")).Outlets, "devices.css"),
+    id: "telemetry",
+    title: "State",
+    icon: "gauge",
+    tab: "sensors",
+    height: 470,
+    wants: () => true,
+    part: async () => (await import("./telemetry.js")).Telemetry,
   },
   {
     id: "map",
     title: "Map",
     icon: "map",
     tab: "sensors",
+    height: 412,
     wants: (offers) => offers.received("wheel-odometry") || offers.received("localization-pose"),
     part: styled(async () => (await import("./map.js")).Odometry, "map.css"),
+  },
+  {
+    id: "lights",
+    sends: true,
+    title: "Lights",
+    icon: "light",
+    tab: "more",
+    height: 290,
+    wants: (offers) => offers.hasLights,
+    part: styled(async () => (await import("./lights.js")).Lights, "commands.css"),
   },
   {
     id: "plots",
     title: "Plots",
     icon: "plot",
     tab: "sensors",
+    height: 540,
     wants: () => true,
     part: styled(async () => (await import("./plots.js")).Plots, "plots.css", "vendor/uPlot.css"),
   },
   {
+    id: "voice",
+    title: "Listen and talk",
+    icon: "mic",
+    tab: "sound",
+    height: 150,
+    wants: (offers) => offers.has("audio"),
+    part: VOICE,
+  },
+  {
+    id: "sounds",
+    sends: true,
+    title: "Sounds",
+    icon: "sound",
+    tab: "sound",
+    height: 610,
+    wants: (offers) => offers.has("soundboard"),
+    part: styled(async () => (await import("./sounds.js")).Sounds, "commands.css"),
+  },
+  {
+    id: "outlets",
+    sends: true,
+    title: "Outlets",
+    icon: "plug",
+    tab: "more",
+    height: 280,
+    wants: (offers) => offers.section("outlets").available === true || offers.received("outlets/"),
+    part: styled(async () => (await import("./outlets.js")).Outlets, "devices.css"),
+  },
+  {
+    id: "services",
+    engineers: true,
+    title: "Services",
+    icon: "list",
+    tab: "more",
+    wants: (offers) => offers.isRobot && offers.received("status"),
+    part: styled(async () => (await import("./services.js")).Services, "system.css"),
+  },
+  {
     id: "mcus",
     sends: true,
+    engineers: true,
     title: "Microcontrollers",
     icon: "chip",
     tab: "more",
@@ -113,7 +135,7 @@ export const CARDS = [
   },
   {
     id: "logs",
-    wide: true,
+    engineers: true,
     title: "Logs",
     icon: "list",
     tab: "more",
@@ -121,25 +143,28 @@ export const CARDS = [
     part: styled(async () => (await import("./logs.js")).Logs, "system.css"),
   },
   {
-    id: "system",
-    sends: true,
-    right: true,
-    title: "System",
-    icon: "power",
-    tab: "more",
-    wants: (offers) => offers.has("system"),
-    part: styled(async () => (await import("./system.js")).System, "system.css", "panels.css"),
-  },
-  {
     id: "values",
-    wide: true,
+    engineers: true,
     title: "All values",
     icon: "list",
     tab: "more",
     wants: () => true,
     part: styled(async () => (await import("./values.js")).Values, "devices.css"),
   },
+  {
+    id: "system",
+    sends: true,
+    engineers: true,
+    title: "System",
+    icon: "power",
+    tab: "more",
+    wants: (offers) => offers.has("system"),
+    part: styled(async () => (await import("./system.js")).System, "system.css", "panels.css"),
+  },
 ];
+
+/** @param {any} offers */
+export const hasMap = (offers) => CARDS.some(({ id, wants }) => id === "map" && wants(offers));
 
 /** Tabs of a phone, in order; those without any card are left out. */
 export const TABS = [

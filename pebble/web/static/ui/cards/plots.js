@@ -21,10 +21,17 @@ export function Plots({ at }) {
     write(`plots ${at}`, plots);
     setAdded(plots);
   };
-  const usual = USUAL.filter(({ metric }) => metrics.includes(metric));
+  const [all, showAll] = useState(() => read("plots all", false) === true);
+  const known = USUAL.filter(({ metric }) => metrics.includes(metric));
+  const usual = known.filter(({ first }) => first || all);
+  const more = known.length - known.filter(({ first }) => first).length;
+  const toggle = () => {
+    write("plots all", !all);
+    showAll(!all);
+  };
   const parts = { at, paused };
   return html`<div class="plots">
-    ${!usual.length && !added.length && html`<p class="dim">Nothing that could be plotted was received yet.</p>`}
+    ${!known.length && !added.length && html`<p class="dim">Nothing that could be plotted was received yet.</p>`}
     ${usual.map((plot) => html`<${Figure} key=${plot.id} plot=${plot} ...${parts} />`)}
     ${added.map(
       (plot) => html`<${Figure}
@@ -41,6 +48,10 @@ export function Plots({ at }) {
       <button type="button" data-test="plots-pause" onClick=${() => pause(!paused)}>
         <${Icon} name=${paused ? "play" : "halt"} />${paused ? "Go on" : "Pause"}
       </button>
+      ${more > 0 &&
+      html`<button type="button" data-test="plots-all" aria-expanded=${all} onClick=${toggle}>
+        ${all ? `Hide ${more}` : `${more} more`}
+      </button>`}
       <${Add} at=${at} metrics=${metrics} added=${added} onAdd=${(plot) => change([...added, plot])} />
     </div>
   </div>`;

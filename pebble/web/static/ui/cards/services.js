@@ -16,7 +16,7 @@ export function Services({ at, view }) {
   const times = useValue(at, "web/restarts")?.times ?? {};
   const online = useOnline(at);
   useTick(5000);
-  if (!isObject(services)) return null;
+  if (!isObject(services)) return html`<p class="dim">It reports no services.</p>`;
   const names = Object.keys(services);
   return html`<ul class="services-list">
     ${names

@@ -1,19 +1,14 @@
 // What the component reports of itself, in words and numbers.
 
-import { html, styled, useMetric, useOnline, useTick, useValue } from "../parts/hooks.js";
-import { Live, Part } from "../parts/parts.js";
+import { html, useMetric, useOnline, useTick, useValue } from "../parts/hooks.js";
+import { Live } from "../parts/parts.js";
 import { poseOf, poseWords } from "../../core/trail.js";
 import { charging, plain } from "../parts/more-words.js";
 import { battery, inner, isObject, number, roughly, span } from "../parts/words.js";
 
 const STREAM_MS = 1000;
-const SERVICES = styled(async () => (await import("./services.js")).Services, "system.css");
 
-/**
- * ``at``: the component ("pebble/robots/goob"), ``ref`` in the hooks; ``view``: which cards are open.
- * @param {{at: string, view: any}} props
- */
-export function Telemetry({ at, view }) {
+export function Telemetry({ at }) {
   const online = useOnline(at);
   return html`<dl class="values">
     <${Row} at=${at} metric="charging-level" name="Battery" online=${online}>${battery}<//>
@@ -25,7 +20,6 @@ export function Telemetry({ at, view }) {
     <${Row} at=${at} metric="touch-sensors" name="Touch" online=${online} streams>${touch}<//>
     <${Row} at=${at} metric="wheel-odometry" name="Odometry" online=${online} streams>${odometry}<//>
     <${Media} at=${at} online=${online} />
-    <${ServicesRow} at=${at} view=${view} />
   </dl>`;
 }
 
@@ -109,12 +103,4 @@ function Media({ at, online }) {
 function mediaWords(report) {
   if (!isObject(report)) return plain(report);
   return report.running ? plain(report.doing ?? "running") : "rests";
-}
-
-function ServicesRow({ at, view }) {
-  if (!isObject(inner(useValue(at, "status"))?.services)) return null;
-  return html`<div class="services">
-    <dt>Services</dt>
-    <dd><${Part} part=${SERVICES} at=${at} view=${view} /></dd>
-  </div>`;
 }

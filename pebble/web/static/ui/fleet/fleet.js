@@ -17,9 +17,9 @@ import {
   useValue,
 } from "../parts/hooks.js";
 import { Offers, Route, WATCHES } from "../parts/models.js";
-import { charge, drawing, hasFace, looksOf } from "../parts/looks.js";
+import { charge, hasFace, looksOf } from "../parts/looks.js";
 import { plain, shortTime } from "../parts/more-words.js";
-import { Icon, Live, RouteLink, StopButton } from "../parts/parts.js";
+import { Charge, Drawing, Icon, RouteLink, StopButton } from "../parts/parts.js";
 import { RecordingsLink } from "./recordings-link.js";
 import { battery, driverName, inner, isObject, kindOf, nameOf, roughly, typeOf, visible } from "../parts/words.js";
 
@@ -296,7 +296,7 @@ function FleetCard({ at }) {
     </div>
     <div class="fleet-card-foot">
       <ul class="facts">
-        <${BatteryFact} at=${at} cells=${looks.cells} online=${connection.isOpen} />
+        <${BatteryFact} at=${at} online=${connection.isOpen} />
         ${connection.isOpen && html`<${DoubtFact} at=${at} />`}
         <${DriverFact} at=${at} offers=${offers} online=${connection.isOpen} stopped=${estop?.latched} />
         <${ScriptFact} at=${at} online=${connection.isOpen} />
@@ -322,16 +322,13 @@ const Badge = ({ at, looks }) => html`<span class="badge"
   >${hasFace(at) ? html`<${Drawing} picture=${looks.picture} />` : html`<${Icon} name=${iconOf(at)} />`}</span
 >`;
 
-const Drawing = ({ picture }) => html`<svg class="drawing" viewBox="0 0 48 48" aria-hidden="true"><use href=${drawing(picture)} /></svg>`;
-
-function BatteryFact({ at, cells, online }) {
+function BatteryFact({ at, online }) {
   const level = useMetric(at, "charging-level");
   const charges = useValue(at, "charging-status")?.value === true;
   if (!level && !charges) return null;
-  const percent = level && charge(level.value, cells);
   return html`<li class="fact">
     <${Icon} name=${charges ? "charging" : "battery"} />
-    ${level && html`<${Live} entry=${level} online=${online}>${percent === null ? battery(level.value) : `${percent} %`}<//>`}
+    ${level && html`<${Charge} at=${at} level=${level} online=${online} />`}
     ${charges && html`<span class="dim">charging</span>`}
   </li>`;
 }

@@ -127,8 +127,8 @@ function useNotices() {
   return useModel(models.get(page));
 }
 
-/** ``wide``: there is room for a button; else the list is with the settings. */
-export function Bell({ at, wide }) {
+/** ``wide``: there is room for a button, else the list is with the settings; ``room``: for the recordings' link, too. */
+export function Bell({ at, wide, room = wide }) {
   const { panels } = usePage();
   const { shown } = useModel(panels);
   const { notices } = useNotices();
@@ -143,7 +143,7 @@ export function Bell({ at, wide }) {
   };
   return html`<${Announcement} newest=${notices.list[0]} />
     ${at && html`<${DoubtMark} at=${at} />`}
-    ${wide && at && html`<${RecordingsLink} at=${at} className="button quiet" />`}
+    ${room && at && html`<${RecordingsLink} at=${at} className="button quiet" />`}
     ${wide &&
     html`<button
       type="button"

@@ -3,10 +3,10 @@
 import * as browser from "../../core/browser.js";
 import { visible } from "../../core/json.js";
 import { Component, createContext, h, options } from "../../vendor/preact.mjs";
-import { useContext, useEffect, useReducer, useRef, useState } from "../../vendor/hooks.mjs";
+import { useContext, useEffect, useLayoutEffect, useMemo, useReducer, useRef, useState } from "../../vendor/hooks.mjs";
 import htm from "../../vendor/htm.mjs";
 
-export { useContext, useEffect, useRef, useState };
+export { useContext, useEffect, useLayoutEffect, useMemo, useRef, useState };
 export const html = htm.bind(h);
 
 const LABEL = "aria-label";

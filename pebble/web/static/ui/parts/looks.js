@@ -1,7 +1,7 @@
 // How a robot looks to people: as its capabilities say, and where they say nothing, by its id and by what it offers.
 
 import { isObject } from "../../core/json.js";
-import { inner, nameOf, typeOf, visible } from "./words.js";
+import { battery, inner, nameOf, typeOf, visible } from "./words.js";
 
 const FACES = new URL("../../faces.svg", import.meta.url).href;
 
@@ -84,4 +84,10 @@ export function charge(level, cells) {
   if (above < 0) return 100;
   const [[low, from], [high, to]] = [CHARGE[above - 1], CHARGE[above]];
   return Math.round(from + ((to - from) * (volts - low)) / (high - low));
+}
+
+/** @param {any} level payload of charging-level @param {number} cells @returns {string} 81 %, or 7.92 V */
+export function chargeWords(level, cells) {
+  const percent = charge(level, cells);
+  return percent === null ? battery(level) : `${percent} %`;
 }

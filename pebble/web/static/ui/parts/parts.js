@@ -3,6 +3,7 @@
 import * as browser from "../../core/browser.js";
 import { Boundary, html, useEffect, useLater, usePage, usePart, useRef, useState, useTick, useValue } from "./hooks.js";
 import { Route } from "./models.js";
+import { chargeWords, drawing, hasFace, looksOf } from "./looks.js";
 import { reported, roughly } from "./words.js";
 
 const ICONS = new URL("../../icons.svg", import.meta.url).href;
@@ -116,42 +117,99 @@ export function Live({ entry, online = true, children }) {
   return html`<span class=${late ? "late" : ""}>${children}${late && html` <small>${roughly(age)} old</small>`}</span>`;
 }
 
-/** @param {{title: string, id: string, icon?: string, aside?: any, view?: any, className?: string, children: any}} props */
-export function Card({ title, id, icon, aside, view, className = "", children }) {
-  const closed = view?.isClosed(id) ?? false;
-  return html`<section class=${`card ${className}`} aria-labelledby=${`${id}-title`} data-card=${id}>
+/**
+ * ``isFirst``: it is closed until it is opened. ``place``: attributes that say where it is in the columns.
+ * @param {{title: string, id: string, icon?: string, aside?: any, view?: any, isFirst?: boolean, ids?: string[],
+ *   className?: string, place?: Record<string, string>, style?: any, children: any}} props
+ */
+export function Card({ title, id, icon, aside, view, isFirst = false, ids, className = "", place, style, children }) {
+  const closed = view?.isClosed(id, isFirst) ?? false;
+  return html`<section
+    class=${`card ${closed ? "closed" : ""} ${className}`}
+    aria-labelledby=${`${id}-title`}
+    data-card=${id}
+    style=${closed ? undefined : style}
+    ...${place}
+  >
     <header class="card-head">
       ${icon && html`<${Icon} name=${icon} />`}
       <h2 id=${`${id}-title`}>${title}</h2>
       ${aside}
       ${view &&
+      (closed || !ids) &&
       html`<button
-          type="button"
-          class="quiet"
-          aria-expanded=${!closed}
-          aria-label=${`${closed ? "Open" : "Close"} ${title}`}
-          onClick=${() => view.toggle(id)}
-        >
-          <${Icon} name=${closed ? "down" : "up"} />
-        </button>
-        <button type="button" class="quiet" aria-label=${`Hide ${title}`} onClick=${() => view.hide(id)}>
-          <${Icon} name="close" />
-        </button>`}
+        type="button"
+        class="quiet"
+        aria-expanded=${!closed}
+        aria-label=${`${closed ? "Open" : "Close"} ${title}`}
+        onClick=${() => view.toggle(id, isFirst)}
+      >
+        <${Icon} name=${closed ? "down" : "up"} />
+      </button>`}
+      ${view && ids && !closed && html`<${CardMenu} title=${title} id=${id} view=${view} isFirst=${isFirst} ids=${ids} />`}
     </header>
     ${!closed && html`<div class="card-body">${children}</div>`}
   </section>`;
 }
 
+/** What can be done with a card. ``ids``: the cards among which it can be moved, in their order. */
+function CardMenu({ title, id, view, isFirst, ids }) {
+  const [open, show] = useState(false);
+  const place = useRef(/** @type {HTMLElement | null} */ (null));
+  const end = (event) => event.type === "focusout" && place.current?.contains(event.relatedTarget) ? undefined : show(false);
+  const item = (words, does, off = false) => html`<button
+    type="button"
+    disabled=${off}
+    onClick=${() => {
+      show(false);
+      does();
+    }}
+  >
+    ${words}
+  </button>`;
+  const at = ids.indexOf(id);
+  return html`<div
+    class="card-menu"
+    ref=${place}
+    onFocusOut=${end}
+    onKeyDown=${(event) => event.key === "Escape" && show(false)}
+  >
+    <button
+      type="button"
+      class="quiet"
+      data-test=${`menu-${id}`}
+      aria-expanded=${open}
+      aria-label=${`${title}: close, hide, move`}
+      onClick=${() => show(!open)}
+    >
+      <${Icon} name="dots" />
+    </button>
+    ${open &&
+    html`<div class="card-menu-list" role="group" aria-label=${title}>
+      ${item(`Close ${title}`, () => view.toggle(id, isFirst))} ${item(`Hide ${title}`, () => view.hide(id))}
+      ${item("Move up", () => view.move(ids, id, -1), at <= 0)}
+      ${item("Move down", () => view.move(ids, id, 1), at === ids.length - 1)}
+      ${item("Arrange as new", () => view.reset())}
+    </div>`}
+  </div>`;
+}
+
 /** A part of the page that is fetched when it is first shown; ``now``: even before the first picture. */
-export function Part({ part, now = false, ...props }) {
+export function Part({ part, now = false, lines = 3, ...props }) {
   const { body, failed } = usePart(part, now);
   if (body) return html`<${body} ...${props} />`;
-  if (!failed) return html`<p class="loading" role="status">Loading…</p>`;
+  if (!failed) return html`<${Skeleton} lines=${lines} />`;
   return html`<p class="failed" role="alert">
     A part of this page could not be fetched.
-    <button type="button" onClick=${() => location.reload()}>Reload</button>
+    <button type="button" onClick=${() => location.reload()}>Try again</button>
   </p>`;
 }
+
+/** The shape of what will be here; it says so in words only after a while. */
+export const Skeleton = ({ lines }) => html`<div class="loading" role="status">
+  ${Array.from({ length: lines }, (_, line) => html`<i key=${line} class="bone" aria-hidden="true"></i>`)}
+  <span class="loading-words">Loading…</span>
+</div>`;
 
 /**
  * One of the components that ``of`` fetches: nothing until it is here, and it may fail without what it is beside.
@@ -167,6 +225,27 @@ export function useStream(at) {
   const own = reported(useValue(at, "status"));
   return useValue(at, "web/stream-address")?.url || own;
 }
+
+/** What people call it. @param {string} at @returns {string} */
+export const useName = (at) => looksOf(at, useValue(at, "capabilities")).name;
+
+/** In percent where its cells are known. @param {{at: string, level: any, online: boolean}} props ``level``: its entry */
+export function Charge({ at, level, online }) {
+  const { cells } = looksOf(at, useValue(at, "capabilities"));
+  return html`<${Live} entry=${level} online=${online}>${chargeWords(level.value, cells)}<//>`;
+}
+
+/** The drawing of a robot, in its colour; nothing of a component that is none. @param {{at: string}} props */
+export function Face({ at }) {
+  const { picture, colour } = looksOf(at, useValue(at, "capabilities"));
+  if (!hasFace(at)) return null;
+  return html`<span class=${`face tint-${colour}`}><${Drawing} picture=${picture} /></span>`;
+}
+
+/** @param {{picture: string}} props one of looks.js */
+export const Drawing = ({ picture }) => html`<svg class="drawing" viewBox="0 0 48 48" aria-hidden="true"
+  ><use href=${drawing(picture)} /></svg
+>`;
 
 /** Follow a link to a component, or the fleet, without loading the page again. @param {any} props */
 export function RouteLink({ to = "", path = Route.path(to), className, label, children }) {

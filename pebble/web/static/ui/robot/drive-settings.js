@@ -4,20 +4,25 @@ import * as browser from "../../core/browser.js";
 import { html, useEffect, useModel, usePage } from "../parts/hooks.js";
 import { Icon, Slider, set } from "../parts/parts.js";
 
-export function DriveSettings() {
+/** ``open``: there is room for all of it. @param {{open?: boolean}} props */
+export function DriveSettings({ open = false }) {
   const { driver } = usePage();
+  const pad = driver.pads?.pad?.id;
   const { turn, balance } = useModel(driver).sliders;
   const part = `${Math.round(100 * turn)} %`;
   const side = balance === 0 ? "centred" : `${Math.round(100 * Math.abs(balance))} % ${balance > 0 ? "right" : "left"}`;
   return html`<div class="sliders">
     <${Slider} name="Turn" value=${turn} min=${5} text=${part} onInput=${set(driver, "turn")} />
-    <${Slider} name="Balance" value=${balance} min=${-50} max=${50} text=${side} onInput=${set(driver, "balance")} />
-    <div class="aux">
+    <details class="folded" open=${open}>
+      <summary data-test="fold-drive">Balance, extra axis</summary>
+      <${Slider} name="Balance" value=${balance} min=${-50} max=${50} text=${side} onInput=${set(driver, "balance")} />
+      <div class="aux">
       <span>Extra axis <kbd>Q</kbd> <kbd>E</kbd></span>
       <${AuxButton} driver=${driver} value=${1} label="Extra axis up">+<//>
       <${AuxButton} driver=${driver} value=${-1} label="Extra axis down">−<//>
-    </div>
-    <p class="pad-name"><${Icon} name="pad" />${driver.pads?.pad?.id || "no gamepad: press one of its buttons"}</p>
+      </div>
+    </details>
+    ${pad && html`<p class="pad-name"><${Icon} name="pad" />${pad}</p>`}
   </div>`;
 }
 

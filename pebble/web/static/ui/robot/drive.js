@@ -2,41 +2,52 @@
 
 import { ROOT } from "../../core/browser.js";
 import { DRIVE, KEYS } from "../cards/cards.js";
-import { html, useCalm, useModel, usePage, useValue } from "../parts/hooks.js";
-import { Card, HoldButton, Icon, Part, Slider, set } from "../parts/parts.js";
+import { html, useCalm, useLater, useModel, usePage, useValue } from "../parts/hooks.js";
+import { Card, HoldButton, Part, Slider, set, useName } from "../parts/parts.js";
 import { Stick } from "./stick.js";
-import { driverName, nameOf } from "../parts/words.js";
+import { driverName } from "../parts/words.js";
+
+const FLASH_MS = 3000;
 
 export function DriveCard({ at }) {
-  return html`<${Card} id="drive" title="Drive" icon="wheel" className="drive">
-    <${WhyLine} at=${at} />
+  return html`<${Card} id="drive" title="Drive" icon="wheel" className="drive" place=${{ "data-at": "side" }}>
+    <${Slot} at=${at} />
     <${DrivePad} />
     <${Hints} />
     <${Speed} />
-    <${Part} part=${DRIVE} />
+    <div class="drive-settings"><${Part} part=${DRIVE} lines=${2} /></div>
   <//>`;
 }
 
 function Hints() {
   const { hints } = useModel(usePage().settings);
-  return hints ? html`<div style=${{ minHeight: "88px" }}><${Part} part=${KEYS} /></div>` : null;
+  return hints ? html`<div class="key-place"><${Part} part=${KEYS} lines=${2} /></div>` : null;
 }
 
-/** Why it cannot be driven now, and what can be done about it; or that it can. */
-export function WhyLine({ at }) {
+/**
+ * Who drives, or why it cannot be driven, and what can be done about it. Its text and its buttons change, its size does
+ * not.
+ */
+export function Slot({ at }) {
   const { connection, driver } = usePage();
   useModel(driver);
   const view = useValue(at, "web/driver");
   const mine = useModel(connection).isOpen && view?.you;
   const reason = driver.reason() ?? driver.doubt;
-  const connected = useValue("", "web/broker")?.connected !== false; // else the banner says why
+  const connected = useValue("", "web/broker")?.connected !== false; // else the band says why
+  const name = useName(at);
+  const script = useValue(at, "autonomy-status");
   const why = reason?.code === "broker" && !connected ? "The server cannot reach the broker" : reason?.text;
-  const keys = driver.typing ? " Keys go to the field you have chosen: click beside it." : "";
-  const text = why ?? (mine ? `You are driving ${nameOf(at)}.${keys}` : "");
-  return html`<div class=${`why-line ${reason ? "off" : "on"}`}>
-    <p id="why-drive" data-test="why"><i aria-hidden="true">${reason ? "○" : "●"}</i><span>${text}</span></p>
+  const text = why ?? (mine ? `You are driving ${name}` : "");
+  const [title, detail] = slotWords(reason, text, view, driver.typing, script?.running === true ? String(script.file).slice(0, 40) : "");
+  const [more] = [driver.doubt, ...(driver.pads?.reasons() ?? [])].filter((one) => one && one !== reason);
+  const kind = !reason ? "on" : reason.code === "stopped" ? "stopped" : "off";
+  return html`<div class=${`slot why-line ${kind}`}>
+    <div class="slot-words" id="why-drive" data-test="why" title=${text}>
+      <i class="dot" aria-hidden="true"></i>
+      <p><b>${title}</b>${more ? html`<small data-test=${more.code}>${more.text}.</small>` : html`<small>${detail}</small>`}</p>
+    </div>
     <span class="sr" role="status">${useCalm(text)}</span>
-    ${[driver.doubt, ...(driver.pads?.reasons() ?? "")].filter((one) => one && one !== reason).slice(0, 2).map(({ code, text }) => html`<p key=${text} class="why" data-test=${code}>${text}.</p>`)}
     <div class="why-actions">
       <${ReasonAction} action=${reason?.action} />
       ${mine && html`<button type="button" data-test="release" onClick=${() => driver.release()}>Release</button>`}
@@ -45,17 +56,41 @@ export function WhyLine({ at }) {
   </div>`;
 }
 
+/** @returns {[string, string]} what counts, and one line more */
+function slotWords(reason, text, view, typing, script) {
+  switch (reason?.code) {
+    case undefined:
+      return ["You drive", typing ? "Keys go to the field you have chosen: click beside it." : "Let go, and it stops."];
+    case "free":
+      return ["Nobody drives", script ? `${script} runs. Take control to drive` : "One person at a time"];
+    case "stopped":
+      return ["Stopped", "Reset it at the picture to drive."];
+    case "lease":
+      return [`${view?.by ?? "Somebody"} drives`, [view?.device, view?.server].filter(Boolean).join(", ")];
+    case "server":
+      return ["Not connected", "What you drove stops by itself."];
+    default:
+      return [text, ""];
+  }
+}
+
 function ReasonAction({ action }) {
   const { commands, driver } = usePage();
+  const hinted = driver.hintedAt > -Infinity && performance.now() - driver.hintedAt < FLASH_MS;
+  useLater(hinted ? FLASH_MS - (performance.now() - driver.hintedAt) : Infinity);
   switch (action?.kind) {
     case "take":
-      return html`<button type="button" class="primary" data-test="take" onClick=${() => commands.take(false)}>
-        ${action.label}
+      return html`<button
+        key=${hinted ? driver.hintedAt : "take"}
+        type="button"
+        class=${`primary ${hinted ? "flash" : ""}`}
+        data-test="take"
+        onClick=${() => commands.take(false)}
+      >
+        ${action.label}<kbd>Enter</kbd>
       </button>`;
     case "take-over":
-      return html`<${HoldButton} test="take-over" onHeld=${() => commands.take(true)}
-        >${action.label} <small>(hold 1 s)</small><//
-      >`;
+      return html`<${HoldButton} test="take-over" onHeld=${() => commands.take(true)}>Hold to take over<//>`;
     case "see":
       return html`<button type="button" data-test="see" onClick=${() => see(driver)}>${action.label}</button>`;
     case "stop-script":

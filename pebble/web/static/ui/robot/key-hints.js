@@ -16,7 +16,7 @@ export function KeyHints() {
         (code) => html`<kbd key=${code} class=${driver.inputs.keys.has(code) ? "on" : ""}>${name(code)}</kbd>`,
       )}
     </div>
-    <p aria-hidden="true">or arrows drive,<br /><b>space</b> stops,<br /><b>Esc Esc</b> is STOP</p>
+    <p aria-hidden="true">or arrows drive,<br /><b>Space</b> halts,<br /><b>Esc Esc</b> is STOP</p>
     <button type="button" class="quiet" data-test="help" aria-label="All keys, and how stopping works" onClick=${() => panels.show("help")}>
       <${Icon} name="help" />
     </button>

@@ -95,16 +95,14 @@ function paint(canvas, picture, overlays) {
   drawOverlays(context, { ...overlays, labels }, contained(picture.width, picture.height, width, height), scale);
 }
 
-/** Buttons below the picture of ``source``. ``wanted``: whether pictures are. */
-export const Tools = ({ source, wanted }) => html`<${StillTools} source=${source} />
+/** Among the settings of the picture of ``source``. ``wanted``: whether pictures are. */
+export const Tools = ({ source, wanted }) => html`<${Marks} source=${source} />
   <${Stream} source=${source} wanted=${wanted} />`;
 
 /** Snapshots, and whether overlays are drawn. */
 export function StillTools({ source }) {
   const { connection, store, video } = usePage();
   useModel(video);
-  useModel(switches);
-  const drawn = useMetrics(source).includes(OVERLAYS);
   const save = () =>
     snapshot(video, store, source).then(
       (name) => connection.show(`Saved as ${name}`),
@@ -113,19 +111,28 @@ export function StillTools({ source }) {
   return html`${video.info &&
   !video.stream &&
   html`<button type="button" data-test="snapshot" onClick=${save}><${Icon} name="save" />Snapshot</button>`}
-  ${drawn &&
-  html`<label class="check overlay-switch"
+    <${Marks} source=${source} />`;
+}
+
+/** Whether what scripts mark is drawn over the picture. */
+function Marks({ source }) {
+  useModel(switches);
+  const drawn = useMetrics(source).includes(OVERLAYS);
+  return (
+    drawn &&
+    html`<label class="check overlay-switch"
     ><input
       type="checkbox"
       data-test="overlays"
       checked=${switches.isOn(source)}
       onChange=${(event) => switches.set(source, event.currentTarget.checked)}
-    /><span>Overlays</span></label
-  >`}`;
+    /><span>Marks of scripts</span></label
+    >`
+  );
 }
 
 /** Save what is on the canvas, under the time at which it was taken; returns the file's name. */
-async function snapshot(video, store, source) {
+export async function snapshot(video, store, source) {
   const name = fileName(source, store.now() - video.age().ms);
   const blob = await new Promise((resolve) => video.canvas.toBlob(resolve, "image/png"));
   if (!blob) throw new Error("this browser makes no PNG of it");

@@ -3,16 +3,13 @@
 import { refusal } from "../../core/stream.js";
 import { html, usePage, useRefs, useState, useTick, useValue } from "../parts/hooks.js";
 import { Offers } from "../parts/models.js";
-import { Extra, Why } from "../parts/parts.js";
+import { Extra, Face, Why, useName } from "../parts/parts.js";
 import { useReasons, whyNotEnd } from "../parts/why-not.js";
 import { nameOf } from "../parts/words.js";
 
 const ENCODINGS = ["h264", "pbvz", "pbvd", "json", "jpeg"];
 
-/**
- * Encoding and source; they count for everybody who looks at this component. With ``video`` it is started and stopped
- * here, with what ``extras`` fetches.
- */
+/** Encoding and source, which count for everybody who looks at this component; and how the picture comes. */
 export function PictureSettings({ at, source, offers, video, extras }) {
   const page = useReasons(at);
   const view = useValue(source, "web/picture");
@@ -21,13 +18,9 @@ export function PictureSettings({ at, source, offers, video, extras }) {
   const why = whyNotEnd(page);
   const more = { disabled: Boolean(why), "aria-describedby": why ? "why-picture" : undefined };
   return html`<div class="picture-settings">
-    ${video &&
-    html`<button type="button" data-test="video" onClick=${video.toggle}>
-        ${video.wanted ? "Stop video" : "Start video"}
-      </button>
-      <${Extra} of=${extras} part="Tools" what="More of the picture" source=${source} wanted=${video.wanted} />`}
+    <${PictureFrom} at=${at} source=${source} offers=${offers} more=${more} />
     <label class="field"
-      ><span>Encoding</span>
+      ><span>Encoding <small>for everybody who watches</small></span>
       <select
         data-test="encoding"
         value=${view?.pinned ?? ""}
@@ -38,10 +31,27 @@ export function PictureSettings({ at, source, offers, video, extras }) {
         ${encodings.map((one) => html`<option key=${one} value=${one}>${one}</option>`)}
       </select></label
     >
-    <${PictureFrom} at=${at} source=${source} offers=${offers} more=${more} />
     ${why && html`<${Why} id="why-picture">${why}<//>`}
+    <${Extra} of=${extras} part="Tools" what="More of the picture" source=${source} wanted=${video?.wanted ?? true} />
     <${StreamAddress} key=${source} source=${source} />
+    <${Facts} source=${source} view=${view} />
   </div>`;
+}
+
+/** For engineers: how the pictures come now. */
+function Facts({ source, view }) {
+  const { video } = usePage();
+  useTick(1000);
+  const { info, interval } = video;
+  if (!info || video.ref !== source || video.stream) return null;
+  const rate = view?.per_second > 0 ? view.per_second : interval > 0 ? 1000 / interval : 0;
+  const facts = [
+    `${info.encoding ?? ""}${info.rescue ? " (converted)" : ""} ${info.width}×${info.height}`,
+    `${rate.toFixed(rate < 9.5 ? 1 : 0)}/s`,
+    view?.kbits > 0 && `${Math.round(view.kbits)} kbit/s`,
+    view?.viewers > 1 && `${view.viewers} viewers`,
+  ];
+  return html`<p class="facts" data-test="picture-facts">Now: ${facts.filter(Boolean).join(" · ")}</p>`;
 }
 
 /** For a component without a camera: another one may look at it, or a stream of any other program. */
@@ -49,8 +59,10 @@ export function NoCamera({ at, offers }) {
   const page = useReasons(at);
   const why = whyNotEnd(page);
   const more = { disabled: Boolean(why), "aria-describedby": why ? "why-picture" : undefined };
+  const name = useName(at);
   return html`<section class="no-camera picture-settings" aria-label="Picture">
-    <p>${nameOf(at)} has no camera.</p>
+    <${Face} at=${at} />
+    <p>${name} has no camera.</p>
     <${PictureFrom} at=${at} source=${at} offers=${offers} more=${more} />
     ${why && html`<${Why} id="why-picture">${why}<//>`}
     <${StreamAddress} source=${at} />

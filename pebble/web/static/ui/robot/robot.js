@@ -1,17 +1,22 @@
 // One component: its picture, how to drive it, and its cards; on a desktop, a phone, and a phone that lies.
 
 import * as browser from "../../core/browser.js";
-import { CARDS, DRIVE, EXTRAS, NO_CAMERA, PICTURE, TABS, VOICE } from "../cards/cards.js";
-import { DriveCard, DrivePad, Speed, WhyLine } from "./drive.js";
-import { Boundary, fetchRest, html, useEffect, useMetric, useMetrics, useModel, usePage, useState, useValue } from "../parts/hooks.js";
+import { Bands } from "../banner.js";
+import { CARDS, DRIVE, EXTRAS, HUD, NO_CAMERA, PICTURE, TABS, VOICE, hasMap } from "../cards/cards.js";
+import { expected, useColumns } from "./columns.js";
+import { DriveCard, DrivePad, Slot, Speed } from "./drive.js";
+import {
+  Boundary, fetchRest, html, useEffect, useMemo, useMetric, useMetrics, useModel, usePage, usePart, useState, useValue,
+} from "../parts/hooks.js";
 import { CardView, Offers, WATCHES } from "../parts/models.js";
-import { Card, Icon, Part, useStream } from "../parts/parts.js";
+import { Card, Icon, Part, StopButton, useName, useStream } from "../parts/parts.js";
 import { Stage, useVideo } from "./video.js";
-import { nameOf, typeOf } from "../parts/words.js";
+import { typeOf } from "../parts/words.js";
 
 export function Robot({ at, layout, drawer, onPanel }) {
   const offers = new Offers(at, useValue(at, "capabilities"), useMetrics(at));
-  const [view] = useState(() => new CardView(at));
+  const { kind } = offers;
+  const view = useMemo(() => new CardView(kind, at), [kind]);
   useModel(view);
   const source = useValue(at, "web/picture-from")?.source || at;
   const stream = useStream(at);
@@ -41,33 +46,43 @@ function Unknown({ at }) {
   const { connection } = usePage();
   useModel(connection);
   const text = connection.isOpen ? `Nothing was received from ${at} yet.` : "Connecting to the server…";
-  return html`<div class="empty"><${Icon} name="robot" /><h1 class="sr">${nameOf(at)}</h1><p>${text}</p></div>`;
+  return html`<div class="empty"><${Icon} name="robot" /><h1 class="sr">${useName(at)}</h1><p>${text}</p></div>`;
 }
 
 function Desktop({ at, offers, view, video, source }) {
   const cards = wanted(offers, view).filter(({ part }) => part !== VOICE || !video);
-  const side = !offers.drives && video ? cards.shift() : null;
-  const shown = (card) => html`<${CardOf} key=${card.id} card=${card} at=${at} offers=${offers} view=${view} />`;
+  const usual = cards.filter(({ engineers }) => !engineers);
+  const side = !offers.drives && video ? usual[0] : null;
+  const columns = expected(!WATCHES && (offers.drives || side !== null));
+  const shown = (card) => html`<${CardOf} key=${card.id} card=${card} among=${card.engineers ? cards.filter(isEngineers) : usual} ...${{ at, offers, view, columns }} side=${card === side} />`;
+  const grid = useColumns(view);
   return html`<div class="robot">
-    <h1 class="sr">${nameOf(at)}</h1>
-    <div class=${`bench ${offers.drives || side ? "" : "no-side"}`}>
-      <div class="bench-main">
-        ${video &&
-        html`<${Boundary} what="The picture"
-          ><${Stage} at=${at} video=${video} source=${source} offers=${offers} wide
-        /><//>`}
-        ${!video && offers.drives && html`<${Part} part=${NO_CAMERA} at=${at} offers=${offers} />`}
-        <div class="cards">
-          ${columns(cards).map((column, index) => html`<div key=${index} class="column">${column.map(shown)}</div>`)}
-        </div>
-        ${cards.filter(({ wide }) => wide).map(shown)}
-        <${Missing} at=${at} offers=${offers} view=${view} hasVideo=${Boolean(video)} />
-      </div>
+    <h1 class="sr">${useName(at)}</h1>
+    ${!video && !offers.drives && html`<${Bands} at=${at} />`}
+    <div class="bench" ref=${grid}>
+      ${video &&
+      html`<${Boundary} what="The picture"
+        ><${Stage} at=${at} video=${video} source=${source} offers=${offers} layout="desktop"
+      /><//>`}
+      ${!video && offers.drives && html`<${NoPicture} at=${at} offers=${offers} />`}
       ${offers.drives && html`<${Boundary} vital what="Driving"><${DriveCard} at=${at} offers=${offers} /><//>`}
-      ${side && html`<${CardOf} card=${side} at=${at} offers=${offers} view=${view} />`}
+      ${usual.map(shown)}
+      <section class="engineers" data-span="all" data-card="engineers" aria-labelledby="engineers-title">
+        <${Missing} at=${at} offers=${offers} view=${view} hasVideo=${Boolean(video)} />
+        <h2 id="engineers-title">For engineers</h2>
+        <div class="engineers-cards">${cards.filter(isEngineers).map(shown)}</div>
+      </section>
     </div>
   </div>`;
 }
+
+const isEngineers = ({ engineers = false }) => engineers;
+
+/** In place of a picture: that there is none, how it looks, and what must not be overlooked. */
+const NoPicture = ({ at, offers }) => html`<div class="stage no-picture" data-span="main" data-card="picture">
+  <${Bands} at=${at} />
+  <${Part} part=${NO_CAMERA} lines=${1} at=${at} offers=${offers} />
+</div>`;
 
 function Portrait({ at, offers, view, video, source, onPanel }) {
   const [chosen, choose] = useState("");
@@ -83,39 +98,47 @@ function Portrait({ at, offers, view, video, source, onPanel }) {
   useEffect(() => {
     const card = cards.find(({ id }) => id === view.wanted);
     if (card) choose(tabOf(card));
+    else if (view.wanted === "picture") choose("more");
   }, [view.wanted]);
+  const here = cards.filter((card) => tabOf(card) === tab);
+  const usual = here.filter((card) => !card.engineers);
+  const engineers = here.filter(isEngineers);
+  const shown = (among) => (card) => html`<${CardOf} key=${card.id} card=${card} among=${among} ...${{ at, offers, view }} />`;
   return html`<div class="robot">
-    <h1 class="sr">${nameOf(at)}</h1>
+    <h1 class="sr">${useName(at)}</h1>
     ${tab === "drive" &&
     html`<div class="phone-drive">
-      ${video &&
-      html`<${Boundary} what="The picture"><${Stage} at=${at} video=${video} source=${source} offers=${offers} /><//>`}
-      ${!video && offers.drives && html`<${Part} part=${NO_CAMERA} at=${at} offers=${offers} />`}
+      ${video
+        ? html`<${Boundary} what="The picture"
+            ><${Stage} at=${at} video=${video} source=${source} offers=${offers} view=${view} layout="portrait"
+          /><//>`
+        : html`<${NoPicture} at=${at} offers=${offers} />`}
       ${offers.drives &&
       html`<${Boundary} vital what="Driving">
         <section class="phone-pad" aria-label="Drive">
-          <${WhyLine} at=${at} />
+          <${Slot} at=${at} />
           <${DrivePad} />
           <${Speed} />
           <details class="more-drive" open=${!video}>
             <summary data-test="more-drive">Turn, balance, extra axis</summary>
-            <${Part} part=${DRIVE} />
+            <${Part} part=${DRIVE} open />
           </details>
         </section>
       <//>`}
     </div>`}
+    ${tab !== "drive" && html`<${Bands} at=${at} />`}
     <div class="cards">
-      ${cards
-        .filter((card) => tabOf(card) === tab)
-        .map((card) => html`<${CardOf} key=${card.id} card=${card} at=${at} offers=${offers} view=${view} />`)}
-      ${tab !== "more" && html`<${Hidden} cards=${hidden(view).filter((card) => tabOf(card) === tab)} view=${view} />`}
+      ${usual.map(shown(usual))}
       ${tab === "more" &&
-      html`${video &&
-        html`<${Card} id="picture" title="Picture" icon="camera"
-          ><${Part} part=${PICTURE} at=${at} source=${source} offers=${offers}
-        /><//>`}
-        <${Missing} at=${at} offers=${offers} view=${view} hasVideo=${Boolean(video)} />
-        <${MoreSettings} onPanel=${onPanel} />`}
+      video &&
+      html`<${Card} id="picture" title="Picture" icon="camera"
+        ><${Part} part=${PICTURE} at=${at} source=${source} offers=${offers} video=${video} extras=${EXTRAS}
+      /><//>`}
+      ${tab !== "more" && html`<${Hidden} cards=${hidden(view).filter((card) => tabOf(card) === tab)} view=${view} />`}
+      ${engineers.length > 0 && html`<h2 class="engineers-head">For engineers</h2>`} ${engineers.map(shown(engineers))}
+      ${tab === "more" &&
+      html`<${Missing} at=${at} offers=${offers} view=${view} hasVideo=${Boolean(video)} />
+        <${MoreSettings} onPanel=${onPanel} view=${view} />`}
     </div>
     <nav class="tabs" aria-label="Parts of this page">
       ${tabs.map(
@@ -137,38 +160,65 @@ function Portrait({ at, offers, view, video, source, onPanel }) {
 function Immersive({ at, offers, view, video, source, drawer, onPanel }) {
   const cards = wanted(offers, view);
   return html`<div class="robot">
-    <h1 class="sr">${nameOf(at)}</h1>
+    <h1 class="sr">${useName(at)}</h1>
     ${video
       ? html`<${Boundary} what="The picture"
-          ><${Stage} at=${at} video=${video} source=${source} offers=${offers} immersive
+          ><${Stage} at=${at} video=${video} source=${source} offers=${offers} layout="immersive"
         /><//>`
-      : html`<div class="stage"><p class="cover">no camera</p></div>`}
+      : html`<div class="stage"><div class="picture"><p class="cover">no camera</p><${Bands} at=${at} /></div></div>`}
+    <${Extras} at=${at} offers=${offers} />
     ${offers.drives &&
     html`<${Boundary} vital what="Driving">
       <div class="float-pad"><${DrivePad} /></div>
-      <div class="float-why"><${WhyLine} at=${at} /></div>
+      <div class="float-why"><${Slot} at=${at} /></div>
     <//>`}
     ${drawer &&
     html`<aside class="drawer" aria-label="Everything else">
       ${offers.drives &&
-      html`<${Card} id="drive-settings" title="Driving" icon="wheel"><${Speed} /><${Part} part=${DRIVE} /><//>`}
+      html`<${Card} id="drive-settings" title="Driving" icon="wheel"><${Speed} /><${Part} part=${DRIVE} open /><//>`}
       ${video &&
       html`<${Card} id="picture" title="Picture" icon="camera"
         ><${Part} part=${PICTURE} at=${at} source=${source} offers=${offers} video=${video} extras=${EXTRAS}
       /><//>`}
-      ${cards.map((card) => html`<${CardOf} key=${card.id} card=${card} at=${at} offers=${offers} view=${view} />`)}
-      <${MoreSettings} onPanel=${onPanel} />
+      ${cards.map((card) => html`<${CardOf} key=${card.id} card=${card} among=${cards} ...${{ at, offers, view }} />`)}
+      <${MoreSettings} onPanel=${onPanel} view=${view} />
     </aside>`}
   </div>`;
 }
 
-const MoreSettings = ({ onPanel }) => html`<button type="button" class="wide" data-test="settings" onClick=${onPanel}>
+/** Over a picture that is the whole page: how fast, how full, and where. They come later, and take no place. */
+function Extras({ at, offers }) {
+  const { body } = usePart(HUD);
+  return (
+    body &&
+    html`<${Boundary} what="What lies over the picture"><${body} at=${at} offers=${offers} map=${hasMap(offers)} /><//>`
+  );
+}
+
+const MoreSettings = ({ onPanel, view }) => html`<button type="button" class="wide" data-test="settings" onClick=${onPanel}>
     <${Icon} name="settings" /><${SettingsWords} />
   </button>
+  <button type="button" class="wide" data-test="arrange" onClick=${() => view.reset()}>Arrange the cards as new</button>
   ${browser.fullScreen.on &&
   html`<button type="button" class="wide" onClick=${() => browser.fullScreen.toggle()}>
     <${Icon} name="small" />Leave full screen
-  </button>`}`;
+  </button>`}
+  <${StopAll} />`;
+
+/** Far from all else, as all that stops. */
+function StopAll() {
+  const { commands } = usePage();
+  return html`<div class="stop-all-place">
+    <${StopButton}
+      test="stop-all"
+      onStop=${() => commands.stop("")}
+      label="STOP ALL: emergency stop of all robots"
+      className="stop-all outlined"
+    >
+      <${Icon} name="stop" />Stop all robots
+    <//>
+  </div>`;
+}
 
 function SettingsWords() {
   const { unread } = useModel(usePage().connection, (one) => one.unread);
@@ -176,33 +226,53 @@ function SettingsWords() {
 }
 
 const wanted = (offers, view) =>
-  CARDS.filter((card) => card.wants(offers) && !view.hidden.has(card.id) && !(WATCHES && card.sends));
+  view.sorted(CARDS.filter((card) => card.wants(offers) && !view.hidden.has(card.id) && !(WATCHES && card.sends)));
 
-/** Two columns, so that a card that grows moves only those below it. */
-function columns(cards) {
-  const narrow = cards.filter(({ wide }) => !wide);
-  const [left, right] = [false, true].map((wanted) => narrow.filter(({ right: is = false }) => is === wanted));
-  if (!right.length) right.push(...left.splice(Math.ceil(left.length / 2)));
-  return [left, right].filter((column) => column.length);
+/** Until its part is here it keeps the height that it had last time. */
+function CardOf({ card, among, at, offers, view, columns = 0, side = false }) {
+  const { body, failed } = usePart(card.part);
+  return html`<${Card}
+    id=${card.id}
+    title=${card.title}
+    icon=${card.icon}
+    view=${view}
+    isFirst=${isEngineers(card)}
+    ids=${among.map(({ id }) => id)}
+    className=${isEngineers(card) ? "of-engineers" : ""}
+    place=${side ? { "data-at": "side" } : undefined}
+    style=${useHeight(view, columns, card, Boolean(body) || failed)}
+  >
+    <${Boundary} what=${card.title}><${Part} part=${card.part} lines=${5} at=${at} offers=${offers} view=${view} /><//>
+  <//>`;
 }
 
-function CardOf({ card, at, offers, view }) {
-  return html`<${Card} id=${card.id} title=${card.title} icon=${card.icon} view=${view}>
-    <${Boundary} what=${card.title}><${Part} part=${card.part} at=${at} offers=${offers} view=${view} /><//>
-  <//>`;
+const SETTLE_MS = 1500; // after it is here, its values come, and lines are drawn
+
+/** @returns {{minHeight: string} | undefined} for the style of a card */
+function useHeight(view, columns, { id, height = 0 }, isHere) {
+  const [settled, settle] = useState(false);
+  useEffect(() => {
+    if (!isHere) return undefined;
+    const timer = setTimeout(() => settle(true), SETTLE_MS);
+    return () => clearTimeout(timer);
+  }, [isHere]);
+  if (settled) return undefined;
+  const px = view.heightOf(columns, id) || (isHere ? 0 : height);
+  return px ? { minHeight: `${px}px` } : undefined;
 }
 
 /** What is not on this page, and why. */
 function Missing({ at, offers, view, hasVideo }) {
   const isRobot = typeOf(at) === "robots";
+  const name = useName(at);
   const lacks = [!hasVideo && "camera", !offers.drives && offers.known && "driving"].filter((one) => isRobot && one);
-  return html`${lacks.length > 0 && html`<p class="dim">Not on ${nameOf(at)}: ${lacks.join(", ")}.</p>`}
+  return html`${lacks.length > 0 && html`<p class="dim">Not on ${name}: ${lacks.join(", ")}.</p>`}
     <${Hidden} cards=${hidden(view)} view=${view} />`;
 }
 
 const hidden = (view) => CARDS.filter((card) => view.hidden.has(card.id));
 
-/** What was closed comes back by these. */
+/** What was hidden comes back by these. */
 function Hidden({ cards, view }) {
   if (!cards.length) return null;
   return html`<div class="missing">

@@ -6,7 +6,8 @@ import { Icon, Why } from "../parts/parts.js";
 import { Sound } from "./sound-model.js";
 import { nameOf } from "../parts/words.js";
 
-export function SoundControls({ at }) {
+/** @param {{at: string, place?: "card" | "bar" | "short" | "over"}} props "short": in a bar with little room */
+export function SoundControls({ at, place = "card" }) {
   const page = usePage();
   /** @type {Sound} */
   const sound = (page.sound.model ??= new Sound(page));
@@ -17,7 +18,10 @@ export function SoundControls({ at }) {
   useValue("", "web/broker");
   const { listening, muted } = sound;
   const noListening = listening ? "" : sound.listenReason();
-  return html`<div class="sound" role="group" aria-label="Sound">
+  const inBar = place !== "card";
+  const short = place === "short";
+  const text = words(sound, view, nameOf(at));
+  return html`<div class=${`sound ${inBar ? "in-bar" : ""}`} role="group" aria-label="Sound">
     <div class="sound-buttons">
       <button
         type="button"
@@ -26,17 +30,44 @@ export function SoundControls({ at }) {
         aria-describedby=${noListening ? "why-listen" : undefined}
         onClick=${() => (listening ? sound.stopListening() : sound.listen())}
       >
-        <${Icon} name=${listening ? "halt" : "sound"} />${listening ? "Stop listening" : "Listen"}
+        <${Icon} name=${listening ? "halt" : "sound"} /><span>${listening ? (inBar ? "Silence" : "Stop listening") : "Listen"}</span>
       </button>
-      <${TalkButton} sound=${sound} noListening=${noListening} />
+      <${TalkButton} sound=${sound} noListening=${noListening} short=${short} />
       ${listening &&
+      (place === "bar" || !inBar) &&
       html`<button type="button" data-test="mute" aria-pressed=${muted} onClick=${() => sound.toggleMute()}>
-        <${Icon} name=${muted ? "muted" : "sound"} />${muted ? "Muted" : "Mute"}<kbd>M</kbd>
+        <${Icon} name=${muted ? "muted" : "sound"} /><span>${muted ? "Muted" : "Mute"}</span><kbd>M</kbd>
       </button>`}
     </div>
-    <${Reasons} sound=${sound} noListening=${noListening} />
-    <${State} text=${words(sound, view, nameOf(at))} />
+    ${inBar
+      ? html`<${Note} sound=${sound} noListening=${noListening} text=${text} />`
+      : html`<${Reasons} sound=${sound} noListening=${noListening} /><${State} text=${text} />`}
   </div>`;
+}
+
+/** One line in what is left of the bar: why something is off, or is not heard. Numbers are behind the gear. */
+function Note({ sound, noListening, text }) {
+  const noTalking = sound.talking ? "" : sound.talkReason();
+  const well = text.includes("buffered");
+  const said = useCalm(well ? "Listening" : text);
+  return html`<p class="bar-note" title=${(well ? "" : text) || noListening || noTalking}>
+      <span data-test="sound-note">${well ? "" : text}</span>
+      ${noListening && html`<span id="why-listen" class=${text && !well ? "sr" : ""}>${noListening}</span>`}
+      ${noTalking &&
+      noTalking !== noListening &&
+      html`<span id="why-talk" class=${noListening || (text && !well) ? "sr" : ""}>${noTalking}</span>`}
+    </p>
+    <span class="sr" role="status">${said}</span>`;
+}
+
+/** For engineers: how the sound comes now. @param {{at: string}} props */
+export function SoundFacts({ at }) {
+  const page = usePage();
+  /** @type {Sound} */
+  const sound = (page.sound.model ??= new Sound(page));
+  useModel(sound);
+  const view = useValue(at, "web/sound");
+  return html`<p class="facts" data-test="sound-state">${words(sound, view, nameOf(at))}</p>`;
 }
 
 /** Numbers are not read aloud. */
@@ -53,7 +84,7 @@ function Reasons({ sound, noListening }) {
   ${noTalking && noTalking !== noListening && html`<${Why} id="why-talk">${noTalking}<//>`}`;
 }
 
-function TalkButton({ sound, noListening }) {
+function TalkButton({ sound, noListening, short }) {
   const why = sound.talking ? "" : sound.talkReason();
   const end = () => sound.talk(false);
   useEffect(() => end, []);
@@ -84,7 +115,7 @@ function TalkButton({ sound, noListening }) {
       event.stopPropagation();
     }}
   >
-    <${Icon} name="mic" />${sound.talking ? "Talking" : "Hold to talk"}<kbd>T</kbd>
+    <${Icon} name="mic" /><span>${sound.talking ? "Talking" : short ? "Talk" : "Hold to talk"}</span><kbd>T</kbd>
   </button>`;
 }
 

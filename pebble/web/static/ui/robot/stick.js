@@ -28,7 +28,7 @@ export function Stick({ driver }) {
     element.current.focus({ preventScroll: true });
     if (dragged) return driver.interrupt(); // a second finger
     if (event.pointerId === pointer) driver.stickEnd(); // its release was not reported
-    if (driver.reason()) return pointAt("why-drive");
+    if (driver.reason()) return driver.isFree() ? driver.hint() : pointAt("why-drive");
     if (event.button || !driver.stickStart(event.pointerId, event.timeStamp)) return undefined;
     browser.capture(event);
     place.current = element.current.getBoundingClientRect();

@@ -1,9 +1,10 @@
-// The live picture: how old it is, how it comes, and where from.
+// The live picture: how old it is, and the bar below it.
 
 import * as browser from "../../core/browser.js";
-import { EXTRAS, PICTURE, VOICE } from "../cards/cards.js";
-import { Boundary, html, useEffect, useModel, usePage, useRef, useState, useTick, useValue } from "../parts/hooks.js";
-import { Extra, Icon, Part } from "../parts/parts.js";
+import { Bands } from "../banner.js";
+import { EXTRAS, PICTURE, SOUND_FACTS, VOICE } from "../cards/cards.js";
+import { Boundary, html, useEffect, useLayoutEffect, useModel, usePage, useRef, useState, useTick, useValue } from "../parts/hooks.js";
+import { Extra, Face, Icon, Part, useName } from "../parts/parts.js";
 import { nameOf, span } from "../parts/words.js";
 
 /** Show pictures of ``source`` as long as this is on the page. @param {string} at @param {string} source "": none */
@@ -24,13 +25,17 @@ export function useVideo(at, source) {
   };
 }
 
-export function Stage({ at, video: control, source, offers, wide = false, immersive = false }) {
+/**
+ * The picture with what must not be overlooked, and one bar below it. ``view``: of the cards, where the picture's
+ * settings are one of them.
+ */
+export function Stage({ at, video: control, source, offers, view, layout }) {
   const page = usePage();
   const { video } = page;
   useModel(video);
   useTick(200);
   const place = useRef(null);
-  useEffect(() => {
+  useLayoutEffect(() => {
     const { current } = place;
     current.append(video.canvas);
     return () => {
@@ -40,38 +45,91 @@ export function Stage({ at, video: control, source, offers, wide = false, immers
   const cover = useCover(control, source);
   const stale = cover !== "";
   const info = video.stream ? null : video.info;
-  const view = useValue(source, "web/picture");
+  const name = useName(source);
   video.canvas.setAttribute("role", "img");
-  video.canvas.setAttribute("aria-label", `What ${nameOf(source)} sees`);
-  return html`<section class=${`stage ${stale ? "stale" : ""} ${video.info ? "" : "blank"}`} aria-label="Live picture">
+  video.canvas.setAttribute("aria-label", `What ${name} sees`);
+  return html`<section
+    class=${`stage ${stale ? "stale" : ""} ${video.info ? "" : "blank"}`}
+    aria-label="Live picture"
+    data-card="picture"
+    data-span="main"
+  >
     <div class="picture">
       <div class="canvas" ref=${place}></div>
       <${Extra} of=${EXTRAS} part="Layer" what="What is drawn over it" source=${source} />
-      ${cover && html`<p class="cover" data-test="cover">${cover}</p>`}
-      ${info && html`<span class="tag tag-how">${howWords(video, view)}</span>`}
-      ${info && html`<span class=${`tag tag-age ${stale ? "bad" : ""}`}>${ageWords(video)}</span>`}
-      ${source !== at && html`<span class="tag tag-from">seen from ${nameOf(source)}</span>`}
+      ${cover && html`<p class="cover" data-test="cover">${!info && html`<${Face} at=${source} />`}${cover}</p>`}
+      ${info && html`<span class=${`tag tag-age ${stale ? "bad" : ""}`} data-test="age"><${Age} video=${video} /></span>`}
+      ${source !== at && html`<span class="tag tag-from">seen from ${name}</span>`}
+      <${Bands} at=${at} />
     </div>
-    ${!immersive &&
-    html`<div class="picture-bar">
-      <button type="button" data-test="video" onClick=${control.toggle}>
-        <${Icon} name=${control.wanted ? "no-camera" : "camera"} />${control.wanted ? "Stop video" : "Start video"}
-      </button>
-      <button
-        type="button"
-        data-test="full-screen"
-        hidden=${!browser.fullScreen.possible}
-        onClick=${() => browser.fullScreen.toggle()}
-      >
-        <${Icon} name=${browser.fullScreen.on ? "small" : "full"} />${browser.fullScreen.on
-          ? "Leave full screen"
-          : "Full screen"}
-      </button>
-      <${Extra} of=${EXTRAS} part="Tools" what="More of the picture" source=${source} wanted=${control.wanted} />
-      ${wide && html`<${Part} part=${PICTURE} at=${at} source=${source} offers=${offers} />`}
-      ${wide && offers.has("audio") && html`<${Boundary} what="Sound"><${Part} part=${VOICE} at=${at} /><//>`}
+    ${layout !== "immersive" &&
+    html`<${Bar} ...${{ at, control, source, offers, view }} short=${layout === "portrait"} wide=${layout === "desktop"} />`}
+    ${layout === "immersive" &&
+    html`<div class="float-tools">
+      <${SnapshotButton} source=${source} />
+      ${offers.has("audio") && html`<${Boundary} what="Sound"><${Part} part=${VOICE} lines=${0} at=${at} place="over" /><//>`}
     </div>`}
   </section>`;
+}
+
+/** One quiet line: what is done with picture and sound. What experts set is behind its last button. */
+function Bar({ at, control, source, offers, view, short, wide }) {
+  const [open, show] = useState(false);
+  const { on, possible } = browser.fullScreen;
+  const full = on ? "Leave full screen" : "Full screen";
+  useEffect(() => {
+    if (!open) return undefined;
+    const end = (event) => event.key === "Escape" && show(false);
+    addEventListener("keydown", end);
+    return () => removeEventListener("keydown", end);
+  }, [open]);
+  return html`<div class="picture-bar" role="group" aria-label="Picture and sound">
+      <button type="button" data-test="video" onClick=${control.toggle}>
+        <${Icon} name=${control.wanted ? "pause" : "play"} /><span>${control.wanted ? "Pause" : "Play"}</span>
+      </button>
+      <button type="button" data-test="full-screen" hidden=${!possible} aria-label=${full} onClick=${() => browser.fullScreen.toggle()}>
+        <${Icon} name=${on ? "small" : "full"} /><span>${short ? "Full" : full}</span>
+      </button>
+      <${SnapshotButton} source=${source} short=${short} />
+      ${offers.has("audio") &&
+      html`<${Boundary} what="Sound"><${Part} part=${VOICE} lines=${0} at=${at} place=${short ? "short" : "bar"} /><//>`}
+      <button
+        type="button"
+        class="gear"
+        data-test="gear"
+        aria-expanded=${wide ? open : undefined}
+        aria-label="Settings of the picture"
+        onClick=${() => (wide ? show(!open) : view?.reveal("picture"))}
+      >
+        <${Icon} name="gear" />${short && html`<span>Picture</span>`}
+      </button>
+    </div>
+    ${wide &&
+    html`<section class="gear-panel" aria-label="Settings of the picture" data-test="gear-panel" hidden=${!open}>
+      <div class="card-head">
+        <h2>Picture</h2>
+        <button type="button" class="quiet" aria-label="Close the settings of the picture" onClick=${() => show(false)}>
+          <${Icon} name="close" />
+        </button>
+      </div>
+      ${offers.has("audio") && html`<${Part} part=${SOUND_FACTS} lines=${0} at=${at} />`}
+      <${Part} part=${PICTURE} at=${at} source=${source} offers=${offers} video=${control} extras=${EXTRAS} />
+    </section>`}`;
+}
+
+/** What takes the snapshot is fetched with the first one. */
+function SnapshotButton({ source, short = false }) {
+  const { connection, store, video } = usePage();
+  const off = !video.info || video.stream !== "";
+  const why = off ? "There is no picture that could be saved" : undefined;
+  const save = async () => {
+    const { snapshot } = await import("./picture-extras.js");
+    return `Saved as ${await snapshot(video, store, source)}`;
+  };
+  const press = () => save().then((text) => connection.show(text), (error) => connection.show(`Not saved: ${error.message}`));
+  return html`<button type="button" data-test="snapshot" disabled=${off} title=${why} aria-label="Snapshot" onClick=${press}>
+    <${Icon} name="photo" /><span>${short ? "Photo" : "Snapshot"}</span>
+  </button>`;
 }
 
 /** Why there is no live picture; "" there is. */
@@ -80,7 +138,7 @@ function useCover(control, source) {
   useModel(connection);
   const view = useValue(source, "web/picture");
   const online = useValue(source, "web/liveness")?.online;
-  if (!control.wanted) return "Video is stopped";
+  if (!control.wanted) return "Paused";
   if (video.stream) return "";
   const old = video.info ? ` · this picture is ${span(video.age().ms)} old` : "";
   if (!connection.isOpen) return `No connection to the server${old}`;
@@ -93,15 +151,13 @@ function useCover(control, source) {
   return view?.state === "silent" ? "The camera sends nothing" : "Waiting for the first picture…";
 }
 
-function howWords({ info, interval }, view) {
-  const size = `${info.encoding ?? ""}${info.rescue ? " (converted)" : ""} ${info.width}×${info.height}`;
-  const rate = view?.per_second > 0 ? view.per_second : interval > 0 ? 1000 / interval : 0;
-  const bits = view?.kbits > 0 ? ` · ${Math.round(view.kbits)} kbit/s` : "";
-  const viewers = view?.viewers > 1 ? ` · ${view.viewers} viewers` : "";
-  return `${size} · ${rate.toFixed(rate < 9.5 ? 1 : 0)}/s${bits}${viewers}`;
+const LIVE_MS = 500; // to this age people call a picture live
+
+/** How old the picture is, if that matters. */
+function Age({ video }) {
+  const { ms, since } = video.age();
+  if (ms >= LIVE_MS) return since === "taken" ? `${late(ms)} old` : `arrived ${late(ms)} ago`;
+  return html`<i class="dot ok" aria-hidden="true"></i>${since === "taken" ? "live" : "just arrived"}`;
 }
 
-function ageWords(video) {
-  const { ms, since } = video.age();
-  return since === "taken" ? `${span(ms)} old` : `arrived ${span(ms)} ago`;
-}
+const late = (ms) => (ms < 10_000 ? `${(ms / 1000).toFixed(1)} s` : span(ms));
