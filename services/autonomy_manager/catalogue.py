@@ -206,8 +206,8 @@ def files(scripts: Iterable[Script]) -> list[dict[str, object]]:
 def _first_seen(script: Script, configs: Iterable[Mapping[str, object]]) -> dict[str, object]:
     """What operators read of it before its settings, and which of these they see first; only what it says itself."""
     keys = {setting["key"] for setting in configs}
-    told = {"summary": script.summary, "main": [key for key in script.main if key in keys]}
-    return {name: value for name, value in told.items() if value}
+    first = {"summary": script.summary, "main": [key for key in script.main if key in keys]}
+    return {name: value for name, value in first.items() if value}
 
 
 def _inside(root: Path) -> list[Path]:

@@ -213,13 +213,13 @@ def test_the_list_is_bounded(tmp_path: Path) -> None:
 
 
 def test_a_summary_and_main_settings_are_listed_where_a_script_has_them(tmp_path: Path) -> None:
-    told: dict[str, Any] = {"summary": "Walks.", "main": ["laps", "log_file", "gone"], "command": ["./run.sh"]}
-    told["configs"] = [{"key": "laps", "type": "int"}, {"key": "log_file"}]
+    first: dict[str, Any] = {"summary": "Walks.", "main": ["laps", "log_file", "gone"], "command": ["./run.sh"]}
+    first["configs"] = [{"key": "laps", "type": "int"}, {"key": "log_file"}]
     write(tmp_path, "plain")
-    write(tmp_path, "told", json.dumps(told), "script.json")
+    write(tmp_path, "first", json.dumps(first), "script.json")
     listed = {entry["file"]: entry for entry in files(scripts(tmp_path).values())}
     assert listed["plain"].keys() == {"file", "label", "configs"}
-    assert (listed["told"]["summary"], listed["told"]["main"]) == ("Walks.", ["laps"])
+    assert (listed["first"]["summary"], listed["first"]["main"]) == ("Walks.", ["laps"])
 
 
 def test_a_file_is_parsed_again_only_when_it_has_changed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
