@@ -55,7 +55,7 @@ def test_following_by_odometry_has_30_settings_and_needs_two_scripts() -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_each_says_what_it_does_and_what_matters_first(name: str) -> None:
+def test_each_has_a_sentence_and_main_settings(name: str) -> None:
     found = described(name)
     assert 10 < len(found["summary"]) <= 160
     assert 1 < len(found["main"]) <= 3
