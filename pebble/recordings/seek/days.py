@@ -80,11 +80,12 @@ def _days(file: RecordingFile) -> list[Day]:
 
 def _driven(file: RecordingFile, begin: int, end: int) -> dict[str, float]:
     """Seconds within a day, by robot."""
-    robots = {number: robot_of(channel) for number, channel in file.channels.items() if _drives(channel.topic)}
+    drives = {number: robot_of(channel) for number, channel in file.channels.items() if _drives(channel.topic)}
+    robots = {number: robot for number, robot in drives.items() if robot is not None}
     found: dict[str, float] = {}
     for chunk in file.chunks if robots else []:
         within = max(0, min(chunk.end_ns, end) - max(chunk.start_ns, begin)) / 1e9
-        for robot in {robots.get(number) for number in chunk.channels} - {None} if within else ():
+        for robot in {robots[number] for number in chunk.channels if number in robots} if within else ():
             found[robot] = found.get(robot, 0.0) + within
     return found
 
