@@ -83,7 +83,10 @@ class WebInterface(Section, frozen=True, kw_only=True):
     recordings: Annotated[
         File | None, doc("Folder of recordings to look at on the page; unset: that of services.recorder, if it runs.")
     ] = None
-    robots: Annotated[tuple[dict[str, Any], ...], doc("Hints about robots, in the original's format.")] = ()
+    robots: Annotated[
+        tuple[dict[str, Any], ...],
+        doc("Read and ignored: robots are found by their messages, and named by `robot.name` of their own configs."),
+    ] = ()
     robot_discovery: Annotated[dict[str, Any], doc("Read and ignored: robots are found by their messages.")] = field(
         default_factory=dict
     )

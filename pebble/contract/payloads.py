@@ -377,6 +377,10 @@ class SoundboardStatus(Payload, frozen=True, kw_only=True):
     controls: bool = True
 
 
+#: What a script says of itself before its settings: characters of its summary, and settings that are seen first.
+LONGEST_SUMMARY, MOST_MAIN = 160, 3
+
+
 class AutonomyFiles(Payload, frozen=True, kw_only=True):
     files: list[dict[str, Any]]
     timestamp: float  # epoch seconds

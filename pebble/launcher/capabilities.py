@@ -45,8 +45,8 @@ def _identity(config: Config) -> dict[str, Any]:
     """Who it is, and how people shall see it: only what its config says, programs have their own defaults."""
     robot = config.robot
     looks = {key: getattr(robot, key) for key in ("name", "description", "colour", "picture", "battery_cells")}
-    stated = {key: value for key, value in looks.items() if value is not None}
-    return {"system": robot.system, "type": robot.type, "id": robot.id, **stated}
+    given = {key: value for key, value in looks.items() if value is not None}
+    return {"system": robot.system, "type": robot.type, "id": robot.id, **given}
 
 
 def _video(config: Config, addresses: Addresses) -> dict[str, Any]:

@@ -5,14 +5,14 @@ import logging
 import os
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from pebble.config import Config, load
-from pebble.contract.payloads import LAST_RUN
+from pebble.contract.payloads import LAST_RUN, LONGEST_SUMMARY, MOST_MAIN
 from pebble.errors import ConfigError, PebbleError, TransportError
 from pebble.runtime.connections import local_transport
 from pebble.runtime.parent import launcher_runs, set_up_logging
@@ -27,16 +27,25 @@ _CONNECT_S = 2.0
 log = logging.getLogger(__name__)
 
 
-def run(main: Callable[..., None], *, label: str = "", needs: Mapping[str, Mapping[str, Any]] | None = None) -> None:
+def run(
+    main: Callable[..., None],
+    *,
+    label: str = "",
+    summary: str = "",
+    main_options: Sequence[str] = (),
+    needs: Mapping[str, Mapping[str, Any]] | None = None,
+) -> None:
     """Be the program of ``main(robot)`` or ``main(robot, options)``, ``options`` being a msgspec Struct of your own.
 
-    ``label`` is its name for operators; ``needs`` lists other scripts that must run, with their options. Returns when
-    main has returned; raises SystemExit otherwise. The wheels are stopped in any case.
+    ``label`` is its name for operators, ``summary`` the sentence that says what it does (else the first line of its
+    docstring), ``main_options`` names up to three options that they see first (else the first three); ``needs`` lists
+    other scripts that must run, with their options. Returns when main has returned; raises SystemExit otherwise. The
+    wheels are stopped in any case.
     """
     options = _options_of(main)
     name = _name()
     if sys.argv[1:] == ["--describe"]:
-        _describe(label or name, options, needs or {})
+        _describe({"label": label or name, "summary": summary or _first_line(main)}, options, main_options, needs or {})
         return
     arguments = _arguments(main, label or name, options)
     set_up_logging("INFO")
@@ -71,10 +80,30 @@ def _name() -> str:
     return path.parent.name if path.stem == "run" else path.stem
 
 
-def _describe(label: str, options: type[msgspec.Struct] | None, needs: Mapping[str, Mapping[str, Any]]) -> None:
+def _documentation(main: Callable[..., None]) -> str:
+    return inspect.getdoc(main) or inspect.getdoc(inspect.getmodule(main)) or ""
+
+
+def _first_line(main: Callable[..., None]) -> str:
+    line = _documentation(main).partition("\n")[0]
+    return line[:LONGEST_SUMMARY] if line.isprintable() else ""
+
+
+def _describe(
+    words: Mapping[str, str],
+    options: type[msgspec.Struct] | None,
+    first: Sequence[str],
+    needs: Mapping[str, Mapping[str, Any]],
+) -> None:
+    configs = [] if options is None else form(options)
+    keys = [entry["key"] for entry in configs]
+    unknown = [key for key in first if key not in keys]
+    if unknown or len(first) > MOST_MAIN:
+        wrong = f"there is no option {unknown[0]}" if unknown else f"{len(first)} are more than {MOST_MAIN}"
+        raise TypeError(f"main_options: {wrong}")
     description = {
-        "label": label,
-        "configs": [] if options is None else form(options),
+        **{key: value for key, value in {**words, "main": list(first)}.items() if value},
+        "configs": configs,
         "dependencies": [{"file": file, "config": dict(config)} for file, config in needs.items()],
     }
     sys.stdout.write(msgspec.json.encode(description).decode() + "\n")
@@ -84,8 +113,7 @@ def _arguments(
     main: Callable[..., None], label: str, options: type[msgspec.Struct] | None
 ) -> tuple[Path, tuple[msgspec.Struct, ...]]:
     """The robot's config file, and main's further arguments, from the command line."""
-    about = inspect.getdoc(main) or inspect.getdoc(inspect.getmodule(main)) or ""
-    parser = OneLineParser(prog=Path(sys.argv[0]).name, description=about or label)
+    parser = OneLineParser(prog=Path(sys.argv[0]).name, description=_documentation(main) or label)
     parser.add_argument(
         "--config",
         metavar="ROBOT.json",

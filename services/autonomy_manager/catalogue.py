@@ -124,6 +124,8 @@ class Catalogue:
             command=command,
             folder=section.cwd or folder,
             settings=settings,
+            summary=described.summary,
+            main=tuple(described.main),
             dependencies=_dependencies(name, section, described, ours=ours),
             environment={**login, **self._section.env, **section.env},
             ours=ours,
@@ -196,8 +198,16 @@ def files(scripts: Iterable[Script]) -> list[dict[str, object]]:
     for script in scripts:
         configs = form(script.settings)
         left -= len(msgspec.json.encode(configs))
-        entries.append({"file": script.file, "label": script.label, "configs": configs if left >= 0 else []})
+        configs = configs if left >= 0 else []
+        entries.append({"file": script.file, "label": script.label, "configs": configs, **_first_seen(script, configs)})
     return entries
+
+
+def _first_seen(script: Script, configs: Iterable[Mapping[str, object]]) -> dict[str, object]:
+    """What operators read of it before its settings, and which of these they see first; only what it says itself."""
+    keys = {setting["key"] for setting in configs}
+    first = {"summary": script.summary, "main": [key for key in script.main if key in keys]}
+    return {name: value for name, value in first.items() if value}
 
 
 def _inside(root: Path) -> list[Path]:
@@ -216,6 +226,8 @@ def _merged(first: Description, second: Description) -> Description:
     keys = {setting.key for setting in first.configs}
     return Description(
         label=first.label or second.label,
+        summary=first.summary or second.summary,
+        main=first.main or second.main,
         configs=[*first.configs, *(setting for setting in second.configs if setting.key not in keys)][:MAX_SETTINGS],
         dependencies=first.dependencies or second.dependencies,
     )

@@ -16,6 +16,7 @@ import msgspec
 from msgspec import Struct
 
 from pebble.config.text_files import NotTextError, text_of
+from pebble.contract.payloads import LONGEST_SUMMARY, MOST_MAIN
 from pebble.runtime.parent import tied_to_parent
 from pebble.services.autonomy_manager.forms import MAX_SETTINGS, Setting
 
@@ -38,9 +39,14 @@ class Need(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Description(Struct, frozen=True):
-    """What a script publishes about itself; ``command`` only in a manifest."""
+    """What a script publishes about itself; ``command`` only in a manifest.
+
+    ``summary`` says in one sentence what it does; ``main`` are the keys of the settings that operators see first.
+    """
 
     label: str | None = None
+    summary: str = ""
+    main: list[str] = []
     configs: list[Setting] = []
     dependencies: list[Need] = []
     command: list[str] = []
@@ -48,6 +54,10 @@ class Description(Struct, frozen=True):
     def __post_init__(self) -> None:
         if len(self.configs) > MAX_SETTINGS:
             raise ValueError(f"more than {MAX_SETTINGS} settings")
+        if len(self.summary) > LONGEST_SUMMARY:
+            raise ValueError(f"its summary is longer than {LONGEST_SUMMARY} characters")
+        if len(self.main) > MOST_MAIN:
+            raise ValueError(f"more than {MOST_MAIN} main settings")
         if not all(map(str.isprintable, _texts(self))):
             raise ValueError("its texts must not contain control characters")
         keys = [setting.key for setting in self.configs]
@@ -58,6 +68,7 @@ class Description(Struct, frozen=True):
 def _texts(description: Description) -> Iterator[str]:
     """What operators see of it, also in a terminal."""
     yield description.label or ""
+    yield description.summary
     for setting in description.configs:
         options = map(str, setting.options)
         yield from (setting.key, setting.label or "", setting.arg or "", setting.arg_false or "", *options)

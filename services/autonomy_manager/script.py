@@ -29,6 +29,8 @@ class Script(Struct, frozen=True, kw_only=True):
     command: tuple[str, ...]
     folder: Path  # to run it in
     settings: tuple[Setting, ...] = ()
+    summary: str = ""  # what it does, in one sentence
+    main: tuple[str, ...] = ()  # the settings that operators see first
     dependencies: tuple[Dependency, ...] = ()
     environment: dict[str, str] = {}
     ours: bool = False  # it uses pebble.script, which signs its drive commands and stops the wheels at its end

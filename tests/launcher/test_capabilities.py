@@ -20,7 +20,7 @@ def of(kind: str = "mqtt", **services: Any) -> dict[str, Any]:
     return capabilities(config, Addresses(config))
 
 
-def test_people_see_it_as_in_its_config() -> None:
+def test_people_see_it_as_its_config_describes_it() -> None:
     looks = {"name": "Goob", "description": "Rover", "colour": "blue", "picture": "goob", "battery_cells": 2}
     config = parse({"robot": {"id": "rover", **looks}}, folder=Path("/robots"), env={})
     assert capabilities(config, Addresses(config))["identity"] == {

@@ -48,7 +48,7 @@ def test_two_processes_describe_a_script_alike(tmp_path: Path) -> None:
         "from pebble import Robot, run\n"
         "from tests.script.test_options import Options\n"
         "def main(robot: Robot, options: Options) -> None: raise SystemExit(9)\n"
-        "run(main, needs={'wheel-odometry': {'magnets': 10}})\n"
+        "run(main, summary='Walks.', main_options=['power'], needs={'wheel-odometry': {'magnets': 10}})\n"
     )
     command, env = [sys.executable, str(script), "--describe"], {"PYTHONPATH": str(ROOT)}
     runs = [subprocess.run(command, env=env, capture_output=True, check=False) for _ in range(2)]
@@ -57,9 +57,31 @@ def test_two_processes_describe_a_script_alike(tmp_path: Path) -> None:
     assert runs[0].stdout.count(b"\n") == 1
     assert json.loads(runs[0].stdout) == {
         "label": "follow",
+        "summary": "Walks.",
+        "main": ["power"],
         "configs": json.loads(GOLDEN.read_bytes()),
         "dependencies": [{"file": "wheel-odometry", "config": {"magnets": 10}}],
     }
+
+
+@pytest.mark.parametrize(
+    ("more", "end"),
+    [
+        ("main_options=['speedd']", "TypeError: main_options: there is no option speedd"),
+        ("main_options=['power'] * 4", "TypeError: main_options: 4 are more than 3"),
+    ],
+)
+def test_main_options_are_some_of_its_options(tmp_path: Path, more: str, end: str) -> None:
+    script = tmp_path / "run.py"
+    script.write_text(
+        "from pebble import Robot, run\n"
+        "from tests.script.test_options import Options\n"
+        "def main(robot: Robot, options: Options) -> None: raise SystemExit(9)\n"
+        f"run(main, {more})\n"
+    )
+    command = [sys.executable, str(script), "--describe"]
+    run = subprocess.run(command, env={"PYTHONPATH": str(ROOT)}, capture_output=True, check=False, text=True)
+    assert (run.stdout, run.stderr.splitlines()[-1]) == ("", end)
 
 
 def test_what_is_not_given_has_its_default() -> None:

@@ -55,6 +55,13 @@ def test_following_by_odometry_has_30_settings_and_needs_two_scripts() -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
+def test_each_has_a_sentence_and_main_settings(name: str) -> None:
+    found = described(name)
+    assert 10 < len(found["summary"]) <= 160
+    assert 1 < len(found["main"]) <= 3
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_no_setting_is_a_path(name: str) -> None:
     words = {word for entry in described(name)["configs"] for word in entry["key"].split("_")}
     assert words.isdisjoint({"file", "path", "dir", "folder", "calibration"})

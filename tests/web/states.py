@@ -324,7 +324,7 @@ UNDRIVEABLE = (
 )
 
 #: The server has recordings.
-REPLAYING = State("/replay", fleet, LIVE, {"recordings": True}, recordings=True)
+REPLAYING = State("/replay?days", fleet, LIVE, {"recordings": True}, recordings=True)
 
 SILENT = at(GOOB, "web/liveness", liveness(online=False, silent_s=5.2))
 NO_BROKER = {"connected": False, "problem": "connection refused by 10.0.0.2:8883", "robots_omitted": 0}

@@ -75,7 +75,7 @@ def test_a_server_that_is_gone_is_explained(hall: Hall, browser: Browser) -> Non
 def test_it_fits_and_its_controls_are_large_enough(hall: Hall, browser: Browser, size) -> None:
     with tab(browser, f"{hall.served.origin}/login", size) as opened:
         assert opened.page.evaluate("() => document.documentElement.scrollWidth <= innerWidth")
-        for control in (opened.page.locator("input, button")).all():
+        for control in opened.page.locator("input, button").all():
             box = control.bounding_box()
             assert box is not None
             assert box["height"] >= 44

@@ -9,6 +9,8 @@ from typing import Final
 
 from msgspec import Struct, field
 
+from pebble.contract import DRIVE
+from pebble.recordings.library import robot_of
 from pebble.recordings.recorder.intake import EVENTS
 from pebble.recordings.seek.archive import Archive
 from pebble.recordings.seek.file import Chunk, RecordingFile
@@ -20,6 +22,7 @@ _MOST_DAYS: Final = 31  # of one chunk
 class Day(Struct):
     """One day of UTC; ``first`` and ``last`` in epoch milliseconds, ``gaps``: of the recording itself.
 
+    ``driven``: about how many seconds each robot was sent commands to drive, in steps of the recording's chunks.
     ``unread``: a line for each file that cannot be read completely, on the day when it was written last.
     """
 
@@ -29,6 +32,7 @@ class Day(Struct):
     first: float = 0.0
     last: float = 0.0
     gaps: int = 0
+    driven: dict[str, float] = field(default_factory=dict)
     unread: list[str] = field(default_factory=list)
 
 
@@ -69,8 +73,25 @@ def _days(file: RecordingFile) -> list[Day]:
         first, last = max(file.first_ns, begin), min(file.last_ns, end - 1)
         size = 0 if days else file.size()
         within = sum(begin <= ns < end for ns in gaps)
-        days.append(Day(_day_of(number * 86_400), sorted(file.robots()), size, first / 1e6, last / 1e6, within))
+        driven = _driven(file, begin, end)
+        days.append(Day(_day_of(number * 86_400), sorted(file.robots()), size, first / 1e6, last / 1e6, within, driven))
     return days
+
+
+def _driven(file: RecordingFile, begin: int, end: int) -> dict[str, float]:
+    """Seconds within a day, by robot."""
+    drives = {number: robot_of(channel) for number, channel in file.channels.items() if _drives(channel.topic)}
+    robots = {number: robot for number, robot in drives.items() if robot is not None}
+    found: dict[str, float] = {}
+    for chunk in file.chunks if robots else []:
+        within = max(0, min(chunk.end_ns, end) - max(chunk.start_ns, begin)) / 1e9
+        for robot in {robots[number] for number in chunk.channels if number in robots} if within else ():
+            found[robot] = found.get(robot, 0.0) + within
+    return found
+
+
+def _drives(topic: str) -> bool:
+    return topic.rpartition("/")[2] == DRIVE.metric
 
 
 def _day_of(seconds: int) -> str:
@@ -89,6 +110,8 @@ def _merge(day: Day, other: Day) -> None:
     day.bytes += other.bytes
     day.first, day.last = min(day.first, other.first), max(day.last, other.last)
     day.gaps += other.gaps
+    for robot, seconds in other.driven.items():
+        day.driven[robot] = day.driven.get(robot, 0.0) + seconds
 
 
 def _gaps(file: RecordingFile) -> list[int]:

@@ -76,4 +76,9 @@ def main(robot: Robot, options: Options) -> None:
 
 
 if __name__ == "__main__":
-    run(main)
+    run(
+        main,
+        label="Follow a tag",
+        summary="Drives towards a printed tag and stays in front of it.",
+        main_options=("tag_id", "target_distance_m", "tag_size_m"),
+    )

@@ -53,4 +53,9 @@ def main(robot: Robot, options: Options) -> None:
 
 
 if __name__ == "__main__":
-    run(main)
+    run(
+        main,
+        label="Look for tags",
+        summary="Outlines the printed tags that the camera sees, and moves nothing.",
+        main_options=("control_rate_hz", "marker_dictionary"),
+    )

@@ -98,4 +98,10 @@ def main(robot: Robot, options: Options) -> None:
 
 if __name__ == "__main__":  # the scripts that it needs are named after their topics
     frames = {"width": 1280, "height": 720, "fps": 15.0}
-    run(main, needs={APRILTAG_LOCATIONS.metric: frames, WHEEL_ODOMETRY.metric: {"use_tune_state": False}})
+    run(
+        main,
+        label="Follow a tag, also out of sight",
+        summary="Drives to a printed tag, and on to where it was last while it is out of sight.",
+        main_options=("tag_id", "target_distance_m", "tag_size_m"),
+        needs={APRILTAG_LOCATIONS.metric: frames, WHEEL_ODOMETRY.metric: {"use_tune_state": False}},
+    )

@@ -114,4 +114,9 @@ def tune_state(robot: Robot) -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    run(main)
+    run(
+        main,
+        label="Wheel odometry",
+        summary="Works out where the robot is from its turning wheels, and draws it on the map.",
+        main_options=("wheel_diameter_mm", "track_width_mm", "magnets"),
+    )

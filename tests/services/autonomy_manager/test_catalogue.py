@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import stat
 import sys
@@ -209,6 +210,16 @@ def test_the_list_is_bounded(tmp_path: Path) -> None:
     assert entries[0]["configs"] == form(large)
     assert entries[-1]["configs"] == []
     assert len(msgspec.json.encode(entries)) < 300_000
+
+
+def test_a_summary_and_main_settings_are_listed_where_a_script_has_them(tmp_path: Path) -> None:
+    first: dict[str, Any] = {"summary": "Walks.", "main": ["laps", "log_file", "gone"], "command": ["./run.sh"]}
+    first["configs"] = [{"key": "laps", "type": "int"}, {"key": "log_file"}]
+    write(tmp_path, "plain")
+    write(tmp_path, "first", json.dumps(first), "script.json")
+    listed = {entry["file"]: entry for entry in files(scripts(tmp_path).values())}
+    assert listed["plain"].keys() == {"file", "label", "configs"}
+    assert (listed["first"]["summary"], listed["first"]["main"]) == ("Walks.", ["laps"])
 
 
 def test_a_file_is_parsed_again_only_when_it_has_changed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -120,6 +120,16 @@ def test_a_manifest_describes_a_script_of_any_language(tmp_path: Path) -> None:
         read_manifest(path)
 
 
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [('{"summary": "%s"}' % ("x" * 161), "longer than 160"), ('{"main": ["a", "b", "c", "d"]}', "more than 3 main")],
+)
+def test_what_operators_read_first_is_short(tmp_path: Path, text: str, why: str) -> None:
+    (tmp_path / "script.json").write_text(text)
+    with pytest.raises(DescribeError, match=why):
+        read_manifest(tmp_path / "script.json")
+
+
 class Asked:
     """Counts the questions, and fails while ``error`` is set."""
 
@@ -161,6 +171,7 @@ def test_a_failure_is_logged_once_and_tried_again_after_a_minute(entry: Path, ca
     "text",
     [
         r'{"label": "\u001b[31mred"}',
+        r'{"summary": "two\nlines"}',
         r'{"configs": [{"key": "a\nb"}]}',
         r'{"configs": [{"key": "a", "label": "\u202e"}]}',
         r'{"configs": [{"key": "a", "arg": "--a\u0000"}]}',

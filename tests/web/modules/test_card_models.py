@@ -201,7 +201,8 @@ SOUNDS: Rows = {
 # -- forms of scripts
 
 forms = Script(
-    {"ui/cards/form-model.js": "filled, hint, lastScript, remember, remembered, scripts, whyNotSent"}, _STORED
+    {"ui/cards/form-model.js": "filled, hint, lastScript, moreWords, remember, remembered, scripts, whyNotSent"},
+    _STORED,
 )
 
 
@@ -323,10 +324,11 @@ def test_a_robot_may_list_anything() -> None:
 
 
 HINTS = [
-    (entry("a", "int", min=1, max=9, default=3), "a whole number, 1 to 9, default 3"),
-    (entry("a", "float", min=0.5), "at least 0.5"),
-    (entry("a", "float", max=2, default=1.5), "at most 2, default 1.5"),
-    (entry("a", "bool", default=False), "default off"),
+    (entry("a", "int", min=1, max=9, default=3), "A whole number from 1 to 9"),
+    (entry("a", "float", min=0.5), "A number, at least 0.5"),
+    (entry("a", "float", max=2, default=1.5), "A number, at most 2"),
+    (entry("a", "int"), "A whole number"),
+    (entry("a", "bool", default=False), ""),
     (entry("a"), ""),
 ]
 LISTED = {"files": [{"file": "x", "configs": [one | {"key": f"k{n}"} for n, (one, _) in enumerate(HINTS)]}]}
@@ -343,6 +345,18 @@ FORMS: Rows = {
         f"result = scripts({json.dumps(LISTED)})[0].fields.map(hint);", [expected for _, expected in HINTS]),
     **{f"the scripts of {payload}": (f"result = scripts({payload})?.map((one) => one.label);", labels)
         for payload, labels in LABELS.items()},
+    "three settings come first, those that a script names, and what must be filled in": ("""
+        const configs = ["a", "b", "c", "d"].map((key) => ({ key }));
+        configs.push({ key: "e", required: true });
+        result = [undefined, ["c", "b"], ["gone"], 7, ["e", "d", "c", "b"]].map((main) => {
+          const [one] = scripts({ files: [{ file: "x", configs, main }] });
+          return [one.main, one.more].map((fields) => fields.map(({ key }) => key).join("")).join(" ");
+        });""", ["abce d", "cbe ad", "abce d", "abce d", "edc ab"]),
+    "what else there is": ("""
+        const [{ more }] = scripts({ files: [{ file: "x", configs: ["a", "b", "c", "d"].map((key) => ({ key })) }] });
+        const words = (fields, texts) => moreWords(fields, new Map(texts));
+        result = [words(more, []), words([...more, ...more], []), words(more, [["d", "1"]])];
+        """, ["1 more, at its default", "2 more, all at their defaults", "1 more, 1 changed"]),
     "a form with mistakes is not sent": ("""
         const reasons = (mistakes, config = {}) => whyNotSent({ config, mistakes: new Map(mistakes) });
         const long = Object.fromEntries([...Array(64).keys()].map((n) => [`k${n}`, "x".repeat(256)]));

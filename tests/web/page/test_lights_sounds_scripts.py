@@ -29,8 +29,9 @@ CONFIGS = [
     setting("family", "Family", "enum", "25H9", options=["25H9", "36H11"]),
     setting("name", "Name", "string", "tag"),
 ]
+SUMMARY = "Drives towards a printed tag."
 SCRIPTS = [
-    {"file": "april-follow", "label": "Follow a tag", "configs": CONFIGS},
+    {"file": "april-follow", "label": "Follow a tag", "summary": SUMMARY, "main": ["search"], "configs": CONFIGS},
     {"file": "circle", "label": "Drive in a circle", "configs": []},
 ]
 IDLE: dict[str, Any] = {"running": False, "timestamp": 1.0, "dependencies": []}
@@ -73,7 +74,7 @@ def opened(_tab: Tab, robot: Robot) -> Iterator[Tab]:
     robot.show("soundboard-status", QUIET)
     robot.show("autonomy-files", {"files": SCRIPTS, "controls": True, "timestamp": 1.0})
     robot.show("autonomy-status", IDLE)
-    assert _tab.until(lambda: _tab.test("clip").count() > 0 and _tab.test("script").count() == 1)
+    assert _tab.until(lambda: _tab.test("clip").count() > 0 and _tab.test("scripts").count() == 1)
     assert _tab.until(lambda: _tab.test("lights-solid").is_enabled())
     robot.received.clear()
     before = len(_tab.complaints())
@@ -179,20 +180,55 @@ def test_hundreds_of_clips_are_filtered_and_one_is_played(opened: Tab, robot: Ro
 # -- scripts
 
 
+def show_script(opened: Tab, file: str) -> None:
+    """Open the form of this script."""
+    row = opened.test(f"script-{file}")
+    if row.get_attribute("aria-expanded") == "false":
+        row.click()
+    opened.page.locator(f'[data-test="script-{file}"][aria-expanded="true"]').wait_for()
+
+
+def show_more(opened: Tab) -> None:
+    opened.page.evaluate("document.querySelector('.script-more').open = true")
+
+
+def test_a_form_shows_what_matters_first_and_its_defaults(opened: Tab, robot: Robot) -> None:
+    show_script(opened, "april-follow")
+    assert SUMMARY in text(opened, "script-april-follow")
+    first = opened.page.locator(".scripts > li > .ask-form [data-test^=set-]")
+    names = [one.get_attribute("data-test") for one in first.all()]
+    assert names == ["set-search", "set-tag_id"]  # what the script names, and what has no default
+    assert text(opened, "more-settings") == "3 more, all at their defaults"
+    show_more(opened)
+    name = opened.test("set-name")
+    assert name.input_value() == "tag"
+    name.fill("other")
+    assert opened.until(lambda: text(opened, "more-settings") == "3 more, 1 changed", 2)
+    name.fill("")
+    assert name.input_value() == ""
+    name.blur()  # its default is there again
+    assert opened.until(lambda: name.input_value() == "tag", 2)
+    assert text(opened, "more-settings") == "3 more, all at their defaults"
+
+
 def test_a_form_is_sent_when_it_has_no_mistakes(opened: Tab, robot: Robot) -> None:
-    opened.test("script").select_option("Follow a tag")
+    show_script(opened, "april-follow")
     start = opened.test("start-script")
     assert why(start) == "The form has 1 mistake"
-    assert "required" in text(opened, "why-tag_id")
-    opened.test("set-distance").press_sequentially("-")
+    assert text(opened, "why-tag_id") == "Required. A whole number from 0 to 34"
+    show_more(opened)
+    distance = opened.test("set-distance")
+    assert distance.input_value() == "0.6"
+    distance.press("Control+A")
+    distance.press_sequentially("-")
     assert opened.until(lambda: why(start) == "The form has 2 mistakes", 2)
-    opened.test("set-distance").press_sequentially("5")
-    assert opened.until(lambda: "at least 0.2" in text(opened, "why-distance"), 2)
-    assert opened.test("set-distance").input_value() == "-5"
+    distance.press_sequentially("5")
+    assert opened.until(lambda: text(opened, "why-distance") == "At least 0.2. A number from 0.2 to 3", 2)
+    assert distance.input_value() == "-5"
     opened.test("restore-distance").click()
-    assert opened.test("set-distance").input_value() == ""
+    assert distance.input_value() == "0.6"
     opened.test("set-tag_id").fill("35")
-    assert opened.until(lambda: "at most 34" in text(opened, "why-tag_id"), 2)
+    assert opened.until(lambda: "At most 34." in text(opened, "why-tag_id"), 2)
     opened.test("set-tag_id").fill("7")
     assert opened.until(start.is_enabled, 2)
     opened.test("set-distance").fill("0.8")
@@ -211,11 +247,11 @@ def test_a_form_is_sent_when_it_has_no_mistakes(opened: Tab, robot: Robot) -> No
 
 
 def test_a_form_is_remembered_for_its_robot_and_script(opened: Tab, robot: Robot, served: Served) -> None:
-    opened.test("script").select_option("Follow a tag")
+    show_script(opened, "april-follow")
     opened.test("set-tag_id").fill("9")
-    opened.test("script").select_option("Drive in a circle")
+    show_script(opened, "circle")
     assert opened.until(lambda: opened.test("set-tag_id").count() == 0, 2)
-    opened.test("script").select_option("Follow a tag")
+    show_script(opened, "april-follow")
     assert opened.test("set-tag_id").input_value() == "9"
     opened.test("restore-all").click()
     assert opened.test("set-tag_id").input_value() == ""
@@ -283,7 +319,7 @@ def test_a_person_has_to_stop_the_script_and_to_press_again(driver: Tab, robot: 
 
 
 def test_no_script_starts_while_a_person_drives(driver: Tab, robot: Robot) -> None:
-    driver.test("script").select_option("Drive in a circle")
+    show_script(driver, "circle")
     driver.page.evaluate("document.activeElement.blur()")
     assert driver.until(driver.test("start-script").is_enabled, 2)
     driver.page.keyboard.down("KeyW")

@@ -123,7 +123,8 @@ def _at_card(name: str) -> Act:
 
 def _mistaken(page: Page) -> None:
     """Fill a form in, with two mistakes."""
-    page.locator('[data-test="script"]').select_option("apriltag-follow")
+    page.locator('[data-test="script-apriltag-follow"]').click()
+    page.locator('[data-test="more-settings"]').click()
     page.locator('[data-test="set-distance_m"]').fill("9")
     page.locator('[data-test="set-search"]').uncheck()
 

@@ -46,6 +46,11 @@ def shown(opened: Tab, at: int, within: float = 15.0) -> bool:
     return opened.until(lambda: opened.page.evaluate(_DRAWN, at), within)
 
 
+def shown_any(opened: Tab, at: int) -> bool:
+    """Whether the picture that was received at this time is drawn, however it came to be."""
+    return opened.until(f"pebble.replay.drawnAt?.receivedMs === {at}", 15)
+
+
 def position(opened: Tab) -> float:
     return float(opened.page.evaluate("pebble.replay.player.position"))
 
@@ -61,6 +66,9 @@ def stored(opened: Tab, metric: str) -> Any:
 def test_the_way_to_a_day_and_a_robot(show: Show) -> None:
     with show(replace(STATES["recordings"], path="/")) as opened:
         opened.page.get_by_role("link", name="Recordings").click()
+        assert opened.until("window.pebble?.replay?.drawnAt", 30)  # a picture is there at once
+        assert GAP[1] <= position(opened) < GAP[1] + 10_000  # the first one of the newest session
+        opened.page.get_by_role("link", name="All days").click()
         day = opened.test(f"day-{DAY}")
         day.wait_for()
         assert "10:00 to 10:06" in day.inner_text()
@@ -126,6 +134,26 @@ def test_playing_and_its_keys(replay: Tab):
     assert replay.until(lambda: END - 10_000 <= position(replay) <= END + 10_000)
     keys.press("Home")
     assert replay.until(lambda: START - 10_000 <= position(replay) <= START)
+
+
+def test_one_picture_on_and_back(replay: Tab):
+    for key, at in ((".", AT + 100), (".", AT + 200), (",", AT + 100), (".", AT + 200)):
+        replay.page.keyboard.press(key)
+        assert shown_any(replay, at), key
+    replay.test("picture-back").click()
+    assert shown_any(replay, AT + 100)
+
+
+def test_the_month_shows_what_was_recorded_and_how_long_it_was_driven(replay: Tab):
+    month = replay.test("month")
+    month.locator("button").first.wait_for()
+    names = [one.get_attribute("aria-label") for one in month.locator("button").all()]
+    assert names[0] == "Saturday, 21 November 2026, not driven"
+    assert names[1].startswith("Sunday, 22 November 2026, driven for ")
+    assert month.locator("[aria-current]").inner_text() == "22"
+    assert month.locator("button i").last.bounding_box()["width"] > 5
+    replay.test("day-2026-11-21").click()
+    assert replay.until("pebble.replay.day === '2026-11-21' && !pebble.replay.player.seeking", 30)
 
 
 def test_a_key_in_a_list_is_not_the_replays(replay: Tab):

@@ -16,7 +16,8 @@ export class RefusedError extends Error {}
  * @typedef {{since: number, until: number, why?: string}} Stretch
  * @typedef {{from: number, step: number, activity: number[], video: number[], audio: number[], rest: number[],
  *   gaps: Stretch[], outages: Stretch[], sessions: Stretch[]}} Timeline
- * @typedef {{day: string, robots: string[], bytes: number, first: number, last: number, gaps: number, unread: string[]}} Day
+ * @typedef {{day: string, robots: string[], bytes: number, first: number, last: number, gaps: number, unread: string[],
+ *   driven?: Record<string, number>}} Day ``driven``: seconds by robot
  * @typedef {{state: "running" | "ready" | "failed", done: number, why: string, name: string, bytes: number}} ExportState
  */
 

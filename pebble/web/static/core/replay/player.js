@@ -1,7 +1,7 @@
 /** Plays recorded messages: loads a little ahead, keeps the time, seeks, and leaves gaps out. No DOM. */
 
 import { RefusedError } from "./archive.js";
-import { CHAIN, SOUND, STATE } from "./frames.js";
+import { CHAIN, INCOMING, PICTURE, SOUND, STATE } from "./frames.js";
 
 export const SPEEDS = [0.25, 0.5, 1, 2, 4, 8];
 
@@ -69,6 +69,21 @@ export class Player {
     if (this.ended) this.ended = this.complete = false; // more may have been recorded meanwhile
     if (this.refused && this.problem) this.refused = false;
     this.tickedAt = this.clock();
+    this.changed();
+  }
+
+  /** The next picture that is loaded, after where it is; undefined: none is. @returns {Frame | undefined} */
+  get nextPicture() {
+    return this.frames.find(({ at, flags }) => at > this.position && flags & PICTURE && !(flags & INCOMING));
+  }
+
+  /** Paused, and a little later, with all that happened meanwhile. @param {number} ms epoch, of what is loaded */
+  go(ms) {
+    this.pause();
+    this.ended = false;
+    this.position = Math.max(this.position, Math.min(ms, this.loadedTo));
+    this.jumps = this.jumps.filter(({ to }) => to > this.position);
+    this.handOver();
     this.changed();
   }
 

@@ -140,5 +140,18 @@ export function stretchOf(marked, end, sessions, ms) {
   return { since, until };
 }
 
+const PICTURE_BIT = 64;
+
+/**
+ * Where the first picture of a session is; its begin if it has none.
+ * @param {import("./archive.js").Timeline} timeline @param {{since: number, until: number}} session
+ */
+export function firstPictureOf({ from, step, activity }, { since, until }) {
+  const first = Math.max(0, Math.floor((since - from) / step));
+  const last = Math.min(activity.length, Math.ceil((until - from) / step));
+  for (let index = first; index < last; index++) if (activity[index] & PICTURE_BIT) return Math.max(since, from + index * step);
+  return since;
+}
+
 /** What was said of a stretch without messages. @param {{since: number, until: number, why?: string}[]} gaps @param {{since: number, until: number}} skipped */
 export const whyOf = (gaps, { since, until }) => gaps.find((gap) => gap.since < until && gap.until > since)?.why ?? "";

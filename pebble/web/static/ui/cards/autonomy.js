@@ -2,9 +2,10 @@
 
 import { useAnswer } from "../parts/asking.js";
 import { Since, handDriven, statusOf, whyNotStarted } from "./autonomy-model.js";
-import { filled, lastScript, remember, remembered, scripts, whyNotSent } from "./form-model.js";
+import { filled, lastScript, moreWords, remember, remembered, scripts, whyNotSent } from "./form-model.js";
 import { Form } from "./form.js";
 import { html, useMetric, useOnline, useState, useTick, useValue } from "../parts/hooks.js";
+import { Nothing } from "../parts/nothing.js";
 import { Icon, Why } from "../parts/parts.js";
 import { useReasons, whyNotEnd } from "../parts/why-not.js";
 import { plain } from "../parts/more-words.js";
@@ -25,24 +26,38 @@ export function Autonomy({ at }) {
   const find = (file) => listed?.find((one) => one.file === file);
   const script = find(chosen);
   const parts = { at, page, entry, status };
+  const open = (file) => choose(file === chosen ? "" : file);
   return html`<div class="autonomy">
     <${Running} ...${parts} script=${find(status.file)} />
-    ${!listed && html`<p class="dim">No list of scripts was received yet: is autonomy_manager enabled in its config?</p>`}
-    ${listed?.length === 0 && html`<p class="dim">${nameOf(at)} has no scripts: put a folder with a run.py into its autonomy folder.</p>`}
+    ${!listed &&
+    html`<${Nothing} icon="script" what="No list of scripts yet">Is autonomy_manager enabled in its config?<//>`}
+    ${listed?.length === 0 &&
+    html`<${Nothing} icon="script" what=${`${nameOf(at)} has no scripts`}
+      >Put a folder with a run.py into its autonomy folder<//
+    >`}
     ${Boolean(listed?.length) &&
-    html`<label class="field wide">
-        <span>script</span>
-        <select
-          data-test="script"
-          value=${script ? chosen : ""}
-          onChange=${(event) => choose(event.currentTarget.value)}
-        >
-          <option value="">choose…</option>
-          ${listed.map(({ file, label }) => html`<option key=${file} value=${file}>${plain(label)}</option>`)}
-        </select>
-      </label>
-      <${Starter} key=${`${chosen} ${Boolean(script)}`} ...${parts} script=${script} />`}
+    html`<ul class="scripts" data-test="scripts">
+      ${listed.map((one) => html`<${Row} key=${one.file} ...${parts} script=${one} isOpen=${one === script} onOpen=${open} />`)}
+    </ul>`}
   </div>`;
+}
+
+/** One script; its form is below it while it is open. */
+function Row({ script, isOpen, onOpen, ...parts }) {
+  const { file, label, summary } = script;
+  return html`<li class=${isOpen ? "open" : ""}>
+    <button
+      type="button"
+      class="quiet script-row"
+      data-test=${`script-${file}`}
+      aria-expanded=${isOpen}
+      onClick=${() => onOpen(file)}
+    >
+      <span><b>${plain(label)}</b>${summary && html`<small>${plain(summary)}</small>`}</span>
+      <${Icon} name=${isOpen ? "up" : "down"} />
+    </button>
+    ${isOpen && html`<${Starter} ...${parts} script=${script} />`}
+  </li>`;
 }
 
 /** What runs, and the end of it. */
@@ -60,7 +75,8 @@ function Running({ at, page, entry, status, script }) {
               ${" "}${since(seen)}`
           : html`<span class="dim">No script runs.</span>`}
       </p>
-      <button
+      ${(status.running || !entry) &&
+      html`<button
         type="button"
         data-test="end-script"
         disabled=${Boolean(why)}
@@ -68,9 +84,9 @@ function Running({ at, page, entry, status, script }) {
         onClick=${() => page.commands.stopScript(at)}
       >
         <${Icon} name="halt" />Stop script
-      </button>
+      </button>`}
     </div>
-    ${why && html`<${Why} id="why-end-script">${why}<//>`}
+    ${why && (status.running || !entry) && html`<${Why} id="why-end-script">${why}<//>`}
     ${status.error && html`<p class="bad" data-test="script-error">✖ ${plain(status.error)}</p>`}
     ${status.dependencies.length > 0 &&
     html`<ul class="dependencies" aria-label="Scripts that it needs">
@@ -98,13 +114,15 @@ const since = ({ at, isExact }) => `since ${clockTime(at)}${isExact ? "" : " or 
 
 /** The form of one script, and its start. */
 function Starter({ at, page, entry, status, script }) {
-  const [{ texts, version }, set] = useState(() => ({ texts: remembered(at, script?.file ?? ""), version: 0 }));
-  const form = filled(script?.fields ?? [], texts);
-  const why = whyNotStarted(page, at) || (script ? whyNotSent(form) : "Choose a script first");
+  const [{ texts, version }, set] = useState(() => ({ texts: remembered(at, script.file), version: 0 }));
+  const [opened, setOpened] = useState(false);
+  const { main, more } = script;
+  const form = filled(script.fields, texts);
+  const why = whyNotStarted(page, at) || whyNotSent(form);
   const { by, waits } = handDriven(page, at);
-  const note = by && waits ? `${by} driving: the script will wait` : "";
+  const note = by && waits ? `${by} driving: the script will wait` : meaning(at, waits);
   const restore = (event) => {
-    event.currentTarget.closest(".card-body").querySelector("select").focus(); // the button vanishes
+    event.currentTarget.closest("li").querySelector("button").focus(); // the button vanishes
     change(new Map(), version + 1);
   };
   const change = (next, drawn = version) => {
@@ -113,38 +131,41 @@ function Starter({ at, page, entry, status, script }) {
   };
   const onText = (key, text) => {
     const others = [...texts].filter(([one]) => one !== key);
-    change(new Map(text ? [...others, [key, text]] : others));
+    change(new Map(text === null ? others : [...others, [key, text]]));
   };
-  return html`${script &&
-    html`<${Form}
-      key=${version}
-      id="script-set"
-      fields=${script.fields}
-      texts=${texts}
-      mistakes=${form.mistakes}
-      onText=${onText}
-    />`}
-    ${script?.omitted > 0 && html`<p class="dim">… ${script.omitted} more settings cannot be shown.</p>`}
-    <div class="ask-row">
+  const shared = { texts, mistakes: form.mistakes, onText };
+  const wrong = more.some(({ key }) => form.mistakes.has(key));
+  return html`<${Form} key=${`main ${version}`} id="script-set" fields=${main} ...${shared} />
+    ${more.length > 0 &&
+    html`<details class="script-more" open=${opened || wrong} onToggle=${(event) => setOpened(event.currentTarget.open)}>
+      <summary data-test="more-settings">${moreWords(more, texts)}</summary>
+      <div class="script-more-fields" tabindex="0" role="group" aria-label="More settings">
+        <${Form} key=${`more ${version}`} id="script-more" fields=${more} ...${shared} />
+        ${script.omitted > 0 && html`<p class="dim">… ${script.omitted} more settings cannot be shown.</p>`}
+      </div>
+    </details>`}
+    <div class="script-start">
       <${StartButton}
         at=${at}
         page=${page}
         entry=${entry}
         why=${why}
-        note=${note}
         config=${form.config}
-        file=${script?.file}
+        file=${script.file}
         >${startWords(status, script)}<//
       >
       ${texts.size > 0 &&
       html`<button type="button" data-test="restore-all" onClick=${restore}>
         All defaults
       </button>`}
-    </div>
-    ${(why || note) && html`<${Why} id="why-start">${why || note}<//>`}`;
+      <${Why} id="why-start">${why || note}<//>
+    </div>`;
 }
 
-function StartButton({ at, page, entry, why, note, config, file, children }) {
+/** What a start means. */
+const meaning = (at, waits) => `${nameOf(at)} may move by itself${waits ? ". Drive by hand to interrupt it" : ""}`;
+
+function StartButton({ at, page, entry, why, config, file, children }) {
   const [asked, setAsked] = useState(/** @type {{at: number, of: number | undefined, n: number} | null} */ (null));
   const answer = useAnswer(asked?.n);
   const isAsked = asked !== null && Date.now() - asked.at < ASKED_MS && entry?.receivedAt === asked.of;
@@ -159,7 +180,7 @@ function StartButton({ at, page, entry, why, note, config, file, children }) {
       class=${why ? "" : "primary"}
       data-test="start-script"
       disabled=${Boolean(why)}
-      aria-describedby=${why || note ? "why-start" : undefined}
+      aria-describedby="why-start"
       onClick=${start}
     >
       <${Icon} name="play" />${children}
@@ -177,5 +198,5 @@ function startedWords({ op, why }, name) {
 
 function startWords({ running, file }, script) {
   if (!running) return "Start";
-  return file === script?.file ? "Start again" : `Start instead of ${file.slice(0, 40)}`;
+  return file === script.file ? "Start again" : `Start instead of ${file.slice(0, 40)}`;
 }

@@ -7,6 +7,7 @@ import { inner, isObject } from "../parts/words.js";
 const MOST_SCRIPTS = 256; // of one robot; robots list no more
 const MOST_FIELDS = 64; // of one script; robots list no more
 const MOST_OPTIONS = 200; // of one setting
+const MOST_MAIN = 3; // settings of a script before the others
 const LONGEST_TEXT = 256; // characters; robots accept no more
 const LONGEST_KEY = 100;
 const LONGEST_CONFIG = 14_000; // characters of JSON: the server reads messages of 16 KB
@@ -24,7 +25,10 @@ const NOT_PRINTABLE = /\p{C}|(?! )\p{Z}/u;
 /** The text of a number that is none yet, as a lone sign: browsers do not report it. */
 export const UNREADABLE = "?";
 
-/** @typedef {{file: string, label: string, fields: Field[], omitted: number}} Script */
+/**
+ * ``summary`` says what it does; ``main`` are the fields that come first, ``more`` the others.
+ * @typedef {{file: string, label: string, summary: string, fields: Field[], main: Field[], more: Field[], omitted: number}} Script
+ */
 
 /** @param {unknown} payload of autonomy-files @returns {Script[] | null} null: none was received */
 export function scripts(payload) {
@@ -40,10 +44,21 @@ export function scripts(payload) {
     return {
       file: one.file,
       label: isShared ? `${label} (${one.file})` : label,
+      summary: isName(one.summary, LONGEST_TEXT) ? one.summary : "",
       fields: found,
+      ...divided(found, one.main),
       omitted: configs.length - found.length,
     };
   });
+}
+
+/** The fields that come first, and the others. @param {Field[]} fields @param {unknown} named by the script */
+function divided(fields, named) {
+  const keys = Array.isArray(named) ? named.slice(0, MOST_MAIN) : [];
+  const chosen = keys.map((key) => fields.find((one) => one.key === key)).filter(Boolean);
+  const main = [...new Set(chosen.length ? chosen : fields.slice(0, MOST_MAIN))];
+  main.push(...fields.filter((one) => one.required && one.default === null && !main.includes(one)));
+  return { main, more: fields.filter((one) => !main.includes(one)) };
 }
 
 const isName = (value, longest) => typeof value === "string" && value.trim() !== "" && value.length <= longest;
@@ -135,12 +150,20 @@ export function whyNotSent({ config, mistakes }) {
   return JSON.stringify(config).length > LONGEST_CONFIG ? "The settings are too long together" : "";
 }
 
-/** @param {Field} field @returns {string} what it accepts, and its default */
-export function hint({ type, min, max, default: usual }) {
-  const both = min !== null && max !== null;
-  const limits = both ? [`${min} to ${max}`] : [min !== null && `at least ${min}`, max !== null && `at most ${max}`];
-  const words = [type === "int" && "a whole number", ...limits, usual && `default ${option(type, usual)}`];
-  return words.filter(Boolean).join(", ");
+/** @param {Field} field @returns {string} what it accepts, for one that holds something else; "" anything */
+export function hint({ type, min, max }) {
+  if (type !== "int" && type !== "float") return "";
+  const noun = type === "int" ? "A whole number" : "A number";
+  if (min !== null && max !== null) return `${noun} from ${min} to ${max}`;
+  if (min !== null) return `${noun}, at least ${min}`;
+  return max === null ? noun : `${noun}, at most ${max}`;
+}
+
+/** @param {Field[]} fields @param {Texts} texts @returns {string} how many more there are, and how many were changed */
+export function moreWords(fields, texts) {
+  const changed = fields.filter(({ key }) => texts.has(key)).length;
+  const usual = fields.length === 1 ? "at its default" : "all at their defaults";
+  return `${fields.length} more, ${changed ? `${changed} changed` : usual}`;
 }
 
 /** @param {Field["type"]} type @param {string} value @returns {string} as people read it */

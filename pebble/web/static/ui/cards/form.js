@@ -5,8 +5,9 @@ import { UNREADABLE, hint, option } from "./form-model.js";
 import { plain } from "../parts/more-words.js";
 
 /**
+ * ``onText``: what was typed, of which "" is nothing yet; null restores the default.
  * @param {{id: string, fields: import("./form-model.js").Field[], texts: import("./form-model.js").Texts,
- *   mistakes: Map<string, string>, onText: (key: string, text: string) => void}} props "" restores the default
+ *   mistakes: Map<string, string>, onText: (key: string, text: string | null) => void}} props
  */
 export const Form = ({ id, fields, texts, mistakes, onText }) => html`<div class="ask-form">
   ${fields.map(
@@ -26,9 +27,9 @@ function FormField({ id, field, text, wrong, onText }) {
   const restore = (event) => {
     const input = document.getElementById(id);
     // one for numbers may show what it does not report
-    if (input instanceof HTMLInputElement && input.type === "number") input.value = "";
+    if (input instanceof HTMLInputElement && input.type === "number") input.value = field.default;
     if (event.detail === 0) input?.focus(); // by a key: this button is about to go
-    onText("");
+    onText(null);
   };
   return html`<div class=${`ask-field ${wrong ? "wrong" : ""}`}>
     <label for=${id}>${plain(field.label)}${field.required && field.default === null && html` <span class="required">(required)</span>`}</label>
@@ -46,10 +47,12 @@ function FormField({ id, field, text, wrong, onText }) {
       </button>`}
     </div>
     <span class="why" id=${`${id}-why`} data-test=${`why-${field.key}`}
-      >${wrong && html`<b class="bad">✖ ${wrong}.</b> `}${hint(field)}</span
+      >${wrong && html`<b class="bad">${wrongWords(wrong, hint(field))}</b>`}</span
     >
   </div>`;
 }
+
+const wrongWords = (wrong, accepted) => `${wrong.charAt(0).toUpperCase()}${wrong.slice(1)}${accepted && `. ${accepted}`}`;
 
 /** What all kinds of inputs have in common. */
 const common = ({ id, field, wrong }) => ({
@@ -60,16 +63,25 @@ const common = ({ id, field, wrong }) => ({
   "aria-required": field.required && field.default === null ? "true" : undefined,
 });
 
+/** An input that was emptied stays so until it is left: then its default is there again. */
+const typing = (field, onText) => ({
+  onInput: (event) => {
+    const { value, validity } = event.currentTarget;
+    const text = validity.badInput ? UNREADABLE : value;
+    onText(text === field.default || (text === "" && field.default === null) ? null : text);
+  },
+  onBlur: (event) => event.currentTarget.value === "" && !event.currentTarget.validity.badInput && onText(null),
+});
+
 /** @param {any} props */
-function TextInput({ text = "", onText, ...props }) {
+function TextInput({ text, onText, ...props }) {
   return html`<input
     type="text"
     ...${common(props)}
     autocomplete="off"
     spellcheck="false"
-    placeholder=${props.field.default ?? ""}
-    value=${text}
-    onInput=${(event) => onText(event.currentTarget.value)}
+    value=${text ?? props.field.default ?? ""}
+    ...${typing(props.field, onText)}
   />`;
 }
 
@@ -77,9 +89,8 @@ function TextInput({ text = "", onText, ...props }) {
  * While its text is no number yet, as a lone sign, browsers report it as empty: it must stay as it was typed.
  * @param {any} props
  */
-function NumberInput({ text = "", onText, ...props }) {
+function NumberInput({ text, onText, ...props }) {
   const { min, max, step, type, default: usual } = props.field;
-  const input = (event) => onText(event.currentTarget.validity.badInput ? UNREADABLE : event.currentTarget.value);
   return html`<input
     type="number"
     ...${common(props)}
@@ -87,9 +98,8 @@ function NumberInput({ text = "", onText, ...props }) {
     min=${min ?? undefined}
     max=${max ?? undefined}
     step=${step ?? (type === "int" ? 1 : "any")}
-    placeholder=${usual ?? ""}
-    value=${text === UNREADABLE ? undefined : text}
-    onInput=${input}
+    value=${text === UNREADABLE ? undefined : (text ?? usual ?? "")}
+    ...${typing(props.field, onText)}
   />`;
 }
 
@@ -99,7 +109,7 @@ function Switch({ text, onText, ...props }) {
   const on = (text ?? usual) === "true";
   const change = (event) => {
     const value = String(event.currentTarget.checked);
-    onText(value === usual ? "" : value);
+    onText(value === usual ? null : value);
   };
   return html`<label class="check">
     <input type="checkbox" role="switch" ...${common(props)} checked=${on} onChange=${change} />
@@ -112,7 +122,7 @@ function Choice({ text, onText, ...props }) {
   const { options, default: usual, required, type } = props.field;
   const listed = usual !== null && options.includes(usual);
   const none = usual !== null ? `default (${plain(usual)})` : required ? "choose…" : "not set";
-  const change = (event) => onText(event.currentTarget.value === usual ? "" : event.currentTarget.value);
+  const change = (event) => onText(["", usual].includes(event.currentTarget.value) ? null : event.currentTarget.value);
   return html`<select ...${common(props)} value=${text ?? (listed ? usual : "")} onChange=${change}>
     ${!listed && html`<option value="">${none}</option>`}
     ${options.map((one) => html`<option key=${one} value=${one}>${option(type, one)}</option>`)}

@@ -4,6 +4,7 @@ import * as browser from "../../core/browser.js";
 import * as more from "../../core/browser-more.js";
 import { differs, pieces, poseOf, poseWords } from "../../core/trail.js";
 import { html, useEffect, useMetrics, useOnline, usePage, useRef, useState, useTick } from "../parts/hooks.js";
+import { Nothing } from "../parts/nothing.js";
 import { Gone, Icon, isGone } from "../parts/parts.js";
 import { recorderOf } from "../parts/recorder.js";
 
@@ -43,15 +44,19 @@ export function Odometry({ at, offers }) {
   if (view.current) view.current.gone = gone;
   const words = poseWords(series.newest);
   return html`<div class="map">
-    <canvas ref=${canvas} class="map-canvas" role="img" tabindex="0" data-arrows data-test="map"
+    ${!series.newest &&
+    html`<${Nothing} icon="map" what="No trail yet"
+      >${offers.section("autonomy").available ? html`Start <b>Wheel odometry</b> in Scripts, and drive` : "It begins with the first position that is received"}<//
+    >`}
+    <canvas ref=${canvas} class=${series.newest ? "map-canvas" : "map-canvas unused"} role="img" tabindex="0" data-arrows data-test="map"
       aria-label="Trail of the odometry; arrow keys move it"></canvas>
-    <p class="map-words" data-test="map-pose">
+    <p class="map-words" data-test="map-pose" hidden=${!series.newest}>
       ${gone && series.newest ? html`<${Gone} age=${age}>${words}<//>` : words}
     </p>
     ${source === "wheel-odometry" &&
     offers.section("telemetry").touch_sensors === false &&
     html`<p class="map-words" data-test="map-lacks"><${Icon} name="plug" /> ${NO_SAMPLES}</p>`}
-    <div class="map-tools">
+    <div class="map-tools" hidden=${!series.newest && sources.length < 2}>
       <button type="button" data-test="map-in" aria-label="Zoom in" onClick=${() => view.current?.zoom(1.5)}>+</button>
       <button type="button" data-test="map-out" aria-label="Zoom out" onClick=${() => view.current?.zoom(1 / 1.5)}>−</button>
       <button type="button" data-test="map-centre" onClick=${() => view.current?.follow()}>Centre</button>

@@ -1,8 +1,9 @@
 // Which day and which robot.
 
 import { Archive } from "../../core/replay/archive.js";
+import { ROOT } from "../../core/browser.js";
 import { html, useEffect, useModel, usePage, useState } from "../parts/hooks.js";
-import { Icon, RouteLink, Why } from "../parts/parts.js";
+import { Icon, RouteLink } from "../parts/parts.js";
 import { recordingsOf } from "../fleet/recordings-link.js";
 import { iconOf } from "../fleet/fleet.js";
 import { shortTime } from "../parts/more-words.js";
@@ -33,6 +34,8 @@ export function sizeWords(bytes) {
   return bytes < 1e9 ? `${(bytes / 1e6).toFixed(bytes < 1e7 ? 1 : 0)} MB` : `${(bytes / 1e9).toFixed(1)} GB`;
 }
 
+const monthWords = new Intl.DateTimeFormat("en-GB", { month: "long", year: "numeric", timeZone: "UTC" });
+
 /** @returns {{days: import("../../core/replay/archive.js").Day[] | null, problem: string, again: () => void}} */
 function useDays() {
   const [days, setDays] = useState(null);
@@ -49,22 +52,42 @@ function useDays() {
 
 const addressOf = (ref, day) => `${recordingsOf(ref)}?day=${day}`;
 
-/** All days with recordings, newest first. */
+const ALL_DAYS = `${ROOT}replay?days`;
+
+/** The newest recording, or all days, newest first, where the address asks for them or there is nothing to show. */
 export function Choose() {
+  const { route } = usePage();
   const { days, problem, again } = useDays();
+  const [newest] = days ?? [];
+  const shown = newest?.robots.length && !new URLSearchParams(location.search).has("days") ? newest : null;
+  useEffect(() => {
+    if (!shown) return;
+    history.replaceState(null, "", recordingsOf(mostDriven(shown)));
+    route.changed();
+  }, [shown]);
   return html`<div class="replay-choose">
     <h1>Recordings</h1>
     ${problem &&
     html`<p class="failed" role="alert">
       The recordings cannot be listed: ${problem} <button type="button" onClick=${again}>Try again</button>
     </p>`}
-    ${!days && !problem && html`<p class="dim" role="status">Looking for recordings…</p>`}
-    ${days && !days.length && html`<div class="empty"><${Icon} name="recordings" /><p>Nothing is recorded yet.</p></div>`}
+    ${(shown || (!days && !problem)) &&
+    html`<div class="loading bones" role="status"><span class="sr">Looking for recordings…</span><i></i><i></i><i></i></div>`}
+    ${days &&
+    !days.length &&
+    html`<div class="empty">
+      <${Icon} name="recordings" />
+      <p><b>Nothing is recorded yet</b></p>
+      <p>Run <code>pebble record</code> at this server's broker: what it writes appears here while it runs.</p>
+    </div>`}
     <ul class="replay-days">
-      ${(days ?? []).map((one) => html`<${Day} key=${one.day} one=${one} />`)}
+      ${(shown ? [] : (days ?? [])).map((one) => html`<${Day} key=${one.day} one=${one} />`)}
     </ul>
   </div>`;
 }
+
+/** @param {import("../../core/replay/archive.js").Day} day @returns {string} */
+const mostDriven = ({ robots, driven = {} }) => [...robots].sort((a, b) => (driven[b] ?? 0) - (driven[a] ?? 0))[0];
 
 function Day({ one: { day, robots, bytes, first, last, gaps, unread } }) {
   const facts = [`${shortTime(first)} to ${shortTime(last)}`, sizeWords(bytes), gaps ? `${gaps} ${gaps === 1 ? "gap" : "gaps"}` : ""];
@@ -86,13 +109,6 @@ function Day({ one: { day, robots, bytes, first, last, gaps, unread } }) {
   </li>`;
 }
 
-/** @param {number} count of days @param {number} index of the one that is open @returns {string} */
-function whyNoDay(count, index) {
-  if (count < 2) return "No other day of it is recorded";
-  if (index < 1) return "No earlier day of it is recorded";
-  return index === count - 1 ? "No later day of it is recorded" : "";
-}
-
 /** Another robot, or another day. */
 export function Elsewhere({ at, replay }) {
   const { route } = usePage();
@@ -101,47 +117,84 @@ export function Elsewhere({ at, replay }) {
   const { day } = replay;
   const known = days ?? [];
   const robots = [...new Set([at, ...(known.find((one) => one.day === day)?.robots ?? [])])].sort();
-  const own = [...new Set([day, ...known.filter((one) => one.robots.includes(at)).map((one) => one.day)])].filter(Boolean);
-  const index = own.sort().indexOf(day);
-  const why = whyNoDay(own.length, index);
+  const own = known.filter((one) => one.robots.includes(at));
   const open = (other) => {
-    history.replaceState(null, "", addressOf(at, other));
+    history.replaceState(null, "", addressOf(at, other.day));
     replay.player.pause(); // else its own day would be opened again
-    replay.openDay(other, () => replay.seek(replay.timeline.sessions[0]?.since ?? known.find((one) => one.day === other)?.first ?? NaN));
+    const first = () => replay.timeline.sessions[0]?.since ?? other.first;
+    replay.openDay(other.day, () => replay.seekPicture(first()));
   };
   return html`<div class="replay-elsewhere">
-    <label class="field"
-      ><span>Robot</span
-      ><select
-        data-test="replay-robot"
-        value=${at}
-        onChange=${(event) => route.open(`${recordingsOf(event.currentTarget.value)}?at=${Math.round(replay.player.position)}`)}
-      >
-        ${robots.map((ref) => html`<option key=${ref} value=${ref}>${nameOf(ref)}</option>`)}
-      </select></label
-    >
-    <div class="replay-day-choice">
+    <div class="replay-robot">
       <label class="field"
-        ><span>Day</span
-        ><select data-test="replay-day" value=${day} onChange=${(event) => open(event.currentTarget.value)}>
-          ${own.map((one) => html`<option key=${one} value=${one}>${one}</option>`)}
+        ><span>Robot</span
+        ><select
+          data-test="replay-robot"
+          value=${at}
+          onChange=${(event) => route.open(`${recordingsOf(event.currentTarget.value)}?at=${Math.round(replay.player.position)}`)}
+        >
+          ${robots.map((ref) => html`<option key=${ref} value=${ref}>${nameOf(ref)}</option>`)}
         </select></label
       >
-      ${[-1, 1].map((step) => {
-        const off = index < 0 || !own[index + step];
-        return html`<button
-          key=${step}
-          type="button"
-          class=${step > 0 ? "turned" : ""}
-          aria-label=${step > 0 ? "Day after" : "Day before"}
-          disabled=${off}
-          aria-describedby=${off ? "why-day" : undefined}
-          onClick=${() => open(own[index + step])}
-        >
-          <${Icon} name="back" />
-        </button>`;
-      })}
+      <${RouteLink} path=${ALL_DAYS} className="button" label="All days with recordings">All days<//>
     </div>
-    ${why && html`<${Why} id="why-day">${why}<//>`}
+    <${Calendar} key=${day.slice(0, 7)} at=${at} day=${day} days=${own} onOpen=${open} />
   </div>`;
+}
+
+const MOST_BAR = 18; // pixels
+
+/** A month, in which the recorded days can be opened; the bar below a day is how long it was driven. */
+function Calendar({ at, day, days, onOpen }) {
+  const [month, turn] = useState(day.slice(0, 7));
+  const months = [...new Set([...days.map((one) => one.day.slice(0, 7)), day.slice(0, 7)])].filter(Boolean).sort();
+  if (!month) return null;
+  const index = months.indexOf(month);
+  const driven = (one) => one.driven?.[at] ?? 0;
+  const inside = days.filter((one) => one.day.startsWith(month));
+  const most = Math.max(60, ...inside.map(driven));
+  const first = Date.parse(`${month}-01T00:00:00Z`);
+  const before = (new Date(first).getUTCDay() + 6) % 7; // weeks begin on Monday
+  const [year, number] = month.split("-").map(Number);
+  const count = new Date(Date.UTC(year, number, 0)).getUTCDate();
+  const cells = Array.from({ length: count }, (_, n) => `${month}-${String(n + 1).padStart(2, "0")}`);
+  const arrow = (step, name) => html`<button
+    type="button"
+    class=${`quiet ${step > 0 ? "turned" : ""}`}
+    aria-label=${name}
+    disabled=${!months[index + step]}
+    aria-describedby=${months[index + step] ? undefined : "why-month"}
+    onClick=${() => turn(months[index + step])}
+  >
+    <${Icon} name="back" />
+  </button>`;
+  const cell = (name) => {
+    const one = inside.find((known) => known.day === name);
+    if (!one) return html`<li key=${name}><span class="dim">${Number(name.slice(8))}</span></li>`;
+    const minutes = Math.round(driven(one) / 60);
+    const words = driven(one) ? `, driven for ${minutes < 1 ? "less than a minute" : `${minutes} min`}` : ", not driven";
+    return html`<li key=${name}>
+      <button
+        type="button"
+        data-test=${`day-${name}`}
+        aria-current=${name === day ? "date" : undefined}
+        aria-label=${`${longDay(name)}${words}`}
+        onClick=${() => onOpen(one)}
+      >
+        ${Number(name.slice(8))}<i style=${{ width: `${Math.round((MOST_BAR * driven(one)) / most)}px` }}></i>
+      </button>
+    </li>`;
+  };
+  return html`<section class="card month" aria-label="Days with recordings">
+    <div class="month-head">${arrow(-1, "Earlier month")}
+      <h2>${monthWords.format(first)}</h2>
+      ${arrow(1, "Later month")}
+    </div>
+    <ul class="month-days" data-test="month">
+      ${["M", "T", "W", "T", "F", "S", "S"].map((name, n) => html`<li key=${`w${n}`} class="dim" aria-hidden="true">${name}</li>`)}
+      ${Array.from({ length: before }, (_, n) => html`<li key=${`b${n}`} aria-hidden="true"></li>`)} ${cells.map(cell)}
+    </ul>
+    <p class="dim">The bar below a day is how long it was driven.</p>
+    <span class="sr" id="why-month">No other month on that side has recordings</span>
+  </section>`;
 }

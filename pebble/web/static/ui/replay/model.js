@@ -20,6 +20,7 @@ const TICK_MS = 20;
 const LIVENESS_MS = 500;
 const END_MS = 2000; // before the last message
 const ADDRESS_MS = 400; // browsers limit how often it may change
+const PICTURE_WITHIN_MS = 3000; // a picture that was asked for and is not loaded by then is not shown
 const text = new TextDecoder();
 
 /** The connection of a recording: always there, and nothing is sent by it. */
@@ -93,6 +94,7 @@ export class Replay extends Model {
     this.dayProblem = "";
     this.then = () => {}; // once the timeline is here
     this.start = () => {}; // choose a day
+    this.wantedAt = -Infinity; // when the next picture was asked for, by the page's clock; -Infinity: it was not
     this.dayAbort = new AbortController();
     this.connection = new Recorded(page.connection);
     /** What widgets get instead of the page's own services. */
@@ -130,6 +132,7 @@ export class Replay extends Model {
   /** @param {number} ms */
   seek(ms) {
     if (!Number.isFinite(ms) || this.closed) return;
+    this.wantedAt = -Infinity;
     this.openDay(dayOf(ms));
     this.player.seek(ms);
   }
@@ -137,6 +140,29 @@ export class Replay extends Model {
   /** @param {number} ms from where it is */
   step(ms) {
     this.seek(this.player.position + ms);
+  }
+
+  /** To where a picture is: to the first one from there on, if there is none of before. @param {number} ms */
+  seekPicture(ms) {
+    this.seek(ms);
+    this.wantedAt = performance.now();
+  }
+
+  /** One picture on or back. @param {1 | -1} way */
+  stepPicture(way) {
+    this.player.pause();
+    if (way > 0) {
+      this.wantedAt = performance.now();
+      this.goToPicture();
+    } else if (this.video.info) this.seek(this.video.info.receivedMs - 1);
+  }
+
+  /** The picture that was asked for, once it is loaded. */
+  goToPicture() {
+    if (this.wantedAt === -Infinity || this.player.seeking) return;
+    const next = this.player.nextPicture;
+    if (next) this.player.go(next.at);
+    if (next || performance.now() - this.wantedAt > PICTURE_WITHIN_MS) this.wantedAt = -Infinity;
   }
 
   /** @param {1 | -1} steps */
@@ -219,6 +245,7 @@ export class Replay extends Model {
 
   tick() {
     this.player.tick();
+    this.goToPicture();
     const { position, playing } = this.player;
     this.sound.run(playing && this.player.speed === 1 && !this.player.waiting);
     if (this.player.speed !== this.speed) {

@@ -93,6 +93,10 @@ function Bar({ at, replay, player }) {
         ${SPEEDS.map((speed) => html`<option key=${speed} value=${speed}>×${speed}</option>`)}
       </select></label
     >
+    <div class="replay-keys" role="group" aria-label="One picture">
+      <button type="button" data-test="picture-back" aria-label="One picture back" onClick=${() => replay.stepPicture(-1)}><${Icon} name="back" /><kbd>,</kbd></button>
+      <button type="button" data-test="picture-on" class="turned" aria-label="One picture on" onClick=${() => replay.stepPicture(1)}><${Icon} name="back" /><kbd>.</kbd></button>
+    </div>
     <output class="replay-time" data-test="time">${player.seeks ? stamp(player.position) : "–"} <small>${words}</small></output>
     <${Listen} sound=${replay.sound} player=${player} />
     <${StillTools} source=${at} />

@@ -1,6 +1,6 @@
 // Recordings: which day and robot, or one robot at one time, with the same cards as live.
 
-import { startOf } from "../../core/replay/timeline.js";
+import { firstPictureOf, startOf } from "../../core/replay/timeline.js";
 import { CARDS } from "../cards/cards.js";
 import {
   Boundary,
@@ -59,7 +59,8 @@ async function start(replay) {
   if (Number.isFinite(at)) return replay.seek(at);
   const asked = query.get("day") ?? "";
   const day = Number.isFinite(startOf(asked)) ? asked : await newestDay(replay);
-  if (day) replay.openDay(day, () => replay.player.seeks || replay.seek(firstOf(replay)));
+  const first = () => (asked ? firstOf(replay) : newestOf(replay));
+  if (day) replay.openDay(day, () => replay.player.seeks || replay.seekPicture(first()));
 }
 
 /** @param {Model} replay */
@@ -83,6 +84,12 @@ function firstOf({ timeline, day }) {
   if (timeline.sessions.length) return timeline.sessions[0].since;
   const index = timeline.activity.findIndex((bits) => bits !== 0);
   return index < 0 ? startOf(day) : timeline.from + index * timeline.step;
+}
+
+/** The first picture of the newest session of the day. @param {Model} replay */
+function newestOf(replay) {
+  const session = replay.timeline?.sessions.at(-1);
+  return session ? firstPictureOf(replay.timeline, session) : firstOf(replay);
 }
 
 const STEP_MS = 10_000;
@@ -113,6 +120,8 @@ function act(replay, key, step) {
   else if (key === "ArrowRight") replay.step(step);
   else if (key === "+" || key === "=") replay.faster(1);
   else if (key === "-") replay.faster(-1);
+  else if (key === ",") replay.stepPicture(-1);
+  else if (key === ".") replay.stepPicture(1);
   else if (key === "Home") replay.seek(firstOf(replay));
   else if (key === "End") replay.seek(replay.last);
   else return false;
