@@ -153,6 +153,8 @@ class AutonomyManager(Service):
     def drive(self, drive: Drive, _arrived: float) -> None:
         """On the transport's thread. A person's commands all mean the same here."""
         if not drive.signed:
+            if (gate := self._gate) is not None:
+                gate[1].override(self.addresses[DRIVE].topic, _HOLD_S)
             self.post(self._person_drives, newest_of="person")
             if not drive.moves and drive.valid_ms == 0:
                 self.post(self._person_stops, newest_of="person stops")
@@ -199,6 +201,8 @@ class AutonomyManager(Service):
             gate = Gate(self.config, self._publish_signed, run)
             gate.open()
             self._gate = (run, gate)
+            if (left := self._overridden_until - self.clock()) > 0:
+                gate.override(self.addresses[DRIVE].topic, left)
         return self._gate[1].config_path
 
     def end_run(self, run: int) -> None:

@@ -206,6 +206,19 @@ def test_wheels_stop_when_the_scripts_connection_ends(rig: Rig, driven: Subscrib
     assert driven.payloads[-1] == {"x": 0.0, "z": 0.0, "source": "autonomy", "run": 7}
 
 
+def test_nothing_of_a_script_is_published_while_a_person_drives(rig: Rig, driven: Subscriber) -> None:
+    rig.script("--control-rate-hz", "40")
+    assert until(lambda: driven.messages)
+    rig.gate.override(DRIVE, 0.5)
+    swallowed, passed = rig.gate.counters["overridden"], len(driven.messages)
+    assert until(lambda: rig.gate.counters["overridden"] > swallowed + 5, step=0.01)
+    assert len(driven.messages) <= passed + 1, "one may have been on its way"
+    assert until(lambda: len(driven.messages) > passed + 5), "it goes on afterwards"
+    rig.gate.override(f"{BASE}/incoming/arm/drive-values", 60)
+    before = len(driven.messages)
+    assert until(lambda: len(driven.messages) > before + 5), "a person at another motor owner is no reason"
+
+
 def test_a_script_receives_what_the_robot_publishes(rig: Rig, driven: Subscriber) -> None:
     corners = [[0.45, 0.4], [0.55, 0.4], [0.55, 0.533], [0.45, 0.533]]
     tag = {"marker_id": 13, "corners_norm": corners, "center_norm": [0.5, 0.4667]}
