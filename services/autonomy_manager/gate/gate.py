@@ -11,6 +11,7 @@ from pathlib import Path
 from pebble.config import Config
 from pebble.errors import PebbleError
 from pebble.runtime.connections import LOCAL_RECONNECT_S, mqtt_settings
+from pebble.services.autonomy_manager.gate.activity import Activity
 from pebble.services.autonomy_manager.gate.client_filter import ClientFilter, Login
 from pebble.services.autonomy_manager.gate.config_copy import ConfigCopy, broker_of
 from pebble.services.autonomy_manager.gate.drive_outlet import DriveOutlet
@@ -33,6 +34,7 @@ class Gate:
     def __init__(self, config: Config, publish: Callable[[str, bytes], object], run: int) -> None:
         """Raises PebbleError if the robot has no broker, or its config no file."""
         self.counters = Counters()  # signed, refused, stale, halted, overridden
+        self.activity = Activity()
         self._rules = TopicRules.of(config)
         self._broker = broker_of(config)
         self._copy = ConfigCopy(config)
@@ -97,6 +99,7 @@ class Gate:
             lambda: (self._broker.host, self._broker.port, credentials.context()),
             self._outlet,
             lambda: ClientFilter(self._rules, own, Login(user, _encoded(credentials.password()))),
+            self.activity,
         )
         thread = threading.Thread(target=server.serve, name="gate", daemon=True)
         thread.start()

@@ -232,6 +232,19 @@ def test_a_script_receives_what_the_robot_publishes(rig: Rig, driven: Subscriber
     assert until(follows, step=0.05)
 
 
+def test_what_passes_in_both_directions_is_noted(rig: Rig) -> None:
+    noted: list[bool] = []
+    rig.gate.activity.message = lambda: noted.append(True)  # type: ignore[method-assign]
+    client = rig.log_in()
+    client.sendall(subscribe(f"{BASE}/outgoing/touch-sensors") + PINGREQ)
+    assert read(client, len(SUBACK) + len(PINGRESP)) == SUBACK + PINGRESP
+    assert not noted, "a client that only pings is silent"
+    rig.transport.publish(f"{BASE}/outgoing/touch-sensors", b"{}")
+    assert until(lambda: len(noted) == 1)
+    client.sendall(publish(f"{BASE}/outgoing/notes", "{}") + publish(DRIVE, "{}"))
+    assert until(lambda: len(noted) >= 2), "its drive commands count as well"
+
+
 def test_a_flood_is_limited_and_no_zero_is_lost(rig: Rig, driven: Subscriber) -> None:
     client, zeros, began = rig.log_in(), 0, time.monotonic()
     for number in range(300):
