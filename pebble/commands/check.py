@@ -1,14 +1,17 @@
 """``pebble check``: all problems of a config at once, or a summary of it."""
 
+from __future__ import annotations
+
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
 from pebble.config import Config, Mqtt, load, resolved
 from pebble.config.secret_text import shown_user, without_secrets
+from pebble.config.visible import shown
 from pebble.config.web import is_loopback
 from pebble.contract import CHANNELS, MEDIA_STATUS, STATUS, TOUCH_SENSORS, Channel
 from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
@@ -17,6 +20,9 @@ from pebble.launcher.programs import programs
 from pebble.runtime.addresses import Addresses
 from pebble.runtime.connections import check_connections, tls_settings
 from pebble.runtime.process import view_of
+
+if TYPE_CHECKING:
+    from pebble.services.autonomy_manager.script import Script
 
 SCHEMA = "schema.json"  # in the folder of configs, so `configs/*.json` includes it
 _LAUNCHER = "launcher"
@@ -61,8 +67,39 @@ def _check(path: Path, *, as_json: bool, first: bool) -> bool:
         return True
     if not first:
         typer.echo()
-    _print(config, path)
-    return True
+    found = _found_scripts(config)
+    _print(config, path, found)
+    return _sizes_fit(found, path)
+
+
+def _found_scripts(config: Config) -> dict[str, Script]:
+    """The scripts that ``autonomy_manager`` would offer, by name."""
+    if config.robot.platform != "linux" or not config.services.autonomy_manager.enabled:
+        return {}
+    from pebble.services.autonomy_manager.catalogue import Catalogue  # few checks need it
+
+    found: list[dict[str, Script]] = []
+    Catalogue(config, asks=False).scan(found.append)
+    return found[-1]
+
+
+def _sizes_fit(scripts: Mapping[str, Script], path: Path) -> bool:
+    """A script that asks for another size would report tags in wrong places, and no error."""
+    if not scripts:
+        return True
+    from pebble.services.autonomy_manager.script import size_problems
+
+    problems = list(size_problems(scripts))
+    for problem in problems:
+        typer.echo(f"pebble: {path.name}: services.autonomy_manager.scripts.{problem}", err=True)
+    return not problems
+
+
+def _fitness(script: Script) -> str:
+    """Whether it can run here, in a few words."""
+    if script.instead_of:
+        return f"runs: Pebble's own, because the copy in autonomy_root cannot: {script.instead_of}"
+    return f"does not run: {script.broken}" if script.broken else "runs" + (", Pebble's own" if script.ours else "")
 
 
 def _check_certificates(config: Config) -> None:
@@ -91,7 +128,7 @@ def _check_certificates(config: Config) -> None:
         raise ConfigError(problems)
 
 
-def _print(config: Config, path: Path) -> None:
+def _print(config: Config, path: Path, scripts: Mapping[str, Script]) -> None:
     from rich.console import Console
     from rich.padding import Padding
     from rich.table import Table
@@ -119,6 +156,11 @@ def _print(config: Config, path: Path) -> None:
                     "yes" if line.retained else "",
                 )
         console.print(Padding(table, (1, 0, 0, 2)))
+    if scripts:
+        grid = Table.grid(padding=(0, 2))
+        for name, script in scripts.items():
+            grid.add_row(Text("script", style="dim"), Text(shown(name)), Text(shown(_fitness(script))))
+        console.print(Padding(grid, (1, 0, 0, 2)))
     if config.warnings:
         grid = Table.grid(padding=(0, 2))
         for warning in config.warnings:

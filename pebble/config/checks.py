@@ -172,6 +172,9 @@ def _web(reader: Reader, web: WebInterface, path: Path) -> WebInterface:
         )
     if web.mqtt_history.enabled:
         reader.notes.warning((*path, "mqtt_history"), "is not used: enable services.recorder, which records into files")
+    if any(robot.get("name") for robot in web.robots):
+        text = "names are not used, robots announce themselves: write robot.name in each robot's own config"
+        reader.notes.warning((*path, "robots"), text)
     if not web.mqtt.host and web.mqtt != WebMqtt():
         reader.notes.warning((*path, "mqtt"), "not used: it has no host, so the page connects to the robot's broker")
     if web.plain_http and web.tls.certificate is not None:

@@ -1,10 +1,14 @@
 """The settings and dependencies of three scripts of the original Pebble, whose configs do not list them.
 
-Its names, options, defaults and limits, except `log_file`: a command must not choose a file to write.
+Its names, options, defaults and limits, except `log_file` (a command must not choose a file to write), and the size of
+pictures, which is the camera's.
 """
 
 from typing import Any
 
+from msgspec.structs import replace
+
+from pebble.config.media import CameraCapture
 from pebble.services.autonomy_manager.forms import Setting
 
 
@@ -21,10 +25,11 @@ _ODOMETRY = (
        arg_false="--no-use-tune-state"),
 )  # fmt: skip
 
+#: Their default is the camera's: pictures of another size run on into one another, and tags are misplaced.
 _LOCATIONS = (
-    _s("width", "Frame Width", "int", 1280, "--width", 160),
-    _s("height", "Frame Height", "int", 720, "--height", 120),
-    _s("fps", "Frame FPS", "float", 15.0, "--fps", 1.0),
+    _s("width", "Frame Width", "int", None, "--width", 160),
+    _s("height", "Frame Height", "int", None, "--height", 120),
+    _s("fps", "Frame FPS", "float", None, "--fps", 1.0),
     _s("control_rate_hz", "Publish Rate (Hz)", "float", 12.0, "--rate", 1.0),
     _s("marker_dictionary", "Tag Dictionary", "string", "APRILTAG_25H9", "--marker-dictionary"),
     _s("locations_topic", "Locations Topic", "string", "", "--locations-topic"),
@@ -74,17 +79,24 @@ _ODOM_FOLLOW = (
     _PREVIEW,
 )
 
-#: By the script's folder.
-SETTINGS: dict[str, tuple[Setting, ...]] = {
+#: By the script's folder; :func:`settings_of` completes them.
+_SETTINGS: dict[str, tuple[Setting, ...]] = {
     "wheel-odometry": _ODOMETRY,
     "apriltag-locations": _LOCATIONS,
     "apriltag-odom-follow": _ODOM_FOLLOW,
 }
 
+
+def settings_of(name: str, camera: CameraCapture) -> tuple[Setting, ...]:
+    """The settings of a script; none for one that is not known."""
+    own = {"width": camera.width, "height": camera.height, "fps": float(camera.fps)}
+    return tuple(replace(one, default=own.get(one.key, one.default)) for one in _SETTINGS.get(name, ()))
+
+
 #: By the script's folder: the scripts it needs, with their settings.
 DEPENDENCIES: dict[str, tuple[tuple[str, dict[str, Any]], ...]] = {
     "apriltag-odom-follow": (
-        ("apriltag-locations", {"width": 1280, "height": 720, "fps": 15.0}),
+        ("apriltag-locations", {}),
         ("wheel-odometry", {"use_tune_state": False}),
     )
 }

@@ -125,7 +125,12 @@ def read_manifest(path: Path) -> Description | None:
 
 def ask(command: Sequence[str], folder: Path, environment: Mapping[str, str]) -> Description:
     """Run ``command --describe`` and return its answer. Raises DescribeError; takes at most 20 s."""
-    limited = ["nice", "-n", _NICE, "prlimit", f"--fsize={_LONGEST + 1}", *command, "--describe"]
+    return _parse(answer_of((*command, "--describe"), folder, environment, "its --describe"), "its --describe")
+
+
+def answer_of(command: Sequence[str], folder: Path, environment: Mapping[str, str], name: str = "it") -> bytes:
+    """Run ``command``, and return what it prints. Raises DescribeError; takes at most 20 s."""
+    limited = ["nice", "-n", _NICE, "prlimit", f"--fsize={_LONGEST + 1}", *command]
     with TemporaryFile() as output, TemporaryFile() as errors:
         try:
             process = subprocess.Popen(
@@ -142,7 +147,7 @@ def ask(command: Sequence[str], folder: Path, environment: Mapping[str, str]) ->
         try:
             code = process.wait(_LIMIT_S)
         except subprocess.TimeoutExpired:
-            raise DescribeError(f"its --describe takes longer than {_LIMIT_S:g} s") from None
+            raise DescribeError(f"{name} takes longer than {_LIMIT_S:g} s") from None
         finally:
             with suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)
@@ -150,8 +155,8 @@ def ask(command: Sequence[str], folder: Path, environment: Mapping[str, str]) ->
         answer, reason = _content(output), _content(errors)[-_REASON_BYTES:].decode(errors="replace")
     if code != 0:
         last = reason.strip().rpartition("\n")[2]
-        raise BrokenScriptError(f"its --describe ended with code {code}{f': {_shown(last[:300])}' if last else ''}")
-    return _parse(answer, "its --describe")
+        raise BrokenScriptError(f"{name} ended with code {code}{f': {_shown(last[:300])}' if last else ''}")
+    return answer
 
 
 def _shown(text: str) -> str:

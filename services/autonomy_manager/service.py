@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import msgspec
 from msgspec.structs import replace
 
 from pebble.contract import AUTONOMY_COMMAND, AUTONOMY_FILES, AUTONOMY_STATUS, DRIVE, ESTOP_STATE
@@ -31,7 +32,9 @@ from pebble.runtime.service import Service, on
 from pebble.services.autonomy_manager.catalogue import Catalogue, files
 from pebble.services.autonomy_manager.child import Processes, Spawn
 from pebble.services.autonomy_manager.forms import shown
+from pebble.services.autonomy_manager.gate.activity import SILENT_S
 from pebble.services.autonomy_manager.gate.config_copy import broker_of
+from pebble.services.autonomy_manager.local_media import LocalMedia
 from pebble.services.autonomy_manager.motor_owners import OVERRIDDEN, Baseline, MotorOwners
 from pebble.services.autonomy_manager.runner import Runner
 from pebble.services.autonomy_manager.script import Plan, Script, StartError, plan
@@ -44,6 +47,7 @@ _START = frozenset(("start", "run", "play", "enable", "enabled", "on"))
 _HALTS_S = (0.1, 0.3)  # after the first one
 _HOLD_S = HOLD_MS / 1000
 _SHORTEST_SCAN_S = 1.0
+_LOOK_S = 2.0  # between two looks at whether a script waits
 _CLOSE_S = 1.0  # for scripts to end after SIGTERM when this process ends; it is killed after 3 s
 
 
@@ -72,6 +76,7 @@ class AutonomyManager(Service):
         self._files: list[dict[str, object]] | None = None
         self._status: AutonomyStatus | None = None
         self._connected_before = False
+        self._media, self._began = LocalMedia(self.config), 0.0
         self._gate: tuple[int, Gate] | None = None  # of the present run, if one of its scripts needs it
 
     @property
@@ -85,6 +90,7 @@ class AutonomyManager(Service):
             threading.Thread(target=self._scan, name="scripts", daemon=True).start()
             period = max(_SHORTEST_SCAN_S, self._section.scan_interval_seconds)
             self.timers.add(self.clock(), self._scan_now.set, period=period)
+        self.timers.add(self.clock(), self._look, period=_LOOK_S)
         self.changed()
 
     def stop(self) -> None:
@@ -153,6 +159,8 @@ class AutonomyManager(Service):
     def drive(self, drive: Drive, _arrived: float) -> None:
         """On the transport's thread. A person's commands all mean the same here."""
         if not drive.signed:
+            if (gate := self._gate) is not None:
+                gate[1].override(self.addresses[DRIVE].topic, _HOLD_S)
             self.post(self._person_drives, newest_of="person")
             if not drive.moves and drive.valid_ms == 0:
                 self.post(self._person_stops, newest_of="person stops")
@@ -183,6 +191,7 @@ class AutonomyManager(Service):
     def begin_run(self) -> tuple[int, Baseline]:
         if refusal := self._owners.refusal:
             raise StartError(refusal)
+        self._began = self.clock()
         run = self._owners.newest_run = next_run(self.config, self._owners.barred, self._owners.newest_run)
         for step in self._owners.steps_to(run):
             self.halt(step)
@@ -199,6 +208,8 @@ class AutonomyManager(Service):
             gate = Gate(self.config, self._publish_signed, run)
             gate.open()
             self._gate = (run, gate)
+            if (left := self._overridden_until - self.clock()) > 0:
+                gate.override(self.addresses[DRIVE].topic, left)
         return self._gate[1].config_path
 
     def end_run(self, run: int) -> None:
@@ -252,7 +263,35 @@ class AutonomyManager(Service):
             config=None if self._runner.config is None else dict(self._runner.config),
         )
         overridden = main is not None and self.clock() < self._overridden_until
-        return replace(status, overridden=True) if overridden else status
+        waiting_for = self._waiting_for() if main is not None else ""
+        return replace(
+            status,
+            overridden=True if overridden else msgspec.UNSET,
+            waiting_for=waiting_for or msgspec.UNSET,
+        )
+
+    def _look(self) -> None:
+        """A script that begins to wait says nothing: ask again and again."""
+        if self._runner.active is not None:
+            self.changed()
+
+    def _waiting_for(self) -> str:
+        """What the present run waits for; empty: it does something, or nobody knows."""
+        run = self._runner.active
+        if run is None or self.clock() - self._began < SILENT_S:
+            return ""
+        for step, part in zip(run.plan.dependencies, run.dependencies, strict=False):
+            if not part.ended and (absent := self._media.absent(step.script.needs)):
+                return f"{part.file}, which waits for {absent}"
+        activity = None if self._gate is None else self._gate[1].activity
+        if activity is not None and not activity.silent:
+            return ""
+        needs = run.plan.main.script.needs
+        known = self._media.absent(needs)
+        if known or activity is None:
+            return known
+        media = {"pictures": needs.pictures, "sound": needs.sound, "hall samples": needs.hall}
+        return next((what for what, needed in media.items() if needed), activity.waits_for)
 
     # -- the catalogue
 

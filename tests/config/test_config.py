@@ -183,7 +183,8 @@ class TestOriginal:
 
     def test_its_page_for_other_machines_needs_a_certificate(self) -> None:
         config = load(ORIGINAL, env={})
-        (warning,) = [line for line in config.warnings if line.startswith("web_interface")]
+        warning, names = [line for line in config.warnings if line.startswith("web_interface")]
+        assert names.startswith("web_interface.robots: names are not used")
         assert warning.startswith("web_interface.host: other machines reach 0.0.0.0, so the page starts only with a ")
         assert "`pebble cert init`" in warning
         assert (config.services.web_handler.enabled, config.web_interface.mqtt.host) == (True, "127.0.0.1")
@@ -736,6 +737,7 @@ class TestWebInterface:
         [
             ({"mqtt": {"port": 8883}}, "mqtt: not used: it has no host"),
             ({"mqtt_history": {"enabled": True}}, "mqtt_history: is not used: enable services.recorder"),
+            ({"robots": [{"id": "goob", "name": "Goob"}]}, "robots: names are not used, robots announce themselves"),
         ],
     )
     def test_keys_without_an_effect_are_reported(self, keys: dict[str, Any], expected: str) -> None:

@@ -88,6 +88,9 @@ def test_a_person_goes_first_and_every_end_of_the_script_stops_the_wheels(rig: R
     resumed = next(at for at, wheels in lines[first:] if not by_person(wheels) and wheels != STOP)
     assert lines[first][0] - began < 0.25, "a few milliseconds on an idle machine"
     assert 1.9 < resumed - released < 4.0, "2 s on an idle machine"
+    signs = [seen.json for seen in local.on("incoming/drive-values") if began + 0.25 < seen.at < released + 1.9]
+    assert signs
+    assert not [drive for drive in signs if drive.get("source")], "odometry takes its signs from these"
 
     stopped = time.monotonic()
     rig.operator.send("incoming/autonomy-command", {"action": "stop"})

@@ -1,6 +1,6 @@
 """Inserts the gate's answers into what the broker sends to a client, between two packets. Pure."""
 
-from pebble.services.autonomy_manager.gate.packets import PacketError, packet_size
+from pebble.services.autonomy_manager.gate.packets import Kind, PacketError, packet_size
 
 _MOST_WAITING = 64 * 1024  # bytes; each answer has four
 
@@ -13,6 +13,7 @@ class AnswerMerger:
         self._missing = 0  # bytes of the current packet
         self._begun = False  # a whole packet has passed
         self._waiting = bytearray()
+        self.messages = 0  # from the broker, so far
 
     def answer(self, answers: bytes | bytearray) -> bytes:
         """What to send now, if the broker is between two packets; otherwise they wait for the end of its packet.
@@ -49,6 +50,7 @@ class AnswerMerger:
             size = packet_size(self._head, limit=None)
             if size is not None:
                 self._missing = size - len(self._head)
+                self.messages += self._head[0] >> 4 == Kind.PUBLISH
                 self._head.clear()
                 self._begun = self._begun or not self._missing
                 return at

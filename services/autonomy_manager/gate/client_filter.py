@@ -45,6 +45,7 @@ class Output:
         self.drive: list[DriveCommand] = []  # in order
         self.refused_topics: list[str] = []
         self.refusal: str | None = None
+        self.published = self.subscribed = False
 
 
 class ClientFilter:
@@ -73,10 +74,12 @@ class ClientFilter:
                 elif packet[0] >> 4 == Kind.CONNECT:
                     raise PacketError("a second CONNECT")
                 elif packet[0] >> 4 == Kind.PUBLISH:
+                    output.published = True
                     self._publish(packet, output)
                 elif packet[0] >> 4 == Kind.PUBREL:
                     self._release(packet, output)
                 else:
+                    output.subscribed = output.subscribed or packet[0] >> 4 == Kind.SUBSCRIBE
                     output.upstream += packet
         except _LoginError:
             output.answers += connack(BAD_LOGIN)

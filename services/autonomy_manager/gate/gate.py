@@ -3,6 +3,7 @@
 import secrets
 import socket
 import threading
+import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
@@ -10,6 +11,7 @@ from pathlib import Path
 from pebble.config import Config
 from pebble.errors import PebbleError
 from pebble.runtime.connections import LOCAL_RECONNECT_S, mqtt_settings
+from pebble.services.autonomy_manager.gate.activity import Activity
 from pebble.services.autonomy_manager.gate.client_filter import ClientFilter, Login
 from pebble.services.autonomy_manager.gate.config_copy import ConfigCopy, broker_of
 from pebble.services.autonomy_manager.gate.drive_outlet import DriveOutlet
@@ -31,13 +33,15 @@ class Gate:
 
     def __init__(self, config: Config, publish: Callable[[str, bytes], object], run: int) -> None:
         """Raises PebbleError if the robot has no broker, or its config no file."""
-        self.counters = Counters()  # signed, refused, stale, halted
+        self.counters = Counters()  # signed, refused, stale, halted, overridden
+        self.activity = Activity()
         self._rules = TopicRules.of(config)
         self._broker = broker_of(config)
         self._copy = ConfigCopy(config)
         self._outlet = DriveOutlet(run, self._send, self.counters)
         self._publish = publish
         self._halted = False
+        self._overridden: dict[str, float] = {}  # by drive topic, until when
         self._sending = threading.Lock()  # orders the commands of scripts and the caller's stop
         self._server: GateServer | None = None
         self._opened = ExitStack()
@@ -70,13 +74,22 @@ class Gate:
         if self._server is not None:
             self._server.post(self._outlet.halt)
 
+    def override(self, topic: str, seconds: float) -> None:
+        """Publish nothing on this drive topic for ``seconds``: a person drives there. On any thread.
+
+        The motor owner would refuse it, but others hear it: wheel odometry takes the sign of each wheel from there.
+        """
+        self._overridden[topic] = time.monotonic() + seconds
+
     def close(self) -> None:
         """Close all connections, and remove the config. May be called again."""
         self._opened.close()
 
     def _send(self, topic: str, payload: bytes, moves: bool) -> None:
         with self._sending:
-            if not (moves and self._halted):
+            if time.monotonic() < self._overridden.get(topic, float("-inf")):
+                self.counters.add("overridden")
+            elif not (moves and self._halted):
                 self._publish(topic, payload)
 
     def _serve(self, listener: socket.socket, credentials: Credentials, own: Login, opened: ExitStack) -> None:
@@ -86,6 +99,7 @@ class Gate:
             lambda: (self._broker.host, self._broker.port, credentials.context()),
             self._outlet,
             lambda: ClientFilter(self._rules, own, Login(user, _encoded(credentials.password()))),
+            self.activity,
         )
         thread = threading.Thread(target=server.serve, name="gate", daemon=True)
         thread.start()

@@ -21,6 +21,7 @@ class Kind(IntEnum):
     PUBREC = 5
     PUBREL = 6
     PUBCOMP = 7
+    SUBSCRIBE = 8
 
 
 class PacketError(Exception):

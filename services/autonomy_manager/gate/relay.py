@@ -8,6 +8,7 @@ import socket
 import ssl
 from collections.abc import Callable
 
+from pebble.services.autonomy_manager.gate.activity import Activity
 from pebble.services.autonomy_manager.gate.answers import AnswerMerger
 from pebble.services.autonomy_manager.gate.client_filter import ClientFilter, Output
 from pebble.services.autonomy_manager.gate.packets import PacketError, connack, refusal
@@ -33,10 +34,11 @@ class Relay:
         packets: ClientFilter,
         on_output: Callable[[Output, Relay], None],
         on_end: Callable[[Relay], None],
+        activity: Activity,
     ) -> None:
         self._reader, self._writer = client
         self._packets, self._on_output, self._on_end = packets, on_output, on_end
-        self._answers = AnswerMerger()
+        self._answers, self._activity = AnswerMerger(), activity
 
     async def run(self, broker: Broker) -> None:
         """Log the client in, and pass its packets until one end closes or sends something invalid."""
@@ -112,7 +114,10 @@ class Relay:
 
     async def _down(self, broker: asyncio.StreamReader, data: bytes) -> None:
         while data := data or await broker.read(CHUNK):
+            before = self._answers.messages
             self._writer.write(self._answers.feed(data))
+            if self._answers.messages > before:
+                self._activity.message()
             await self._writer.drain()
             data = b""
 

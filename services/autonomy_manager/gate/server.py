@@ -7,6 +7,7 @@ import socket
 from collections.abc import Callable
 
 from pebble.runtime.rate_limit import RateLimitedLog
+from pebble.services.autonomy_manager.gate.activity import Activity
 from pebble.services.autonomy_manager.gate.client_filter import ClientFilter, Output
 from pebble.services.autonomy_manager.gate.drive_outlet import DriveOutlet
 from pebble.services.autonomy_manager.gate.relay import CHUNK, Broker, Relay
@@ -23,8 +24,10 @@ class GateServer:
         broker: Callable[[], Broker],
         outlet: DriveOutlet,
         make_filter: Callable[[], ClientFilter],
+        activity: Activity,
     ) -> None:
         self._listener, self._broker, self._outlet, self._make_filter = listener, broker, outlet, make_filter
+        self._activity = activity
         self._loop = asyncio.new_event_loop()
         self._stopped = asyncio.Event()
         self._timer: asyncio.TimerHandle | None = None
@@ -64,12 +67,16 @@ class GateServer:
             self._log.warning("connections", "a script has more than %d connections: refused one", MAX_CONNECTIONS)
             writer.transport.abort()
             return
-        relay = Relay((reader, writer), self._make_filter(), self._handle, self._ended)
+        relay = Relay((reader, writer), self._make_filter(), self._handle, self._ended, self._activity)
         client = self._loop.create_task(relay.run(self._broker()))
         self._clients.add(client)
         client.add_done_callback(self._clients.discard)
 
     def _handle(self, output: Output, relay: Relay) -> None:
+        if output.upstream or output.published:
+            self._activity.client(subscribed=output.subscribed)
+        if output.published:
+            self._activity.message()
         for topic in output.refused_topics:
             self._log.warning("topic", "a script may not publish on %.200r: refused", topic)
         for command in output.drive:

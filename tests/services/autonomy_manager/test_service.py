@@ -11,7 +11,9 @@ import pytest
 
 from pebble.runtime.runs import SUPERSEDED
 from pebble.services.autonomy_manager.forms import Setting
+from pebble.services.autonomy_manager.local_media import LocalMedia
 from pebble.services.autonomy_manager.motor_owners import OVERRIDDEN
+from pebble.services.autonomy_manager.needs import Needs
 from pebble.services.autonomy_manager.script import Dependency, Script
 from tests.services.autonomy_manager.fake_children import Bench, FakeChild
 from tests.support import until
@@ -22,7 +24,7 @@ TERM, KILL = signal.SIGTERM, signal.SIGKILL
 
 def script(file: str, *dependencies: str, **more: Any) -> Script:
     needs = tuple(map(Dependency, dependencies))
-    fields = {"settings": (SPEED,), "ours": True, **more}
+    fields = {"settings": (SPEED,), "ours": True, "needs": Needs(modules=(file,)), **more}
     return Script(file=file, label=file, command=(file,), folder=Path(), dependencies=needs, **fields)
 
 
@@ -308,6 +310,29 @@ def test_the_status_shows_that_a_person_drives(bench: Bench) -> None:
     bench.advance(0.6)
     assert "overridden" not in bench.status
     assert bench.status["running"] is True
+
+
+def test_a_script_that_gets_nothing_is_shown_as_waiting(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A script without a gate shows only by its local media whether it waits."""
+    there = {"eyes": "pictures"}
+    monkeypatch.setattr(LocalMedia, "absent", lambda _media, needs: there.get(needs.modules[0], ""))
+    walk = bench.start("walk")
+    bench.advance(60)
+    assert "waiting_for" not in bench.status
+    walk.end(0)
+    eyes = bench.start("eyes")
+    bench.advance(9)
+    assert "waiting_for" not in bench.status, "it may be starting"
+    bench.advance(2)
+    assert bench.becomes(running=True, waiting_for="pictures")
+    there["eyes"] = ""
+    bench.advance(2)
+    assert until(lambda: "waiting_for" not in bench.status, 3)
+    there["eyes"] = "pictures"
+    eyes.end(0)
+    bench.start("follow")
+    bench.advance(11)
+    assert bench.becomes(running=True, waiting_for="eyes, which waits for pictures")
 
 
 def test_a_run_by_hand_ends_the_script_with_that_reason(bench: Bench) -> None:

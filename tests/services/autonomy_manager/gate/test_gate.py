@@ -206,6 +206,19 @@ def test_wheels_stop_when_the_scripts_connection_ends(rig: Rig, driven: Subscrib
     assert driven.payloads[-1] == {"x": 0.0, "z": 0.0, "source": "autonomy", "run": 7}
 
 
+def test_nothing_of_a_script_is_published_while_a_person_drives(rig: Rig, driven: Subscriber) -> None:
+    rig.script("--control-rate-hz", "40")
+    assert until(lambda: driven.messages)
+    rig.gate.override(DRIVE, 0.5)
+    swallowed, passed = rig.gate.counters["overridden"], len(driven.messages)
+    assert until(lambda: rig.gate.counters["overridden"] > swallowed + 5, step=0.01)
+    assert len(driven.messages) <= passed + 1, "one may have been on its way"
+    assert until(lambda: len(driven.messages) > passed + 5), "it goes on afterwards"
+    rig.gate.override(f"{BASE}/incoming/arm/drive-values", 60)
+    before = len(driven.messages)
+    assert until(lambda: len(driven.messages) > before + 5), "a person at another motor owner is no reason"
+
+
 def test_a_script_receives_what_the_robot_publishes(rig: Rig, driven: Subscriber) -> None:
     corners = [[0.45, 0.4], [0.55, 0.4], [0.55, 0.533], [0.45, 0.533]]
     tag = {"marker_id": 13, "corners_norm": corners, "center_norm": [0.5, 0.4667]}
@@ -217,6 +230,19 @@ def test_a_script_receives_what_the_robot_publishes(rig: Rig, driven: Subscriber
         return any(drive["z"] > 0.5 and drive["x"] == 0 for drive in driven.payloads)
 
     assert until(follows, step=0.05)
+
+
+def test_what_passes_in_both_directions_is_noted(rig: Rig) -> None:
+    noted: list[bool] = []
+    rig.gate.activity.message = lambda: noted.append(True)  # type: ignore[method-assign]
+    client = rig.log_in()
+    client.sendall(subscribe(f"{BASE}/outgoing/touch-sensors") + PINGREQ)
+    assert read(client, len(SUBACK) + len(PINGRESP)) == SUBACK + PINGRESP
+    assert not noted, "a client that only pings is silent"
+    rig.transport.publish(f"{BASE}/outgoing/touch-sensors", b"{}")
+    assert until(lambda: len(noted) == 1)
+    client.sendall(publish(f"{BASE}/outgoing/notes", "{}") + publish(DRIVE, "{}"))
+    assert until(lambda: len(noted) >= 2), "its drive commands count as well"
 
 
 def test_a_flood_is_limited_and_no_zero_is_lost(rig: Rig, driven: Subscriber) -> None:

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from pebble.config import parse
 from pebble.errors import PayloadError
+from pebble.services.autonomy_manager.gate.activity import Activity
 from pebble.services.autonomy_manager.gate.answers import AnswerMerger
 from pebble.services.autonomy_manager.gate.client_filter import DriveCommand
 from pebble.services.autonomy_manager.gate.drive_outlet import DriveOutlet, sign
@@ -24,6 +25,29 @@ from pebble.transports.counters import Counters
 from tests.services.autonomy_manager.gate.mqtt_bytes import BASE, CONNACK, DRIVE, puback, publish
 
 SIGNATURE = {"source": "autonomy", "run": 7}
+
+
+@pytest.mark.parametrize(
+    ("seen", "waits_for"),
+    [
+        ([], "its own start: it has not connected to the broker"),
+        (["client"], "something: it has neither published nor subscribed"),
+        (["client", "message"], ""),
+        (["client", "subscribed"], "the messages that it subscribed to"),
+        (["client", "subscribed", "message"], "the messages that it subscribed to"),
+    ],
+    ids=["starts", "connected", "acts once a minute", "listens", "listened"],
+)
+def test_a_silent_script_is_known_to_wait_after_10_s(seen: list[str], waits_for: str) -> None:
+    now = [100.0]
+    activity = Activity(lambda: now[0])
+    for one in seen:
+        (activity.message if one == "message" else lambda: activity.client(subscribed="subscribed" in seen))()
+    assert (activity.silent, activity.waits_for) == (False, "")
+    now[0] += 10.1
+    assert (activity.silent, activity.waits_for) == (True, waits_for)
+    activity.message()
+    assert (activity.silent, activity.waits_for) == (False, ""), "messages in whichever direction"
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import { inner, isObject, nameOf } from "../parts/words.js";
 const MOST_DEPENDENCIES = 16;
 
 /**
- * @typedef {{running: boolean, file: string, waits: boolean, error: string, pid: unknown,
+ * @typedef {{running: boolean, file: string, waits: boolean, waitingFor: string, error: string, pid: unknown,
  *   dependencies: {file: string, running: boolean}[], config: [string, unknown][]}} Status
  */
 
@@ -21,6 +21,7 @@ export function statusOf(payload) {
     running,
     file: text(status.file) || (running ? "A script" : ""),
     waits: status.overridden === true,
+    waitingFor: text(status.waiting_for),
     error: text(status.error),
     pid: status.pid,
     dependencies: parts

@@ -60,6 +60,13 @@ function Row({ script, isOpen, onOpen, ...parts }) {
   </li>`;
 }
 
+/** What a script does, as far as is known. */
+function how({ waits, waitingFor }, past) {
+  if (waits) return " waits: a person drives";
+  if (past) return " ran when it was last seen";
+  return waitingFor ? ` waits for ${plain(waitingFor)}` : " runs";
+}
+
 /** What runs, and the end of it. */
 function Running({ at, page, entry, status, script }) {
   const why = whyNotEnd(page);
@@ -71,7 +78,7 @@ function Running({ at, page, entry, status, script }) {
       <p role="status" data-test="script-state">
         ${status.running
           ? html`<b>${past ? "○" : "●"} ${plain(status.file)}</b>
-              ${status.waits ? " waits: a person drives" : past ? " ran when it was last seen" : " runs"},
+              ${how(status, past)},
               ${" "}${since(seen)}`
           : html`<span class="dim">No script runs.</span>`}
       </p>

@@ -348,7 +348,7 @@ function DriverFact({ at, offers, online, stopped }) {
 function ScriptFact({ at, online }) {
   const status = useValue(at, "autonomy-status");
   if (!online || !status?.running) return null;
-  return html`<li class="fact"><${Icon} name="script" />script: ${plain(status.file ?? "?")}</li>`;
+  return html`<li class="fact"><${Icon} name="script" />script: ${plain(status.file ?? "?")}${status.waiting_for ? ", waiting" : ""}</li>`;
 }
 
 /** In a word or two, what a component reports that is no robot. */
