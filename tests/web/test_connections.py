@@ -155,7 +155,7 @@ SLOW: dict[str, tuple[int, bytes, list[bytes], float, float]] = {
 }
 
 
-def test_an_answer_on_a_kept_connection_waits_for_no_acknowledgement(
+def test_an_answer_waits_for_no_acknowledgement_of_the_one_before(
     serve: Callable[..., Serving], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     taken: list[socket.socket] = []
