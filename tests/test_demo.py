@@ -13,7 +13,9 @@ import time
 import urllib.error
 import urllib.request
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -129,26 +131,69 @@ def test_all_robots_do_what_they_are_commanded(demos: list[Demo], temporary: Pat
         requested(page)
     for event in ("STARTS: apriltag-follow", "TAKES OVER: drives goob", "LETS GO", "GIVES BACK", "ENDS"):
         assert f"operator {event}" in demo.output
-    assert " zenoh " in demo.output
-    assert " mqtt " in demo.output
+    for name, inside in {"goob": "zenoh", "fred": "mqtt", "minilamp": "mqtt", "benjr": "mqtt"}.items():
+        assert re.search(rf"s  {name} is online: .+, {inside} inside\n", demo.output), demo.output
+    steps = re.findall(r"(?m)^ *[\d.]+ s  (?:operator:? )?(.+)$", demo.output)
+    assert not [step for step, after in pairwise(steps) if step == after]  # a line at each step
+    assert len(steps) < SHORTEST_S + SLOW_S
     assert demo.leftovers() == []
     assert demo.folders() == []
+
+
+def ended_by(demo: Demo, sign: signal.Signals) -> int:
+    """It ends within some seconds, and leaves no process; returns its exit code."""
+    demo.process.send_signal(sign)
+    began = time.monotonic()
+    code = demo.process.wait(30)
+    assert time.monotonic() - began <= END_S
+    assert demo.leftovers() == []
+    return code
 
 
 def ends_by(demo: Demo, sign: signal.Signals) -> None:
-    """It ends within some seconds, and leaves nothing."""
-    demo.process.send_signal(sign)
-    began = time.monotonic()
-    assert demo.process.wait(30) == 0, demo.output
-    assert time.monotonic() - began <= END_S
-    assert demo.leftovers() == []
+    """It ends as one that succeeded, and leaves nothing."""
+    assert ended_by(demo, sign) == 0, demo.output
     assert demo.folders() == []
 
 
-def test_a_signal_ends_everything_within_five_seconds(demos: list[Demo], temporary: Path) -> None:
+def test_what_is_printed_can_be_pasted_and_a_signal_ends_everything_within_five_seconds(
+    demos: list[Demo], temporary: Path
+) -> None:
     demo = start(demos, temporary, "")
     assert until(lambda: "forward, stop" in demo.output, START_S), demo.output
-    ends_by(demo, signal.SIGINT)
+    (broker,) = set(re.findall(r"mqtt://127.0.0.1:\d+", demo.output))
+    assert f"by their broker at {broker}:" in demo.output
+    echo, drive, record, stop, reset = re.findall(r"(?m)^  # .+\n  (.+)$", demo.output)
+    with pasted(echo, temporary / "echo") as echoed, pasted(record, temporary / "record") as recorded:
+        assert until(lambda: "Recording" in recorded() and '"z"' in echoed()), (recorded(), echoed())
+        shell(drive)
+        assert until(lambda: '"z": 0.3}' in echoed()), echoed()
+        assert "goob" in shell(stop)
+        assert "goob" in shell(reset)
+    assert re.search(r"Recorded [\d,]+ messages \(.+\) of 4 robots;", recorded()), recorded()
+    ended_by(demo, signal.SIGINT)
+
+
+def shell(line: str) -> str:
+    """What a line prints that must succeed."""
+    done = subprocess.run(line, shell=True, cwd=ROOT, capture_output=True, text=True, timeout=20, check=False)
+    assert done.returncode == 0, (line, done.stdout, done.stderr)
+    return done.stdout
+
+
+@contextmanager
+def pasted(line: str, output: Path) -> Iterator[Callable[[], str]]:
+    """Runs a line until Ctrl-C at the end of the block; what it has printed. It leaves nothing in the checkout."""
+    output.mkdir()
+    log = output / "log"
+    absolute = line if line.startswith("/") else f"{ROOT}/{line}"
+    with log.open("wb") as file:
+        running = subprocess.Popen(["sh", "-c", f"exec {absolute}"], cwd=output, stdout=file, stderr=file)
+    try:
+        yield log.read_text
+    finally:
+        running.send_signal(signal.SIGINT)
+        assert running.wait(20) in (0, 130), log.read_text()
 
 
 def test_a_closed_terminal_ends_everything_though_its_signal_goes_elsewhere(demos: list[Demo], temporary: Path) -> None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import http.server
+import math
 import os
 import re
+import shutil
 import subprocess
 import sys
 import threading
@@ -13,6 +15,7 @@ from pathlib import Path
 
 import pytest
 
+from pebble.demo.main import SHORTEST_S
 from tests.support import ROOT, free_port, gone, until
 
 PATH = "/@micropython/micropython-webassembly-pyscript/-/micropython-webassembly-pyscript-1.29.0-6.tgz"
@@ -125,3 +128,18 @@ def test_processes_that_a_test_leaves_behind_are_named_and_ended(tmp_path: Path)
     left = re.search(r"LEFT BEHIND, please report: (\d+) sleep 60 PYTEST_CURRENT_TEST=test_it.py::test_leaves", output)
     assert left is not None
     assert until(lambda: gone(int(left[1])))
+
+
+@pytest.mark.parametrize(
+    ("options", "why"), [("SECONDS=25", "takes 26 s: give it at least that many"), ("SECONDS=soon", "takes 26 s")]
+)
+def test_a_demo_with_wrong_options_is_refused_before_the_set_up(tmp_path: Path, options: str, why: str) -> None:
+    shutil.copy(ROOT / "Makefile", tmp_path)  # without anything to set up
+    command = ["make", "demo", *options.split()]
+    done = subprocess.run(
+        command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=20, stdin=subprocess.DEVNULL
+    )
+    assert done.returncode == 2
+    assert why in done.stderr
+    assert list(tmp_path.iterdir()) == [tmp_path / "Makefile"]
+    assert math.ceil(SHORTEST_S) == 26

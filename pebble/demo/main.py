@@ -16,7 +16,7 @@ from rich.console import Console
 from pebble.client.page_packages import require_packages
 from pebble.client.page_settings import DEFAULT_PORT
 from pebble.contract.encodings import ALL_VIDEO
-from pebble.demo import emergency, following
+from pebble.demo import emergency, following, invitation
 from pebble.demo.brokers import BrokerKind, best_kind
 from pebble.demo.machine import Machine
 from pebble.demo.media import ROUND_S as MEDIA_ROUND_S
@@ -101,14 +101,16 @@ def _run_demo(
     )
     console.print("MiniLAMP and BenJr are MCUs that use MQTT themselves: their firmware, on simulated pins.")
     url = _start_page(testbed, ending, console)
+    _invite(testbed.broker_port, console)
     testbed.start_robots()
     operator = Operator(testbed.broker_port)
     operator.connect()
+    addresses = ([f"Operator page: {url}"] if url else []) + [f"Broker: {invitation.broker_url(testbed.broker_port)}"]
     counting = [robot.name for robot in testbed.robots.values() if robot.has_counter]
     machine = Machine()
     media_check = MediaCheck(testbed.broker_port, counting, partial(machine.overloaded, on_average=True))
     try:
-        with View(console, operator, media_check, list(testbed.robots.values()), ending, url) as view:
+        with View(console, operator, media_check, list(testbed.robots.values()), ending, addresses) as view:
             if not _discovered(operator, view, ending):
                 problems = [] if ending.is_set() else [*_not_ready(operator), *testbed.unexpected_exits()]
                 return _Observed(Results(), [], problems, set())
@@ -137,6 +139,14 @@ def _start_page(testbed: Testbed, ending: threading.Event, console: Console) -> 
     page = _usual_or_free(testbed, ending)
     console.print(f"See and drive them in a browser: {page.url}", highlight=False, soft_wrap=True)
     return page.url
+
+
+def _invite(port: int, console: Console) -> None:
+    """Print the broker's address, and what can be pasted into another terminal."""
+    print_line = partial(console.print, highlight=False, markup=False, soft_wrap=True)
+    print_line(f"Or from another terminal, by their broker at {invitation.broker_url(port)}:")
+    for what, line in invitation.lines(port):
+        print_line(f"  # {what}\n  {line}")
 
 
 def _usual_or_free(testbed: Testbed, ending: threading.Event) -> PageServer:

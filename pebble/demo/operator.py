@@ -33,6 +33,7 @@ from pebble.transports import Message, MqttSettings, QoS, create
 COMMAND_PERIOD_S = 0.05  # how often a held stick is repeated
 NAME = "the demo's operator"
 STOP = Drive()
+OBSERVING = ": observing"  # after the name of a step
 _POLL_S = 0.02
 _MOST_TIMES = 3  # for the emergency stop and for the script
 _MOST_WAITING = 1000  # events and completed steps; beyond them the oldest is dropped
@@ -274,7 +275,7 @@ class Operator:
         released = self._hold(step.drive, step.drive_s)
         if step.sends_stop:
             released = self._drive(STOP)
-        self._doing = f"{step.name}: observing"
+        self._doing = f"{step.name}{OBSERVING}"
         self._wait(step.rest_s)
         ended = time.monotonic()
         self._complete(*(CompletedStep(robot.name, step, began, released, ended) for robot in self._robots))

@@ -1,4 +1,4 @@
-"""Output of the demo: a live table in a terminal, plain lines once a second elsewhere, and tables of results."""
+"""Output of the demo: a live table in a terminal, a plain line at each step elsewhere, and tables of results."""
 
 import math
 import threading
@@ -18,12 +18,11 @@ from pebble.demo.emergency import StopResult
 from pebble.demo.following import FollowResult
 from pebble.demo.media import MediaCheck
 from pebble.demo.media_assessment import MediaResult
-from pebble.demo.operator import Operator
+from pebble.demo.operator import OBSERVING, Operator
 from pebble.demo.results import Result
 from pebble.demo.steps import StepResult
 from pebble.rig.robot import SimulatedRobot
 
-_LINE_PERIOD_S = 1.0
 _COLUMN_WIDTH = 26  # characters, of the longest usual cell: keeps the layout stable
 _COLUMN_EDGE = 3  # a line, and a space on each side
 _LABEL_WIDTH = 20  # the first column, with its edges
@@ -34,8 +33,8 @@ T = TypeVar("T")
 class View:
     """Shows the robots while they run; call ``update`` at any rate.
 
-    ``ending`` is set when the terminal was closed: under make, SIGHUP reaches only make. ``url`` of the operator page
-    stays above the table.
+    ``ending`` is set when the terminal was closed: under make, SIGHUP reaches only make. ``addresses`` stay above the
+    table.
     """
 
     def __init__(
@@ -45,13 +44,14 @@ class View:
         media: MediaCheck,
         robots: Sequence[SimulatedRobot],
         ending: threading.Event,
-        url: str = "",
+        addresses: Sequence[str] = (),
     ) -> None:
-        self._url = url
+        self._addresses = addresses
         self._console, self._operator, self._media = console, operator, media
         self._robots, self._ending = robots, ending
         self._began = time.monotonic()
-        self._printed_at = -math.inf
+        self._known: set[str] = set()  # without a terminal: the robots that were named
+        self._step = ""  # that was printed last
         self._live = Live(console=console, auto_refresh=False) if console.is_terminal else None
 
     def __enter__(self) -> Self:
@@ -68,25 +68,39 @@ class View:
         self._notice_closed_terminal()
         now = time.monotonic()
         self._print_events()
-        rows = [self._row(robot, now) for robot in self._robots]
-        activity = f"{now - self._began:5.1f} s  operator: {self._operator.activity}"
         if self._live is not None:
+            activity = f"{now - self._began:5.1f} s  operator: {self._operator.activity}"
+            rows = [self._row(robot, now) for robot in self._robots]
             tables = [_table(some) for some in _side_by_side(rows, self._console)]
             last = Text.assemble(activity, ("   Ctrl-C ends it", "dim"), no_wrap=True, overflow="ellipsis")
-            address = [Text(f"Operator page: {self._url}", style="bold")] if self._url else []
-            self._live.update(Group(*address, *tables, last), refresh=True)
-        elif now - self._printed_at >= _LINE_PERIOD_S:
-            self._printed_at = now
-            for line in (activity, *("  ".join(["       ", *row.values()]) for row in rows)):
-                self._console.print(line, highlight=False, markup=False, soft_wrap=True)
+            addresses = Text("   ".join(self._addresses), style="bold", no_wrap=True, overflow="ellipsis")
+            self._live.update(Group(addresses, *tables, last), refresh=True)
+        else:
+            self._print_changes(now)
+
+    def _print_changes(self, now: float) -> None:
+        """A line for each robot when it is discovered, and for each step when it begins."""
+        for robot in self._robots:
+            seen = self._discovered(robot.name)
+            if seen is not None and seen.capabilities and robot.name not in self._known:
+                self._known.add(robot.name)
+                self._print(now, f"{robot.name} is online: {robot.runs_on}, {seen.transport} inside")
+        step = self._operator.activity.replace(OBSERVING, "")
+        if step != self._step:
+            self._step = step
+            self._print(now, f"operator: {step}")
+
+    def _print(self, at: float, line: str, style: str = "") -> None:
+        self._console.print(
+            f"{at - self._began:5.1f} s  {line}", style=style, highlight=False, markup=False, soft_wrap=True
+        )
 
     def _print_events(self) -> None:
         """Above the live table, where they stay."""
         while self._operator.events:
             at, line = self._operator.events.popleft()
-            self._console.print(
-                f"{at - self._began:5.1f} s  {line}", style="bold yellow", highlight=False, markup=False, soft_wrap=True
-            )
+            self._print(at, line, "bold yellow")
+            self._step = line.removeprefix("operator ")  # it is one of them
 
     def _notice_closed_terminal(self) -> None:
         if self._live is not None and not self._console.is_terminal:

@@ -155,6 +155,21 @@ SLOW: dict[str, tuple[int, bytes, list[bytes], float, float]] = {
 }
 
 
+def test_an_answer_waits_for_no_acknowledgement_of_the_one_before(
+    serve: Callable[..., Serving], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    taken: list[socket.socket] = []
+    accept = Listener.accept
+
+    def remember(listener: Listener) -> tuple[socket.socket, Any]:
+        taken.append((accepted := accept(listener))[0])
+        return accepted
+
+    monkeypatch.setattr(Listener, "accept", remember)
+    with serve().connect():
+        assert until(lambda: bool(taken) and bool(taken[0].getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)))
+
+
 def test_who_sends_too_slowly_is_closed(serve: Callable[..., Serving]) -> None:
     serving = serve()
 

@@ -83,7 +83,7 @@ class Listener(socket.socket):
     def __init__(
         self, family: int, limit: int = MAX_CONNECTIONS, each: int = MAX_EACH, strangers: int = MAX_STRANGERS
     ) -> None:
-        super().__init__(family, socket.SOCK_STREAM)
+        super().__init__(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)  # asyncio sets TCP_NODELAY only then
         self._limit, self._each, self._strangers = limit, each, strangers
         self._lock = threading.RLock()  # sessions are read on other threads, too
         self._others: dict[Any, _Accepted] = {}  # by address and port, the oldest first
