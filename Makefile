@@ -5,7 +5,7 @@ VENV := .venv/bin/python
 
 .DEFAULT_GOAL := help
 unexport PYTHONDONTWRITEBYTECODE  # every test starts programs: compiling them each time would cost a third of the time
-.PHONY: help demo demo-options test quick thorough stops soak floods schedules script-schedules page-schedules page-tests brokers check firmware report clean lock audit sbom check-types check-names check-collection test-running test-further test-robots test-pages test-computing
+.PHONY: help demo demo-options test quick thorough stops soak floods schedules script-schedules page-schedules page-tests gstreamer gstreamer-tests brokers check firmware report clean lock audit sbom check-types check-names check-collection test-running test-further test-robots test-pages test-computing
 
 help:
 	@echo "make demo             four simulated robots, on Zenoh, on MQTT and on MCUs, driven through a broker; Ctrl-C ends it"
@@ -20,6 +20,7 @@ help:
 	@echo "make script-schedules  200 of them with whole robots, 30 minutes"
 	@echo "make page-tests       every state, card, interruption and finger at the operator page in Chromium, 20 minutes"
 	@echo "make page-schedules   200 random sequences of inputs and faults at the operator page in Chromium, 15 minutes"
+	@echo "make gstreamer-tests  install GStreamer and OpenCV for the system's Python, and have the original's local media read by them, three minutes"
 	@echo "make brokers          install NATS, RabbitMQ and aedes where that is possible, and test robots with them, two minutes"
 	@echo "make check            lint, types, imports and names only"
 	@echo "make firmware         measure the firmware's use of each board in the real MicroPython; writes docs/firmware.md"
@@ -103,13 +104,25 @@ test-computing:
 		{ cat .venv/computing.log; exit 1; }
 	@echo "pebble: what only computes: $$(tail -n 1 .venv/computing.log)"
 
-thorough:
+thorough: gstreamer
 	@PEBBLE_THOROUGH=1 $(MAKE) --no-print-directory test
 
 # Every state of the operator page on every size, every card, its sound, every interruption, and fingers.
 page-tests: .venv/.ready-dev
 	@sh tools/debian-packages.sh mosquitto=mosquitto chromium=chromium
 	@$(VENV) tools/run_tests.py -m page tests/web
+
+# 250 MB, so only for those who ask for it: make test has a stand-in for shmsrc, which reads Debian's shmsink here.
+gstreamer:
+	@sh tools/debian-packages.sh gst-launch-1.0=gstreamer1.0-tools
+	@gst-inspect-1.0 --exists shmsrc && gst-inspect-1.0 --exists videotestsrc || \
+		sh tools/debian-packages.sh =gstreamer1.0-plugins-base =gstreamer1.0-plugins-bad
+	@/usr/bin/python3 -c "import cv2, paho.mqtt.client" 2>/dev/null || \
+		sh tools/debian-packages.sh =python3-opencv =python3-paho-mqtt
+
+gstreamer-tests: .venv/.ready-dev gstreamer
+	@sh tools/debian-packages.sh mosquitto=mosquitto
+	@PEBBLE_THOROUGH=1 $(VENV) tools/run_tests.py tests/services/gstreamer_mirror
 
 # Brokers of other makers; where they are installed, make thorough tests them as well.
 brokers: .venv/.ready-dev

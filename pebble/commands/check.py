@@ -190,6 +190,7 @@ def facts(config: Config) -> list[tuple[str, str]]:
         found.append(("uplink", _uplink(config)))
     found += _scripts(config)
     found += [("serial", line) for line in _serial_lines(config)]
+    found += [("for the original's scripts", text) for text in _local_media(config)]
     table = programs(config)
     found.append(("processes", ", ".join([_LAUNCHER, *(program.name for program in table if not program.on_demand)])))
     on_request = ", ".join(program.name for program in table if program.on_demand)
@@ -284,6 +285,16 @@ def _mqtt(mqtt: Mqtt) -> str:
     name = " without a check of the name" if mqtt.tls.insecure else ""
     tls = f"TLS{name}" if mqtt.tls.enabled else "not encrypted"
     return f"{mqtt.host}:{mqtt.port}, MQTT {mqtt.protocol}, {user}{password}, {tls}"
+
+
+def _local_media(config: Config) -> Iterator[str]:
+    """What programs of the original find on the robot besides MQTT."""
+    devices = config.services.av_daemon
+    forms = {"video": "pictures", "audio": "sound"}
+    yield from (f"{forms[name]} at {path}" for name, path in devices.sockets().items())
+    for line in config.motor_lines().values():
+        if (name := config.hall_memory(line)) is not None:
+            yield f"hall samples in the shared memory {name}"
 
 
 def _serial_lines(config: Config) -> Iterator[str]:

@@ -10,7 +10,7 @@ from msgspec.structs import replace
 
 from pebble.config.exposure import warn_if_readable, warn_of_logins_in_clear
 from pebble.config.hosts import HostError, check_web_url
-from pebble.config.media import VideoStream
+from pebble.config.media import AvDaemon, VideoStream
 from pebble.config.problems import Path
 from pebble.config.reader import Check, Reader
 from pebble.config.secret_text import without_login
@@ -75,6 +75,18 @@ def _services(reader: Reader, services: Services, path: Path) -> Services:
     if services.soundboard_handler.enabled and not services.soundboard_handler.playback.player_command:
         reader.notes.doubt((*path, "soundboard_handler", "playback", "player_command"), "is missing, write aplay")
     return services
+
+
+def _av_daemon(reader: Reader, devices: AvDaemon, path: Path) -> AvDaemon:
+    """The sockets for programs of the original. Without a folder for them the robot runs, and they wait."""
+    sockets = devices.sockets()
+    for section, file in sockets.items():
+        if not file.parent.is_dir():
+            text = f"there is no folder {file.parent}: until there is, no program finds this socket"
+            reader.notes.warning((*path, section, "socket_path"), text)
+    if len(sockets) > len(set(sockets.values())):
+        reader.notes.problem((*path, "audio", "socket_path"), "is also that of video, write another")
+    return devices
 
 
 def _video_stream(reader: Reader, stream: VideoStream, path: Path) -> VideoStream:
@@ -250,6 +262,7 @@ CHECKS = _table(
     (Root, _root),
     (TransportSection, _transport),
     (Services, _services),
+    (AvDaemon, _av_daemon),
     (VideoStream, _video_stream),
     (MqttBridge, _bridge),
     (SerialBridges, _serial),

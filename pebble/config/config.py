@@ -73,6 +73,13 @@ class Config(Root, frozen=True, kw_only=True):
         lines: dict[str, SerialBridge] = {"": own, **own.instances}
         return {name: line for name, line in lines.items() if line.enabled and line.serial.port is not None}
 
+    def hall_memory(self, line: SerialBridge) -> str | None:
+        """The name of the shared memory that gets this line's hall samples; None: there is none."""
+        ring = line.odometry_shm
+        if ring is None or not ring.enabled:
+            return None
+        return ring.name or f"{self.base.replace('/', '_')}_odometry_raw"
+
     def motor_lines(self) -> dict[str, SerialBridge]:
         """Those of the enabled serial lines that drive motors."""
         lines = self.serial_instances().items()

@@ -1,5 +1,6 @@
 """The config sections of camera, microphone and video, on the robot and towards operators."""
 
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 from msgspec import Meta, field
@@ -28,14 +29,15 @@ from pebble.contract.encodings import SoundEncoding, VideoEncoding
 
 _FRAMES = "pictures and sound use the robot's own shared memory, found by transport.run_dir"
 _SOURCE = "every frame has its own size and format"
-_SHARED_MEMORY = {"socket_path": _FRAMES, "shm_size": _FRAMES, "wait_for_connection": _FRAMES}
+_SOCKET = "a socket has the memory that its frames need, and never waits for its readers"
+_SHMSINK = {"shm_size": _SOCKET, "wait_for_connection": _SOCKET}
 _INPUT = {"input_shm": _FRAMES, "input_retry_seconds": _FRAMES}
 
 
 class CameraCapture(Section, frozen=True, kw_only=True):
     """The camera."""
 
-    retired: ClassVar = _SHARED_MEMORY
+    retired: ClassVar = _SHMSINK
 
     enabled: Annotated[bool, doc("Open the camera.")] = True
     backend: Annotated[
@@ -55,12 +57,15 @@ class CameraCapture(Section, frozen=True, kw_only=True):
     height: Annotated[Pixels, doc("Pixels.")] = 480
     fps: Annotated[FramesPerSecond, doc("Frames per second.")] = 15
     rotate_degrees: Annotated[Rotation, doc("Clockwise.")] = 0
+    socket_path: Annotated[
+        File | None, doc("Offer pictures to programs of the original: raw BGR at this GStreamer `shmsink` socket.")
+    ] = None
 
 
 class Microphone(Section, frozen=True, kw_only=True):
     """The microphone."""
 
-    retired: ClassVar = _SHARED_MEMORY
+    retired: ClassVar = _SHMSINK
 
     enabled: Annotated[bool, doc("Open the microphone.")] = True
     source: Annotated[
@@ -69,6 +74,9 @@ class Microphone(Section, frozen=True, kw_only=True):
     device: Annotated[str | None, doc("ALSA device; unset: the default.")] = None
     rate: Annotated[SampleRate, doc("Samples per second.")] = 16000
     channels: Annotated[AudioChannels, doc("1 is mono, 2 stereo.")] = 1
+    socket_path: Annotated[
+        File | None, doc("Offer sound to programs of the original: S16LE at this GStreamer `shmsink` socket.")
+    ] = None
 
 
 class AvDaemon(ServiceSection, frozen=True, kw_only=True):
@@ -80,6 +88,17 @@ class AvDaemon(ServiceSection, frozen=True, kw_only=True):
     env: Annotated[Variables, doc("Environment variables to add.")] = EMPTY
     video: Annotated[CameraCapture, doc("Camera.")] = CameraCapture()
     audio: Annotated[Microphone, doc("Microphone.")] = Microphone()
+
+    def sockets(self) -> dict[str, Path]:
+        """The sockets that `gstreamer_mirror` offers, by the section that names them."""
+        if not self.enabled:
+            return {}
+        sections: dict[str, CameraCapture | Microphone] = {"video": self.video, "audio": self.audio}
+        return {
+            name: section.socket_path
+            for name, section in sections.items()
+            if section.enabled and section.socket_path is not None
+        }
 
 
 class VideoStream(ServiceSection, frozen=True, kw_only=True):

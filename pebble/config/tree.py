@@ -26,6 +26,7 @@ from pebble.config.types import (
     Section,
     Sentence,
     ServiceSection,
+    SharedMemoryName,
     Topic,
     Variables,
     doc,
@@ -205,11 +206,11 @@ class SerialTelemetry(Section, frozen=True, kw_only=True):
 
 
 class OdometryRing(Section, frozen=True, kw_only=True):
-    """The original's ring of raw hall-sensor samples; still checked, no longer used."""
+    """The shared memory in which the original's `wheel-odometry` finds every raw hall-sensor sample."""
 
-    enabled: Annotated[bool, doc("No longer used.")] = True
-    name: Annotated[str | None, doc("No longer used.")] = None
-    slots: Annotated[int, Meta(ge=64, le=1_000_000, description="No longer used.")] = 2048
+    enabled: Annotated[bool, doc("Write it.")] = True
+    name: Annotated[SharedMemoryName | None, doc("Its name; unset: `{system}_{type}_{id}_odometry_raw`.")] = None
+    slots: Annotated[int, Meta(ge=64, le=65_535, description="How many samples it holds, 32 bytes each.")] = 2048
 
 
 class SerialSafety(Section, frozen=True, kw_only=True):
@@ -260,12 +261,12 @@ class SerialHealth(Section, frozen=True, kw_only=True):
 class SerialBridge(ServiceSection, frozen=True, kw_only=True):
     """One serial line to an MCU; one process each."""
 
-    retired: ClassVar = {"odometry_shm": "raw hall samples travel through the robot's own transport"}
-
     protocol: Annotated[SerialProtocolName, doc("The serial protocol of the MCU.")] = "goob_base_v1"
     serial: Annotated[SerialPort, doc("The line.")] = SerialPort()
     telemetry: Annotated[SerialTelemetry, doc("What is published.")] = SerialTelemetry()
-    odometry_shm: Annotated[OdometryRing, doc("No longer used.")] = OdometryRing()
+    odometry_shm: Annotated[
+        OdometryRing | None, doc("Hall samples for the original's `wheel-odometry`; absent: none, `{}`: as below.")
+    ] = None
     safety: Annotated[SerialSafety, doc("When to stop.")] = SerialSafety()
     topics: Annotated[SerialTopics, doc("Other names for topics.")] = SerialTopics()
     publish: Annotated[ImuPublish, doc("IMU samples.")] = ImuPublish()

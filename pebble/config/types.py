@@ -79,6 +79,9 @@ AudioChannels = Annotated[int, Meta(ge=1, le=8)]
 Command = tuple[str, ...]
 #: Relative to the config file; ``~`` is the user's home.
 File = Annotated[Path, Meta(extra={"expected": "a path", "parse": hosts.no_url})]
+SharedMemoryName = Annotated[
+    str, Meta(pattern=r"^/?(?!\.{0,2}$)[^/\x00]{1,200}$(?!\n)", extra={"expected": "a name without /"})
+]
 #: Environment variables by name.
 Variables = dict[Annotated[str, Meta(pattern="^[^=]+$", extra={"expected": "the name of a variable, without ="})], str]
 Password = Annotated[str, Meta(extra={"secret": True})]

@@ -26,6 +26,20 @@ def media(config: Config, devices: Path, which: Which = shutil.which) -> Iterato
     if daemon.audio.enabled and daemon.audio.source != "synthetic":
         yield program("microphone", ("arecord",), "sudo apt install alsa-utils", which)
     yield codecs(config, installed=pyav.installed())
+    for name, path in daemon.sockets().items():
+        yield shm_socket(f"{name} for the original's scripts", path)
+
+
+def shm_socket(what: str, path: Path) -> Finding:
+    """Whether `gstreamer_mirror` can make the socket."""
+    folder = path.parent
+    if not folder.is_dir():
+        return fail(what, f"there is no folder {folder}", f"sudo install -d -o $USER {folder}")
+    if not os.access(folder, os.W_OK | os.X_OK):
+        return fail(what, f"{folder} is not writable for this user", f"sudo chown $USER {folder}")
+    if path.exists() and not path.is_socket():
+        return fail(what, f"{path} is a file and no socket", f"rm {path}")
+    return ok(what, str(path))
 
 
 def camera(backend: str, device: str, devices: Path, which: Which) -> Finding:

@@ -63,6 +63,7 @@ def programs(config: Config) -> tuple[Program, ...]:
         (services.autonomy_manager.enabled, _service(config, "autonomy_manager", Stage.CONNECTION, runs_scripts=True)),
         (services.mqtt_bridge.enabled, _service(config, "mqtt_bridge", Stage.CONNECTION, may_request=True)),
         (mirror is not None, _service(config, "mqtt_mirror", Stage.CONNECTION)),
+        (bool(services.av_daemon.sockets()), _service(config, "gstreamer_mirror", Stage.CONNECTION, preloaded=False)),
         (services.soundboard_handler.enabled, _service(config, "soundboard_handler", Stage.CONNECTION)),
         (services.web_handler.enabled, _web_handler(config)),
         (services.recorder.enabled, _service(config, "recorder", Stage.CONNECTION, preloaded=False)),

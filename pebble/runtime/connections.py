@@ -48,6 +48,11 @@ def check_connections(config: Config) -> None:
         problems.append(
             f"transport.run_dir: {config.run_dir()} is too long for the sockets in it, set it to a shorter path"
         )
+    for name, path in config.services.av_daemon.sockets().items():
+        if not fits_socket(path):
+            problems.append(
+                f"services.av_daemon.{name}.socket_path: {path} is too long for a socket, write a shorter one"
+            )
     if problems:
         raise ConfigError(problems)
 

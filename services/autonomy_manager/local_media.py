@@ -70,12 +70,12 @@ class LocalMedia:
             return ""
         if not devices.enabled or not self._sections[section].enabled:
             return f"it reads {what}, and services.av_daemon.{section} is not enabled"
-        if getattr(self._sections[section], "socket_path", None) is None:
+        if self._sections[section].socket_path is None:
             return f"it reads {what} at a GStreamer socket: set services.av_daemon.{section}.socket_path"
         return ""
 
     def _socket(self, section: str) -> Path:
-        return Path(getattr(self._sections[section], "socket_path", None) or _SOCKETS[section])
+        return Path(self._sections[section].socket_path or _SOCKETS[section])
 
     def _listens(self, path: Path) -> bool:
         """Whether a process listens there. To connect would switch the camera on."""

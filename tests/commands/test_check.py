@@ -56,6 +56,16 @@ def test_check_and_up_refuse_a_run_directory_that_is_too_long(
     assert not run_dir.exists()
 
 
+def test_check_and_up_refuse_a_path_that_no_socket_can_have(run: Run, tmp_path: Path) -> None:
+    socket = tmp_path / ("s" * 100)
+    transport = {"kind": "mqtt", "run_dir": str(tmp_path / "run")}
+    devices = {"enabled": True, "video": {"socket_path": str(socket)}}
+    path = config_file(tmp_path, transport=transport, services={"av_daemon": devices})
+    for command in ("check", "up"):
+        assert run(command, path) == 1
+        assert f"services.av_daemon.video.socket_path: {socket} is too long for a socket" in run.err
+
+
 def test_all_of_our_configs_can_be_checked_at_once(run: Run) -> None:
     assert run("check", *sorted((ROOT / "configs").glob("*.json"))) == 0
     assert run.err == "pebble: schema.json: the JSON Schema of configs, not a config\n"
@@ -103,6 +113,22 @@ def test_check_names_the_broker_where_others_may_pose_as_a_script(
 ) -> None:
     assert run("check", config_file(tmp_path, **{"local_mqtt": {"host": "127.0.0.1"}, **keys}), columns=160) == 0
     assert ("anybody at broker 127.0.0.1:1883 may pose as one, or end one" in run.out) == shared
+
+
+def test_check_shows_what_scripts_of_the_original_find(run: Run, tmp_path: Path) -> None:
+    services: dict[str, object] = {
+        "av_daemon": {"enabled": True, "video": {"socket_path": "v.sock"}, "audio": {"socket_path": "a.sock"}},
+        "serial_mcu_bridge": {"enabled": True, "serial": {"port": "/dev/ttyACM7"}, "odometry_shm": {}},
+    }
+    assert run("check", config_file(tmp_path, services=services), columns=200) == 0
+    lines = [" ".join(line.split()) for line in run.out.splitlines()]
+    for expected in (
+        f"pictures at {tmp_path / 'v.sock'}",
+        f"sound at {tmp_path / 'a.sock'}",
+        "hall samples in the shared memory pebble_robots_goob_odometry_raw",
+    ):
+        assert f"for the original's scripts {expected}" in lines
+    assert "processes launcher, announcer, serial_mcu_bridge, av_daemon, gstreamer_mirror" in lines
 
 
 def test_check_shows_what_runs_on_request(run: Run, tmp_path: Path) -> None:

@@ -164,12 +164,22 @@ class TestOriginal:
     def test_every_key_whose_meaning_is_gone_is_reported_once_with_what_replaces_it(self) -> None:
         gone = [line for line in load(ORIGINAL, env={}).warnings if "no longer used" in line]
         assert len(gone) == 3
-        shared_memory, programs, odometry = gone
-        assert "services.av_daemon.video.{socket_path, shm_size, wait_for_connection}" in shared_memory
-        assert "services.mqtt_bridge.media.audio_publisher.{input_shm, input_retry_seconds}" in shared_memory
+        sockets, inputs, programs = gone
+        assert "services.av_daemon.video.{shm_size, wait_for_connection}" in sockets
+        assert "services.mqtt_bridge.media.audio_publisher.{input_shm, input_retry_seconds}" in inputs
         assert "services.mqtt_bridge.video_control.{command, cwd}" in programs
-        assert odometry.startswith("services.serial_mcu_bridge.odometry_shm: no longer used, ")
         assert all(line.partition("no longer used, ")[2] for line in gone)
+
+    def test_what_its_scripts_find_on_the_robot_is_offered(self) -> None:
+        services = load(ORIGINAL, env={}).services
+        assert services.av_daemon.sockets() == {
+            "video": Path("/run/pebble/video.sock"), "audio": Path("/run/pebble/audio.sock")
+        }  # fmt: skip
+        ring = services.serial_mcu_bridge.odometry_shm
+        assert ring is not None
+        assert (ring.enabled, ring.name, ring.slots) == (True, "pebble_robots_rover-7_odometry_raw", 2048)
+        own = read({"robot": {"id": "goob"}}).services
+        assert (own.av_daemon.sockets(), own.serial_mcu_bridge.odometry_shm) == ({}, None), "only where it is written"
 
     def test_services_of_later_releases_are_skipped_with_a_warning_each(self) -> None:
         enabled = {"services": {"ros1_bridge": {"enabled": True}}}
@@ -299,9 +309,9 @@ class TestInheritance:
         ]
 
     def test_a_warning_about_a_shared_value_is_reported_where_it_stands(self) -> None:
-        serial: dict[str, Any] = {"odometry_shm": {}, "instances": {"a": {}}}
+        serial: dict[str, Any] = {"safety": {"stop_on_shutdown": False}, "instances": {"a": {}}}
         (warning,) = read(at("services.serial_mcu_bridge", serial)).warnings
-        assert warning.startswith("services.serial_mcu_bridge.odometry_shm: ")
+        assert warning.startswith("services.serial_mcu_bridge.safety.stop_on_shutdown: ")
 
 
 class TestSerialInstances:
@@ -426,6 +436,9 @@ class TestMistakes:
             ("services.serial_mcu_bridge.safety.drive_timeout_seconds", 0, "must be a number above 0 and at most 5"),
             ("services.serial_mcu_bridge.safety.drive_timeout_seconds", 5.1, "must be a number above 0 and at most 5"),
             ("services.serial_mcu_bridge.odometry_shm.slots", 63, "must be a whole number from 64"),
+            ("services.serial_mcu_bridge.odometry_shm.slots", 65_536, "must be a whole number from 64"),
+            ("services.serial_mcu_bridge.odometry_shm.name", "../x", "must be a name without /"),
+            ("services.serial_mcu_bridge.odometry_shm.name", "/..", "must be a name without /"),
             ("services.serial_mcu_bridge.protocol", "goob", 'must be "goob_base_v1", "imu_mpu6050_v1"'),
             ("services.av_daemon.video.rotate_degrees", 45, "must be 0, 90, 180 or 270, not 45"),
             ("services.av_daemon.video.io_mode", [], "must be text or a whole number, not a list"),
@@ -477,6 +490,18 @@ class TestMistakes:
     )  # fmt: skip
     def test_what_is_missing_or_does_not_fit_together(self, raw: dict[str, Any], expected: str) -> None:
         assert only_problem(raw).startswith(expected)
+
+    def test_two_sockets_cannot_have_one_path(self, tmp_path: Path) -> None:
+        same = {"socket_path": str(tmp_path / "a.sock")}
+        raw = at("services.av_daemon", {"enabled": True, "video": same, "audio": same})
+        assert only_problem(raw) == "services.av_daemon.audio.socket_path: is also that of video, write another"
+
+    def test_a_socket_without_a_folder_is_no_reason_not_to_start(self, tmp_path: Path) -> None:
+        socket = {"socket_path": str(tmp_path / "none" / "a.sock")}
+        (warning,) = read(at("services.av_daemon", {"enabled": True, "audio": socket})).warnings
+        assert warning.startswith(f"services.av_daemon.audio.socket_path: there is no folder {tmp_path / 'none'}")
+        for unused in ({"audio": socket}, {"enabled": True, "audio": {"enabled": False, **socket}}):
+            assert read(at("services.av_daemon", unused)).warnings == ()
 
     def test_a_zenoh_uplink_needs_no_remote_broker(self) -> None:
         remote = {"kind": "zenoh", "connect": ["tls/base.example:7447"]}

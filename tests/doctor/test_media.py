@@ -9,7 +9,7 @@ import pytest
 
 from pebble.config import Config, parse
 from pebble.doctor import Level
-from pebble.doctor.media import camera, codecs, media
+from pebble.doctor.media import camera, codecs, media, shm_socket
 
 
 def config_of(devices: dict[str, Any], **sent: Any) -> Config:
@@ -43,6 +43,19 @@ def test_nothing_there(tmp_path: Path) -> None:
     assert [found[what].level for what in ("camera", "microphone")] == [Level.FAIL, Level.FAIL]
     assert "alsa-utils" in found["microphone"].fix
     assert "video0 does not exist" in found["camera"].text
+
+
+def test_sockets_for_scripts_of_the_original(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    devices = {
+        "enabled": True,
+        "video": {"backend": "synthetic", "socket_path": str(tmp_path / "v.sock")},
+        "audio": {"source": "synthetic", "socket_path": str(tmp_path / "none" / "a.sock")},
+    }
+    found = {finding.what: finding for finding in media(config_of(devices), tmp_path, nothing)}
+    assert found["video for the original's scripts"].level is Level.OK
+    assert "there is no folder" in found["audio for the original's scripts"].text
+    assert shm_socket("x", tmp_path / "file").text.endswith("is a file and no socket")
 
 
 @pytest.mark.parametrize(

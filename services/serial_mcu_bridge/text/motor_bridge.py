@@ -30,6 +30,7 @@ from pebble.services.serial_mcu_bridge.serial_service import SerialService
 from pebble.services.serial_mcu_bridge.text import goob_base
 from pebble.services.serial_mcu_bridge.text.device_log import DeviceLogLine, is_known
 from pebble.services.serial_mcu_bridge.text.goob_base import Charging, Level, Report, Touch
+from pebble.services.serial_mcu_bridge.text.hall_memory import HallMemory
 
 _LIGHTS = "lights"  # a steady colour and a fade replace one another
 _SAVE_AGAIN_S = 1.0
@@ -79,11 +80,18 @@ class MotorBridge(SerialService):
         self._guard_timer: Timer | None = None
         self.announced = self._notified = True  # that it latches: to operators, and to the launcher
         self._charging: ChargingStatus | None = None
+        self._hall = self._make_hall_memory()
         self._splitter = LineSplitter()
+
+    def _make_hall_memory(self) -> HallMemory | None:
+        name, ring = self.config.hall_memory(self.options), self.options.odometry_shm
+        return None if name is None or ring is None else HallMemory(name, ring.slots)
 
     def start(self) -> None:
         self.on_stop(self.state_file.close)
         self.on_stop(self._barred_file.close)
+        if self._hall is not None:
+            self.on_stop(self._hall.close)
         self._guard.begin(self.clock())
         super().start()
 
@@ -262,10 +270,19 @@ class MotorBridge(SerialService):
 
     def on_input(self, chunk: bytes) -> None:
         for line in self._splitter.feed(chunk):
-            for report in self.protocol.parse(line):
+            reports = self.protocol.parse(line)
+            for report in reports:
                 self.note_report(is_known(report))
                 self._report(report)
+            if self._hall is not None:
+                self._keep_samples(self._hall, reports)  # last: what the line says of the charger belongs to them
         self.count_discarded(self._splitter.discarded_lines)
+
+    def _keep_samples(self, hall: HallMemory, reports: list[Report]) -> None:
+        charging = None if self._charging is None else self._charging.value
+        for report in reports:
+            if isinstance(report, Touch):
+                hall.write(round(self.clock() * 1e9), (report.a0, report.a1, report.a2), charging)
 
     def _report(self, report: Report) -> None:
         match report:

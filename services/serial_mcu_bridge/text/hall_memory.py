@@ -1,0 +1,108 @@
+"""Samples of the wheels' hall sensors in a POSIX shared memory: where the original's `wheel-odometry` reads them."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import logging
+import mmap
+import os
+import struct
+
+from pebble.transports.segments import SHM
+
+log = logging.getLogger(__name__)
+
+#: Magic, version, slots, 0, and the number of the newest sample; they are counted from 1.
+_HEADER = struct.Struct("<8sHHIQ")
+#: Number, CLOCK_MONOTONIC in ns, three values as the ADC read them, and whether it charges: 0, 1, or -1 for unknown.
+_SLOT = struct.Struct("<QQiiii")
+_NEWEST = struct.Struct("<Q")
+_NEWEST_AT = _HEADER.size - _NEWEST.size
+_MAGIC, _VERSION = b"PBODRAW1", 1
+_MODE = 0o600  # as the original's: its readers open it for writing, too
+_CHECK_NS = 1_000_000_000  # how soon it is made again, and how often that is tried
+
+
+class HallMemory:
+    """A ring of ``slots`` samples called ``name``. It is made for the first sample, and stays when its writer ends.
+
+    A reader maps it once and reads on while its number grows: so one that exists is used again, and continued.
+    """
+
+    def __init__(self, name: str, slots: int) -> None:
+        self._path, self._slots = SHM / name.removeprefix("/"), slots
+        self._size = _HEADER.size + slots * _SLOT.size
+        self._number = 0
+        self._opened: tuple[int, mmap.mmap] | None = None
+        self._check_at_ns = 0
+        self._problem = ""
+
+    def write(self, at_ns: int, values: tuple[int, int, int], charging: bool | None) -> None:
+        """Add a sample, of that time on CLOCK_MONOTONIC. Without a memory it is lost, which is logged once."""
+        if at_ns >= self._check_at_ns:
+            self._check_at_ns = at_ns + _CHECK_NS
+            self._keep()
+        if self._opened is None:
+            return
+        _, memory = self._opened
+        self._number += 1
+        place = _HEADER.size + (self._number - 1) % self._slots * _SLOT.size
+        _SLOT.pack_into(memory, place, self._number, at_ns, *values, -1 if charging is None else int(charging))
+        _NEWEST.pack_into(memory, _NEWEST_AT, self._number)  # last: a reader goes by it
+
+    def close(self) -> None:
+        if self._opened is not None:
+            descriptor, memory = self._opened
+            self._opened = None
+            memory.close()
+            os.close(descriptor)
+
+    def _keep(self) -> None:
+        """Open it, also after it was removed: Python's own SharedMemory does so when a reader ends."""
+        if self._opened is not None and self._in_place(self._opened[0]):
+            return
+        self.close()
+        try:
+            self._opened = self._open()
+            self._problem = ""
+        except OSError as error:
+            text = os.strerror(error.errno or 0) if error.errno else str(error)
+            if text != self._problem:
+                self._problem = text
+                log.error("no hall samples for wheel-odometry: %s %s", self._path, text)
+
+    def _in_place(self, descriptor: int) -> bool:
+        try:
+            found = self._path.lstat()
+        except OSError:
+            return False
+        return os.path.samestat(found, os.fstat(descriptor))
+
+    def _open(self) -> tuple[int, mmap.mmap]:
+        descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, _MODE)
+        try:
+            memory = self._mapped(descriptor)
+        except BaseException:
+            os.close(descriptor)
+            raise
+        *form, newest = _HEADER.unpack_from(memory)
+        if form == [_MAGIC, _VERSION, self._slots, 0]:
+            self._number = max(self._number, newest)
+        _HEADER.pack_into(memory, 0, _MAGIC, _VERSION, self._slots, 0, self._number)
+        return descriptor, memory
+
+    def _mapped(self, descriptor: int) -> mmap.mmap:
+        """The memory behind ``descriptor``, if it is ours alone. Raises OSError."""
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise OSError("is written by another process") from None
+        found = os.fstat(descriptor)
+        if found.st_uid != os.geteuid():
+            raise PermissionError(errno.EPERM, "belongs to another user")
+        if found.st_size not in (0, self._size):
+            raise OSError(f"has {found.st_size} bytes, and {self._slots} slots need {self._size}: remove it")
+        if not found.st_size:
+            os.posix_fallocate(descriptor, 0, self._size)  # so that no write into it can be fatal
+        return mmap.mmap(descriptor, self._size)
