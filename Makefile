@@ -122,7 +122,7 @@ gstreamer:
 
 gstreamer-tests: .venv/.ready-dev gstreamer
 	@sh tools/debian-packages.sh mosquitto=mosquitto
-	@PEBBLE_THOROUGH=1 $(VENV) tools/run_tests.py tests/services/gstreamer_mirror
+	@PEBBLE_THOROUGH=1 $(VENV) tools/run_tests.py tests/services/gstreamer_mirror tests/robot/test_original_media.py
 
 # Brokers of other makers; where they are installed, make thorough tests them as well.
 brokers: .venv/.ready-dev

@@ -15,19 +15,19 @@ from pathlib import Path
 from typing import Any
 
 import paho.mqtt.client as paho
-from paho.mqtt.enums import CallbackAPIVersion
 
 FOCAL = 624 / 640  # in widths of the picture: the original's calibration
 LOST_S = 0.5
 
 
 def main() -> None:
-    options = _options()
+    options = follow_options().parse_args()
     config = json.loads(Path(options.config).read_text())
     robot, broker = config["robot"], config["local_mqtt"]
     base = f"{robot.get('system', 'pebble')}/{robot.get('type', 'robots')}/{robot['id']}"
     script = Follow(options)
-    client = paho.Client(CallbackAPIVersion.VERSION2, client_id=f"{base}-follow")
+    version = getattr(paho, "CallbackAPIVersion", None)  # of paho 2
+    client: Any = paho.Client(*(() if version is None else (version.VERSION2,)), client_id=f"{base}-follow")
     if broker.get("username"):
         client.username_pw_set(broker["username"], broker.get("password"))
     client.on_connect = lambda *_: client.subscribe(
@@ -43,8 +43,8 @@ def main() -> None:
         time.sleep(1 / options.control_rate_hz)
 
 
-def _options() -> argparse.Namespace:
-    parser = argparse.ArgumentParser()
+def follow_options() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(add_help=False)
     parser.add_argument("--config", required=True)
     parser.add_argument("--tag-id", type=int, default=13)
     parser.add_argument("--tag-size-m", type=float, default=0.25)
@@ -53,7 +53,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--search-power", type=float, default=0.25)
     parser.add_argument("--qos", type=int, default=0)
     parser.add_argument("--retain", action="store_true")
-    return parser.parse_args()
+    return parser
 
 
 class Follow:

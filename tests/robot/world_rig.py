@@ -83,11 +83,20 @@ class World:
 class WorldRig(Rig):
     """A robot in a world: its camera, scripts (Pebble's and those of the tests) and a simulated loudspeaker.
 
-    Without ``world`` it has one of its own. ``camera`` False: none, for what needs no pictures.
+    Without ``world`` it has one of its own. ``camera`` False: none, for what needs no pictures. ``pictures_socket``:
+    programs of the original find its pictures. ``scripts``: their sections in the config.
     """
 
     def __init__(
-        self, kind: str, world: World | None = None, *, name: str = "goob", camera: bool = True, **more: Any
+        self,
+        kind: str,
+        world: World | None = None,
+        *,
+        name: str = "goob",
+        camera: bool = True,
+        pictures_socket: bool = False,
+        scripts: dict[str, Any] | None = None,
+        **more: Any,
     ) -> None:
         self._own = None if world is not None else World()
         self.world = world or self._own
@@ -96,8 +105,18 @@ class WorldRig(Rig):
         (self.world.folder / "timing").touch()
         services = {
             "soundboard_handler": {"enabled": True, "playback": self._playback()},
-            "autonomy_manager": {"enabled": True, "stop_timeout_seconds": STOP_TIMEOUT_S, "env": self._environment()},
-            "av_daemon": {"enabled": camera, "video": self._video(name), "audio": {"enabled": False}},
+            "autonomy_manager": {
+                "enabled": True,
+                "stop_timeout_seconds": STOP_TIMEOUT_S,
+                "env": self._environment(),
+                "scripts": scripts or {},
+            },
+            "av_daemon": {
+                "enabled": camera,
+                "video": self._video(name)
+                | ({"socket_path": str(self.world.folder / f"{name}.sock")} if pictures_socket else {}),
+                "audio": {"enabled": False},
+            },
         }
         super().__init__(kind, name=name, motors=self.world.motors(name), direct=True, start=False, **(services | more))
         (self.folder / "autonomy").symlink_to(SCRIPTS)

@@ -1,0 +1,148 @@
+"""Stand-ins for the original's four scripts on a whole robot: pictures at its socket, hall samples in shared memory."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.robot.closed_loop.following import ORIGINAL_WITHIN_M, TARGET_M, Start
+from tests.robot.world_rig import FOLLOW, WorldRig
+from tests.support import cases, gone, until
+
+pytestmark = pytest.mark.alone  # deadlines are checked
+
+SYSTEM = "/usr/bin/python3"
+_NEEDED = "import cv2, paho.mqtt.client; assert 'GStreamer:                   YES' in cv2.getBuildInformation()"
+#: The system's Python, whose OpenCV has GStreamer: what owners of the original run its scripts with.
+with_gstreamer = pytest.mark.skipif(
+    not Path(SYSTEM).exists() or subprocess.run([SYSTEM, "-c", _NEEDED], stderr=subprocess.DEVNULL).returncode != 0,
+    reason="the system's Python has no OpenCV with GStreamer, or no paho",
+)
+PYTHONS = {
+    "stand-in": pytest.param(sys.executable, id="stand-in"),
+    "shmsrc": pytest.param(SYSTEM, id="shmsrc", marks=[pytest.mark.thorough, with_gstreamer]),
+}
+PERSON = {"x": 0, "z": -0.4}
+PERSONS_WHEELS = (-0.4, -0.4)
+LEAST_RATE = cases(5, 10)  # of 15 pictures a second: others may use this machine
+MOST_S = 40.0  # to find the tag and drive to it
+
+
+class OriginalRig(WorldRig):
+    """A robot in a world with the original's local media, and stand-ins for its scripts in ``python``."""
+
+    def __init__(self, kind: str, python: str) -> None:
+        self.shm = f"pebble-test-{os.getpid()}-{kind}-{Path(python).parent.name}"
+        shm_name = {"key": "shm_name", "arg": "--shm-name", "default": self.shm}
+        needs = [{"file": "original-locations"}, {"file": "original-odometry"}]
+        scripts: dict[str, dict[str, Any]] = {
+            "original-follow": {"dependencies": needs},
+            "original-locations": {"python": python},
+            "original-video-follow": {"python": python},
+            "original-odometry": {"args": [shm_name]},
+        }
+        super().__init__(
+            kind, mirror=kind == "zenoh", pictures_socket=True, scripts=scripts,
+            serial_mcu_bridge={"odometry_shm": {"name": self.shm}},
+        )  # fmt: skip
+
+    def close(self) -> None:
+        super().close()
+        (Path("/dev/shm") / self.shm).unlink(missing_ok=True)
+
+    def arrives(self) -> bool:
+        """Whether it stands at its distance from the tag for a second, before long."""
+        end = time.monotonic() + MOST_S
+        while time.monotonic() < end:
+            since = time.monotonic()
+            if not until(lambda: not self.near(), 1.0, step=0.05) and time.monotonic() - since >= 1.0:
+                return True
+            time.sleep(0.05)
+        return False
+
+    def near(self) -> bool:
+        return abs(self.world.tag_from(self.name)[0] - TARGET_M) <= ORIGINAL_WITHIN_M
+
+
+@pytest.fixture(scope="module")
+def rigs() -> Iterator[Callable[[str, str], OriginalRig]]:
+    """Robots by transport and Python, each started when it is first needed."""
+    with ExitStack() as stack:
+        yield cache(lambda kind, python: stack.enter_context(OriginalRig(kind, python)))  # type: ignore[arg-type]
+
+
+@pytest.fixture(params=["zenoh", "mqtt"])
+def kind(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+def odometry(rig: OriginalRig) -> dict[str, Any]:
+    seen = rig.operator.last("outgoing/wheel-odometry")
+    return {} if seen is None else dict(seen.json["value"])
+
+
+def rate(rig: OriginalRig, since: float) -> float:
+    """How many pictures came through the socket in a second."""
+    seen = [message.json for message in rig.operator.on("outgoing/stand-in-pictures", since)]
+    return float(seen[-1]["count"] - seen[0]["count"]) / (seen[-1]["at"] - seen[0]["at"])
+
+
+@pytest.mark.parametrize("python", PYTHONS.values())
+def test_all_at_once_follow_a_tag_obey_a_person_and_end(
+    rigs: Callable[[str, str], OriginalRig], kind: str, python: str
+) -> None:
+    rig = rigs(kind, python)
+    rig.world.place(rig.name, *Start(distance=1.1, beside=15.0, off=20.0).pose)
+    pid = rig.driving("original-follow", FOLLOW)
+    assert rig.arrives(), rig.log.read_text()[-3000:]
+
+    since, before = time.monotonic(), odometry(rig)
+    time.sleep(cases(4, 60))
+    assert rate(rig, since) >= LEAST_RATE
+    after = odometry(rig)
+    assert after["gaps"] == 0
+    assert (after["samples"] - before["samples"]) / (time.monotonic() - since) > 30, "50 are sent"
+
+    began = time.monotonic()
+    for _ in range(10):
+        rig.operator.send("incoming/drive-values", PERSON)
+        time.sleep(0.05)
+    released = time.monotonic()
+    rig.operator.send("incoming/drive-values", {"x": 0, "z": 0})
+    assert until(lambda: rig.mcu.moving(released + 0.5), 10), "the script goes on"
+    wheels = [one for at, one in rig.mcu.drives(began) if at < released]
+    first = wheels.index(PERSONS_WHEELS)
+    assert set(wheels[first:]) == {PERSONS_WHEELS}, "and nothing of the script's in between"
+    ways = [seen.json["value"]["x_mm"] - after["x_mm"] for seen in rig.operator.on("outgoing/wheel-odometry", began)]
+    assert max(map(abs, ways)) > 15, "what a person drives is counted, too"
+    assert rig.arrives()
+
+    rig.end()
+    assert until(lambda: gone(pid), 3)
+    assert until(lambda: not rig.mcu.turning(), 2)
+    assert until(lambda: not rig.script().get("running"))
+
+
+@pytest.mark.parametrize("python", PYTHONS.values())
+def test_one_follows_a_tag_with_the_pictures_alone(
+    rigs: Callable[[str, str], OriginalRig], kind: str, python: str
+) -> None:
+    rig = rigs(kind, python)
+    rig.world.place(rig.name, *Start(distance=1.0, beside=-10.0, off=-15.0).pose)
+    pid = rig.driving("original-video-follow", FOLLOW)
+    began = time.monotonic()
+    assert rig.arrives(), rig.log.read_text()[-3000:]
+    assert rate(rig, began) >= LEAST_RATE
+    killed = rig.kill("gstreamer_mirror")
+    assert until(lambda: rig.operator.on("outgoing/stand-in-pictures", killed + 0.5), 15), "it opens the socket again"
+    rig.idle()
+    assert until(lambda: gone(pid), 3)
