@@ -80,7 +80,7 @@ _ODOM_FOLLOW = (
 )
 
 #: By the script's folder; :func:`settings_of` completes them.
-_SETTINGS: dict[str, tuple[Setting, ...]] = {
+SETTINGS: dict[str, tuple[Setting, ...]] = {
     "wheel-odometry": _ODOMETRY,
     "apriltag-locations": _LOCATIONS,
     "apriltag-odom-follow": _ODOM_FOLLOW,
@@ -90,7 +90,7 @@ _SETTINGS: dict[str, tuple[Setting, ...]] = {
 def settings_of(name: str, camera: CameraCapture) -> tuple[Setting, ...]:
     """The settings of a script; none for one that is not known."""
     own = {"width": camera.width, "height": camera.height, "fps": float(camera.fps)}
-    return tuple(replace(one, default=own.get(one.key, one.default)) for one in _SETTINGS.get(name, ()))
+    return tuple(replace(one, default=own.get(one.key, one.default)) for one in SETTINGS.get(name, ()))
 
 
 #: By the script's folder: the scripts it needs, with their settings.
