@@ -173,7 +173,9 @@ def test_an_audit_without_the_service_fails_by_name(tmp_path: Path) -> None:
 def test_the_sbom_names_every_vendored_file_and_package_once() -> None:
     entries = json.loads(sbom.VENDOR.read_text())
     components = sbom.vendored(entries)
-    assert {part["purl"] for part in components} == {f"pkg:npm/{one['name']}@{one['version']}" for one in entries}
+    assert {part["purl"] for part in components} == {
+        f"pkg:npm/{one['name'].replace('@', '%40')}@{one['version']}" for one in entries
+    }
     assert len({part["bom-ref"] for part in components}) == len(components)
     files = {(file["name"], file["hashes"][0]["content"]) for part in components for file in part["components"]}
     assert files == {(one["file"], one["sha256"]) for one in entries}

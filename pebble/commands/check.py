@@ -76,8 +76,10 @@ def _found_scripts(config: Config) -> dict[str, Script]:
     """The scripts that ``autonomy_manager`` would offer, by name."""
     if config.robot.platform != "linux" or not config.services.autonomy_manager.enabled:
         return {}
-    from pebble.services.autonomy_manager.catalogue import Catalogue  # few checks need it
-
+    try:
+        from pebble.services.autonomy_manager.catalogue import Catalogue  # few checks need it
+    except ModuleNotFoundError:  # a system without fcntl runs no robots
+        return {}
     found: list[dict[str, Script]] = []
     Catalogue(config, asks=False).scan(found.append)
     return found[-1]

@@ -302,6 +302,7 @@ def test_it_takes_no_lease_back(show: Show, server: CannedServer) -> None:
         opened.page.goto(server.url)
         assert opened.until("window.pebble?.connection.isOpen")
         assert server.sent("hello")[-1]["token"] == "canned"
+        opened.test("fleet-more").click()
         opened.test("watch").click()
         assert opened.until(lambda: opened.page.url == f"{server.url}/?watch")
         assert opened.until("window.pebble?.connection.isOpen")

@@ -38,9 +38,6 @@ export function Fleet() {
   const refs = useRefs();
   const omitted = useValue("", "web/broker")?.robots_omitted ?? 0;
   const [filter, setFilter] = useState("");
-  const nodes = useNodes(
-    (ref) => html`<li key=${ref}><${Boundary} what=${nameOf(ref)}><${FleetCard} at=${ref} /><//></li>`,
-  );
   const online = refs.filter((ref) => isPresent(store, ref));
   const away = refs.filter((ref) => !isPresent(store, ref) && !settings.forgotten.has(ref));
   useEffect(() => {
@@ -48,7 +45,6 @@ export function Fleet() {
   }, [online.join()]);
   const matches = (ref) => ref.toLowerCase().includes(filter.trim().toLowerCase());
   const shown = sorted(store, online.filter(matches), settings.sort);
-  const cards = nodes(shown);
   const shownAway = away.filter(matches).sort();
   const total = online.length + away.length;
   const robots = refs.filter((ref) => typeOf(ref) === "robots" && (online.includes(ref) || away.includes(ref)));
@@ -79,14 +75,7 @@ export function Fleet() {
     </p>`}
     ${total === 0 && html`<${Empty} />`}
     ${total > 0 && !shown.length && !shownAway.length && html`<p class="empty">Nothing matches “${filter}”.</p>`}
-    ${groups.map(
-      ({ title, list }) => html`<section key=${title} aria-label=${title || "Robots"}>
-        ${title && html`<h2 class="fleet-group">${title}</h2>`}
-        <ul class=${`fleet-cards ${dense ? "dense" : ""}`}>
-          ${list.map((ref) => cards.get(ref))}
-        </ul>
-      </section>`,
-    )}
+    ${groups.map(({ title, list }) => html`<${Group} key=${title} title=${title} refs=${list} />`)}
     ${total > 0 && !dense && !WATCHES && html`<${FirstTime} refs=${present} />`}
     ${shownAway.length > 0 &&
     html`<section class="away" aria-labelledby="away-title">
@@ -420,15 +409,19 @@ function AwayRow({ at }) {
 }
 
 /**
- * Draw each item again only when it changes by itself: Preact passes over a node that it has drawn before. ``draw`` may
- * use nothing but its argument.
- * @param {(ref: string) => any} draw @returns {(refs: string[]) => Map<string, any>}
+ * One list of cards. Each card is drawn again only when it changes by itself: Preact passes over a node that it has drawn
+ * before, in the same list.
  */
-function useNodes(draw) {
-  const nodes = useRef(new Map());
-  return (refs) => {
-    const old = nodes.current;
-    nodes.current = new Map(refs.map((ref) => [ref, old.get(ref) ?? draw(ref)]));
-    return nodes.current;
-  };
+function Group({ title, refs }) {
+  const cards = useRef(new Map());
+  const old = cards.current;
+  cards.current = new Map(refs.map((ref) => [ref, old.get(ref) ?? cardOf(ref)]));
+  return html`<section aria-label=${title || "Robots"}>
+    ${title && html`<h2 class="fleet-group">${title}</h2>`}
+    <ul class=${`fleet-cards ${title ? "dense" : ""}`}>
+      ${[...cards.current.values()]}
+    </ul>
+  </section>`;
 }
+
+const cardOf = (ref) => html`<li key=${ref}><${Boundary} what=${nameOf(ref)}><${FleetCard} at=${ref} /><//></li>`;
