@@ -16,12 +16,12 @@ _CALIBRATION_OPTION, CALIBRATION = "--calibration", "camera_calibration.yaml"
 _ORIGINAL = "control"
 
 HALL_OPTION = "--shm-name"
-#: Features of OpenCV that are checked as modules are.
-GSTREAMER, DETECT_MARKERS = "OpenCV with GStreamer", "OpenCV 4's aruco.detectMarkers"
+#: Features of OpenCV and of GStreamer that are checked as modules are; the library of GStreamer is that of OpenCV.
+GSTREAMER, DETECT_MARKERS, SHMSRC = "OpenCV with GStreamer", "OpenCV 4's aruco.detectMarkers", "GStreamer's shmsrc"
 
 
 class Needs(Struct, frozen=True):
-    """``modules`` are neither Python's nor beside the script, and ``features`` are those of its OpenCV."""
+    """``modules`` are neither Python's nor beside the script; ``features``: of its OpenCV and GStreamer."""
 
     modules: tuple[str, ...] = ()
     features: tuple[str, ...] = ()
@@ -98,7 +98,8 @@ class _Source:
         pictures = _PICTURE_OPTION in texts or (sockets and not sound)
         opencv = "cv2" in self._imported
         old_aruco = opencv and "detectMarkers" in self._names and not {"ArucoDetector"} & (self._names | texts)
-        features = {GSTREAMER: opencv and ("CAP_GSTREAMER" in self._names or sockets), DETECT_MARKERS: old_aruco}
+        gstreamer = opencv and ("CAP_GSTREAMER" in self._names or sockets)
+        features = {GSTREAMER: gstreamer, DETECT_MARKERS: old_aruco, SHMSRC: sockets}
         moves_path = "path" in self._names and "sys" in self._imported
         elsewhere = any(text.startswith("/") for text in texts) if moves_path else False
         return Needs(

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from pebble.services.autonomy_manager.describe import DescribeError, answer_of, stamp
-from pebble.services.autonomy_manager.needs import DETECT_MARKERS, GSTREAMER, Needs
+from pebble.services.autonomy_manager.needs import DETECT_MARKERS, GSTREAMER, SHMSRC, Needs
 
 SYSTEM = (Path("/usr/bin/python3"), Path("/usr/local/bin/python3"))
 _RETRY_S = 60.0  # after an answer that did not come
@@ -20,6 +20,7 @@ _PACKAGES = {
     "cv2": "python3-opencv",
     GSTREAMER: "python3-opencv",
     DETECT_MARKERS: "python3-opencv",
+    SHMSRC: "gstreamer1.0-plugins-bad",
     "paho": "python3-paho-mqtt",
     "numpy": "python3-numpy",
     "scipy": "python3-scipy",
@@ -32,7 +33,17 @@ _PACKAGES = {
 _ORIGINAL = "it imports `control` of the original's repository, and is no longer inside it: leave it there"
 
 _PROBE = """
-import importlib.util, json, sys
+import ctypes, importlib.util, json, os, sys
+path = list(sys.path)
+def has_element(name):
+    gst = ctypes.CDLL("libgstreamer-1.0.so.0")
+    gst.gst_init(None, None)
+    for function in (gst.gst_element_factory_find, gst.gst_registry_get, gst.gst_registry_find_plugin):
+        function.restype = ctypes.c_void_p
+    gst.gst_plugin_get_filename.restype = ctypes.c_char_p
+    core = gst.gst_registry_find_plugin(ctypes.c_void_p(gst.gst_registry_get()), b"coreelements")
+    path.append(os.path.dirname(os.fsdecode(gst.gst_plugin_get_filename(ctypes.c_void_p(core)) or b"")))
+    return gst.gst_element_factory_find(name)
 def lacks(name):
     if name == "OpenCV with GStreamer":
         import cv2
@@ -40,18 +51,20 @@ def lacks(name):
     if name == "OpenCV 4's aruco.detectMarkers":
         import cv2
         return not hasattr(cv2.aruco, "detectMarkers")
+    if name == "GStreamer's shmsrc":
+        return not has_element(b"shmsrc")
     return importlib.util.find_spec(name) is None
 def missing(name):
     try:
         return lacks(name)
     except Exception:
         return True
-print(json.dumps({"missing": [name for name in sys.argv[1:] if missing(name)], "path": sys.path}))
+print(json.dumps({"missing": [name for name in sys.argv[1:] if missing(name)], "path": path}))
 """
 
 log = logging.getLogger(__name__)
 
-#: The things among those given that a Python lacks, and the folders of its modules. Raises DescribeError.
+#: The things among those given that a Python lacks, and the folders of its modules and plugins. Raises DescribeError.
 Probe = Callable[[str, Sequence[str], Path, Mapping[str, str]], tuple[list[str], list[str]]]
 
 
@@ -68,7 +81,7 @@ def probe(
 
 
 class Pythons:
-    """Chooses interpreters, and remembers their answers until their folders of modules change. For one thread."""
+    """Chooses interpreters, and remembers their answers until the folders of what they use change. For one thread."""
 
     def __init__(
         self, ask: Probe = probe, system: Sequence[Path] = SYSTEM, clock: Callable[[], float] = time.monotonic

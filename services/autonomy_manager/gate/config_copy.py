@@ -11,6 +11,11 @@ from pebble.config.secret_text import is_secret, without_secrets
 from pebble.errors import PebbleError
 
 _MOST_LINKS = 1000
+#: What the original's scripts read of camera and microphone. Where it is missing, each assumes something else.
+_MEDIA = {
+    "video": ("width", "height", "fps", "rotate_degrees", "socket_path"),
+    "audio": ("rate", "channels", "socket_path"),
+}
 
 
 class ConfigCopy:
@@ -33,7 +38,7 @@ class ConfigCopy:
             self._folder.mkdir(mode=0o700)
             self._link()
             self.path.touch(mode=0o600, exist_ok=False)
-            self.path.write_text(json.dumps(self._data(broker), indent=2), encoding="utf-8")
+            self.path.write_text(json.dumps(self._data(broker), indent=2, default=str), encoding="utf-8")
         except (OSError, ValueError) as error:
             raise PebbleError(f"the config of scripts, {self.path}, cannot be written: {error}") from None
         self._written = port, username, password
@@ -59,7 +64,15 @@ class ConfigCopy:
             "run_dir": str(self._config.run_dir()),
             "state_dir": str(self._config.state_dir()),
         }
+        self._fill(data.setdefault("services", {}).setdefault("av_daemon", {}))
         return dict(data)
+
+    def _fill(self, devices: dict[str, Any]) -> None:
+        """Write into the section of camera and microphone what it leaves to defaults, and whole paths."""
+        for name, keys in _MEDIA.items():
+            used = getattr(self._config.services.av_daemon, name)
+            values = {key: getattr(used, key) for key in keys}
+            devices.setdefault(name, {}).update({key: value for key, value in values.items() if value is not None})
 
     def _link(self) -> None:
         """Scripts of the original look for ``camera_calibration.yaml`` beside their config."""

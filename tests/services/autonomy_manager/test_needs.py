@@ -13,7 +13,7 @@ from pebble.config import Config, parse
 from pebble.services.autonomy_manager.catalogue import Catalogue
 from pebble.services.autonomy_manager.describe import DescribeError
 from pebble.services.autonomy_manager.local_media import LocalMedia
-from pebble.services.autonomy_manager.needs import DETECT_MARKERS, GSTREAMER, Needs, needs_of
+from pebble.services.autonomy_manager.needs import DETECT_MARKERS, GSTREAMER, SHMSRC, Needs, needs_of
 from pebble.services.autonomy_manager.pythons import Pythons, probe
 from pebble.services.autonomy_manager.script import Script, StartError, plan
 
@@ -32,7 +32,7 @@ PAHO = "import paho.mqtt.client"
     ("files", "needs"),
     [
         ({"run.py": "import json, os.path"}, {}),
-        ({"run.py": READS_PICTURES}, {"modules": ("cv2", "paho"), "features": (GSTREAMER,), "pictures": True}),
+        ({"run.py": READS_PICTURES}, {"modules": ("cv2", "paho"), "features": (GSTREAMER, SHMSRC), "pictures": True}),
         ({"run.py": "import shape\nRUN = 'follow.py'", "shape.py": PAHO, "follow.py": "import cv2"},
          {"modules": ("paho", "cv2")}),
         ({"run.py": "import cv2\nfound = cv2.aruco.detectMarkers"},
@@ -41,7 +41,8 @@ PAHO = "import paho.mqtt.client"
           "    d = cv2.aruco.detectMarkers"}, {"modules": ("cv2",)}),
         ({"run.py": "try:\n    import cv2\nexcept ImportError:\n    cv2 = None"}, {}),
         ({"run.py": "def show():\n    import matplotlib"}, {}),
-        ({"run.py": "PIPE = 'shmsrc socket-path=x ! audio/x-raw,format=S16LE'"}, {"sound": True}),
+        ({"run.py": "PIPE = 'shmsrc socket-path=x ! audio/x-raw,format=S16LE'"},
+         {"features": (SHMSRC,), "sound": True}),
         ({"run.py": "MAGIC = b'PBODRAW1'"}, {"hall": True}),
         ({"run.py": "OPTIONS = ('--calibration', 'camera_calibration.yaml')"}, {"calibration": True}),
         ({"run.py": "NOTE = 'camera_calibration.yaml'"}, {}),
@@ -83,7 +84,8 @@ class Machine:
 
 
 PICTURES = Needs(modules=("cv2", "paho"), features=(GSTREAMER,))
-ALL = f"cv2 paho {GSTREAMER} {DETECT_MARKERS}"
+SOCKET = Needs(modules=("cv2",), features=(GSTREAMER, SHMSRC))
+ALL = f"cv2 paho {GSTREAMER} {DETECT_MARKERS} {SHMSRC}"
 
 
 @pytest.mark.parametrize(
@@ -99,6 +101,9 @@ ALL = f"cv2 paho {GSTREAMER} {DETECT_MARKERS}"
          "/mine lacks OpenCV with GStreamer: set scripts.walk.python to {}/python3"),
         ("paho", "mine", PICTURES, "mine",
          "/mine lacks OpenCV with GStreamer: apt install python3-opencv, and set scripts.walk.python to {}/python3"),
+        (f"cv2 {GSTREAMER}", None, SOCKET, "python3", f"/python3 lacks {SHMSRC}: apt install gstreamer1.0-plugins-bad"),
+        ("", None, SOCKET, "python3",
+         f"/python3 lacks cv2, {GSTREAMER}, {SHMSRC}: apt install python3-opencv gstreamer1.0-plugins-bad"),
         (ALL, None, Needs(modules=("pupil_apriltags",)), "python3", "/python3 lacks pupil_apriltags"),
         (ALL, None, Needs(modules=("beside",), moves_path=True), "own", ""),
         (ALL, "unknown", PICTURES, "unknown", ""),

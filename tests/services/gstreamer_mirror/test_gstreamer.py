@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from pebble.services.autonomy_manager.needs import SHMSRC
+from pebble.services.autonomy_manager.pythons import SYSTEM, probe
 from tests.kit.shm_reader import connected
 from tests.services.gstreamer_mirror.mirror_rig import (
     HEIGHT,
@@ -38,6 +40,16 @@ def whole(frames: list[bytes]) -> bool:
     """Whether each picture has one number throughout, and none comes twice."""
     assert all(frame == frame[:1] * len(frame) for frame in frames)
     return all(before != after for before, after in pairwise(frames))
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_a_missing_plugin_is_known_without_running_a_script(tmp_path: Path, there: bool) -> None:
+    variables = {} if there else {"GST_PLUGIN_SYSTEM_PATH_1_0": str(tmp_path)}
+    missing, path = probe(
+        str(SYSTEM[0]), [SHMSRC], tmp_path, {"GST_REGISTRY_1_0": str(tmp_path / "registry"), **variables}
+    )
+    assert missing == [SHMSRC][there:]
+    assert any("gstreamer-1.0" in place for place in path) == there, "to be asked again once it is installed"
 
 
 def test_our_stand_in_reads_what_debians_writer_sends(tmp_path: Path) -> None:

@@ -1,5 +1,1 @@
-"""The stand-in for a script of the original, as a script of this robot."""
-
-from tests.fakes.original_odometry import main
-
-main()
+../../../fakes/original_odometry.py

@@ -391,12 +391,21 @@ def test_no_command_passes_once_halt_has_returned(
 
 def test_the_scripts_config_has_no_secret_and_its_files_beside_it(make: Make) -> None:
     remote = {"host": "far", "username": "goob", "password": "hunter2", "tls": {"enabled": True}}
-    services = {"mqtt_bridge": {"remote_mqtt": remote, "media": {}}}
+    services = {
+        "mqtt_bridge": {"remote_mqtt": remote, "media": {}},
+        "av_daemon": {"video": {"width": 1280, "socket_path": "v.sock"}},
+    }
     rig = make(services=services, local_mqtt={"username": "robot", "password": "hunter3"})
     shutil.rmtree(rig.gate.config_path.parent)  # as with a run directory that a logout removes
     text, path = rig.gate.config_path.read_text(), rig.gate.config_path
     assert "hunter" not in text
-    assert json.loads(text)["services"]["mqtt_bridge"]["remote_mqtt"]["host"] == "far"
+    services = json.loads(text)["services"]
+    assert services["mqtt_bridge"]["remote_mqtt"]["host"] == "far"
+    socket_path = str(rig.file.parent / "v.sock")
+    assert services["av_daemon"] == {  # scripts would assume other sizes, and seek the socket elsewhere
+        "video": {"width": 1280, "height": 480, "fps": 15, "rotate_degrees": 0, "socket_path": socket_path},
+        "audio": {"rate": 16000, "channels": 1},
+    }
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
     assert stat.S_IMODE(path.parent.stat().st_mode) == 0o700
     assert (path.parent / "camera_calibration.yaml").read_text() == "fx: 624"
