@@ -1,7 +1,8 @@
 """Deliberate bugs in the product, each with the tests that must find it: is what tests prove still proved?
 
-``python -m tests.forwarding.mutations [WORDS]`` and ``python -m tests.transports.mutations [WORDS]`` put each bug, or
-those with these words, into a copy of the tree. One is found if a test of its fails.
+``python -m tests.forwarding.mutations [WORDS]``, and the same of ``tests.transports``, ``tests.client`` and
+``tests.recordings.recorder``, put each bug, or those with these words, into a copy of the tree. One is found if a test
+of its fails.
 """
 
 # ruff: noqa: T201  (a program)
@@ -22,7 +23,7 @@ _LEFT_OUT = shutil.ignore_patterns(".git", ".venv", "__pycache__", ".*_cache")
 
 
 class Mutation(NamedTuple):
-    """``old``, which occurs once in ``file``, is replaced by ``new``; ``tests``: arguments for pytest."""
+    """``old``, which occurs once in ``file``, is replaced by ``new``; ``tests``: files, and words for pytest's -k."""
 
     bug: str
     tests: str
@@ -50,7 +51,8 @@ def found_by(mutation: Mutation, tree: Path, tests: str) -> str:
     file.write_text(text.replace(mutation.old, mutation.new))
     first, *more = mutation.tests.split(" -k ")
     command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "-p", "no:xdist"]
-    command += ["-m", "not thorough", f"{tests}/{first}", *(word for words in more for word in ("-k", words))]
+    command += ["-m", "not thorough", *(f"{tests}/{path}" for path in first.split())]
+    command += [word for words in more for word in ("-k", words)]
     ran = subprocess.run(command, cwd=tree, capture_output=True, text=True, check=False)
     file.write_text(text)
     failed = re.search(r"^(?:FAILED|ERROR) (\S+)", ran.stdout, re.MULTILINE)
