@@ -74,14 +74,15 @@ def test_two_are_under_way_and_one_when_acknowledgements_are_late() -> None:
     assert queue.window == 2
 
 
-def test_more_are_under_way_if_they_are_small() -> None:
+@pytest.mark.parametrize(("size", "most"), [(100, 8), (500, 8), (1000, 4), (3000, 2)])
+def test_more_are_under_way_if_they_are_small(size: int, most: int) -> None:
     queue, taken = MediaQueue(), 0
     for seq in range(20):
-        queue.offer(frame(seq, keyframe=True, size=500))
+        queue.offer(frame(seq, keyframe=True, size=size))
         taken += queue.take(0.0) is not None
-    assert taken == 8
+    assert taken == most
     queue.acknowledge(0, 1.0)
-    queue.offer(frame(20, keyframe=True, size=2000))
+    queue.offer(frame(20, keyframe=True, size=4000))
     assert queue.window == 1
     assert queue.take(1.0) is None
 
