@@ -6,9 +6,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack
-from functools import cache
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -27,10 +25,13 @@ with_gstreamer = pytest.mark.skipif(
     not Path(SYSTEM).exists() or subprocess.run([SYSTEM, "-c", _NEEDED], stderr=subprocess.DEVNULL).returncode != 0,
     reason="the system's Python has no OpenCV with GStreamer, or no paho",
 )
-PYTHONS = {
-    "stand-in": pytest.param(sys.executable, id="stand-in"),
-    "shmsrc": pytest.param(SYSTEM, id="shmsrc", marks=[pytest.mark.thorough, with_gstreamer]),
-}
+ROBOTS = [
+    *(pytest.param((kind, sys.executable), id=f"{kind}, stand-in") for kind in ("zenoh", "mqtt")),
+    *(
+        pytest.param((kind, SYSTEM), id=f"{kind}, shmsrc", marks=[pytest.mark.thorough, with_gstreamer])
+        for kind in ("zenoh", "mqtt")
+    ),
+]
 PERSON = {"x": 0, "z": -0.4}
 PERSONS_WHEELS = (-0.4, -0.4)
 LEAST_RATE = cases(5, 10)  # of 15 pictures a second: others may use this machine
@@ -44,7 +45,7 @@ class OriginalRig(WorldRig):
     """
 
     def __init__(self, kind: str, python: str) -> None:
-        self.shm = f"pebble-test-{os.getpid()}-{kind}-{Path(python).parent.name}"
+        self.shm = f"pebble-test-{os.getpid()}-{kind}"
         needs = [{"file": "original-locations"}, {"file": "original-odometry"}]
         scripts: dict[str, dict[str, Any]] = {
             "original-follow": {"dependencies": needs},
@@ -74,16 +75,12 @@ class OriginalRig(WorldRig):
         return abs(self.world.tag_from(self.name)[0] - TARGET_M) <= ORIGINAL_WITHIN_M
 
 
-@pytest.fixture(scope="module")
-def rigs() -> Iterator[Callable[[str, str], OriginalRig]]:
-    """Robots by transport and Python, each started when it is first needed."""
-    with ExitStack() as stack:
-        yield cache(lambda kind, python: stack.enter_context(OriginalRig(kind, python)))  # type: ignore[arg-type]
-
-
-@pytest.fixture(params=["zenoh", "mqtt"])
-def kind(request: pytest.FixtureRequest) -> str:
-    return str(request.param)
+@pytest.fixture(scope="module", params=ROBOTS)
+def rig(request: pytest.FixtureRequest) -> Iterator[OriginalRig]:
+    """One robot at a time: several would slow one another down."""
+    robot = OriginalRig(*request.param)
+    with robot:
+        yield robot
 
 
 def odometry(rig: OriginalRig) -> dict[str, Any]:
@@ -97,11 +94,7 @@ def rate(rig: OriginalRig, since: float) -> float:
     return float(seen[-1]["count"] - seen[0]["count"]) / (seen[-1]["at"] - seen[0]["at"])
 
 
-@pytest.mark.parametrize("python", PYTHONS.values())
-def test_all_at_once_follow_a_tag_obey_a_person_and_end(
-    rigs: Callable[[str, str], OriginalRig], kind: str, python: str
-) -> None:
-    rig = rigs(kind, python)
+def test_all_at_once_follow_a_tag_obey_a_person_and_end(rig: OriginalRig) -> None:
     rig.world.place(rig.name, *Start(distance=1.1, beside=15.0, off=20.0).pose)
     pid = rig.driving("original-follow", FOLLOW)
     assert rig.arrives(), rig.log.read_text()[-3000:]
@@ -133,11 +126,7 @@ def test_all_at_once_follow_a_tag_obey_a_person_and_end(
     assert until(lambda: not rig.script().get("running"))
 
 
-@pytest.mark.parametrize("python", PYTHONS.values())
-def test_one_follows_a_tag_with_the_pictures_alone(
-    rigs: Callable[[str, str], OriginalRig], kind: str, python: str
-) -> None:
-    rig = rigs(kind, python)
+def test_one_follows_a_tag_with_the_pictures_alone(rig: OriginalRig) -> None:
     rig.world.place(rig.name, *Start(distance=1.0, beside=-10.0, off=-15.0).pose)
     pid = rig.driving("original-video-follow", FOLLOW)
     began = time.monotonic()

@@ -13,6 +13,7 @@ import pytest
 
 from pebble.services.autonomy_manager.needs import SHMSRC
 from pebble.services.autonomy_manager.pythons import SYSTEM, probe
+from pebble.transports.segments import SHM
 from tests.kit.shm_reader import connected
 from tests.services.gstreamer_mirror.mirror_rig import (
     HEIGHT,
@@ -65,6 +66,8 @@ def test_our_stand_in_reads_what_debians_writer_sends(tmp_path: Path) -> None:
     finally:
         writer.kill()
         writer.wait(10)
+        for left in SHM.glob(f"shmpipe.{writer.pid}.*"):  # it leaves that even when it ends regularly
+            left.unlink()
 
 
 @pytest.mark.parametrize("size", [(WIDTH, HEIGHT), (161, 90), (162, 91)], ids=str)
