@@ -7,7 +7,7 @@ import json
 import pytest
 
 from pebble.client.discovery import Discovery
-from pebble.client.robot_view import Liveness, RobotView
+from pebble.client.robot_view import MAX_REMEMBERED, Liveness, RobotView
 from pebble.transports import Message
 from tests.recordings.demo_robots import DRIVE, GOOB, MINILAMP, ROBOTS, messages, received, values
 
@@ -70,6 +70,34 @@ def test_a_slow_link_widens_the_window() -> None:
         liveness.heartbeat(now, 0.5)
     assert liveness.online(2.4) is True
     assert liveness.online(2.6) is False
+
+
+@pytest.mark.parametrize(
+    "heartbeats",
+    [
+        [(0.0, 0.01), (0.25, 0.01), (0.5, 0.01), (40.0, 0.01)],
+        [(39.5, 0.01), (39.75, 3600.0), (40.0, 0.01)],
+        [(39.5, 0.01), (39.75, -3600.0), (40.0, 0.01)],
+    ],
+    ids=["a pause", "a clock that is late", "a clock that is early"],
+)
+def test_what_is_no_interval_and_no_latency_does_not_widen_the_window(heartbeats: list[tuple[float, float]]) -> None:
+    liveness = Liveness()
+    for now, latency_s in heartbeats:
+        liveness.heartbeat(now, latency_s)
+    assert (liveness.online(40.4), liveness.online(40.6)) == (True, False)
+
+
+def test_strangers_fill_no_memory_and_keep_no_capabilities_out() -> None:
+    seen = RobotView(BASE)
+    known = Message(f"{BASE}/outgoing/estop/serial", b"1")
+    capabilities = Message(f"{BASE}/outgoing/capabilities", b"2")
+    for message in [known, *(Message(f"{BASE}/outgoing/estop/{n}", b"") for n in range(100)), capabilities]:
+        seen.remember(message)
+    assert len(seen.remembered) == MAX_REMEMBERED + 1
+    newer = Message(known.topic, b"3")
+    seen.remember(newer)
+    assert (seen.remembered[known.topic], seen.remembered[capabilities.topic]) == (newer, capabilities)
 
 
 def test_recorded_robots_are_ready_once_they_published_how_to_drive_them() -> None:
