@@ -107,7 +107,7 @@ def test_all_at_once_follow_a_tag_obey_a_person_and_end(rig: OriginalRig) -> Non
     assert (after["samples"] - before["samples"]) / (time.monotonic() - since) > 30, "50 are sent"
 
     began = time.monotonic()
-    for _ in range(10):
+    for _ in range(20):
         rig.operator.send("incoming/drive-values", PERSON)
         time.sleep(0.05)
     released = time.monotonic()
