@@ -185,12 +185,12 @@ pebble/client/media_request/request.py
 - await asyncio.to_thread(self._viewer.request_keyframe, known)
 + pass
 
-request, what arrives waits without bound: web/media
+request, what arrives waits without bound: client/test_media_request.py
 pebble/client/media_request/request.py
 - if self._pending >= _MAX_PENDING or self._pending_bytes + size > _MAX_PENDING_BYTES:
 + if False:
 
-request, it is withdrawn while there is no broker: web/media
+request, it is withdrawn while there is no broker: client/test_media_request.py
 pebble/client/media_request/request.py
 - return idle and (self._broker.connected or self._viewer is None)
 + return idle
@@ -224,7 +224,7 @@ pebble/client/robot_view.py
 - return age <= max(2 * interval, 4 * latency) or age < at_least_s
 + return True
 
-robot view, one late heartbeat is a silence for people: client web/test_driving.py
+robot view, one late heartbeat is a silence for people: client/test_discovery.py client/test_terminal_driver.py web/test_driving.py
 pebble/client/robot_view.py
 - return self.liveness.online(now, SILENT_S)
 + return self.liveness.online(now)
@@ -252,12 +252,12 @@ pebble/client/robot_view.py
 +             except PayloadError:
 +                 self.capabilities = {}
 
-robot view, a robot without capabilities drives: client web/test_driving.py
+robot view, a robot without capabilities drives: client/test_discovery.py client/test_terminal_driver.py web/test_driving.py
 pebble/client/robot_view.py
 - drive.get("available") is True and drive.get("controls") is not False
 + drive.get("available") is not False
 
-robot view, a robot that must not be controlled drives: client web/test_driving.py
+robot view, a robot that must not be controlled drives: client/test_discovery.py client/test_terminal_driver.py web/test_driving.py
 pebble/client/robot_view.py
 -  and drive.get("controls") is not False
 +
@@ -282,12 +282,12 @@ pebble/client/robot_view.py
 - .get("arbitrates") is True
 + .get("arbitrates") is not False
 
-robot view, topics of strangers have no bound: client
+robot view, topics of strangers have no bound: client/test_discovery.py
 pebble/client/robot_view.py
 - if len(self.remembered) < MAX_REMEMBERED or message.topic in (
 + if True or message.topic in (
 
-robot view, strangers keep capabilities out: client
+robot view, strangers keep capabilities out: client/test_discovery.py
 pebble/client/robot_view.py
 - c.CAPABILITIES.topic(self.base),
 +

@@ -1,0 +1,82 @@
+"""What the request for pictures bounds and keeps: the event loop may be late, and the broker away."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+import pytest
+
+from pebble.client.broker import Broker
+from pebble.client.media_request import request as module
+from pebble.client.media_request.request import MediaRequest
+from tests.web.media.robots import CAMERA, REF, VIDEO, PictureRobot, broker_on, until
+
+pytestmark = pytest.mark.anyio
+
+
+@pytest.fixture
+def anyio_backend() -> str:
+    return "asyncio"
+
+
+class Requested:
+    """A robot that sends nothing by itself, and a request for its pictures that runs."""
+
+    def __init__(self) -> None:
+        self.robot = PictureRobot()
+        self.robot.mute = True
+        self.broker = broker_on(self.robot.hub)
+        self.received: list[bytes] = []
+        self.steps = 0
+        self.request = MediaRequest(self.broker, REF, "video", self.received.append)
+
+    async def step(self) -> None:
+        self.steps += 1
+        await self.request.follow({"video": VIDEO}, lambda: "json")
+
+    @asynccontextmanager
+    async def running(self) -> AsyncIterator[None]:
+        await self.broker.open()
+        self.request.want(True)
+        task = asyncio.create_task(self.request.run(self.step))
+        try:
+            await until(lambda: self.robot.requests)
+            yield
+        finally:
+            self.request.close()
+            await task
+            await self.broker.close()
+            self.robot.close()
+
+
+@pytest.mark.parametrize(("count", "size", "most"), [(2100, 1, 2000), (20, 1 << 20, 16)])
+async def test_what_arrives_while_the_event_loop_is_late_is_bounded(count: int, size: int, most: int) -> None:
+    one, taken = Requested(), threading.Event()
+    async with one.running():
+        one.broker.transport.subscribe(CAMERA, lambda _: taken.set())  # after the request has got it
+        for _ in range(count):
+            one.robot.send(bytes(size))
+            assert taken.wait(10), "the loop takes nothing meanwhile"
+            taken.clear()
+        await until(lambda: len(one.received) >= most)
+        one.robot.send(b"later")
+        await until(lambda: one.received[-1:] == [b"later"])
+        assert len(one.received) == most + 1
+
+
+async def test_it_is_withdrawn_once_there_is_a_broker_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "LINGER_S", 0.0)
+    there = [True]
+    monkeypatch.setattr(Broker, "connected", property(lambda _: there[0]))
+    one = Requested()
+    async with one.running():
+        there[0] = False
+        one.request.want(False)
+        seen = one.steps
+        await until(lambda: one.steps > seen + 1)
+        assert one.robot.encodings == ["json"]
+        there[0] = True
+        await until(lambda: one.robot.encodings == ["json", None])
