@@ -135,6 +135,28 @@ def test_topics_of_another_robot_in_capabilities_are_not_used() -> None:
     assert seen.estop.drive_topic == f"{BASE}/incoming/drive-values"
 
 
+@pytest.mark.parametrize(
+    ("drive", "drives", "arbitrates"),
+    [
+        ({}, False, False),
+        ({"available": True}, True, False),
+        ({"available": True, "controls": False}, False, False),
+        ({"available": True, "controls": True, "arbitrates": True}, True, True),
+        ({"available": "yes", "arbitrates": "yes"}, False, False),
+    ],
+)
+def test_only_what_a_robot_offers_is_assumed_of_it(drive: dict[str, object], drives: bool, arbitrates: bool) -> None:
+    discovery = Discovery()
+    value = {"schema": "pebble-capabilities/v1", "t": 1, "value": {"drive": drive}}
+    publish(discovery, "capabilities", value, retain=True)
+    publish(discovery, "autonomy-status", {"timestamp": 1, "running": True})
+    publish(discovery, "capabilities", "nonsense")
+    publish(discovery, "autonomy-status", "nonsense")
+    seen = publish_heartbeats(discovery, 0.0, 0.25, 0.5).situation(1.9)
+    assert (seen.drives, seen.arbitrates, seen.script, seen.online) == (drives, arbitrates, True, True)
+    assert discovery.robots[BASE].online(2.1) is False, "people are told after 1.5 s"
+
+
 def test_battery_and_message_count() -> None:
     discovery = discovered()
     robots = discovery.robots
