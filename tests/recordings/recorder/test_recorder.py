@@ -301,6 +301,30 @@ class TestDisk:
         assert all("media" in event["file"] for event in events(root, "pruned")[:2])
         assert len(payloads(root)) == 60
 
+    def test_files_that_are_too_old_go_one_in_a_minute(self, tmp_path: Path) -> None:
+        """The clock may have been set wrong."""
+        root, later_s = tmp_path / "rec", [0.0]
+        (root / "2026").mkdir(parents=True)
+        for number in range(1, 4):
+            path = root / "2026" / f"20260101T000000Z-{number:06d}.state.mcap"
+            path.write_bytes(b"")
+            os.utime(path, (0, 0))
+
+        def boot_ns() -> int:
+            return time.monotonic_ns() + int(later_s[0] * 1e9)
+
+        clocks = Clocks(boot_ns=boot_ns, awake_ns=boot_ns)
+        running = Running(root, Options(free_bytes=0, flush_seconds=0.2, keep_state_days=1.0), clocks)
+        gone = []
+        for _ in range(6):
+            later_s[0] += 61
+            for _ in range(2):  # so that a whole turn has passed
+                running.send()
+                assert running.written(running.sent)
+            gone.append(running.recorder.counters["event_pruned"])
+        running.stop()
+        assert list(dict.fromkeys(gone)) == [0, 1, 2], "and the newest stays"
+
     def test_a_folder_that_is_removed_is_made_again(self, running: Running) -> None:
         running.send(5)
         assert running.written(5)

@@ -1,0 +1,63 @@
+"""Which recordings make room for new ones, by their size and by their age."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from pebble.recordings.recorder.disk_space import Disk, Limits, outdated, surplus
+from pebble.recordings.recorder.folder import Entry
+
+NOW, DAY_S = 1_760_000_000.0, 86_400.0
+MEDIA = "media.pebble.robots.goob"
+MUCH = Disk(1 << 40)
+
+
+def entry(number: int, lane: str = "state", days: float = 0.0, ending: str = "") -> Entry:
+    """A file of 10 bytes."""
+    return Entry(Path(f"{number}.{lane}.mcap{ending}"), number, lane, 10, NOW - days * DAY_S)
+
+
+STATE = [entry(number) for number in (1, 3, 5)]
+BOTH = [*STATE, *(entry(number, MEDIA) for number in (2, 4, 6))]
+
+
+@pytest.mark.parametrize(
+    ("entries", "limits", "disk", "deleted"),
+    [
+        (BOTH, Limits(free_bytes=0), MUCH, []),
+        (BOTH, Limits(keep_bytes=60), MUCH, []),
+        (BOTH, Limits(keep_bytes=45), MUCH, [2, 4]),
+        (BOTH, Limits(keep_bytes=1), MUCH, [2, 4, 1, 3]),
+        ([*STATE, entry(9, ending=".active")], Limits(keep_bytes=35), MUCH, [1]),
+        ([*STATE, entry(9, ending=".damaged")], Limits(keep_bytes=35), MUCH, []),
+        (BOTH, Limits(free_bytes=115), Disk(100), [2, 4]),
+        (BOTH, Limits(free_bytes=0), Disk(100, has_inodes=False), [2]),
+    ],
+)
+def test_the_oldest_go_and_pictures_before_state(
+    entries: list[Entry], limits: Limits, disk: Disk, deleted: list[int]
+) -> None:
+    assert [one.number for one in surplus(entries, limits, disk)] == deleted
+
+
+OLD = [entry(1, days=9), entry(2, MEDIA, days=8), entry(3, days=3), entry(4, MEDIA, days=2), entry(5), entry(6, MEDIA)]
+
+
+@pytest.mark.parametrize(
+    ("entries", "limits", "found"),
+    [
+        (OLD, Limits(), None),
+        (OLD, Limits(keep_media_days=7), 2),
+        (OLD, Limits(keep_media_days=10), None),
+        (OLD, Limits(keep_state_days=7), 1),
+        (OLD, Limits(keep_state_days=7, keep_media_days=1), 2),
+        (OLD[:2], Limits(keep_state_days=1, keep_media_days=1), None),
+    ],
+)
+def test_one_that_is_too_old_but_never_the_newest_of_its_kind(
+    entries: list[Entry], limits: Limits, found: int | None
+) -> None:
+    old = outdated(entries, limits, NOW)
+    assert (None if old is None else old.number) == found
