@@ -358,3 +358,9 @@ def test_it_gets_worse_at_once_and_better_after_a_while() -> None:
     choice.pinned = ""
     assert choice.update(("json", "pbvd"), [ALL], 10.2) == "json"
     assert choice.update(("pbvd",), [ALL], 10.3) == "pbvd"
+
+
+def test_without_viewers_it_stays() -> None:
+    choice, plain = EncodingChoice(), ALL - {"h264"}
+    assert [choice.update(OFFERED, [plain][at:], 10.0 * at) for at in range(4)] == ["pbvz"] * 4
+    assert choice.update(("json",), [], 40.0) == "json"
