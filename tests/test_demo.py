@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import pty
 import re
@@ -171,7 +172,17 @@ def test_what_is_printed_can_be_pasted_and_a_signal_ends_everything_within_five_
         assert "goob" in shell(stop)
         assert "goob" in shell(reset)
     assert re.search(r"Recorded [\d,]+ messages \(.+\) of 4 robots;", recorded()), recorded()
-    ended_by(demo, signal.SIGINT)
+    (folder,) = re.findall(r"They are recorded into (\S+), for its Recordings", demo.output)
+    assert Path(folder).is_relative_to(temporary)
+    assert until(lambda: recorded_robots(page_of(demo)) == ["benjr", "fred", "goob", "minilamp"])
+    ends_by(demo, signal.SIGINT)
+    assert "Left to people, and not judged meanwhile: goob" in demo.output
+
+
+def recorded_robots(page: str) -> list[str]:
+    """The robots of the newest day of the page's Recordings."""
+    days = json.loads(requested(f"{page}archive/days"))
+    return sorted(one["ref"].rpartition("/")[2] for one in days[0]["robots"]) if days else []
 
 
 def shell(line: str) -> str:
