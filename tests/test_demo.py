@@ -7,6 +7,8 @@ import os
 import pty
 import re
 import signal
+import socket
+import ssl
 import subprocess
 import time
 import urllib.error
@@ -30,7 +32,7 @@ SLOW_S, END_S = 60.0, 5.0
 
 
 def requested(url: str) -> str:
-    with urllib.request.urlopen(url, timeout=5) as answer:
+    with urllib.request.urlopen(url, timeout=5, context=ssl._create_unverified_context()) as answer:
         return str(answer.read().decode())
 
 
@@ -127,10 +129,12 @@ def pasted(line: str, output: Path) -> Iterator[Callable[[], str]]:
         assert running.wait(20) in (0, 130), log.read_text()
 
 
-def test_a_closed_terminal_ends_everything_though_its_signal_goes_elsewhere(demos: list[Demo], temporary: Path) -> None:
+def test_a_phone_can_log_in_and_a_closed_terminal_ends_everything_though_its_signal_goes_elsewhere(
+    demos: list[Demo], temporary: Path
+) -> None:
     """SIGHUP reaches the session leader, for example make, which only waits."""
     ours, terminal = pty.openpty()
-    demo = start(demos, temporary, "", terminal)
+    demo = start(demos, temporary, "for_phones=True", terminal)
     os.close(terminal)
     shown = bytearray()
 
@@ -140,6 +144,12 @@ def test_a_closed_terminal_ends_everything_though_its_signal_goes_elsewhere(demo
 
     try:
         assert until(lambda: shows(b"forward, stop"), START_S), shown
+        ((host, port),) = re.findall(rb"in a browser: https://([^:/]+):(\d+)/", shown)
+        (broker,) = set(re.findall(rb"mqtt://127.0.0.1:(\d+)", shown))
+        assert re.findall(rb"Log in as visitor with the password \w{8}\r", shown)
+        assert "Log in" in requested(f"https://127.0.0.1:{int(port)}/")
+        with pytest.raises(OSError):  # the broker is on loopback
+            socket.create_connection((host.decode(), int(broker)), 5)
     finally:
         os.close(ours)
     assert demo.process.wait(END_S) == 0, demo.output

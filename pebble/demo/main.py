@@ -78,6 +78,7 @@ def run(
     if seconds is not None and seconds < SHORTEST_S:
         raise PebbleError(f"one round of driving takes {SHORTEST_S:.0f} s: give it at least that many seconds")
     if for_phones:
+        require_packages()
         phone.require_terminal()
     kind = broker or best_kind()
     with _ending_on_signals() as ending, Testbed(ending) as testbed:
@@ -149,18 +150,15 @@ def _start_page(testbed: Testbed, ending: threading.Event, console: Console, ope
     try:
         require_packages()
     except PebbleError as error:
-        if opened is not None:
-            raise
         what, _, remedy = str(error).partition(" needs ")
-        console.print(f"Without {what}, which needs {remedy}", highlight=False, markup=False, soft_wrap=True)
+        _print_line(console, f"Without {what}, which needs {remedy}")
         return ""
     recordings = testbed.folder / "recordings"
     recordings.mkdir()
     testbed.start_recorder(recordings, *_RECORDED)
     page = _usual_or_free(testbed, ending, recordings=recordings, **({} if opened is None else opened.settings))
-    print_line = partial(console.print, highlight=False, markup=False, soft_wrap=True)
-    print_line(f"See and drive them in a browser: {page.url}")
-    print_line(f"They are recorded into {recordings}, for its Recordings; the folder goes with the demo.")
+    _print_line(console, f"See and drive them in a browser: {page.url}")
+    _print_line(console, f"They are recorded into {recordings}, for its Recordings; the folder goes with the demo.")
     if opened is not None:
         opened.show(page.url, console)
     return page.url
@@ -168,10 +166,14 @@ def _start_page(testbed: Testbed, ending: threading.Event, console: Console, ope
 
 def _invite(port: int, console: Console) -> None:
     """Print the broker's address, and what can be pasted into another terminal."""
-    print_line = partial(console.print, highlight=False, markup=False, soft_wrap=True)
-    print_line(f"Or from another terminal, by their broker at {invitation.broker_url(port)}:")
+    _print_line(console, f"Or from another terminal, by their broker at {invitation.broker_url(port)}:")
     for what, line in invitation.lines(port):
-        print_line(f"  # {what}\n  {line}")
+        _print_line(console, f"  # {what}\n  {line}")
+
+
+def _print_line(console: Console, line: str) -> None:
+    """To be copied: neither wrapped nor coloured."""
+    console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
 def _usual_or_free(testbed: Testbed, ending: threading.Event, **settings: Any) -> PageServer:

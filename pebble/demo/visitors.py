@@ -42,8 +42,8 @@ class Visitors:
 
     def receive_drive(self, message: Message, now: float) -> None:
         """Take any drive command of any robot: the operator's own, or one that was pasted into a terminal."""
-        address, sent = parse_topic(message.topic), self._sent[message.topic]
-        if message.payload in sent:
+        address, sent = parse_topic(message.topic), self._sent.get(message.topic)
+        if sent and message.payload in sent:
             sent.remove(message.payload)
         elif address is not None and not message.retain:
             self._driven[address.identity.base] = now
