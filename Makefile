@@ -10,6 +10,7 @@ unexport PYTHONDONTWRITEBYTECODE  # every test starts programs: compiling them e
 help:
 	@echo "make demo             four simulated robots, on Zenoh, on MQTT and on MCUs, driven through a broker; Ctrl-C ends it"
 	@echo "make demo SECONDS=30  ends by itself; succeeds only if every robot moved, stopped and obeyed as it should"
+	@echo "make demo PHONE=1     opens its page to the network, by https, with a login and a QR code"
 	@echo "make test             all checks and tests, a quarter of an hour"
 	@echo "make quick            what to run before each commit: lint, types, contract, memory transport, one robot; a minute"
 	@echo "make thorough         the same, with all cases of the random tests, and the tests that take longest"
@@ -35,9 +36,11 @@ help:
 demo-options:
 	@awk 'BEGIN { exit ARGV[1] + 0 < 26 }' "$(or $(SECONDS),26)" || \
 		{ echo "make demo: one round of driving takes 26 s: give it at least that many, make demo SECONDS=30" >&2; exit 2; }
+	@test -z "$(PHONE)" || test -t 1 || \
+		{ echo "make demo: PHONE=1 prints a password, to a terminal only: start it in one, without a pipe" >&2; exit 2; }
 
 demo: demo-options .venv/.ready-demo
-	@$(VENV) -m pebble.cli demo $(if $(SECONDS),--seconds $(SECONDS))
+	@$(VENV) -m pebble.cli demo $(if $(SECONDS),--seconds $(SECONDS)) $(if $(PHONE),--phone)
 
 # Folders whose tests take longest come first: else the last of them run while the other processors have nothing to do.
 TESTS := $(VENV) tools/run_tests.py --dist loadscope --no-loadscope-reorder

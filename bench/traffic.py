@@ -28,7 +28,7 @@ from pebble.client.media_receiver import MediaReceiver
 from pebble.errors import PebbleError
 from pebble.recordings.library import FOREVER_NS
 from pebble.recordings.traffic.results import AUDIO, IDLE, SESSION, VIDEO, RobotTraffic, Traffic
-from pebble.rig.processes import OPERATORS, Program, end_all, python
+from pebble.rig.processes import end_all
 from pebble.rig.testbed import ROBOTS, Testbed
 from pebble.transports import MqttSettings, create
 
@@ -83,8 +83,7 @@ def record(folder: Path, idle_s: float, session_s: float) -> None:
     """Record all robots into ``folder``: idle for ``idle_s``, then used for ``session_s``. Raises PebbleError."""
     with Testbed(threading.Event()) as testbed:
         testbed.start_brokers()
-        command = python("pebble.cli", "record", "--url", f"mqtt://127.0.0.1:{testbed.broker_port}", "--into", folder)
-        recorder = testbed.add(Program("pebble record", command, testbed.folder / "record.log"), OPERATORS)
+        recorder = testbed.start_recorder(folder)
         recorder.wait_until(lambda: b"Recording" in recorder.log.read_bytes(), _READY_S)  # it is connected
         testbed.start_robots()
         testbed.wait_until_ready()

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import os
 import pty
 import re
 import signal
+import socket
+import ssl
 import subprocess
-import sys
-import tempfile
 import time
 import urllib.error
 import urllib.request
-import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import pairwise
@@ -21,95 +21,18 @@ from pathlib import Path
 import pytest
 
 from pebble.demo.main import SHORTEST_S
+from tests.kit.demo import START_S, Demo, demos, page_of, start, temporary
 from tests.support import ROOT, until
+
+__all__ = ["demos", "temporary"]
 
 pytestmark = pytest.mark.alone
 
-START_S, SLOW_S, END_S = 40.0, 60.0, 5.0
-MARK = "PEBBLE_TEST_DEMO"
-
-
-class Demo:
-    """One run, with everything it starts marked by a variable that children inherit."""
-
-    def __init__(self, folder: Path, code: str, terminal: int | None = None) -> None:
-        self.temporary = folder
-        self.log = folder / "demo.log"
-        self._mark = uuid.uuid4().hex
-        with self.log.open("wb") as output:
-            self.process = subprocess.Popen(
-                [sys.executable, "-c", code],
-                cwd=ROOT,
-                env={**os.environ, MARK: self._mark, "TMPDIR": str(folder)},
-                stdout=output if terminal is None else terminal,
-                stderr=output,
-            )
-
-    @property
-    def output(self) -> str:
-        return self.log.read_text()
-
-    def leftovers(self) -> list[str]:
-        """Command lines of living processes that this demo started."""
-        entry = f"{MARK}={self._mark}".encode()
-        return [line for pid in _pids() if entry in _read(pid, "environ") and (line := _command(pid))]
-
-    def folders(self) -> list[Path]:
-        return list(self.temporary.glob("pebble-demo-*"))
-
-    def end(self) -> None:
-        if self.process.poll() is None:
-            self.process.kill()
-            self.process.wait(10)
-
-
-def _pids() -> list[str]:
-    return [path.name for path in Path("/proc").iterdir() if path.name.isdecimal() and int(path.name) != os.getpid()]
-
-
-def _read(pid: str, name: str) -> bytes:
-    try:
-        return Path("/proc", pid, name).read_bytes()
-    except OSError:  # it has ended meanwhile
-        return b""
-
-
-def _command(pid: str) -> str:
-    return _read(pid, "cmdline").replace(b"\0", b" ").decode()
-
-
-@pytest.fixture
-def temporary() -> Iterator[Path]:
-    """A short path: the robots' unix sockets are below it, and their paths are limited to 108 bytes."""
-    with tempfile.TemporaryDirectory(prefix="pebble-", dir="/tmp") as folder:
-        yield Path(folder)
-        assert until(lambda: not any(folder in _command(pid) for pid in _pids()))  # of a demo that was killed
-
-
-@pytest.fixture
-def demos(temporary: Path) -> Iterator[list[Demo]]:
-    """Ends every demo that a test appends."""
-    running: list[Demo] = []
-    yield running
-    for demo in running:
-        demo.end()
-
-
-def start(demos: list[Demo], folder: Path, arguments: str, terminal: int | None = None) -> Demo:
-    imports = "import sys; from pebble.demo.brokers import BrokerKind; from pebble.demo.main import run"
-    demos.append(Demo(folder, f"{imports}; sys.exit(run({arguments}))", terminal))
-    return demos[-1]
-
-
-def page_of(demo: Demo) -> str:
-    """The address of the operator page, once it was printed."""
-    printed = re.compile(r"in a browser: (http://127.0.0.1:\d+/)\n").findall
-    assert until(lambda: printed(demo.output), START_S), demo.output
-    return str(printed(demo.output)[0])
+SLOW_S, END_S = 60.0, 5.0
 
 
 def requested(url: str) -> str:
-    with urllib.request.urlopen(url, timeout=5) as answer:
+    with urllib.request.urlopen(url, timeout=5, context=ssl._create_unverified_context()) as answer:
         return str(answer.read().decode())
 
 
@@ -171,7 +94,17 @@ def test_what_is_printed_can_be_pasted_and_a_signal_ends_everything_within_five_
         assert "goob" in shell(stop)
         assert "goob" in shell(reset)
     assert re.search(r"Recorded [\d,]+ messages \(.+\) of 4 robots;", recorded()), recorded()
-    ended_by(demo, signal.SIGINT)
+    (folder,) = re.findall(r"They are recorded into (\S+), for its Recordings", demo.output)
+    assert Path(folder).is_relative_to(temporary)
+    assert until(lambda: recorded_robots(page_of(demo)) == ["benjr", "fred", "goob", "minilamp"])
+    ends_by(demo, signal.SIGINT)
+    assert "Left to people, and not judged meanwhile: goob" in demo.output
+
+
+def recorded_robots(page: str) -> list[str]:
+    """The robots of the newest day of the page's Recordings."""
+    days = json.loads(requested(f"{page}archive/days"))
+    return sorted(one["ref"].rpartition("/")[2] for one in days[0]["robots"]) if days else []
 
 
 def shell(line: str) -> str:
@@ -196,10 +129,12 @@ def pasted(line: str, output: Path) -> Iterator[Callable[[], str]]:
         assert running.wait(20) in (0, 130), log.read_text()
 
 
-def test_a_closed_terminal_ends_everything_though_its_signal_goes_elsewhere(demos: list[Demo], temporary: Path) -> None:
+def test_a_phone_can_log_in_and_a_closed_terminal_ends_everything_though_its_signal_goes_elsewhere(
+    demos: list[Demo], temporary: Path
+) -> None:
     """SIGHUP reaches the session leader, for example make, which only waits."""
     ours, terminal = pty.openpty()
-    demo = start(demos, temporary, "", terminal)
+    demo = start(demos, temporary, "for_phones=True", terminal)
     os.close(terminal)
     shown = bytearray()
 
@@ -209,6 +144,12 @@ def test_a_closed_terminal_ends_everything_though_its_signal_goes_elsewhere(demo
 
     try:
         assert until(lambda: shows(b"forward, stop"), START_S), shown
+        ((host, port),) = re.findall(rb"in a browser: https://([^:/]+):(\d+)/", shown)
+        (broker,) = set(re.findall(rb"mqtt://127.0.0.1:(\d+)", shown))
+        assert re.findall(rb"Log in as visitor with the password \w{8}\r", shown)
+        assert "Log in" in requested(f"https://127.0.0.1:{int(port)}/")
+        with pytest.raises(OSError):  # the broker is on loopback
+            socket.create_connection((host.decode(), int(broker)), 5)
     finally:
         os.close(ours)
     assert demo.process.wait(END_S) == 0, demo.output

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from typing import NamedTuple, Protocol, TypeVar
 
@@ -49,39 +50,64 @@ R = TypeVar("R", bound=Ranked)
 
 
 class RankedTable(dict[str, R]):
-    """At most ``most`` components by base topic; where it is full, one of the lowest rank gives way to a higher one."""
+    """At most ``most`` components by base topic. Where it is full, one gives way:
 
-    def __init__(self, most: int) -> None:
+    * One that is known from before gives way to none, and gets a place of any other.
+    * Of the others, those of one rank keep ``share`` places, whatever is invented of other ranks: it gets them from one
+      that has more. What a rank has beyond gives way to higher ones.
+    * Of equal ones those that were there first stay.
+    """
+
+    def __init__(self, most: int, share: int = 0) -> None:
         super().__init__()
-        self._most = most
-        self._floor = Rank()  # none in the table has a lower rank, so that most of a flood is refused without a search
+        self._most, self._share = most, share
+        self._refused: set[Rank] = set()  # there was no room for these: most of a flood is refused without a search
+        self._refusals = 0
+        self._shared = 0  # places that were got as a share, since ranks may have changed
 
     def __setitem__(self, base: str, one: R) -> None:
-        self._floor = min(self._floor, one.rank)
+        self._refused.clear()
         super().__setitem__(base, one)
 
     def refuses(self, rank: Rank) -> bool:
-        """Whether there is surely no room for one of this rank."""
-        return len(self) >= self._most and rank <= self._floor
+        """Whether there was no room for one of this rank lately."""
+        if len(self) < self._most or rank not in self._refused:
+            return False
+        self._refusals += 1
+        if self._refusals % self._most == 0:
+            self.ranks_have_changed()
+        return True
 
     def make_room(self, rank: Rank, remove: Callable[[str], object]) -> bool:
-        """Makes room for one of this rank by ``remove``, if necessary; False if none has a lower rank."""
+        """Makes room for one of this rank by ``remove``, if necessary; False if none gives way to it."""
         if len(self) < self._most:
             return True
-        lowest = self.lowest(rank)
-        if lowest is None:
+        if self.refuses(rank):
             return False
+        counts = Counter(one.rank for one in self.values())
+        lacks = counts[rank] < self._share and self._shared < self._share
+
+        def gives_way(other: Rank) -> bool:
+            return rank.known or (counts[other] > self._share and (lacks or other < rank))
+
+        lowest = self._lowest(lambda one: gives_way(one.rank))
+        if lowest is None:
+            self._refused.add(rank)
+            return False
+        self._shared += self[lowest].rank >= rank
         remove(lowest)
         return True
 
-    def lowest(self, below: Rank) -> str | None:
-        """One of the lowest rank there is, if that is ``below`` this one."""
-        if below <= self._floor:
-            return None
-        base = min(self, key=lambda one: self[one].rank)
-        self._floor = self[base].rank
-        return base if self._floor < below else None
+    def below(self, rank: Rank, among: Callable[[R], bool]) -> str | None:
+        """One of the lowest rank ``among`` those that are not known from before, and of a lower rank than this."""
+        return self._lowest(lambda one: one.rank < rank and among(one))
 
-    def ranks_may_have_fallen(self) -> None:
-        """To be called from time to time where ranks fall; where they only rise, never."""
-        self._floor = Rank()
+    def ranks_have_changed(self) -> None:
+        """To be called from time to time where ranks fall."""
+        self._refused.clear()
+        self._shared = 0
+
+    def _lowest(self, gives_way: Callable[[R], bool]) -> str | None:
+        """Of equal ranks the newest one; None: there is none."""
+        found = [base for base in reversed(self) if not self[base].rank.known and gives_way(self[base])]
+        return min(found, key=lambda base: self[base].rank, default=None)

@@ -199,6 +199,9 @@ def demo(
     seconds: Annotated[
         float | None, typer.Option("--seconds", "-s", min=1, help="End after this long of driving.", show_default=False)
     ] = None,
+    phone: Annotated[
+        bool, typer.Option("--phone", help="Open the page to the network: https, a login and a QR code.")
+    ] = False,
 ) -> int:
     """Four simulated robots, driven by a scripted operator through one broker, until Ctrl-C.
 
@@ -207,11 +210,12 @@ def demo(
 
     \b
         pebble demo
-        pebble demo --seconds 20
+        pebble demo --seconds 30
+        pebble demo --phone
     """
     from pebble.demo.main import run
 
-    return run(seconds)
+    return run(seconds, for_phones=phone)
 
 
 def _serial(kind: str, link: Path | None, charging: bool, *options: str) -> int:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import getpass
 import signal
-import socket
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +23,7 @@ from pebble.config import load
 from pebble.config.hosts import name_of_page
 from pebble.config.web import WebTls, is_loopback
 from pebble.errors import PebbleError
-from pebble.fleet.certificates import CA_CERT, SERVER_CERT, SERVER_KEY
+from pebble.fleet.certificates import CA_CERT, SERVER_CERT, SERVER_KEY, own_names
 from pebble.fleet.people import NAME
 from pebble.runtime.connections import REMOTE_RECONNECT_S
 from pebble.transports import MqttSettings
@@ -194,24 +193,12 @@ def _print_missing(settings: WebSettings, missing: list[str], folder: Path) -> N
     )
     lines = [f"pebble: {others}, so the page needs a {' and a '.join(missing)}:"]
     if "certificate" in missing:
-        lines.append(f"    pebble cert init --folder {folder} {' '.join(_own_names())}")
+        lines.append(f"    pebble cert init --folder {folder} {' '.join(own_names())}")
     if "user" in missing:
         lines.append(f"    pebble web user add {_me()} --role admin --people {settings.people}")
     repeated = " ".join(sys.argv[1:])
     tls = "" if "--tls" in repeated or "certificate" not in missing else f" --tls {folder}"
     typer.echo("\n".join([*lines, f"    pebble {repeated}{tls}"]), err=True)
-
-
-def _own_names() -> list[str]:
-    """Names by which other machines probably reach this one."""
-    names = [f"{socket.gethostname().partition('.')[0].lower()}.local"]
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        try:
-            probe.connect(("192.0.2.1", 9))  # sends nothing; the kernel chooses the address of the way out
-            names.append(probe.getsockname()[0])
-        except OSError:
-            pass
-    return names
 
 
 def _me() -> str:

@@ -9,14 +9,14 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
 from types import FrameType
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 from rich.console import Console
 
 from pebble.client.page_packages import require_packages
 from pebble.client.page_settings import DEFAULT_PORT
 from pebble.contract.encodings import ALL_VIDEO
-from pebble.demo import emergency, following, invitation
+from pebble.demo import emergency, following, invitation, phone
 from pebble.demo.brokers import BrokerKind, best_kind
 from pebble.demo.machine import Machine
 from pebble.demo.media import ROUND_S as MEDIA_ROUND_S
@@ -34,6 +34,7 @@ from pebble.demo.operator import (
     CompletedStop,
     Operator,
 )
+from pebble.demo.phone import Phone
 from pebble.demo.results import Result, Results
 from pebble.demo.steps import assess
 from pebble.demo.view import View, show_media_results, show_results
@@ -46,6 +47,7 @@ _DISCOVERY_S = 30.0  # until all robots can be driven, on the smallest machine
 _MEDIA_START_S = 2.0  # from the first request to the first picture, with some to spare
 _POLL_S = 0.1
 _REPORTED_S = 0.3  # an MCU reports ten times a second: the end of a step is reported a little later
+_RECORDED = ("--keep", "256M", "--rotate-size", "32M", "--free", "512M", "--level", "1")  # fast rather than small
 _SLOW_S = 60.0  # how much longer an overloaded machine may take for the first round, and to repeat steps of it
 
 
@@ -58,20 +60,30 @@ class _Observed(NamedTuple):
     left_alone: set[str]
 
 
-def run(seconds: float | None = None, *, broker: BrokerKind | None = None, console: Console | None = None) -> int:
+def run(
+    seconds: float | None = None,
+    *,
+    broker: BrokerKind | None = None,
+    console: Console | None = None,
+    for_phones: bool = False,
+) -> int:
     """Run the demo until Ctrl-C, or for ``seconds`` of driving; 0 if every robot moved and stopped as commanded.
 
     With ``seconds`` at least one whole round of the script must have been driven, and steps that went wrong while the
     machine was overloaded are repeated; pictures that such a machine lost are shown, but no failure. ``broker`` selects
-    a kind instead of the best one available. Every process ends with the demo; its folder of logs stays only after a
-    failure. Raises PebbleError if the demo cannot be set up.
+    a kind instead of the best one available. ``for_phones``: other machines reach the page, see Phone. Every process
+    ends with the demo; its folder of logs stays only after a failure. Raises PebbleError if the demo cannot be set up.
     """
     console = console or Console()
     if seconds is not None and seconds < SHORTEST_S:
         raise PebbleError(f"one round of driving takes {SHORTEST_S:.0f} s: give it at least that many seconds")
+    if for_phones:
+        require_packages()
+        phone.require_terminal()
     kind = broker or best_kind()
     with _ending_on_signals() as ending, Testbed(ending) as testbed:
-        results, media, problems, left_alone = _run_demo(testbed, kind, seconds, ending, console)
+        opened = Phone(testbed.folder) if for_phones else None
+        results, media, problems, left_alone = _run_demo(testbed, kind, seconds, ending, console, opened)
         with_media = [robot.name for robot in testbed.robots.values() if robot.has_media]
         if seconds is not None:
             problems += _steps_not_done(testbed, results.all(), left_alone)
@@ -83,14 +95,19 @@ def run(seconds: float | None = None, *, broker: BrokerKind | None = None, conso
         show_media_results(console, with_media, media)
         show_results(console, ROBOTS, results.all(), problems)
         if left_alone:
-            console.print(f"Left to people at the page, and not judged meanwhile: {', '.join(sorted(left_alone))}.")
+            console.print(f"Left to people, and not judged meanwhile: {', '.join(sorted(left_alone))}.")
         if problems:
             console.print(f"Logs, configs and traces: {testbed.folder}", soft_wrap=True)
     return 1 if problems else 0
 
 
 def _run_demo(
-    testbed: Testbed, kind: BrokerKind, seconds: float | None, ending: threading.Event, console: Console
+    testbed: Testbed,
+    kind: BrokerKind,
+    seconds: float | None,
+    ending: threading.Event,
+    console: Console,
+    opened: Phone | None,
 ) -> _Observed:
     """Set up, drive and observe."""
     console.print(f"Two brokers ({kind}): a remote one, and the one that Fred carries.")
@@ -100,7 +117,7 @@ def _run_demo(
         "Goob also with an inertial sensor that describes itself, a loudspeaker and scripts, in a room with tags."
     )
     console.print("MiniLAMP and BenJr are MCUs that use MQTT themselves: their firmware, on simulated pins.")
-    url = _start_page(testbed, ending, console)
+    url = _start_page(testbed, ending, console, opened)
     _invite(testbed.broker_port, console)
     testbed.start_robots()
     operator = Operator(testbed.broker_port)
@@ -128,34 +145,44 @@ def _run_demo(
         operator.close()
 
 
-def _start_page(testbed: Testbed, ending: threading.Event, console: Console) -> str:
-    """Returns its address; empty without the packages that it needs."""
+def _start_page(testbed: Testbed, ending: threading.Event, console: Console, opened: Phone | None) -> str:
+    """With what it shows of the past. Returns its address; empty without the packages that it needs."""
     try:
         require_packages()
     except PebbleError as error:
         what, _, remedy = str(error).partition(" needs ")
-        console.print(f"Without {what}, which needs {remedy}", highlight=False, markup=False, soft_wrap=True)
+        _print_line(console, f"Without {what}, which needs {remedy}")
         return ""
-    page = _usual_or_free(testbed, ending)
-    console.print(f"See and drive them in a browser: {page.url}", highlight=False, soft_wrap=True)
+    recordings = testbed.folder / "recordings"
+    recordings.mkdir()
+    testbed.start_recorder(recordings, *_RECORDED)
+    page = _usual_or_free(testbed, ending, recordings=recordings, **({} if opened is None else opened.settings))
+    _print_line(console, f"See and drive them in a browser: {page.url}")
+    _print_line(console, f"They are recorded into {recordings}, for its Recordings; the folder goes with the demo.")
+    if opened is not None:
+        opened.show(page.url, console)
     return page.url
 
 
 def _invite(port: int, console: Console) -> None:
     """Print the broker's address, and what can be pasted into another terminal."""
-    print_line = partial(console.print, highlight=False, markup=False, soft_wrap=True)
-    print_line(f"Or from another terminal, by their broker at {invitation.broker_url(port)}:")
+    _print_line(console, f"Or from another terminal, by their broker at {invitation.broker_url(port)}:")
     for what, line in invitation.lines(port):
-        print_line(f"  # {what}\n  {line}")
+        _print_line(console, f"  # {what}\n  {line}")
 
 
-def _usual_or_free(testbed: Testbed, ending: threading.Event) -> PageServer:
+def _print_line(console: Console, line: str) -> None:
+    """To be copied: neither wrapped nor coloured."""
+    console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+
+def _usual_or_free(testbed: Testbed, ending: threading.Event, **settings: Any) -> PageServer:
     """The page at its usual port, or at a free one if another program has that."""
     with suppress(PebbleError):
-        usual = testbed.start_page(DEFAULT_PORT)
+        usual = testbed.start_page(DEFAULT_PORT, **settings)
         usual.wait(ending)
         return usual
-    page = testbed.start_page()
+    page = testbed.start_page(**settings)
     page.wait(ending)
     return page
 

@@ -1,6 +1,6 @@
 """A scripted operator drives the robots of a broker: steps, an emergency stop, and a script that it overrules.
 
-It yields to people: a robot that is driven or was stopped from the operator page is left alone until the step after.
+It yields to people: a robot that somebody else drives, or has stopped, is left alone until the step after.
 Times are seconds of time.monotonic().
 """
 
@@ -74,12 +74,14 @@ _FORWARD = Drive(z=0.5)
 
 BY_ITSELF = "by itself"  # a robot follows a tag by a script, and is driven for a moment in between
 FOLLOW = "apriltag-follow"
+TRAIL = "wheel-odometry"  # draws the map of the operator page
 TAG_SIZE_M = 0.25
 DISTANCE_M, TOLERANCE_M = 0.9, 0.05
 HOLD_S = HOLD_MS / 1000  # scripts are refused this long after a person's last command
 _APPROACH_S, _OVERRIDE_S, _STEADY_S, _FOLLOWED_REST_S = 1.0, 1.0, 0.8, 0.5
 _START_S, _ARRIVAL_S = 10.0, 10.0  # at most, on the smallest machine
 _STATUS_S = 1.0  # until the robot's status has changed
+_TRAIL_S = 3.0  # until a script that was started runs
 #: Of most runs; a slow one takes longer.
 TAKEOVER_S = 2.0 + _APPROACH_S + _OVERRIDE_S + HOLD_S + 4.5 + _STEADY_S + _FOLLOWED_REST_S
 _BACK = Drive(x=-0.1, z=-0.5)
@@ -153,6 +155,8 @@ class Operator:
         self._transport.open(timeout=0.0)
         self._transport.subscribe(ALL_OUTGOING, lambda one: self.discovery.receive(one, time.monotonic(), time.time()))
         self._transport.subscribe(FILTER, lambda one: self._visitors.receive(one, time.monotonic()))
+        drives = DRIVE.filter("+/+/+")
+        self._transport.subscribe(drives, lambda one: self._visitors.receive_drive(one, time.monotonic()))
 
     def ready(self, wanted: int) -> bool:
         """Are that many robots online, with a drive topic?"""
@@ -196,6 +200,7 @@ class Operator:
         robots = self.discovery.all_robots()
         with suppress(EndedEarlyError):
             while not (yours and self.rounds):
+                self._show_trails(robots)
                 for step in SCRIPT:
                     self._begin(step.name, robots)
                     self._perform(step)
@@ -204,6 +209,8 @@ class Operator:
                     self.until_right(BY_ITSELF, partial(self._take_over, robots))
                 self.rounds += 1
             self._doing = yours
+            while not self._show_trails(robots):
+                self._wait(_TRAIL_S)
             self._stopping.wait()
         self._begin("disconnecting", robots)
         self._drive(STOP)
@@ -245,7 +252,9 @@ class Operator:
         """Send one command to all robots that are free; returns when."""
         for robot in filter(self._mine, self._robots):
             self.commands[robot.base] = drive, time.monotonic()
-            self._publish(robot.drive_topic, codec.encode(DRIVE, drive))
+            payload = codec.encode(DRIVE, drive)
+            self._visitors.note_sent(str(robot.drive_topic), payload)
+            self._publish(robot.drive_topic, payload)
         return time.monotonic()
 
     def _hold(self, drive: Drive, seconds: float) -> float:
@@ -306,6 +315,18 @@ class Operator:
         for robot, reset in resets.items():
             confirmed_s, free = sender.robots[robot.base].confirmed_s, bool(reset.shown) and reset.free
             self._complete(CompletedStop(robot.name, began, pressed, confirmed_s, reset_at, free, ended))
+
+    def _show_trails(self, robots: Sequence[RobotView]) -> bool:
+        """Have each robot with scripts that runs none publish where it is; whether all of them run one.
+
+        One that a person has refuses to start a script.
+        """
+        idle = [one for one in robots if one.offers("autonomy") and not (one.autonomy and one.autonomy.running)]
+        now = time.monotonic()
+        for robot in [one for one in idle if not self._visitors.taken(one, now)]:
+            command = AutonomyCommand(action="start", file=TRAIL)
+            self._publish(AUTONOMY_COMMAND.topic(robot.base), codec.encode(AUTONOMY_COMMAND, command))
+        return not idle
 
     def _take_over(self, robots: Sequence[RobotView]) -> None:
         """Let each robot with scripts follow a tag, and overrule the script for a moment."""

@@ -1,13 +1,18 @@
-"""Which robots people have taken from the demo's operator: driven from a page, or stopped. Pure."""
+"""Which robots people have taken from the demo's operator: driven by any program, or stopped. Pure."""
 
 import math
+from collections import defaultdict, deque
 from contextlib import suppress
+from functools import partial
 
 from pebble.client.driver_lease import VALID_S
 from pebble.client.robot_view import RobotView
 from pebble.contract import DRIVING, codec
+from pebble.contract.identity import parse_topic
 from pebble.errors import PayloadError
 from pebble.transports import Message
+
+_SENT = 100  # drive commands of the operator that are on their way back: five seconds of a held stick
 
 
 class Visitors:
@@ -17,7 +22,9 @@ class Visitors:
         """``name``: that of the operator, whose own stops are none of a person."""
         self.left_alone: set[str] = set()  # names of robots that were found to be taken
         self._name = name
-        self._driven: dict[str, tuple[str, float]] = {}  # by base topic: who drives it from the page, announced when
+        self._driven: dict[str, float] = {}  # by base topic: when somebody drove it, or was announced to
+        self._drivers: dict[str, tuple[str, float]] = {}  # those that were announced
+        self._sent: defaultdict[str, deque[bytes]] = defaultdict(partial(deque, maxlen=_SENT))  # by topic
         self._step_began = 0.0
 
     def receive(self, message: Message, now: float) -> None:
@@ -27,7 +34,19 @@ class Visitors:
         with suppress(PayloadError):
             for base, driver in codec.decode(DRIVING, message.payload).robots.items():
                 who = f"{driver.by} on {driver.device}" if driver.device else driver.by
-                self._driven[base] = who, now
+                self._drivers[base], self._driven[base] = (who, now), now
+
+    def note_sent(self, topic: str, payload: bytes) -> None:
+        """The operator drives a robot by this, which the broker sends back to it."""
+        self._sent[topic].append(payload)
+
+    def receive_drive(self, message: Message, now: float) -> None:
+        """Take any drive command of any robot: the operator's own, or one that was pasted into a terminal."""
+        address, sent = parse_topic(message.topic), self._sent.get(message.topic)
+        if sent and message.payload in sent:
+            sent.remove(message.payload)
+        elif address is not None and not message.retain:
+            self._driven[address.identity.base] = now
 
     def begin_step(self, now: float) -> None:
         """What people had before no longer counts."""
@@ -35,16 +54,15 @@ class Visitors:
 
     def taken(self, robot: RobotView, now: float) -> str:
         """Why people have the control of it now; empty: they have not."""
-        who, at = self._driven.get(robot.base, ("", -math.inf))
-        if now - at < VALID_S:
-            return f"is driven by {who}"
+        if now - self._driven.get(robot.base, -math.inf) < VALID_S:
+            who, at = self._drivers.get(robot.base, ("", -math.inf))
+            return f"is driven by {who if now - at < VALID_S else 'another program'}"
         stop = robot.stopped_by
         return "" if stop is None or stop.by == self._name else f"is stopped by {stop.by or 'unknown'}"
 
     def free(self, robot: RobotView, now: float) -> bool:
         """Whether it may be driven in the present step, in which no person has had it so far."""
-        _, at = self._driven.get(robot.base, ("", -math.inf))
-        if at < self._step_began and not self.taken(robot, now):
+        if self._driven.get(robot.base, -math.inf) < self._step_began and not self.taken(robot, now):
             return True
         self.left_alone.add(robot.name)
         return False

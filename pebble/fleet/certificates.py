@@ -6,6 +6,7 @@ import datetime
 import ipaddress
 import os
 import re
+import socket
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -98,6 +99,18 @@ def show(file: Path) -> Shown:
     digest = certificate.fingerprint(SHA256()).hex().upper()
     pairs = (digest[place : place + 2] for place in range(0, len(digest), 2))
     return Shown(file, _names_of(certificate), certificate.not_valid_after_utc, ":".join(pairs))
+
+
+def own_names() -> list[str]:
+    """Names by which other machines probably reach this one."""
+    names = [f"{socket.gethostname().partition('.')[0].lower()}.local"]
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(("192.0.2.1", 9))  # sends nothing; the kernel chooses the address of the way out
+            names.append(probe.getsockname()[0])
+        except OSError:
+            pass
+    return names
 
 
 # -- inside

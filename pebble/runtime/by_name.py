@@ -99,6 +99,10 @@ class ByName:
         """The connection is lost: what comes by the next one is not known."""
         self._robots = {}
 
+    def forget(self, base: str) -> None:
+        """What has come of this robot is not known any more: its next heartbeat is its first one."""
+        self._robots.pop(base, None)
+
     def receive(self, message: Message, now: float) -> None:
         """Take any message of any robot."""
         address = parse_topic(message.topic)

@@ -26,6 +26,7 @@ from pebble.web.recent import Recent
 from pebble.web.restarts import Restarts
 
 MAX_COMPONENTS, MAX_METRICS, MAX_VALUE_BYTES = 500, 200, 64 * 1024
+_SHARE = MAX_COMPONENTS // 16  # of each of eight ranks: half of the places are left for what is known from before
 _MAX_CLIPS_BYTES = 400 * 1024  # of the list of clips, which has up to 256 KiB of names
 LARGE_BYTES = 16 * 1024  # a value beyond holds up a slow connection: one is sent, then the page has to answer
 MAX_BYTES = 32 * 1024 * 1024  # of all values together
@@ -109,11 +110,12 @@ class Robots:
     """All components. Only the event loop calls it."""
 
     def __init__(self) -> None:
-        self.components = RankedTable[Component](MAX_COMPONENTS)
+        self.components = RankedTable[Component](MAX_COMPONENTS, _SHARE)
         self.before: Collection[str] = ()  # robots that are known from before
         self.omitted = 0  # messages of components, metrics and values beyond the limits
         self.interests: set[Interest] = set()
         self.on_message: list[Callable[[Message, float], None]] = []  # of every component, before it is interpreted
+        self.on_forget: Callable[[str], object] = lambda _: None
         self.logs: dict[str, LogLines] = {}  # of watched components
         self.recent = Recent()
         self.sources: dict[str, str] = {}  # the components whose pictures are shown on the pages of others
@@ -239,6 +241,7 @@ class Robots:
         if component is not None:
             self._bytes -= component.bytes
         self.recent.forget(ref)
+        self.on_forget(ref)
         for key in [key for key in self._server if key[0] == ref]:
             del self._server[key]
         for interest in self.interests:
@@ -250,7 +253,7 @@ class Robots:
 
         What is merely older than before is sent of a third of the components: no page has to draw all of them at once.
         """
-        self.components.ranks_may_have_fallen()
+        self.components.ranks_have_changed()
         older: list[Component] = []
         for component in self.components.values():
             if component.robot.online(now) is not component.sent_online or component.refreshed_at == float("-inf"):
@@ -284,14 +287,14 @@ class Robots:
         return component
 
     def _has_room(self, component: Component, metric: str, channel: c.Channel, grows: int) -> bool:
-        """Whether there is room for a value, if necessary after removing components of a lower rank."""
+        """Whether there is room for a value, if necessary after removing components of a lower rank that have more."""
         is_new = metric not in component.values
         if is_new and len(component.values) >= MAX_METRICS and channel.is_pattern and not component.lists(metric):
             return False
         if component.bytes + grows <= RESERVED_BYTES:
             return True
         while self._bytes + grows > MAX_BYTES - MAX_COMPONENTS * RESERVED_BYTES:
-            lowest = self.components.lowest(component.rank)
+            lowest = self.components.below(component.rank, lambda one: one.bytes > RESERVED_BYTES)
             if lowest is None:
                 return False
             self.forget(lowest)

@@ -64,6 +64,7 @@ class Server:
         self.sound = SoundHub(self.broker, self.robots, self._note_talk)
         self.open_components = OpenComponents(self.broker, self.robots, self.spawn)
         self.by_name = ByName(FLEET, lambda ref: ref in known or ref in self.open_components)
+        self.robots.on_forget = self.by_name.forget
         self.driven_here = DrivenHere(server)
         self._tasks: set[asyncio.Task[None]] = set()
 
@@ -103,10 +104,11 @@ class Server:
         address = parse_topic(message.topic)
         if address is None:
             return
-        self.robots.receive(message, now)
-        self.by_name.receive(message, now)
         ref = address.identity.base
+        self.robots.receive(message, now)
         self._send(self.stops.receive(message, clock()))
+        if address.metric == ONLINE.metric or ref in self.robots.components:
+            self.by_name.receive(message, now)  # what found no place is asked for
         if ref not in self.robots.components:
             return
         if address.metric != ONLINE.metric or self.robots.value(ref, _ESTOP_METRIC) is None:

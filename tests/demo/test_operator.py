@@ -9,9 +9,18 @@ from pathlib import Path
 
 import pytest
 
-from pebble.contract import CAPABILITIES, DRIVE, DRIVING, ESTOP_STATE, ONLINE, codec
-from pebble.contract.payloads import Capabilities, Drive, Driver, Driving, EstopState, Heartbeat
-from pebble.demo.operator import Operator
+from pebble.contract import (
+    AUTONOMY_COMMAND,
+    AUTONOMY_STATUS,
+    CAPABILITIES,
+    DRIVE,
+    DRIVING,
+    ESTOP_STATE,
+    ONLINE,
+    codec,
+)
+from pebble.contract.payloads import AutonomyStatus, Capabilities, Drive, Driver, Driving, EstopState, Heartbeat
+from pebble.demo.operator import TRAIL, Operator
 from pebble.transports import Message, MqttSettings, QoS, Transport, create
 from tests.support import Broker, until
 
@@ -26,10 +35,13 @@ class Robot:
         self.transport: Transport = create("mqtt", "goob", MqttSettings(host="127.0.0.1", port=port))
         self.transport.open()
         self.drives: list[tuple[float, Drive]] = []
+        self.scripts: list[str | None] = []
         self.transport.subscribe(DRIVE.topic(BASE), self._receive)
+        self.transport.subscribe(AUTONOMY_COMMAND.topic(BASE), self._receive_script)
         value = {
             "drive": {"available": True, "topic": DRIVE.topic(BASE)},
             "estop": {"available": True, "owners": ["m"]},
+            "autonomy": {"available": True},
         }
         payload = codec.encode(CAPABILITIES, Capabilities(t=1, value=value))
         self.transport.publish(CAPABILITIES.topic(BASE), payload, retain=True, qos=QoS.DELIVERED)
@@ -50,6 +62,10 @@ class Robot:
         payload = codec.encode(DRIVING, Driving(t=1, robots=driven))
         self.transport.publish(DRIVING.topic("pebble/servers/hall"), payload, qos=QoS.DELIVERED)
 
+    def show_script(self) -> None:
+        status = codec.encode(AUTONOMY_STATUS, AutonomyStatus(running=True, file=self.scripts[-1] or ""))
+        self.transport.publish(AUTONOMY_STATUS.topic(BASE), status, qos=QoS.DELIVERED)
+
     def show_stop(self, *, by: str, latched: bool = True) -> None:
         state = EstopState(
             latched=latched, boot="b", count=1, recent=[], by=by, why="", since=1, reset_refused=None, persisted=None
@@ -61,6 +77,9 @@ class Robot:
         while not self._ended.wait(0.1):
             payload = codec.encode(ONLINE, Heartbeat(t=int(1000 * time.time())))
             self.transport.publish(ONLINE.topic(BASE), payload)
+
+    def _receive_script(self, message: Message) -> None:
+        self.scripts.append(codec.decode(AUTONOMY_COMMAND, message.payload).file)
 
     def _receive(self, message: Message) -> None:
         self.drives.append((time.monotonic(), codec.decode(DRIVE, message.payload)))
@@ -126,3 +145,27 @@ def test_a_persons_stop_is_left_to_the_person(robot: Robot, operator: Operator) 
     assert not until(lambda: robot.drives, 1.0)
     robot.show_stop(by="anna", latched=False)
     assert until(lambda: robot.drives, START_S)
+
+
+def test_a_robot_that_another_program_drives_is_left_alone_as_well(
+    broker: Broker, robot: Robot, operator: Operator
+) -> None:
+    operator.begin()
+    assert until(lambda: robot.driven_since(0.0))
+    with create("mqtt", "visitor", MqttSettings(host="127.0.0.1", port=broker.port)) as visitor:
+        visitor.publish(DRIVE.topic(BASE), b'{"x": 0, "z": 0.3}', qos=QoS.DELIVERED)
+    assert until(lambda: operator.activity.endswith("; goob is driven by another program"))
+    taken = time.monotonic()
+    assert operator.left_alone == {"goob"}
+    assert until(lambda: robot.driven_since(taken + 0.1), 2 * START_S)
+    assert [one for one in operator.completed if one.ended > taken > one.began] == []
+
+
+def test_a_robot_with_scripts_draws_its_trail_from_the_first_drive_on(robot: Robot, operator: Operator) -> None:
+    operator.begin("yours")
+    assert until(lambda: robot.driven_since(0.0))
+    assert robot.scripts == [TRAIL]
+    robot.show_script()
+    robot.announce(BASE)  # so that the operator drives no more
+    assert until(lambda: operator.activity.startswith("yours"), 30.0)
+    assert robot.scripts == [TRAIL]

@@ -1,4 +1,4 @@
-"""Which robots people have, by what servers announce."""
+"""Which robots people have, by what servers announce and by who else drives."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import pytest
 
 from pebble.client.driver_lease import VALID_S
 from pebble.client.robot_view import RobotView
-from pebble.contract import DRIVING, codec
-from pebble.contract.payloads import Driver, Driving
+from pebble.contract import DRIVE, DRIVING, codec
+from pebble.contract.payloads import Drive, Driver, Driving
 from pebble.demo.visitors import Visitors
 from pebble.transports import Message
 
@@ -51,3 +51,30 @@ def test_what_is_no_announcement_of_now_is_ignored(message: Message) -> None:
     visitors = Visitors("me")
     visitors.receive(message, 1.0)
     assert visitors.taken(GOOB, 1.0) == ""
+
+
+OURS, PASTED = codec.encode(DRIVE, Drive(z=0.6)), b'{"x": 0, "z": 0.3}'
+TOPIC = DRIVE.topic(GOOB.base)
+
+
+@pytest.mark.parametrize(
+    ("received", "taken"),
+    [
+        ([Message(TOPIC, OURS)], ""),
+        ([Message(TOPIC, PASTED)], "is driven by another program"),
+        ([Message(TOPIC, OURS), Message(TOPIC, OURS)], "is driven by another program"),  # one of them is not ours
+        ([Message(TOPIC, PASTED, retain=True)], ""),  # it moves nothing
+        ([Message(TOPIC, PASTED), announcement("hall", GOOB)], "is driven by anna on phone"),
+        ([announcement("hall", GOOB), Message(TOPIC, PASTED)], "is driven by anna on phone"),
+    ],
+    ids=["own", "pasted", "own and the same", "retained", "then announced", "announced before"],
+)
+def test_a_robot_is_driven_by_whoever_sends_what_the_operator_has_not_sent(received: list[Message], taken: str) -> None:
+    visitors = Visitors("me")
+    visitors.note_sent(TOPIC, OURS)
+    for message in received:
+        (visitors.receive_drive if message.topic == TOPIC else visitors.receive)(message, 10.0)
+    assert [visitors.taken(robot, 11.0) for robot in (GOOB, FRED)] == [taken, ""]
+    assert visitors.free(GOOB, 20.0)
+    visitors.begin_step(5.0)
+    assert visitors.free(GOOB, 20.0) is (taken == "")

@@ -87,7 +87,7 @@ def server(broker: Broker, tmp_path_factory: pytest.TempPathFactory) -> Iterator
     assert "Traceback" not in written, written
 
 
-def flood(port: int, messages: Iterable[tuple[str, bytes]]) -> int:
+def flood(port: int, messages: Iterable[tuple[str, bytes]], *, retain: bool = False) -> int:
     """Publish everything with QoS 0, as fast as the broker takes it."""
     count = 0
     with socket.create_connection(("127.0.0.1", port), 30) as client:
@@ -95,7 +95,7 @@ def flood(port: int, messages: Iterable[tuple[str, bytes]]) -> int:
         assert client.recv(4) == b"\x20\x02\x00\x00"
         for topic, payload in messages:
             body = len(topic).to_bytes(2, "big") + topic.encode() + payload
-            client.sendall(b"\x30" + _length(len(body)) + body)
+            client.sendall((b"\x31" if retain else b"\x30") + _length(len(body)) + body)
             count += 1
         client.sendall(b"\xc0\x00")
         assert client.recv(2) == b"\xd0\x00", "the broker has taken everything"
@@ -297,6 +297,7 @@ STRANGERS = {
     "heartbeats": ("online", online),
     "capabilities": ("capabilities", lambda: LARGE % b""),
     "large capabilities": ("capabilities", lambda: LARGE % (b"x" * 60_000)),
+    "states": ("estop/s", lambda: json.dumps(FREE | {"latched": True, "persisted": True}).encode()),
     "what is no state": ("estop/s", lambda: b'{"latched":false}'),
     "pictures": ("front-camera", lambda: b"x"),
 }
@@ -347,8 +348,29 @@ def test_a_crowd_of_strangers_hides_no_robot_and_keeps_no_stop_from_it(
             robot.publish("estop/serial", FREE, retain=True)  # as its motor owner does when it begins
             assert page.knows(robot.base, 15)
             assert is_stopped(page, robot, ""), "by a stop of all"
+        with new_robot(broker) as robot:
+            assert page.knows(robot.base, 15), "without a state of a stop, as what has no motors"
+            assert until(lambda: page.value(robot.base, "capabilities"))
         with new_robot(broker, capabilities={}) as robot:
             assert is_stopped(page, robot, robot.base), "by its own stop, known or not"
+
+
+#: What strangers have left at the broker for each of 600 components, without being there.
+LEFT = {metric: STRANGERS[name][1] for name, metric in {"capabilities": "capabilities", "states": "estop/s"}.items()}
+
+
+def test_a_robot_is_shown_whole_by_a_server_that_finds_what_strangers_have_left(broker: Broker) -> None:
+    topics = [f"pebble/robots/left{number}/outgoing/{metric}" for number in range(600) for metric in LEFT]
+    flood(broker.port, ((topic, LEFT[topic.split("outgoing/")[1]]()) for topic in topics), retain=True)
+    try:
+        with new_robot(broker) as robot, Served(broker.port) as served, served.page() as page:
+            assert page.knows(robot.base, 15)
+            assert until(lambda: page.value(robot.base, "capabilities"), 10), (
+                "asked for again: there was no place for it"
+            )
+            assert drives(page, robot)
+    finally:
+        flood(broker.port, ((topic, b"") for topic in topics), retain=True)
 
 
 def test_a_robot_known_from_before_is_shown_and_stopped_at_once(broker: Broker, tmp_path: Path) -> None:

@@ -1,0 +1,146 @@
+"""A visitor's first ten minutes with the demo: fingers in Chromium, and a clock. Nobody waits for the visitor to think.
+
+``pytest -s`` prints the clock at each step; the pictures of all steps are in pytest's folder of the test.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import av
+import pytest
+from playwright.sync_api import Browser
+
+from tests.kit.demo import START_S, Demo, demos, page_of, start, temporary
+from tests.web.browser import Tab, tab
+
+__all__ = ["demos", "temporary"]
+pytest.importorskip("duckdb")  # it makes timelines
+pytestmark = [pytest.mark.page, pytest.mark.timeout(400)]
+
+GOOB = "pebble/robots/goob"
+LONGEST_S = 240.0  # on a busy machine; half of it is the demo's own round
+#: Controls in sight whose middle belongs to something else.
+COVERED = """() => [...document.querySelectorAll("button, a[href], input, select, summary")].filter((one) => {
+  const box = one.getBoundingClientRect();
+  const [x, y] = [box.x + box.width / 2, box.y + box.height / 2];
+  if (!one.checkVisibility({ visibilityProperty: true, opacityProperty: true }) || box.width < 4) return false;
+  if (box.top < 0 || box.bottom > innerHeight || box.left < 0 || box.right > innerWidth) return false;
+  const top = document.elementFromPoint(x, y);
+  return top && !one.contains(top) && !top.contains(one) && !one.labels?.[0]?.contains(top);
+}).map((one) => one.outerHTML.slice(0, 160))"""
+#: How far apart the ends of the map's trail are, in metres.
+TRAIL = """async () => {
+  const { recorderOf } = await import(`/static/${pebble.connection.version}/ui/parts/recorder.js`);
+  const rows = recorderOf(pebble, pebble.route.ref).all.get("poses wheel-odometry")?.rows ?? [];
+  return Math.max(0, ...rows.map(({ x, y }) => Math.hypot(x - rows[0].x, y - rows[0].y)));
+}"""
+
+
+class Visitor:
+    """Presses what the page shows. Each step ends with a look at the whole page."""
+
+    def __init__(self, opened: Tab, folder: Path) -> None:
+        self.tab, self.page, self._folder = opened, opened.page, folder
+        self._began = time.monotonic()
+        self._steps = 0
+
+    @property
+    def clock(self) -> float:
+        return time.monotonic() - self._began
+
+    def did(self, what: str) -> None:
+        """Nothing is covered, nothing has failed, and there is no control without a name."""
+        self._steps += 1
+        sys.stdout.write(f"{self.clock:6.1f} s  {what}\n")
+        self.page.screenshot(path=self._folder / f"{self._steps}-{what.replace(' ', '-')}.png")
+        assert self.tab.until(lambda: self.page.evaluate(COVERED) == [], 5), self.page.evaluate(COVERED)
+        assert self.tab.complaints() == []
+
+    def sees(self, condition: Callable[[], object] | str, within: float = 30.0) -> None:
+        assert self.tab.until(condition, within), self.page.locator("body").inner_text()
+
+    def state(self, metric: str) -> Any:
+        return self.page.evaluate("([ref, metric]) => pebble.store.get(ref, metric)?.value", [GOOB, metric])
+
+    def presses(self, name: str, within: float = 30.0) -> None:
+        self.tab.test(name).click(timeout=1000 * within)
+
+    def drives(self) -> None:
+        """Takes control, also from the demo's operator, and holds a key until the robot has gone some way."""
+        self.presses("take")
+        self.sees("pebble.driver.reason() === null")
+        began = self.travelled
+        self.page.keyboard.down("KeyW")
+        self.sees(lambda: self.travelled > began + 100)
+        self.page.keyboard.up("KeyW")
+
+    @property
+    def travelled(self) -> float:
+        """Millimetres, as its odometry publishes."""
+        odometry = self.state("wheel-odometry") or {}
+        return float(odometry.get("value", {}).get("distance_mm", 0.0))
+
+
+@pytest.fixture
+def demo(demos: list[Demo], temporary: Path) -> Iterator[Demo]:
+    """It has ended by Ctrl-C as one that succeeded, and has left nothing, whatever its visitor did."""
+    running = start(demos, temporary, "")
+    yield running
+    running.process.send_signal(signal.SIGINT)
+    assert running.process.wait(START_S) == 0, running.output
+    assert (running.leftovers(), running.folders()) == ([], [])
+
+
+def test_a_visitor_sees_drives_stops_starts_a_script_and_takes_a_film_home(
+    demo: Demo, browser: Browser, tmp_path: Path
+) -> None:
+    url = page_of(demo)
+    with tab(browser, url, engineers=False, accept_downloads=True) as opened:
+        visitor = Visitor(opened, tmp_path)
+        visitor.sees("document.querySelectorAll('.fleet-card').length >= 4", START_S)
+        visitor.did("all robots are there")
+
+        opened.page.locator(".fleet-card", has_text="goob").first.click()
+        visitor.sees(lambda: opened.test("video").is_visible())
+        visitor.sees(lambda: visitor.state("wheel-odometry"))
+        visitor.did("Goob is open")
+        visitor.drives()
+        visitor.did("it drives")
+
+        opened.page.get_by_role("button", name="STOP: emergency stop of Goob").click()
+        visitor.sees(lambda: visitor.state("web/estop")["latched"])
+        visitor.did("it is stopped")
+        opened.test("reset").hover()
+        opened.page.mouse.down()
+        visitor.sees(lambda: not visitor.state("web/estop")["latched"])
+        opened.page.mouse.up()
+        visitor.did("it is reset")
+
+        opened.test("script-apriltag-follow").click()
+        visitor.sees(lambda: opened.test("start-script").is_enabled())
+        visitor.presses("start-script")
+        visitor.sees(lambda: "runs" in opened.test("script-state").inner_text())
+        visitor.did("a script runs")
+        visitor.presses("end-script")
+        visitor.sees(lambda: "No script runs" in opened.test("script-state").inner_text())
+
+        opened.test("map").scroll_into_view_if_needed()
+        visitor.sees(lambda: opened.page.evaluate(TRAIL) > 0.1)
+        visitor.did("the map has its trail")
+
+        opened.page.get_by_role("link", name="Recordings").first.click()
+        visitor.sees("window.pebble?.replay?.drawnAt", 60)
+        visitor.did("its recording is open")
+        visitor.presses("download")
+        with opened.page.expect_download(timeout=120_000) as download:
+            visitor.presses("download-file", 120)
+        with av.open(download.value.path()) as film:
+            assert sum(1 for _ in film.decode(video=0)) > 10
+        visitor.did("a film is downloaded")
+        assert visitor.clock < LONGEST_S
