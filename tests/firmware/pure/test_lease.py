@@ -142,6 +142,17 @@ def test_only_the_key_of_now_moves_and_a_zero_needs_none() -> None:
         assert not own.refuses(True, False, own.key, "mia", WRAPS)  # below the level of names nobody vouches for them
 
 
+def test_a_command_for_several_owners_has_the_key_of_each() -> None:
+    own = lease()
+    own.hold(ANN, 3000, False, WRAPS)
+    for keys, right in ((f"ffffffff {own.key}", True), (f"{own.key} ffffffff", True), (f"{own.key},", False),
+                        (own.key[1:], False), (own.key + "0", False), (" ".join([own.key] * 9), False)):  # fmt: skip
+        assert own.holds(keys, "") is right, keys
+    own.release(ANN, WRAPS)
+    assert not own.holds("", "")
+    assert not own.holds(" ", "")
+
+
 def test_scripts_need_no_key_but_no_wrong_one_either() -> None:
     own = lease(REFUSE)
     assert not own.refuses(True, True, "", "", WRAPS)
