@@ -146,7 +146,7 @@ def test_a_command_for_several_owners_has_the_key_of_each() -> None:
     own = lease()
     own.hold(ANN, 3000, False, WRAPS)
     for keys, right in ((f"ffffffff {own.key}", True), (f"{own.key} ffffffff", True), (f"{own.key},", False),
-                        (own.key[1:], False), (own.key + "0", False), (" ".join([own.key] * 9), False)):  # fmt: skip
+                        (own.key[1:], False), (own.key + "0", False), (" ".join([own.key] * 10), False)):  # fmt: skip
         assert own.holds(keys, "") is right, keys
     own.release(ANN, WRAPS)
     assert not own.holds("", "")
