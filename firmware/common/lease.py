@@ -1,0 +1,129 @@
+"""Who has control of one motor owner: a lease that it gives, renews and ends. Pure; boards and Linux robots share it.
+
+Control orders people; it is no safety function. A stop and a zero need none. A drive command names the control under
+which it is sent by a key, which is new whenever another one gets control: so commands of before have no effect.
+A client is ``(account, id, by, device)``; the account is "" where names are not checked.
+"""
+
+
+class Lease:
+    """``hold`` and ``release`` for requests; ``refuses`` for drive commands; ``tick`` regularly."""
+
+    def __init__(self, now: int, diff, random, strangers: int) -> None:
+        """``random(4)`` returns 8 hex digits.
+
+        ``strangers``: commands without a key move the motors always (0), while nobody has control (1), or never (2).
+        """
+        self.key = ""  # "": nobody has control
+        self.holder: tuple = ()  # nobody
+        self.asker: tuple = ()
+        self.others = False  # in the last 2 s a command without a key moved something, unless it was refused elsewhere
+        self.changed = True  # since the last state
+        self.halts = False  # another one has control, or nobody: the motors are to be stopped
+        self.strangers = strangers
+        self._diff = diff
+        self._random = random
+        self._since = self._held_from = self._asked = self._received = now
+        self._limit_ms = self._wait = 0  # of the holder, and of the asker
+        self._held = False  # in the last 5 s the holder moved something: others have to ask
+
+    def hold(self, client: tuple, ms: int, urgent: bool, now: int) -> None:
+        """Request control, or renew it. ``urgent``: without asking whoever has it."""
+        self.tick(now)
+        ms = min(max(ms, 1000), 10_000)
+        if client[:2] == self.holder[:2]:
+            self._since = now
+            self._limit_ms = ms
+        elif urgent or not self._held:
+            self.take(client, ms, now)
+        elif not self.asker or client[:2] == self.asker[:2]:
+            self.changed = self.changed or not self.asker
+            self.asker = client
+            self._wait = ms
+            self._asked = now
+
+    def release(self, client: tuple, now: int) -> None:
+        """End control, or the request for it."""
+        self.tick(now)
+        if client[:2] == self.holder[:2]:
+            self._end(now)
+        elif client[:2] == self.asker[:2]:
+            self.asker = ()
+            self.changed = True
+
+    def holds(self, key: str, by: str) -> bool:
+        """Whether a command of this account is from who has control; its key has those of several motor owners."""
+        own = self.key
+        # nobody can try many keys at once
+        return own != "" and (key == own or (len(key) < 80 and own in key.split(" "))) and self.holder[:1] == (by,)
+
+    def refuses(self, moves: bool, script: bool, key: str, by: str, now: int) -> bool:
+        """Whether a drive command has no effect; one of who has control renews it. A zero always has an effect.
+
+        ``script``: this sender needs no key. Call ``tick`` before.
+        """
+        if self.holds(key, by):
+            self._since = now
+            if moves:
+                self._held_from = now
+                self._held = True
+        elif moves:
+            if key:
+                return True
+            if not script:
+                if self.strangers == 2 or (self.strangers and self.key):
+                    return True
+                self._received = now
+                self.changed = self.changed or not self.others
+                self.others = True
+        return False
+
+    def tick(self, now: int) -> None:
+        """Let what is over end; at least every few minutes, because clocks of boards wrap."""
+        diff = self._diff
+        if self.others and diff(now, self._received) >= 2000:
+            self.others = False
+            self.changed = True
+        if self.asker and diff(now, self._asked) >= self._wait:
+            self.asker = ()
+            self.changed = True
+        if self._held and diff(now, self._held_from) >= 5000:
+            self._held = False
+        if self.key and (diff(now, self._since) >= self._limit_ms or (self.asker and not self._held)):
+            self._end(now)
+
+    def take(self, client: tuple, ms: int, now: int) -> None:
+        """Control passes on to this client, or to nobody."""
+        self.holder = client
+        self.asker = ()
+        self.key = self._random(4) if ms else ""
+        self._since = self._held_from = now
+        self._limit_ms = ms
+        self._held = ms > 0
+        self.changed = self.halts = True
+
+    def _end(self, now: int) -> None:
+        self.take(self.asker, self._wait if self.asker else 0, now)
+
+
+def request_of(fields: dict) -> tuple[str, str, str, int] | None:
+    """``(id, by, device, for_ms)``; 0: it is a release. None: it is no request."""
+    name = fields.get("id")
+    want = fields.get("want", "hold")
+    by = fields.get("by", "")
+    device = fields.get("device", "")
+    ms = fields.get("for_ms", 3000)
+    if not (isinstance(name, str) and isinstance(by, str) and isinstance(device, str)) or len(name) != 8:
+        return None
+    for char in name:
+        if char not in "0123456789abcdefABCDEF":
+            return None
+    if want not in ("hold", "release") or type(ms) not in (int, float):
+        return None
+    return name, shown(by, 40), shown(device, 20), int(min(max(ms, 1), 10_000)) if want == "hold" else 0
+
+
+def shown(text: str, limit: int) -> str:
+    """``text`` in the letters of names; "/" separates a server and its person."""
+    letters = "abcdefghijklmnopqrstuvwxyz0123456789_-/"
+    return "".join([char if char in letters else "_" for char in text.lower()[:limit]])
