@@ -14,7 +14,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
 from pebble.client.estop_states import Reset
 from pebble.fleet.database import DatabaseError
-from pebble.fleet.roles import Session, rights
+from pebble.fleet.roles import Session, page_rights
 from pebble.transports.clock import since_boot as clock
 from pebble.web import messages as m
 from pebble.web import robot_commands
@@ -119,7 +119,7 @@ class Control:
                 version=version,
                 user=self._session.user,
                 role=self._session.role,
-                rights=tuple(sorted(rights(self._session.role))),
+                rights=tuple(sorted(self._rights())),
                 login=settings.login,
                 token=self._tab.token,
                 now=1000 * time.time(),
@@ -127,7 +127,7 @@ class Control:
                 recordings=settings.recordings is not None,
             )
         )
-        if "drive" in rights(self._session.role):
+        if "drive" in self._rights():
             server.publish(server.driving.restore(hello.token, self._tab, clock()))
         server.robots.join(self._interest)
         self._interest.dirty |= {(ref, "web/driver") for ref in server.robots.components}
@@ -318,8 +318,11 @@ class Control:
             self._audit("take over" if op.over else "take", op.ref)
         self._moved.discard(op.ref)
 
+    def _rights(self) -> frozenset[str]:
+        return page_rights(self._session.role, self._server.settings.level)
+
     def _may(self, right: str, op: m.FromPage) -> bool:
-        if right in rights(self._session.role):
+        if right in self._rights():
             return True
         self._refuse(op, f"The role {self._session.role} may not do this")
         return False
