@@ -298,7 +298,7 @@ def _local_media(config: Config) -> Iterator[str]:
 def _security(config: Config) -> Iterator[tuple[str, str]]:
     if config.security.level != "open":
         who = {"drive": "may drive, too", "free": "may drive while nobody has control", "refuse": "may not drive"}
-        yield "security", f"level {config.security.level}; who has no control {who[config.security.admits]}"
+        yield "security", f"level {config.security.level}; who has no control {who[config.security.unnamed]}"
 
 
 def _serial_lines(config: Config) -> Iterator[str]:

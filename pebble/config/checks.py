@@ -38,13 +38,15 @@ def _root(reader: Reader, root: Root, _path: Path) -> Root:
         )
     if root.robot.type == SERVERS:
         reader.notes.problem(("robot", "type"), f'must not be "{SERVERS}": those are operators\' servers, not robots')
+    if root.security.named:
+        reader.notes.problem(("security", "level"), 'must not be "named" in this release, write "login"')
     if platform != "linux" and kind != "mqtt":
         reader.notes.doubt(("transport", "kind"), f'must be "mqtt" where robot.platform is "{platform}"')
     if not reader.notes.problems:
         for path, other in shared_topics(root):
             reader.notes.problem(path, f"is also the topic of {other.suffix}, choose another")
         warn_of_logins_in_clear(reader.notes, root)
-        check_doors(reader.notes, root)
+    check_doors(reader.notes, root)
     return root
 
 

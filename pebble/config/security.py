@@ -9,25 +9,29 @@ Strangers = Literal["drive", "free", "refuse"]
 
 
 class Security(Section, frozen=True, kw_only=True):
-    """Who may do what to this robot; `docs/fleet.md` explains the levels."""
+    """Who may do what to this robot; docs/fleet.md explains the levels."""
 
     level: Annotated[
         SecurityLevel,
         doc(
-            "`open`: whoever reaches the broker may do everything. `login`: the broker asks for a name and knows its "
-            "roles, so every connection beyond loopback must be encrypted and log in. `named`: the name is in the "
-            "topics, too, and the robot checks who has control."
+            "`open`: whoever may publish at the broker does everything. `login`: every connection beyond this machine "
+            "is encrypted and logs in, and the broker knows roles. `named`: with a checked name in the topics, too."
         ),
     ] = "open"
     strangers: Annotated[
         Strangers | None,
         doc(
-            "Drive commands of those who do not have control: `drive`, they move the robot; `free`, as long as nobody "
-            "has control; `refuse`, never. Unset: `refuse` at level `named`, else `drive`."
+            "Drive commands without a key of control: obeyed, only while nobody has control, or never. "
+            "Unset: `drive`, at `named` `refuse`."
         ),
     ] = None
 
     @property
-    def admits(self) -> Strangers:
-        """``strangers``, or what it is where it is not set."""
+    def unnamed(self) -> Strangers:
+        """What becomes of drive commands without a key of control."""
         return self.strangers or ("refuse" if self.level == "named" else "drive")
+
+    @property
+    def named(self) -> bool:
+        """Whether the names of senders are checked."""
+        return self.level == "named"

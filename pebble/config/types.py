@@ -11,8 +11,9 @@ from pebble.contract.identity import LEVEL, LEVEL_RULE
 
 # As pebble.transports.topics checks it: brokers close the connection on what is refused here.
 _BAD = r"+#\x00-\x1f\x7f-\x9f\ufdd0-\ufdef\ufffe\uffff"
-_ESTOP = "(?:[^/]+/){3}(?:incoming|outgoing)/estop"  # of any robot: nothing else may be published there
-_TOPIC = rf"^(?!\$)(?!{_ESTOP})(?!(?:[^/]*/){{200}})[^{_BAD}]{{1,250}}$(?!\n)"
+# Of any robot, who stops and who drives it: nothing else may be published there.
+_RESERVED = "(?:[^/]+/){3}(?:incoming|outgoing)/(?:estop|(?:by|control)(?:/|$))"
+_TOPIC = rf"^(?!\$)(?!{_RESERVED})(?!(?:[^/]*/){{200}})[^{_BAD}]{{1,250}}$(?!\n)"
 
 # ``expected`` completes a problem's text "must be …, not …".
 Level = Annotated[str, Meta(pattern=LEVEL, extra={"expected": LEVEL_RULE, "parse": hosts.no_login})]
@@ -21,7 +22,8 @@ Topic = Annotated[
     Meta(
         pattern=_TOPIC,
         extra={
-            "expected": "a topic: 1 to 250 characters, no + or #, no $ at the start, not one of an emergency stop",
+            "expected": "a topic: 1 to 250 characters, no + or #, no $ at the start, "
+            "not one of an emergency stop or control",
             "parse": hosts.no_login,
         },
     ),

@@ -17,6 +17,7 @@ from pebble.contract import payloads as p
 INCOMING, OUTGOING = "incoming", "outgoing"
 WAITS_S = 0.5  # how long what happens once may wait; in the connection another 2 s at most
 _PATIENT_S = 2.0  # the same, where it moves nothing
+_HOLD_S = 3.0  # the same, of what is repeated every second and lasts for 3 s
 
 
 class Kind(Enum):
@@ -139,6 +140,10 @@ DRIVE = _c("drive-values", Kind.COMMAND, p.Drive, "Wanted steering x and throttl
            rate_hz=20, newest=True, override=_serial("drive_values"))  # fmt: skip
 ESTOP = _c("estop", Kind.COMMAND, p.EstopCommand, "Emergency stop: nothing moves until a reset.", waits_s=math.inf)
 ESTOP_RESET = _c("estop-reset", Kind.COMMAND, p.EstopReset, "Ends the emergency stop of one motor owner.")
+CONTROL = _c("control", Kind.COMMAND, p.ControlRequest, "Requests, renews or releases control: who drives.",
+             waits_s=_HOLD_S)  # fmt: skip
+CONTROL_TAKE = _c("control/take", Kind.COMMAND, p.ControlRequest, "Takes control over from somebody else.",
+                  waits_s=_HOLD_S)  # fmt: skip
 LIGHTS_SOLID = _c("lights-solid", Kind.COMMAND, p.LightsSolid, "A steady colour.",
                   newest=True, waits_s=_PATIENT_S, override=_serial("lights_solid"))  # fmt: skip
 LIGHTS_FLASH = _c("lights-flash", Kind.COMMAND, p.LightsFlash, "A colour fading in and out.",
@@ -180,6 +185,9 @@ CAPABILITIES = _c("capabilities", Kind.STATE, p.Capabilities, "What the robot ca
                   override=_full("services.launcher.capabilities"))  # fmt: skip
 STATUS = _c("status", Kind.STATE, p.Status, "General state; robots list the state of their services.")
 ESTOP_STATE = _c("estop/{owner}", Kind.STATE, p.EstopState, "Whether a motor owner is stopped, and by whom.")
+CONTROL_STATE = _c(
+    "control/{owner}", Kind.STATE, p.ControlState, "Who has control of a motor owner, and who asks for it."
+)
 BRIDGE_PROBE = _c("bridge-probe", Kind.EVENT, p.AnyObject,
                   "By it the bridge detects that two of the robot's connections lead to one broker.")  # fmt: skip
 LOGS = _c("logs", Kind.STREAM, p.LogRecord, "Log lines of all services.", override=_full("services.launcher.logs"))

@@ -10,6 +10,7 @@ from msgspec import UNSET
 
 from pebble.contract import INCOMING, Channel
 from pebble.contract.payloads import (
+    LARGEST_MS,
     LAST_RUN,
     SCRIPT,
     AutonomyCommand,
@@ -193,7 +194,7 @@ def _request(channel: Channel, plain: Any) -> Any:
 
 
 def _drive(channel: Channel, plain: dict[str, Any], remark: Remark) -> dict[str, Any]:
-    """A wrong ``source``, ``run`` or ``valid_ms`` refuses a command that moves anything, but never a stop."""
+    """A wrong ``source``, ``run``, ``valid_ms`` or ``key`` refuses a command that moves anything, but never a stop."""
     axes = _numbers(channel, plain, remark)
     if not axes:
         found = ", ".join([_shown(key) for key in plain][:_KEYS_SHOWN]) or "nothing"
@@ -211,14 +212,21 @@ def _drive(channel: Channel, plain: dict[str, Any], remark: Remark) -> dict[str,
     more = {key: value for key, value in more.items() if key not in wrong}
     if "valid_ms" in more:
         more["valid_ms"] = int(more["valid_ms"])
-    return axes | more
+    return axes | more | {key: plain[key] for key, fits in _DRIVE_MORE.items() if fits(plain.get(key))}
 
 
 #: What a drive command may have besides its axes; null is the same as absent.
 _DRIVE_CHECKS: dict[str, tuple[Callable[[Any], bool], str]] = {
     "source": (lambda value: isinstance(value, str), "a string"),
+    "key": (lambda value: isinstance(value, str), "a string"),
     "run": (lambda value: type(value) is int and 1 <= value <= LAST_RUN, f"an integer from 1 to {LAST_RUN}"),
     "valid_ms": (lambda value: type(value) in (int, float) and 0 <= value < _LONGEST_MS, "a number of milliseconds"),
+}
+#: What else it may have: what does not fit is the same as absent, because it decides about no motion.
+_DRIVE_MORE: dict[str, Callable[[Any], bool]] = {
+    "t": lambda value: type(value) is int and 0 <= value <= LARGEST_MS,
+    "by": lambda value: isinstance(value, str),
+    "group": lambda value: isinstance(value, bool),
 }
 
 
@@ -240,7 +248,10 @@ def _usual_drive(raw: bytes) -> Drive | None:
         return None
     try:
         found = _drive_decoder.decode(raw)
-        drive = Drive(x=found.x, z=found.z, y=found.y, source=found.source, run=found.run, valid_ms=found.valid_ms)
+        drive = Drive(
+            x=found.x, z=found.z, y=found.y, source=found.source, run=found.run, valid_ms=found.valid_ms,
+            key=found.key, t=found.t, by=found.by, group=found.group,
+        )  # fmt: skip
     except (msgspec.DecodeError, ValueError):
         return None
     usual = (drive.source != SCRIPT or drive.run is not UNSET) and (

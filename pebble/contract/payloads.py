@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 from msgspec import UNSET, Meta, Struct, UnsetType, field
 from msgspec.structs import force_setattr
 
-from pebble.motion import arbiter
+from pebble.motion import arbiter, lease
 
 
 class Payload(Struct, frozen=True, kw_only=True, omit_defaults=False):
@@ -37,12 +37,14 @@ def _clamp(payload: Payload, low: float, high: float, *names: str) -> None:
 
 SCRIPT = "autonomy"  # the source of a script's drive command; any other source is a person
 LAST_RUN = arbiter.LAST_RUN
+LARGEST_MS = (1 << 53) - 1  # of a clock: the largest number that every JSON reader knows exactly
 
 
 class Drive(Payload, frozen=True, kw_only=True):
     """Wanted motion. Axes that are missing or no number are 0; all are clamped to -1..1 (paper A.8.3).
 
     A script signs its commands with ``source`` and ``run``; ``valid_ms`` limits how long this command moves anything.
+    Who has control puts its ``key`` in: a command that moves anything and has another key is refused.
     Fields that say nothing are not written: old sketches have 256 bytes for the topic and the payload.
     """
 
@@ -52,6 +54,12 @@ class Drive(Payload, frozen=True, kw_only=True):
     source: str | UnsetType = UNSET  # "autonomy" of a script; anything else counts as a person
     run: Annotated[int, Meta(ge=1, le=LAST_RUN)] | UnsetType = UNSET  # of a script: grows until 2^30 - 1, then from 1
     valid_ms: Annotated[int, Meta(ge=0)] | UnsetType = UNSET  # of a zero, 0: the script must not resume
+    key: str | UnsetType = (
+        UNSET  # of control, as outgoing/control/{owner} has it; of several owners all, with a blank between
+    )
+    t: Annotated[int, Meta(ge=0, le=LARGEST_MS)] | UnsetType = UNSET  # the sender's clock, in milliseconds
+    by: str | UnsetType = UNSET  # the account of a sender elsewhere, where the robot checks names
+    group: bool | UnsetType = UNSET  # a copy of what a group of commands contained
 
     def __post_init__(self) -> None:
         if not (-1.0 <= self.x <= 1.0 and -1.0 <= self.z <= 1.0 and -1.0 <= self.y <= 1.0):  # NaN is not within, either
@@ -86,6 +94,29 @@ class EstopReset(Payload, frozen=True, kw_only=True):
     boot: str
     count: int
     by: str | UnsetType = UNSET
+
+
+class ControlRequest(Payload, frozen=True, kw_only=True, omit_defaults=True):
+    """Requests control of all motor owners of a robot, repeated every second, or releases it; their state answers.
+
+    ``by`` and ``device`` are shown to others: small letters, digits, ``_``, ``-`` and ``/``; others become ``_``.
+    """
+
+    id: Annotated[str, Meta(pattern=r"\A[0-9A-Fa-f]{8}\Z")]  # new for each tab or process: 8 hex digits
+    want: Literal["hold", "release"] = "hold"
+    for_ms: float = lease.USUAL_MS  # control ends so long after the last request or command; within 1,000 to 10,000
+    by: str = ""  # who, at most 40 characters
+    device: str = ""  # with what, at most 20
+    t: Annotated[int, Meta(ge=0, le=LARGEST_MS)] | UnsetType = UNSET  # the sender's clock, in milliseconds
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _clamp(self, lease.SHORTEST_MS, lease.LONGEST_MS, "for_ms")
+        force_setattr(self, "by", lease.shown(self.by, lease.BY))
+        force_setattr(self, "device", lease.shown(self.device, lease.DEVICE))
+
+    def ends(self) -> bool:
+        return self.want == "release"
 
 
 class LightsSolid(Payload, frozen=True, kw_only=True):
@@ -228,6 +259,23 @@ class EstopState(Payload, frozen=True, kw_only=True):
     def last_barred(self) -> int:
         """``barred``; 0 where it is unset."""
         return self.barred if isinstance(self.barred, int) else 0
+
+
+class ControlState(Payload, frozen=True, kw_only=True):
+    """Who has control of one motor owner, at most 300 bytes; ``key`` is ``""`` while nobody has.
+
+    Where a robot has several owners, the first one by name decides who drives.
+    """
+
+    by: str  # as that request has it
+    id: str
+    key: str  # random, new whenever another one gets control; for the drive commands of who has it
+    device: str = ""
+    asks: str = ""  # who asks for control meanwhile, the first one
+    asks_id: str = ""  # "": nobody does
+    others: bool = False  # a command without a key has moved something in the last 2 s, while somebody has control
+    named: bool = False  # the broker vouches for the names
+    boot: str = ""  # random at each start of the owner, as in its emergency stop
 
 
 class LogRecord(Payload, frozen=True, kw_only=True):

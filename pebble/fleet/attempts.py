@@ -31,7 +31,7 @@ class Row(NamedTuple):
     retained: bool = False
 
 
-_DRIVE = (c.DRIVE.metric, "control")
+_DRIVE = (c.DRIVE.metric, c.CONTROL.metric)
 ROWS = (
     Row("emergency stop", Form.OWN, (c.ESTOP.metric,)),
     Row("emergency stop, without a name", Form.PLAIN, (c.ESTOP.metric,)),
@@ -40,7 +40,7 @@ ROWS = (
     Row("drive, under another's name", Form.OTHER, (*_DRIVE, c.ESTOP_RESET.metric, c.REBOOT.metric)),
     Row("leave a drive command as a will", Form.OWN, (c.DRIVE.metric,), will=True),
     Row("leave a drive command retained", Form.OWN, (c.DRIVE.metric,), retained=True),
-    Row("take control over", Form.OWN, ("control/take",)),
+    Row("take control over", Form.OWN, (c.CONTROL_TAKE.metric,)),
     Row("reset an emergency stop", Form.OWN, (c.ESTOP_RESET.metric,)),
     Row("start and end scripts", Form.OWN, (c.AUTONOMY_COMMAND.metric,)),
     Row("lights", Form.OWN, (c.LIGHTS_SOLID.metric, c.LIGHTS_FLASH.metric)),

@@ -70,7 +70,7 @@ WRITES: Mapping[Right, tuple[Channel | str, ...]] = {
     Right.STOP: (c.ESTOP,),
     Right.DRIVE: (
         c.DRIVE,
-        "control",
+        c.CONTROL,
         c.LIGHTS_SOLID,
         c.LIGHTS_FLASH,
         c.AUDIO_CONTROL,
@@ -84,7 +84,7 @@ WRITES: Mapping[Right, tuple[Channel | str, ...]] = {
         c.MQTT_VIDEO,
     ),
     Right.RESET: (c.ESTOP_RESET,),
-    Right.TAKE: ("control/take",),
+    Right.TAKE: (c.CONTROL_TAKE,),
     Right.SYSTEM: (c.REBOOT, c.SERVICE_RESTART, c.GIT_PULL, c.REMOTE_MIRROR, "audit-read"),
 }
 

@@ -128,6 +128,7 @@ def _motor(config: Config, addresses: Addresses, lacking: Collection[str], found
             "controls": present,
             "topic": addresses[c.DRIVE].topic,
             **({"arbitrates": True} if present else {}),
+            **({"control": True} if present and "control" not in lacking else {}),
         },
         "estop": _estop(config, [] if "estop" in lacking else list(lines)),
         "lights": {

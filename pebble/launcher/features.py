@@ -4,17 +4,17 @@ import re
 from collections.abc import Callable
 
 #: A robot has these unless a process reports that it lacks them; all others it has while a process reports them.
-_EXPECTED = frozenset({"estop"})
+_EXPECTED = frozenset({"estop", "control"})
 _MOST_REPORTS = 256  # of all processes; a self-describing MCU names its own outlets
 
-_report = re.compile(r"(LACKS|HAS) (estop|wheel-odometry|outlets/[^/]{1,64}/(?:status|power))").fullmatch
+_report = re.compile(r"(LACKS|HAS) (estop|control|wheel-odometry|outlets/[^/]{1,64}/(?:status|power))").fullmatch
 
 
 class Features:
     """Handles ``LACKS <feature>`` and ``HAS <feature>``; ``on_change()`` is called when a property changes.
 
-    ``estop``: the emergency stop. ``wheel-odometry``: it is being published. ``outlets/NAME/status`` and
-    ``outlets/NAME/power``: the contract's topics of an outlet are in use.
+    ``estop``: the emergency stop. ``control``: requests for control are answered. ``wheel-odometry``: it is being
+    published. ``outlets/NAME/status`` and ``outlets/NAME/power``: the contract's topics of an outlet are in use.
     """
 
     def __init__(self, on_change: Callable[[], None]) -> None:

@@ -22,6 +22,7 @@ from pebble.contract import CHANNELS, Channel, codec
 from pebble.contract.payloads import (
     AutonomyCommand,
     ChargingLevel,
+    ControlRequest,
     Drive,
     EstopCommand,
     EstopReset,
@@ -100,7 +101,7 @@ def test_nothing_else_switches_a_boolean_control(raw: bytes) -> None:
         (b'{"x": 7, "z": -7, "y": "1e9"}', Drive(x=1, z=-1, y=1)),
         (b'{"x": 123456789012345678901234567890}', Drive(x=1)),
         (b'{"x": -1, "x": 1}', Drive(x=1)),
-        (b'{"x": 1, "t": 1710969600123, "origin": {"a": [1]}}', Drive(x=1)),
+        (b'{"x": 1, "t": 1710969600123, "origin": {"a": [1]}}', Drive(x=1, t=1710969600123)),
     ],
 )
 def test_drive_values_are_bare_or_wrapped_numbers_or_numeric_strings(raw: bytes, drive: Drive) -> None:
@@ -115,6 +116,10 @@ def test_drive_values_are_bare_or_wrapped_numbers_or_numeric_strings(raw: bytes,
         (b'{"z": 1, "source": "joystick", "valid_ms": 400}', Drive(z=1, source="joystick", valid_ms=400)),
         (b'{"z": 1, "source": null, "run": null, "valid_ms": null}', Drive(z=1)),
         (b'{"z": 1, "valid_ms": 250.9}', Drive(z=1, valid_ms=250)),
+        (b'{"z": 1, "key": "0badf00d", "by": "otto"}', Drive(z=1, key="0badf00d", by="otto")),
+        (b'{"z": "1", "key": "0badf00d", "t": 1, "group": true}', Drive(z=1, key="0badf00d", t=1, group=True)),
+        (b'{"z": 1, "key": null, "t": -1, "by": 5, "group": "a"}', Drive(z=1)),
+        (b'{"z": 0, "key": 5}', Drive()),
         (b'{"z": 0, "valid_ms": 0}', Drive(valid_ms=0)),
         (b'{"source": "autonomy", "run": 17}', Drive(source="autonomy", run=17)),
     ],
@@ -173,6 +178,7 @@ COMMANDS = {
     c.DRIVE: ['{"x":0,"z":0}', '{"value":{"z":0.5}}', "{}"],
     c.ESTOP: ['{"stop":"c9a9f10cc9a9f10c","by":"eve"}'],
     c.ESTOP_RESET: ['{"boot":"a1b2c3d4","count":3}'],
+    c.CONTROL: ['{"id":"3f2a91c0","by":"ann"}', '{"value":{"id":"3f2a91c0","want":"release"}}'],
     c.LIGHTS_SOLID: ['{"b":0,"g":0,"r":0}'],
     c.LIGHTS_FLASH: ['{"r":1,"period":"3"}'],
     c.SOUNDBOARD_COMMAND: ["false", '{"action":"stop"}'],
@@ -392,6 +398,30 @@ def test_an_empty_payload_is_no_stop() -> None:
 def test_a_reset_names_the_boot_and_the_count_of_the_state_it_ends(raw: str) -> None:
     assert codec.decode(c.ESTOP_RESET, b'{"boot": "a1b2c3d4", "count": 3}') == EstopReset(boot="a1b2c3d4", count=3)
     refused(c.ESTOP_RESET, raw.encode())
+
+
+@pytest.mark.parametrize(
+    ("raw", "request_"),
+    [
+        (b'{"want": "hold", "id": "3f2a91c0"}', ControlRequest(id="3f2a91c0")),
+        (b'{"id": "3F2A91C0", "for_ms": 0}', ControlRequest(id="3F2A91C0", for_ms=1000)),
+        (b'{"id": "3f2a91c0", "for_ms": 1e9}', ControlRequest(id="3f2a91c0", for_ms=10_000)),
+        (b'{"id": "3f2a91c0", "by": "page-1/Ann B."}', ControlRequest(id="3f2a91c0", by="page-1/ann_b_")),
+        (b'{"id": "3f2a91c0", "device": "' + b"p" * 50 + b'"}', ControlRequest(id="3f2a91c0", device="p" * 20)),
+        (b'{"id": "3f2a91c0", "t": 1, "other": []}', ControlRequest(id="3f2a91c0", t=1)),
+    ],
+)
+def test_a_request_for_control_is_within_limits(raw: bytes, request_: ControlRequest) -> None:
+    assert codec.decode(c.CONTROL, raw) == codec.decode(c.CONTROL_TAKE, raw) == request_
+
+
+@pytest.mark.parametrize(
+    "raw",
+    [b"{}", b'{"id": ""}', b'{"id": "3f2a91c"}', b'{"id": "3f2a91c0\\n"}', b'{"id": 1}', b'{"id": "3f2a91cg"}',
+     b'{"id": "3f2a91c0", "want": "drive"}', b'{"id": "3f2a91c0", "for_ms": "1"}', b'{"id": "3f2a91c0", "by": 1}'],
+)  # fmt: skip
+def test_what_is_no_request_for_control_is_refused(raw: bytes) -> None:
+    refused(c.CONTROL, raw)
 
 
 def test_nesting_may_be_32_deep() -> None:
@@ -621,6 +651,10 @@ COMMAND_VALUES = {
     "source": ['"autonomy"', '"stick"', "null", "1", '""'],
     "run": ["1", "17", "0", "-1", "1073741823", "1073741824", "2.0", '"3"', "null", "9" * 30],
     "valid_ms": ["400", "400.0", "1.5", "1", "0", "-1", "999999999999", "1000000000000", "1e300", "null", '"9"'],
+    "key": ['"0badf00d"', '""', "null", "1", '"\\u0030badf00d"'],
+    "t": ["1", "0", "-1", "1.0", "9007199254740991", "9007199254740992", "9" * 30, "null", "true"],
+    "by": ['"otto"', '""', "null", "1"],
+    "group": ["true", "false", "null", "1"],
     "other": ["1", "1e999", '"a"'],
 }
 
@@ -629,7 +663,7 @@ def test_a_command_in_the_usual_form_means_what_it_means_to_the_reader_of_all_fo
     rng = random.Random(20_262)
     differing, accepted = [], 0
     for _ in range(TRIED):
-        keys = rng.choices(list(COMMAND_VALUES), weights=[3, 3, 1, 1, 1, 1, 0.3], k=rng.randrange(6))
+        keys = rng.choices(list(COMMAND_VALUES), weights=[3, 3, 1, 1, 1, 1, *[0.5] * 4, 0.3], k=rng.randrange(6))
         raw = ("{" + ", ".join(f'"{key}": {rng.choice(COMMAND_VALUES[key])}' for key in keys) + "}").encode()
         usual, any_form = (
             decoded_exactly(c.DRIVE, raw),

@@ -1,0 +1,1 @@
+../../firmware/common/lease.py
