@@ -1,11 +1,16 @@
-"""What accounts may try at a broker: one row each, for the live check, and for the table in docs/fleet.md."""
+"""What accounts may try at a broker: one row each, for the live check, and for the table in docs/fleet.md.
+
+Run ``python -m pebble.fleet.attempts`` after a change of roles.
+"""
 
 from collections.abc import Iterable, Mapping, Sequence
 from enum import Enum
+from pathlib import Path
 from typing import NamedTuple
 
 from pebble.config.security import SecurityLevel
 from pebble.contract import channels as c
+from pebble.contract.docs import filled
 from pebble.contract.identity import SERVERS
 from pebble.fleet.roles import CONTROL_TOPIC, Account, ProgramRole, Role, Rule, rules
 from pebble.transports.topics import matches
@@ -89,6 +94,7 @@ def may(held: Iterable[Rule], access: str, topic: str) -> bool:
 
 # -- the table of docs/fleet.md
 
+DOCS = Path(__file__).resolve().parents[2] / "docs" / "fleet.md"
 _BASE = "pebble/robots/goob"
 _LEVELS: Sequence[SecurityLevel] = ("login", "named")
 _COLUMNS: Mapping[str, Account] = {
@@ -114,6 +120,11 @@ def table() -> str:
     return "\n".join(lines)
 
 
+def document() -> str:
+    """The whole of docs/fleet.md, with the table in it."""
+    return filled(DOCS.read_text(encoding="utf-8"), {"attempts": table()})
+
+
 def _line(what: str, cells: Mapping[str, str]) -> str:
     return f"| {what} | {' | '.join(cells.values())} |"
 
@@ -132,3 +143,7 @@ def _cell(
 
 def _account(column: str) -> str:
     return column.replace(" ", "-")
+
+
+if __name__ == "__main__":
+    DOCS.write_text(document(), encoding="utf-8")

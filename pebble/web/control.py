@@ -30,7 +30,7 @@ log = logging.getLogger(__name__)
 
 FLUSH_S = 0.05  # between two states
 HELLO_S = 5.0  # to begin with
-CHECK_S = 5.0  # between two looks at whether the session still exists
+CHECK_S = 5.0  # between two looks at whether the session still exists, while no person and no session changes
 _STOP_WAITS_S = 0.05  # at most, however much the page has sent
 _WATCH_COST = 20  # it subscribes to so many topics
 _WAITING = 64  # messages that wait to be sent, besides the state
@@ -354,6 +354,7 @@ class Control:
     async def _send_all(self) -> None:
         """States at most every 50 ms, pings twice a second."""
         ping_at, check_at = time.monotonic() + PING_S, time.monotonic() + CHECK_S
+        people = self._server.people_version
         while self._websocket.application_state is WebSocketState.CONNECTED:
             with suppress(TimeoutError):
                 await asyncio.wait_for(self._wake.wait(), max(0.0, min(ping_at, check_at) - time.monotonic()))
@@ -362,8 +363,8 @@ class Control:
             if now >= ping_at:
                 ping_at = now + PING_S
                 self._waiting.append(self._ping())
-            if now >= check_at:
-                check_at = now + CHECK_S
+            if now >= check_at or people != self._server.people_version:
+                check_at, people = now + CHECK_S, self._server.people_version
                 await self._check_session()
             await self._flush(now)
             await asyncio.sleep(FLUSH_S if not self._waiting else 0)
