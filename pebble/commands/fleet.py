@@ -1,6 +1,7 @@
 """``pebble fleet``: the accounts of a broker, and what each of them may do."""
 
 import json
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -73,6 +74,8 @@ def init(
     """
     require_packages()
     place = folder_.absolute()
+    if level == "named" and not plain:
+        raise PebbleError("--level named alone lets nobody drive: robots of this release need --plain, too")
     if level is not None and level not in _LEVELS:
         raise PebbleError(f'--level must be "login" or "named", not "{level}"')
     if (place / folder.FLEET).exists():
@@ -87,7 +90,9 @@ def init(
     typer.echo(f"{_shown(place)} has all files of a broker at {server.host}:{server.port}, level {fleet.level}.")
     if plugin is None and not without_plugin:
         typer.echo("mosquitto's plugin is not installed: it reads rules from files, and again after each change.")
-    typer.echo(f"Start it, as this user:\n    mosquitto -c {_shown(place / CONF)}")
+    typer.echo(f"Start it:\n    mosquitto -c {_shown(place / CONF)}")
+    if os.geteuid() == 0:
+        typer.echo("It will run as root, as whom these files were made: a user of its own would do.")
     typer.echo(f"Keep {_shown(place)} secret, and a copy of it: its keys and the password of {ADMIN} are in it.")
     return 0
 
@@ -118,15 +123,14 @@ def add(
     """
     given = tuple(dict.fromkeys(split_names(roles)))
     bases = tuple(base or ((f"pebble/robots/{name}",) if given == (ProgramRole.ROBOT,) else ()))
-    account = Account(roles=given, bases=bases, plain=plain)
+    database = "" if people is None else str(people.absolute())
+    account = Account(roles=given, bases=bases, plain=plain, people=database)
     with _changing(folder_) as (place, fleet):
         if why := folder.refused(fleet, name, account):
             raise FleetError(why)
         if len(fleet.accounts) >= folder.MAX_ACCOUNTS:
             raise FleetError(f"{place} has {folder.MAX_ACCOUNTS} accounts already: remove one, or make another fleet")
         after = fleet.with_account(name, account)
-        if people is not None:
-            after = replace(after, pages=(*after.pages, str(people.absolute())))
         secret = new_password()
         how = applying.apply(place, fleet, after, {name: secret})
     _print_account(place, after, name, secret, how)
@@ -285,9 +289,12 @@ def _print_account(place: Path, fleet: Fleet, name: str, secret: str, how: str) 
     if ProgramRole.ROBOT in account.roles:
         typer.echo(f"In its config, beside a copy of {ca}, which no other user can read (a board: as local_mqtt):")
         typer.echo(json.dumps(piece_of_config(fleet, name, secret), indent=2))
+        return
+    url = f"mqtts://{name}@{server.host}:{server.port}"
+    if ProgramRole.PAGE in account.roles:
+        typer.echo(f"    pebble web --url {url} --ca-cert {ca} --password-file FILE")
     elif ProgramRole.GATEWAY not in account.roles:
-        url = f"mqtts://{name}@{server.host}:{server.port}"
-        typer.echo(f"    export PEBBLE_PASSWORD=…\n    pebble drive ROBOT --url {url} --ca-cert {ca}")
+        typer.echo(f"    pebble drive ROBOT --url {url} --ca-cert {ca} --password-file FILE")
 
 
 def piece_of_config(fleet: Fleet, name: str, secret: str) -> dict[str, Any]:
@@ -301,20 +308,19 @@ def piece_of_config(fleet: Fleet, name: str, secret: str) -> dict[str, Any]:
 
 def _remove_from_pages(fleet: Fleet, name: str) -> Iterator[str]:
     """Remove the person from the pages' own lists on this machine; yields where that cannot be done."""
-    for page in map(Path, fleet.pages):
-        if not page.is_file():
-            yield f"{page} is not there: who is in it may still get in by that page"
+    for page, account in fleet.accounts.items():
+        if ProgramRole.PAGE not in account.roles:
             continue
-        people = People(page)
+        if not account.people:
+            yield f"{page} has people of its own: if {name} is one, `pebble web user remove {name}` on its machine"
+            continue
+        if not Path(account.people).is_file():
+            yield f"{page}: {account.people} is not there: who is in it may still get in by that page"
+            continue
+        people = People(Path(account.people))
         try:
             if any(user.name == name for user in people.list()):
                 people.remove(name)
-                typer.echo(f"{name} is removed from {page} and logged out there")
+                typer.echo(f"{name} is removed from the people of {page} and logged out there")
         finally:
             people.close()
-    servers = [one for one, account in fleet.accounts.items() if ProgramRole.PAGE in account.roles]
-    if len(servers) > len(fleet.pages):
-        yield (
-            f"{', '.join(servers)}: a page has people of its own; if {name} is among them, run on that machine "
-            f"`pebble web user remove {name}`, or add the page with --people FILE if it is on this one"
-        )

@@ -6,6 +6,7 @@ import secrets
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -203,6 +204,8 @@ class _Attempts:
             self._settle(robot, observer, expected & visible)
             seen = {payload for _, payload in (*robot.received, *observer.received)}
             for row, topic, payload in tried:
+                if row.retained and topic.startswith(self._base):
+                    robot.publish(topic, b"", retain=True)  # nothing stays at the broker
                 if topic == CONTROL_TOPIC:
                     if self._fleet.rules == "plugin":
                         self._note(name, row.what, topic, may(rules, "write", topic), bool(client.received))
@@ -216,14 +219,9 @@ class _Attempts:
             robot.listen(0.01)
             observer.listen(0.01)
         end = secrets.token_bytes(8)
-        for row in ROWS:
-            if row.retained:  # nothing stays at the broker
-                for topic in {one for one, _ in robot.received}:
-                    robot.publish(topic, b"", retain=True)
-                break
         robot.publish(f"{self._base}/outgoing/end", end)
         for one in (robot, observer):
-            one.wait(lambda found=one.received: end in (payload for _, payload in found), "deliver messages")
+            one.wait(partial(_has, one, end), "deliver messages")
 
     def _reads(self, name: str, robot: BrokerClient) -> None:
         topics_ = [f"{self._base}/{suffix}" for _, suffixes in READS for suffix in suffixes]
@@ -292,6 +290,10 @@ class _Attempts:
             else:
                 return place
         raise FleetError(f"{why}: attempts need a broker that runs")
+
+
+def _has(client: BrokerClient, payload: bytes) -> bool:
+    return any(one == payload for _, one in client.received)
 
 
 def _name(base: str) -> str:

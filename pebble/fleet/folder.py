@@ -44,8 +44,7 @@ class Fleet(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The content of `fleet.json`. The first broker is the one whose files are in this folder.
 
     ``rules``: whether the broker knows them by its dynamic-security plugin, or by `acl` and `passwords`.
-    ``plain``: all robots keep their topics without names beside those with names. ``pages``: databases of page servers'
-    people on this machine.
+    ``plain``: all robots keep their topics without names beside those with names.
     """
 
     level: SecurityLevel
@@ -54,7 +53,6 @@ class Fleet(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     plain: bool = False
     accounts: dict[str, Account] = msgspec.field(default_factory=dict)
     extra: Extra = Extra()
-    pages: tuple[str, ...] = ()
 
     def rules_of(self, name: str) -> tuple[Rule, ...]:
         account = self.accounts[name]
@@ -113,6 +111,8 @@ def refused(fleet: Fleet, name: str, account: Account) -> str:
         return "a robot has one base, and nobody else has any"
     if account.plain and not robot:
         return "only a robot can be plain"
+    if account.people and ProgramRole.PAGE not in account.roles:
+        return "only a page has people of its own"
     for base in account.bases:
         if why := _refused_base(base, several=gateway):
             return why

@@ -99,12 +99,14 @@ class Rule(NamedTuple):
 class Account(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
     """What `fleet.json` has of one account. ``bases``: of a robot its own, of a gateway those that it carries.
 
-    ``plain``: a robot that does not know names, so its topics stay as they are without them.
+    ``plain``: a robot that does not know names, so its topics stay as they are without them. ``people``: of a page server
+    on this machine the database of its people.
     """
 
     roles: tuple[str, ...]
     bases: tuple[str, ...] = ()
     plain: bool = False
+    people: str = ""
 
 
 class Extra(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -137,6 +139,11 @@ def rights(roles: Iterable[str], level: SecurityLevel) -> frozenset[Right]:
 def page_rights(role: Role, level: SecurityLevel = "open") -> frozenset[str]:
     """What a person may do on the operator page beyond what everybody may there."""
     return frozenset(right.value for right in rights((role,), level) - _EVERYBODY)
+
+
+def right_of(channel: Channel) -> str:
+    """The right that may write this channel."""
+    return next(right.value for right, channels in WRITES.items() if channel in channels)
 
 
 def add_up(roles: Sequence[str]) -> str:

@@ -49,6 +49,11 @@ class FleetBroker:
         return load(self.folder)
 
     @property
+    def pid(self) -> int:
+        assert self._process is not None
+        return self._process.pid
+
+    @property
     def place(self) -> Place:
         return Place(HOST, self.port, self.folder / CA_CERT)
 
@@ -78,6 +83,10 @@ class FleetBroker:
     def add(self, name: str, account: Account) -> str:
         self.passwords[name] = new_password()
         return self.change(self.fleet.with_account(name, account), {name: self.passwords[name]})
+
+    def renew(self, name: str) -> str:
+        self.passwords[name] = new_password()
+        return self.change(self.fleet, {name: self.passwords[name]})
 
     def remove(self, name: str) -> str:
         return self.change(self.fleet.without(name))
