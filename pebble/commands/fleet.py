@@ -5,7 +5,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 from msgspec.structs import replace
@@ -84,7 +84,7 @@ def init(
         raise PebbleError("--host is missing: the name or address by which robots and people reach the broker")
     server = Server(host=host_of("--host", host), port=port, unencrypted=unencrypted)
     plugin = None if without_plugin else applying.found_plugin()
-    rules = "files" if plugin is None else "plugin"
+    rules: Literal["plugin", "files"] = "files" if plugin is None else "plugin"
     fleet = Fleet(level=_LEVELS[level or "login"], brokers=(server,), rules=rules, plain=bool(plain))
     applying.make(place, fleet, plugin)
     typer.echo(f"{_shown(place)} has all files of a broker at {server.host}:{server.port}, level {fleet.level}.")
@@ -265,7 +265,7 @@ def _place(folder_: Path | None) -> Path:
 
 
 def _shown(path: Path) -> str:
-    """As it was written, where it is below this folder."""
+    """Show a path below this folder without the folder."""
     return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else str(path)
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from pebble.config.web import is_loopback
 from pebble.fleet import broker_files, certificates, dynsec
-from pebble.fleet.broker_client import NobodyError, Place
+from pebble.fleet.broker_client import Place, RefusedError, UnreachableError
 from pebble.fleet.folder import (
     ACL,
     ADMIN,
@@ -29,6 +29,7 @@ from pebble.fleet.roles import Account, Role
 from pebble.fleet.whole_file import write
 
 _LOOPBACK = "127.0.0.1"
+_ANEW = f"(stop mosquitto, then `pebble fleet password {ADMIN}`)"
 PLUGINS = ("/usr/lib", "/usr/local/lib", "/opt/homebrew/lib")
 PLUGIN = "mosquitto_dynamic_security.so"
 
@@ -88,14 +89,14 @@ def apply(folder: Path, before: Fleet, after: Fleet, passwords: Mapping[str, str
     Raises FleetError if a broker does not know it then; `fleet.json` stays as it is.
     """
     new = passwords or {}
-    how = tell(folder, before, after, new)
+    how = change_brokers(folder, before, after, new)
     if ADMIN in new:
         write(folder / ADMIN_PASSWORD, f"{new[ADMIN]}\n".encode(), 0o600, FleetError)
     save(folder, after)
     return how
 
 
-def tell(folder: Path, before: Fleet, after: Fleet, passwords: Mapping[str, str]) -> str:
+def change_brokers(folder: Path, before: Fleet, after: Fleet, passwords: Mapping[str, str]) -> str:
     """The same without `fleet.json`."""
     if after.rules == "files":
         return _apply_files(folder, before, after, passwords)
@@ -120,7 +121,7 @@ def pid_of(folder: Path) -> int | None:
 
 
 def passwords_of(folder: Path, fleet: Fleet) -> dict[str, broker_files.Hashed]:
-    """Of the accounts of the fleet, as the files have them. Raises FleetError."""
+    """Read those of the fleet's accounts from its files. Raises FleetError."""
     file = folder / (SECURITY if fleet.rules == "plugin" else PASSWORDS)
     read = broker_files.passwords_in_security if fleet.rules == "plugin" else broker_files.passwords_in
     try:
@@ -146,20 +147,22 @@ def admin_password(folder: Path) -> str:
     try:
         return file.read_text(encoding="utf-8").strip()
     except OSError as error:
-        raise FleetError(
-            f"{file}: {error.strerror}; stop mosquitto, then `pebble fleet password --folder {folder} {ADMIN}`"
-        ) from None
+        raise FleetError(f"{file}: {error.strerror} {_ANEW}") from None
 
 
 def control(folder: Path, server: Server, *, own: bool) -> dynsec.Control | None:
     """A connection that may change accounts; None: the broker of this folder does not run. Raises FleetError."""
-    why: NobodyError | None = None
+    pid = pid_of(folder) if own else None
+    if own and pid is None and not (folder / ADMIN_PASSWORD).exists():
+        return None  # so that it can be made anew
+    why: UnreachableError | None = None
     for place in places(folder, server, own=own):
         try:
             return dynsec.Control(place, ADMIN, admin_password(folder))
-        except NobodyError as error:
+        except UnreachableError as error:
             why = error
-    pid = pid_of(folder) if own else None
+        except RefusedError as error:
+            raise FleetError(f"{error} {_ANEW}") from None
     if pid is not None:
         raise FleetError(f"{why}, but mosquitto runs there (process {pid}): end it, or wait until it answers")
     if not own:
@@ -189,6 +192,8 @@ def _apply_commands(
             how = f"in {folder / SECURITY}: mosquitto does not run"
         else:
             with connection:
+                if ADMIN in new:
+                    raise FleetError(f"mosquitto runs: stop it first, because it is changed by the account {ADMIN}")
                 connection.send(wanted)
             how = how or "at once"
     if failed:

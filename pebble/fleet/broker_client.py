@@ -30,7 +30,7 @@ class RefusedError(FleetError):
     """The broker does not let this account in."""
 
 
-class NobodyError(FleetError):
+class UnreachableError(FleetError):
     """Nothing answers at this address."""
 
 
@@ -111,13 +111,13 @@ class BrokerClient(packets.Listener, packets.Quota):
         return self._answers.pop(mid)
 
     def publish(self, topic: str, payload: bytes, *, retain: bool = False) -> None:
-        """With QoS 1; :meth:`settle` waits until the broker has it."""
+        """With QoS 1; :meth:`acknowledged` waits until the broker has it."""
         self.wait(lambda: len(self._unacknowledged) < _WINDOW, "acknowledge messages")
         mid = self._next()
         self._unacknowledged.add(mid)
         self._send(packets.publish(topic, payload, 1, mid, retain=retain, modern=False, expires_s=None))
 
-    def settle(self) -> None:
+    def acknowledged(self) -> None:
         self.wait(lambda: not self._unacknowledged, "acknowledge messages")
 
     def wait(self, condition: Callable[[], bool], what: str, timeout_s: float | None = None) -> None:
@@ -143,7 +143,7 @@ class BrokerClient(packets.Listener, packets.Quota):
         try:
             addresses = addresses_of(place.host, place.port)
         except (OSError, UnicodeError) as error:
-            raise NobodyError(f"broker {place}: {getattr(error, 'strerror', None) or error}") from None
+            raise UnreachableError(f"broker {place}: {getattr(error, 'strerror', None) or error}") from None
         why: Exception | None = None
         for address in addresses:
             try:
@@ -152,7 +152,7 @@ class BrokerClient(packets.Listener, packets.Quota):
                 raise FleetError(f"broker {place} is another one: {error.reason or error}") from None
             except OSError as error:
                 why = error
-        raise NobodyError(f"broker {place}: {getattr(why, 'strerror', None) or why}")
+        raise UnreachableError(f"broker {place}: {getattr(why, 'strerror', None) or why}")
 
     def _dialled(self, address: Address) -> socket.socket:
         plain = dial(address, self._timeout_s)

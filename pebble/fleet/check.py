@@ -13,9 +13,9 @@ from typing import Any
 from msgspec.structs import replace
 
 from pebble.fleet import broker_files, certificates, dynsec
-from pebble.fleet.applying import admin_password, conf_differences, control, places, tell
+from pebble.fleet.applying import admin_password, change_brokers, conf_differences, control, places
 from pebble.fleet.attempts import READS, ROWS, Row, may, topics
-from pebble.fleet.broker_client import BrokerClient, NobodyError, Place, RefusedError
+from pebble.fleet.broker_client import BrokerClient, Place, RefusedError, UnreachableError
 from pebble.fleet.folder import ACL, ADMIN, PASSWORDS, SECURITY, Fleet, FleetError, Server
 from pebble.fleet.roles import CONTROL_ANSWERS, CONTROL_TOPIC, Account, ProgramRole, Role, Rule
 from pebble.transports.base import Message, QoS
@@ -159,31 +159,31 @@ class _Attempts:
         made |= {
             f"check-{_name(base)}-{nonce}": Account(roles=robot, bases=(base,)) for base in (self._base, self._other)
         }
-        self._robot, self._observer = f"check-a-{nonce}", f"check-admin-{nonce}"
+        self._robot, self._admin = f"check-a-{nonce}", f"check-admin-{nonce}"
         self._fleet_then = replace(fleet, accounts=fleet.accounts | made)
         self._passwords = {name: broker_files.new_password() for name in made}
         self._place = self._reachable(fleet.brokers[0])
         self._tried = Tried()
 
     def run(self) -> Tried:
-        tell(self._folder, self._fleet, self._fleet_then, self._passwords)
+        change_brokers(self._folder, self._fleet, self._fleet_then, self._passwords)
         try:
             self._wait_until_known()
-            with self._login(self._robot) as robot, self._login(self._observer) as observer:
+            with self._login(self._robot) as robot, self._login(self._admin) as admin:
                 robot.subscribe([f"{self._base}/#"])
-                observer.subscribe(["+/+/+/outgoing/#", CONTROL_ANSWERS])
+                admin.subscribe(["+/+/+/outgoing/#", CONTROL_ANSWERS])
                 for name in self._passwords:
-                    self._writes(name, robot, observer)
+                    self._writes(name, robot, admin)
                     self._reads(name, robot)
             self._strangers()
         finally:
-            tell(self._folder, self._fleet_then, self._fleet, {})
+            change_brokers(self._folder, self._fleet_then, self._fleet, {})
         return self._tried
 
-    def _writes(self, name: str, robot: BrokerClient, observer: BrokerClient) -> None:
+    def _writes(self, name: str, robot: BrokerClient, admin: BrokerClient) -> None:
         tried: list[tuple[Row, str, bytes]] = []
         robot.received.clear()
-        observer.received.clear()
+        admin.received.clear()
         with self._login(name) as client:
             client.subscribe([CONTROL_ANSWERS])
             for row in ROWS:
@@ -196,13 +196,13 @@ class _Attempts:
                         client.publish(topic, b'{"commands":[{"command":"getDefaultACLAccess"}]}')
                     else:
                         client.publish(topic, payload, retain=row.retained)
-            client.settle()
+            client.acknowledged()
             client.subscribe([f"{self._base}/end"])  # answered after the plugin's answer
             rules = self._fleet_then.rules_of(name)
             expected = {payload for _, topic, payload in tried if may(rules, "write", topic) and topic[0] != "$"}
             visible = {payload for _, topic, payload in tried if topic.startswith(self._base) or "/outgoing/" in topic}
-            self._settle(robot, observer, expected & visible)
-            seen = {payload for _, payload in (*robot.received, *observer.received)}
+            self._wait_for(robot, admin, expected & visible)
+            seen = {payload for _, payload in (*robot.received, *admin.received)}
             for row, topic, payload in tried:
                 if row.retained and topic.startswith(self._base):
                     robot.publish(topic, b"", retain=True)  # nothing stays at the broker
@@ -212,15 +212,15 @@ class _Attempts:
                 elif payload in visible:
                     self._note(name, row.what, topic, payload in expected, payload in seen)
 
-    def _settle(self, robot: BrokerClient, observer: BrokerClient, expected: set[bytes]) -> None:
+    def _wait_for(self, robot: BrokerClient, admin: BrokerClient, expected: set[bytes]) -> None:
         """Until what was expected is here, and then what was sent before a last message of the robot."""
         deadline = time.monotonic() + _ADOPTED_S
-        while time.monotonic() < deadline and not expected <= {one for _, one in (*robot.received, *observer.received)}:
+        while time.monotonic() < deadline and not expected <= {one for _, one in (*robot.received, *admin.received)}:
             robot.listen(0.01)
-            observer.listen(0.01)
+            admin.listen(0.01)
         end = secrets.token_bytes(8)
         robot.publish(f"{self._base}/outgoing/end", end)
-        for one in (robot, observer):
+        for one in (robot, admin):
             one.wait(partial(_has, one, end), "deliver messages")
 
     def _reads(self, name: str, robot: BrokerClient) -> None:
@@ -229,7 +229,7 @@ class _Attempts:
             client.subscribe(["#", *topics_])
             for topic in topics_:
                 robot.publish(topic, name.encode())
-            robot.settle()
+            robot.acknowledged()
             rules = self._fleet_then.rules_of(name)
             expected = {topic for topic in topics_ if may(rules, "read", topic)}
             deadline = time.monotonic() + _ADOPTED_S
@@ -267,7 +267,7 @@ class _Attempts:
     def _gets_in(self, place: Place, name: str | None, password: str | None) -> bool:
         try:
             BrokerClient(place, name, password).__exit__()
-        except (RefusedError, NobodyError):
+        except (RefusedError, UnreachableError):
             return False
         return True
 
@@ -285,7 +285,7 @@ class _Attempts:
         for place in places(self._folder, server, own=True):
             try:
                 BrokerClient(place, ADMIN, admin_password(self._folder)).__exit__()
-            except NobodyError as error:
+            except UnreachableError as error:
                 why = error
             else:
                 return place

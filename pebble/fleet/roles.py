@@ -99,8 +99,8 @@ class Rule(NamedTuple):
 class Account(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
     """What `fleet.json` has of one account. ``bases``: of a robot its own, of a gateway those that it carries.
 
-    ``plain``: a robot that does not know names, so its topics stay as they are without them. ``people``: of a page server
-    on this machine the database of its people.
+    ``plain``: a robot that does not know names, so its topics stay as they are without them. ``people``: the database
+    of a page server's own people, if that is on this machine.
     """
 
     roles: tuple[str, ...]

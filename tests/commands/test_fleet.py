@@ -1,4 +1,4 @@
-"""``pebble fleet``: every command of docs/fleet.md as it is printed, in order, with a real broker; and what is refused."""
+"""``pebble fleet``: the commands of docs/fleet.md in order, as printed, with a real broker; and what is refused."""
 
 from __future__ import annotations
 
@@ -67,14 +67,12 @@ def test_the_first_page_as_a_newcomer_types_it(tmp_path: Path) -> None:
                 _robot_accepts(json.loads(piece), tmp_path)
         assert "attempts, 0 not as the table says" in done.stdout
     assert len(set(passwords)) == 5
-    found = subprocess.run(
-        ["grep", "-rlE", "|".join(passwords), str(tmp_path / "hall")], check=False, capture_output=True
-    )
-    assert found.stdout == b""  # no file has a password of theirs
+    search = ["grep", "-rlE", "|".join(passwords), str(tmp_path / "hall")]
+    assert subprocess.run(search, check=False, capture_output=True).stdout == b""  # no file has one of them
 
 
 def _robot_accepts(piece: dict[str, Any], folder: Path) -> None:
-    """With the piece that was printed, and the copy of the authority, a config is valid."""
+    """The piece that was printed and a copy of the authority make a valid config."""
     file = folder / "robot.json"
     (folder / "ca.pem").write_bytes((folder / "hall" / "ca.pem").read_bytes())
     piece["services"]["mqtt_bridge"]["remote_mqtt"]["host"] = "broker.lab"
@@ -112,7 +110,7 @@ def hall(tmp_path: Path) -> Path:
         ("pebble fleet check --live", "attempts need a broker that runs"),
     ],
 )
-def test_what_is_refused_says_what_to_do(hall: Path, line: str, error: str) -> None:
+def test_a_refusal_names_the_remedy(hall: Path, line: str, error: str) -> None:
     done = pebble(line, hall)
     assert (done.returncode, done.stdout) == (1, "")
     assert error in done.stderr

@@ -38,13 +38,13 @@ def passes(broker: FleetBroker, client: BrokerClient, topic: str) -> bool:
     with broker.login("goob") as robot:
         robot.subscribe(["pebble/robots/goob/#"])
         client.publish(topic, b"tried")
-        client.settle()
+        client.acknowledged()
         robot.publish("pebble/robots/goob/outgoing/end", b"end")
         robot.wait(lambda: any(payload == b"end" for _, payload in robot.received), "deliver")
         return (topic, b"tried") in robot.received
 
 
-def test_a_change_counts_at_once_and_costs_nobody_a_connection(broker: FleetBroker) -> None:
+def test_a_change_counts_at_once_and_costs_no_other_connection(broker: FleetBroker) -> None:
     with broker.login("goob") as robot, broker.login("otto") as otto:
         took = {}
         for what, change in (
@@ -58,7 +58,7 @@ def test_a_change_counts_at_once_and_costs_nobody_a_connection(broker: FleetBrok
         for one in (robot, otto):
             one.listen(0.05)
             one.publish("pebble/robots/goob/outgoing/end", b"")
-            one.settle()
+            one.acknowledged()
             assert not one.closed
     assert max(took.values()) < 0.5, took
 
@@ -186,14 +186,14 @@ def test_attempts_find_one_rule_too_many_and_one_too_few(broker: FleetBroker, mo
         (PASSWORDS, "goob:", "bob:", "goob: an account too few"),
     ],
 )
-def test_it_finds_what_somebody_wrote_into_files(tmp_path: Path, file: str, old: str, new: str, found: str) -> None:
+def test_it_finds_changes_of_files(tmp_path: Path, file: str, old: str, new: str, found: str) -> None:
     broker = FleetBroker(tmp_path / "hall", {"otto": DRIVER, "goob": GOOB}, rules="files")
     changed = (broker.folder / file).read_text().replace(old, new)
     (broker.folder / file).write_text(changed)
     assert any(found in line for line in check.compare(broker.folder, broker.fleet))
 
 
-def test_it_finds_what_somebody_changed_in_the_plugin(tmp_path: Path) -> None:
+def test_it_finds_changes_of_the_plugin(tmp_path: Path) -> None:
     with FleetBroker(tmp_path / "hall", {"otto": DRIVER}) as broker:
         with Control(broker.place, "admin", broker.passwords["admin"]) as control:
             acls = [{"acltype": "publishClientReceive", "allow": True}]
