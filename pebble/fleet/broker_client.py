@@ -111,13 +111,13 @@ class BrokerClient(packets.Listener, packets.Quota):
         return self._answers.pop(mid)
 
     def publish(self, topic: str, payload: bytes, *, retain: bool = False) -> None:
-        """With QoS 1; :meth:`acknowledged` waits until the broker has it."""
+        """With QoS 1; :meth:`flush` waits until the broker has it."""
         self.wait(lambda: len(self._unacknowledged) < _WINDOW, "acknowledge messages")
         mid = self._next()
         self._unacknowledged.add(mid)
         self._send(packets.publish(topic, payload, 1, mid, retain=retain, modern=False, expires_s=None))
 
-    def acknowledged(self) -> None:
+    def flush(self) -> None:
         self.wait(lambda: not self._unacknowledged, "acknowledge messages")
 
     def wait(self, condition: Callable[[], bool], what: str, timeout_s: float | None = None) -> None:

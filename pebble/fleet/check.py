@@ -196,7 +196,7 @@ class _Attempts:
                         client.publish(topic, b'{"commands":[{"command":"getDefaultACLAccess"}]}')
                     else:
                         client.publish(topic, payload, retain=row.retained)
-            client.acknowledged()
+            client.flush()
             client.subscribe([f"{self._base}/end"])  # answered after the plugin's answer
             rules = self._fleet_then.rules_of(name)
             expected = {payload for _, topic, payload in tried if may(rules, "write", topic) and topic[0] != "$"}
@@ -229,7 +229,7 @@ class _Attempts:
             client.subscribe(["#", *topics_])
             for topic in topics_:
                 robot.publish(topic, name.encode())
-            robot.acknowledged()
+            robot.flush()
             rules = self._fleet_then.rules_of(name)
             expected = {topic for topic in topics_ if may(rules, "read", topic)}
             deadline = time.monotonic() + _ADOPTED_S

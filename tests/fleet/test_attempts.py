@@ -131,7 +131,7 @@ def test_each_account_writes_what_it_may_and_nothing_else(broker: FleetBroker, e
         with broker.login(name) as client:
             for topic in TOPICS:
                 client.publish(topic, name.encode())
-            client.acknowledged()
+            client.flush()
         passed = {topic for topic, payload in seen(eye) if payload == name.encode()}
         expected = {topic for topic in TOPICS if lets_through(name, topic, broker.fleet.level)}
         wrong += [(name, topic) for topic in sorted(passed ^ expected)]
@@ -156,18 +156,18 @@ def test_each_account_reads_what_it_may_and_nothing_else(broker: FleetBroker) ->
     with broker.login("goob") as robot:
         for topic, retained in published:
             robot.publish(topic, b"before", retain=retained)
-        robot.acknowledged()
+        robot.flush()
         for name in expected:
             with broker.login(name) as client:
                 client.subscribe(["#", "$SYS/#", "+/+/+/#", *everything])
                 for topic, _ in published:
                     robot.publish(topic, name.encode())
-                robot.acknowledged()
+                robot.flush()
                 client.subscribe(["pebble/end"])  # answered after what was delivered before
                 found[name] = {topic for topic, _ in client.received}
         for topic, retained in published:
             robot.publish(topic, b"", retain=retained)
-        robot.acknowledged()
+        robot.flush()
     assert found == expected
 
 
@@ -190,7 +190,7 @@ def test_only_an_admin_changes_accounts(broker: FleetBroker) -> None:
         with broker.login(name) as client:
             client.subscribe(["$CONTROL/#", CONTROL_ANSWERS])
             client.publish(CONTROL_TOPIC, b'{"commands": [{"command": "listClients"}]}')
-            client.acknowledged()
+            client.flush()
             client.subscribe(["pebble/end"])
             answered |= {name} if client.received else set()
     assert answered == ({"admin"} if broker.fleet.rules == "plugin" else set())

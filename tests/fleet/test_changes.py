@@ -38,7 +38,7 @@ def passes(broker: FleetBroker, client: BrokerClient, topic: str) -> bool:
     with broker.login("goob") as robot:
         robot.subscribe(["pebble/robots/goob/#"])
         client.publish(topic, b"tried")
-        client.acknowledged()
+        client.flush()
         robot.publish("pebble/robots/goob/outgoing/end", b"end")
         robot.wait(lambda: any(payload == b"end" for _, payload in robot.received), "deliver")
         return (topic, b"tried") in robot.received
@@ -58,7 +58,7 @@ def test_a_change_counts_at_once_and_costs_no_other_connection(broker: FleetBrok
         for one in (robot, otto):
             one.listen(0.05)
             one.publish("pebble/robots/goob/outgoing/end", b"")
-            one.acknowledged()
+            one.flush()
             assert not one.closed
     assert max(took.values()) < 0.5, took
 
