@@ -58,6 +58,8 @@ def _robot(config: Config) -> Iterator[Finding]:
     run_dir = config.run_dir()
     if open_ := warning_of_open(config):
         yield warn("security", open_, "pebble fleet init, then the account of this robot")
+    else:
+        yield ok("security", f"level {config.security.level}")
     yield run_directory(run_dir, os.geteuid())
     yield leftover_sockets(run_dir, is_listening)
     yield state_directory(config.state_dir())
