@@ -7,6 +7,7 @@ import getpass
 import os
 import signal
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 
 from pebble.config.web import is_loopback
@@ -100,14 +101,15 @@ def change_brokers(folder: Path, before: Fleet, after: Fleet, passwords: Mapping
     """The same without `fleet.json`."""
     if after.rules == "files":
         return _apply_files(folder, before, after, passwords)
-    return _apply_commands(folder, after, list(dynsec.changes(before, after, passwords)), before, passwords)
+    wanted = list(dynsec.changes(before, after, passwords))
+    return _apply_commands(folder, after, lambda _control: wanted, before, passwords)
 
 
 def repair(folder: Path, fleet: Fleet) -> str:
     """Give every account the rules of the table again."""
     if fleet.rules == "files":
         return _apply_files(folder, fleet, fleet, {})
-    return _apply_commands(folder, fleet, list(dynsec.repairs(fleet)), fleet, {})
+    return _apply_commands(folder, fleet, partial(dynsec.repairs, fleet), fleet, {})
 
 
 def pid_of(folder: Path) -> int | None:
@@ -174,10 +176,13 @@ def control(folder: Path, server: Server, *, own: bool) -> dynsec.Control | None
 
 
 def _apply_commands(
-    folder: Path, after: Fleet, commands: Iterable[dynsec.Command], before: Fleet, new: Mapping[str, str]
+    folder: Path,
+    after: Fleet,
+    commands: Callable[[dynsec.Control], Iterable[dynsec.Command]],
+    before: Fleet,
+    new: Mapping[str, str],
 ) -> str:
-    wanted, how = list(commands), ""
-    failed: list[str] = []
+    how, failed = "", list[str]()
     for number, server in enumerate(after.brokers):
         try:
             connection = control(folder, server, own=number == 0)
@@ -194,7 +199,7 @@ def _apply_commands(
             with connection:
                 if ADMIN in new:
                     raise FleetError(f"mosquitto runs: stop it first, because it is changed by the account {ADMIN}")
-                connection.send(wanted)
+                connection.send(commands(connection))
             how = how or "at once"
     if failed:
         raise FleetError("\n".join(failed))

@@ -52,7 +52,7 @@ def _certificate(folder: Path) -> Iterator[str]:
 
 def _of_plugin(fleet: Fleet, connection: dynsec.Control) -> Iterator[str]:
     default = connection.ask("getDefaultACLAccess")
-    group = connection.ask("getAnonymousGroup").get("group", {}).get("groupname")
+    group = connection.anonymous_group()
     yield from _compared(fleet, connection.accounts(), connection.roles(), default.get("acls", []), group)
 
 
@@ -90,7 +90,7 @@ def _compared(
         if wanted.get(one["acltype"]) != one["allow"]:
             yield f"everybody: one rule too many: {one['acltype']} is {'allowed' if one['allow'] else 'denied'} for all"
     if anonymous:
-        yield f"clients without a name: are let in, as group {anonymous}"
+        yield f"clients without a name: have the rights of group {anonymous}: stop mosquitto before the next line"
     yield from _rules_compared(fleet, held)
 
 

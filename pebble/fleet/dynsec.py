@@ -33,11 +33,24 @@ def changes(before: Fleet, after: Fleet, passwords: Mapping[str, str]) -> Iterat
             yield {"command": "modifyRole", "rolename": role_of(name), "acls": acls(after.rules_of(name))}
 
 
-def repairs(fleet: Fleet) -> Iterator[Command]:
-    """What gives every account the rules of the table again, whatever the broker has."""
+def repairs(fleet: Fleet, control: "Control") -> Iterator[Command]:
+    """What leaves a broker with the accounts of the fleet and the rules of the table; it cannot make lost accounts."""
     yield {"command": "setDefaultACLAccess", "acls": default_access()}
-    for name in fleet.accounts:
-        yield {"command": "modifyRole", "rolename": role_of(name), "acls": acls(fleet.rules_of(name))}
+    groups = set(control.ask("listGroups").get("groups", ())) - {control.anonymous_group()}  # whose end is mosquitto's
+    yield from ({"command": "deleteGroup", "groupname": name} for name in sorted(groups))
+    for client in control.accounts():
+        name = client["username"]
+        if name not in fleet.accounts:
+            yield {"command": "deleteClient", "username": name}
+        elif client.get("disabled"):
+            yield {"command": "enableClient", "username": name}
+    names = {role_of(name): name for name in fleet.accounts}
+    for role in control.roles():
+        if role["rolename"] in names:
+            held = acls(fleet.rules_of(names[role["rolename"]]))
+            yield {"command": "modifyRole", "rolename": role["rolename"], "acls": held}
+        else:
+            yield {"command": "deleteRole", "rolename": role["rolename"]}
 
 
 def _removal(name: str) -> Iterator[Command]:
@@ -74,6 +87,10 @@ class Control:
     def ask(self, command: str) -> dict[str, Any]:
         """The data of one answer."""
         return dict(self._batch([{"command": command}])[0].get("data") or {})
+
+    def anonymous_group(self) -> str:
+        """The group of clients without a name; empty if there is none."""
+        return str(self.ask("getAnonymousGroup").get("group", {}).get("groupname", ""))
 
     def _pages(self, command: str, key: str) -> Iterator[dict[str, Any]]:
         offset = 0

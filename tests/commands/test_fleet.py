@@ -9,22 +9,25 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from pebble.config import load
+from pebble.fleet.broker_client import BrokerClient, Place
 from pebble.fleet.folder import CONF
 from pebble.fleet.people import People
 from pebble.fleet.roles import Role
-from pebble.rig.processes import mosquitto_path
+from pebble.rig.processes import mosquitto_path, python
+from tests.commands.test_drive import Console
 from tests.support import ROOT, Child, free_port, listening, until
 
 PAGE = (ROOT / "docs" / "fleet.md").read_text()
 #: The first block of the page: what a newcomer types, one after the other.
 FIRST = re.findall(r"^    (\S.*)$", PAGE.partition("## ")[2].partition("## ")[0], re.MULTILINE)
+LAMP = "pebble/robots/minilamp"
 PASSWORD = re.compile(r"password: ((?:[a-z0-9]{4}-){3}[a-z0-9]{4})")
 
 
@@ -51,24 +54,51 @@ def mosquitto(conf: Path, port: int) -> Iterator[None]:
 
 def test_the_first_page_as_a_newcomer_types_it(tmp_path: Path) -> None:
     """The host is this machine instead of the broker's, and the port a free one: nothing else differs."""
-    port = free_port()
-    init, start, *rest = FIRST
-    assert len(FIRST) == 8
-    done = pebble(init.replace("broker.lab", f"127.0.0.1 --port {port}"), tmp_path)
-    assert (done.returncode, done.stderr) == (0, "")
-    assert start.split("  ")[0] in done.stdout  # it says how the broker is started
-    passwords = []
+    port, passwords = free_port(), dict[str, str]()
+    init, start, *accounts, check = FIRST[:8]
+    simulate, drive, stop, *later = (line.replace("broker.lab:8883", f"127.0.0.1:{port}") for line in FIRST[8:])
+    assert run(init.replace("broker.lab", f"127.0.0.1 --port {port}"), tmp_path).count(start.split("  ")[0]) == 1
     with mosquitto(tmp_path / start.split()[2], port):
-        for line in rest:
-            done = pebble(line, tmp_path)
-            assert (done.returncode, done.stderr) == (0, ""), (line, done)
-            passwords += PASSWORD.findall(done.stdout)
-            for piece in re.findall(r"^\{.*^\}", done.stdout, re.DOTALL | re.MULTILINE):
+        for line in accounts:
+            shown = run(line, tmp_path)
+            passwords[line.split()[3]] = PASSWORD.findall(shown)[0]
+            for piece in re.findall(r"^\{.*^\}", shown, re.DOTALL | re.MULTILINE):
                 _robot_accepts(json.loads(piece), tmp_path)
-        assert "attempts, 0 not as the table says" in done.stdout
-    assert len(set(passwords)) == 5
-    search = ["grep", "-rlE", "|".join(passwords), str(tmp_path / "hall")]
+        assert "attempts, 0 not as the table says" in run(check, tmp_path)
+        for name, password in passwords.items():
+            (tmp_path / f"{name}-password").write_text(f"{password}\n")
+        place = Place("127.0.0.1", port, tmp_path / "hall" / "ca.pem")
+        with BrokerClient(place, "minilamp", passwords["minilamp"]) as robot, typed(simulate, tmp_path):
+            robot.subscribe([f"{LAMP}/incoming/drive-values", f"{LAMP}/outgoing/estop/#"])
+            with closing(Console(*python("pebble.cli", *shlex.split(drive)[1:]), cwd=tmp_path)) as console:
+                console.hold(b"w")
+                assert until(lambda: robot.listen(0.05) or any(b'"z":' in one for _, one in robot.received), 20)
+            assert "stopped and confirmed" in run(stop, tmp_path)
+            assert until(lambda: robot.listen(0.05) or any(b'"latched":true' in one for _, one in robot.received), 5)
+        for line in later:
+            run(line, tmp_path)
+    assert list(passwords) == ["goob", "fred", "minilamp", "ann", "otto"]
+    search = ["grep", "-rlE", "|".join(passwords.values()), str(tmp_path / "hall")]
     assert subprocess.run(search, check=False, capture_output=True).stdout == b""  # no file has one of them
+
+
+def run(line: str, folder: Path) -> str:
+    """What a line prints that succeeds without a complaint."""
+    done = pebble(line, folder)
+    assert (done.returncode, done.stderr) == (0, ""), (line, done)
+    return done.stdout
+
+
+@contextmanager
+def typed(line: str, folder: Path) -> Iterator[None]:
+    """A program that runs until it is ended."""
+    with (folder / "simulation.log").open("ab") as log:
+        process = Child(python("pebble.cli", *shlex.split(line)[1:]), cwd=folder, stdout=log, stderr=log)
+    try:
+        yield
+    finally:
+        process.terminate()
+        process.wait(10)
 
 
 def _robot_accepts(piece: dict[str, Any], folder: Path) -> None:

@@ -210,9 +210,16 @@ def test_it_finds_changes_of_the_plugin(tmp_path: Path) -> None:
         assert check.compare(broker.folder, broker.fleet) == [
             "otto: is disabled at the broker",
             "everybody: one rule too many: publishClientReceive is allowed for all",
-            "clients without a name: are let in, as group guests",
+            "clients without a name: have the rights of group guests: stop mosquitto before the next line",
             "otto: one rule too many: write #",
         ]
+        applying.repair(broker.folder, broker.fleet)
+        (left,) = check.compare(broker.folder, broker.fleet)
+        assert left.startswith("clients without a name")
+        broker.stop()
+        applying.repair(broker.folder, broker.fleet)
+        broker.start()
+        assert check.compare(broker.folder, broker.fleet) == []
 
 
 # -- a person who drives
