@@ -35,6 +35,7 @@ def settings_of(config: Config) -> WebSettings:
         certificate=web.tls.certificate,
         key=web.tls.key,
         authority=web.tls.ca,
+        level=config.security.level,
         plain_http_drive=web.plain_http_drive,
         recordings=_recordings(config),
     )

@@ -4,6 +4,7 @@ import socket
 from dataclasses import dataclass
 from pathlib import Path
 
+from pebble.config.security import SecurityLevel
 from pebble.transports import MqttSettings
 
 DEFAULT_PORT = 8080
@@ -19,6 +20,7 @@ class WebSettings:
     names: tuple[str, ...] = ()  # further host names by which browsers may address it
     server: str = ""  # its name; "": this machine's
     login: bool = False
+    level: SecurityLevel = "open"  # of its robots
     people: Path | None = None  # the database of users, sessions and settings; None: in memory
     certificate: Path | None = None
     key: Path | None = None

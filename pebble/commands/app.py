@@ -34,14 +34,17 @@ COMMANDS = {
     "replay": "recordings.replay",
     "analyse": "recordings.analyse",
     "cert": "cert",
+    "fleet": "fleet",
     "flash": "flash",
     "bench": "bench",
     "impair": "impair",
 }
 
-_REGISTERED = ("topic", "script", "sim", "web", "recordings", "cert", "bench", "impair")
+_REGISTERED = ("topic", "script", "sim", "web", "recordings", "cert", "fleet", "bench", "impair")
 #: What prints its help when nothing follows.
-_GROUPS = [words.split() for words in ("", "topic", "bench", "sim", "script", "cert", "recordings", "web user")]
+_GROUPS = [
+    words.split() for words in ("", "topic", "bench", "sim", "script", "cert", "fleet", "recordings", "web user")
+]
 
 _HELP = """Runs and inspects Pebble robots.
 
@@ -58,6 +61,7 @@ _HELP = """Runs and inspects Pebble robots.
     pebble foxglove goob.json  show robots live in the Foxglove app
     pebble record --url URL    record robots; for recordings, replay, analyse
     pebble cert init NAME      make certificates, so that phones can, too
+    pebble fleet init hall     give robots and people accounts at a broker
     pebble flash lamp.json     install a robot's firmware on its board
     pebble bench control       compare MQTT and Zenoh on this machine
     pebble impair              measure robots behind an impaired network

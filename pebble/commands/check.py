@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 import typer
 
 from pebble.config import Config, Mqtt, load, resolved
+from pebble.config.doors import place_of
 from pebble.config.secret_text import shown_user, without_secrets
 from pebble.config.visible import shown
-from pebble.config.web import is_loopback
 from pebble.contract import CHANNELS, MEDIA_STATUS, STATUS, TOUCH_SENSORS, Channel
 from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
 from pebble.errors import ConfigError, TransportError
@@ -185,7 +185,7 @@ def facts(config: Config) -> list[tuple[str, str]]:
     if config.robot.platform != "linux":
         firmware = f"runs on its own MCU ({config.robot.platform}), not with `pebble up`"
         return [("platform", firmware), ("broker", _mqtt(config.local_mqtt)), *_scripts(config)]
-    found = [("transport", _transport(config))]
+    found = [("transport", _transport(config)), *_security(config)]
     if config.transport.mqtt_mirror is not None:
         found.append(("mirror", _mqtt(config.transport.mqtt_mirror)))
     if config.services.mqtt_bridge.enabled:
@@ -270,15 +270,11 @@ def _scripts(config: Config) -> list[tuple[str, str]]:
     bridge, shared = config.services.mqtt_bridge, config.transport.mqtt_mirror
     if config.transport.kind == "mqtt":
         elsewhere = bridge.remote is not None and bridge.remote.kind != "mqtt"
-        apart = elsewhere or _place(bridge.remote_mqtt) != _place(config.local_mqtt)
+        apart = elsewhere or place_of(bridge.remote_mqtt) != place_of(config.local_mqtt)
         shared = None if bridge.enabled and apart else config.local_mqtt
     if shared is None:
         return []
     return [("scripts", f"anybody at broker {shared.host}:{shared.port} may pose as one, or end one")]
-
-
-def _place(mqtt: Mqtt) -> tuple[str, int]:
-    return "" if is_loopback(mqtt.host) else mqtt.host, mqtt.port
 
 
 def _mqtt(mqtt: Mqtt) -> str:
@@ -297,6 +293,12 @@ def _local_media(config: Config) -> Iterator[str]:
     for line in config.motor_lines().values():
         if (name := config.hall_memory(line)) is not None:
             yield f"hall samples in the shared memory {name}"
+
+
+def _security(config: Config) -> Iterator[tuple[str, str]]:
+    if config.security.level != "open":
+        who = {"drive": "may drive, too", "free": "may drive while nobody has control", "refuse": "may not drive"}
+        yield "security", f"level {config.security.level}; who has no control {who[config.security.unnamed]}"
 
 
 def _serial_lines(config: Config) -> Iterator[str]:

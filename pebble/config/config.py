@@ -202,7 +202,7 @@ def resolved(config: Config) -> dict[str, Any]:
     """
     own = {
         name: masked(getattr(config, name), name)
-        for name in ("log_level", "robot", "local_mqtt", "transport", "services", "web_interface")
+        for name in ("log_level", "robot", "local_mqtt", "transport", "security", "services", "web_interface")
     }
     return own | {
         "derived": {

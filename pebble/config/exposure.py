@@ -25,7 +25,7 @@ def warn_if_readable(notes: Notes, path: Path, file: FilePath, what: str) -> Non
 
 def warn_of_logins_in_clear(notes: Notes, root: Root) -> None:
     """Warn of each broker on the network that receives a user name and a password without encryption."""
-    for path, mqtt in _brokers(root):
+    for path, mqtt in brokers(root):
         if mqtt.username is not None and not mqtt.tls.enabled and not is_loopback(mqtt.host):
             fix = "set tls.enabled"
             if root.robot.platform == "esp8266":
@@ -33,7 +33,7 @@ def warn_of_logins_in_clear(notes: Notes, root: Root) -> None:
             notes.warning((*path, "username"), f"its password crosses the network unencrypted: {fix}")
 
 
-def _brokers(root: Root) -> Iterator[tuple[Path, Mqtt]]:
+def brokers(root: Root) -> Iterator[tuple[Path, Mqtt]]:
     bridge, mirror = root.services.mqtt_bridge, root.transport.mqtt_mirror
     if root.transport.kind == "mqtt":
         yield ("local_mqtt",), root.local_mqtt

@@ -1,25 +1,33 @@
-"""The config section of who may do what."""
+"""The config section of who may do what: how strictly names and roles are checked."""
 
 from typing import Annotated, Literal
 
 from pebble.config.types import Section, doc
 
+SecurityLevel = Literal["open", "login", "named"]
+Strangers = Literal["drive", "free", "refuse"]
+
 
 class Security(Section, frozen=True, kw_only=True):
-    """Who may drive the robot; see docs/control.md."""
+    """Who may do what to this robot; docs/fleet.md explains the levels."""
 
     level: Annotated[
-        Literal["open", "login", "named"],
-        doc("`open`: whoever may publish at the broker. `login`: with a login there. `named`: with a checked name."),
+        SecurityLevel,
+        doc(
+            "`open`: whoever may publish at the broker does everything. `login`: every connection beyond this machine "
+            "is encrypted and logs in, and the broker knows roles. `named`: with a checked name in the topics, too."
+        ),
     ] = "open"
     strangers: Annotated[
-        Literal["drive", "free", "refuse"] | None,
-        doc("Drive commands without a key of control: obeyed, only while nobody has control, or never. "
-            "Unset: `drive`, at `named` `refuse`."),
-    ] = None  # fmt: skip
+        Strangers | None,
+        doc(
+            "Drive commands without a key of control: obeyed, only while nobody has control, or never. "
+            "Unset: `drive`, at `named` `refuse`."
+        ),
+    ] = None
 
     @property
-    def unnamed(self) -> Literal["drive", "free", "refuse"]:
+    def unnamed(self) -> Strangers:
         """What becomes of drive commands without a key of control."""
         return self.strangers or ("refuse" if self.level == "named" else "drive")
 

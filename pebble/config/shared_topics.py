@@ -1,4 +1,4 @@
-"""Finds the keys of a config that give a channel the topic of another one."""
+"""Finds the keys of a config that give a channel another topic, or that of another one."""
 
 from collections.abc import Iterator
 from functools import reduce
@@ -6,7 +6,7 @@ from typing import Any
 
 from pebble.config.problems import Path
 from pebble.config.tree import Root, SerialBridge
-from pebble.contract import CHANNELS, Channel
+from pebble.contract import CHANNELS, INCOMING, Channel
 from pebble.contract.identity import Identity
 
 _SERIAL = ("services", "serial_mcu_bridge")
@@ -30,6 +30,13 @@ def shared_topics(root: Root) -> Iterator[tuple[Path, Channel]]:
         owner = owners.setdefault(topic, channel)
         if owner is not channel:
             yield path, owner
+
+
+def renamed_commands(root: Root) -> Iterator[tuple[Path, str]]:
+    """Each key that gives something which a robot receives another topic, and that topic."""
+    for channel in CHANNELS:
+        if channel.direction == INCOMING:
+            yield from ((path, topic) for path, topic in _keys(channel, root) if topic is not None)
 
 
 def _keys(channel: Channel, root: Root) -> Iterator[tuple[Path, str | None]]:

@@ -310,6 +310,6 @@ class Root(Section, frozen=True, kw_only=True):
     transport: Annotated[TransportSection, doc("How messages move inside the robot; absent: MQTT.")] = TransportSection(
         kind="mqtt"
     )
-    security: Annotated[Security, doc("Who may drive the robot.")] = Security()
+    security: Annotated[Security, doc("Who may do what.")] = Security()
     services: Annotated[Services, doc("One section per service.")] = Services()
     web_interface: Annotated[WebInterface, doc("The operator page.")] = WebInterface()

@@ -18,6 +18,7 @@ from pathlib import Path
 from pebble.client.page_from_config import settings_of
 from pebble.client.page_packages import require_packages
 from pebble.config import Config, Mqtt
+from pebble.config.doors import warning_of_open
 from pebble.config.secret_text import shown_user
 from pebble.doctor import Finding, Level, device_names, fail, ok, warn
 from pebble.doctor.broker_probe import REFUSED_ID, REFUSED_LOGINS, ProbeResult, probe
@@ -55,6 +56,10 @@ def run_checks(config: Config | None) -> Iterator[Finding]:
 
 def _robot(config: Config) -> Iterator[Finding]:
     run_dir = config.run_dir()
+    if open_ := warning_of_open(config):
+        yield warn("security", open_, "pebble fleet init, then the account of this robot")
+    else:
+        yield ok("security", f"level {config.security.level}")
     yield run_directory(run_dir, os.geteuid())
     yield leftover_sockets(run_dir, is_listening)
     yield state_directory(config.state_dir())

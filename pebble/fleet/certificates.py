@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import datetime
 import ipaddress
-import os
 import re
 import socket
 from collections.abc import Iterable, Sequence
@@ -15,6 +14,7 @@ from typing import TYPE_CHECKING
 from pebble.config.hosts import HostError
 from pebble.config.hosts import host as host_of
 from pebble.errors import PebbleError
+from pebble.fleet.whole_file import write
 
 if TYPE_CHECKING:
     from cryptography import x509
@@ -70,7 +70,7 @@ def init(folder: Path, names: Sequence[str]) -> None:
         raise CertificateError(f"{folder}: {error.strerror}") from None
     key, certificate = _authority(hosts)
     _write_key(folder / CA_KEY, key)
-    _write(folder / CA_CERT, _pem(certificate), 0o644)
+    write(folder / CA_CERT, _pem(certificate), 0o644, CertificateError)
     _sign(folder, key, certificate, hosts)
 
 
@@ -174,7 +174,7 @@ def _sign(folder: Path, key: EllipticCurvePrivateKey, authority: x509.Certificat
     )
     certificate = _signed(builder, key)
     _write_key(folder / SERVER_KEY, own)
-    _write(folder / SERVER_CERT, _pem(certificate), 0o644)
+    write(folder / SERVER_CERT, _pem(certificate), 0o644, CertificateError)
 
 
 def _check_permitted(folder: Path, authority: x509.Certificate, hosts: Iterable[str]) -> None:
@@ -273,19 +273,4 @@ def _pem(certificate: x509.Certificate) -> bytes:
 def _write_key(file: Path, key: EllipticCurvePrivateKey) -> None:
     from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
 
-    _write(file, key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()), 0o600)
-
-
-def _write(file: Path, content: bytes, mode: int) -> None:
-    """Replace the file at once: never half of it, never a key that others can read for a moment."""
-    temporary = file.with_name(f".{file.name}.new")
-    try:
-        temporary.unlink(missing_ok=True)
-        with os.fdopen(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as output:
-            output.write(content)
-            output.flush()
-            os.fsync(output.fileno())
-        temporary.chmod(mode)
-        temporary.replace(file)
-    except OSError as error:
-        raise CertificateError(f"{file}: {error.strerror}") from None
+    write(file, key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()), 0o600, CertificateError)

@@ -64,6 +64,13 @@ class Database:
         with self._errors():
             return self._current().execute(statement, values)
 
+    def version(self) -> tuple[int, int, int]:
+        """Another one after each change, by this process or any other. Raises DatabaseError."""
+        with self._errors():
+            connection = self._current()
+            (by_others,) = connection.execute("PRAGMA data_version").fetchone()
+            return self.opened, by_others, connection.total_changes
+
     @contextmanager
     def _errors(self) -> Iterator[None]:
         try:

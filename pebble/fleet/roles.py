@@ -1,11 +1,28 @@
-"""What a person may do: roles, the rights of each, and sessions. Every role may stop a robot."""
+"""The one table of who may do what: roles, the rights of each, and the channels of each right.
 
+Rules for brokers, the rights of people on the operator page, and the tables of docs/fleet.md are made from it.
+"""
+
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import NamedTuple
+
+from msgspec import Struct
+
+from pebble.config.security import SecurityLevel
+from pebble.contract import INCOMING, OUTGOING, Channel, Kind
+from pebble.contract import channels as c
+from pebble.contract.identity import SERVERS
+
+GATEWAYS = "gateways"  # the type of programs that carry the topics of several robots to a broker
+CONTROL_TOPIC, CONTROL_ANSWERS = "$CONTROL/dynamic-security/v1", "$CONTROL/dynamic-security/#"
+_ANY = "+/+/+"  # any component
 
 
 class Role(StrEnum):
-    """One role of a person. SAFETY drives and resets as DRIVER does; from level ``fleet`` on, only SAFETY resets."""
+    """One role of a person."""
 
     VIEWER = "viewer"
     DRIVER = "driver"
@@ -14,19 +31,90 @@ class Role(StrEnum):
     ADMIN = "admin"
 
 
-_DRIVING = frozenset({"drive", "reset"})
-_RIGHTS: dict[Role, frozenset[str]] = {
-    Role.VIEWER: frozenset(),
+class ProgramRole(StrEnum):
+    """The role of a program that has an account of its own."""
+
+    PAGE = "page"  # a server of the operator page, which asks the rights of its own people
+    ROBOT = "robot"
+    GATEWAY = "gateway"
+
+
+class Right(StrEnum):
+    LOOK = "look"
+    STOP = "stop"
+    DRIVE = "drive"
+    RESET = "reset"
+    TAKE = "take"
+    SYSTEM = "system"
+    PEOPLE = "people"
+
+
+_EVERYBODY = frozenset({Right.LOOK, Right.STOP})
+_DRIVING = _EVERYBODY | {Right.DRIVE}
+_RIGHTS: Mapping[str, frozenset[Right]] = {
+    Role.VIEWER: _EVERYBODY,
     Role.DRIVER: _DRIVING,
-    Role.MAINTAINER: _DRIVING | {"system"},
-    Role.SAFETY: _DRIVING,
-    Role.ADMIN: _DRIVING | {"system", "people"},
+    Role.MAINTAINER: _DRIVING | {Right.TAKE, Right.SYSTEM},
+    Role.SAFETY: _DRIVING | {Right.RESET, Right.TAKE},
+    Role.ADMIN: frozenset(Right),
+    ProgramRole.PAGE: frozenset(Right) - {Right.PEOPLE},
+    ProgramRole.ROBOT: frozenset(),  # robots and gateways have the topics of their own bases
+    ProgramRole.GATEWAY: frozenset(),
+}
+ROLES = tuple(_RIGHTS)
+#: Roles that go with no other one.
+_ALONE = frozenset(ProgramRole)
+#: What each right may write to a robot: channels of the contract, or metrics below ``incoming/``.
+WRITES: Mapping[Right, tuple[Channel | str, ...]] = {
+    Right.LOOK: (c.VIDEO_CONTROL,),
+    Right.STOP: (c.ESTOP,),
+    Right.DRIVE: (
+        c.DRIVE,
+        c.CONTROL,
+        c.LIGHTS_SOLID,
+        c.LIGHTS_FLASH,
+        c.AUDIO_CONTROL,
+        c.AUDIO_STREAM,
+        c.SOUNDBOARD_COMMAND,
+        c.AUTONOMY_COMMAND,
+        c.MCU_COMMAND,
+        c.OUTLET_COMMAND,
+        c.MIP_RAW,
+        c.MQTT_AUDIO,
+        c.MQTT_VIDEO,
+    ),
+    Right.RESET: (c.ESTOP_RESET,),
+    Right.TAKE: (c.CONTROL_TAKE,),
+    Right.SYSTEM: (c.REBOOT, c.SERVICE_RESTART, c.GIT_PULL, c.REMOTE_MIRROR, "audit-read"),
 }
 
 
-def rights(role: Role) -> frozenset[str]:
-    """Those of ``drive``, ``reset``, ``system`` (restart, reboot, update) and ``people`` that the role has."""
-    return _RIGHTS[role]
+class Rule(NamedTuple):
+    """One thing that a broker lets an account do. ``access``: ``read`` or ``write``."""
+
+    access: str
+    filter: str
+
+
+class Account(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
+    """What `fleet.json` has of one account. ``bases``: of a robot its own, of a gateway those that it carries.
+
+    ``plain``: a robot that does not know names, so its topics stay as they are without them. ``people``: the database
+    of a page server's own people, if that is on this machine.
+    """
+
+    roles: tuple[str, ...]
+    bases: tuple[str, ...] = ()
+    plain: bool = False
+    people: str = ""
+
+
+class Extra(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """Metrics beyond the contract, by the right that may write them: ``{"drive": ["arm/+"]}``."""
+
+    look: tuple[str, ...] = ()
+    drive: tuple[str, ...] = ()
+    system: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,3 +128,88 @@ class Session:
 
 #: What a browser on the same machine gets where there is no login.
 LOCAL = Session("local", "local", Role.ADMIN)
+
+
+def rights(roles: Iterable[str], level: SecurityLevel) -> frozenset[Right]:
+    """What somebody with these roles may do, which add up. Below ``named`` whoever drives also resets."""
+    found = frozenset[Right]().union(*(_RIGHTS[role] for role in roles))
+    return found | {Right.RESET} if level != "named" and Right.DRIVE in found else found
+
+
+def page_rights(role: Role, level: SecurityLevel = "open") -> frozenset[str]:
+    """What a person may do on the operator page beyond what everybody may there."""
+    return frozenset(right.value for right in rights((role,), level) - _EVERYBODY)
+
+
+def right_of(channel: Channel) -> str:
+    """The right that may write this channel."""
+    return next(right.value for right, channels in WRITES.items() if channel in channels)
+
+
+def add_up(roles: Sequence[str]) -> str:
+    """Empty if one account may have these roles, else why not."""
+    unknown = [role for role in roles if role not in _RIGHTS]
+    if unknown or not roles:
+        return f"{unknown[0] if unknown else ''!r} is no role: use {', '.join(ROLES)}"
+    alone = [role for role in roles if role in _ALONE]
+    return f"{alone[0]} goes with no other role" if alone and len(set(roles)) > 1 else ""
+
+
+def rules(
+    name: str,
+    account: Account,
+    level: SecurityLevel,
+    *,
+    plain: Sequence[str] = (),
+    extra: Extra | None = None,
+) -> tuple[Rule, ...]:
+    """All that a broker lets this account do. ``plain``: bases of robots that do not know names, or ``+/+/+``.
+
+    They are literal: the ``%u`` of some brokers is unknown to mosquitto 2.0's plugin.
+    """
+    found = [
+        *_of_bases(name, account),
+        *_of_rights(name, rights(account.roles, level), level, plain, extra or Extra()),
+    ]
+    return tuple(dict.fromkeys(found))
+
+
+def metrics(right: Right, extra: Extra | None = None) -> tuple[str, ...]:
+    """What the right may write below ``incoming/``, as parts of filters."""
+    own = (one if isinstance(one, str) else one.metric for one in WRITES.get(right, ()))
+    return (*(re.sub(r"{[^}]*}", "+", one) for one in own), *getattr(extra, right, ()))
+
+
+def _of_bases(name: str, account: Account) -> Iterator[Rule]:
+    for base in account.bases:
+        if ProgramRole.ROBOT in account.roles:
+            yield from (Rule(access, f"{base}/#") for access in ("read", "write"))
+        else:
+            yield from (Rule("read", f"{base}/{direction}/#") for direction in (INCOMING, OUTGOING))
+            yield Rule("write", f"{base}/{OUTGOING}/#")
+            yield from (Rule("write", one.filter(base)) for one in c.CHANNELS if one.kind is Kind.FLAG)
+    if ProgramRole.GATEWAY in account.roles:
+        yield Rule("read", c.ONLINE.filter(f"+/{GATEWAYS}/+"))
+        yield Rule("write", c.ONLINE.filter(f"+/{GATEWAYS}/{name}"))
+
+
+def _of_rights(
+    name: str, held: frozenset[Right], level: SecurityLevel, plain: Sequence[str], extra: Extra
+) -> Iterator[Rule]:
+    if Right.LOOK in held:
+        yield Rule("read", f"{_ANY}/{OUTGOING}/#")
+        yield Rule("read", f"{_ANY}/{INCOMING}/flags/#")
+    if Right.STOP in held:
+        yield Rule("write", c.ESTOP.filter(_ANY))  # a stop needs no name, at any level
+    for right in Right:
+        if right in held:
+            for metric in metrics(right, extra):
+                if level == "named":
+                    yield Rule("write", f"{_ANY}/{INCOMING}/by/{name}/{metric}")
+                for base in plain if level == "named" else (_ANY,):
+                    yield Rule("write", f"{base}/{INCOMING}/{metric}")
+    if Right.DRIVE in held:
+        yield Rule("write", c.DRIVING.filter(f"+/{SERVERS}/+"))
+    if Right.PEOPLE in held:
+        yield Rule("read", CONTROL_ANSWERS)
+        yield Rule("write", CONTROL_TOPIC)

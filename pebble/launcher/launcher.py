@@ -7,6 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from pebble.config import Config
+from pebble.config.doors import warning_of_open
 from pebble.errors import ConfigError, PebbleError
 from pebble.launcher.child import Child
 from pebble.launcher.config_watch import ConfigWatch
@@ -90,8 +91,9 @@ class Launcher:
                 return
             if not supervisor.program.on_demand:
                 supervisor.start()
-        for warning in self._config.warnings:
-            log.warning("%s", warning)
+        for warning in (*self._config.warnings, warning_of_open(self._config)):
+            if warning:
+                log.warning("%s", warning)
         self._reactor.every(_CONFIG_POLL_S, self._config_watch.poll)
         if os.getpid() == 1:
             self._reactor.every(_ORPHANS_S, self._reap_orphans)

@@ -14,7 +14,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
 from pebble.client.estop_states import Reset
 from pebble.fleet.database import DatabaseError
-from pebble.fleet.roles import Session, rights
+from pebble.fleet.roles import Session, page_rights
 from pebble.transports.clock import since_boot as clock
 from pebble.web import messages as m
 from pebble.web import robot_commands
@@ -30,7 +30,7 @@ log = logging.getLogger(__name__)
 
 FLUSH_S = 0.05  # between two states
 HELLO_S = 5.0  # to begin with
-CHECK_S = 5.0  # between two looks at whether the session still exists
+CHECK_S = 5.0  # between two looks at whether the session still exists, while no person and no session changes
 _STOP_WAITS_S = 0.05  # at most, however much the page has sent
 _WATCH_COST = 20  # it subscribes to so many topics
 _WAITING = 64  # messages that wait to be sent, besides the state
@@ -119,7 +119,7 @@ class Control:
                 version=version,
                 user=self._session.user,
                 role=self._session.role,
-                rights=tuple(sorted(rights(self._session.role))),
+                rights=tuple(sorted(self._rights())),
                 login=settings.login,
                 token=self._tab.token,
                 now=1000 * time.time(),
@@ -127,7 +127,7 @@ class Control:
                 recordings=settings.recordings is not None,
             )
         )
-        if "drive" in rights(self._session.role):
+        if "drive" in self._rights():
             server.publish(server.driving.restore(hello.token, self._tab, clock()))
         server.robots.join(self._interest)
         self._interest.dirty |= {(ref, "web/driver") for ref in server.robots.components}
@@ -318,8 +318,11 @@ class Control:
             self._audit("take over" if op.over else "take", op.ref)
         self._moved.discard(op.ref)
 
+    def _rights(self) -> frozenset[str]:
+        return page_rights(self._session.role, self._server.settings.level)
+
     def _may(self, right: str, op: m.FromPage) -> bool:
-        if right in rights(self._session.role):
+        if right in self._rights():
             return True
         self._refuse(op, f"The role {self._session.role} may not do this")
         return False
@@ -351,6 +354,7 @@ class Control:
     async def _send_all(self) -> None:
         """States at most every 50 ms, pings twice a second."""
         ping_at, check_at = time.monotonic() + PING_S, time.monotonic() + CHECK_S
+        people = self._server.people_version
         while self._websocket.application_state is WebSocketState.CONNECTED:
             with suppress(TimeoutError):
                 await asyncio.wait_for(self._wake.wait(), max(0.0, min(ping_at, check_at) - time.monotonic()))
@@ -359,8 +363,8 @@ class Control:
             if now >= ping_at:
                 ping_at = now + PING_S
                 self._waiting.append(self._ping())
-            if now >= check_at:
-                check_at = now + CHECK_S
+            if now >= check_at or people != self._server.people_version:
+                check_at, people = now + CHECK_S, self._server.people_version
                 await self._check_session()
             await self._flush(now)
             await asyncio.sleep(FLUSH_S if not self._waiting else 0)

@@ -218,7 +218,7 @@ class _ToPage(Struct, frozen=True, kw_only=True, tag_field="op"):
 
 
 class Welcome(_ToPage, frozen=True, kw_only=True, tag="welcome"):
-    """The answer to Hello. ``rights``: of drive, reset, system, people."""
+    """The answer to Hello. ``rights``: of drive, reset, take, system, people."""
 
     server: str
     version: str

@@ -9,6 +9,7 @@ from pebble import contract as c
 from pebble.client.robot_topics import FLAGS, section_of
 from pebble.contract import Channel, codec
 from pebble.contract import payloads as p
+from pebble.fleet.roles import right_of
 from pebble.transports import Message, QoS
 from pebble.web import messages as m
 
@@ -22,7 +23,6 @@ class _Command(NamedTuple):
     section: str = ""  # of the capabilities that may name another topic; with dots: a section of a section
     key: str = ""
     names: dict[str, str] = {}  # of the channel's topic  # noqa: RUF012 - never changed
-    right: str = "drive"
 
 
 _ACTIONS = {"reboot": c.REBOOT, "service-restart": c.SERVICE_RESTART, "git-pull": c.GIT_PULL}
@@ -32,7 +32,7 @@ _FLAGS = {flag.metric.removeprefix("flags/"): (flag, section) for section, flag 
 
 def right(op: m.RobotOp) -> str:
     """That a person needs to ask this."""
-    return _command(op).right
+    return right_of(_command(op).channel)
 
 
 def ends(op: m.RobotOp) -> bool:
@@ -114,7 +114,7 @@ def _command(op: m.RobotOp) -> _Command:
         case m.McuOp(uid=uid, name=name, value=value):
             return _Command(c.MCU_COMMAND, value, names={"uid": uid, "name": name})
         case m.ActionOp(name=name):
-            return _Command(_ACTIONS[name], True, right="system")
+            return _Command(_ACTIONS[name], True)
         case m.FlagOp(name=name, on=on):
             channel, section = _FLAGS[name]
             return _Command(channel, on, section, "flag_topic")

@@ -41,6 +41,7 @@ from pebble.web.stops import Stops
 log = logging.getLogger(__name__)
 
 TICK_S = 0.05
+PEOPLE_S = 0.5  # between two looks at whether people or sessions were changed
 _REFRESH_S = 0.25
 _ESTOP_METRIC = "web/estop"
 _STREAM_ADDRESS = "stream-address "  # what a setting of the server begins with; then the component
@@ -66,6 +67,7 @@ class Server:
         self.by_name = ByName(FLEET, lambda ref: ref in known or ref in self.open_components)
         self.robots.on_forget = self.by_name.forget
         self.driven_here = DrivenHere(server)
+        self.people_version = (0, 0, 0)
         self._tasks: set[asyncio.Task[None]] = set()
 
     async def open(self) -> None:
@@ -78,6 +80,8 @@ class Server:
             await self.broker.subscribe(channel.filter("+/+/+"), self.receive, deferred=deferred)
         await self.broker.subscribe(DRIVING.filter("+/+/+"), self._announced)
         self.spawn(self._tick())
+        if self.settings.login:
+            self.spawn(self._watch_people())
         self.spawn(self.broker.ask(self.by_name))
 
     async def close(self) -> None:
@@ -276,6 +280,13 @@ class Server:
                     self._show_broker()
                     self._remember_robots()
                 self._announce(now)
+
+    async def _watch_people(self) -> None:
+        """A person who is removed is out soon, though each page looks after its session rarely."""
+        while True:
+            with suppress(DatabaseError):  # which the looks at sessions report
+                self.people_version = await asyncio.to_thread(self.people.version)
+            await asyncio.sleep(PEOPLE_S)
 
     def operated(self, ref: str) -> None:
         """A person drives this robot from here."""

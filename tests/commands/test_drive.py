@@ -94,12 +94,12 @@ class Lamp:
 class Console:
     """A process in a terminal of its own, whose keys can be held as a terminal repeats them."""
 
-    def __init__(self, *command: str) -> None:
+    def __init__(self, *command: str, cwd: Path = ROOT) -> None:
         self.master, slave = pty.openpty()
         self.mode = termios.tcgetattr(slave)
         self._slave = slave  # open: so the mode can be read after the process has ended
         self.process = subprocess.Popen(
-            ["setsid", "--ctty", *command], cwd=ROOT, stdin=slave, stdout=slave, stderr=slave, env=os.environ | SHELL
+            ["setsid", "--ctty", *command], cwd=cwd, stdin=slave, stdout=slave, stderr=slave, env=os.environ | SHELL
         )
         self._held = b""
         self._shown = b""

@@ -15,7 +15,7 @@ import pytest
 from pebble.errors import PebbleError
 from pebble.fleet.database import DatabaseError
 from pebble.fleet.people import SESSION_S, People, PeopleError, TooManyTriesError, User
-from pebble.fleet.roles import LOCAL, Role, rights
+from pebble.fleet.roles import LOCAL, Role, page_rights
 from pebble.fleet.tries import TRIES, WINDOW_S, network_of
 
 PASSWORD = "correct horse"
@@ -44,17 +44,17 @@ def people(clock: Clock, cheap_hashes: None) -> Iterator[People]:
 
 
 def test_rights_of_each_role() -> None:
-    assert {role.value: sorted(rights(role)) for role in Role} == {
+    assert {role.value: sorted(page_rights(role)) for role in Role} == {
         "viewer": [],
         "driver": ["drive", "reset"],
-        "maintainer": ["drive", "reset", "system"],
-        "safety": ["drive", "reset"],
-        "admin": ["drive", "people", "reset", "system"],
+        "maintainer": ["drive", "reset", "system", "take"],
+        "safety": ["drive", "reset", "take"],
+        "admin": ["drive", "people", "reset", "system", "take"],
     }
 
 
 def test_the_local_session_is_admin() -> None:
-    assert rights(LOCAL.role) == rights(Role.ADMIN)
+    assert page_rights(LOCAL.role) == page_rights(Role.ADMIN)
 
 
 def test_the_right_password_is_accepted(people: People) -> None:

@@ -15,7 +15,7 @@ from pebble.client.media_request.offer import offered, refusal
 from pebble.contract import AUDIO, AUDIO_STREAM
 from pebble.contract.packets import Codec, Sound
 from pebble.errors import PayloadError
-from pebble.fleet.roles import Session, rights
+from pebble.fleet.roles import Session, page_rights
 from pebble.transports import QoS
 from pebble.web.media.stream import MediaStream, Streams
 from pebble.web.media.talk import PIECE_BYTES, SILENT_S, Talk, Voice
@@ -145,7 +145,7 @@ class SoundStream(MediaStream[SoundPage, SoundView]):
         self._request.wake()
 
     def _why_not(self, page: SoundPage) -> str:
-        if "drive" not in rights(page.session.role):
+        if "drive" not in page_rights(page.session.role):
             return f"The role {page.session.role} may not do this"
         if self._talker is not None and self._talker is not page:
             return f"{self._talker.session.user} is talking"

@@ -224,7 +224,7 @@ function Flag({ at, name, title, meaning, value, known }) {
   const answer = useAnswer(asked?.n);
   const isWaiting = asked && answer.op !== "refused" && performance.now() - asked.at < ECHO_MS;
   const pending = isWaiting ? asked : null;
-  const why = whyNotEnd(page) || (known ? "" : "Not received yet");
+  const why = whyNotEnd(page, name === "remote-mirror" ? "system" : "drive") || (known ? "" : "Not received yet");
   const change = (event) => {
     const on = event.currentTarget.checked;
     ask({ on, at: performance.now(), was: value, n: page.commands.setFlag(at, name, on) });

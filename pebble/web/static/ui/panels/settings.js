@@ -10,7 +10,13 @@ import { nameOf } from "../parts/words.js";
 
 const THEMES = { auto: "as the system", light: "light", dark: "dark" };
 const SIDES = { left: "on the left", right: "on the right" };
-const RIGHTS = { drive: "drive", reset: "reset stops", system: "restart and update robots", people: "manage users" };
+const RIGHTS = {
+  drive: "drive",
+  reset: "reset stops",
+  take: "take over from others",
+  system: "restart and update robots",
+  people: "manage users",
+};
 const MORE = [
   { name: "help", icon: "help", text: "Keys, and how stopping works" },
   { name: "gamepad", icon: "pad", text: "Set up a gamepad" },

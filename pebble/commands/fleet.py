@@ -1,0 +1,326 @@
+"""``pebble fleet``: the accounts of a broker, and what each of them may do."""
+
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import typer
+from msgspec.structs import replace
+
+from pebble.client.page_packages import require_packages
+from pebble.commands.options import host_of, split_names
+from pebble.config.security import SecurityLevel
+from pebble.errors import PebbleError
+from pebble.fleet import applying, certificates, check, folder
+from pebble.fleet.broker_files import new_password
+from pebble.fleet.folder import ADMIN, CONF, Fleet, FleetError, Server
+from pebble.fleet.people import People
+from pebble.fleet.roles import Account, ProgramRole
+
+_HELP = """The accounts of a broker: robots, people and page servers, and what each may do.
+
+\b
+    pebble fleet init hall --host broker.lab       all files of a broker
+    mosquitto -c hall/mosquitto.conf               the broker
+    pebble fleet add ann --role driver             a person; prints a password once
+    pebble fleet add goob --role robot             a robot; prints the piece of its config
+    pebble fleet role ann maintainer
+    pebble fleet remove ann
+    pebble fleet check --live
+"""
+_Folder = Annotated[
+    Path | None, typer.Option("--folder", help="Folder of the fleet; else the only one here.", metavar="FOLDER")
+]
+_Name = Annotated[str, typer.Argument(help="1 to 32 of a-z, 0-9, _ and -.", metavar="NAME", show_default=False)]
+_Roles = Annotated[
+    str,
+    typer.Option(
+        "--role",
+        help="viewer, driver, maintainer, safety, admin, or several of them: driver,safety; else page, robot, gateway.",
+        metavar="ROLE[,ROLE]",
+    ),
+]
+_LEVELS: dict[str, SecurityLevel] = {"login": "login", "named": "named"}
+
+
+def init(
+    folder_: Annotated[Path, typer.Argument(metavar="FOLDER", help="A new folder.", show_default=False)],
+    host: Annotated[
+        str | None, typer.Option(help="Name or address by which robots and people reach the broker.", metavar="HOST")
+    ] = None,
+    level: Annotated[str | None, typer.Option(help="login, or named: names in topics, too.", metavar="LEVEL")] = None,
+    port: Annotated[int, typer.Option(help="Port of the broker, which is encrypted.", min=1, max=65535)] = folder.PORT,
+    unencrypted: Annotated[
+        int | None,
+        typer.Option("--board-port", help="Also a port without TLS, for boards that have none.", min=1, max=65535),
+    ] = None,
+    plain: Annotated[
+        bool | None, typer.Option("--plain/--no-plain", help="At level named: topics without names are allowed, too.")
+    ] = None,
+    without_plugin: Annotated[
+        bool, typer.Option("--without-plugin", help="Rules in acl and passwords, not in mosquitto's plugin.")
+    ] = False,
+) -> int:
+    """Write all files of a broker: authority, certificate, mosquitto.conf, accounts and rules.
+
+    In a folder that is a fleet already it changes the level, and gives every account its rules again.
+
+    \b
+        pebble fleet init hall --host broker.lab
+        pebble fleet init hall --level named --plain
+    """
+    require_packages()
+    place = folder_.absolute()
+    if level == "named" and not plain:
+        raise PebbleError("--level named alone lets nobody drive: robots of this release need --plain, too")
+    if level is not None and level not in _LEVELS:
+        raise PebbleError(f'--level must be "login" or "named", not "{level}"')
+    if (place / folder.FLEET).exists():
+        return _init_again(place, host, level, plain)
+    if host is None:
+        raise PebbleError("--host is missing: the name or address by which robots and people reach the broker")
+    server = Server(host=host_of("--host", host), port=port, unencrypted=unencrypted)
+    plugin = None if without_plugin else applying.found_plugin()
+    rules: Literal["plugin", "files"] = "files" if plugin is None else "plugin"
+    fleet = Fleet(level=_LEVELS[level or "login"], brokers=(server,), rules=rules, plain=bool(plain))
+    applying.make(place, fleet, plugin)
+    typer.echo(f"{_shown(place)} has all files of a broker at {server.host}:{server.port}, level {fleet.level}.")
+    if plugin is None and not without_plugin:
+        typer.echo("mosquitto's plugin is not installed: it reads rules from files, and again after each change.")
+    typer.echo(f"Start it:\n    mosquitto -c {_shown(place / CONF)}")
+    if os.geteuid() == 0:
+        typer.echo("It will run as root, as whom these files were made: a user of its own would do.")
+    typer.echo(f"Keep {_shown(place)} secret, and a copy of it: its keys and the password of {ADMIN} are in it.")
+    return 0
+
+
+def add(
+    name: _Name,
+    roles: _Roles,
+    base: Annotated[
+        list[str] | None,
+        typer.Option(help="Of a robot, unless pebble/robots/NAME; of a gateway, each that it carries.", metavar="BASE"),
+    ] = None,
+    plain: Annotated[
+        bool, typer.Option("--plain", help="A robot that does not know names: its topics stay without them.")
+    ] = False,
+    people: Annotated[
+        Path | None,
+        typer.Option(help="Of a page on this machine: its database of people; remove acts there, too.", metavar="FILE"),
+    ] = None,
+    folder_: _Folder = None,
+) -> int:
+    """Add an account, and print its password: this once, and nowhere else.
+
+    \b
+        pebble fleet add ann --role driver,safety
+        pebble fleet add goob --role robot
+        pebble fleet add lamp --role robot --base pebble/lamps/lamp --plain
+        pebble fleet add page-1 --role page
+    """
+    given = tuple(dict.fromkeys(split_names(roles)))
+    bases = tuple(base or ((f"pebble/robots/{name}",) if given == (ProgramRole.ROBOT,) else ()))
+    database = "" if people is None else str(people.absolute())
+    account = Account(roles=given, bases=bases, plain=plain, people=database)
+    with _changing(folder_) as (place, fleet):
+        if why := folder.refused(fleet, name, account):
+            raise FleetError(why)
+        if len(fleet.accounts) >= folder.MAX_ACCOUNTS:
+            raise FleetError(f"{place} has {folder.MAX_ACCOUNTS} accounts already: remove one, or make another fleet")
+        after = fleet.with_account(name, account)
+        secret = new_password()
+        how = applying.apply(place, fleet, after, {name: secret})
+    _print_account(place, after, name, secret, how)
+    return 0
+
+
+def role_(
+    name: _Name,
+    roles: Annotated[str, typer.Argument(metavar="ROLE[,ROLE]", help="What it may do.", show_default=False)],
+    folder_: _Folder = None,
+) -> int:
+    """Change what an account may do; it stays connected."""
+    with _changing(folder_) as (place, fleet):
+        account = _account(place, fleet, name)
+        _keep_admin(name)
+        changed = replace(account, roles=tuple(dict.fromkeys(split_names(roles))))
+        if why := folder.refused(fleet.without(name), name, changed):
+            raise FleetError(why)
+        after = replace(fleet, accounts={**fleet.accounts, name: changed})
+        how = applying.apply(place, fleet, after)
+    typer.echo(f"{name} is {', '.join(changed.roles)} now ({how})")
+    return 0
+
+
+def password(name: _Name, folder_: _Folder = None) -> int:
+    """Give an account a new password, print it this once, and end its connections."""
+    with _changing(folder_) as (place, fleet):
+        _account(place, fleet, name)
+        secret = new_password()
+        how = applying.apply(place, fleet, fleet, {name: secret})
+    _print_account(place, fleet, name, secret, how)
+    return 0
+
+
+def remove(name: _Name, folder_: _Folder = None) -> int:
+    """Remove an account everywhere, and end its connections; say where it may still get in."""
+    with _changing(folder_) as (place, fleet):
+        account = _account(place, fleet, name)
+        _keep_admin(name)
+        how = applying.apply(place, fleet, fleet.without(name))
+        typer.echo(f"{name} is removed and disconnected ({how})")
+        left = list(_remove_from_pages(fleet, name)) if not set(account.roles) & set(ProgramRole) else []
+    for line in left:
+        typer.echo(f"pebble: {line}", err=True)
+    return 1 if left else 0
+
+
+def list_(folder_: _Folder = None) -> int:
+    """Print the accounts and what each is."""
+    place = _place(folder_)
+    fleet = folder.load(place)
+    typer.echo(
+        f"{_shown(place)}: level {fleet.level}, broker " + ", ".join(f"{s.host}:{s.port}" for s in fleet.brokers)
+    )
+    for name, account in fleet.accounts.items():
+        what = [", ".join(account.roles), *account.bases, *(["plain"] if account.plain or fleet.plain else [])]
+        typer.echo(f"{name:<32}  {'  '.join(what)}")
+    return 0
+
+
+def check_(
+    live: Annotated[
+        bool, typer.Option("--live", help="Also try what the broker lets through, with accounts that exist meanwhile.")
+    ] = False,
+    folder_: _Folder = None,
+) -> int:
+    """Compare the folder with its broker, and name each account and rule too many or too few.
+
+    \b
+        pebble fleet check --live
+    """
+    require_packages()
+    with _changing(folder_) as (place, fleet):
+        found = check.compare(place, fleet)
+        tried = check.attempt(place, fleet) if live else None
+    wrong = found + ([] if tried is None else tried.wrong)
+    for line in wrong:
+        typer.echo(f"pebble: {line}", err=True)
+    if found:
+        typer.echo(f"pebble: `pebble fleet init {_shown(place)}` gives every account its rules again", err=True)
+    if tried is not None:
+        typer.echo(f"{tried.attempts} attempts, {len(tried.wrong)} not as the table says")
+    if not wrong:
+        typer.echo(f"The broker knows the {len(fleet.accounts)} accounts of {_shown(place)}, and their rules.")
+    return 1 if wrong else 0
+
+
+def register(app: typer.Typer) -> None:
+    group = typer.Typer(help=_HELP, rich_markup_mode=None)
+    commands: dict[str, Any] = {"init": init, "add": add, "role": role_, "password": password, "remove": remove}
+    for name, command in (commands | {"list": list_, "check": check_}).items():
+        group.command(name)(command)
+    app.add_typer(group, name="fleet")
+
+
+# -- inside
+
+
+def _init_again(place: Path, host: str | None, level: str | None, plain: bool | None) -> int:
+    if host is not None:
+        raise PebbleError(f"{_shown(place)} is a fleet already, so leave out --host; another host needs another folder")
+    with _changing(place) as (_, fleet):
+        after = replace(
+            fleet,
+            level=fleet.level if level is None else _LEVELS[level],
+            plain=fleet.plain if plain is None else plain,
+        )
+        how = applying.apply(place, fleet, after)
+        applying.repair(place, after)
+    typer.echo(f"{_shown(place)} has level {after.level}{' and plain topics' if after.plain else ''} ({how})")
+    return 0
+
+
+@contextmanager
+def _changing(folder_: Path | None) -> Iterator[tuple[Path, Fleet]]:
+    place = _place(folder_)
+    with folder.locked(place):
+        yield place, folder.load(place)
+
+
+def _place(folder_: Path | None) -> Path:
+    """The folder that is named, else the only fleet in this one. Raises PebbleError."""
+    if folder_ is not None:
+        return folder_.absolute()
+    found = [Path(), *sorted(path for path in Path().iterdir() if path.is_dir() and not path.name.startswith("."))]
+    fleets = [path.absolute() for path in found if (path / folder.FLEET).is_file()]
+    if len(fleets) != 1:
+        names = ", ".join(map(_shown, fleets))
+        why = f"there are several fleets here, {names}" if fleets else "there is no fleet here"
+        raise PebbleError(f"{why}: name one with --folder FOLDER")
+    return fleets[0]
+
+
+def _shown(path: Path) -> str:
+    """Show a path below this folder without the folder."""
+    return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else str(path)
+
+
+def _account(place: Path, fleet: Fleet, name: str) -> Account:
+    if name not in fleet.accounts:
+        raise FleetError(f"{_shown(place / folder.FLEET)} has no account {name!r}: `pebble fleet list` lists them")
+    return fleet.accounts[name]
+
+
+def _keep_admin(name: str) -> None:
+    if name == ADMIN:
+        raise FleetError(f"{ADMIN} is the account by which this command changes the broker: it stays as it is")
+
+
+def _print_account(place: Path, fleet: Fleet, name: str, secret: str, how: str) -> None:
+    account, server = fleet.accounts[name], fleet.brokers[0]
+    typer.echo(f"{name} may log in as {', '.join(account.roles)} ({how})")
+    typer.echo(f"    password: {secret}")
+    typer.echo("It is shown this once.")
+    ca = _shown(place / certificates.CA_CERT)
+    if ProgramRole.ROBOT in account.roles:
+        typer.echo(f"In its config, beside a copy of {ca}, which no other user can read (a board: as local_mqtt):")
+        typer.echo(json.dumps(piece_of_config(fleet, name, secret), indent=2))
+        return
+    url = f"mqtts://{name}@{server.host}:{server.port}"
+    if ProgramRole.PAGE in account.roles:
+        typer.echo(f"    pebble web --url {url} --ca-cert {ca} --password-file FILE")
+    elif ProgramRole.GATEWAY not in account.roles:
+        typer.echo(f"    pebble drive ROBOT --url {url} --ca-cert {ca} --password-file FILE")
+
+
+def piece_of_config(fleet: Fleet, name: str, secret: str) -> dict[str, Any]:
+    """What a robot's config needs, to be at this broker."""
+    server = fleet.brokers[0]
+    login = {"host": server.host, "port": server.port, "username": name, "password": secret}
+    link = login | {"tls": {"enabled": True, "ca_cert": certificates.CA_CERT}}
+    level = "login" if fleet.accounts[name].plain else fleet.level
+    return {"security": {"level": level}, "services": {"mqtt_bridge": {"enabled": True, "remote_mqtt": link}}}
+
+
+def _remove_from_pages(fleet: Fleet, name: str) -> Iterator[str]:
+    """Remove the person from the pages' own lists on this machine; yields where that cannot be done."""
+    for page, account in fleet.accounts.items():
+        if ProgramRole.PAGE not in account.roles:
+            continue
+        if not account.people:
+            yield f"{page} has people of its own: if {name} is one, `pebble web user remove {name}` on its machine"
+            continue
+        if not Path(account.people).is_file():
+            yield f"{page}: {account.people} is not there: who is in it may still get in by that page"
+            continue
+        people = People(Path(account.people))
+        try:
+            if any(user.name == name for user in people.list()):
+                people.remove(name)
+                typer.echo(f"{name} is removed from the people of {page} and logged out there")
+        finally:
+            people.close()

@@ -1,0 +1,101 @@
+"""What the security level of a config refuses: ways to the robot by which nobody is asked who they are."""
+
+import re
+from collections.abc import Iterator
+
+from pebble.config.exposure import brokers
+from pebble.config.problems import Notes, Path
+from pebble.config.shared_topics import renamed_commands
+from pebble.config.transport import Mqtt
+from pebble.config.tree import Root
+from pebble.config.web import is_loopback
+
+_ZENOH_ENCRYPTED = ("tls/", "quic/")
+_ZENOH_LOCAL = ("unixsock-stream/", "unixpipe/", "vsock/")
+_BARE_HOST = re.compile(r"^[a-z0-9-]+/\[?([^\]/]*?)\]?(?::\d+)?(?:[?#].*)?$")
+
+
+def check_doors(notes: Notes, root: Root) -> None:
+    """Note what the level refuses. ``open`` refuses nothing."""
+    if root.security.level == "open":
+        return
+    _check_links(notes, root)
+    if root.security.level == "named" and root.robot.platform == "linux":
+        _check_sides(notes, root)
+
+
+def warning_of_open(root: Root) -> str:
+    """What the level ``open`` means where other machines reach the robot; empty: none does, or it is another level."""
+    hosts = [f"broker {mqtt.host}" for _, mqtt in _robots_brokers(root) if not is_loopback(mqtt.host)]
+    places = [*hosts, *(endpoint for _, endpoint in _endpoints(root))]
+    if root.security.level != "open" or not places:
+        return ""
+    return f'security.level is "open": whoever may publish by {places[0]} drives this robot (docs/fleet.md)'
+
+
+def _robots_brokers(root: Root) -> Iterator[tuple[Path, Mqtt]]:
+    return (one for one in brokers(root) if one[0][0] != "web_interface")
+
+
+def _check_links(notes: Notes, root: Root) -> None:
+    level = root.security.level
+    for path, mqtt in brokers(root):
+        if is_loopback(mqtt.host):
+            continue
+        if not mqtt.tls.enabled and root.robot.platform != "esp8266":  # which has no memory for it
+            notes.problem(
+                (*path, "tls", "enabled"), f'must be true at security.level "{level}": {mqtt.host} is another machine'
+            )
+        if mqtt.tls.enabled and mqtt.tls.insecure:
+            notes.problem((*path, "tls", "insecure"), f'must be false at security.level "{level}"')
+        if mqtt.username is None:
+            notes.problem(
+                (*path, "username"),
+                f'is missing at security.level "{level}": `pebble fleet add NAME --role robot` makes an account',
+            )
+    for path, endpoint in _endpoints(root):
+        if not endpoint.startswith(_ZENOH_ENCRYPTED):
+            notes.problem(path, f'{endpoint} is not encrypted: write tls/… at security.level "{level}"')
+
+
+def _endpoints(root: Root) -> Iterator[tuple[Path, str]]:
+    """Those of Zenoh that lead beyond this machine."""
+    transport, bridge = root.transport, root.services.mqtt_bridge
+    sections = {("transport",): transport if transport.kind == "zenoh" else None}
+    if bridge.enabled and bridge.remote is not None and bridge.remote.kind == "zenoh":
+        sections["services", "mqtt_bridge", "remote"] = bridge.remote  # type: ignore[index, assignment]
+    for path, section in sections.items():
+        for key in ("listen", "connect") if section is not None else ():
+            for endpoint in getattr(section, key):
+                if not _is_near(endpoint):
+                    yield (*path, key), endpoint
+
+
+def _is_near(endpoint: str) -> bool:
+    host = _BARE_HOST.match(endpoint)
+    return endpoint.startswith(_ZENOH_LOCAL) or (host is not None and is_loopback(host[1]))
+
+
+def _check_sides(notes: Notes, root: Root) -> None:
+    """At ``named`` the bridge knows the names, so nothing may go past it."""
+    bridge, transport = root.services.mqtt_bridge, root.transport
+    why = 'at security.level "named" the bridge checks names'
+    if not bridge.enabled:
+        notes.problem(("services", "mqtt_bridge", "enabled"), f"must be true: {why}")
+    for path, _ in renamed_commands(root):
+        notes.problem(path, f"cannot be renamed: {why}, by the contract's topics")
+    for path, mqtt in _robots_brokers(root):
+        if path[-1] != "remote_mqtt" and not is_loopback(mqtt.host):
+            notes.problem((*path, "host"), f"must be on loopback: {why}, and nobody does at {mqtt.host}")
+    for path, endpoint in _endpoints(root):
+        if path == ("transport", "listen"):
+            notes.problem(path, f"{endpoint}: must be on loopback: {why}, and nobody does there")
+    remote, local = bridge.remote_mqtt, root.local_mqtt
+    if bridge.enabled and transport.kind == "mqtt" and bridge.remote is None and place_of(remote) == place_of(local):
+        place = ("services", "mqtt_bridge", "remote_mqtt", "host")
+        notes.problem(place, f"must be another broker than local_mqtt: {why}, between the two")
+
+
+def place_of(mqtt: Mqtt) -> tuple[str, int]:
+    """Host and port; all names of this machine are one."""
+    return "" if is_loopback(mqtt.host) else mqtt.host, mqtt.port

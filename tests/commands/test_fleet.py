@@ -1,0 +1,197 @@
+"""``pebble fleet``: the commands of docs/fleet.md in order, as printed, with a real broker; and what is refused."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pebble.config import load
+from pebble.fleet.broker_client import BrokerClient, Place
+from pebble.fleet.folder import CONF
+from pebble.fleet.people import People
+from pebble.fleet.roles import Role
+from pebble.rig.processes import mosquitto_path, python
+from tests.commands.test_drive import Console
+from tests.support import ROOT, Child, free_port, listening, until
+
+PAGE = (ROOT / "docs" / "fleet.md").read_text()
+#: The first block of the page: what a newcomer types, one after the other.
+FIRST = re.findall(r"^    (\S.*)$", PAGE.partition("## ")[2].partition("## ")[0], re.MULTILINE)
+LAMP = "pebble/robots/minilamp"
+PASSWORD = re.compile(r"password: ((?:[a-z0-9]{4}-){3}[a-z0-9]{4})")
+
+
+def pebble(line: str, folder: Path, **more: str) -> subprocess.CompletedProcess[str]:
+    """Run a line that begins with ``pebble``, in this folder."""
+    words = shlex.split(line, comments=True)
+    assert words[0] == "pebble"
+    command = [sys.executable, "-m", "pebble.cli", *words[1:]]
+    env = {**os.environ, "PYTHONPATH": str(ROOT), "XDG_STATE_HOME": str(folder / "state"), **more}
+    return subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True, check=False, timeout=60)
+
+
+@contextmanager
+def mosquitto(conf: Path, port: int) -> Iterator[None]:
+    with (conf.parent / "log").open("ab") as log:
+        process = Child([str(mosquitto_path()), "-c", str(conf)], cwd=conf.parent.parent, stdout=log, stderr=log)
+    try:
+        assert until(lambda: listening(port), 10), (conf.parent / "log").read_text()
+        yield
+    finally:
+        process.kill()
+        process.wait(10)
+
+
+def test_the_first_page_as_a_newcomer_types_it(tmp_path: Path) -> None:
+    """The host is this machine instead of the broker's, and the port a free one: nothing else differs."""
+    port, passwords = free_port(), dict[str, str]()
+    init, start, *accounts, check = FIRST[:8]
+    simulate, drive, stop, *later = (line.replace("broker.lab:8883", f"127.0.0.1:{port}") for line in FIRST[8:])
+    assert run(init.replace("broker.lab", f"127.0.0.1 --port {port}"), tmp_path).count(start.split("  ")[0]) == 1
+    with mosquitto(tmp_path / start.split()[2], port):
+        for line in accounts:
+            shown = run(line, tmp_path)
+            passwords[line.split()[3]] = PASSWORD.findall(shown)[0]
+            for piece in re.findall(r"^\{.*^\}", shown, re.DOTALL | re.MULTILINE):
+                _robot_accepts(json.loads(piece), tmp_path)
+        assert "attempts, 0 not as the table says" in run(check, tmp_path)
+        for name, password in passwords.items():
+            (tmp_path / f"{name}-password").write_text(f"{password}\n")
+        place = Place("127.0.0.1", port, tmp_path / "hall" / "ca.pem")
+        with BrokerClient(place, "minilamp", passwords["minilamp"]) as robot, typed(simulate, tmp_path):
+            robot.subscribe([f"{LAMP}/incoming/drive-values", f"{LAMP}/outgoing/estop/#"])
+            with closing(Console(*python("pebble.cli", *shlex.split(drive)[1:]), cwd=tmp_path)) as console:
+                console.hold(b"w")
+                assert until(lambda: robot.listen(0.05) or any(b'"z":' in one for _, one in robot.received), 20)
+            assert "stopped and confirmed" in run(stop, tmp_path)
+            assert until(lambda: robot.listen(0.05) or any(b'"latched":true' in one for _, one in robot.received), 5)
+        for line in later:
+            run(line, tmp_path)
+    assert list(passwords) == ["goob", "fred", "minilamp", "ann", "otto"]
+    search = ["grep", "-rlE", "|".join(passwords.values()), str(tmp_path / "hall")]
+    assert subprocess.run(search, check=False, capture_output=True).stdout == b""  # no file has one of them
+
+
+def run(line: str, folder: Path) -> str:
+    """What a line prints that succeeds without a complaint."""
+    done = pebble(line, folder)
+    assert (done.returncode, done.stderr) == (0, ""), (line, done)
+    return done.stdout
+
+
+@contextmanager
+def typed(line: str, folder: Path) -> Iterator[None]:
+    """A program that runs until it is ended."""
+    with (folder / "simulation.log").open("ab") as log:
+        process = Child(python("pebble.cli", *shlex.split(line)[1:]), cwd=folder, stdout=log, stderr=log)
+    try:
+        yield
+    finally:
+        process.terminate()
+        process.wait(10)
+
+
+def _robot_accepts(piece: dict[str, Any], folder: Path) -> None:
+    """The piece that was printed and a copy of the authority make a valid config."""
+    file = folder / "robot.json"
+    (folder / "ca.pem").write_bytes((folder / "hall" / "ca.pem").read_bytes())
+    piece["services"]["mqtt_bridge"]["remote_mqtt"]["host"] = "broker.lab"
+    file.write_text(json.dumps({"robot": {"id": "goob"}, **piece}))
+    file.chmod(0o600)
+    config = load(file)
+    assert (config.security.level, config.warnings) == ("login", ())
+
+
+@pytest.fixture
+def hall(tmp_path: Path) -> Path:
+    port = free_port()
+    done = pebble(f"pebble fleet init hall --host 127.0.0.1 --port {port} --board-port {free_port()}", tmp_path)
+    assert done.returncode == 0, done.stderr
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("line", "error"),
+    [
+        ("pebble fleet init hall --host x.lab", "hall is a fleet already, so leave out --host"),
+        ("pebble fleet init other", "--host is missing: the name or address by which robots and people reach"),
+        ("pebble fleet init other --host x.lab --level open", '--level must be "login" or "named", not "open"'),
+        ("pebble fleet init hall --level named", "robots of this release need --plain"),
+        ("pebble fleet add Ann --role driver", "'Ann' is no name: use 1 to 32 of a-z, 0-9, _ and -"),
+        ("pebble fleet add ann --role boss", "'boss' is no role: use viewer, driver"),
+        ("pebble fleet add ann --role robot,driver", "robot goes with no other role"),
+        ("pebble fleet add ann --role driver --plain", "only a robot can be plain"),
+        ("pebble fleet add admin --role viewer", "admin exists already, as admin"),
+        ("pebble fleet role otto driver", "hall/fleet.json has no account 'otto': `pebble fleet list` lists them"),
+        ("pebble fleet role admin driver", "admin is the account by which this command changes the broker"),
+        ("pebble fleet remove admin", "admin is the account by which this command changes the broker"),
+        ("pebble fleet remove otto", "hall/fleet.json has no account 'otto'"),
+        ("pebble fleet list --folder nowhere", "nowhere/fleet.json: `pebble fleet init"),
+        ("pebble fleet check --live", "attempts need a broker that runs"),
+    ],
+)
+def test_a_refusal_names_the_remedy(hall: Path, line: str, error: str) -> None:
+    done = pebble(line, hall)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert error in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_without_a_fleet_or_with_several_one_must_be_named(hall: Path) -> None:
+    done = pebble("pebble fleet list", hall / "hall" / "..")
+    assert done.returncode == 0
+    (hall / "empty").mkdir()
+    assert "there is no fleet here: name one with --folder FOLDER" in pebble("pebble fleet list", hall / "empty").stderr
+    pebble(f"pebble fleet init second --host 127.0.0.1 --port {free_port()}", hall)
+    assert "there are several fleets here, hall, second" in pebble("pebble fleet list", hall).stderr
+    assert pebble("pebble fleet list --folder second", hall).returncode == 0
+
+
+def test_accounts_come_and_go_in_the_files_of_a_broker_that_is_down(hall: Path) -> None:
+    for line in (
+        "pebble fleet add dora --role driver,safety",
+        "pebble fleet add lamp --role robot --base pebble/lamps/lamp --plain",
+        "pebble fleet add gate --role gateway --base pebble/robots/+",
+        "pebble fleet role dora viewer",
+        "pebble fleet password dora",
+    ):
+        done = pebble(line, hall)
+        assert (done.returncode, done.stderr) == (0, ""), done
+    listed = pebble("pebble fleet list", hall).stdout.splitlines()
+    assert [line.split() for line in listed[1:]] == [
+        ["admin", "admin"],
+        ["dora", "viewer"],
+        ["lamp", "robot", "pebble/lamps/lamp", "plain"],
+        ["gate", "gateway", "pebble/robots/+"],
+    ]
+    assert "mosquitto does not run" in pebble("pebble fleet remove dora", hall).stdout
+    done = pebble("pebble fleet check", hall)
+    assert (done.returncode, done.stdout) == (0, "The broker knows the 3 accounts of hall, and their rules.\n")
+    assert (hall / "hall" / CONF).read_text().count("listener") == 3  # per_listener_settings, and two of them
+
+
+def test_removing_a_person_acts_on_pages_here_and_names_those_elsewhere(hall: Path) -> None:
+    people = People(hall / "people.sqlite")
+    people.add("ann", "a long password", Role.DRIVER)
+    pebble("pebble fleet add ann --role driver", hall)
+    pebble("pebble fleet add page-1 --role page --people people.sqlite", hall)
+    done = pebble("pebble fleet remove ann", hall)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert people.list() == []
+    people.close()
+    pebble("pebble fleet add ann --role driver", hall)
+    pebble("pebble fleet add page-2 --role page", hall)
+    done = pebble("pebble fleet remove ann", hall)
+    assert done.returncode == 1
+    assert "run on that machine `pebble web user remove ann`" in done.stderr
+    assert pebble("pebble fleet remove page-2", hall).returncode == 0

@@ -1,0 +1,146 @@
+"""What each security level refuses in a config, and what it lets pass; and the warning of a robot that asks nobody."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pebble.config import load, parse
+from pebble.config.doors import warning_of_open
+from pebble.config.raw import deep_merge
+from pebble.errors import ConfigError
+from tests.support import ROOT
+
+REMOTE, UPLINK = "services.mqtt_bridge.remote_mqtt", "services.mqtt_bridge.remote"
+MIRROR, PAGE, DRIVE = "transport.mqtt_mirror", "web_interface.mqtt", "services.serial_mcu_bridge.topics.drive_values"
+TLS = {"enabled": True}
+LOGIN = {"username": "goob", "tls": TLS}
+GOOD: dict[str, Any] = {
+    "robot": {"id": "goob"},
+    "transport": {"kind": "zenoh"},
+    "services": {"mqtt_bridge": {"enabled": True, "remote_mqtt": {"host": "broker.lab", **LOGIN}}},
+}
+MQTT: dict[str, Any] = {"transport": {"kind": "mqtt"}}
+NOT_YET = "security.level: must not be"
+
+
+def at(path: str, value: Any) -> dict[str, Any]:
+    for key in reversed(path.split(".")):
+        value = {key: value}
+    return value
+
+
+def problems(level: str, *changes: dict[str, Any]) -> list[str]:
+    """Where a config is refused at this level, besides that no release has ``named`` yet."""
+    raw = GOOD | at("security.level", level)
+    for change in changes:
+        raw = deep_merge(raw, change)
+    try:
+        parse(raw, folder=Path("/nowhere"), env={})
+    except ConfigError as error:
+        return [one.partition(": ")[0] for one in error.problems if not one.startswith(NOT_YET)]
+    return []
+
+
+@pytest.mark.parametrize(
+    ("change", "refused"),
+    [
+        ({}, []),
+        (at(f"{REMOTE}.tls.enabled", False), [f"{REMOTE}.tls.enabled"]),
+        (at(f"{REMOTE}.tls.insecure", True), [f"{REMOTE}.tls.insecure"]),
+        (at(f"{REMOTE}.username", None), [f"{REMOTE}.username"]),
+        (at(REMOTE, {"host": "127.0.0.1", "username": None, "tls": {"enabled": False}}), []),
+        (at(REMOTE, {"host": "localhost", "username": None, "tls": {"enabled": False}}), []),
+        (at("local_mqtt.host", "10.0.0.2"), []),  # not used: the transport is Zenoh
+        (at(MIRROR, {"host": "10.0.0.2"}), [f"{MIRROR}.tls.enabled", f"{MIRROR}.username"]),
+        (at(MIRROR, {"host": "127.0.0.1"}), []),
+        (at(PAGE, {"host": "broker.lab"}), [f"{PAGE}.tls.enabled", f"{PAGE}.username"]),
+        (at("transport.listen", ["tcp/0.0.0.0:7447"]), ["transport.listen"]),
+        (at("transport.listen", ["tcp/127.0.0.1:7447", "tcp/[::1]:7447"]), []),
+        (at("transport.connect", ["udp/10.0.0.2:7447"]), ["transport.connect"]),
+        (at(UPLINK, {"kind": "zenoh", "connect": ["tcp/hub.lab:7447"]}), [f"{UPLINK}.connect"]),
+        (at(UPLINK, {"kind": "zenoh", "connect": ["tls/hub.lab:7447"]}), []),
+        (at("services.mqtt_bridge.enabled", False), []),
+    ],
+    ids=str,
+)
+def test_a_login_and_tls_are_needed_beyond_this_machine(change: dict[str, Any], refused: list[str]) -> None:
+    assert problems("login", change) == refused
+    assert problems("named", change)[: len(refused)] == refused
+    assert problems("open", change) == []
+
+
+@pytest.mark.parametrize(
+    ("change", "refused"),
+    [
+        ({}, []),
+        (at("services.mqtt_bridge.enabled", False), ["services.mqtt_bridge.enabled"]),
+        (at(DRIVE, "x/y"), [DRIVE]),
+        (at("services.mqtt_bridge.topics.reboot", "x/y"), ["services.mqtt_bridge.topics.reboot"]),
+        (at("services.serial_mcu_bridge.topics.charging_level", "x/y"), []),
+        (at(MIRROR, {"host": "broker.lab", **LOGIN}), ["transport.mqtt_mirror.host"]),
+        (at(MIRROR, {"host": "127.0.0.1"}), []),
+        (deep_merge(MQTT, at("local_mqtt", {"host": "broker.lab", "port": 1884, **LOGIN})), ["local_mqtt.host"]),
+        (deep_merge(MQTT, at("local_mqtt", {"host": "127.0.0.1"})), []),
+        (deep_merge(MQTT, at(REMOTE, {"host": "localhost"})), [f"{REMOTE}.host"]),
+        (deep_merge(MQTT, at(REMOTE, {"host": "localhost", "port": 1884})), []),
+        (
+            deep_merge(
+                at("transport.listen", ["tls/0.0.0.0:7447"]),
+                at("transport.tls", {"enabled": True, "ca_cert": "/etc/hostname"}),
+            ),
+            ["transport.listen"],
+        ),
+    ],
+    ids=str,
+)
+def test_named_refuses_what_leads_past_the_bridge(change: dict[str, Any], refused: list[str]) -> None:
+    assert problems("named", change) == refused
+    assert problems("login", change) == []
+
+
+def test_a_board_that_has_no_memory_for_tls_logs_in_without_it() -> None:
+    board = {"robot": {"id": "benjr", "platform": "esp8266"}, "local_mqtt": {"host": "broker.lab", "username": "benjr"}}
+    config = parse(board | at("security.level", "login"), folder=Path("/nowhere"), env={})
+    assert any("its password crosses the network unencrypted" in warning for warning in config.warnings)
+    del board["local_mqtt"]["username"]
+    with pytest.raises(ConfigError, match="username: is missing"):
+        parse(board | at("security.level", "login"), folder=Path("/nowhere"), env={})
+
+
+@pytest.mark.parametrize(
+    ("change", "where"),
+    [
+        ({}, "broker broker.lab"),
+        (at("security.level", "login"), ""),
+        (at(f"{REMOTE}.host", "127.0.0.1"), ""),
+        (at(f"{REMOTE}.host", "10.0.0.2"), "broker 10.0.0.2"),
+        (
+            deep_merge(at(f"{REMOTE}.host", "127.0.0.1"), at("transport.connect", ["tcp/10.0.0.2:7447"])),
+            "tcp/10.0.0.2:7447",
+        ),
+        (deep_merge(at(f"{REMOTE}.host", "127.0.0.1"), at(PAGE, {"host": "broker.lab"})), ""),
+    ],
+    ids=str,
+)
+def test_one_warning_says_that_the_robot_asks_for_no_name(change: dict[str, Any], where: str) -> None:
+    warning = warning_of_open(parse(deep_merge(GOOD, change), folder=Path("/nowhere"), env={}))
+    expected = f'security.level is "open": whoever may publish by {where} drives this robot (docs/fleet.md)'
+    assert warning == {True: expected, False: ""}[bool(where)]
+
+
+def test_the_demo_and_simulations_are_not_warned() -> None:
+    loopback = deep_merge(GOOD, at(REMOTE, {"host": "127.0.0.1", "port": 41883, "username": None, "tls": {}}))
+    assert warning_of_open(parse(loopback, folder=Path("/nowhere"), env={})) == ""
+    assert warning_of_open(load(ROOT / "configs" / "goob.json", env={})) != ""
+
+
+@pytest.mark.parametrize(
+    ("security", "unnamed"),
+    [({}, "drive"), ({"level": "login"}, "drive"), ({"level": "login", "strangers": "free"}, "free")],
+)
+def test_drive_commands_without_control(security: dict[str, str], unnamed: str) -> None:
+    config = parse(GOOD | {"security": security}, folder=Path("/nowhere"), env={})
+    assert config.security.unnamed == unnamed
