@@ -35,8 +35,10 @@ class Visitors:
 
     def taken(self, robot: RobotView, now: float) -> str:
         """Why people have the control of it now; empty: they have not."""
+        if robot.controlled and robot.control.who:  # as it tells itself
+            self._driven[robot.base] = robot.control.who, now
         who, at = self._driven.get(robot.base, ("", -math.inf))
-        if now - at < VALID_S:
+        if robot.control.who if robot.controlled else now - at < VALID_S:
             return f"is driven by {who}"
         stop = robot.stopped_by
         return "" if stop is None or stop.by == self._name else f"is stopped by {stop.by or 'unknown'}"

@@ -18,14 +18,15 @@ _DRIVING = frozenset({"drive", "reset"})
 _RIGHTS: dict[Role, frozenset[str]] = {
     Role.VIEWER: frozenset(),
     Role.DRIVER: _DRIVING,
-    Role.MAINTAINER: _DRIVING | {"system"},
-    Role.SAFETY: _DRIVING,
-    Role.ADMIN: _DRIVING | {"system", "people"},
+    Role.MAINTAINER: _DRIVING | {"take", "system"},
+    Role.SAFETY: _DRIVING | {"take"},
+    Role.ADMIN: _DRIVING | {"take", "system", "people"},
 }
 
 
 def rights(role: Role) -> frozenset[str]:
-    """Those of ``drive``, ``reset``, ``system`` (restart, reboot, update) and ``people`` that the role has."""
+    """Those of ``drive``, ``reset``, ``take`` (control from who drives), ``system`` (restart, reboot, update) and
+    ``people`` that the role has."""
     return _RIGHTS[role]
 
 
