@@ -1,4 +1,4 @@
-"""Who moves the motors: nobody while latched, people before scripts. Pure; boards and Linux robots share it.
+"""Who moves the motors: nobody while latched, who has control, people before scripts. Pure; boards share it with Linux.
 
 A drive command with all axes 0 is a zero. A person's zero is always judged. Commands of a script carry the number of
 its run, which grows with each start; a run that is barred never moves anything again. The numbers have no end: after
@@ -23,9 +23,10 @@ def newer(run: int, than: int) -> bool:
 class Arbiter:
     """``judge`` every drive command; ``stop`` at every emergency stop; ``tick`` regularly."""
 
-    def __init__(self, latch, now: int, diff, watchdog_ms: int) -> None:
+    def __init__(self, latch, lease, now: int, diff, watchdog_ms: int) -> None:
         """``watchdog_ms`` is how long a command moves anything, at most; see latch.py for ``diff``."""
         self.latch = latch
+        self.lease = lease
         self.barred = 0  # runs up to this number
         self._diff = diff
         self._watchdog_ms = watchdog_ms
@@ -39,22 +40,30 @@ class Arbiter:
         self._script_from = now
         self._script_ms = 0
 
-    def judge(self, moves: bool, run: int, valid_ms: float, now: int) -> int:
+    def judge(self, moves: bool, run: int, valid_ms: float, now: int, key: str = "", by: str = "") -> int:
         """Return for how many milliseconds it moves, 0: it stops the motors, REFUSED: it has no effect.
 
         ``moves``: any axis is not 0. ``run`` may be PERSON, or UNKNOWN_RUN of a zero. ``valid_ms`` < 0: not given.
+        ``key`` and ``by`` are for the lease. A zero of somebody else than who has control ends a script, too, but is
+        nobody's letting go.
         """
         self.tick(now)
+        lease = self.lease
+        if lease.refuses(moves, run != PERSON, key, by, now):
+            return REFUSED
+        ours = run != PERSON or not lease.key or lease.holds(key, by)
         if newer(run, self.barred) and run != self._newest:  # it has begun, even if this command is refused
             self._newest = run
             self.bar(run - 1 or LAST_RUN)
         if self.latch.latched:
             self.bar(run)
-        if self.latch.refuses(moves, run != PERSON, now):
+        if self.latch.refuses(moves, run != PERSON, now, ours):
             return REFUSED
         limit = self._watchdog_ms if valid_ms < 0 or valid_ms > self._watchdog_ms else int(valid_ms)
         if run == PERSON:
-            self._take(moves, valid_ms == 0, now)
+            self._take(moves, valid_ms == 0 or not ours, now)
+            if moves:
+                lease.moved(key, now)
         elif self._held or self._starting or (run > 0 and not newer(run, self.barred)):
             return REFUSED
         else:
@@ -75,6 +84,7 @@ class Arbiter:
         """Let what is over end; at least every few minutes, because clocks of boards wrap."""
         diff = self._diff
         self.latch.tick(now)
+        self.lease.tick(now)
         if self._starting and diff(now, self._started) >= _START_MS:
             self._starting = False
         if self._scripted and diff(now, self._script_from) >= self._script_ms:

@@ -2,11 +2,11 @@
 
 import json
 import os
-from binascii import hexlify
 
 from micropython import const
 
 from common.arbiter import Arbiter
+from common.control import Control, Paced, compact, random_digits
 from common.latch import Latch, reset_of, stop_of
 from common.payload import load
 from common.ticks import diff
@@ -15,22 +15,23 @@ _FILE = const("/estop.json")
 _NEW = const("/estop.new")  # renamed when it is complete: a power cut leaves the old file or the new one
 _NAMES = const(4)
 _LONGEST_STATE = const(300)
-_PAUSE_MS = const(250)  # between two states
 _EROFS = const(30)  # not in every port's errno
 _ENODEV = const(19)
 
 
-class EmergencyStop:
-    """``stop`` and ``reset`` for their messages, then ``save`` while the motors are off; ``tick`` every turn."""
+class EmergencyStop(Paced):
+    """``stop`` and ``reset`` for their messages, then ``save`` while the motors are off; ``tick`` every turn.
+
+    Its state is never published in the turn of a stop.
+    """
 
     def __init__(self, now: int, watchdog_ms: int) -> None:
-        self.latch = Latch(_random(4), _NAMES, diff)
-        self.arbiter = Arbiter(self.latch, now, diff, watchdog_ms)
-        self.changed = True  # since the last state
-        self.due = False  # the state is to be published: at most four times a second, and not in the turn of a stop
+        Paced.__init__(self, now)
+        boot = random_digits(4)
+        self.latch = Latch(boot, _NAMES, diff)
+        self.control = Control(boot, now)
+        self.arbiter = Arbiter(self.latch, self.control.lease, now, diff, watchdog_ms)
         self._barred = 0  # of the last state
-        self._paused = False
-        self._since = now
         self._unsaved = False
         self._saves = True  # there is a file system that can be written to
         self._saved: bool | None = False  # `latched` by the file; None: unknown
@@ -38,11 +39,10 @@ class EmergencyStop:
 
     def tick(self, now: int) -> None:
         self.arbiter.tick(now)
-        if self._paused and diff(now, self._since) >= _PAUSE_MS:
-            self._paused = False
         if self.arbiter.barred != self._barred:
             self.changed = True
-        self.due = self.changed and not self._paused
+        Paced.tick(self, now)
+        self.control.tick(now)
 
     # -- in
 
@@ -55,7 +55,7 @@ class EmergencyStop:
             except (ValueError, OverflowError, MemoryError):
                 pass
         self.changed = True
-        new = self.arbiter.stop(name or _random(8), by, why, since)
+        new = self.arbiter.stop(name or random_digits(8), by, why, since)
         self._unsaved = self._unsaved or self.latch.latched  # again if writing failed
         return new
 
@@ -76,18 +76,16 @@ class EmergencyStop:
         state = self.latch.state(self._saved == self.latch.latched if self._saves else None)
         if self.arbiter.barred:
             state["barred"] = self.arbiter.barred
-        text = _json(state)
+        text = compact(state)
         excess = len(text) - _LONGEST_STATE
         if excess > 0:
             state["why"] = state["why"][:-excess]
-            text = _json(state)
+            text = compact(state)
         return text.encode()
 
     def published(self, now: int) -> None:
-        self.changed = self.due = False
+        Paced.published(self, now)
         self._barred = self.arbiter.barred
-        self._paused = True
-        self._since = now
 
     # -- the file
 
@@ -125,11 +123,3 @@ class EmergencyStop:
             pass
         self.latch.restore(saved)
         self._saved = self.latch.latched
-
-
-def _random(count: int) -> str:
-    return hexlify(os.urandom(count)).decode()
-
-
-def _json(fields: dict) -> str:
-    return json.dumps(fields, separators=(",", ":"))

@@ -83,13 +83,18 @@ class Latch:
         self._waits_from = now
         return True
 
-    def refuses(self, moves: bool, script: bool, now: int) -> bool:
-        """Whether a drive command has no effect. While latched a zero passes: it may end the run of a script."""
+    def refuses(self, moves: bool, script: bool, now: int, ours: bool = True) -> bool:
+        """Whether a drive command has no effect. While latched a zero passes: it may end the run of a script.
+
+        ``ours`` False: somebody else has control, so this zero does not show that the one who drives lets go.
+        """
         if self.latched:
             return moves
         if not self._waits or script:
             return False
         self.tick(now)
+        if not moves and not ours:
+            return False
         self._waits = self._waits and moves
         self._waits_from = now
         return self._waits

@@ -22,7 +22,9 @@ from common.wifi import Wifi
 _DRIVE_LIMIT_MS = const(900)  # one second, including a slow turn of the loop
 _ESTOP = const(0)  # places of the topics in the subscription: stops come first
 _RESET = const(1)
-_DRIVE = const(2)
+_CONTROL = const(2)
+_TAKE = const(3)
+_DRIVE = const(4)
 _HEARTBEAT_MS = const(250)
 _REPORT_EVERY = const(20)  # heartbeats: 5 s
 
@@ -42,10 +44,11 @@ class NetworkRobot:
         self._wifi = Wifi(get(settings, "wifi", "ssid"), get(settings, "wifi", "password", ""))
         self._clock = Clock(settings.get("ntp", "pool.ntp.org"), now)
         incoming = root + b"/incoming/"
-        topics = incoming + b"estop", incoming + b"estop-reset", incoming + b"drive-values"
-        self.session = Session(settings, root, topics, wrap, self._take)
+        names = b"estop", b"estop-reset", b"control", b"control/take", b"drive-values"
+        self.session = Session(settings, root, tuple([incoming + name for name in names]), wrap, self._take)
         self.stops = EmergencyStop(now, _DRIVE_LIMIT_MS)
         self._stoppable = True  # the broker granted both topics of stops
+        self._controllable = True  # and of control
         self.deadman = DeadMan(_DRIVE_LIMIT_MS)
         self._body = body
         self.refused = 0  # commands that were retained, and drive commands that were invalid or not admitted
@@ -71,6 +74,7 @@ class NetworkRobot:
 
     def _guard(self, now: int) -> None:
         self.stops.tick(now)
+        self._halt_if_passed_on()
         if self.deadman.expired(now):
             self._body.stop()
         self._body.refresh()
@@ -87,6 +91,13 @@ class NetworkRobot:
         self._body.stop()
         self.deadman.rest()
         self._next = None
+
+    def _halt_if_passed_on(self) -> None:
+        """Whoever gets control begins with wheels at rest."""
+        lease = self.stops.control.lease
+        if lease.halts:
+            lease.halts = False
+            self._halt()
 
     # -- in
 
@@ -112,6 +123,7 @@ class NetworkRobot:
             if granted[_DRIVE] > 127:
                 raise ValueError("subscription refused")
             self._stoppable = granted[_ESTOP] <= 127 and granted[_RESET] <= 127
+            self._controllable = granted[_CONTROL] <= 127
             self._heartbeats = 0
             self._due = now
         elif client.retained:  # stale
@@ -127,6 +139,10 @@ class NetworkRobot:
             self._judge(raw, now)
         elif raw is not None and not len(raw):  # it removes a retained message
             pass
+        elif topic == _CONTROL or topic == _TAKE:
+            if raw is not None:
+                stops.control.request(raw, topic == _TAKE, now)
+                self._halt_if_passed_on()
         elif not self._stoppable:  # without a way to reset it, a stop is only a zero
             if topic == _ESTOP:
                 stops.arbiter.judge(False, PERSON, 0, now)
@@ -141,9 +157,10 @@ class NetworkRobot:
     def _judge(self, raw: memoryview | None, now: int) -> None:
         command = None if raw is None else parse(raw)
         if command:
-            x, z, y, run, valid_ms = command
+            x, z, y, run, valid_ms, key = command
             moves = x != 0.0 or z != 0.0 or y != 0.0
-            limit_ms = self.stops.arbiter.judge(moves, run, valid_ms, now)
+            limit_ms = self.stops.arbiter.judge(moves, run, valid_ms, now, key)
+            self._halt_if_passed_on()
             if limit_ms != REFUSED:
                 self._next = command
                 self._limit_ms = limit_ms
@@ -161,16 +178,17 @@ class NetworkRobot:
         if session.stuck:
             return False
         stops = self.stops
-        due = stops.due and self._heartbeats and self._stoppable
-        if due and session.publish(b"estop/mcu", stops.state(), 1):
-            stops.published(now)
+        if self._heartbeats and (
+            (self._stoppable and stops.due and self._publish(b"estop/mcu", stops, now))
+            or (self._controllable and stops.control.due and self._publish(b"control/mcu", stops.control, now))
+        ):
             return True  # so the rest has room in the next turn
         if diff(now, self._due) < 0:
             return False
         if not self._heartbeats:
-            what = describe(self._clock.read(now), session.root, self._stoppable, self._charging)
+            what = describe(self._clock.read(now), session.root, self._stoppable, self._controllable, self._charging)
             session.publish(b"capabilities", what, 1)
-            stops.changed = True
+            stops.changed = stops.control.changed = True
             self._due = now
         else:
             self._due = add(self._due, _HEARTBEAT_MS)
@@ -181,3 +199,9 @@ class NetworkRobot:
                 self._body.report(session.publish)
         self._heartbeats += 1
         return False
+
+    def _publish(self, topic: bytes, paced, now: int) -> bool:
+        sent = self.session.publish(topic, paced.state(), 1)
+        if sent:
+            paced.published(now)
+        return sent

@@ -45,12 +45,12 @@ def load(raw: memoryview | bytes):
     return json.loads(raw)  # type: ignore[type-var]  # any buffer will do (extmod/modjson.c)
 
 
-def parse(raw: memoryview | bytes) -> tuple[float, float, float, int, int] | None:
-    """Return ``(x, z, y, run, valid_ms)`` from bare or wrapped JSON. None: refused.
+def parse(raw: memoryview | bytes) -> tuple[float, float, float, int, int, str] | None:
+    """Return ``(x, z, y, run, valid_ms, key)`` from bare or wrapped JSON. None: refused.
 
-    Axes are within -1..1; missing ones, and those that are no number, are 0; NaN and infinity are refused. ``run`` and
-    ``valid_ms`` are as the arbiter needs them. Wrong ones, or a wrong ``source``, refuse a command that moves anything,
-    but never a stop.
+    Axes are within -1..1; missing ones, and those that are no number, are 0; NaN and infinity are refused. The others
+    are as the arbiter needs them. Wrong ones, or a wrong ``source``, refuse a command that moves anything, but never a
+    stop.
     """
     try:
         body = load(raw)
@@ -61,7 +61,7 @@ def parse(raw: memoryview | bytes) -> tuple[float, float, float, int, int] | Non
             x, z, y = _axis(body, "x"), _axis(body, "z"), _axis(body, "y")
             stops = x == 0.0 and z == 0.0 and y == 0.0
             run, valid_ms = _run(body, stops), _valid_ms(body, stops)
-            return x, z, y, run, valid_ms
+            return x, z, y, run, valid_ms, _key(body, stops)
     except (ValueError, OverflowError, MemoryError):  # not UTF-8, no JSON, no number
         pass
     return None
@@ -91,6 +91,15 @@ def _valid_ms(body: dict, stops: bool) -> int:
         if not stops:
             raise ValueError
     return -1
+
+
+def _key(body: dict, stops: bool) -> str:
+    value = body.get("key")
+    if isinstance(value, str):
+        return value
+    if value is None or stops:
+        return ""
+    raise ValueError
 
 
 def _axis(body: dict, name: str) -> float:

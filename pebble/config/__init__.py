@@ -9,6 +9,7 @@ from pebble.config.config import hand_over as hand_over
 from pebble.config.config import load as load
 from pebble.config.config import parse as parse
 from pebble.config.config import resolved as resolved
+from pebble.config.security import Security as Security
 from pebble.config.transport import Mqtt as Mqtt
 from pebble.config.transport import RemoteConnection as RemoteConnection
 from pebble.config.transport import RemoteMqtt as RemoteMqtt

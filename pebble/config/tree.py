@@ -8,6 +8,7 @@ from pebble.config.autonomy import AutonomyManager
 from pebble.config.media import AvDaemon, Media, SoundboardHandler, VideoStream
 from pebble.config.planned import Ros1Bridge
 from pebble.config.recorder import Recorder
+from pebble.config.security import Security
 from pebble.config.transport import Mqtt, RemoteConnection, RemoteMqtt, TransportSection
 from pebble.config.types import (
     EMPTY,
@@ -309,5 +310,6 @@ class Root(Section, frozen=True, kw_only=True):
     transport: Annotated[TransportSection, doc("How messages move inside the robot; absent: MQTT.")] = TransportSection(
         kind="mqtt"
     )
+    security: Annotated[Security, doc("Who may drive the robot.")] = Security()
     services: Annotated[Services, doc("One section per service.")] = Services()
     web_interface: Annotated[WebInterface, doc("The operator page.")] = WebInterface()

@@ -54,7 +54,9 @@ class Drive(Payload, frozen=True, kw_only=True):
     source: str | UnsetType = UNSET  # "autonomy" of a script; anything else counts as a person
     run: Annotated[int, Meta(ge=1, le=LAST_RUN)] | UnsetType = UNSET  # of a script: grows until 2^30 - 1, then from 1
     valid_ms: Annotated[int, Meta(ge=0)] | UnsetType = UNSET  # of a zero, 0: the script must not resume
-    key: str | UnsetType = UNSET  # of control, as outgoing/control/{owner} has it; "" is the same as absent
+    key: str | UnsetType = (
+        UNSET  # of control, as outgoing/control/{owner} has it; of several owners all, with a blank between
+    )
     t: Annotated[int, Meta(ge=0, le=LARGEST_MS)] | UnsetType = UNSET  # the sender's clock, in milliseconds
     by: str | UnsetType = UNSET  # the account of a sender elsewhere, where the robot checks names
     group: bool | UnsetType = UNSET  # a copy of what a group of commands contained
@@ -260,7 +262,10 @@ class EstopState(Payload, frozen=True, kw_only=True):
 
 
 class ControlState(Payload, frozen=True, kw_only=True):
-    """Who has control of one motor owner, at most 300 bytes; ``key`` is ``""`` while nobody has."""
+    """Who has control of one motor owner, at most 300 bytes; ``key`` is ``""`` while nobody has.
+
+    Where a robot has several owners, the first one by name decides who drives.
+    """
 
     by: str  # as that request has it
     id: str

@@ -2,9 +2,10 @@
 
 import operator
 
-from pebble.contract.payloads import Drive, EstopState
+from pebble.contract.payloads import ControlState, Drive, EstopState
 from pebble.motion.arbiter import PERSON, REFUSED, UNKNOWN_RUN, Arbiter
 from pebble.motion.latch import Latch
+from pebble.motion.lease import Lease
 
 _HOLD_S = 0.35  # wheels coast so long
 _LEAST_POWER = 0.02
@@ -12,11 +13,16 @@ _LONG_AGO_MS = 10_000  # the motor owner started before us: what it refuses in i
 
 
 class MotorPower:
-    """The power of both motors, from the commands that the motor owner obeys; ``watchdog_s`` is its own."""
+    """The power of both motors, from the commands that the motor owner obeys.
 
-    def __init__(self, watchdog_s: float, now: float) -> None:
+    ``watchdog_s`` is its own, and ``strangers`` what it does with commands without a key.
+    """
+
+    def __init__(self, watchdog_s: float, strangers: str, now: float) -> None:
         self._latch = Latch("", 1, operator.sub)
-        self._arbiter = Arbiter(self._latch, _ms(now) - _LONG_AGO_MS, operator.sub, round(1000 * watchdog_s))
+        self._lease = Lease(0, lambda _later, _earlier: -1, str, strangers)  # only its owner ends it
+        began, watchdog_ms = _ms(now) - _LONG_AGO_MS, round(1000 * watchdog_s)
+        self._arbiter = Arbiter(self._latch, self._lease, began, operator.sub, watchdog_ms)
         self._power = (0.0, 0.0)  # left, right, until _until
         self._until = now
         self._signs = [0, 0]
@@ -25,7 +31,7 @@ class MotorPower:
     def command(self, drive: Drive, now: float) -> bool:
         """Take a drive command; False: it is refused, and changes nothing."""
         valid_ms = drive.valid_ms if isinstance(drive.valid_ms, int) else -1
-        limit = self._arbiter.judge(drive.moves, _run(drive), valid_ms, _ms(now))
+        limit = self._arbiter.judge(drive.moves, _run(drive), valid_ms, _ms(now), drive.key or "")
         if limit == REFUSED:
             return False
         self.at(now)
@@ -38,6 +44,12 @@ class MotorPower:
         self._latch.latched = state.latched
         self._arbiter.bar(state.last_barred)
         if state.latched:
+            self._power = (0.0, 0.0)
+
+    def control(self, state: ControlState) -> None:
+        """Follow who has control: a change of it halts the wheels."""
+        if state.key != self._lease.key:
+            self._lease.key = state.key
             self._power = (0.0, 0.0)
 
     def at(self, now: float) -> tuple[tuple[float, int], tuple[float, int]]:

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from msgspec import Struct
 
-from pebble.contract.payloads import Drive, EstopState, ImuFast, TouchValues
+from pebble.contract.payloads import ControlState, Drive, EstopState, ImuFast, TouchValues
 from pebble.perception.gyro import GyroHeading
 from pebble.perception.hall import HallSample, HallWheel
 from pebble.perception.motor_power import MotorPower
@@ -93,15 +93,15 @@ class _Wheel:
 
 
 class Odometry:
-    """Feed it every command and sample. ``watchdog_s`` is that of the motor owner."""
+    """Feed it every command and sample. ``watchdog_s`` and ``strangers`` are those of the motor owner."""
 
-    def __init__(self, geometry: WheelGeometry, *, watchdog_s: float, now: float) -> None:
+    def __init__(self, geometry: WheelGeometry, *, watchdog_s: float, strangers: str = "drive", now: float) -> None:
         self.pose = self._base = WheelPose()
         self.distance_mm = 0.0
         self._part = _Part()
         self._was_ready = True
         self._geometry = geometry
-        self._power = MotorPower(watchdog_s, now)
+        self._power = MotorPower(watchdog_s, strangers, now)
         self._left, self._right = map(_Wheel, geometry.step_mm)
         self._gyro = GyroHeading()
         self._heading_source = "wheels"
@@ -117,6 +117,9 @@ class Odometry:
 
     def owner(self, state: EstopState) -> None:
         self._power.owner(state)
+
+    def control(self, state: ControlState) -> None:
+        self._power.control(state)
 
     def imu(self, imu: ImuFast, now: float) -> None:
         """A sample of the inertial sensor."""

@@ -13,7 +13,7 @@ from pebble.simulation.micropython.loader import firmware_root
 from tests.kit.mutations import Mutation, in_copy
 from tests.motion import world
 
-_LATCH, _ARBITER, _TICKS = _CORES = ("common/latch.py", "common/arbiter.py", "common/ticks.py")
+_LATCH, _LEASE, _ARBITER, _TICKS = _CORES = tuple(f"common/{name}.py" for name in world.CORE_NAMES)
 _MODULES = {"world": world.__file__, "estop": estop.__file__}
 
 
@@ -79,15 +79,70 @@ MUTATIONS = {
     "a release bars": Mutation(_ARBITER, "self._resumes = not moves and not final", "self._resumes = False"),
     "valid_ms has no effect": Mutation(_ARBITER, "else int(valid_ms)", "else self._watchdog_ms"),
     "valid_ms has no limit": Mutation(_ARBITER, "valid_ms < 0 or valid_ms > self._watchdog_ms", "valid_ms < 0"),
+    "the key of before moves": Mutation(_LEASE, '        return key != "" or ', "        return "),
+    "a key stays when control passes on": Mutation(_LEASE, "who, self._random())", "who, self.key or self._random())"),
+    "a zero needs a key": Mutation(_LEASE, "if not moves or (not key", "if (not key"),
+    "control never ends": Mutation(_LEASE, "diff(now, self._since) >= self._for or", "False or"),
+    "everybody takes over": Mutation(_LEASE, "elif over or self._idle:", "elif True:"),
+    "nobody takes over": Mutation(_LEASE, "elif over or self._idle:", "elif self._idle:"),
+    "anybody releases": Mutation(
+        _LEASE,
+        "if self.key and self._same(who, self.holder):\n            self._end",
+        "if self.key:\n            self._end",
+    ),
+    "the key of another account moves": Mutation(
+        _LEASE, "return not self._named or _account(by) == _account(self.holder[0])", "return True"
+    ),
+    "another account with the same id has control": Mutation(
+        _LEASE, "and (not self._named or _account(who[0]) == _account(other[0]))", ""
+    ),
+    "strangers drive while somebody has control": Mutation(
+        _LEASE, ' or (self._strangers == FREE and self.key != "")', ""
+    ),
+    "strangers are not refused": Mutation(_LEASE, "self._strangers == REFUSE or", "False or"),
+    "programs of the robot are strangers": Mutation(_LEASE, "(script or (self._named and not by))", "script"),
+    "scripts are strangers": Mutation(_LEASE, "(script or (self._named and not by))", "(self._named and not by)"),
+    "the last one who asks gets control": Mutation(
+        _LEASE, "elif self.asker is _NOBODY or self._same(who, self.asker):", "else:"
+    ),
+    "who asks gets nothing": Mutation(
+        _LEASE,
+        "        if self.asker is _NOBODY:\n            self._change",
+        "        if True:\n            self._change",
+    ),
+    "who asked once asks for ever": Mutation(_LEASE, "diff(now, self._asked) >= self._asks_for", "False"),
+    "who drives counts as idle": Mutation(
+        _LEASE,
+        "            self._moved = now\n            self._idle = False\n        else",
+        "            pass\n        else",
+    ),
+    "who only holds is idle too late": Mutation(_LEASE, "_IDLE_MS = 5000", "_IDLE_MS = 6000"),
+    "commands do not renew": Mutation(
+        _LEASE, "            self._since = now\n            return False\n", "            return False\n"
+    ),
+    "control has no longest time": Mutation(
+        _LEASE, "min(max(for_ms, SHORTEST_MS), LONGEST_MS)", "max(for_ms, SHORTEST_MS)"
+    ),
+    "the wheels turn on when control passes on": Mutation(
+        _LEASE, "self.changed = self.halts = True", "self.changed = True"
+    ),
+    "it is not shown that others drive": Mutation(_LEASE, "            self.others = True\n", "            pass\n"),
+    "a stranger's zero lets go after a reset": Mutation(_LATCH, "if not moves and not ours:", "if False:"),
+    "a stranger's zero lets the run resume": Mutation(_ARBITER, "valid_ms == 0 or not ours", "valid_ms == 0"),
+    "what has no key of now begins a run": Mutation(
+        _ARBITER,
+        "return REFUSED\n        ours",
+        "self._newest = max(run, self._newest)\n            return REFUSED\n        ours",
+    ),
     "times do not wrap": Mutation(
         _TICKS, "return ahead if ahead < _HALF else ahead - _HALF - _HALF", "return later - earlier"
     ),
     "a zero is lost when it is replaced": Mutation("world", "if old is not None and not old[4]:", "if False:"),
     "a stop leaves a command in the slot": Mutation(
-        "world", "            self.slot = None\n            self.until = 0\n", "            self.until = 0\n"
+        "world", "        self.slot = None\n        self.until = 0\n", "        self.until = 0\n"
     ),
     "a stop leaves the wheels turning": Mutation(
-        "world", "            self.slot = None\n            self.until = 0\n", "            self.slot = None\n"
+        "world", "        self.slot = None\n        self.until = 0\n", "        self.slot = None\n"
     ),
     "saved is what is only renamed": Mutation(
         "world",

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 from msgspec import Meta, Struct, convert
 
 from pebble import Robot, run
-from pebble.contract import DRIVE, ESTOP_STATE, IMU_FAST, TOUCH_SENSORS, WHEEL_ODOMETRY
+from pebble.contract import CONTROL_STATE, DRIVE, ESTOP_STATE, IMU_FAST, TOUCH_SENSORS, WHEEL_ODOMETRY
 from pebble.contract.payloads import WheelOdometry
 from pebble.contract.renaming import renamed
 from pebble.perception.odometry import Odometry, WheelGeometry
@@ -44,8 +44,12 @@ class Options(Struct):
 
 def main(robot: Robot, options: Options) -> None:
     channel = renamed(WHEEL_ODOMETRY, options.topic, robot.config.base)
-    watchdog_s = robot.config.services.serial_mcu_bridge.safety.drive_timeout_seconds
-    odometry = Odometry(geometry(robot, options), watchdog_s=watchdog_s, now=time.monotonic())
+    odometry = Odometry(
+        geometry(robot, options),
+        watchdog_s=robot.config.services.serial_mcu_bridge.safety.drive_timeout_seconds,
+        strangers=robot.config.security.unnamed,
+        now=time.monotonic(),
+    )
     inputs: queue.Queue[tuple[Callable[..., None], Any, float]] = queue.Queue(WAITING)
 
     log = RateLimitedLog(robot.log)
@@ -68,6 +72,7 @@ def main(robot: Robot, options: Options) -> None:
     robot.on(TOUCH_SENSORS, take(touched))
     robot.on(IMU_FAST, take(odometry.imu))
     robot.on(ESTOP_STATE, take(lambda state, _now: odometry.owner(state)))
+    robot.on(CONTROL_STATE, take(lambda state, _now: odometry.control(state)))
     rate = Rate(options.publish_rate_hz)
     silent_at: float | None = time.monotonic() + SILENCE_S  # None: a sample has arrived, or the warning is logged
     while True:

@@ -1,16 +1,19 @@
-"""What waits to be judged before it reaches the motors: stops, resets and drive commands."""
+"""What waits to be judged before it reaches the motors: stops, resets, requests for control and drive commands."""
 
 import threading
 from itertools import chain
 
 from msgspec import Struct
 
-from pebble.contract.payloads import SCRIPT, Drive, EstopCommand, EstopReset
+from pebble.contract.payloads import SCRIPT, ControlRequest, Drive, EstopCommand, EstopReset
 from pebble.motion.arbiter import PERSON, UNKNOWN_RUN
+from pebble.services.serial_mcu_bridge.motion.control import Control
 
 _STOPS = 8  # as many names as a latch remembers
 _RESETS = 8
-_SENDERS = 8  # the person, and runs of scripts
+_REQUESTS = 8
+_SENDERS = 8  # who has control, all other persons, and runs of scripts
+_HOLDER = -2  # in place of the number of a run: who has control
 
 
 class ReceivedDrive(Struct, frozen=True):
@@ -27,11 +30,20 @@ class ReceivedReset(Struct, frozen=True):
     at: float
 
 
+class ReceivedRequest(Struct, frozen=True):
+    """A request for control, whether it takes control over, and when it was received on the service's clock."""
+
+    request: ControlRequest
+    over: bool
+    at: float
+
+
 class Batch(Struct):
     """All that was waiting, to be judged in the order of the fields."""
 
     stops: list[EstopCommand]
     resets: list[ReceivedReset]
+    requests: list[ReceivedRequest]
     drives: list[ReceivedDrive]
 
 
@@ -39,14 +51,17 @@ class MotionInbox:
     """Bounded. Any thread puts, one takes; a ``put`` returns True if nothing was waiting before: wake the one up then.
 
     Of drive commands the newest of each sender waits, and before it the zero that it replaced: a zero is always judged.
+    Who has control is a sender of its own, whom others do not replace. So is whoever requests it, by id.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, control: Control) -> None:
         self.dropped = 0
+        self._control = control
         self._lock = threading.Lock()
         self._stops: list[EstopCommand] = []
         self._resets: list[ReceivedReset] = []
-        self._drives: dict[int, list[ReceivedDrive]] = {}  # by sender, the newest sender last
+        self._requests: dict[tuple[str, str], ReceivedRequest] = {}  # by sender, the newest sender last
+        self._drives: dict[int, list[ReceivedDrive]] = {}  # the same
 
     def put_stop(self, stop: EstopCommand) -> bool:
         with self._lock:
@@ -65,13 +80,28 @@ class MotionInbox:
                 self._drop(self._resets)
             return was_empty
 
+    def put_request(self, request: ControlRequest, over: bool, now: float) -> bool:
+        with self._lock:
+            was_empty = self._empty
+            sender = request.by, request.id
+            waiting = self._requests.pop(sender, None)
+            if len(self._requests) >= _REQUESTS:
+                known = [key for key, one in self._requests.items() if not self._control.knows(one.request)]
+                del self._requests[known[0]]
+                self.dropped += 1
+            over = not request.ends() and (over or (waiting is not None and waiting.over))
+            self._requests[sender] = ReceivedRequest(request, over, now)
+            return was_empty
+
     def put_drive(self, drive: Drive, now: float) -> bool:
         with self._lock:
-            was_empty = not (self._drives or self._stops or self._resets)
+            was_empty = not (self._drives or self._stops or self._resets or self._requests)
             sender = run_of(drive)
+            if drive.key and sender == PERSON and self._control.holds(drive):
+                sender = _HOLDER
             waiting = self._drives.pop(sender, None)
             if len(self._drives) >= _SENDERS:
-                del self._drives[next(key for key in self._drives if key != PERSON)]
+                del self._drives[next(key for key in self._drives if key not in (PERSON, _HOLDER))]
                 self.dropped += 1
             newest = ReceivedDrive(drive, now)
             self._drives[sender] = [newest] if waiting is None else _replaced(waiting, newest)
@@ -80,13 +110,14 @@ class MotionInbox:
     def take(self) -> Batch:
         """Return all that waits, and forget it."""
         with self._lock:
-            batch = Batch(self._stops, self._resets, list(chain.from_iterable(self._drives.values())))
-            self._stops, self._resets, self._drives = [], [], {}
+            drives = list(chain.from_iterable(self._drives.values()))
+            batch = Batch(self._stops, self._resets, list(self._requests.values()), drives)
+            self._stops, self._resets, self._requests, self._drives = [], [], {}, {}
             return batch
 
     @property
     def _empty(self) -> bool:
-        return not (self._stops or self._resets or self._drives)
+        return not (self._stops or self._resets or self._requests or self._drives)
 
     def _drop(self, waiting: list[EstopCommand] | list[ReceivedReset]) -> None:
         del waiting[0]

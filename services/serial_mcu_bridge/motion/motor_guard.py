@@ -4,7 +4,6 @@ import logging
 import operator
 import secrets
 import time
-from collections import deque
 from collections.abc import Callable
 from typing import Any
 
@@ -14,14 +13,15 @@ from pebble.contract.payloads import LAST_RUN, Drive, EstopCommand, EstopReset, 
 from pebble.motion.arbiter import HOLD_MS, PERSON, REFUSED, Arbiter, newer
 from pebble.motion.latch import Latch, stop_of
 from pebble.runtime.rate_limit import RateLimitedLog
+from pebble.services.serial_mcu_bridge.motion.control import Control, sender
 from pebble.services.serial_mcu_bridge.motion.motion_inbox import run_of
+from pebble.services.serial_mcu_bridge.motion.paced import Paced
 from pebble.services.serial_mcu_bridge.motion.state_file import StateFile
 from pebble.transports.counters import Counters
 
 log = logging.getLogger(__name__)
 
 NAMES = 8  # names of stops that are remembered
-_STATES_PER_S = 4
 _REPEAT_S = 0.25  # a repetition that comes sooner after a state was sent before that arrived: it needs no answer
 _HOLD_S = HOLD_MS / 1000 + 0.01  # the arbiter counts whole milliseconds
 
@@ -47,17 +47,17 @@ class MotorGuard:
         barred_file: StateFile,
         publish: Callable[[EstopState], object],
         counters: Counters,
+        control: Control,
         *,
         watchdog_s: float,
         now: float,
     ) -> None:
-        self._file, self._barred_file, self._publish, self._counters = file, barred_file, publish, counters
-        self._latch = Latch(secrets.token_hex(4), NAMES, operator.sub)
-        self._arbiter = Arbiter(self._latch, _ms(now), operator.sub, round(1000 * watchdog_s))
+        self._file, self._barred_file, self._counters, self._control = file, barred_file, counters, control
+        self._state = Paced(lambda: publish(self.state()))
+        self._latch = Latch(control.boot, NAMES, operator.sub)
+        self._arbiter = Arbiter(self._latch, control.lease, _ms(now), operator.sub, round(1000 * watchdog_s))
         self._saving = self._saved = 0  # numbers of writes: the newest one, and the newest one that succeeded
-        self._publish_at: float | None = None  # when a state is published that could not be before
         self._hold_until: float | None = None  # of the person who commanded last
-        self._published = deque([float("-inf")] * _STATES_PER_S, maxlen=_STATES_PER_S)
         self._barred = 0  # as noted last
         self._log = RateLimitedLog(log, burst=5)
         self._can_save = False
@@ -77,7 +77,7 @@ class MotorGuard:
             self._barred = barred
         if self.latched:
             self._log.log("stop", logging.WARNING, "still stopped by %s", _described(self._latch.by, self._latch.why))
-        self._changed(now)
+        self._state.changed(now)
 
     @property
     def latched(self) -> bool:
@@ -95,9 +95,9 @@ class MotorGuard:
         if self._arbiter.stop(name, by, why, time.time_ns() // 1_000_000):
             self._log.log("stop", logging.WARNING, "emergency stop by %s", _described(by, why))
             self._save()
-            self._changed(now)
-        elif now >= self._published[-1] + _REPEAT_S:
-            self._changed(now)
+            self._state.changed(now)
+        elif now >= self._state.last + _REPEAT_S:
+            self._state.changed(now)
 
     def reset(self, reset: EstopReset, age_s: float, now: float) -> None:
         if self._latch.reset(reset.boot, reset.count, _ms(age_s), _ms(now)):
@@ -106,20 +106,22 @@ class MotorGuard:
         elif self._latch.reset_refused:
             why = _REFUSED_RESETS[self._latch.reset_refused]
             self._log.log("refused", logging.WARNING, "refused a reset: %s", why)
-        self._changed(now)
+        self._state.changed(now)
 
     def judge(self, drive: Drive, now: float) -> float | None:
         """Seconds from now for which this command moves the motors, 0: it stops them; None: it has no effect."""
         valid_ms = drive.valid_ms if isinstance(drive.valid_ms, int) else -1
         run = run_of(drive)
-        limit: int = self._arbiter.judge(drive.moves, run, valid_ms, _ms(now))
+        key = drive.key if isinstance(drive.key, str) else ""
+        limit: int = self._arbiter.judge(drive.moves, run, valid_ms, _ms(now), key, sender(drive))
         if self._arbiter.barred != self._barred:
             self._note_barred(now)
         if limit == REFUSED:
-            reason = "latched" if self.latched else "overruled"
+            strange = self._control.lease.refuses(drive.moves, run != PERSON, key, sender(drive), _ms(now))
+            reason = "stranger" if strange else "latched" if self.latched else "overruled"
             self._counters.add(reason)
             if drive.moves or run == PERSON:  # a script's zero is only to bar older runs, which the arbiter has done
-                self._log.warning(reason, "refused a drive command: %s", self._why_refused(run))
+                self._log.warning(reason, "refused a drive command: %s", self._why_refused(run, key, strange))
             return None
         if run == PERSON:
             self._hold_until = now + _HOLD_S
@@ -128,9 +130,7 @@ class MotorGuard:
     @property
     def due(self) -> float | None:
         """When :meth:`tick` has something to do; None: nothing."""
-        if self._publish_at is None or self._hold_until is None:
-            return self._hold_until if self._publish_at is None else self._publish_at
-        return min(self._publish_at, self._hold_until)
+        return min((at for at in (self._state.due, self._hold_until) if at is not None), default=None)
 
     def tick(self, now: float) -> None:
         """Let a person's hold end, and publish a state that had to wait."""
@@ -139,15 +139,14 @@ class MotorGuard:
             self._arbiter.tick(_ms(now))
             if self._arbiter.barred != self._barred:
                 self._note_barred(now)
-        if self._publish_at is not None and now >= self._publish_at:
-            self._publish_state(now)
+        self._state.tick(now)
 
     def on_saved(self, number: int, succeeded: bool, now: float) -> None:
         """A write has ended."""
         if succeeded:
             self._saved = number
         if number == self._saving:
-            self._changed(now)
+            self._state.changed(now)
 
     def save_again(self) -> None:
         """Repeat a write that failed, or whose file was removed since; one that takes long is not repeated."""
@@ -175,26 +174,15 @@ class MotorGuard:
 
     def repeat_state(self, now: float) -> None:
         """Publish the state again: a broker that was restored from an older save retains an older one."""
-        self._changed(now)
+        self._state.changed(now)
 
     def state(self) -> EstopState:
         fields: dict[str, Any] = self._latch.state(self.persisted)
         return EstopState(**fields, barred=self._barred or UNSET)
 
-    def _changed(self, now: float) -> None:
-        """Publish the state, now or as soon as the rate allows."""
-        allowed_at = self._published[0] + 1.0
-        if now >= allowed_at:
-            self._publish_state(now)
-        else:
-            self._publish_at = allowed_at
-
-    def _publish_state(self, now: float) -> None:
-        self._publish_at = None
-        self._published.append(now)
-        self._publish(self.state())
-
-    def _why_refused(self, run: int) -> str:
+    def _why_refused(self, run: int, key: str, strange: bool) -> str:
+        if strange:
+            return "its key of control is not the one of now" if key else "only who has control may drive"
         if self.latched:
             return "the robot is stopped"
         if run == PERSON:
@@ -206,7 +194,7 @@ class MotorGuard:
     def _note_barred(self, now: float) -> None:
         self._barred = self._arbiter.barred
         self._barred_file.save(self._barred)
-        self._changed(now)
+        self._state.changed(now)
 
     def _save(self) -> None:
         if self._can_save:

@@ -9,6 +9,8 @@ from pebble import contract as c
 from pebble.contract.payloads import (
     ChargingLevel,
     ChargingStatus,
+    ControlRequest,
+    ControlState,
     Drive,
     EstopCommand,
     EstopReset,
@@ -23,7 +25,8 @@ from pebble.runtime.lines import LineSplitter
 from pebble.runtime.service import WAIT_LIMIT_S, every, on
 from pebble.runtime.timers import Timer
 from pebble.services.serial_mcu_bridge.line.serial_line import LineState
-from pebble.services.serial_mcu_bridge.motion.motion_inbox import MotionInbox, ReceivedDrive
+from pebble.services.serial_mcu_bridge.motion.control import Control
+from pebble.services.serial_mcu_bridge.motion.motion_inbox import MotionInbox, ReceivedDrive, ReceivedRequest
 from pebble.services.serial_mcu_bridge.motion.motor_guard import MotorGuard
 from pebble.services.serial_mcu_bridge.motion.state_file import StateFile
 from pebble.services.serial_mcu_bridge.serial_service import SerialService
@@ -57,7 +60,7 @@ class MotorBridge(SerialService):
     A bridge of another text protocol sets ``protocol`` and ``stop_line``.
     """
 
-    publishes = (c.ESTOP_STATE, c.TOUCH_SENSORS, c.CHARGING_STATUS, c.CHARGING_LEVEL)
+    publishes = (c.ESTOP_STATE, c.CONTROL_STATE, c.TOUCH_SENSORS, c.CHARGING_STATUS, c.CHARGING_LEVEL)
     protocol: ClassVar[MotorProtocol] = goob_base
     stop_line = goob_base.STOP
 
@@ -65,7 +68,8 @@ class MotorBridge(SerialService):
         super().__init__(*arguments, **options)
         self._publishes_touch = self.options.telemetry.publish_touch_sensors
         self._owner = self.config.motor_owner(self.instance)
-        self._waiting = MotionInbox()
+        self._control = Control(self.config.security, self._publish_control, self.clock())
+        self._waiting = MotionInbox(self._control)
         self.state_file = StateFile(self.config.state_file(f"estop-{self._owner}"), self._on_saved)
         self._barred_file = StateFile(self.config.run_dir() / f"barred-{self._owner}.json")
         self._guard = MotorGuard(
@@ -73,12 +77,14 @@ class MotorBridge(SerialService):
             self._barred_file,
             self._publish_state,
             self.counters,
+            self._control,
             watchdog_s=self.options.safety.drive_timeout_seconds,
             now=self.clock(),
         )
         self._deadline: Timer | None = None  # stops the motors unless a command arrives; None: they are stopped
         self._guard_timer: Timer | None = None
         self.announced = self._notified = True  # that it latches: to operators, and to the launcher
+        self._lacks_control = False  # as the launcher knows it
         self._charging: ChargingStatus | None = None
         self._hall = self._make_hall_memory()
         self._splitter = LineSplitter()
@@ -93,6 +99,7 @@ class MotorBridge(SerialService):
         if self._hall is not None:
             self.on_stop(self._hall.close)
         self._guard.begin(self.clock())
+        self._control.note(self.clock())
         super().start()
 
     # -- on the transport's threads; the stop is subscribed to before the drive commands
@@ -104,6 +111,14 @@ class MotorBridge(SerialService):
     @on(c.ESTOP_RESET, direct=True)
     def receive_reset(self, reset: EstopReset, arrived: float) -> None:
         self._judge_soon(self._waiting.put_reset(reset, arrived))
+
+    @on(c.CONTROL, direct=True)
+    def receive_request(self, request: ControlRequest, arrived: float) -> None:
+        self._judge_soon(self._waiting.put_request(request, False, arrived))
+
+    @on(c.CONTROL_TAKE, direct=True)
+    def receive_take(self, request: ControlRequest, arrived: float) -> None:
+        self._judge_soon(self._waiting.put_request(request, True, arrived))
 
     @on(c.DRIVE, direct=True)
     def receive_drive(self, drive: Drive, arrived: float) -> None:
@@ -128,6 +143,8 @@ class MotorBridge(SerialService):
                 self._guard.judge(_FINAL_ZERO, self.clock())
         for waiting in batch.resets:
             self._guard.reset(waiting.reset, self.clock() - waiting.at, self.clock())
+        for request in batch.requests:
+            self._answer(request)
         for received in batch.drives:
             if latches or not (batch.stops and received.drive.moves):
                 self._drive(received)
@@ -148,6 +165,8 @@ class MotorBridge(SerialService):
             self.count_late(c.DRIVE)
             return
         valid_s = self._guard.judge(drive, now)
+        if self._control.note(now):
+            self._halt()
         if valid_s is None:
             return
         if self._deadline is not None and now >= self._deadline.due:
@@ -158,6 +177,15 @@ class MotorBridge(SerialService):
             return
         self.line.drive(self.protocol.drive_line(*self.protocol.mix(drive.x, drive.z)), valid_s)
         self._set_deadline(now + valid_s)
+
+    def _answer(self, received: ReceivedRequest) -> None:
+        now = self.clock()
+        if now - received.at > c.CONTROL.waits_s and not received.request.ends():
+            self.count_late(c.CONTROL)
+            return
+        self._control.request(received.request, received.over, now)
+        if self._control.note(now):
+            self._halt()
 
     def _halt(self) -> None:
         self._set_deadline(None)
@@ -189,6 +217,9 @@ class MotorBridge(SerialService):
         if self._latches is not self.announced:
             self.announced = self._latches
             self._announce()
+        lacks_control = self.refused(c.CONTROL)
+        if lacks_control is not self._lacks_control and self.notifier.lacks("control", lacks_control):
+            self._lacks_control = lacks_control
         if self._notified is not self.announced and self.notifier.lacks("estop", not self.announced):
             self._notified = self.announced
 
@@ -211,7 +242,7 @@ class MotorBridge(SerialService):
     # -- the guard
 
     def _arm_guard(self) -> None:
-        due = self._guard.due
+        due = min((at for at in (self._guard.due, self._control.due) if at is not None), default=None)
         if due is None or (self._guard_timer is not None and self._guard_timer.due <= due):
             return
         if self._guard_timer is not None:
@@ -221,6 +252,9 @@ class MotorBridge(SerialService):
     def _tick_guard(self) -> None:
         self._guard_timer = None
         self._guard.tick(self.clock())
+        self._control.tick(self.clock())
+        if self._control.note(self.clock()):
+            self._halt()
         self._arm_guard()
 
     @every(_SAVE_AGAIN_S)
@@ -234,6 +268,7 @@ class MotorBridge(SerialService):
     @every(_REPEAT_S)
     def repeat_state(self) -> None:
         self._guard.repeat_state(self.clock())
+        self._control.repeat_state(self.clock())
         self._arm_guard()
 
     def _publish_state(self, state: EstopState) -> None:
@@ -242,6 +277,9 @@ class MotorBridge(SerialService):
             self.publish(c.ESTOP_STATE, state, owner=self._owner)
         else:
             self.clear(c.ESTOP_STATE, owner=self._owner)
+
+    def _publish_control(self, state: ControlState) -> None:
+        self.publish(c.CONTROL_STATE, state, owner=self._owner)
 
     def _on_saved(self, number: int, succeeded: bool) -> None:
         """On the file's thread."""

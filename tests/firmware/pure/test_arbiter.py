@@ -2,6 +2,7 @@
 
 from common.arbiter import PERSON, REFUSED, UNKNOWN_RUN, Arbiter
 from common.latch import Latch
+from common.lease import Lease
 from common.ticks import diff
 
 READY = 2000  # scripts are refused until then
@@ -9,7 +10,7 @@ NAME = "00000000000000aa"
 
 
 def arbiter(now: int = 0) -> Arbiter:
-    return Arbiter(Latch("0badcafe", 4, diff), now, diff, 900)
+    return Arbiter(Latch("0badcafe", 4, diff), Lease(now, diff, str), now, diff, 900)
 
 
 def test_a_person_moves_at_once_and_for_as_long_as_it_asks_but_no_longer_than_the_watchdog() -> None:

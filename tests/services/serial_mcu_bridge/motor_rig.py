@@ -27,12 +27,15 @@ class Bench:
     service: MotorBridge
     running: Running
 
-    def __init__(self, folder: Path, kind: str, *, broker: Broker | None = None, **section: Any) -> None:
+    def __init__(
+        self, folder: Path, kind: str, *, broker: Broker | None = None, security: Any = None, **section: Any
+    ) -> None:
         self.mcu = PtyMcu(kind, folder / "tty")
         self.mcu.__enter__()
         serial = {"enabled": True, "serial": {"port": str(folder / "tty")}, **section}
         transport = {"kind": "mqtt", "state_dir": str(folder / "state"), "run_dir": str(folder / "run")}
         raw = {"robot": {"id": ROBOT}, "transport": transport, "services": {"serial_mcu_bridge": serial}}
+        raw |= {"security": security or {}}
         config = parse(raw, folder=folder, env={})
         settings = MemoryHub() if broker is None else MqttSettings(host="127.0.0.1", port=broker.port)
         network = "memory" if broker is None else "mqtt"

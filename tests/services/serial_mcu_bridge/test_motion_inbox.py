@@ -1,13 +1,31 @@
-"""The inbox before the motors: the newest command of each sender, and every zero."""
+"""The inbox before the motors: the newest command and request of each sender, and every zero."""
 
 import random
 
 import pytest
 
-from pebble.contract.payloads import Drive, EstopCommand, EstopReset
+from pebble.config import Security
+from pebble.contract.payloads import ControlRequest, Drive, EstopCommand, EstopReset
+from pebble.services.serial_mcu_bridge.motion.control import Control
 from pebble.services.serial_mcu_bridge.motion.motion_inbox import MotionInbox
 
 NAMES = [f"{number:016x}" for number in range(20)]
+
+
+ANN, OTTO = ControlRequest(id="aaaaaaaa", by="ann", for_ms=10_000), ControlRequest(id="00000001", by="otto")
+RELEASE = ControlRequest(id="aaaaaaaa", by="ann", want="release")
+
+
+def control() -> Control:
+    """Of an owner of which ann has control, and otto asks for it."""
+    made = Control(Security(), lambda _state: None, 0.0)
+    for request in (ANN, OTTO):
+        made.request(request, over=False, now=0.0)
+    return made
+
+
+def empty() -> MotionInbox:
+    return MotionInbox(control())
 
 
 def script(run: int, z: float = 0.5) -> Drive:
@@ -35,7 +53,7 @@ WAITING = {
 
 @pytest.mark.parametrize(("arrived", "waiting"), WAITING.values(), ids=WAITING)
 def test_what_waits(arrived: list[Drive], waiting: list[Drive]) -> None:
-    inbox = MotionInbox()
+    inbox = empty()
     for drive in arrived:
         inbox.put_drive(drive, 0.0)
     assert drives(inbox) == waiting
@@ -43,7 +61,7 @@ def test_what_waits(arrived: list[Drive], waiting: list[Drive]) -> None:
 
 
 def test_any_number_of_runs_never_displaces_the_person() -> None:
-    inbox = MotionInbox()
+    inbox = empty()
     inbox.put_drive(Drive(), 0.0)
     for run in range(1, 1000):
         inbox.put_drive(script(run), 0.0)
@@ -56,7 +74,7 @@ def test_any_number_of_runs_never_displaces_the_person() -> None:
 def test_a_zero_of_every_sender_is_always_there_whatever_follows() -> None:
     for seed in range(300):
         chance = random.Random(seed)
-        inbox, zeros = MotionInbox(), set()
+        inbox, zeros = empty(), set()
         for _ in range(chance.randrange(1, 30)):
             run, z = chance.randrange(4), chance.choice((0.0, 0.0, 1.0))
             inbox.put_drive(script(run, z) if run else Drive(z=z), 0.0)
@@ -67,7 +85,7 @@ def test_a_zero_of_every_sender_is_always_there_whatever_follows() -> None:
 
 
 def test_stops_have_one_place_per_name_and_are_bounded() -> None:
-    inbox = MotionInbox()
+    inbox = empty()
     assert inbox.put_stop(EstopCommand(stop=NAMES[0]))
     for name in NAMES:
         assert not inbox.put_stop(EstopCommand(stop=name))
@@ -76,7 +94,7 @@ def test_stops_have_one_place_per_name_and_are_bounded() -> None:
 
 
 def test_the_first_put_after_a_take_is_marked() -> None:
-    inbox = MotionInbox()
+    inbox = empty()
     assert inbox.put_drive(Drive(), 0.0)
     assert not inbox.put_reset(EstopReset(boot="a", count=1), 0.0)
     assert not inbox.put_stop(EstopCommand())
@@ -86,3 +104,42 @@ def test_the_first_put_after_a_take_is_marked() -> None:
         inbox.put_reset(EstopReset(boot="a", count=1), 0.0)
     assert len(inbox.take().resets) == 8
     assert inbox.put_stop(EstopCommand())
+
+
+def test_strangers_displace_nothing_of_who_has_control_or_asks_for_it() -> None:
+    owner = control()
+    inbox, held = MotionInbox(owner), Drive(z=1, key=owner.lease.key)
+    inbox.put_drive(Drive(key=owner.lease.key), 0.0)
+    for request in (ANN, OTTO):
+        inbox.put_request(request, False, 0.0)
+    inbox.put_drive(held, 0.0)
+    for number in range(1000):
+        inbox.put_drive(Drive(z=-1), 0.0)
+        inbox.put_drive(Drive(z=-1, key=f"{number:08x}"), 0.0)
+        inbox.put_drive(script(number + 1), 0.0)
+        inbox.put_request(ControlRequest(id=f"f{number:07x}"), number % 2 == 0, 0.0)
+    batch = inbox.take()
+    assert [received.drive for received in batch.drives][:2] == [Drive(key=owner.lease.key), held]
+    assert [received.drive for received in batch.drives if not received.drive.signed][2:] == [
+        Drive(z=-1, key="000003e7")
+    ]
+    assert [received.request for received in batch.requests][:2] == [ANN, OTTO]
+    assert len(batch.requests) == 8
+
+
+#: What one client sends, and what waits then: whether it is a release, and whether it takes control over.
+REQUESTS = {
+    "the newest": ([(ANN, False), (ANN, False)], [(False, False)]),
+    "a take that is repeated as a request": ([(ANN, True), (ANN, False)], [(False, True)]),
+    "a release after it": ([(ANN, True), (RELEASE, False)], [(True, False)]),
+    "a request after a release": ([(RELEASE, False), (ANN, False)], [(False, False)]),
+    "no release takes over": ([(RELEASE, True)], [(True, False)]),
+}
+
+
+@pytest.mark.parametrize(("arrived", "waiting"), REQUESTS.values(), ids=REQUESTS)
+def test_which_request_waits(arrived: list[tuple[ControlRequest, bool]], waiting: list[tuple[bool, bool]]) -> None:
+    inbox = empty()
+    for request, over in arrived:
+        inbox.put_request(request, over, 0.0)
+    assert [(one.request.ends(), one.over) for one in inbox.take().requests] == waiting

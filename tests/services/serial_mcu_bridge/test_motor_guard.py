@@ -12,7 +12,9 @@ import msgspec
 import pytest
 from msgspec import structs
 
+from pebble.config import Security
 from pebble.contract.payloads import Drive, EstopCommand, EstopReset, EstopState
+from pebble.services.serial_mcu_bridge.motion.control import Control
 from pebble.services.serial_mcu_bridge.motion.motor_guard import MotorGuard
 from pebble.services.serial_mcu_bridge.motion.state_file import StateFile
 from pebble.transports.counters import Counters
@@ -32,8 +34,9 @@ class Rig:
         self._results: list[tuple[int, bool]] = []
         self.file = StateFile(path, lambda number, succeeded: self._results.append((number, succeeded)))
         self.barred_file = StateFile(path.with_name("barred.json"))
+        control = Control(Security(), lambda _state: None, self.now)
         self.guard = MotorGuard(
-            self.file, self.barred_file, self.states.append, self.counters, watchdog_s=0.75, now=self.now
+            self.file, self.barred_file, self.states.append, self.counters, control, watchdog_s=0.75, now=self.now
         )
         self.guard.begin(self.now)
 

@@ -1,0 +1,91 @@
+"""Who has control of a Linux robot's motor owner: it answers requests, and publishes its state."""
+
+import logging
+import operator
+import secrets
+from collections.abc import Callable
+
+from msgspec import UNSET
+
+from pebble.config import Security
+from pebble.contract.payloads import ControlRequest, ControlState, Drive
+from pebble.motion.lease import Lease
+from pebble.runtime.rate_limit import RateLimitedLog
+from pebble.services.serial_mcu_bridge.motion.paced import Paced
+
+log = logging.getLogger(__name__)
+
+_TICK_S = 0.25  # while somebody has control, or others drive: what is over ends so late at most
+
+
+class Control:
+    """The lease of one motor owner, with a clock in seconds; on the service's thread.
+
+    ``publish(state)`` is called with each new state. Nothing is saved: after a restart nobody has control.
+    """
+
+    def __init__(self, security: Security, publish: Callable[[ControlState], object], now: float) -> None:
+        self.boot = secrets.token_hex(4)  # of this life of the motor owner
+        self.lease = Lease(_ms(now), operator.sub, lambda: secrets.token_hex(4), security.unnamed, security.named)
+        self._state = Paced(lambda: publish(self.state()))
+        self._log = RateLimitedLog(log, burst=5)
+        self._next: float | None = None  # the next tick
+
+    def state(self) -> ControlState:
+        return ControlState(**self.lease.state(self.boot))
+
+    def holds(self, drive: Drive) -> bool:
+        """Whether this command is from who has control. Any thread may ask."""
+        return isinstance(drive.key, str) and self.lease.holds(drive.key, sender(drive))
+
+    def knows(self, request: ControlRequest) -> bool:
+        """Whether this one has control, or is the first who asks for it. Any thread may ask."""
+        who = request.by, request.id
+        return who in (self.lease.holder[:2], self.lease.asker[:2])
+
+    def request(self, request: ControlRequest, over: bool, now: float) -> None:
+        """Requests and releases; ``over``: without asking."""
+        who = request.by, request.id, request.device
+        if request.ends():
+            self.lease.release(who, _ms(now))
+        else:
+            self.lease.hold(who, int(request.for_ms), over, _ms(now))
+
+    def note(self, now: float) -> bool:
+        """Publish what has changed; True: control has passed on, so halt the motors first."""
+        lease = self.lease
+        if lease.changed:
+            lease.changed = False
+            self._state.changed(now)
+        if self._next is None and (lease.key or lease.others):
+            self._next = now + _TICK_S
+        halts, lease.halts = lease.halts, False
+        if halts:
+            by, _, device = lease.holder
+            shown = f"{by or 'somebody without a name'}{f' ({device})' if device else ''}" if lease.key else "nobody"
+            self._log.log("control", logging.INFO, "%s has control", shown)
+        return halts
+
+    @property
+    def due(self) -> float | None:
+        """When :meth:`tick` has something to do; None: nothing."""
+        return min((at for at in (self._next, self._state.due) if at is not None), default=None)
+
+    def tick(self, now: float) -> None:
+        """Let what is over end; then :meth:`note`."""
+        if self._next is not None and now >= self._next:
+            self._next = None
+            self.lease.tick(_ms(now))
+        self._state.tick(now)
+
+    def repeat_state(self, now: float) -> None:
+        self._state.changed(now)
+
+
+def sender(drive: Drive) -> str:
+    """The account of a command from elsewhere; "" of a program of the robot, and where names are not checked."""
+    return "" if drive.by is UNSET else str(drive.by)
+
+
+def _ms(seconds: float) -> int:
+    return int(1000 * seconds)

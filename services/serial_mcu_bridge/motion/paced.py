@@ -1,0 +1,34 @@
+"""Publishes a state when it has changed, and not more often than its topic may."""
+
+from collections import deque
+from collections.abc import Callable
+
+STATES_PER_S = 4
+
+
+class Paced:
+    """Calls ``publish()`` at each change, or as soon as the rate allows: at most four times a second."""
+
+    def __init__(self, publish: Callable[[], object]) -> None:
+        self._publish = publish
+        self._published = deque([float("-inf")] * STATES_PER_S, maxlen=STATES_PER_S)
+        self.due: float | None = None  # when a state is published that could not be before
+
+    @property
+    def last(self) -> float:
+        """When the newest state was published."""
+        return self._published[-1]
+
+    def changed(self, now: float) -> None:
+        allowed_at = self._published[0] + 1.0
+        if now < allowed_at:
+            self.due = allowed_at
+        else:
+            self.due = None
+            self._published.append(now)
+            self._publish()
+
+    def tick(self, now: float) -> None:
+        """Publish what had to wait; to be called at :attr:`due`."""
+        if self.due is not None and now >= self.due:
+            self.changed(now)

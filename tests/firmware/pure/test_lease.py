@@ -1,0 +1,255 @@
+"""Who has control: the table of states, one row each, and what a drive command with or without a key may do."""
+
+from common.arbiter import PERSON, REFUSED, Arbiter
+from common.latch import Latch
+from common.lease import BY, DRIVE, FREE, REFUSE, Lease, shown
+from common.ticks import add, diff
+
+NAME = "00000000000000aa"
+ANN, OTTO, MIA = ("ann", "aaaaaaaa", "phone"), ("otto", "00000001", "laptop"), ("mia", "00000002", "")
+WRAPS = (1 << 30) - 4000  # of a board's clock, within each test
+
+
+class Keys:
+    made = 0
+
+    def __call__(self) -> str:
+        self.made += 1
+        return f"{self.made:08x}"
+
+
+def lease(strangers: str = DRIVE, named: bool = False, now: int = WRAPS) -> Lease:
+    return Lease(now, diff, Keys(), strangers, named)
+
+
+def after(ms: int) -> int:
+    return add(WRAPS, ms)
+
+
+def perform(own: Lease, event: tuple) -> None:
+    at, what, who = event[:3]
+    now = after(at)
+    if what == "hold" or what == "take":
+        own.hold(who, event[3] if len(event) > 3 else 3000, what == "take", now)
+    elif what == "release":
+        own.release(who, now)
+    elif what == "tick":
+        own.tick(now)
+    else:
+        own.tick(now)
+        assert not own.refuses(what == "moves", False, own.key, who[0], now)
+        if what == "moves":
+            own.moved(own.key, now)
+
+
+#: What happens, as (milliseconds, event, who); who has control then, who asks for it, and how many keys there were.
+HISTORIES = (
+    ((), "", "", 0),
+    (((0, "hold", ANN),), "ann", "", 1),
+    (((0, "take", ANN),), "ann", "", 1),
+    (((0, "hold", ANN), (2999, "tick", ANN)), "ann", "", 1),
+    (((0, "hold", ANN), (3000, "tick", ANN)), "", "", 1),
+    (((0, "hold", ANN), (2999, "hold", ANN), (5998, "tick", ANN)), "ann", "", 1),
+    (((0, "hold", ANN), (2999, "moves", ANN), (5998, "tick", ANN)), "ann", "", 1),
+    (((0, "hold", ANN), (2999, "zero", ANN), (5998, "tick", ANN)), "ann", "", 1),
+    (((0, "hold", ANN, 0), (999, "tick", ANN)), "ann", "", 1),
+    (((0, "hold", ANN, 0), (1000, "tick", ANN)), "", "", 1),
+    (((0, "hold", ANN, 99999), (9999, "tick", ANN)), "ann", "", 1),
+    (((0, "hold", ANN, 99999), (10000, "tick", ANN)), "", "", 1),
+    (((0, "hold", ANN), (3000, "hold", ANN)), "ann", "", 2),  # it came too late, and the old key is void
+    (((0, "hold", ANN), (10, "hold", OTTO)), "ann", "otto", 1),
+    (((0, "hold", ANN), (10, "hold", OTTO), (20, "hold", MIA)), "ann", "otto", 1),
+    (((0, "hold", ANN, 9999), (10, "hold", OTTO), (3010, "hold", MIA)), "ann", "mia", 1),  # otto has not repeated it
+    (((0, "hold", ANN, 9999), (10, "hold", OTTO), (3009, "hold", OTTO), (3010, "hold", MIA)), "ann", "otto", 1),
+    (((0, "hold", ANN, 9999), (10, "hold", OTTO), (20, "release", OTTO)), "ann", "", 1),
+    (((0, "hold", ANN, 9999), (10, "hold", OTTO), (20, "release", MIA)), "ann", "otto", 1),
+    (((0, "hold", ANN, 9999), (4999, "hold", OTTO)), "ann", "otto", 1),
+    (((0, "hold", ANN, 9999), (5000, "hold", OTTO)), "otto", "", 2),
+    (((0, "hold", ANN, 9999), (4000, "moves", ANN), (8999, "hold", OTTO)), "ann", "otto", 1),
+    (((0, "hold", ANN, 9999), (4000, "zero", ANN), (5000, "hold", OTTO)), "otto", "", 2),
+    (((0, "hold", ANN, 9999), (4000, "hold", OTTO), (5000, "tick", ANN)), "otto", "", 2),
+    (((0, "hold", ANN, 9999), (4000, "hold", OTTO), (5000, "hold", MIA)), "otto", "mia", 2),  # otto was first
+    (((0, "hold", ANN), (10, "take", OTTO)), "otto", "", 2),
+    (((0, "hold", ANN), (10, "hold", OTTO), (20, "take", MIA)), "mia", "", 2),
+    (((0, "hold", ANN), (10, "take", ANN)), "ann", "", 1),
+    (((0, "hold", ANN), (10, "release", ANN)), "", "", 1),
+    (((0, "hold", ANN), (10, "release", OTTO)), "ann", "", 1),
+    (((0, "hold", ANN), (10, "hold", OTTO), (20, "release", ANN)), "otto", "", 2),
+    (((0, "hold", ANN), (10, "hold", OTTO), (2990, "hold", OTTO), (3000, "tick", ANN)), "otto", "", 2),
+    (((0, "hold", ANN), (10, "hold", OTTO, 9999), (3000, "tick", ANN), (12998, "tick", ANN)), "otto", "", 2),
+    (((0, "release", ANN),), "", "", 0),
+)
+
+
+def test_the_table_of_states() -> None:
+    for events, by, asks, keys in HISTORIES:
+        random = Keys()
+        own = Lease(WRAPS, diff, random)
+        for event in events:
+            perform(own, event)
+        state = own.state("0badcafe")
+        assert (state["by"], state["asks"], random.made) == (by, asks, keys), events
+        assert (state["key"] != "") == (by != ""), events
+        assert state["boot"] == "0badcafe"
+
+
+def test_a_state_changes_and_the_motors_are_halted_only_where_something_changes() -> None:
+    for events, changed, halts in (
+        (((0, "hold", ANN),), True, True),
+        (((0, "hold", ANN), (9, "hold", ANN)), False, False),
+        (((0, "hold", ANN), (9, "moves", ANN)), False, False),
+        (((0, "hold", ANN), (9, "hold", OTTO)), True, False),
+        (((0, "hold", ANN), (9, "hold", OTTO), (19, "hold", OTTO)), False, False),
+        (((0, "hold", ANN), (9, "hold", OTTO), (19, "hold", MIA)), False, False),
+        (((0, "hold", ANN), (9, "take", OTTO)), True, True),
+        (((0, "hold", ANN), (9, "release", ANN)), True, True),
+        (((0, "hold", ANN), (9, "release", OTTO)), False, False),
+        (((0, "hold", ANN), (3000, "tick", ANN)), True, True),
+    ):
+        own = lease()
+        assert own.changed  # the first state is to be published
+        assert not own.halts
+        for event in events:
+            own.changed = own.halts = False
+            perform(own, event)
+        assert (own.changed, own.halts) == (changed, halts), events
+
+
+def test_clocks_that_wrap_make_nobody_busy_or_idle() -> None:
+    half = 1 << 29  # a board's clock measures no longer times
+    own = lease()
+    perform(own, (0, "hold", ANN, 9999))
+    for turn in range(1, 400):
+        perform(own, (turn * half // 100, "tick", ANN))
+    assert own.key == ""
+    perform(own, (4 * half, "hold", OTTO))
+    perform(own, (4 * half + 10, "hold", MIA))
+    assert own.state("")["by"] == "otto"
+
+
+def test_only_the_key_of_now_moves_and_a_zero_needs_none() -> None:
+    for strangers, free, held in ((DRIVE, True, True), (FREE, True, False), (REFUSE, False, False)):
+        own = lease(strangers)
+        assert own.refuses(True, False, "", "", WRAPS) is not free
+        assert own.refuses(True, False, "00000001", "", WRAPS)  # nobody has it yet
+        own.hold(ANN, 3000, False, WRAPS)
+        old = own.key
+        assert own.refuses(True, False, "", "", WRAPS) is not held
+        own.hold(OTTO, 3000, True, WRAPS)
+        for key in (old, "", "x", "00000003"):
+            assert not own.refuses(False, False, key, "", WRAPS)
+            assert own.refuses(True, False, key, "", WRAPS) is (key != "" or not held)
+        assert not own.refuses(True, False, own.key, "mia", WRAPS)  # below the level of names nobody vouches for them
+
+
+def test_a_command_for_several_owners_has_the_key_of_each() -> None:
+    own = lease()
+    own.hold(ANN, 3000, False, WRAPS)
+    for keys, right in ((f"ffffffff {own.key}", True), (f"{own.key} ffffffff", True), (f"{own.key},", False),
+                        (own.key[1:], False), (own.key + "0", False), (" ".join([own.key] * 10), False)):  # fmt: skip
+        assert own.holds(keys, "") is right, keys
+    own.release(ANN, WRAPS)
+    assert not own.holds("", "")
+    assert not own.holds(" ", "")
+
+
+def test_scripts_need_no_key_but_no_wrong_one_either() -> None:
+    own = lease(REFUSE)
+    assert not own.refuses(True, True, "", "", WRAPS)
+    assert own.refuses(True, True, "00000001", "", WRAPS)
+    own.hold(ANN, 3000, False, WRAPS)
+    assert not own.refuses(True, True, "", "", WRAPS)
+    assert not own.refuses(True, True, own.key, "", WRAPS)
+
+
+def test_with_names_the_account_counts_and_programs_of_the_robot_are_no_strangers() -> None:
+    own = lease(REFUSE, True)
+    page, other = ("page-1/ann", "aaaaaaaa", ""), ("page-1/bob", "aaaaaaaa", "")
+    own.hold(page, 3000, False, WRAPS)
+    for by, moves in (("page-1", True), ("page-1/bob", True), ("page-2/ann", False), ("-", False), ("", False)):
+        assert own.refuses(True, False, own.key, by, WRAPS) is not moves, by
+    assert own.refuses(True, False, "", "-", WRAPS)
+    assert not own.refuses(True, False, "", "", WRAPS)
+    own.release(("page-2/ann", "aaaaaaaa", ""), WRAPS)
+    assert own.state("")["by"] == "page-1/ann"
+    own.release(other, WRAPS)
+    assert own.key == ""
+    assert own.state("")["named"]
+
+
+def test_it_shows_that_others_drive_too_for_a_while() -> None:
+    own = lease()
+    own.moved("", WRAPS)
+    assert own.others
+    own.changed = False
+    own.tick(after(1999))
+    assert own.others
+    assert not own.changed
+    own.moved("", after(1999))
+    own.tick(after(3998))
+    assert own.others
+    assert not own.changed
+    own.tick(after(3999))
+    assert own.changed
+    assert not own.others
+
+
+def arbiter(own: Lease) -> Arbiter:
+    return Arbiter(Latch("0badcafe", 4, diff), own, WRAPS, diff, 900)
+
+
+def test_a_strangers_zero_after_a_reset_is_nobodys_letting_go() -> None:
+    own = lease()
+    judge = arbiter(own)
+    own.hold(ANN, 9999, False, WRAPS)
+    judge.stop(NAME, "ann", "", 0)
+    assert judge.latch.reset("0badcafe", 1, 0, WRAPS)
+    assert judge.judge(True, PERSON, -1, after(100), own.key) == REFUSED
+    assert judge.judge(False, PERSON, -1, after(200)) == 0  # it stops all the same
+    assert judge.judge(False, PERSON, -1, after(250), "ffffffff") == 0
+    assert judge.judge(True, PERSON, -1, after(300), own.key) == REFUSED
+    assert judge.judge(True, PERSON, -1, after(350), "ffffffff") == REFUSED  # and does not make the pause longer
+    assert judge.judge(True, PERSON, -1, after(800), own.key) == 900
+    judge.stop("00000000000000bb", "ann", "", 0)
+    assert judge.latch.reset("0badcafe", 2, 0, after(900))
+    assert judge.judge(False, PERSON, -1, after(950), own.key) == 0
+    assert judge.judge(True, PERSON, -1, after(960), own.key) == 900
+
+
+def test_a_strangers_zero_ends_the_script_and_does_not_let_it_resume() -> None:
+    own = lease()
+    judge = arbiter(own)
+    judge.tick(after(2000))
+    assert judge.judge(True, 7, -1, after(2000)) == 900
+    own.hold(ANN, 9999, False, after(2000))
+    assert judge.judge(True, PERSON, -1, after(2100), own.key) == 900
+    assert judge.judge(False, PERSON, -1, after(2200)) == 0
+    assert judge.barred == 7
+    assert judge.judge(True, 8, -1, after(4200)) == 900
+    assert judge.judge(True, PERSON, -1, after(4300), own.key) == 900
+    assert judge.judge(False, PERSON, -1, after(4400), own.key) == 0
+    assert judge.judge(True, 8, -1, after(6400)) == 900  # the holder has let go
+
+
+def test_what_is_refused_neither_holds_nor_bars() -> None:
+    own = lease(REFUSE)
+    judge = arbiter(own)
+    judge.tick(after(2000))
+    own.hold(ANN, 9999, False, after(2000))
+    assert judge.judge(True, 7, -1, after(2000)) == 900
+    assert judge.judge(True, PERSON, -1, after(2010)) == REFUSED
+    assert judge.judge(True, PERSON, -1, after(2020), "ffffffff") == REFUSED
+    assert judge.judge(True, 9, -1, after(2030), "ffffffff") == REFUSED
+    assert judge.judge(True, 7, -1, after(2040)) == 900
+    assert not own.others
+
+
+def test_names_are_shown_in_their_letters_only() -> None:
+    for text, short in (
+        ("page-1/ann", "page-1/ann"),
+        ("Ann B.", "ann_b_"),
+        ('"\\\x00\x7f', "____"),
+        ("\u00e9\u212a\u0130", "___"),
+        ("a" * 50, "a" * BY),
+    ):
+        assert shown(text, BY) == short

@@ -1,0 +1,139 @@
+"""Control of a Linux robot's motors: what its owner answers, and what reaches the line. The rules: tests/motion."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pebble.config import Security
+from pebble.contract import CONTROL_STATE, codec
+from pebble.contract.payloads import ControlRequest, ControlState
+from pebble.services.serial_mcu_bridge.motion.control import Control
+from tests.services.serial_mcu_bridge.motor_rig import STOPPED, Bench
+from tests.support import until
+
+ANN, OTTO = {"id": "aaaaaaaa", "by": "ann", "device": "phone"}, {"id": "00000001", "by": "otto"}
+LONGEST = "z" * 50
+
+
+# -- on a clock that the test moves
+
+
+def test_states_are_published_when_they_change_and_not_more_than_four_times_a_second() -> None:
+    states: list[ControlState] = []
+    control = Control(Security(), states.append, 100.0)
+    control.note(100.0)
+    assert [state.key for state in states] == [""]
+    for number in range(1000):  # a flood of people who ask, and release
+        control.request(ControlRequest(id=f"{number:08x}", by=f"mia{number}"), over=True, now=100.0)
+        assert control.note(100.0)
+    assert len(states) == 4
+    now = 100.0
+    while control.due is not None:
+        now = control.due
+        control.tick(now)
+        control.note(now)
+    assert len(states) == 6  # the newest as soon as it may be, and that nobody has control any more
+    assert states[4].by == "mia999"
+    assert (states[5].key, now) == ("", pytest.approx(103.0, abs=0.3))
+
+
+def test_a_state_is_short() -> None:
+    states: list[ControlState] = []
+    control = Control(Security(), states.append, 0.0)
+    for over, name in ((True, "aaaaaaaa"), (False, "bbbbbbbb")):
+        control.request(ControlRequest(id=name, by=LONGEST, device=LONGEST), over=over, now=0.0)
+    control.note(0.0)
+    raw = codec.encode(CONTROL_STATE, states[-1])
+    assert states[-1].asks == "z" * 40
+    assert len(raw) <= 300
+    assert codec.decode(CONTROL_STATE, raw) == states[-1]
+
+
+# -- a service, an MCU and operators
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[Bench]:
+    one = Bench(tmp_path, "goob")
+    yield one
+    one.close()
+
+
+def held(bench: Bench, by: str) -> str:
+    """The key, once this one has control."""
+    assert until(lambda: bench.world.newest("control/serial").get("by") == by, 5), bench.payloads("control/serial")
+    key: str = bench.world.newest("control/serial")["key"]
+    return key
+
+
+def test_who_has_control_drives_and_keys_of_before_do_not(bench: Bench) -> None:
+    assert bench.moves(0.1)  # nobody has control
+    bench.send("control", ANN)
+    ann = held(bench, "ann")
+    assert bench.moves(0.2, key=ann)
+    bench.send("control", OTTO)
+    assert until(lambda: bench.world.newest("control/serial")["asks"] == "otto", 5)
+    assert bench.moves(0.3, key=ann)
+    halts = bench.lines.count(STOPPED)
+    bench.send("control/take", OTTO)
+    otto = held(bench, "otto")
+    assert until(lambda: bench.lines.count(STOPPED) > halts, 5)
+    bench.drive(0.4, key=ann)
+    assert bench.moves(0.5, key=otto)
+    assert bench.moves(0.6)  # as ever without a key
+    assert until(lambda: bench.world.newest("control/serial")["others"], 5)
+    bench.drive(0.0)
+    assert until(lambda: bench.lines[-1] == STOPPED, 5)
+    bench.send("control", OTTO | {"want": "release"})
+    assert held(bench, "") == ""
+    assert "M 0.400 0.400" not in bench.lines
+    assert bench.service.counters["stranger"] == 1
+
+
+def test_after_a_restart_nobody_has_control_and_its_key_is_void(bench: Bench) -> None:
+    bench.send("control", ANN)
+    key, boot = held(bench, "ann"), bench.world.newest("control/serial")["boot"]
+    assert bench.moves(0.2, key=key)
+    bench.restart()
+    assert until(lambda: bench.world.newest("control/serial")["boot"] != boot, 5)
+    assert held(bench, "") == ""
+    assert bench.world.newest("control/serial")["boot"] == bench.state["boot"]
+    bench.drive(0.3, key=key)
+    assert bench.moves(0.4)
+    assert "M 0.300 0.300" not in bench.lines
+
+
+def test_a_strangers_zero_after_a_reset_frees_no_stick_that_is_held(bench: Bench) -> None:
+    bench.send("control", ANN)
+    key = held(bench, "ann")
+    bench.send("estop", {})
+    assert bench.stopped()
+    assert bench.world.newest("control/serial")["by"] == "ann"
+    bench.drive(0.2, key=key)
+    assert bench.reset()
+    bench.drive(0.3, key=key)
+    bench.drive(0.0)
+    bench.drive(0.4, key=key)
+    bench.drive(0.0, key=key)
+    assert bench.moves(0.5, key=key)
+    assert not {"M 0.200 0.200", "M 0.300 0.300", "M 0.400 0.400"} & set(bench.lines)
+
+
+@pytest.mark.parametrize(("strangers", "free", "held_by_ann"), [("drive", True, True), ("free", True, False),
+                                                               ("refuse", False, False)])  # fmt: skip
+def test_what_strangers_may_do(tmp_path: Path, strangers: Any, free: bool, held_by_ann: bool) -> None:
+    bench = Bench(tmp_path, "goob", security={"strangers": strangers})
+    try:
+        bench.drive(0.1)
+        bench.send("control", ANN)
+        key = held(bench, "ann")
+        bench.drive(0.2)
+        bench.drive(0.0)
+        assert bench.moves(0.3, key=key)
+        assert ("M 0.100 0.100" in bench.lines, "M 0.200 0.200" in bench.lines) == (free, held_by_ann)
+    finally:
+        bench.close()
