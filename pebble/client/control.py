@@ -27,6 +27,7 @@ IDLE_S = 60.0  # without a gesture control is given back
 
 _STATE_BYTES = 1024  # the contract allows 300
 _ID = 8  # characters of an id, and of a key
+_KEYS = 8  # in one command: motor owners read no more
 
 
 class RobotControl:
@@ -40,7 +41,7 @@ class RobotControl:
 
     @property
     def states(self) -> list[ControlState]:
-        """In the order of the owners' names; with capabilities only those that they list."""
+        """They are in the order of the owners' names; with capabilities only those that these list."""
         names = self._estop.owners if self._estop.has_capabilities else self._states
         return [self._states[name] for name in sorted(names) if name in self._states]
 
@@ -87,10 +88,10 @@ class ControlClient:
         self.wanted = self.held = False
         self.decided = ""  # the key of the owner that decides: a new one needs a new gesture
         self.failed = ""
-        self.kept = ""  # the id of who was not let drive
+        self.passed_over = ""  # the id of who was not let drive
         self._by, self._device = by, device
         self._take = False
-        self._asked_at = self._heard_at = self._due_at = 0.0
+        self._asked_at = self._answered_at = self._due_at = 0.0
         self._out: list[Message] = []
 
     # -- what is wanted
@@ -100,7 +101,7 @@ class ControlClient:
         if not self.wanted:
             self.failed, self._out = "", []  # a release that was not sent yet is none
         self.wanted, self._take = True, over
-        self._asked_at = self._heard_at = self._due_at = now
+        self._asked_at = self._answered_at = self._due_at = now
         self.update(now)
 
     def release(self) -> None:
@@ -113,7 +114,7 @@ class ControlClient:
     def keep(self) -> None:
         """Do not let drive who asks now."""
         state = self.robot.state
-        self.kept = state.asks_id if state is not None else ""
+        self.passed_over = state.asks_id if state is not None else ""
 
     # -- what follows
 
@@ -127,12 +128,12 @@ class ControlClient:
             self._give_up(f"{self.robot.who} has control now")
             return
         if self.held and not mine:  # free: it has ended, or the motor owner was started again
-            self._asked_at = self._heard_at = self._due_at = now
+            self._asked_at = self._answered_at = self._due_at = now
         self.held, self.decided = mine, state.key if mine else ""
         if mine:
             self._take = False
         elif state.asks_id:  # of this client, or of another: then it waits for its turn
-            self._heard_at = now
+            self._answered_at = now
         if not mine and state.id and self._has_any():
             self._out = [self._message(CONTROL, want="release")]
             self._due_at = max(self._due_at, now + APART_S)
@@ -157,13 +158,14 @@ class ControlClient:
     @property
     def key(self) -> str:
         """What a drive command needs: the keys of all motor owners that this client has control of."""
-        return "".join(one.key for one in self.robot.states if one.id == self.id) if self.held else ""
+        keys = [one.key for one in self.robot.states if one.id == self.id]
+        return " ".join(keys[:_KEYS]) if self.held else ""
 
     @property
     def asked_by(self) -> str:
         """Who asks for it, and was not refused; "" nobody does, or it is not held."""
         state = self.robot.state
-        if not self.held or state is None or state.asks_id in ("", self.id, self.kept):
+        if not self.held or state is None or state.asks_id in ("", self.id, self.passed_over):
             return ""
         return state.asks or "somebody"
 
@@ -176,7 +178,7 @@ class ControlClient:
 
     def _hopeless(self, now: float) -> str:
         """Why it is given up; empty: it is not."""
-        if now - self._heard_at > ANSWER_S:
+        if now - self._answered_at > ANSWER_S:
             return f"{self.robot.base.rpartition('/')[2]} does not answer"
         return f"{self.robot.who} drives on" if now - self._asked_at > ASKS_S else ""
 

@@ -110,7 +110,7 @@ class Controls:
         return Elsewhere("", state.by or "somebody", state.device)
 
     def state(self, ref: str) -> ControlState | None:
-        """As that robot has published it; None if it does not keep control itself."""
+        """It is what that robot has published; None if it does not keep control itself."""
         robot = self._robot_of(ref)
         return robot.control.state if robot is not None and robot.controlled else None
 

@@ -98,7 +98,7 @@ class Driving:
     def __init__(self, server: str = "") -> None:
         self.leases: dict[str, Lease] = {}
         self.changed: set[str] = set()
-        self.kept_elsewhere: Callable[[str], Elsewhere | None] = lambda _ref: None  # as robots tell it themselves
+        self.held_elsewhere: Callable[[str], Elsewhere | None] = lambda _ref: None  # as robots tell it themselves
         self._server = server
         self._announced: dict[str, Announced] = {}
         self._reserved: dict[str, tuple[str, Lease, float]] = {}  # by token: the robot, and until when
@@ -194,7 +194,7 @@ class Driving:
         one = self._announced.get(ref)
         if one is not None and now - one.at <= ANNOUNCED_S:
             return Elsewhere(one.server, one.by, one.device)
-        return self.kept_elsewhere(ref)
+        return self.held_elsewhere(ref)
 
     def moved_by(self, ref: str, now: float) -> str:
         """Who moves that robot now: while a gesture lasts, or a lease at another server. Empty: no page does."""

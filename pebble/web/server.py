@@ -57,7 +57,7 @@ class Server:
         self.broker = Broker(settings.broker)
         self.robots, self.stops, self.driving = Robots(), Stops(), Driving(server)
         self.controls = Controls(self.driving, self._robot)
-        self.driving.kept_elsewhere = self.controls.elsewhere
+        self.driving.held_elsewhere = self.controls.elsewhere
         self.saved = SavedRobots(people)
         known = self.robots.before = self.saved.robots
         self.own_hosts = OwnHosts(settings)

@@ -19,33 +19,33 @@ class KeepingCab(Cab):
     def __init__(self, *, take_over: bool = False, published: bool = True) -> None:
         drive = {"available": True, "topic": DRIVE, "arbitrates": True, "control": True}
         super().__init__(take_over=take_over, drive=drive)
-        self.keeper = KeepingRobot(GOOB, "serial")
+        self.keeping = KeepingRobot(GOOB, "serial")
         self.bob = ControlClient(self.driver.robot.control, by="bob", device="phone")
         self.bob_drives = False
         self._published = published
         self._answered = 0
         if published:
-            self.receive(*self.keeper.states())
+            self.receive(*self.keeping.states())
 
     def run(self, seconds: float, key: str = "") -> list[Any]:
         drives: list[Any] = []
         for _ in range(round(seconds / 0.05)):
             drives += super().run(0.05, key)
             sent, self._answered = self.sent[self._answered :], len(self.sent)
-            if self.bob_drives:
-                self.keeper.owners[0].drive(self.bob.key, self.now)
-            answers = self.keeper.take([*sent, *self.bob.tick(self.now)], self.now)
+            if self.bob_drives and self.bob.key:
+                self.keeping.owners[0].drive(self.bob.key, self.now)
+            answers = self.keeping.take([*sent, *self.bob.tick(self.now)], self.now)
             self.receive(*(answers if self._published else []))
         return drives
 
     def bob_has_it(self) -> None:
         self.bob.ask(self.now)
-        self.receive(*self.keeper.take(self.bob.tick(self.now), self.now))
+        self.receive(*self.keeping.take(self.bob.tick(self.now), self.now))
         self.bob_drives = True
 
     @property
     def key(self) -> str:
-        return self.keeper.owners[0].key
+        return self.keeping.owners[0].lease.key
 
     @property
     def mine(self) -> bool:
@@ -129,8 +129,8 @@ def test_who_asks_is_shown_and_may_be_let_or_not() -> None:
     cab.bob.release()
     cab.run(0.2)
     cab.bob.ask(cab.now)
-    cab.bob.kept = ""
-    cab.driver.control.kept = ""
+    cab.bob.passed_over = ""
+    cab.driver.control.passed_over = ""
     cab.run(0.2, "w")
     cab.type("l")
     assert (cab.mine, cab.bob.held) == (False, True)
@@ -140,16 +140,16 @@ def test_after_a_minute_without_a_drive_it_is_given_back_and_a_key_takes_it_agai
     cab = KeepingCab().ready()
     cab.run(IDLE_S + 0.5)
     assert not cab.mine
-    assert cab.keeper.owners[0].holder is None
+    assert cab.keeping.owners[0].by == ""
     assert "nobody drives: t takes control" in cab.status
     cab.run(0.2, "w")
     assert cab.mine
     assert cab.moves()
 
 
-def test_somebody_else_who_drives_without_control_is_shown() -> None:
+def test_another_one_who_drives_without_control_is_shown() -> None:
     cab = KeepingCab().ready()
-    state = json.loads(cab.keeper.owners[0].state().payload) | {"others": True}
+    state = json.loads(cab.keeping.owners[0].state().payload) | {"others": True}
     cab.receive(Message(f"{GOOB}/outgoing/control/serial", json.dumps(state).encode()))
     assert "somebody else drives, too" in cab.status
 

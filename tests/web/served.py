@@ -181,7 +181,7 @@ def now_ms() -> float:
 class RecordingRobot:
     """Publishes heartbeats and capabilities, and records what arrives; it also takes stops.
 
-    ``keeps``: it keeps control itself, as ``keeper`` does.
+    ``keeps``: it keeps control itself, as ``keeping`` does.
     """
 
     def __init__(
@@ -192,7 +192,7 @@ class RecordingRobot:
         self.latched = False
         self._count = 0
         self._recent: list[str] = []
-        self.keeper = KeepingRobot(base, "serial") if keeps else None
+        self.keeping = KeepingRobot(base, "serial") if keeps else None
         self._answering = threading.Lock()
         self._transport = create(
             "mqtt", f"robot-{base.replace('/', '-')}", MqttSettings(host="127.0.0.1", port=broker_port)
@@ -206,7 +206,7 @@ class RecordingRobot:
         if value:
             payload = msgspec.json.encode({"schema": "pebble-capabilities/v1", "t": 1, "value": value})
             self._transport.publish(CAPABILITIES.topic(base), payload, qos=QoS.DELIVERED, retain=True)
-        self._publish_all(self.keeper.states() if self.keeper else [])
+        self._publish_all(self.keeping.states() if self.keeping else [])
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._heartbeats, daemon=True)
         self._thread.start()
@@ -253,11 +253,15 @@ class RecordingRobot:
     def answer(self, messages: list[Message]) -> None:
         """Requests for control reach it, or only time."""
         with self._answering:
-            self._publish_all(self.keeper.take(messages, time.monotonic()) if self.keeper else [])
+            self._publish_all(self.keeping.take(messages, time.monotonic()) if self.keeping else [])
+
+    def stranger(self, **drive: float) -> None:
+        """Somebody publishes a drive command without any control, as the original's page does."""
+        self._transport.publish(f"{self.base}/incoming/drive-values", msgspec.json.encode(drive), qos=QoS.DELIVERED)
 
     def publish_states(self) -> None:
         """Publish who has control."""
-        self._publish_all(self.keeper.states() if self.keeper else [])
+        self._publish_all(self.keeping.states() if self.keeping else [])
 
     def _publish_all(self, states: list[Message]) -> None:
         for state in states:

@@ -41,7 +41,7 @@ export class Driver {
     this.pads = null;
     this.padLatches = this.padStops = 0; // gamepads that press it
     this.mine = false;
-    this.kept = ""; // who was not let drive
+    this.passedOver = ""; // who was not let drive
     this.idleFrom = Infinity; // since when the lease is not used
     this.output = { x: 0, z: 0, y: 0 };
     this.escapeAt = -Infinity;
@@ -163,12 +163,12 @@ export class Driver {
   /** Who asks this page for control, and was not refused; "" nobody. */
   get asks() {
     const view = this.store.get(this.ref, "web/driver")?.value;
-    return view?.you && view.asks !== this.kept ? view.asks : "";
+    return view?.you && view.asks !== this.passedOver ? view.asks : "";
   }
 
   /** Do not let drive who asks now. */
   keep() {
-    this.kept = this.asks;
+    this.passedOver = this.asks;
     this.changed();
   }
 
@@ -337,7 +337,7 @@ export class Driver {
     const now = performance.now();
     if (this.mine && !view.you) this.onControlLost(view.by, Math.max(0, now - this.idleFrom));
     this.mine = view.you;
-    if (!view.asks) this.kept = "";
+    if (!view.asks) this.passedOver = "";
     const idle = this.idleMs();
     if (this.mine) this.idleFrom = idle < 0 ? Infinity : now - idle;
   }

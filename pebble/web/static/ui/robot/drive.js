@@ -40,7 +40,7 @@ export function Slot({ at }) {
   const script = useValue(at, "autonomy-status");
   const why = reason?.code === "broker" && !connected ? "The server cannot reach the broker" : reason?.text;
   const asks = mine ? driver.asks : "";
-  const also = view?.others ? "Someone else drives, too" : "";
+  const also = view?.others && view.by ? "Someone else drives, too" : "";
   const text = [why ?? (mine ? `You are driving ${name}` : ""), asks && `${asks} asks to drive`, also].filter(Boolean).join(". ");
   const words = slotWords(reason, why ?? "", view, driver.typing, script?.running === true ? String(script.file).slice(0, 40) : "");
   const [title, detail] = asks ? [`${asks} asks to drive`, "Rest for 5 s, and it is theirs."] : [words[0], also || words[1]];
@@ -72,6 +72,7 @@ function slotWords(reason, text, view, typing, script) {
     case undefined:
       return ["You drive", typing ? "Keys go to the field you have chosen: click beside it." : "Let go, and it stops."];
     case "free":
+      if (view?.others) return ["Nobody has control", "Someone drives all the same"];
       return ["Nobody drives", script ? `${script} runs. Take control to drive` : "One person at a time"];
     case "stopped":
       return ["Stopped", "Reset it at the picture to drive."];

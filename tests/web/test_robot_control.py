@@ -20,7 +20,7 @@ NAMES = itertools.count(1)
 
 @pytest.fixture
 def robot(broker) -> Iterator[RecordingRobot]:
-    with RecordingRobot(broker.port, f"pebble/robots/keeper{next(NAMES)}", keeps=True) as one:
+    with RecordingRobot(broker.port, f"pebble/robots/keeping{next(NAMES)}", keeps=True) as one:
         yield one
 
 
@@ -56,8 +56,8 @@ def test_a_page_has_control_when_the_robot_has_answered_and_its_commands_have_th
         assert (view(there, robot)["device"], view(there, robot)["checked"]) == ("phone", False)
         page.drive(robot.base, 1, z=0.5)
         assert until(lambda: moving(robot))
-        assert robot.keeper is not None
-        key = robot.keeper.owners[0].key
+        assert robot.keeping is not None
+        key = robot.keeping.owners[0].lease.key
         assert moving(robot)[-1] == {"x": 0.0, "z": 0.5, "y": 0.0, "valid_ms": 400, "key": key}
         page.drive(robot.base, 1)
         assert until(lambda: robot.drives()[-1] == {"x": 0.0, "z": 0.0, "y": 0.0, "key": key})
@@ -65,7 +65,7 @@ def test_a_page_has_control_when_the_robot_has_answered_and_its_commands_have_th
         assert until(lambda: there.refused)
         assert there.refused[0]["why"] == "ann_b_ is driving"
         assert {one["z"] for one in moving(robot)} == {0.5}
-    assert until(lambda: robot.keeper.owners[0].holder is None), "it is given back when the page is closed"
+    assert until(lambda: robot.keeping.owners[0].by == ""), "it is given back when the page is closed"
     assert not any(topic.endswith("/driving") for topic in robot.topics())
 
 
@@ -130,14 +130,14 @@ def test_a_page_that_connects_again_is_given_control_again(served, robot):
         assert again.ready()
         again.drive(robot.base, 1, z=0.5)
         assert until(lambda: moving(robot))
-        assert robot.keeper is not None
-        assert moving(robot)[-1]["key"] == robot.keeper.owners[0].key
+        assert robot.keeping is not None
+        assert moving(robot)[-1]["key"] == robot.keeping.owners[0].lease.key
 
 
-def test_a_robot_that_does_not_answer_is_said_not_to(served, robot):
+def test_that_a_robot_does_not_answer_is_shown(served, robot):
     with ready(served, robot) as page:
-        assert robot.keeper is not None
-        robot.keeper.owners[0].hears = False
+        assert robot.keeping is not None
+        robot.keeping.owners[0].receives = False
         page.send("lease", ref=robot.base, take=True)
         assert until(lambda: page.refused, 6)
         assert (page.refused[0]["cmd"], page.refused[0]["why"]) == (
@@ -151,15 +151,15 @@ def test_a_motor_owner_that_is_started_again_needs_a_new_gesture(served, robot):
         assert page.take(robot.base)
         page.drive(robot.base, 1, z=0.5)
         assert until(lambda: moving(robot))
-        assert robot.keeper is not None
-        robot.keeper.owners[0].start(0.0)
+        assert robot.keeping is not None
+        robot.keeping.owners[0].start(0.0)
         robot.publish_states()
-        assert until(lambda: robot.keeper.owners[0].holder is not None and view(page, robot)["you"])
+        assert until(lambda: robot.keeping.owners[0].by != "" and view(page, robot)["you"])
         page.drive(robot.base, 1, z=0.6)
         assert until(lambda: page.refused)
         page.drive(robot.base, 2, z=0.7)
         assert until(lambda: moving(robot)[-1]["z"] == 0.7)
-        assert moving(robot)[-1]["key"] == robot.keeper.owners[0].key
+        assert moving(robot)[-1]["key"] == robot.keeping.owners[0].lease.key
 
 
 def test_what_old_servers_announce_does_not_count_and_strangers_are_shown(served, broker, robot):
@@ -170,9 +170,7 @@ def test_what_old_servers_announce_does_not_count_and_strangers_are_shown(served
         transport.publish(
             "pebble/servers/old/outgoing/driving", json.dumps({"t": 1, "robots": robots}).encode(), qos=QoS.DELIVERED
         )
-        assert robot.keeper is not None
-        robot.keeper.owners[0].others = True
-        robot.publish_states()
+        robot.stranger(z=0.3)
         assert until(lambda: view(page, robot)["others"] is True)
         assert view(page, robot)["you"] is True
 
