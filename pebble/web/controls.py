@@ -127,8 +127,8 @@ class Controls:
     def _update(self, wish: Wish, now: float, epoch_ms: int) -> list[Command]:
         client, lease = wish.client, self._driving.leases.get(wish.ref)
         robot = self._robot_of(wish.ref)
-        if robot is None or not robot.controlled:
-            client.release()
+        if robot is None or not robot.controlled or robot.control is not client.robot:
+            client.release()  # it is gone, or was forgotten meanwhile
         client.update(now)
         has = had = lease is not None and lease.control is client
         commands: list[Command] = []
