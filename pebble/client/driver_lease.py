@@ -1,10 +1,12 @@
 """Who drives a robot, among servers of operator pages and terminals: each announces whom it lets drive. Pure.
 
-The newest of several wins, so that a take-over ends what was before it. Robots do not know of it.
+The newest of several wins, so that a take-over ends what was before it. Robots do not know of it: those that keep
+control themselves (control.py) need none of it.
 """
 
 from typing import NamedTuple
 
+from pebble.client.control import IDLE_S
 from pebble.contract import DRIVING, codec
 from pebble.contract.identity import SERVERS, Identity, parse_topic
 from pebble.contract.payloads import Driver, Driving
@@ -14,7 +16,6 @@ from pebble.transports import Message, QoS
 EVERY_S = 1.0
 VALID_S = 3.0  # so long an announcement counts
 LISTEN_S = 1.5  # before it is known that there is no other driver
-IDLE_S = 60.0  # without a gesture a lease ends
 ANSWER_S = 0.25  # a broker that acknowledges nothing for longer would deliver commands late, all at once
 FILTER = DRIVING.filter(f"+/{SERVERS}/+")
 
@@ -43,9 +44,11 @@ class DriverLease:
     def __init__(self, base: str, server: str, *, by: str, device: str) -> None:
         self.held = False
         self.round_trip_s: float | None = None  # of the newest own announcement, through the broker and back
-        self._base, self._server, self._by, self._device = base, server, by[:64], device[:64]
+        self.device = device[:64]
+        self._base, self._server, self._by = base, server, by[:64]
         self._topic = DRIVING.topic(Identity(base.partition("/")[0], SERVERS, server).base)
         self._since_ms = 0
+        self._announces = True
         self._used_at = self._announced_at = float("-inf")
         self._others: dict[str, OtherDriver] = {}
         self._unanswered: dict[int, float] = {}  # by stamp: when it was sent
@@ -75,10 +78,13 @@ class DriverLease:
             return None
         return max(self._others.values(), key=lambda one: (one.since_ms, one.server), default=None)
 
-    def take(self, now: float, epoch_ms: int) -> None:
-        """Hold the lease from now on, also if it is held elsewhere: a newer one wins."""
+    def take(self, now: float, epoch_ms: int, *, announce: bool = True) -> None:
+        """Hold the lease from now on, also if it is held elsewhere: a newer one wins.
+
+        Without ``announce`` nobody is told, and nobody ends it: then it only measures the way through the broker.
+        """
         newest = max((one.since_ms for one in self._others.values()), default=0)
-        self.held = True
+        self.held, self._announces = True, announce
         self._since_ms, self._used_at = max(epoch_ms, newest + 1), now
         self._announced_at = float("-inf")
 
@@ -101,9 +107,10 @@ class DriverLease:
             return []
         robots = {}
         if self.held:
-            robots[self._base] = Driver(by=self._by, device=self._device, since=self._since_ms)
             self._announced_at = now
-        else:
+        if self.held and self._announces:
+            robots[self._base] = Driver(by=self._by, device=self.device, since=self._since_ms)
+        if not self.held:
             self._since_ms = 0
         self._unanswered = {**dict(list(self._unanswered.items())[-_UNANSWERED:]), epoch_ms: now}
         payload = codec.encode(DRIVING, Driving(t=epoch_ms, robots=robots))
@@ -121,7 +128,7 @@ class DriverLease:
 
     def _update(self, one: OtherDriver) -> None:
         self._others[one.server] = one
-        if self.held and (one.since_ms, one.server) > (self._since_ms, self._server):
+        if self.held and self._announces and (one.since_ms, one.server) > (self._since_ms, self._server):
             self.release()
 
     def _answered(self, stamp: int, now: float) -> None:

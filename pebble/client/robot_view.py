@@ -4,6 +4,7 @@ from collections import deque
 from typing import Any
 
 from pebble import contract as c
+from pebble.client.control import RobotControl
 from pebble.client.drive_reasons import SILENT_S, Situation
 from pebble.client.driveable import Driveable, driveable_of
 from pebble.client.robot_topics import section_of
@@ -74,6 +75,7 @@ class RobotView:
         self.base = base
         self.liveness = Liveness()
         self.estop = RobotEstop(base)
+        self.control = RobotControl(self.estop)
         self.reset_at = float("-inf")  # when its emergency stop ended, as far as it was seen
         self.remembered: dict[str, Message] = {}  # by topic: what an emergency stop that begins later needs to know
         self.capabilities: dict[str, Any] = {}
@@ -99,6 +101,8 @@ class RobotView:
             self.heartbeat(message, now, wall)
         elif channel in (c.CAPABILITIES, c.ESTOP_STATE):
             self.receive_stop(channel, message, now)
+        elif channel is c.CONTROL_STATE:
+            self.control.receive(message)
         elif channel is c.STATUS:
             self.driveable = driveable_of(message.payload)
         elif channel in _TELEMETRY:
@@ -175,6 +179,11 @@ class RobotView:
     def arbitrates(self) -> bool:
         """Whether it decides itself between a script and a person."""
         return section_of(self.capabilities, "drive").get("arbitrates") is True
+
+    @property
+    def controlled(self) -> bool:
+        """Whether it decides itself which person drives it."""
+        return section_of(self.capabilities, "drive").get("control") is True
 
     @property
     def drive_topic(self) -> str | None:

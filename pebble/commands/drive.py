@@ -23,7 +23,8 @@ from pebble.transports.clock import since_boot as clock
 
 _KEYS = """\
 W A S D or arrows drive, Q E grousers, space stops.
-! or Esc Esc is the emergency stop, Ctrl-C ends."""
+! or Esc Esc is the emergency stop, Ctrl-C ends.
+T takes control, or asks for it; O takes it over."""
 _STOP_S = 3.0  # so long an emergency stop is still sent after the terminal has ended
 _ARRIVED = 1000  # messages that wait to be handled
 _OVERHEAD = 32  # bytes of a message on the wire besides topic and payload
@@ -53,6 +54,9 @@ def drive(
     A terminal repeats a key that is held and does not report its release, so a key counts as held for 0.4 s: the
     robot moves on for so long after you let go, and halts briefly where the first repetition comes later than that.
     Of several keys only the last one repeats. What interrupts a drive ends it: let go of all keys, then press again.
+
+    Control is taken if nobody has it, and given back after a minute without a drive. T asks another driver for it, O
+    takes it over. When another one asks, L lets them drive, K keeps it.
 
     \b
         pebble drive goob.json

@@ -54,6 +54,8 @@ class Visitors:
 
     def taken(self, robot: RobotView, now: float) -> str:
         """Why people have the control of it now; empty: they have not."""
+        if robot.controlled and robot.control.who:  # as it tells itself
+            self._drivers[robot.base], self._driven[robot.base] = (robot.control.who, now), now
         if now - self._driven.get(robot.base, -math.inf) < VALID_S:
             who, at = self._drivers.get(robot.base, ("", -math.inf))
             return f"is driven by {who if now - at < VALID_S else 'another program'}"

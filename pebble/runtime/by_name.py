@@ -66,7 +66,8 @@ class _Robot:
     def ask(self, now: float, channels: Collection[Channel]) -> list[str]:
         """The topics to ask for; empty: nothing is missing."""
         estop = self.estop = self.estop or RobotEstop(self.base)
-        topics = estop.missing if estop.has_capabilities else [channel.topic(estop.base) for channel in channels]
+        known = [*estop.missing, *estop.missing_control]
+        topics = known if estop.has_capabilities else [channel.topic(estop.base) for channel in channels]
         self.asked += bool(topics)
         self.due = now + next(self._pauses, inf) if topics else inf
         return topics
@@ -76,8 +77,9 @@ class ByName:
     """Decides which robots are asked for, and for what: those whose capabilities do not come by themselves.
 
     A robot is asked for 1 s after its first heartbeat on the present connection, then twice more; when it answers, for
-    the states of the motor owners that its capabilities list. Anybody can invent robots: one is asked for at a time,
-    first those known from before, those that have answered, and those that go on sending heartbeats.
+    the states of the motor owners that its capabilities list, and for who has control of them. Anybody can invent
+    robots: one is asked for at a time, first those known from before, those that have answered, and those that go on
+    sending heartbeats.
     One thread may receive, and another ask.
     """
 

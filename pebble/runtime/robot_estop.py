@@ -7,7 +7,7 @@ from typing import Any
 
 import msgspec
 
-from pebble.contract import AUTONOMY_COMMAND, CAPABILITIES, DRIVE, ESTOP_STATE, Channel, codec
+from pebble.contract import AUTONOMY_COMMAND, CAPABILITIES, CONTROL_STATE, DRIVE, ESTOP_STATE, Channel, codec
 from pebble.contract.identity import LEVEL, is_of_another
 from pebble.contract.payloads import EstopState
 from pebble.errors import PayloadError, TransportError
@@ -36,6 +36,7 @@ class RobotEstop:
         self.has_capabilities = False
         self.announces = False  # its capabilities have a section about emergency stops
         self.available = False  # it can be stopped by an emergency stop
+        self.keeps_control = False  # it decides itself which person drives it
         self.drives = True  # False: its capabilities exclude drive commands. Readers assume what is missing
         self.drive_topic = DRIVE.topic(base)
         self.script_topic = AUTONOMY_COMMAND.topic(base)
@@ -72,6 +73,12 @@ class RobotEstop:
         return [ESTOP_STATE.topic(self.base, owner=owner) for owner in self.owners if owner not in self._states]
 
     @property
+    def missing_control(self) -> list[str]:
+        """Who has control of these owners, if the robot keeps it itself."""
+        owners = [owner for owner in self.owners if owner not in self._states] if self.keeps_control else []
+        return [CONTROL_STATE.topic(self.base, owner=owner) for owner in owners]
+
+    @property
     def old(self) -> bool:
         """Whether it is known to have no emergency stop; one that announces it, but cannot receive it, is not old."""
         return self.has_capabilities and not self.announces
@@ -104,6 +111,7 @@ class RobotEstop:
         estop, drive = _section(value, "estop"), _section(value, "drive")
         self.announces, self.available = bool(estop), estop.get("available") is True
         self.owners = _owners(estop.get("owners"))
+        self.keeps_control = drive.get("control") is True
         self.drives = drive.get("available") is not False
         self.drive_topic = self._topic(drive.get("topic"), DRIVE)
         self.script_topic = self._topic(_section(value, "autonomy").get("command_topic"), AUTONOMY_COMMAND)

@@ -10,6 +10,7 @@ from contextlib import suppress
 from typing import Any
 
 import msgspec
+from msgspec.structs import replace
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
 from pebble.client.estop_states import Reset
@@ -128,7 +129,7 @@ class Control:
             )
         )
         if "drive" in self._rights():
-            server.publish(server.driving.restore(hello.token, self._tab, clock()))
+            server.restore(hello.token, self._tab, lambda: None, lambda _why: None)
         server.robots.join(self._interest)
         self._interest.dirty |= {(ref, "web/driver") for ref in server.robots.components}
         self._post(self._ping())
@@ -136,7 +137,7 @@ class Control:
     def _end(self) -> None:
         self._server.robots.leave(self._interest)
         try:
-            self._server.publish(self._server.driving.closed(self._tab, clock()))
+            self._server.closed(self._tab)
         finally:
             if self._interest.watched:
                 self._server.unwatch(self._interest.watched)
@@ -150,7 +151,7 @@ class Control:
             pass  # it has gone already
 
     def _end_leases(self) -> None:
-        self._server.publish(self._server.driving.withdraw(self._tab, clock()))
+        self._server.closed(self._tab, for_good=True)
 
     def _is_secure(self) -> bool:
         client = self._websocket.client
@@ -300,23 +301,26 @@ class Control:
 
     def _lease(self, op: m.Lease) -> None:
         server = self._server
+        self._moved.discard(op.ref)
         if not op.take:
-            lease = server.driving.leases.get(op.ref)
-            server.publish(server.driving.release(self._tab, op.ref, clock()))
-            if lease is not None and lease.tab is self._tab:
+            if server.release(self._tab, op.ref):
                 self._audit("release", op.ref)
-        elif self._may("drive", op):
-            why = self._why_not or ("" if op.ref in server.robots.components else "unknown component")
-            if not why:
-                now = int(1000 * time.time())
-                commands, why = server.driving.take(self._tab, op.ref, clock(), now, over=op.over)
-                server.publish(commands)
-            if why:
-                self._refuse(op, why)
-                return
+            return
+        component = server.robots.components.get(op.ref)
+        right = "take" if op.over and server.keeps_control(op.ref) else "drive"
+        if not self._may(right, op):
+            return
+        if self._why_not or component is None:
+            self._refuse(op, self._why_not or "unknown component")
+            return
+
+        def granted() -> None:
             server.operated(op.ref)
             self._audit("take over" if op.over else "take", op.ref)
-        self._moved.discard(op.ref)
+
+        if not op.over and (state := server.controls.state(op.ref)) is not None and state.id:
+            self._audit("ask", op.ref)
+        server.take(self._tab, component.robot, granted, lambda why: self._refuse(op, why), over=op.over)
 
     def _rights(self) -> frozenset[str]:
         return page_rights(self._session.role, self._server.settings.level)
@@ -404,15 +408,21 @@ class Control:
         return m.Ping(n=number, now=1000 * time.time(), round_trip_ms=-1 if round_trip is None else 1000 * round_trip)
 
     def _driver(self, ref: str) -> m.DriverView:
-        driving, now = self._server.driving, clock()
+        driving, controls, now = self._server.driving, self._server.controls, clock()
+        state = controls.state(ref)
+        asking = controls.asks(self._tab, ref)
+        view = m.DriverView(keeps=self._server.keeps_control(ref), asking=asking)
+        if state is not None:
+            asks = (state.asks or "somebody") if state.asks_id else ""
+            view = replace(view, asks=asks, checked=state.named, others=state.others)
         if (other := driving.elsewhere(ref, now)) is not None:
-            return m.DriverView(by=other.by, device=other.device, server=other.server, you=False, idle_s=None)
+            return replace(view, by=other.by, device=other.device, server=other.server)
         lease = driving.leases.get(ref)
         if lease is None:
-            return m.DriverView(by="", device="", server="", you=False, idle_s=None)
+            return view
         tab = lease.tab
         idle = None if tab.live is not None and tab.live_ref == ref else now - lease.idle_from
-        return m.DriverView(by=tab.user, device=tab.device, server="", you=tab is self._tab, idle_s=idle)
+        return replace(view, by=tab.user, device=tab.device, you=tab is self._tab, idle_s=idle)
 
 
 def _tag(op: m.FromPage) -> str:

@@ -4,10 +4,13 @@ Motion belongs to a numbered gesture: from the moment the inputs leave neutral u
 a gesture ends it for good, so a key that is held down never moves anything again before it was released.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+import msgspec
+
+from pebble.client.control import IDLE_S, ControlClient
 from pebble.contract.payloads import Drive
 from pebble.web.messages import DriveOp
 from pebble.web.page_clock import PageClock
@@ -15,7 +18,6 @@ from pebble.web.page_clock import PageClock
 VALID_MS = 400  # of a command: twenty per second, so seven lost in a row do not stop the robot
 SILENCE_S = 0.25  # without a command of a gesture it is over
 REPEATS_S = (0.1, 0.2)  # after a zero of the server's own
-IDLE_S = 60.0  # without a gesture a lease ends
 TAKEN_FROM_IDLE_S = 5.0  # a driver who has not moved for so long is not asked
 RESERVED_S = 5.0  # for a page that connects again
 ANNOUNCED_S = 3.0  # so long another server's announcement counts; they come every second
@@ -56,6 +58,21 @@ class Lease:
     moving: bool = False  # its last command was no zero
     sent_at: float = float("-inf")  # of the last command that was forwarded
     received_at: float = float("-inf")  # of the last command of the gesture, forwarded or not
+    control: ControlClient | None = None  # of a robot that keeps it itself
+    decided: str = ""  # the key by which it was granted
+
+    def signed(self, drive: Drive) -> Drive:
+        """That command with the key of control."""
+        key = "" if self.control is None else self.control.key
+        return msgspec.structs.replace(drive, key=key) if key else drive
+
+
+class Elsewhere(NamedTuple):
+    """Who drives a robot, but not by this server. ``server``: by which; "" where the robot has told it itself."""
+
+    server: str
+    by: str
+    device: str
 
 
 class Announced(NamedTuple):
@@ -81,6 +98,7 @@ class Driving:
     def __init__(self, server: str = "") -> None:
         self.leases: dict[str, Lease] = {}
         self.changed: set[str] = set()
+        self.held_elsewhere: Callable[[str], Elsewhere | None] = lambda _ref: None  # as robots tell it themselves
         self._server = server
         self._announced: dict[str, Announced] = {}
         self._reserved: dict[str, tuple[str, Lease, float]] = {}  # by token: the robot, and until when
@@ -103,6 +121,20 @@ class Driving:
         self.changed.add(ref)
         return Outcome(commands)
 
+    def grant(self, tab: Tab, ref: str, control: ControlClient, now: float, epoch_ms: int) -> list[Command]:
+        """The robot has given ``tab`` the control that it keeps itself."""
+        commands = self._end_lease(ref, now) if ref in self.leases else []
+        if tab.live is not None:
+            commands += self._end_gesture(tab, tab.live, now)
+        self.leases[ref] = Lease(tab, epoch_ms, now, control=control, decided=control.decided)
+        self.changed.add(ref)
+        return commands
+
+    def revoke(self, ref: str, now: float) -> list[Command]:
+        """The robot has taken it away."""
+        self.leases[ref].control = None  # there is nothing to give back
+        return self._end_lease(ref, now)
+
     def release(self, tab: Tab, ref: str, now: float) -> list[Command]:
         """Give the lease back."""
         lease = self.leases.get(ref)
@@ -122,19 +154,23 @@ class Driving:
         self._reserved.pop(tab.token, None)
         return commands
 
-    def restore(self, token: str, tab: Tab, now: float) -> list[Command]:
+    def restore(self, token: str, tab: Tab, now: float) -> tuple[list[Command], str]:
         """Give a page that has connected again its lease back, unless another page has taken it, but no gesture.
 
-        Its old connection may still be open, if nothing comes from it any more.
+        Its old connection may still be open, if nothing comes from it any more. With the commands, a robot that has to
+        be asked, because it keeps control itself; "" none.
         """
         old = (one.tab for one in self.leases.values() if one.tab.token == token)
         stalled = next((one for one in old if one.clock.problem(now)), None)
         commands = [] if stalled is None else self.closed(stalled, now)
         ref, lease, until = self._reserved.pop(token, ("", None, 0.0))
-        if lease is not None and now <= until and ref not in self.leases and not self._active(ref, now):
-            self.leases[ref] = Lease(tab, lease.since_ms, now)
-            self.changed.add(ref)
-        return commands
+        if lease is None or now > until or ref in self.leases or self._active(ref, now):
+            return commands, ""
+        if lease.control is not None:
+            return commands, ref
+        self.leases[ref] = Lease(tab, lease.since_ms, now)
+        self.changed.add(ref)
+        return commands, ""
 
     def announced(self, server: str, robots: dict[str, tuple[str, str, int]], now: float) -> list[Command]:
         """Take over what another server announces: by robot, who drives it, from which device and since when."""
@@ -153,15 +189,17 @@ class Driving:
                 self.changed.add(ref)
         return commands
 
-    def elsewhere(self, ref: str, now: float) -> Announced | None:
+    def elsewhere(self, ref: str, now: float) -> Elsewhere | None:
         """The lease of that robot at another server."""
-        announced = self._announced.get(ref)
-        return announced if announced is not None and now - announced.at <= ANNOUNCED_S else None
+        one = self._announced.get(ref)
+        if one is not None and now - one.at <= ANNOUNCED_S:
+            return Elsewhere(one.server, one.by, one.device)
+        return self.held_elsewhere(ref)
 
     def moved_by(self, ref: str, now: float) -> str:
         """Who moves that robot now: while a gesture lasts, or a lease at another server. Empty: no page does."""
-        if (announced := self.elsewhere(ref, now)) is not None:
-            return announced.by
+        if (other := self.elsewhere(ref, now)) is not None:
+            return other.by
         lease = self.leases.get(ref)
         return "" if lease is None or lease.tab.live is None or lease.tab.live_ref != ref else lease.tab.user
 
@@ -183,7 +221,7 @@ class Driving:
         if now - lease.sent_at < MIN_STEP_S:
             return Outcome([])
         lease.sent_at, lease.moving = now, True
-        return Outcome([Command(op.ref, Drive(x=op.x, z=op.z, y=op.y, valid_ms=VALID_MS))])
+        return Outcome([Command(op.ref, lease.signed(Drive(x=op.x, z=op.z, y=op.y, valid_ms=VALID_MS)))])
 
     def stop(self, ref: str, now: float) -> list[Command]:
         """A zero from anybody; the gesture that moves the robot is over."""
@@ -213,8 +251,8 @@ class Driving:
 
     def _active(self, ref: str, now: float) -> str:
         """Who drives it now and has to be asked; empty: it can be taken."""
-        if (announced := self.elsewhere(ref, now)) is not None:
-            return f"{announced.by} at {announced.server}"
+        if (other := self.elsewhere(ref, now)) is not None:
+            return f"{other.by} at {other.server}" if other.server else other.by
         lease = self.leases.get(ref)
         if lease is None or (lease.tab.live is None and now - lease.idle_from >= TAKEN_FROM_IDLE_S):
             return ""
@@ -248,7 +286,9 @@ class Driving:
             lease.moving = False
         if tab.live is not None and op.g >= tab.live:
             self._over(tab, now)
-        return [Command(op.ref, FINAL_ZERO if op.final or not mine else ZERO)]
+        if lease is None or not mine or op.final:
+            return [Command(op.ref, FINAL_ZERO)]
+        return [Command(op.ref, lease.signed(ZERO))]  # with the key it is the letting go of who has control
 
     def _end_gesture(self, tab: Tab, gesture: int, now: float) -> list[Command]:
         """Interrupt it: it stays over, and what it moved stops."""
@@ -271,10 +311,13 @@ class Driving:
         tab.live, tab.live_ref = None, ""
 
     def _end_lease(self, ref: str, now: float) -> list[Command]:
-        tab = self.leases[ref].tab
+        lease = self.leases[ref]
+        tab = lease.tab
         commands = []
         if tab.live is not None and tab.live_ref == ref:
             commands = self._end_gesture(tab, tab.live, now)
+        if lease.control is not None:
+            lease.control.release()
         del self.leases[ref]
         self.changed.add(ref)
         return commands

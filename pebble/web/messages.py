@@ -62,7 +62,7 @@ class ReadLogs(_FromPage, frozen=True, kw_only=True, tag="read-logs"):
 
 
 class Lease(_FromPage, frozen=True, kw_only=True, tag="lease"):
-    """Request (``take``) or release the driver lease. ``over``: from a driver who is active."""
+    """Request (``take``) or release control, or ask for it no more. ``over``: from a driver who is active."""
 
     ref: Ref
     take: bool
@@ -352,13 +352,18 @@ class EstopView(Struct, frozen=True, kw_only=True):
 
 
 class DriverView(Struct, frozen=True, kw_only=True):
-    """``web/driver``: who holds the lease; ``by`` is "" while it is free."""
+    """``web/driver``: who has control; ``by`` is "" while nobody has."""
 
-    by: str
-    device: str
-    server: str  # "": this one
-    you: bool
-    idle_s: float | None  # since the last gesture ended; None: a gesture lasts
+    by: str = ""
+    device: str = ""
+    server: str = ""  # that has announced it; "": this one, or the robot itself
+    you: bool = False
+    idle_s: float | None = None  # since the last gesture ended; None: a gesture lasts, or it is not known
+    keeps: bool = False  # the robot keeps control itself: who drives it is asked for it
+    asking: bool = False  # this page waits for control
+    asks: str = ""  # who asks for it, by the robot
+    checked: bool = False  # the broker vouches for the names
+    others: bool = False  # commands without control have just moved it, too
 
 
 class PictureView(Struct, frozen=True, kw_only=True):

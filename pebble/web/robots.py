@@ -89,7 +89,8 @@ class Component:
 
     def lists(self, metric: str) -> bool:
         """Whether this is the state of a motor owner that its capabilities list."""
-        return metric in [c.ESTOP_STATE.metric.format(owner=owner) for owner in self.robot.estop.owners]
+        states, owners = (c.ESTOP_STATE, c.CONTROL_STATE), self.robot.estop.owners
+        return metric in [state.metric.format(owner=owner) for state in states for owner in owners]
 
 
 def _ms(seconds: float | None) -> float | None:
@@ -331,6 +332,7 @@ class Robots:
         component.aliases.pop(metric, None)
         component.robot.remembered.pop(message.topic, None)
         component.robot.receive_stop(None, message, now)
+        component.robot.control.receive(message)
 
     def _interpret(self, component: Component, metric: str, channel: c.Channel, message: Message, now: float) -> None:
         robot = component.robot
@@ -341,6 +343,8 @@ class Robots:
             if robot.receive_stop(channel, message, now):
                 component.update_rank(known=self._is_known(component.ref))
             robot.capabilities = robot.capabilities or before  # empty ones take nothing away
+        elif channel is c.CONTROL_STATE:
+            robot.control.receive(message)
         elif channel is c.MCU_DESCRIBE:
             component.aliases[metric] = _aliases(message.payload)
         elif channel is c.ONLINE or channel in SYNONYMS:

@@ -4,7 +4,7 @@ import asyncio
 import logging
 import secrets
 import time
-from collections.abc import Coroutine
+from collections.abc import Callable, Coroutine
 from contextlib import suppress
 from typing import Any
 
@@ -16,7 +16,7 @@ from pebble.client.estop import send
 from pebble.client.page_settings import WebSettings
 from pebble.client.robot_topics import FLEET, SYNONYMS
 from pebble.client.robot_view import RobotView
-from pebble.contract import CAPABILITIES, DRIVE, DRIVING, ONLINE, codec
+from pebble.contract import CAPABILITIES, CONTROL_STATE, DRIVE, DRIVING, ONLINE, channel_of, codec
 from pebble.contract.identity import Identity, parse_topic
 from pebble.errors import ConfigError
 from pebble.fleet.audit import Audit
@@ -28,8 +28,9 @@ from pebble.transports import Message
 from pebble.transports.clock import since_boot as clock
 from pebble.web import messages as m
 from pebble.web import robot_commands
+from pebble.web.controls import Controls
 from pebble.web.driven_here import DrivenHere
-from pebble.web.driving import Command, Driving
+from pebble.web.driving import Command, Driving, Tab
 from pebble.web.known_robots import SavedRobots
 from pebble.web.media.pictures import MediaHub
 from pebble.web.media.robot_streams import OwnHosts, origin
@@ -56,6 +57,8 @@ class Server:
         server = f"{settings.name}-{secrets.token_hex(2)}"
         self.broker = Broker(settings.broker)
         self.robots, self.stops, self.driving = Robots(), Stops(), Driving(server)
+        self.controls = Controls(self.driving, self._robot)
+        self.driving.held_elsewhere = self.controls.elsewhere
         self.saved = SavedRobots(people)
         known = self.robots.before = self.saved.robots
         self.own_hosts = OwnHosts(settings)
@@ -88,7 +91,7 @@ class Server:
         """Stop what pages move, then disconnect."""
         try:
             for lease in list(self.driving.leases.values()):
-                self.publish(self.driving.closed(lease.tab, clock()))
+                self.closed(lease.tab)
             for task in list(self._tasks):
                 task.cancel()
             await asyncio.gather(*self._tasks, return_exceptions=True)
@@ -117,6 +120,8 @@ class Server:
             return
         if address.metric != ONLINE.metric or self.robots.value(ref, _ESTOP_METRIC) is None:
             self.stops.changed.add(ref)
+        if channel_of(f"outgoing/{address.metric}") in (CAPABILITIES, CONTROL_STATE):
+            self.publish(self.controls.update(ref, clock(), _epoch_ms()))
         if address.metric == CAPABILITIES.metric:
             for one in (ref, *(page for page, source in self.robots.sources.items() if source == ref)):
                 self.open_components.update(one)
@@ -125,7 +130,9 @@ class Server:
         """Another server drives robots."""
         announced = self.driven_here.receive(message)
         if announced is not None:
-            self.publish(self.driving.announced(*announced, clock()))
+            server, robots = announced
+            robots = {ref: one for ref, one in robots.items() if not self.keeps_control(ref)}
+            self.publish(self.driving.announced(server, robots, clock()))
 
     def _show_broker(self) -> None:
         view = m.BrokerView(
@@ -159,20 +166,77 @@ class Server:
         self.show_stops()
         self.audit.write("stop", ref=ref or "all", user=session.user, device=device, address=address, detail=why)
 
+    # -- control
+
+    def keeps_control(self, ref: str) -> bool:
+        """Whether that robot decides itself who drives it; of others, the servers announce it to each other."""
+        robot = self._robot(ref)
+        return robot is not None and robot.controlled
+
+    def take(
+        self, tab: Tab, robot: RobotView, granted: Callable[[], None], failed: Callable[[str], None], *, over: bool
+    ) -> None:
+        """A page wants control; ``granted``, or ``failed`` with the reason, is called as soon as that is known."""
+        ref, now = robot.base, clock()
+        if robot.controlled:
+            why = self.controls.ask(tab, robot, now, granted, failed, over=over)
+            self.send_control()
+        else:
+            commands, why = self.driving.take(tab, ref, now, _epoch_ms(), over=over)
+            self.publish(commands)
+            if not why:
+                granted()
+        if why:
+            failed(why)
+
+    def release(self, tab: Tab, ref: str) -> bool:
+        """A page gives control back, or does not ask for it any more; whether it had it."""
+        lease = self.driving.leases.get(ref)
+        self.publish(self.driving.release(tab, ref, clock()))
+        self.controls.withdraw(tab, ref)
+        self.send_control()
+        return lease is not None and lease.tab is tab
+
+    def restore(self, token: str, tab: Tab, granted: Callable[[], None], failed: Callable[[str], None]) -> None:
+        """A page has connected again."""
+        commands, ref = self.driving.restore(token, tab, clock())
+        self.publish(commands)
+        if ref and (robot := self._robot(ref)) is not None:
+            self.take(tab, robot, granted, failed, over=False)
+
+    def closed(self, tab: Tab, *, for_good: bool = False) -> None:
+        """The connection of a page has ended; ``for_good``: its user may no longer drive."""
+        end = self.driving.withdraw if for_good else self.driving.closed
+        try:
+            self.publish(end(tab, clock()))
+        finally:
+            self.controls.closed(tab)
+            self.send_control()
+
+    def send_control(self) -> None:
+        """Publish what is due of control; after the zeros of who has had it."""
+        step = self.controls.tick(clock(), _epoch_ms())
+        self.publish(step.commands)
+        self._send(step.messages)
+
+    def _robot(self, ref: str) -> RobotView | None:
+        component = self.robots.components.get(ref)
+        return None if component is None else component.robot
+
+    # -- what is asked of robots
+
     def blocked(self, ref: str) -> str:
         """Why this component may not be moved by any page; empty if it may."""
-        component = self.robots.components.get(ref)
-        robot = RobotView(ref) if component is None else component.robot
+        robot = self._robot(ref) or RobotView(ref)
         return self._words(robot, first_reason(self._situation(robot), SERVER_ORDER))
 
     def refuses(self, op: m.RobotOp) -> str:
         """Why this is not asked of a robot now; empty if it is. What ends something is always asked."""
-        component = self.robots.components.get(op.ref)
-        if component is None:
+        robot = self._robot(op.ref)
+        if robot is None:
             return "unknown component"
         if robot_commands.ends(op):
             return "" if self.broker.connected else "The server cannot reach the broker"
-        robot = component.robot
         order = (Code.BROKER,) if isinstance(op, m.FlagOp) else (Code.BROKER, Code.SILENT)  # a broker remembers flags
         why = self._words(robot, first_reason(self._situation(robot), order))
         why = why or robot_commands.refusal(op, robot.capabilities)
@@ -272,6 +336,7 @@ class Server:
                 self.broker.deliver()
                 now = clock()
                 self.publish(self.driving.tick(now))
+                self.send_control()
                 self._send(self.stops.tick(now))
                 self.show_stops()
                 if now >= refresh_at:
@@ -299,7 +364,8 @@ class Server:
             self.spawn(saving)
 
     def _announce(self, now: float) -> None:
-        for message in self.driven_here.tick(self.driving.leases, now, int(1000 * time.time())):
+        leases = {ref: one for ref, one in self.driving.leases.items() if one.control is None}
+        for message in self.driven_here.tick(leases, now, _epoch_ms()):
             self.broker.publish(message.topic, message.payload)
 
     def show_stops(self) -> None:
@@ -316,6 +382,10 @@ class Server:
         for interest in self.robots.interests if changed else ():
             interest.dirty |= {(ref, "web/driver") for ref in changed}
             interest.notify()
+
+
+def _epoch_ms() -> int:
+    return int(1000 * time.time())
 
 
 def _is_base(ref: str) -> bool:

@@ -7,7 +7,8 @@ from typing import Any
 
 import pytest
 
-from pebble.client.driver_lease import IDLE_S, DriverLease
+from pebble.client.control import IDLE_S
+from pebble.client.driver_lease import DriverLease
 from pebble.transports import Message
 
 GOOB = "pebble/robots/goob"

@@ -20,6 +20,7 @@ from pebble.contract.payloads import EstopState, Heartbeat
 from pebble.transports import Message, MqttSettings, QoS, create
 from pebble.web.access.connections import Loop
 from pebble.web.serve import listen, server_config
+from tests.client.control_robot import KeepingRobot
 from tests.support import until
 
 HEARTBEAT_S = 0.25
@@ -178,25 +179,34 @@ def now_ms() -> float:
 
 
 class RecordingRobot:
-    """Publishes heartbeats and capabilities, and records what arrives; with ``latches`` it also takes stops."""
+    """Publishes heartbeats and capabilities, and records what arrives; it also takes stops.
 
-    def __init__(self, broker_port: int, base: str, *, capabilities: dict[str, Any] | None = None) -> None:
+    ``keeps``: it keeps control itself, as ``keeping`` does.
+    """
+
+    def __init__(
+        self, broker_port: int, base: str, *, capabilities: dict[str, Any] | None = None, keeps: bool = False
+    ) -> None:
         self.base = base
         self.received: list[tuple[float, str, Any]] = []
         self.latched = False
         self._count = 0
         self._recent: list[str] = []
+        self.keeping = KeepingRobot(base, "serial") if keeps else None
+        self._answering = threading.Lock()
         self._transport = create(
             "mqtt", f"robot-{base.replace('/', '-')}", MqttSettings(host="127.0.0.1", port=broker_port)
         )
         self._transport.open()
         self._transport.subscribe(f"{base}/incoming/#", self._receive, direct=True)
         drive = {"available": True, "controls": True, "topic": f"{base}/incoming/drive-values", "arbitrates": True}
+        drive |= {"control": True} if keeps else {}
         estop = {"available": True, "owners": ["serial"]}
         value = {"drive": drive, "estop": estop} if capabilities is None else capabilities
         if value:
             payload = msgspec.json.encode({"schema": "pebble-capabilities/v1", "t": 1, "value": value})
             self._transport.publish(CAPABILITIES.topic(base), payload, qos=QoS.DELIVERED, retain=True)
+        self._publish_all(self.keeping.states() if self.keeping else [])
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._heartbeats, daemon=True)
         self._thread.start()
@@ -236,8 +246,26 @@ class RecordingRobot:
         while True:
             payload = codec.encode(ONLINE, Heartbeat(t=int(1000 * time.time()), online=True))
             self._transport.publish(ONLINE.topic(self.base), payload, qos=QoS.DELIVERED, retain=True)
+            self.answer([])
             if self._ending.wait(HEARTBEAT_S):
                 return
+
+    def answer(self, messages: list[Message]) -> None:
+        """Requests for control reach it, or only time."""
+        with self._answering:
+            self._publish_all(self.keeping.take(messages, time.monotonic()) if self.keeping else [])
+
+    def stranger(self, **drive: float) -> None:
+        """Somebody publishes a drive command without any control, as the original's page does."""
+        self._transport.publish(f"{self.base}/incoming/drive-values", msgspec.json.encode(drive), qos=QoS.DELIVERED)
+
+    def publish_states(self) -> None:
+        """Publish who has control."""
+        self._publish_all(self.keeping.states() if self.keeping else [])
+
+    def _publish_all(self, states: list[Message]) -> None:
+        for state in states:
+            self._transport.publish(state.topic, state.payload, qos=QoS.DELIVERED, retain=True)
 
     def _receive(self, message: Message) -> None:
         try:
@@ -245,6 +273,7 @@ class RecordingRobot:
         except ValueError:
             payload = message.payload
         self.received.append((time.monotonic(), message.topic, payload))
+        self.answer([message])
         if message.topic.endswith("/incoming/estop"):
             self._stop(payload)
         elif message.topic.endswith("/estop-reset") and payload.get("count") == self._count:

@@ -23,6 +23,7 @@ GOOB_PATH = f"/r/{GOOB}"
 LIVE = {"web/liveness": 1.0, "online": 1.0, "position": 1.0, "charging-level": 5.0, "sensors/imu": 0.2}
 LIVE |= dict.fromkeys(("touch-sensors", "wheel-odometry", "video-overlays"), 0.1)
 VIEWER = {"user": "visitor", "role": "viewer", "rights": []}
+MAY_TAKE = {"role": "maintainer", "rights": ["drive", "reset", "take", "system"]}
 
 Values = Callable[[int], list[Value]]
 
@@ -53,7 +54,8 @@ def liveness(online: bool | None = True, silent_s: float | None = 0.1, **more: A
 
 
 def driver(by: str = "", device: str = "", *, you: bool = False, server: str = "") -> dict[str, Any]:
-    return {"by": by, "device": device, "server": server, "you": you, "idle_s": None}
+    more = {"keeps": False, "asking": False, "asks": "", "checked": False, "others": False}
+    return {"by": by, "device": device, "server": server, "you": you, "idle_s": None} | more
 
 
 def estop(now: int, by: str = "", *, sending: str = "", text: str = "", why: str = "button") -> dict[str, Any]:
@@ -287,7 +289,12 @@ DRIVING = State(GOOB_PATH, changed(fleet, MINE), LIVE, logs=logs)
 #: May restart robots, and is not logged in.
 OPERATING = replace(
     DRIVING,
-    welcome={"user": "local", "role": "admin", "rights": ["drive", "people", "reset", "system"], "login": False},
+    welcome={
+        "user": "local",
+        "role": "admin",
+        "rights": ["drive", "people", "reset", "system", "take"],
+        "login": False,
+    },
 )
 
 SQUARE = [[0.25, 0.25], [0.75, 0.25], [0.75, 0.75], [0.25, 0.75]]
@@ -330,6 +337,13 @@ SILENT = at(GOOB, "web/liveness", liveness(online=False, silent_s=5.2))
 NO_BROKER = {"connected": False, "problem": "connection refused by 10.0.0.2:8883", "robots_omitted": 0}
 UNCONFIRMED = "base has not confirmed it"
 BOB_DRIVES = at(GOOB, "web/driver", driver("bob", "phone"))
+
+
+def keeping(**more: Any) -> Callable[[int], Value]:
+    """A robot keeps control itself."""
+    return at(GOOB, "web/driver", driver() | {"keeps": True} | more)
+
+
 EVE_STOPPED = (stopped(GOOB, "eve on phone"), stopped(FRED, "eve on phone"))
 
 
@@ -359,6 +373,10 @@ STATES: dict[str, State] = {
     "overlays": of(GOOB_PATH, MINE, at(GOOB, "video-overlays", OVERLAYS), logs=logs),
     "own-stream": of(GOOB_PATH, MINE, with_stream(f"{STREAM}/stream"), logs=logs, frames=STREAM),
     "taken": of(GOOB_PATH, BOB_DRIVES),
+    "kept": of(GOOB_PATH, keeping(by="bob", device="phone"), welcome=MAY_TAKE),
+    "kept-and-asked": of(GOOB_PATH, keeping(by="bob", device="phone", asking=True, others=True), welcome=MAY_TAKE),
+    "others-ask": of(GOOB_PATH, keeping(by="alice", you=True, asks="otto")),
+    "others-drive": of(GOOB_PATH, keeping(by="alice", you=True, others=True)),
     "viewer": of(GOOB_PATH, welcome=VIEWER),
     "stopped": of(GOOB_PATH, MINE, *EVE_STOPPED),
     "stop-sent": of(GOOB_PATH, MINE, stopped(GOOB, "", sending="sent", text=UNCONFIRMED)),

@@ -5,20 +5,35 @@ The rules are those of the operator page: a reason against driving ends the gest
 
 from collections.abc import Sequence
 
+import msgspec
+
+from pebble.client.control import IDLE_S, ControlClient
 from pebble.client.drive_reasons import SLOW_S, SLOW_SPEED, Code, Situation, first_reason
 from pebble.client.driver_lease import FILTER, LISTEN_S, DriverLease
 from pebble.client.estop import Progress, StopSender, new_name
 from pebble.client.names import id_of
 from pebble.client.robot_view import RobotView
 from pebble.client.terminal.key_decoder import ESCAPE, SPACE
-from pebble.client.terminal.key_gesture import KeyGesture
-from pebble.contract import AUTONOMY_STATUS, CAPABILITIES, CHARGING_LEVEL, DRIVE, ESTOP_STATE, ONLINE, channel_of, codec
+from pebble.client.terminal.key_gesture import AXES, KeyGesture
+from pebble.contract import (
+    AUTONOMY_STATUS,
+    CAPABILITIES,
+    CHARGING_LEVEL,
+    CONTROL_STATE,
+    DRIVE,
+    ESTOP_STATE,
+    ONLINE,
+    channel_of,
+    codec,
+)
 from pebble.contract.payloads import Drive
 from pebble.transports import Message, QoS
 
 TWICE_S = 0.6  # between two presses of Escape
 
-_RECEIVED = (ESTOP_STATE, CAPABILITIES, ONLINE, CHARGING_LEVEL, AUTONOMY_STATUS)
+TAKE, TAKE_OVER, LET, KEEP = "t", "o", "l", "k"  # keys
+
+_RECEIVED = (ESTOP_STATE, CONTROL_STATE, CAPABILITIES, ONLINE, CHARGING_LEVEL, AUTONOMY_STATUS)
 _WORDS = {
     Code.UNSEEN: "waiting for {name}",
     Code.STOPPING: "emergency stop",
@@ -49,9 +64,12 @@ class TerminalDriver:
     ) -> None:
         self.robot = RobotView(base)
         self.gesture, self.lease = gesture, lease
+        self.control = ControlClient(self.robot.control, by=by.partition("@")[0], device=lease.device)
         self.stopping: StopSender | None = None  # the newest emergency stop from here
         self._by, self._take_over, self._heartbeat = by, take_over, heartbeat
-        self._began = now
+        self._began = self._used_at = now
+        self._wants_control = True
+        self._decided = ""  # the key of control, as far as the gesture knows of it
         self._escape_at = float("-inf")
         self._reason = "connecting"
         self._connected = False
@@ -71,12 +89,15 @@ class TerminalDriver:
     def receive(self, message: Message, now: float, wall: float) -> None:
         held = self.lease.held
         self.lease.receive(message, now)
-        if held and not self.lease.held:
+        if held and not self.lease.held:  # of a robot that does not keep control itself
             self._take_over = False  # a newer driver is asked for, not fought
             self._drive(self.gesture.interrupt(now, repeat=False))
         if message.topic.startswith(f"{self.robot.base}/"):
-            self.robot.receive(channel_of(message.topic[len(self.robot.base) + 1 :]), message, now, wall)
-            self.robot.remember(message)
+            channel = channel_of(message.topic[len(self.robot.base) + 1 :])
+            self.robot.receive(channel, message, now, wall)
+            if channel is not CONTROL_STATE:
+                self.robot.remember(message)
+            self._check_control(now)
         if self.stopping is not None:
             self.stopping.receive(message, now)
 
@@ -89,6 +110,9 @@ class TerminalDriver:
                 self._estop(now)
             elif key == SPACE:
                 self._drive(self.gesture.stop(now))
+            elif self.robot.controlled:
+                self._press_control(key, now)
+        self._wants_control = self._wants_control or not AXES.keys().isdisjoint(keys)
         self.gesture.press(keys, now)
 
     # -- what follows
@@ -106,7 +130,9 @@ class TerminalDriver:
         self._reason = self._words(against, situation, now)
         limit = SLOW_SPEED if (self.lease.round_trip_s or 0.0) >= SLOW_S else 1.0
         self._drive(self.gesture.update(against is None, now, limit=limit))
-        if self.gesture.active:
+        if self.robot.controlled:
+            self._tick_control(now, int(1000 * wall), problem)
+        elif self.gesture.active:
             if not self.lease.held:
                 self._take_over = False
                 self.lease.take(now, int(1000 * wall))
@@ -124,6 +150,8 @@ class TerminalDriver:
     def leave(self, now: float, wall: float) -> list[Message]:
         """The terminal is gone, or the driver leaves: stop, and give the lease back. Then :meth:`tick` twice more."""
         self._drive(self.gesture.interrupt(now))
+        self.control.release()
+        self._out += self.control.tick(now)
         self.lease.release()
         self._out += self.lease.tick(now, int(1000 * wall))
         out, self._out = self._out, []
@@ -144,7 +172,7 @@ class TerminalDriver:
 
     def status(self) -> str:
         """One line: what is sent, or why nothing is, and what is known of the robot. Parts of it come from others."""
-        parts = [self.name, self._doing(), self._stop_text(), self._battery(), self._latency()]
+        parts = [self.name, self._doing(), self._stop_text(), *self._others(), self._battery(), self._latency()]
         return " · ".join(part for part in parts if part)
 
     def _doing(self) -> str:
@@ -165,6 +193,12 @@ class TerminalDriver:
             return "" if stop.estop.latched else "it was reset since"
         return f"EMERGENCY STOP {'sent, ' if stop.sending else ''}NOT CONFIRMED: {stop.why}"
 
+    def _others(self) -> list[str]:
+        """Who else wants to drive, or does."""
+        state, asks = self.robot.control.state, self.control.asked_by
+        asked = f"{asks} asks for control: l lets {asks} drive, k keeps it" if asks else ""
+        return [asked, "somebody else drives, too" if self.control.held and state is not None and state.others else ""]
+
     def _battery(self) -> str:
         return "" if self.robot.volts is None else f"{self.robot.volts:.1f} V"
 
@@ -179,14 +213,20 @@ class TerminalDriver:
     def _situation(self, now: float, problem: str, late_s: float) -> Situation:
         """What speaks for and against driving now."""
         lease = self.lease
-        other = lease.other(now)
         situation = self.robot.situation(now)
+        if self.robot.controlled:
+            driven = self.robot.control.who != "" and not self.control.held
+            listening = not self.control.held
+        else:
+            other = lease.other(now)
+            driven = other is not None and not self._take_over
+            listening = not lease.held and other is None and now - self._began < LISTEN_S
         return situation._replace(
             problem=problem,
             online=situation.online if self._heartbeat else True,
             stopping=self.stopping is not None and not self.stopping.finished,
-            driven=other is not None and not self._take_over,
-            listening=not lease.held and other is None and now - self._began < LISTEN_S,
+            driven=driven,
+            listening=listening,
             late_s=max(late_s, lease.late_s(now), lease.round_trip_s or 0.0),
         )
 
@@ -208,6 +248,8 @@ class TerminalDriver:
                 by = robot.stopped_by
                 why = f" ({by.why})" if by is not None and by.why else ""
                 return f"stopped by {(by and by.by) or 'unknown'}{why}: pebble estop reset {name}"
+            case Code.LEASE | Code.LISTENING if robot.controlled:
+                return self._whose()
             case Code.LEASE:
                 return f"{self.lease.other(now)} is driving (--take-over drives instead)"
             case Code.SCRIPT:
@@ -215,6 +257,51 @@ class TerminalDriver:
             case Code.LATE:
                 return f"commands are late ({1000 * situation.late_s:.0f} ms)"
         return _WORDS[code].format(name=name)
+
+    def _whose(self) -> str:
+        """Who has control, which is not here, and what can be done about it."""
+        control, state = self.robot.control, self.robot.control.state
+        if state is None:
+            return f"{self.name} has not published who has control"
+        if not control.who:
+            return "taking control" if self.control.wanted else "nobody drives: t takes control"
+        device = f"{state.device}, " if state.device else ""
+        who = f"{control.who} ({device}name {'' if state.named else 'not '}checked) drives"
+        return f"{who}: asked, o takes over" if self.control.wanted else f"{who}: t asks for control, o takes over"
+
+    def _press_control(self, key: str, now: float) -> None:
+        if key in (TAKE, TAKE_OVER):
+            self.control.ask(now, over=key == TAKE_OVER)
+        elif key == KEEP:
+            self.control.keep()
+        elif key == LET and self.control.asked_by:
+            self._drive(self.gesture.interrupt(now, repeat=False))
+            self.control.release()
+
+    def _tick_control(self, now: float, epoch_ms: int, problem: str) -> None:
+        """Have control while this terminal is used; the lease only measures the way through the broker."""
+        if self.gesture.active or not self.control.held:
+            self._used_at = now
+        if self.control.held and now - self._used_at > IDLE_S:
+            self.control.release()
+        elif self._wants_control and not problem and self.robot.control.state is not None:
+            self._wants_control = False
+            if self._take_over or not self.robot.control.who:
+                self.control.ask(now, over=self._take_over)
+        self._out += self.control.tick(now)
+        self._check_control(now)
+        if self.control.held and not self.lease.held:
+            self.lease.take(now, epoch_ms, announce=False)
+        elif self.lease.held and not self.control.held:
+            self.lease.release()
+        self.lease.use(now)
+
+    def _check_control(self, now: float) -> None:
+        """Whoever gets control, begins from rest; so does this terminal."""
+        self.control.update(now)
+        if self.control.decided != self._decided:
+            self._decided = self.control.decided
+            self._drive(self.gesture.interrupt(now, repeat=False))
 
     def _estop(self, now: float) -> None:
         if self.stopping is None or self.stopping.finished:
@@ -228,4 +315,6 @@ class TerminalDriver:
         self._out += map(self._message, commands)
 
     def _message(self, command: Drive) -> Message:
+        if key := self.control.key:
+            command = msgspec.structs.replace(command, key=key)
         return Message(self.robot.estop.drive_topic, codec.encode(DRIVE, command), QoS(DRIVE.default_qos))

@@ -21,7 +21,7 @@ _STEP_S = 0.02  # at least, between two commands
 _NEVER = float("-inf")
 
 #: Axis and direction of each key.
-_AXES = {
+AXES = {
     "w": ("z", 1), UP: ("z", 1), "s": ("z", -1), DOWN: ("z", -1),
     "d": ("x", 1), RIGHT: ("x", 1), "a": ("x", -1), LEFT: ("x", -1),
     "q": ("y", 1), "e": ("y", -1),
@@ -49,7 +49,7 @@ class KeyGesture:
 
     def press(self, keys: Sequence[str], now: float) -> None:
         """The keys that were read; those that move nothing are ignored. The newest key of an axis counts."""
-        moving = [_AXES[key] for key in keys if key in _AXES]
+        moving = [AXES[key] for key in keys if key in AXES]
         for axis, direction in moving:
             self._held[axis] = direction, now
             self._key_at = now

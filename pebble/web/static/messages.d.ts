@@ -257,11 +257,16 @@ export interface EstopView {
 }
 
 export interface DriverView {
-  by: string;
-  device: string;
-  server: string;
-  you: boolean;
-  idle_s: number | null;
+  by?: string;
+  device?: string;
+  server?: string;
+  you?: boolean;
+  idle_s?: number | null;
+  keeps?: boolean;
+  asking?: boolean;
+  asks?: string;
+  checked?: boolean;
+  others?: boolean;
 }
 
 export interface PictureView {

@@ -21,7 +21,9 @@ def mutated(mutation: Mutation) -> Iterator[Path]:
             yield CORE
 
 
-_DRIVING, _CLOCK, _CONTROL = "pebble.web.driving", "pebble.web.page_clock", "pebble.web.control"
+_DRIVING, _CLOCK, _SERVER, _CONTROLS = (
+    f"pebble.web.{name}" for name in ("driving", "page_clock", "server", "controls")
+)
 _DRIVER, _INPUTS, _GESTURE, _REASONS, _SOCKET = (
     f"core/{name}.js" for name in ("driver", "inputs", "gesture", "reasons", "control-socket")
 )
@@ -70,14 +72,12 @@ MUTATIONS = {
         "        lease = self.leases.get(op.ref)\n        if lease is None:\n",
     ),
     "a lost connection stops nothing": Mutation(
-        _CONTROL,
-        "        self._server.publish(self._server.driving.closed(self._tab, clock()))\n",
-        "        self._server.driving.closed(self._tab, clock())\n",
+        _SERVER, "            self.publish(end(tab, clock()))\n", "            end(tab, clock())\n"
     ),
     "zeros are not forwarded": Mutation(
         _DRIVING,
-        "        return [Command(op.ref, FINAL_ZERO if op.final or not mine else ZERO)]\n",
-        "        return []\n",
+        "            return [Command(op.ref, FINAL_ZERO)]\n        return [Command(op.ref, lease.signed(ZERO))]",
+        "            return []\n        return []",
     ),
     "commands are valid for long": Mutation(
         _DRIVING, "Drive(x=op.x, z=op.z, y=op.y, valid_ms=VALID_MS)", "Drive(x=op.x, z=op.z, y=op.y, valid_ms=5000)"
@@ -91,6 +91,9 @@ MUTATIONS = {
         _DRIVING,
         "        tab.over = max(tab.over, gesture)\n        ref = tab.live_ref\n",
         "        tab.over = max(tab.over, gesture + 1000)\n        ref = tab.live_ref\n",
+    ),
+    "control that the robot has given to another is not noticed": Mutation(
+        _CONTROLS, "        if has and lease is not None and client.decided != lease.decided:\n", "        if False:\n"
     ),
     # -- the page
     "keys stay down when the window loses the focus": Mutation(

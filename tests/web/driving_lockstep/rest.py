@@ -45,7 +45,7 @@ def _mend(world: World) -> None:
         if human.blocked_from is not None:
             world.unblock(slot, human.page, ("input", "network", "timers"))
         if world.server.roles.get(slot) is Role.VIEWER or world.ask(slot)["reason"] in ("role",):
-            world.server.roles[slot] = Role.DRIVER
+            world.server.roles[slot] = Role.MAINTAINER
         if human.meta:
             world.do_meta(slot, 0)
         if human.has_pad:
@@ -112,8 +112,8 @@ def _drives(world: World, slot: int) -> None:
         elif reason == "release":  # a release was lost
             world.press_key(slot, "KeyW")
             world.release(slot, "KeyW")
-        if state["action"] in ("take", "take-over"):
-            world.pages.do(human.page, "take", state["action"] == "take-over")
+        if state["action"] in ("take", "take-over", "ask"):
+            world.pages.do(human.page, "take", state["action"] != "take")
         elif reason == "stopped":
             world.pages.do(human.page, "reset")
         elif reason == "pad":

@@ -161,6 +161,7 @@ class WebServer(Process):
         with patch.object(broker, "create", lambda *_: connection):
             self.server = server.Server(WebSettings(broker=None, server="fair"), _Nothing(), _Nothing())  # type: ignore[arg-type]
         self.server.driving.announced = self._announced(self.server.driving)
+        self.server.driving.revoke = self._revoked(self.server.driving)
         self.loop.create_task(self.server.open())
         self.wake()
 
@@ -175,6 +176,15 @@ class WebServer(Process):
             return take(server, robots, now)
 
         return announced
+
+    def _revoked(self, driving: Any) -> Any:
+        revoke = driving.revoke
+
+        def revoked(ref: str, now: float) -> Any:
+            self.lease_moved(driving.leases[ref].tab)
+            return revoke(ref, now)
+
+        return revoked
 
     def kill(self, restart_s: float | None) -> None:
         """End at once: nothing is published any more."""
@@ -196,10 +206,10 @@ class WebServer(Process):
     def accept(self, page: int, socket: ServerSocket) -> None:
         """Serve a connection of a page."""
         assert self.loop is not None
-        session = Session(f"session-{page}", f"human-{page}", self.roles.get(page % 8, Role.DRIVER))
+        session = Session(f"session-{page}", f"human-{page}", self.roles.get(page % 8, Role.MAINTAINER))
 
         def check() -> Session | None:
-            return Session(session.id, session.user, self.roles.get(page % 8, Role.DRIVER))
+            return Session(session.id, session.user, self.roles.get(page % 8, Role.MAINTAINER))
 
         one = RecordedControl(self.server, socket, session, check)  # type: ignore[arg-type]
         one.page, one.handling = page, self._handling

@@ -15,9 +15,9 @@ from typing import Any, Self
 
 import msgspec
 
-from pebble.contract import CAPABILITIES, DRIVING, ONLINE, codec
+from pebble.contract import CAPABILITIES, CONTROL, CONTROL_TAKE, DRIVING, ONLINE, codec
 from pebble.contract.identity import Identity
-from pebble.contract.payloads import Driver
+from pebble.contract.payloads import ControlRequest, Driver
 from pebble.contract.payloads import Driving as DrivingPayload
 from pebble.fleet.roles import Role
 from pebble.transports import Message, QoS, State
@@ -82,6 +82,7 @@ class World:
     def __init__(self, layout: int, rig: Rig) -> None:
         self.rig = rig
         self.layout, self.pages = layout, rig.pages
+        self.keeps = layout // 42 % 2 == 1  # the robot keeps control itself
         self.scheduler = scheduler = PagesScheduler(100.0 + (layout % 7) * 0.0071, rig.pages)
         scheduler.on_output = self._output
         TIME.clock = scheduler.clock
@@ -108,6 +109,7 @@ class World:
         self.states: dict[int, dict[str, Any]] = {}
         self._loads = 0
         self._lease: Any = None
+        self._take = False  # the other server does so with its next request
         self.other_server: tuple[int, float] | None = None  # another server drives: since, and until
         self.owner.start()
         self.server.start()
@@ -530,15 +532,16 @@ class World:
         self.pages.do(human.page, "reset")
 
     def do_other(self, a: int, b: int) -> None:
-        """Another server drives the robot."""
+        """Another server drives the robot; where that keeps control itself, it is taken over or asked for."""
         since = int(1000 * (EPOCH + self.now)) + (0, -3_600_000, 0)[b % 3]
         self.other_server = (since, self.now + (0.1, 0.9, 2.5)[a % 3])
+        self._take = self.keeps and b % 3 == 0
         self._announce_other()
 
     def do_role(self, a: int, b: int) -> None:
         """The human may no longer drive, or may again."""
         slot, _human = self._human(a)
-        self.server.roles[slot] = Role.VIEWER if b % 2 == 0 else Role.DRIVER
+        self.server.roles[slot] = Role.VIEWER if b % 2 == 0 else Role.MAINTAINER
 
     # -- faults
 
@@ -643,6 +646,7 @@ class World:
     def _announce(self) -> None:
         for base in (BASE, OTHER_BASE):
             drive = {"available": True, "controls": True, "arbitrates": True}
+            drive |= {"control": True} if self.keeps and base == BASE else {}
             value = {"drive": drive, "estop": {"available": True, "owners": ["serial"] if base == BASE else []}}
             self._publish(CAPABILITIES.topic(base), {"t": 1, "value": value}, retain=True)
 
@@ -657,6 +661,10 @@ class World:
             return
         since, until = self.other_server
         ends = self.now >= until
+        if self.keeps:
+            request = ControlRequest(id="0e0e0e0e", by="eve", want="release" if ends else "hold")
+            channel, self._take = CONTROL_TAKE if self._take else CONTROL, False
+            self._send(Message(channel.topic(BASE), codec.encode(channel, request), QoS.DELIVERED))
         robots = {} if ends else {BASE: Driver(by="eve", device="desk", since=since)}
         payload = codec.encode(DRIVING, DrivingPayload(t=int(1000 * (EPOCH + self.now)), robots=robots))
         self._send(Message(DRIVING.topic(Identity("pebble", "servers", "other-1").base), payload, QoS.LATEST))

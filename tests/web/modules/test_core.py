@@ -209,6 +209,23 @@ def test_the_first_reason_counts() -> None:
     assert actions == expected | {"script": "stop-script"}
 
 
+@pytest.mark.parametrize(
+    ("change", "rights", "expected"),
+    [
+        ("{}", "[]", ["lease", "bob (phone) has control", "ask", None]),
+        ("{}", "['take']", ["lease", "bob (phone) has control", "ask", "take-over"]),
+        ("{ asking: true }", "['take']", ["asked", "bob (phone) is asked for control", "give-up", "take-over"]),
+        ("{ by: '', device: '', asking: true }", "['take']", ["free", "Take control to drive", "take", None]),
+    ],
+)
+def test_who_drives_a_robot_that_keeps_control_is_asked(change: str, rights: str, expected: list[str | None]) -> None:
+    steps = f"""{_GOOD}
+      const driver = {{ by: "bob", device: "phone", server: "", you: false, keeps: true, ...{change} }};
+      const found = driveReason({{ ...situation, driver, rights: ["drive", ...{rights}] }});
+      result = [found.code, found.text, found.action.kind, found.also?.kind ?? null];"""
+    assert reasons(steps) == expected
+
+
 def test_without_server_or_broker_everything_is_off() -> None:
     steps = "result = mends.map((mend) => offReason(Object.assign(situation, mend))?.code ?? null).slice(0, 4);"
     assert reasons(steps) == ["server", "broker", None, None]

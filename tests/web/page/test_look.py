@@ -162,6 +162,7 @@ class Screen(NamedTuple):
 
 
 ALL: tuple[Size, ...] = ("desktop", "phone", "landscape")
+WHOLE = ("driving", "taken", "others-ask", "stopped", "lost")  # states that are looked at in all sizes
 #: Text that shows that a state has been reached, where it takes a while.
 WHEN = {
     "recordings": "Sunday, 22 November 2026",
@@ -174,6 +175,10 @@ WHEN = {
     "lost": "No connection to the server since",
     "free": "Take control",
     "taken": "Hold to take over",
+    "kept": "Ask for it",
+    "kept-and-asked": "Do not ask",
+    "others-ask": "Let otto drive",
+    "others-drive": "Someone else drives, too",
     "viewer": "Log in as driver",
     "stopped": "Also stopped",
     "stop-sent": "NOT CONFIRMED by goob, and sent again",
@@ -194,7 +199,7 @@ _SENSORS, _MORE = _press("[data-test=tab-sensors]"), _press("[data-test=tab-more
 _LAMP, _LUX = '[data-test="mcu-lamp-1"]', '[data-test="reading-lux"]'
 SCREENS = [
     *(
-        Screen(name, name, sizes=ALL if name in ("driving", "taken", "stopped", "lost") else ("desktop", "phone"))
+        Screen(name, name, sizes=ALL if name in WHOLE else ("desktop", "phone"))
         for name in STATES
         if not name.startswith("asked")  # below the picture
     ),

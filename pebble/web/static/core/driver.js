@@ -41,6 +41,7 @@ export class Driver {
     this.pads = null;
     this.padLatches = this.padStops = 0; // gamepads that press it
     this.mine = false;
+    this.passedOver = ""; // who was not let drive
     this.idleFrom = Infinity; // since when the lease is not used
     this.output = { x: 0, z: 0, y: 0 };
     this.escapeAt = -Infinity;
@@ -159,6 +160,19 @@ export class Driver {
     this.socket.send({ op: "lease", ref: this.ref, take: true, over });
   }
 
+  /** Who asks this page for control, and was not refused; "" nobody. */
+  get asks() {
+    const view = this.store.get(this.ref, "web/driver")?.value;
+    return view?.you && view.asks !== this.passedOver ? view.asks : "";
+  }
+
+  /** Do not let drive who asks now. */
+  keep() {
+    this.passedOver = this.asks;
+    this.changed();
+  }
+
+  /** Give control back, or ask for it no more. */
   release() {
     this.interrupt();
     this.mine = false;
@@ -323,6 +337,7 @@ export class Driver {
     const now = performance.now();
     if (this.mine && !view.you) this.onControlLost(view.by, Math.max(0, now - this.idleFrom));
     this.mine = view.you;
+    if (!view.asks) this.passedOver = "";
     const idle = this.idleMs();
     if (this.mine) this.idleFrom = idle < 0 ? Infinity : now - idle;
   }
@@ -376,7 +391,7 @@ export class Driver {
     const { x, z, y } = this.output;
     const { ref, pads, sliders, inSight, typing } = this;
     const pad = pads && [pads.choice.key, pads.reasons()];
-    const shown = JSON.stringify([ref, this.reason(), x, z, y, pad, sliders, inSight, typing, this.hintedAt]);
+    const shown = JSON.stringify([ref, this.reason(), x, z, y, pad, sliders, inSight, typing, this.hintedAt, this.asks]);
     if (shown === this.shown) return;
     this.shown = shown;
     callAll(this.watchers);

@@ -9,7 +9,8 @@ export const SLOW_SPEED = 0.4;
 const LET_GO = "Let go first"; // the server says the same
 const RESET_MS = 600; // after a reset robots refuse whoever has not paused for 0.5 s
 
-/** @typedef {{code: string, text: string, action?: {label: string, kind: "take"|"take-over"|"see"|"login"|"reload"|"stop-script"}}} Reason */
+/** @typedef {{code: string, text: string, action?: Action, also?: Action}} Reason */
+/** @typedef {{label: string, kind: "take"|"ask"|"give-up"|"take-over"|"see"|"login"|"reload"|"stop-script"}} Action */
 
 /**
  * @typedef {object} Situation
@@ -28,7 +29,7 @@ const RESET_MS = 600; // after a reset robots refuse whoever has not paused for 
  * @property {{latched: boolean, by: string}|undefined} estop
  * @property {number} freeForMs since it was seen stopped
  * @property {Record<string, any>} capabilities
- * @property {{by: string, device: string, server: string, you: boolean}|undefined} driver
+ * @property {import("../messages.js").DriverView|undefined} driver
  * @property {number} driverIdleMs since the driver's last gesture; -1: it lasts, or is not known
  * @property {{running?: boolean, file?: string}|undefined} script
  * @property {number|null} pictureAgeMs null: no picture is wanted here; NaN: its age is not known
@@ -83,11 +84,20 @@ function leaseReason(s) {
   }
   const where = [s.driver.device, s.driver.server].filter(Boolean).join(", ");
   const who = `${s.driver.by}${where ? ` (${where})` : ""}`;
+  if (s.driver.keeps) return askReason(s, who);
   if (s.driverIdleMs >= IDLE_MS) {
     return reason("idle", `${who} has control, but does not drive`, { label: "Take control", kind: "take" });
   }
-  const text = `${who} is driving`;
-  return reason("lease", text, { label: `Take over from ${s.driver.by}`, kind: "take-over" });
+  return reason("lease", `${who} is driving`, OVER);
+}
+
+const OVER = /** @type {const} */ ({ label: "Hold to take over", kind: "take-over" });
+
+/** The robot itself decides: who drives it is asked, and who rests does not keep it. */
+function askReason({ driver, rights }, who) {
+  const also = rights.includes("take") ? OVER : undefined;
+  if (driver.asking) return { ...reason("asked", `${who} is asked for control`, { label: "Do not ask", kind: "give-up" }), also };
+  return { ...reason("lease", `${who} has control`, { label: "Ask for it", kind: "ask" }), also };
 }
 
 function momentReason(s) {

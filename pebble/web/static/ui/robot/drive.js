@@ -8,6 +8,7 @@ import { Stick } from "./stick.js";
 import { driverName } from "../parts/words.js";
 
 const FLASH_MS = 3000;
+const LONG = 12; // letters of a name on a button
 
 export function DriveCard({ at }) {
   return html`<${Card} id="drive" title="Drive" icon="wheel" className="drive" place=${{ "data-at": "side" }}>
@@ -38,8 +39,11 @@ export function Slot({ at }) {
   const name = useName(at);
   const script = useValue(at, "autonomy-status");
   const why = reason?.code === "broker" && !connected ? "The server cannot reach the broker" : reason?.text;
-  const text = why ?? (mine ? `You are driving ${name}` : "");
-  const [title, detail] = slotWords(reason, text, view, driver.typing, script?.running === true ? String(script.file).slice(0, 40) : "");
+  const asks = mine ? driver.asks : "";
+  const also = view?.others && view.by ? "Someone else drives, too" : "";
+  const text = [why ?? (mine ? `You are driving ${name}` : ""), asks && `${asks} asks to drive`, also].filter(Boolean).join(". ");
+  const words = slotWords(reason, why ?? "", view, driver.typing, script?.running === true ? String(script.file).slice(0, 40) : "");
+  const [title, detail] = asks ? [`${asks} asks to drive`, "Rest for 5 s, and it is theirs."] : [words[0], also || words[1]];
   const [more] = [driver.doubt, ...(driver.pads?.reasons() ?? [])].filter((one) => one && one !== reason);
   const kind = !reason ? "on" : reason.code === "stopped" ? "stopped" : "off";
   return html`<div class=${`slot why-line ${kind}`}>
@@ -50,7 +54,13 @@ export function Slot({ at }) {
     <span class="sr" role="status">${useCalm(text)}</span>
     <div class="why-actions">
       <${ReasonAction} action=${reason?.action} />
-      ${mine && html`<button type="button" data-test="release" onClick=${() => driver.release()}>Release</button>`}
+      ${reason?.also && html`<${ReasonAction} action=${reason.also} />`}
+      ${asks
+        ? html`<button type="button" data-test="let" class="primary" title=${`Let ${asks} drive`} onClick=${() => driver.release()}>
+              Let ${asks.length > LONG ? "them" : asks} drive
+            </button>
+            <button type="button" data-test="keep" onClick=${() => driver.keep()}>Keep</button>`
+        : mine && html`<button type="button" data-test="release" onClick=${() => driver.release()}>Release</button>`}
     </div>
     ${reason?.code === "lease" && view?.by && html`<p class="sr">${driverName(view)} has control.</p>`}
   </div>`;
@@ -62,17 +72,23 @@ function slotWords(reason, text, view, typing, script) {
     case undefined:
       return ["You drive", typing ? "Keys go to the field you have chosen: click beside it." : "Let go, and it stops."];
     case "free":
+      if (view?.others) return ["Nobody has control", "Someone drives all the same"];
       return ["Nobody drives", script ? `${script} runs. Take control to drive` : "One person at a time"];
     case "stopped":
       return ["Stopped", "Reset it at the picture to drive."];
     case "lease":
-      return [`${view?.by ?? "Somebody"} drives`, [view?.device, view?.server].filter(Boolean).join(", ")];
+      return [`${view?.by ?? "Somebody"} drives`, origin(view)];
+    case "asked":
+      return [`${view?.by} is asked`, origin(view)];
     case "server":
       return ["Not connected", "What you drove stops by itself."];
     default:
       return [text, ""];
   }
 }
+
+/** By which device and server, and whether the name may be trusted. */
+const origin = (view) => [view?.device, view?.server, view?.keeps && !view.checked && "name not checked"].filter(Boolean).join(", ");
 
 function ReasonAction({ action }) {
   const { commands, driver } = usePage();
@@ -89,8 +105,12 @@ function ReasonAction({ action }) {
       >
         ${action.label}<kbd>Enter</kbd>
       </button>`;
+    case "ask":
+      return html`<button type="button" data-test="ask" onClick=${() => commands.take(false)}>${action.label}</button>`;
+    case "give-up":
+      return html`<button type="button" data-test="give-up" onClick=${() => driver.release()}>${action.label}</button>`;
     case "take-over":
-      return html`<${HoldButton} test="take-over" onHeld=${() => commands.take(true)}>Hold to take over<//>`;
+      return html`<${HoldButton} test="take-over" onHeld=${() => commands.take(true)}>${action.label}<//>`;
     case "see":
       return html`<button type="button" data-test="see" onClick=${() => see(driver)}>${action.label}</button>`;
     case "stop-script":

@@ -1,0 +1,79 @@
+"""A robot that keeps control itself, without a broker: motor owners with their real leases, and what they publish."""
+
+from __future__ import annotations
+
+import json
+import operator
+from itertools import count
+
+from pebble.contract import CONTROL, CONTROL_TAKE, DRIVE, codec
+from pebble.contract.payloads import ControlRequest
+from pebble.motion.lease import Lease
+from pebble.transports import Message
+from tests.client.estop_robot import outgoing
+
+_keys = count(1)
+
+
+class Owner:
+    """One motor owner. Times are seconds; ``receives``: whether requests reach it."""
+
+    def __init__(self, base: str, name: str) -> None:
+        self.base, self.name = base, name
+        self.receives = True
+        self.start(0.0)
+
+    def start(self, now: float) -> None:
+        """It is started again: nobody has control."""
+        self.lease = Lease(round(1000 * now), operator.sub, lambda: f"{next(_keys):08x}")
+
+    @property
+    def by(self) -> str:
+        """Who has control; "" nobody."""
+        return str(self.lease.holder[0])
+
+    def receive(self, message: Message, now: float) -> None:
+        metric, now_ms = message.topic.removeprefix(f"{self.base}/incoming/"), round(1000 * now)
+        if metric == DRIVE.metric:
+            drive = json.loads(message.payload)
+            if any(drive.get(axis) for axis in "xyz"):
+                self.drive(drive.get("key", ""), now)
+        if not self.receives or metric not in (CONTROL.metric, CONTROL_TAKE.metric):
+            return
+        request: ControlRequest = codec.decode(CONTROL, message.payload)
+        who = request.by, request.id, request.device
+        if request.want == "release":
+            self.lease.release(who, now_ms)
+        else:
+            self.lease.hold(who, int(request.for_ms), metric == CONTROL_TAKE.metric, now_ms)
+
+    def drive(self, key: str, now: float) -> bool:
+        """Whether a command with this key moves it."""
+        now_ms = round(1000 * now)
+        self.lease.tick(now_ms)
+        if self.lease.refuses(True, False, key, "", now_ms):
+            return False
+        self.lease.moved(key, now_ms)
+        return True
+
+    def state(self) -> Message:
+        return outgoing(self.base, f"control/{self.name}", self.lease.state("5f0c2a91"), retain=True)
+
+
+class KeepingRobot:
+    """All motor owners of one robot."""
+
+    def __init__(self, base: str, *owners: str) -> None:
+        self.owners = [Owner(base, name) for name in owners or ("serial",)]
+
+    def take(self, messages: list[Message], now: float) -> list[Message]:
+        """Messages reach it, or only time; what it then publishes."""
+        before = self.states()
+        for owner in self.owners:
+            owner.lease.tick(round(1000 * now))
+            for message in messages:
+                owner.receive(message, now)
+        return [one for one in self.states() if one not in before]
+
+    def states(self) -> list[Message]:
+        return [one.state() for one in self.owners]

@@ -1,0 +1,93 @@
+"""Two people at two servers of the page, and a robot that keeps control itself: take, ask, let, keep, take over."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+from playwright.sync_api import Browser
+
+from tests.support import Broker, until
+from tests.web.browser import Size, Tab, tab
+from tests.web.served import RecordingRobot, Served
+
+GOOB = "pebble/robots/goob"
+SLOT = "document.querySelector('[data-test=why]').textContent"
+PLACES = """[...document.querySelectorAll('.slot, .stick, input[type=range]')].filter((one) => one.checkVisibility())
+  .map((one) => one.getBoundingClientRect()).map(({ x, y, width, height }) => [x, y, width, height].map(Math.round))
+  .join(' ')"""
+
+pytestmark = [pytest.mark.page, pytest.mark.timeout(180)]
+
+
+@contextmanager
+def person(browser: Browser, served: Served, name: str, size: Size = "desktop") -> Iterator[Tab]:
+    script = f"localStorage.setItem('pebble name', JSON.stringify('{name}'))"
+    with tab(browser, f"{served.origin}/r/{GOOB}", size, script=script) as opened:
+        assert opened.until("window.pebble?.connection.isOpen && pebble.driver.reason()?.code === 'free'", 30)
+        yield opened
+
+
+def moves(opened: Tab, robot: RecordingRobot) -> bool:
+    """Whether a key, pressed anew, moves the robot."""
+    opened.page.bring_to_front()
+    before = len([one for one in robot.drives() if one["z"]])
+    opened.page.keyboard.down("KeyW")
+    moved = opened.until(lambda: len([one for one in robot.drives() if one["z"]]) > before + 1, 2)
+    opened.page.keyboard.up("KeyW")
+    return moved
+
+
+@pytest.mark.parametrize("size", ["desktop", "phone"])
+def test_control_is_taken_asked_for_let_kept_and_taken_over(browser: Browser, broker: Broker, size: Size) -> None:
+    with (
+        RecordingRobot(broker.port, GOOB, keeps=True) as robot,
+        Served(broker.port) as hall,
+        Served(broker.port, server="attic") as attic,
+        person(browser, hall, "ann", size) as ann,
+        person(browser, attic, "otto", size) as otto,
+    ):
+        assert robot.keeping is not None
+        owner = robot.keeping.owners[0]
+        places = ann.page.evaluate(PLACES)
+        ann.test("take").click()
+        assert ann.until(f"{SLOT}.includes('You drive')")
+        assert moves(ann, robot)
+        assert otto.until(f"{SLOT}.includes('ann drives') && {SLOT}.includes('name not checked')")
+        assert not moves(otto, robot)
+
+        otto.test("ask").click()
+        assert ann.until(f"{SLOT}.includes('otto asks to drive')")
+        assert otto.until(f"{SLOT}.includes('ann is asked')")
+        assert ann.page.evaluate(PLACES) == places
+        ann.test("keep").click()
+        assert ann.until(f"{SLOT}.includes('You drive')")
+        otto.test("give-up").click()
+        assert otto.until(f"{SLOT}.includes('ann drives')")
+
+        assert moves(ann, robot)
+        otto.test("ask").click()
+        ann.test("let").click()
+        assert otto.until(f"{SLOT}.includes('You drive')")
+        assert ann.until(f"{SLOT}.includes('otto drives')")
+        assert moves(otto, robot)
+        assert robot.drives()[-1].get("key") == owner.lease.key
+        assert not moves(ann, robot)
+
+        otto.page.bring_to_front()
+        otto.page.keyboard.down("KeyW")
+        assert otto.until("pebble.driver.gestureActive")
+        ann.test("take-over").hover()
+        ann.page.mouse.down()
+        assert ann.until(f"{SLOT}.includes('You drive')")
+        ann.page.mouse.up()
+        assert otto.until(f"{SLOT}.includes('ann drives')")
+        assert until(lambda: owner.by == "ann")
+        assert not otto.page.evaluate("pebble.driver.gestureActive"), "what is held moves nothing any more"
+        otto.page.keyboard.up("KeyW")
+        assert moves(ann, robot)
+        robot.stranger(z=0.3)
+        assert ann.until(f"{SLOT}.includes('Someone else drives, too')")
+        assert ann.page.evaluate(PLACES) == places
+        assert ann.complaints() + otto.complaints() == []
