@@ -1,13 +1,14 @@
-"""The emergency stop of a board on Wi-Fi: its messages, its state, and the file that survives a power cut. A driver."""
+"""Emergency stop and control of a board on Wi-Fi: messages, states, and a file that survives a power cut. A driver."""
 
 import json
 import os
+from binascii import hexlify
 
 from micropython import const
 
 from common.arbiter import Arbiter
-from common.control import Control, Paced, compact, random_digits
-from common.latch import Latch, reset_of, stop_of
+from common.latch import Latch, fields, reset_of, stop_of
+from common.lease import Lease, request_of
 from common.payload import load
 from common.ticks import diff
 
@@ -15,23 +16,29 @@ _FILE = const("/estop.json")
 _NEW = const("/estop.new")  # renamed when it is complete: a power cut leaves the old file or the new one
 _NAMES = const(4)
 _LONGEST_STATE = const(300)
+_PAUSE_MS = const(250)  # between two states
 _EROFS = const(30)  # not in every port's errno
 _ENODEV = const(19)
+_ESTOP = const(b"estop/mcu")
+_CONTROL = const(b"control/mcu")
+_HOLDER = const(
+    '{"by":"%s","id":"%s","key":"%s","device":"%s","asks":"%s","asks_id":"%s","others":%s,"named":false,"boot":"%s"}'
+)
 
 
-class EmergencyStop(Paced):
-    """``stop`` and ``reset`` for their messages, then ``save`` while the motors are off; ``tick`` every turn.
-
-    Its state is never published in the turn of a stop.
-    """
+class EmergencyStop:
+    """``stop`` and ``reset`` for their messages, then ``save`` while the motors are off; ``tick`` every turn."""
 
     def __init__(self, now: int, watchdog_ms: int) -> None:
-        Paced.__init__(self, now)
-        boot = random_digits(4)
-        self.latch = Latch(boot, _NAMES, diff)
-        self.control = Control(boot, now)
-        self.arbiter = Arbiter(self.latch, self.control.lease, now, diff, watchdog_ms)
+        self.latch = Latch(_random(4), _NAMES, diff)
+        self.lease = Lease(now, diff, _random, 0)
+        self.arbiter = Arbiter(self.latch, self.lease, now, diff, watchdog_ms)
+        self.changed = True  # since the last state
+        self.due = b""  # the state to publish: at most four a second, and that of a stop not in its turn
+        self.stoppable = self.controllable = True  # the broker granted the topics of stops, and of control
         self._barred = 0  # of the last state
+        self._paused = False
+        self._since = now
         self._unsaved = False
         self._saves = True  # there is a file system that can be written to
         self._saved: bool | None = False  # `latched` by the file; None: unknown
@@ -39,10 +46,16 @@ class EmergencyStop(Paced):
 
     def tick(self, now: int) -> None:
         self.arbiter.tick(now)
+        if self._paused and diff(now, self._since) >= _PAUSE_MS:
+            self._paused = False
         if self.arbiter.barred != self._barred:
             self.changed = True
-        Paced.tick(self, now)
-        self.control.tick(now)
+        self.due = b""
+        if not self._paused:
+            if self.changed and self.stoppable:
+                self.due = _ESTOP
+            elif self.lease.changed and self.controllable:
+                self.due = _CONTROL
 
     # -- in
 
@@ -55,7 +68,7 @@ class EmergencyStop(Paced):
             except (ValueError, OverflowError, MemoryError):
                 pass
         self.changed = True
-        new = self.arbiter.stop(name or random_digits(8), by, why, since)
+        new = self.arbiter.stop(name or _random(8), by, why, since)
         self._unsaved = self._unsaved or self.latch.latched  # again if writing failed
         return new
 
@@ -71,21 +84,46 @@ class EmergencyStop(Paced):
 
     # -- the state
 
+    def request(self, raw: memoryview, urgent: bool, now: int) -> None:
+        """A request for control, or the end of it; ``urgent``: without asking."""
+        try:
+            order = request_of(fields(load(raw)))
+        except (ValueError, OverflowError, MemoryError):
+            return
+        if order:
+            name, by, device, ms = order
+            if ms:
+                self.lease.hold(("", name, by, device), ms, urgent, now)
+            else:
+                self.lease.release(("", name), now)
+
     def state(self) -> bytes:
-        """The payload of outgoing/estop/mcu, at most 300 bytes: the reason is cut."""
+        """The payload of what is ``due``, at most 300 bytes: the reason of a stop is cut."""
+        if self.due == _CONTROL:
+            lease = self.lease
+            _, name, by, device = lease.holder or ("", "", "", "")
+            _, asks_id, asks, _ = lease.asker or ("", "", "", "")
+            others = json.dumps(lease.others)
+            return (_HOLDER % (by, name, lease.key, device, asks, asks_id, others, self.latch.boot)).encode()
         state = self.latch.state(self._saved == self.latch.latched if self._saves else None)
         if self.arbiter.barred:
             state["barred"] = self.arbiter.barred
-        text = compact(state)
+        text = _json(state)
         excess = len(text) - _LONGEST_STATE
         if excess > 0:
             state["why"] = state["why"][:-excess]
-            text = compact(state)
+            text = _json(state)
         return text.encode()
 
     def published(self, now: int) -> None:
-        Paced.published(self, now)
-        self._barred = self.arbiter.barred
+        if self.due == _CONTROL:
+            self.lease.changed = False
+        else:
+            self.changed = False
+            self._barred = self.arbiter.barred
+        self.due = b""
+        self._paused = True
+        self._since = now
 
     # -- the file
 
@@ -123,3 +161,11 @@ class EmergencyStop(Paced):
             pass
         self.latch.restore(saved)
         self._saved = self.latch.latched
+
+
+def _random(count: int) -> str:
+    return hexlify(os.urandom(count)).decode()
+
+
+def _json(fields: dict) -> str:
+    return json.dumps(fields, separators=(",", ":"))

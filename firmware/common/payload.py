@@ -12,8 +12,6 @@ _MAX_BRACKETS = const(32)  # limits the parser's memory, which grows with depth
 
 _WATCHDOG_MS = const(60_000)  # longer than any: larger numbers are cut, because they would need memory
 
-_NUMBERS = int, float
-
 
 def load(raw: memoryview | bytes):
     """Parse JSON of limited size and depth. Raises ValueError, OverflowError or MemoryError.
@@ -61,7 +59,10 @@ def parse(raw: memoryview | bytes) -> tuple[float, float, float, int, int, str] 
             x, z, y = _axis(body, "x"), _axis(body, "z"), _axis(body, "y")
             stops = x == 0.0 and z == 0.0 and y == 0.0
             run, valid_ms = _run(body, stops), _valid_ms(body, stops)
-            return x, z, y, run, valid_ms, _key(body, stops)
+            key = body.get("key")
+            if not stops and not (key is None or isinstance(key, str)):
+                raise ValueError
+            return x, z, y, run, valid_ms, key if isinstance(key, str) else ""
     except (ValueError, OverflowError, MemoryError):  # not UTF-8, no JSON, no number
         pass
     return None
@@ -86,27 +87,18 @@ def _run(body: dict, stops: bool) -> int:
 def _valid_ms(body: dict, stops: bool) -> int:
     value = body.get("valid_ms")
     if value is not None:
-        if type(value) in _NUMBERS and 0 <= value < 1e12 and (stops or value >= 1):
+        if type(value) in (int, float) and 0 <= value < 1e12 and (stops or value >= 1):
             return int(min(value, _WATCHDOG_MS))
         if not stops:
             raise ValueError
     return -1
 
 
-def _key(body: dict, stops: bool) -> str:
-    value = body.get("key")
-    if isinstance(value, str):
-        return value
-    if value is None or stops:
-        return ""
-    raise ValueError
-
-
 def _axis(body: dict, name: str) -> float:
     value = body.get(name)
     if isinstance(value, str):
         value = _number(value.strip(" \t\n\r\v\f").lower())
-    elif type(value) not in _NUMBERS:
+    elif type(value) not in (int, float):
         return 0.0
     value = float(value)  # type: ignore[arg-type]
     if not -1e999 < value < 1e999:  # NaN or infinite; arithmetic would allocate memory

@@ -21,22 +21,19 @@ OTHERS_MS = 2000
 
 
 class Client(NamedTuple):
-    """Somebody who drives: below the level of names only the id counts."""
+    """Somebody who drives: below the level of names the account is empty, and only the id counts."""
 
-    by: str
+    account: str
     id: str
+    by: str
     device: str = ""
-
-    @property
-    def account(self) -> str:
-        return self.by.partition("/")[0]
 
 
 class ControlRules:
     """The rules of one life of an owner. The events are called after it has executed them; ``lease`` is its own."""
 
-    def __init__(self, strangers: str, named: bool, lease: Any) -> None:
-        self.strangers, self.named, self._lease = strangers, named, lease
+    def __init__(self, strangers: int, lease: Any) -> None:
+        self.strangers, self._lease = strangers, lease
         self._keys: list[str] = []
         self._holder: Client | None = None
         self._for = self._until = self._idle_at = 0
@@ -64,35 +61,28 @@ class ControlRules:
             self._asker = None
         self._compare()
 
-    def commanded(self, moves: bool, person: bool, key: str, by: str, now: int) -> tuple[bool, bool]:
+    def commanded(self, moves: bool, person: bool, key: str, by: str | None, now: int) -> tuple[bool, bool]:
         """Whether a command is permitted, and whether it is from who drives: then its zero is a letting go."""
         self._pass(now)
         self._learn_key()
-        mine = (
-            self._holder is not None
-            and self._keys[-1] in key.split(" ")
-            and (not self.named or by.partition("/")[0] == self._holder.account)
-        )
+        mine = self._holder is not None and self._keys[-1] in key.split(" ") and by == self._holder.account
         if mine:
             self._until = now + self._for
-        local = not person or (self.named and not by)
-        stranger = self.strangers == "drive" or (self.strangers == "free" and self._holder is None)
+        local = not person or by is None
+        stranger = self.strangers == 0 or (self.strangers == 1 and self._holder is None)
         permitted = not moves or mine or (not key and (local or stranger))
-        return permitted, not person or mine or self._holder is None
-
-    def moved(self, key: str, now: int) -> None:
-        """A person's command was executed that moves something."""
-        if key:
+        if moves and mine:
             self._idle_at = now + IDLE_MS
-        else:
+        elif moves and permitted and not local:
             self._others_until = now + OTHERS_MS
+        return permitted, not person or mine or self._holder is None
 
     def ticked(self, now: int) -> None:
         self._pass(now)
         self._compare()
 
     def _is(self, who: Client, other: Client | None) -> bool:
-        return other is not None and who.id == other.id and (not self.named or who.account == other.account)
+        return other is not None and who.id == other.id and who.account == other.account
 
     def _pass(self, now: int) -> None:
         if self._others_until is not None and now >= self._others_until:
@@ -123,8 +113,8 @@ class ControlRules:
 
     def _compare(self) -> None:
         self._learn_key()
-        lease, nobody = self._lease, Client("", "")
-        check(lease.holder == (self._holder or nobody), "somebody has control who must not, or the other way round")
-        check(lease.asker == (self._asker or nobody), "somebody counts as asking who does not, or the other way round")
+        lease = self._lease
+        check(lease.holder == (self._holder or ()), "somebody has control who must not, or the other way round")
+        check(lease.asker == (self._asker or ()), "somebody counts as asking who does not, or the other way round")
         check(lease.key == (self._keys[-1] if self._holder else ""), "a key is valid of which nobody has control")
         check(lease.others == (self._others_until is not None), "it is not shown that others drive, too")

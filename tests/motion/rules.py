@@ -140,7 +140,7 @@ class Rules:
         check(self.zeros <= 0, "a person's zero is not judged")
         self.zeros = 0
 
-    def judged(self, moves: bool, run: int, valid_ms: float, key: str, by: str, now: int, result: int) -> None:
+    def judged(self, moves: bool, run: int, valid_ms: float, key: str, by: str | None, now: int, result: int) -> None:
         """A drive command was judged; ``result`` is the milliseconds for which it moves, 0 or REFUSED."""
         self._end_hold(now)
         permitted, ours = self.control.commanded(moves, run == PERSON, key, by, now)
@@ -166,8 +166,6 @@ class Rules:
             else:
                 check(result == limit, "a person's command is refused, or lasts too long or too short")
             self._take(moves, valid_ms == 0 or not ours, now)
-            if moves:
-                self.control.moved(key, now)
             return
         if moves and 0 < run <= self.barred:
             check(result == REFUSED, "a barred run moves")

@@ -27,7 +27,7 @@ def test_micropython_returns_the_same_results(tmp_path: Path) -> None:
 def test_a_different_result_is_found(tmp_path: Path) -> None:
     wrong = [
         [0, "latch", ["00c0ffee", 4], None],
-        [0, "lease", [0, 1, "drive", False], None],
+        [0, "lease", [0, 1, 0], None],
         [0, "arbiter", [0, 750], None],
         [0, "tick", [0], 7],
     ]

@@ -44,6 +44,10 @@ def traces(seed: int, count: int) -> Iterator[str]:
         yield json.dumps(calls, separators=(",", ":"))
 
 
+def _all(lease: Any) -> list[Any]:
+    return [lease.key, list(lease.holder), list(lease.asker), lease.others, lease.changed, lease.halts]
+
+
 def _recording(calls: list[Any]) -> Any:
     """Cores that add every call from outside to ``calls``."""
 
@@ -70,17 +74,17 @@ def _recording(calls: list[Any]) -> Any:
             return result
 
     class Lease(CORES.Lease):  # type: ignore[misc]
-        def __init__(self, now: int, diff: Any, keys: Any, strangers: str, named: bool) -> None:
-            self.first = [now, keys.next, strangers, named]
-            super().__init__(now, diff, keys, strangers, named)
+        def __init__(self, now: int, diff: Any, keys: Any, strangers: int) -> None:
+            self.first = [now, keys.next, strangers]
+            super().__init__(now, diff, keys, strangers)
 
         def hold(self, *arguments: Any) -> None:
             super().hold(*arguments)
-            calls.append([self.number, "hold", arguments, [self.state(""), self.halts]])
+            calls.append([self.number, "hold", arguments, _all(self)])
 
         def release(self, *arguments: Any) -> None:
             super().release(*arguments)
-            calls.append([self.number, "release", arguments, [self.state(""), self.halts]])
+            calls.append([self.number, "release", arguments, _all(self)])
 
     class Arbiter(CORES.Arbiter):  # type: ignore[misc]
         def __init__(self, latch: Any, lease: Any, now: int, diff: Any, watchdog_ms: int) -> None:
@@ -94,9 +98,7 @@ def _recording(calls: list[Any]) -> Any:
             self.outside = False
             result: int = super().judge(*arguments)
             self.outside = True
-            calls.append(
-                [self.number, "judge", arguments, [result, self.barred, self.lease.state(""), self.lease.halts]]
-            )
+            calls.append([self.number, "judge", arguments, [result, self.barred, *_all(self.lease)]])
             return result
 
         def stop(self, *arguments: Any) -> bool:

@@ -55,13 +55,14 @@ WAITS = (
     0, 1, 10, 49, 50, 100, 100, 250, 250, 499, 500, 501,
     749, 750, 999, 1000, 1999, 2000, 2001, 5000, 60_000, 290_000,
 )  # fmt: skip
-#: Who drives; ids are copied, and another person of the same server has the same account.
+#: Who drives: ids may be copied, and people of one server have the same account.
 CLIENTS = (
-    *(Client("ann", "aaaaaaaa", "phone"), Client("ann", "bbbbbbbb"), Client("otto", "cccccccc")),
-    *(Client("mia", "aaaaaaaa"), Client("page-1/eve", "dddddddd"), Client("page-1/bob", "eeeeeeee")),
+    *(Client("ann", "aaaaaaaa", "ann", "phone"), Client("ann", "bbbbbbbb", "ann"), Client("mia", "aaaaaaaa", "mia")),
+    *(Client("page-1", "dddddddd", "page-1/eve"), Client("page-1", "eeeeeeee", "page-1/bob")),
+    Client("otto", "cccccccc", "otto"),
 )  # fmt: skip
 FOR = (0, 1000, 3000, 3000, 3000, 10_000, 1 << 40)
-STRANGERS = ("drive", "free", "refuse", "drive")
+STRANGERS = (0, 1, 2, 0)
 VALID = (-1, -1, -1, 100, 400, 750, 751, 5000)
 STALE_MS = 2000  # a command that moves something and is older is dropped on its way
 INBOX_MS = 500
@@ -84,7 +85,7 @@ class Keys:
     def __init__(self, first: int) -> None:
         self.next = first
 
-    def __call__(self) -> str:
+    def __call__(self, _count: int) -> str:
         self.next += 1
         return f"{self.next - 1:08x}"
 
@@ -127,10 +128,10 @@ class Owner:
         if self.visible != MISSING:
             self.latch.restore(self.visible[0])
             self.version = 1  # to be written again: an earlier process may have ended before the file was durable
-        strangers, named = STRANGERS[self.world.layout % 4], self.world.layout % 3 == 0
+        strangers = STRANGERS[self.world.layout % 4]
         keys = Keys((self.index + 1 << 28) + (self.boots << 16))
-        self.lease = cores.Lease(self.clock(now), self.diff, keys, strangers, named)
-        self.rules.control = ControlRules(strangers, named, self.lease)
+        self.lease = cores.Lease(self.clock(now), self.diff, keys, strangers)
+        self.rules.control = ControlRules(strangers, self.lease)
         self.arbiter = cores.Arbiter(self.latch, self.lease, self.clock(now), self.diff, WATCHDOG_MS)
         self.requests: list[Command] = []
         self.stage, self.writing_version = 0, 0
@@ -171,7 +172,7 @@ class Owner:
         else:
             moves, run, _, keys, by = message[4:9]
             self.rules.received(moves, run)
-            key = HOLDER if run == PERSON and self.lease.holds(keys, by) else run
+            key = HOLDER if run == PERSON and self.lease.holds(keys, by or "") else run
             old = self.inbox.pop(key, None)
             if old is not None and not old[4]:
                 self._drive(old, now)
@@ -407,7 +408,7 @@ class World:
         self.now = 0
         self.order = 0
         self.rogues: set[int] = set()
-        self.layout = layout
+        self.layout, self.named = layout, layout % 3 == 0
         self.owners = [Owner(self, index, kind, cores, 1 + layout * 997 % 9000) for index, kind in enumerate(kinds)]
         self.network: list[Command] = []
         self.retained: list[dict[str, Command]] = [{}]  # saves of the broker: by topic; the newest one counts
@@ -463,8 +464,9 @@ class World:
                 owner.work(self.now, self.order)
                 owner.apply(self.now)
 
-    def _drive(self, moves: bool, run: int, valid: int, keys: str = "", by: str = "") -> None:
-        self._send("drive", moves, run, valid, keys, by)
+    def _drive(self, moves: bool, run: int, valid: int, keys: str = "", by: str | None = None) -> None:
+        """Without a ``by`` it is from a program of the robot, where names are checked."""
+        self._send("drive", moves, run, valid, keys, by if self.named else "")
 
     def _send(self, what: str, *fields: Any) -> None:
         for owner in range(len(self.owners)):
@@ -514,29 +516,33 @@ class World:
 
     # -- persons who have control, want it, or have had it
 
+    def _client(self, b: int) -> Client:
+        client = CLIENTS[b % len(CLIENTS)]
+        return client if self.named else client._replace(account="")
+
     def do_hold(self, a: int, b: int) -> None:
-        self._send("control", CLIENTS[b % len(CLIENTS)], FOR[b % len(FOR)], a == 0)
+        self._send("control", self._client(b), FOR[b % len(FOR)], a == 0)
 
     def do_let_go(self, a: int, b: int) -> None:
-        self._send("control", CLIENTS[b % len(CLIENTS)], None, False)
+        self._send("control", self._client(b), None, False)
 
     def do_learn(self, a: int, b: int) -> None:
         """A client receives who has control; one in four times it learns another's key."""
         for index, owner in enumerate(self.owners):
-            if owner.up and (a % 4 == 0 or owner.lease.holder == CLIENTS[b % len(CLIENTS)]):
+            if owner.up and (a % 4 == 0 or owner.lease.holder == self._client(b)):
                 self.keys[b % len(CLIENTS)][index] = owner.lease.key
 
     def do_steer(self, a: int, b: int) -> None:
         """A client drives by the keys that it knows, the ones of now or of before; one in eight is a zero."""
         who = b % len(CLIENTS)
         keys = " ".join(key for _, key in sorted(self.keys[who].items()) if key)
-        self._drive(a != 0, PERSON, VALID[b % len(VALID)], keys, CLIENTS[who].by)
+        self._drive(a != 0, PERSON, VALID[b % len(VALID)], keys, CLIENTS[who].account)
 
     def do_signed(self, a: int, b: int) -> None:
         """A script elsewhere sends under a client's keys."""
         if self.run:
             keys = " ".join(key for key in self.keys[b % len(CLIENTS)].values() if key)
-            self._drive(a != 0, self.run, VALID[b % len(VALID)], keys, CLIENTS[b % len(CLIENTS)].by)
+            self._drive(a != 0, self.run, VALID[b % len(VALID)], keys, self._client(b).account)
 
     def do_control(self, a: int, b: int) -> None:
         """A client asks, is answered, and drives."""

@@ -21,7 +21,7 @@ class _Keys:
     def __init__(self, first):
         self.next = first
 
-    def __call__(self):
+    def __call__(self, _count):
         self.next += 1
         return f"{self.next - 1:08x}"
 
@@ -29,6 +29,10 @@ class _Keys:
 def _plain(result):
     """The value as it is after JSON: tuples are lists."""
     return list(result) if isinstance(result, tuple) else result
+
+
+def _all(lease):
+    return [lease.key, list(lease.holder), list(lease.asker), lease.others, lease.changed, lease.halts]
 
 
 def bodies():
@@ -50,16 +54,15 @@ def repeat(trace):
             diffs[number] = ticks.diff if arguments[1] == 4 else _subtract
             latches[number] = Latch(arguments[0], arguments[1], diffs[number])
         elif method == "lease":
-            now, first, strangers, named = arguments
-            leases[number] = Lease(now, diffs[number], _Keys(first), strangers, named)
+            now, first, strangers = arguments
+            leases[number] = Lease(now, diffs[number], _Keys(first), strangers)
         elif method == "arbiter":
             arbiters[number] = Arbiter(latches[number], leases[number], arguments[0], diffs[number], arguments[1])
         elif method == "hold" or method == "release":
             getattr(leases[number], method)(tuple(arguments[0]), *arguments[1:])
-            result = [leases[number].state(""), leases[number].halts]
+            result = _all(leases[number])
         elif method == "judge":
-            result = [arbiters[number].judge(*arguments), arbiters[number].barred, leases[number].state("")]
-            result.append(leases[number].halts)
+            result = [arbiters[number].judge(*arguments), arbiters[number].barred, *_all(leases[number])]
         elif method == "restore":
             latches[number].restore(*arguments)
             result = latches[number].saved()
