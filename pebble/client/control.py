@@ -28,6 +28,7 @@ IDLE_S = 60.0  # without a gesture control is given back
 _STATE_BYTES = 1024  # the contract allows 300
 _ID = 8  # characters of an id, and of a key
 _KEYS = 8  # in one command: motor owners read no more
+_NAME, _DEVICE = 40, 20  # characters, as robots cut them
 
 
 class RobotControl:
@@ -189,5 +190,5 @@ class ControlClient:
 
 def _clean(state: ControlState) -> ControlState:
     """The state with short, printable names."""
-    by, asks = (lease.shown(text, lease.BY) for text in (state.by, state.asks))
-    return msgspec.structs.replace(state, by=by, asks=asks, device=lease.shown(state.device, lease.DEVICE))
+    by, asks = (lease.shown(text, _NAME) for text in (state.by, state.asks))
+    return msgspec.structs.replace(state, by=by, asks=asks, device=lease.shown(state.device, _DEVICE))

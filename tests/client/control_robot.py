@@ -13,6 +13,7 @@ from pebble.transports import Message
 from tests.client.estop_robot import outgoing
 
 _keys = count(1)
+_NOT = ("", "", "", "")  # no client
 
 
 class Owner:
@@ -25,12 +26,12 @@ class Owner:
 
     def start(self, now: float) -> None:
         """It is started again: nobody has control."""
-        self.lease = Lease(round(1000 * now), operator.sub, lambda: f"{next(_keys):08x}")
+        self.lease = Lease(round(1000 * now), operator.sub, lambda _bytes: f"{next(_keys):08x}", 0)
 
     @property
     def by(self) -> str:
         """Who has control; "" nobody."""
-        return str(self.lease.holder[0])
+        return str(self.lease.holder[2]) if self.lease.key else ""
 
     def receive(self, message: Message, now: float) -> None:
         metric, now_ms = message.topic.removeprefix(f"{self.base}/incoming/"), round(1000 * now)
@@ -41,23 +42,24 @@ class Owner:
         if not self.receives or metric not in (CONTROL.metric, CONTROL_TAKE.metric):
             return
         request: ControlRequest = codec.decode(CONTROL, message.payload)
-        who = request.by, request.id, request.device
-        if request.want == "release":
-            self.lease.release(who, now_ms)
+        client = "", request.id, request.by, request.device
+        if request.ends():
+            self.lease.release(client, now_ms)
         else:
-            self.lease.hold(who, int(request.for_ms), metric == CONTROL_TAKE.metric, now_ms)
+            self.lease.hold(client, int(request.for_ms), metric == CONTROL_TAKE.metric, now_ms)
 
     def drive(self, key: str, now: float) -> bool:
         """Whether a command with this key moves it."""
         now_ms = round(1000 * now)
         self.lease.tick(now_ms)
-        if self.lease.refuses(True, False, key, "", now_ms):
-            return False
-        self.lease.moved(key, now_ms)
-        return True
+        return not self.lease.refuses(True, False, key, "", now_ms)
 
     def state(self) -> Message:
-        return outgoing(self.base, f"control/{self.name}", self.lease.state("5f0c2a91"), retain=True)
+        lease = self.lease
+        (_, name, by, device), (_, asks_id, asks, _) = lease.holder or _NOT, lease.asker or _NOT
+        state = {"by": by, "id": name, "key": lease.key, "device": device, "asks": asks, "asks_id": asks_id}
+        more = {"others": lease.others, "named": False, "boot": "5f0c2a91"}
+        return outgoing(self.base, f"control/{self.name}", state | more, retain=True)
 
 
 class KeepingRobot:

@@ -150,6 +150,7 @@ class TerminalDriver:
     def leave(self, now: float, wall: float) -> list[Message]:
         """The terminal is gone, or the driver leaves: stop, and give the lease back. Then :meth:`tick` twice more."""
         self._drive(self.gesture.interrupt(now))
+        self._wants_control = False
         self.control.release()
         self._out += self.control.tick(now)
         self.lease.release()
@@ -285,9 +286,9 @@ class TerminalDriver:
         if self.control.held and now - self._used_at > IDLE_S:
             self.control.release()
         elif self._wants_control and not problem and self.robot.control.state is not None:
-            self._wants_control = False
-            if self._take_over or not self.robot.control.who:
+            if not self.control.wanted and (self._take_over or not self.robot.control.who):
                 self.control.ask(now, over=self._take_over)
+            self._wants_control = self._take_over = False
         self._out += self.control.tick(now)
         self._check_control(now)
         if self.control.held and not self.lease.held:
