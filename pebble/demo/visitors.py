@@ -54,11 +54,13 @@ class Visitors:
 
     def taken(self, robot: RobotView, now: float) -> str:
         """Why people have the control of it now; empty: they have not."""
-        if now - self._driven.get(robot.base, -math.inf) < VALID_S:
-            who, at = self._drivers.get(robot.base, ("", -math.inf))
-            return f"is driven by {who if now - at < VALID_S else 'another program'}"
         stop = robot.stopped_by
-        return "" if stop is None or stop.by == self._name else f"is stopped by {stop.by or 'unknown'}"
+        if stop is not None and stop.by != self._name:
+            return f"is stopped by {stop.by or 'unknown'}"
+        if now - self._driven.get(robot.base, -math.inf) >= VALID_S:
+            return ""
+        who, at = self._drivers.get(robot.base, ("", -math.inf))
+        return f"is driven by {who if now - at < VALID_S else 'another program'}"
 
     def free(self, robot: RobotView, now: float) -> bool:
         """Whether it may be driven in the present step, in which no person has had it so far."""
