@@ -22,7 +22,8 @@ from pebble.client.driver_lease import FILTER
 from pebble.client.estop import StopSender, new_name
 from pebble.client.estop_states import Reset
 from pebble.client.robot_view import RobotView
-from pebble.contract import APRILTAG_DATA, AUTONOMY_COMMAND, DRIVE, SOUNDBOARD_COMMAND, codec
+from pebble.contract import APRILTAG_DATA, AUTONOMY_COMMAND, AUTONOMY_FILES, DRIVE, SOUNDBOARD_COMMAND, codec
+from pebble.contract.identity import parse_topic
 from pebble.contract.payloads import AutonomyCommand, Drive, LightsFlash, LightsSolid, SoundboardCommand, TagData
 from pebble.demo.visitors import Visitors
 from pebble.errors import PayloadError
@@ -81,6 +82,7 @@ HOLD_S = HOLD_MS / 1000  # scripts are refused this long after a person's last c
 _APPROACH_S, _OVERRIDE_S, _STEADY_S, _FOLLOWED_REST_S = 1.0, 1.0, 0.8, 0.5
 _START_S, _ARRIVAL_S = 10.0, 10.0  # at most, on the smallest machine
 _STATUS_S = 1.0  # until the robot's status has changed
+_LISTED_S = 20.0  # until a robot has listed its scripts, on the smallest machine
 _TRAIL_S = 3.0  # until a script that was started runs
 #: Of most runs; a slow one takes longer.
 TAKEOVER_S = 2.0 + _APPROACH_S + _OVERRIDE_S + HOLD_S + 4.5 + _STEADY_S + _FOLLOWED_REST_S
@@ -144,6 +146,7 @@ class Operator:
         self.completed: deque[CompletedStep | CompletedStop | CompletedFollow] = deque(maxlen=_MOST_WAITING)
         self._doing = "discovering robots"
         self._visitors = Visitors(NAME)
+        self._drawing: set[str] = set()  # base topics of robots that have listed the script for their trail
         self._robots: list[RobotView] = []  # that take part in the present step
         self._scripted: RobotView | None = None  # if a person takes it, the present step ends
         self._transport = create("mqtt", name, MqttSettings(host="127.0.0.1", port=port))
@@ -157,6 +160,7 @@ class Operator:
         self._transport.subscribe(FILTER, lambda one: self._visitors.receive(one, time.monotonic()))
         drives = DRIVE.filter("+/+/+")
         self._transport.subscribe(drives, lambda one: self._visitors.receive_drive(one, time.monotonic()))
+        self._transport.subscribe(AUTONOMY_FILES.filter("+/+/+"), self._receive_scripts)
 
     def ready(self, wanted: int) -> bool:
         """Are that many robots online, with a drive topic?"""
@@ -191,6 +195,13 @@ class Operator:
             self._thread.join(1.0)
         self._transport.close()
 
+    def _receive_scripts(self, message: Message) -> None:
+        address = parse_topic(message.topic)
+        with suppress(PayloadError):
+            files = codec.decode(AUTONOMY_FILES, message.payload).files if message.payload else []
+            if address is not None and any(one.get("file") == TRAIL for one in files):
+                self._drawing.add(address.identity.base)
+
     def _mine(self, robot: RobotView) -> bool:
         return self._visitors.free(robot, time.monotonic())
 
@@ -199,6 +210,8 @@ class Operator:
     def _run(self, yours: str) -> None:
         robots = self.discovery.all_robots()
         with suppress(EndedEarlyError):
+            scripted = [robot.base for robot in robots if robot.offers("autonomy")]
+            self._until(lambda: self._drawing.issuperset(scripted), _LISTED_S)
             while not (yours and self.rounds):
                 self._show_trails(robots)
                 for step in SCRIPT:
@@ -252,9 +265,7 @@ class Operator:
         """Send one command to all robots that are free; returns when."""
         for robot in filter(self._mine, self._robots):
             self.commands[robot.base] = drive, time.monotonic()
-            payload = codec.encode(DRIVE, drive)
-            self._visitors.note_sent(str(robot.drive_topic), payload)
-            self._publish(robot.drive_topic, payload)
+            self._publish(robot.drive_topic, codec.encode(DRIVE, drive))
         return time.monotonic()
 
     def _hold(self, drive: Drive, seconds: float) -> float:
@@ -272,6 +283,8 @@ class Operator:
 
     def _publish_all(self, messages: Iterable[Message]) -> None:
         for one in messages:
+            if one.topic.endswith(DRIVE.suffix):  # the zeros of an emergency stop are among them
+                self._visitors.note_sent(one.topic, one.payload)
             self._transport.publish(one.topic, one.payload, qos=one.qos, urgent=True)
 
     # -- a step, an emergency stop, and a script
@@ -293,6 +306,7 @@ class Operator:
         """Drive all, stop them, drive in vain, reset, drive again; a stop by a person is the person's to reset."""
         received, began = queue.SimpleQueue[Message](), time.monotonic()
         self._begin(EMERGENCY_STOP, robots)
+        self._end_trails()
         with closing(self._transport.subscribe(ALL_OUTGOING, received.put)):  # brings retained capabilities again
             self._hold(_FORWARD, _BEFORE_S)
             pressed = time.monotonic()
@@ -317,16 +331,24 @@ class Operator:
             self._complete(CompletedStop(robot.name, began, pressed, confirmed_s, reset_at, free, ended))
 
     def _show_trails(self, robots: Sequence[RobotView]) -> bool:
-        """Have each robot with scripts that runs none publish where it is; whether all of them run one.
+        """Have each robot with the script for it that runs none publish where it is; whether all of them run one.
 
-        One that a person has refuses to start a script.
+        One that a person has, or that is stopped, refuses to start a script.
         """
-        idle = [one for one in robots if one.offers("autonomy") and not (one.autonomy and one.autonomy.running)]
+        idle = [one for one in robots if one.base in self._drawing and not (one.autonomy and one.autonomy.running)]
         now = time.monotonic()
-        for robot in [one for one in idle if not self._visitors.taken(one, now)]:
-            command = AutonomyCommand(action="start", file=TRAIL)
-            self._publish(AUTONOMY_COMMAND.topic(robot.base), codec.encode(AUTONOMY_COMMAND, command))
+        for robot in [one for one in idle if not one.stopped_by and not self._visitors.taken(one, now)]:
+            self._command(robot, AutonomyCommand(action="start", file=TRAIL))
         return not idle
+
+    def _end_trails(self) -> None:
+        """So that an emergency stop ends no script, which would be told of as a failure."""
+        for robot in self._robots:
+            if robot.autonomy is not None and robot.autonomy.running and robot.autonomy.file == TRAIL:
+                self._command(robot, AutonomyCommand(action="stop"))
+
+    def _command(self, robot: RobotView, command: AutonomyCommand) -> None:
+        self._publish(AUTONOMY_COMMAND.topic(robot.base), codec.encode(AUTONOMY_COMMAND, command))
 
     def _take_over(self, robots: Sequence[RobotView]) -> None:
         """Let each robot with scripts follow a tag, and overrule the script for a moment."""
@@ -350,9 +372,6 @@ class Operator:
             with suppress(PayloadError):
                 seen.append(codec.decode(APRILTAG_DATA, message.payload))
 
-        def command(what: AutonomyCommand) -> None:
-            self._publish(AUTONOMY_COMMAND.topic(robot.base), codec.encode(AUTONOMY_COMMAND, what))
-
         def scripted() -> bool:
             """Whether the robot reports that no person goes before its script, as after the steps before."""
             status = robot.autonomy
@@ -367,9 +386,9 @@ class Operator:
         sound = codec.encode(SOUNDBOARD_COMMAND, SoundboardCommand(action="play", file=CLIP))
         with ExitStack() as stack:
             stack.callback(self._transport.subscribe(APRILTAG_DATA.topic(robot.base), receive).close)
-            stack.callback(command, AutonomyCommand(action="stop"))
+            stack.callback(self._command, robot, AutonomyCommand(action="stop"))
             began = time.monotonic()
-            command(AutonomyCommand(action="start", file=FOLLOW, config=config))
+            self._command(robot, AutonomyCommand(action="start", file=FOLLOW, config=config))
             self._publish(SOUNDBOARD_COMMAND.topic(robot.base), sound)
             self._until(lambda: bool(seen) and scripted(), _START_S)
             self._wait(_APPROACH_S)

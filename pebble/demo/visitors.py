@@ -56,11 +56,13 @@ class Visitors:
         """Why people have the control of it now; empty: they have not."""
         if robot.controlled and robot.control.who:  # as it tells itself
             self._drivers[robot.base], self._driven[robot.base] = (robot.control.who, now), now
-        if now - self._driven.get(robot.base, -math.inf) < VALID_S:
-            who, at = self._drivers.get(robot.base, ("", -math.inf))
-            return f"is driven by {who if now - at < VALID_S else 'another program'}"
         stop = robot.stopped_by
-        return "" if stop is None or stop.by == self._name else f"is stopped by {stop.by or 'unknown'}"
+        if stop is not None and stop.by != self._name:
+            return f"is stopped by {stop.by or 'unknown'}"
+        if now - self._driven.get(robot.base, -math.inf) >= VALID_S:
+            return ""
+        who, at = self._drivers.get(robot.base, ("", -math.inf))
+        return f"is driven by {who if now - at < VALID_S else 'another program'}"
 
     def free(self, robot: RobotView, now: float) -> bool:
         """Whether it may be driven in the present step, in which no person has had it so far."""

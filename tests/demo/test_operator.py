@@ -11,6 +11,7 @@ import pytest
 
 from pebble.contract import (
     AUTONOMY_COMMAND,
+    AUTONOMY_FILES,
     AUTONOMY_STATUS,
     CAPABILITIES,
     DRIVE,
@@ -19,7 +20,16 @@ from pebble.contract import (
     ONLINE,
     codec,
 )
-from pebble.contract.payloads import AutonomyStatus, Capabilities, Drive, Driver, Driving, EstopState, Heartbeat
+from pebble.contract.payloads import (
+    AutonomyFiles,
+    AutonomyStatus,
+    Capabilities,
+    Drive,
+    Driver,
+    Driving,
+    EstopState,
+    Heartbeat,
+)
 from pebble.demo.operator import TRAIL, Operator
 from pebble.transports import Message, MqttSettings, QoS, Transport, create
 from tests.support import Broker, until
@@ -45,6 +55,8 @@ class Robot:
         }
         payload = codec.encode(CAPABILITIES, Capabilities(t=1, value=value))
         self.transport.publish(CAPABILITIES.topic(BASE), payload, retain=True, qos=QoS.DELIVERED)
+        files = codec.encode(AUTONOMY_FILES, AutonomyFiles(files=[{"file": TRAIL}], timestamp=1))
+        self.transport.publish(AUTONOMY_FILES.topic(BASE), files, retain=True, qos=QoS.DELIVERED)
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._send_heartbeats, daemon=True)
         self._thread.start()
@@ -63,7 +75,7 @@ class Robot:
         self.transport.publish(DRIVING.topic("pebble/servers/hall"), payload, qos=QoS.DELIVERED)
 
     def show_script(self) -> None:
-        status = codec.encode(AUTONOMY_STATUS, AutonomyStatus(running=True, file=self.scripts[-1] or ""))
+        status = codec.encode(AUTONOMY_STATUS, AutonomyStatus(running=True, timestamp=1, file=self.scripts[-1] or ""))
         self.transport.publish(AUTONOMY_STATUS.topic(BASE), status, qos=QoS.DELIVERED)
 
     def show_stop(self, *, by: str, latched: bool = True) -> None:
