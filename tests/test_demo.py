@@ -217,6 +217,7 @@ def test_a_closed_terminal_ends_everything_though_its_signal_goes_elsewhere(demo
     assert demo.folders() == []
 
 
+@pytest.mark.thorough
 def test_without_the_packages_of_the_page_everything_else_goes_on(demos: list[Demo], temporary: Path) -> None:
     code = """
 import sys

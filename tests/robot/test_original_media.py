@@ -16,7 +16,7 @@ import pytest
 
 from tests.robot.closed_loop.following import ORIGINAL_WITHIN_M, TARGET_M, Start
 from tests.robot.world_rig import FOLLOW, WorldRig
-from tests.support import cases, gone, until
+from tests.support import cases, further, gone, until
 
 pytestmark = pytest.mark.alone  # deadlines are checked
 
@@ -80,7 +80,7 @@ def rigs() -> Iterator[Callable[[str, str], OriginalRig]]:
         yield cache(lambda kind, python: stack.enter_context(OriginalRig(kind, python)))  # type: ignore[arg-type]
 
 
-@pytest.fixture(params=["zenoh", "mqtt"])
+@pytest.fixture(params=[further("zenoh"), "mqtt"])
 def kind(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
