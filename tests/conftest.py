@@ -18,6 +18,8 @@ from tests.recordings.replayed import recording as recording  # a fixture for al
 signal.signal(signal.SIGINT, signal.default_int_handler)
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
+gc.disable()  # until the tests are collected, of which nothing is garbage: a fifth of the time that it takes
+
 # An example may take long on a busy machine.
 settings.register_profile("pebble", deadline=None)
 settings.load_profile("pebble")
@@ -52,6 +54,7 @@ def pytest_runtest_setup() -> None:
 def pytest_collection_finish() -> None:
     """Garbage is looked for among what tests make, not among all there are: that takes 0.3 s (measured), on a busy
     machine more, and everything in this process, services and transports too, stands still meanwhile."""
+    gc.enable()
     gc.collect()
     gc.freeze()
 
