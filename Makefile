@@ -5,13 +5,13 @@ VENV := .venv/bin/python
 
 .DEFAULT_GOAL := help
 unexport PYTHONDONTWRITEBYTECODE  # every test starts programs: compiling them each time would cost a third of the time
-.PHONY: help demo demo-options test quick thorough stops soak floods schedules script-schedules page-schedules page-tests gstreamer gstreamer-tests brokers check firmware report clean lock audit sbom check-types check-names check-collection test-running test-further test-robots test-pages test-computing
+.PHONY: help demo demo-options test quick thorough stops soak floods schedules script-schedules page-schedules page-tests gstreamer gstreamer-tests brokers check firmware report clean lock audit sbom check-types check-names check-collection quick-tests test-running test-robots test-computing test-checks test-demo
 
 help:
 	@echo "make demo             four simulated robots, on Zenoh, on MQTT and on MCUs, driven through a broker; Ctrl-C ends it"
 	@echo "make demo SECONDS=30  ends by itself; succeeds only if every robot moved, stopped and obeyed as it should"
 	@echo "make demo PHONE=1     opens its page to the network, by https, with a login and a QR code"
-	@echo "make test             all checks and tests, a quarter of an hour"
+	@echo "make test             all checks and tests, eight minutes"
 	@echo "make quick            what to run before each commit: lint, types, contract, memory transport, one robot; a minute"
 	@echo "make thorough         the same, with all cases of the random tests, and the tests that take longest"
 	@echo "make stops            400 random schedules of emergency stops and faults with whole robots, 40 minutes"
@@ -42,21 +42,18 @@ demo-options:
 demo: demo-options .venv/.ready-demo
 	@$(VENV) -m pebble.cli demo $(if $(SECONDS),--seconds $(SECONDS)) $(if $(PHONE),--phone)
 
-# Folders whose tests take longest come first: else the last of them run while the other processors have nothing to do.
-TESTS := $(VENV) tools/run_tests.py --dist loadscope --no-loadscope-reorder
+TESTS := $(VENV) tools/run_tests.py
 LESS := $(if $(PEBBLE_THOROUGH),, and not thorough)
-# What checks no times: it uses what whole robots leave of the processors.
+# Runs when nothing else wants a processor.
+GENTLY := chrt --idle 0
+# Tests that check no times.
 COMPUTING := tests/config tests/contract tests/media tests/motion tests/perception tests/robot/test_lockstep.py \
 	$(addprefix tests/bench/,judging $(addprefix test_,plots.py report.py results.py)) \
 	$(addprefix tests/firmware/test_,compile.py deadman_virtual.py golden.py heap.py motor_boards.py outlets.py) \
 	$(addprefix tests/firmware/test_,types.py vm.py) \
 	$(addprefix tests/web/,modules $(addprefix test_,driving_lockstep.py log_lines.py page_clock.py recent.py types.py))
-# What takes longest of the others.
-FIRST := $(addprefix tests/,web services recordings transports robot forwarding commands)
-# Files with tests of whole robots, to collect no others; those that take longest come first.
-ALONE = $(shell grep --recursive --files-with-matches --include=test_*.py 'mark\.alone' \
-	tests/services tests/robot/test_faults.py tests | grep --invert-match tests/test_demo.py | awk '!seen[$$0]++')
-PAGES = $(filter tests/web/%,$(ALONE))
+# Files with tests of whole robots, to collect no others.
+ALONE = $(shell grep --recursive --files-with-matches --include=test_*.py 'mark\.alone' tests | grep --invert-match test_demo.py)
 
 # Each run of pytest appends what its tests took; without it, for parts that are called alone.
 TIMES := .venv/test-times.tsv
@@ -66,44 +63,41 @@ SHOW_TIMES = $(VENV) tools/test_times.py $(TIMES)
 quick: .venv/.ready-dev
 	@sh tools/debian-packages.sh mosquitto=mosquitto
 	@rm -f $(TIMES)
-	@$(MAKE) --no-print-directory --jobs=2 check-types check-names
-	@$(VENV) tools/run_tests.py --numprocesses 2 tests/contract tests/forwarding --ignore tests/forwarding/links
-	@$(VENV) tools/run_tests.py -k memory tests/transports/test_contract.py
-	@$(VENV) tools/run_tests.py -k "drive_forms or silence" tests/robot/test_robot.py
+	@$(MAKE) --no-print-directory --jobs=3 check-types check-names quick-tests
 	@$(SHOW_TIMES)
 
-# What only computes, as little as possible in the way, uses what the others leave, from the beginning to the end. The
-# others run in two parts, because every process collects all tests of its part: 10 s of a processor for all there are.
+quick-tests:
+	@$(TESTS) --workers 2 tests/contract tests/forwarding --ignore tests/forwarding/links
+	@$(TESTS) -k memory tests/transports/test_contract.py
+	@$(TESTS) -k "(drive_forms or silence) and zenoh" tests/robot/test_robot.py
+
+# Types, lint and what only computes use what tests that wait and measure leave of the processors.
 test: .venv/.ready-dev
-	@$(MAKE) --no-print-directory --jobs=2 --output-sync check-types check-names
 	@sh tools/debian-packages.sh mosquitto=mosquitto mosquitto_pub=mosquitto-clients chromium=chromium node=nodejs ip=iproute2 tc=iproute2 nft=nftables systemd-analyze=systemd
 	@rm -f $(TIMES)
-	@echo "pebble: tests"
-	@$(MAKE) --no-print-directory --jobs=3 test-computing test-running test-further
-	@echo "pebble: whole robots and serial lines, two at a time because these tests check deadlines, beside them one with a page"
-	@$(MAKE) --no-print-directory --jobs=2 test-robots test-pages
-	@echo "pebble: the demo, whose robots need all processors"
-	@$(VENV) tools/run_tests.py $(if $(PEBBLE_THOROUGH),,-m "not thorough") tests/test_demo.py
+	@$(MAKE) --no-print-directory --jobs=3 test-checks test-computing test-demo
 	@$(SHOW_TIMES)
 	@$(VENV) tools/tree_growth.py
 
 test-running:
-	@$(TESTS) --numprocesses 4 -m "not alone and not page$(LESS)" $(addprefix --ignore=,$(COMPUTING)) $(FIRST)
+	@echo "pebble: tests"
+	@$(TESTS) --workers 6 -m "not alone and not page$(LESS)" $(addprefix --ignore=,$(COMPUTING)) tests
 
-test-further:
-	@$(TESTS) --numprocesses 2 -m "not alone and not page$(LESS)" $(addprefix --ignore=,$(COMPUTING) $(FIRST)) tests \
-		>.venv/further.log 2>&1 || { cat .venv/further.log; exit 1; }
-	@echo "pebble: further ones: $$(tail -n 1 .venv/further.log)"
+test-checks:
+	@$(GENTLY) $(MAKE) --no-print-directory --jobs=2 check-types check-names >.venv/checks.log 2>&1 || \
+		{ cat .venv/checks.log; exit 1; }
+	@echo "pebble: lint, types, imports and names are in order"
 
-test-robots:
-	@$(TESTS) --numprocesses 2 -m "alone and not page$(LESS)" $(filter-out $(PAGES),$(ALONE))
+test-robots: test-running
+	@echo "pebble: whole robots and serial lines, three at a time because these tests check deadlines"
+	@$(TESTS) --workers 3 -m "alone and not page$(LESS)" $(ALONE)
 
-test-pages:
-	@$(VENV) tools/run_tests.py -m "alone and not page$(LESS)" $(PAGES) >.venv/pages.log 2>&1 || { cat .venv/pages.log; exit 1; }
-	@echo "pebble: pages at whole robots: $$(tail -n 1 .venv/pages.log)"
+test-demo: test-robots
+	@echo "pebble: the demo, whose robots need all processors"
+	@$(TESTS) $(if $(PEBBLE_THOROUGH),,-m "not thorough") tests/test_demo.py
 
 test-computing:
-	@nice -n 19 $(TESTS) --numprocesses 2 -m "not alone and not page$(LESS)" $(COMPUTING) >.venv/computing.log 2>&1 || \
+	@$(GENTLY) $(TESTS) --workers 2 --timeout 600 -m "not alone and not page$(LESS)" $(COMPUTING) >.venv/computing.log 2>&1 || \
 		{ cat .venv/computing.log; exit 1; }
 	@echo "pebble: what only computes: $$(tail -n 1 .venv/computing.log)"
 
@@ -113,7 +107,7 @@ thorough: gstreamer
 # Every state of the operator page on every size, every card, its sound, every interruption, and fingers.
 page-tests: .venv/.ready-dev
 	@sh tools/debian-packages.sh mosquitto=mosquitto chromium=chromium
-	@$(VENV) tools/run_tests.py -m page tests/web
+	@$(TESTS) -m page tests/web
 
 # 250 MB, so only for those who ask for it: make test has a stand-in for shmsrc, which reads Debian's shmsink here.
 gstreamer:
@@ -131,7 +125,7 @@ gstreamer-tests: .venv/.ready-dev gstreamer
 brokers: .venv/.ready-dev
 	@sh tools/debian-packages.sh mosquitto=mosquitto
 	@sh tools/brokers.sh
-	@$(VENV) tools/run_tests.py -ra tests/transports/test_brokers.py tests/transports/test_client_ids.py
+	@$(TESTS) -ra tests/transports/test_brokers.py tests/transports/test_client_ids.py
 
 # What violates a rule is described in build/stops; the seed in its name repeats it.
 stops: .venv/.ready-dev

@@ -18,6 +18,8 @@ from tests.recordings.replayed import recording as recording  # a fixture for al
 signal.signal(signal.SIGINT, signal.default_int_handler)
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
+gc.disable()  # until the tests are collected, of which nothing is garbage: a fifth of the time that it takes
+
 # An example may take long on a busy machine.
 settings.register_profile("pebble", deadline=None)
 settings.load_profile("pebble")
@@ -27,30 +29,32 @@ _STATE = tempfile.mkdtemp(prefix="pebble-tests-")
 os.environ.pop("STATE_DIRECTORY", None)
 os.environ["XDG_STATE_HOME"] = _STATE
 
-#: Modules of few tests that take long. They begin first: begun last, they would delay the end of the run.
+#: Modules that take longest begin first: begun last, one of them would delay the end of the run.
 _LONG = (
-    *(
-        "robot/test_hostile.py",
-        "test_demo.py",
-        "firmware/test_deadman_virtual.py",
-        "transports/frames/test_frames_faults.py",
-    ),
-    *(
-        "services/camera_publisher/test_service.py",
-        "services/mqtt_bridge/test_bridge_media.py",
-        "services/serial_mcu_bridge/test_mcu_private.py",
-    ),
-    *("bench/test_frames.py", "transports/frames/test_views.py"),
+    *("web/robots/test_controls.py", "robot/test_closed_loop.py", "robot/test_original_media.py"),
+    *("robot/test_surroundings.py", "robot/test_faults.py", "robot/test_driveable.py", "robot/test_hostile.py"),
+    *("web/test_attacks.py", "web/test_hostile_broker.py", "forwarding/links/test_table.py"),
+    *("recordings/test_unread.py", "commands/test_estop.py", "commands/test_drive.py", "launcher/test_launcher.py"),
+    *("flash/test_steps.py", "firmware/test_deadman_virtual.py", "web/test_types.py", "web/test_driving_lockstep.py"),
 )
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    items.sort(key=lambda item: not item.path.as_posix().endswith(_LONG))
+    items.sort(key=lambda item: next((at for at, end in enumerate(_LONG) if item.path.as_posix().endswith(end)), 99))
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup() -> None:
+    """What robots save in one worker is nothing to those of another one."""
+    own = Path(_STATE, str(os.getpid()))
+    own.mkdir(exist_ok=True)
+    os.environ["XDG_STATE_HOME"] = str(own)
 
 
 def pytest_collection_finish() -> None:
     """Garbage is looked for among what tests make, not among all there are: that takes 0.3 s (measured), on a busy
     machine more, and everything in this process, services and transports too, stands still meanwhile."""
+    gc.enable()
     gc.collect()
     gc.freeze()
 

@@ -27,6 +27,8 @@ ROOT = Path(__file__).resolve().parent.parent
 
 T = TypeVar("T")
 
+_LONGEST_PAUSE_S = 0.03
+
 
 #: `make thorough` sets it: tests with many cases then try all of them.
 THOROUGH = bool(os.environ.get("PEBBLE_THOROUGH"))
@@ -35,6 +37,11 @@ THOROUGH = bool(os.environ.get("PEBBLE_THOROUGH"))
 def cases(some: int, all_: int) -> int:
     """How many cases a test with random inputs tries."""
     return all_ if THOROUGH else some
+
+
+def further(*values: Any) -> Any:
+    """Parameters of a rule that other ones of the same test prove as well; ``make thorough`` tries them, too."""
+    return pytest.param(*values, marks=pytest.mark.thorough)
 
 
 def some(all_: Iterable[T], step: int) -> list[T]:
@@ -57,13 +64,17 @@ def beside(work: Callable[[], object], ending: threading.Event) -> Iterator[None
         thread.join()
 
 
-def until(condition: Callable[[], object], timeout: float = 10.0, *, step: float = 0.005) -> bool:
-    """Wait until ``condition()`` is true; False when ``timeout`` seconds went by without it."""
+def until(condition: Callable[[], object], timeout: float = 10.0, *, step: float = 0.003) -> bool:
+    """Wait until ``condition()`` is true; False when ``timeout`` seconds went by without it.
+
+    The pauses between two looks grow from ``step``: many tests wait at the same time, and looking uses the processors.
+    """
     end = time.monotonic() + timeout
     while time.monotonic() < end:
         if condition():
             return True
         time.sleep(step)
+        step = max(step, min(1.2 * step, _LONGEST_PAUSE_S))
     return bool(condition())
 
 

@@ -158,6 +158,7 @@ def test_a_phone_can_log_in_and_a_closed_terminal_ends_everything_though_its_sig
     assert demo.folders() == []
 
 
+@pytest.mark.thorough
 def test_without_the_packages_of_the_page_everything_else_goes_on(demos: list[Demo], temporary: Path) -> None:
     code = """
 import sys

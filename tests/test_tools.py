@@ -87,9 +87,9 @@ def test_first_time(): pass
 
 def run_tests(folder: Path, content: str, workers: int = 1) -> tuple[int, str]:
     (folder / "test_it.py").write_text(content)
-    options = ["-q", "--numprocesses", str(workers), f"--rootdir={folder}"]
+    options = ["-q", "--workers", str(workers), f"--rootdir={folder}"]
     command = [sys.executable, str(ROOT / "tools/run_tests.py"), *options]
-    plugins = {"PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", "PYTEST_PLUGINS": "xdist.plugin"}  # others take seconds to import
+    plugins = {"PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", "PYTEST_PLUGINS": ""}  # others take seconds to import
     environment = {**os.environ, "PYTHONPATH": str(ROOT), **plugins}
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=100, env=environment)
     return done.returncode, done.stdout
@@ -113,6 +113,28 @@ def test_many_failures_are_no_coincidence(tmp_path: Path) -> None:
 
 def test_an_error_in_a_test_file_fails(tmp_path: Path) -> None:
     assert run_tests(tmp_path, "import nothing_like_this")[0] not in (0, 5)
+
+
+DIES = """
+import os, pathlib, pytest
+pathlib.Path("collected").open("a").write("x")
+@pytest.fixture(scope="module")
+def made(): pathlib.Path("made").open("a").write("x")
+def test_first(made): pass
+def test_dies(made): os._exit(3)
+def test_goes_on(made): pass
+"""
+
+
+def test_tests_are_collected_once_and_a_worker_that_dies_fails_its_test_only(tmp_path: Path) -> None:
+    (tmp_path / "test_other.py").write_text("def test_elsewhere(): pass")
+    code, output = run_tests(tmp_path, DIES, workers=2)
+    assert code != 0
+    assert "the process that ran test_it.py::test_dies died" in output
+    assert "1 failed, 3 passed" in output
+    once_and_for_the_second_time = "xx"
+    assert (tmp_path / "collected").read_text() == once_and_for_the_second_time
+    assert (tmp_path / "made").read_text() == "xxx"  # by two workers, and for the second time
 
 
 LEAVES = """

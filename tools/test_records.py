@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -17,9 +18,29 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--times", help="file to append to, per test: seconds, seconds of processor time, name")
 
 
+_TICK_S = 1 / os.sysconf("SC_CLK_TCK")
+
+
 def _processor_s() -> float:
-    """Processor time of this process and of children that have ended, seconds."""
-    return sum(os.times()[:4])
+    """Processor time of this process and of all that it has started, running ones too, seconds."""
+    return sum(os.times()[:4]) + sum(map(_used_s, _descendants(os.getpid())))
+
+
+def _descendants(pid: int) -> Iterator[int]:
+    """Running ones; of Linux only."""
+    for path in Path(f"/proc/{pid}/task").glob("*/children"):
+        with suppress(OSError):
+            for child in map(int, path.read_text().split()):
+                yield child
+                yield from _descendants(child)
+
+
+def _used_s(pid: int) -> float:
+    """What a process and the children that it has waited for have used."""
+    with suppress(OSError):
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        return sum(map(int, fields[11:15])) * _TICK_S
+    return 0.0
 
 
 class Costs:
@@ -71,4 +92,4 @@ def pytest_configure(config: pytest.Config) -> None:
     if times:
         config.pluginmanager.register(Costs())
     if not hasattr(config, "workerinput"):
-        config.pluginmanager.register(Records(failed, times))
+        config.pluginmanager.register(Records(failed, times), "records")

@@ -63,7 +63,7 @@ def _overlap(a: Bbox, b: Bbox) -> bool:
     return min(a.x1, b.x1) - max(a.x0, b.x0) > TOUCH and min(a.y1, b.y1) - max(a.y0, b.y0) > TOUCH
 
 
-@pytest.mark.parametrize("results", some(reversed(SHAPES), 4), ids=lambda results: results.bench)
+@pytest.mark.parametrize("results", some(reversed(SHAPES), 8), ids=lambda results: results.bench)
 def test_pictures_of_every_comparison_can_be_read(
     results: Results, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -109,6 +109,7 @@ def test_without_duckdb_it_is_left_out(monkeypatch: pytest.MonkeyPatch, tmp_path
 
 
 @pytest.mark.alone
+@pytest.mark.thorough
 def test_the_robots_are_recorded_at_a_broker(tmp_path: Path) -> None:
     pytest.importorskip("duckdb")
     short = TRAFFIC.run_of(idle_s=8, session_s=6, quick=True, output=tmp_path, console=Console(quiet=True))

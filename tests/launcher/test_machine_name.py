@@ -17,7 +17,7 @@ import pytest
 from pebble.errors import PebbleError
 from pebble.launcher.machine_name import MachineName
 from pebble.launcher.run_lock import RunLock
-from tests.support import ROOT
+from tests.support import ROOT, further
 
 BASE = "x/y/z"
 STRANGER, PI = 65534, 1234
@@ -125,7 +125,7 @@ def first_line(process: subprocess.Popen[str]) -> str:
     return process.stdout.readline().strip()
 
 
-@pytest.mark.parametrize("user", [STRANGER, 0], ids=["another user", "this user"])
+@pytest.mark.parametrize("user", [STRANGER, further(0)], ids=["another user", "this user"])
 @pytest.mark.parametrize(
     "how", ["listens", "binds", "connects", "full", "many", "lock file", "undumpable", "parent ends"]
 )
@@ -190,7 +190,7 @@ def test_a_user_who_may_not_look_into_it_starts_as_well(
         pytest.param(STRANGER, PI, 0o666, False, id="one who may write it as all may"),
     ],
 )
-@pytest.mark.parametrize("squatted", [False, True], ids=["", "beside a stranger's process"])
+@pytest.mark.parametrize("squatted", [False, further(True)], ids=["", "beside a stranger's process"])
 def test_a_second_launcher_is_refused_if_the_first_may_run_the_robot(
     first: int, second: int, mode: int, refused: bool, squatted: bool, start: Start, folder: Path
 ) -> None:

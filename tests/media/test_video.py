@@ -196,4 +196,4 @@ def test_pyav_is_loaded_by_those_who_use_it() -> None:
         "VideoDecoder().feed(make_encoder('json', fps=9).encode(numpy.zeros((48, 64, 3), numpy.uint8), 1));"
         "sys.exit('av' in sys.modules)"
     )
-    subprocess.run([sys.executable, "-c", program], check=True, timeout=60)
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=600)

@@ -9,6 +9,7 @@ import pytest
 
 from tests.robot.operator import Operator
 from tests.robot.rig import BASE, Rig
+from tests.support import further
 
 
 @dataclass
@@ -38,7 +39,7 @@ def station(request: pytest.FixtureRequest) -> Iterator[Station]:
     yield from _station(request.param)
 
 
-@pytest.fixture(scope="module", params=["mqtt", "zenoh", "single"])
+@pytest.fixture(scope="module", params=["mqtt", "zenoh", further("single")])
 def uplinked(request: pytest.FixtureRequest) -> Iterator[Station]:
     """Only robots with an uplink to a remote broker: for tests of heartbeat, wills and uplink."""
     yield from _station(request.param)

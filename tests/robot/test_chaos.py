@@ -14,12 +14,12 @@ import pytest
 
 from tests.robot.rig import STOP, Rig
 from tests.robot.test_faults import Drive
-from tests.support import until
+from tests.support import cases, further, until
 
 pytestmark = pytest.mark.alone  # deadlines are checked
 
 SEED = 20
-ROUNDS = 2
+ROUNDS = cases(1, 2)
 DEAD_MAN_S = 0.75  # after so long without a command the wheels stop, later than any pause between two of them
 
 
@@ -65,7 +65,7 @@ def test_two_things_at_once_stand_still(driven: Rig) -> None:
         drive.check_stops()
 
 
-@pytest.mark.parametrize("seconds", [1.2, 2.8])
+@pytest.mark.parametrize("seconds", [further(1.2), 2.8])
 def test_the_serial_bridge_stands_still(driven: Rig, seconds: float) -> None:
     """It cannot stop the wheels meanwhile (the MCU does), but it does so before anything else afterwards."""
     drive = Drive(driven)

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from tests.robot.rig import Motors, Rig
-from tests.support import ROOT, until
+from tests.support import ROOT, further, until
 
 
 class Terminal(Motors):
@@ -56,6 +56,7 @@ def pebble(*words: object) -> str:
     return done.stdout + done.stderr
 
 
+@pytest.mark.parametrize("rig", [further("mqtt"), "zenoh"], indirect=True)
 def test_an_unplugged_board_is_named_everywhere_until_it_is_back(rig: Rig) -> None:
     assert shows(rig, "yes")
     rig.mcu.command("unplug")  # type: ignore[attr-defined]

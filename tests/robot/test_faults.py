@@ -14,7 +14,7 @@ import pytest
 from pebble.config import LAUNCHER_LOCK
 from tests.robot.operator import Driver, Operator, number_of, retained_messages
 from tests.robot.rig import BASE, STOP, Rig
-from tests.support import until
+from tests.support import further, until
 
 pytestmark = pytest.mark.alone  # deadlines are checked
 
@@ -124,7 +124,7 @@ def test_another_process_killed(driven: Rig, program: str) -> None:
     drive.check_stops()
 
 
-@pytest.mark.parametrize("program", ["mqtt_bridge", "serial_mcu_bridge"])
+@pytest.mark.parametrize("program", [further("mqtt_bridge"), "serial_mcu_bridge"])
 def test_run_directory_removed(driven: Rig, program: str) -> None:
     """What starts again afterwards reaches the processes that went on, and the lock is held again."""
     drive, run = Drive(driven), driven.folder / "run"

@@ -14,7 +14,7 @@ from tests.kit.mutations import in_process
 from tests.robot.lockstep.schedules import ENGINE
 from tests.support import cases, some
 
-SCHEDULES = cases(80, 150)
+SCHEDULES = cases(40, 150)
 
 
 @pytest.fixture(autouse=True)
@@ -34,7 +34,7 @@ def test_no_schedule_violates_a_rule() -> None:
     assert not found, "python -m tests.kit.schedules lockstep --seed 0 prints the shortest schedule"
 
 
-@pytest.mark.parametrize("name", some(ENGINE.mutations, 4))
+@pytest.mark.parametrize("name", some(ENGINE.mutations, 8))
 def test_each_deliberate_bug_shows(name: str) -> None:
     found = ENGINE.find(name, 1, 500)
     assert found is not None

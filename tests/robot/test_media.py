@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import Any
 
 import pytest
@@ -15,7 +15,7 @@ from pebble.media.sound import SoundDecoder
 from pebble.media.video import VIDEO_ENCODINGS
 from tests.robot.operator import Operator, ReceivedMessage
 from tests.robot.rig import BASE, DEVICES, Rig
-from tests.support import until
+from tests.support import further, until
 
 pytestmark = pytest.mark.alone  # deadlines are checked
 
@@ -28,7 +28,7 @@ def make_rig(kind: str, **more: Any) -> Rig:
     return Rig(kind, av_daemon=DEVICES, **more)
 
 
-@pytest.fixture(scope="module", params=["mqtt", "zenoh", "single"])
+@pytest.fixture(scope="module", params=["mqtt", "zenoh", further("single")])
 def rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
     with make_rig(request.param) as rig:
         yield rig
@@ -88,8 +88,15 @@ def test_nothing_runs_and_nothing_comes_until_flag_and_request_agree(rig: Rig) -
     assert pictures_come(rig, again), "what was asked for before starts when the flag goes up"
 
 
-@two_kinds
-@pytest.mark.parametrize("encoding", ["json", "pbvd", "pbvz", "h264", "nonsense"])
+@pytest.mark.parametrize(
+    ("rig", "encoding"),
+    [
+        *product(["zenoh"], ["json", "pbvd", "pbvz", "h264", "nonsense"]),
+        ("mqtt", "h264"),
+        *(further("mqtt", encoding) for encoding in ("json", "pbvd", "pbvz", "nonsense")),
+    ],
+    indirect=["rig"],
+)
 def test_pictures_in_every_encoding_advance_with_the_camera(rig: Rig, encoding: str) -> None:
     began = want_video(rig, encoding=encoding)
     assert until(lambda: len(rig.operator.on(CAMERA, began)) > 10, 15)
@@ -99,8 +106,11 @@ def test_pictures_in_every_encoding_advance_with_the_camera(rig: Rig, encoding: 
     assert counters(seen) == sorted(set(counters(seen)))
 
 
-@two_kinds
-@pytest.mark.parametrize("encoding", ["pcm", "opus"])
+@pytest.mark.parametrize(
+    ("rig", "encoding"),
+    [("mqtt", "opus"), ("zenoh", "pcm"), further("mqtt", "pcm"), further("zenoh", "opus")],
+    indirect=["rig"],
+)
 def test_sound_in_every_encoding(rig: Rig, encoding: str) -> None:
     began = time.monotonic()
     rig.operator.send(AUDIO_FLAG, {"value": True}, retain=True)
@@ -113,8 +123,16 @@ def test_sound_in_every_encoding(rig: Rig, encoding: str) -> None:
     assert {one.encoding for one in received[-5:] if one is not None} == {encoding}
 
 
-@two_kinds
-@pytest.mark.parametrize("program", ["camera_publisher", "av_daemon"])
+@pytest.mark.parametrize(
+    ("rig", "program"),
+    [
+        ("mqtt", "camera_publisher"),
+        ("zenoh", "av_daemon"),
+        further("mqtt", "av_daemon"),
+        further("zenoh", "camera_publisher"),
+    ],
+    indirect=["rig"],
+)
 def test_a_killed_media_process_is_back_while_it_is_wanted(rig: Rig, program: str) -> None:
     began = want_video(rig)
     assert pictures_come(rig, began)
@@ -154,6 +172,7 @@ def test_stopping_media_does_not_delay_driving(rig: Rig) -> None:
     assert max(later - earlier for earlier, later in pairwise(moves)) < 0.5
 
 
+@pytest.mark.parametrize("rig", ["mqtt"], indirect=True)  # the one that is quiet before and after
 def test_media_do_not_pass_the_robots_own_side() -> None:
     with make_rig("mqtt") as rig:
         assert rig.local is not None
@@ -173,7 +192,7 @@ def status(operator: Operator) -> dict[str, Any]:
     return {} if last is None else dict(last.json["value"])
 
 
-@two_kinds
+@pytest.mark.parametrize("rig", ["mqtt", further("zenoh")], indirect=True)
 def test_after_an_uplink_outage_pictures_are_new_ones(rig: Rig) -> None:
     began = want_video(rig, encoding="pbvz")
     assert pictures_come(rig, began)

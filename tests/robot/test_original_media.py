@@ -14,7 +14,7 @@ import pytest
 
 from tests.robot.closed_loop.following import ORIGINAL_WITHIN_M, TARGET_M, Start
 from tests.robot.world_rig import FOLLOW, WorldRig
-from tests.support import cases, gone, until
+from tests.support import cases, further, gone, until
 
 pytestmark = pytest.mark.alone  # deadlines are checked
 
@@ -26,7 +26,8 @@ with_gstreamer = pytest.mark.skipif(
     reason="the system's Python has no OpenCV with GStreamer, or no paho",
 )
 ROBOTS = [
-    *(pytest.param((kind, sys.executable), id=f"{kind}, stand-in") for kind in ("zenoh", "mqtt")),
+    pytest.param(("zenoh", sys.executable), id="zenoh, stand-in", marks=pytest.mark.thorough),
+    pytest.param(("mqtt", sys.executable), id="mqtt, stand-in"),
     *(
         pytest.param((kind, SYSTEM), id=f"{kind}, shmsrc", marks=[pytest.mark.thorough, with_gstreamer])
         for kind in ("zenoh", "mqtt")

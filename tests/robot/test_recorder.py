@@ -9,7 +9,7 @@ import pytest
 
 from pebble.recordings import library
 from tests.robot.rig import Rig
-from tests.support import until
+from tests.support import further, until
 
 pytestmark = pytest.mark.alone
 
@@ -24,7 +24,7 @@ def counted(folder: Path) -> Counter[tuple[str, str]]:
     return Counter((message.channel.topic, message.channel.metadata.get("source", "")) for message in found)
 
 
-@pytest.mark.parametrize("kind", ["mqtt", "zenoh"])
+@pytest.mark.parametrize("kind", [further("mqtt"), "zenoh"])
 def test_what_a_robot_publishes_is_recorded_on_it(kind: str, tmp_path: Path) -> None:
     folder = tmp_path / "rec"
     section = {"enabled": True, "folder": str(folder), "free_bytes": 0, "remote": True}

@@ -10,7 +10,7 @@ import pytest
 
 from tests.robot.operator import Operator, retained_messages
 from tests.robot.rig import BASE, Rig
-from tests.support import until
+from tests.support import further, until
 
 pytestmark = pytest.mark.alone  # deadlines are checked
 
@@ -42,7 +42,7 @@ def assert_untouched(rig: Rig) -> None:
     assert rig.recorded() == []
 
 
-@pytest.fixture(params=["mqtt", "zenoh", "single", "mirror"])
+@pytest.fixture(params=["mqtt", "zenoh", further("single"), further("mirror")])
 def unstarted(request: pytest.FixtureRequest) -> Iterator[Rig]:
     kind, mirror = ("zenoh", True) if request.param == "mirror" else (request.param, False)
     with Rig(kind, mirror=mirror, start=False) as rig:
@@ -133,6 +133,7 @@ def test_retained_commands_at_the_local_broker(two_brokers: Rig) -> None:
     assert not set(retained_messages(two_brokers.remote.port, BASE)) & set(COMMANDS)
 
 
+@pytest.mark.parametrize("two_brokers", ["mqtt", further("mirror")], indirect=True)
 def test_retained_flags_that_differ_end_with_the_remote_value(two_brokers: Rig) -> None:
     flag = "incoming/flags/mqtt-video"
     assert two_brokers.local is not None
@@ -148,6 +149,7 @@ def test_retained_flags_that_differ_end_with_the_remote_value(two_brokers: Rig) 
         watcher.close()
 
 
+@pytest.mark.parametrize("two_brokers", ["mqtt", further("mirror")], indirect=True)
 def test_a_flag_set_locally_during_an_outage_wins(two_brokers: Rig) -> None:
     flag = "incoming/flags/mqtt-audio"
     assert two_brokers.local is not None

@@ -10,7 +10,7 @@ import pytest
 
 from tests.robot.operator import Operator
 from tests.robot.rig import Rig
-from tests.support import until
+from tests.support import further, until
 
 SCRIPT = """
 from msgspec import Struct
@@ -32,7 +32,7 @@ def strange(sender: Operator) -> None:
             sender.send("incoming/drive-values", {"x": 0, "z": z, "source": "autonomy", "run": run})
 
 
-@pytest.fixture(params=["mqtt", "zenoh", "single"])
+@pytest.fixture(params=[further("mqtt"), "zenoh", "single"])
 def rig(request: pytest.FixtureRequest, tmp_path: Path) -> Rig:
     (folder := tmp_path / "scripts" / "go").mkdir(parents=True)
     (folder / "run.py").write_text(SCRIPT)

@@ -10,7 +10,7 @@ import pytest
 
 from pebble.transports.segments import YOUNG_S
 from tests.robot.rig import DEVICES, Rig
-from tests.support import until
+from tests.support import further, until
 
 pytestmark = pytest.mark.alone
 
@@ -22,7 +22,7 @@ def segments_of(rig: Rig) -> set[str]:
     return {path for one in mapped for path in SEGMENT.findall(one)}
 
 
-@pytest.mark.parametrize("kind", ["mqtt", "zenoh"])
+@pytest.mark.parametrize("kind", [further("mqtt"), "zenoh"])
 def test_a_robot_that_has_stopped_leaves_no_shared_memory(kind: str) -> None:
     with Rig(kind, av_daemon=DEVICES) as rig:
         rig.operator.send("incoming/front-camera", {"enabled": True})

@@ -18,7 +18,7 @@ import pytest
 
 from tests.fakes.bad_brokers import BEHAVIOURS, mute, resolving, serving
 from tests.robot.rig import STOP, Rig, descendants
-from tests.support import ROOT, gone, until
+from tests.support import ROOT, cases, further, gone, until
 
 pytestmark = pytest.mark.alone
 
@@ -44,7 +44,7 @@ def drives_and_stops(rig: Rig) -> None:
     assert "Traceback" not in rig.log.read_text()
 
 
-@pytest.mark.parametrize("kind", ["mqtt", "zenoh"])
+@pytest.mark.parametrize("kind", [further("mqtt"), "zenoh"])
 @pytest.mark.parametrize("surroundings", SURROUNDINGS.values(), ids=SURROUNDINGS)
 def test_a_robot_runs(kind: str, surroundings: dict[str, Any]) -> None:
     with Rig(kind, start=False) as rig:
@@ -53,7 +53,7 @@ def test_a_robot_runs(kind: str, surroundings: dict[str, Any]) -> None:
         drives_and_stops(rig)
 
 
-@pytest.mark.parametrize("kind", ["mqtt", "zenoh"])
+@pytest.mark.parametrize("kind", ["mqtt", further("zenoh")])
 def test_a_robot_runs_where_some_addresses_of_its_brokers_are_dead(kind: str) -> None:
     with ExitStack() as opened:
         rig = opened.enter_context(Rig(kind, start=False, mqtt_bridge={"remote_mqtt": {"host": "fleet.test"}}))
@@ -78,7 +78,7 @@ def test_a_robot_runs_in_a_folder_that_was_deleted(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["mqtt", "zenoh"])
-@pytest.mark.parametrize("files", [12, 20, 40])
+@pytest.mark.parametrize("files", [further(12), 20, further(40)])
 def test_too_few_descriptors_are_an_error_or_enough(kind: str, files: int) -> None:
     with Rig(kind, start=False) as rig:
         began = rig.start(ready=False, preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_NOFILE, (files, files)))
@@ -92,7 +92,7 @@ def test_too_few_descriptors_are_an_error_or_enough(kind: str, files: int) -> No
 
 def test_a_stop_at_any_moment_of_the_start_leaves_nothing() -> None:
     with Rig("zenoh", start=False) as rig:
-        for index in range(20):
+        for index in range(cases(10, 20)):
             rig.start(ready=False)
             time.sleep(0.04 * index)
             children = descendants(rig.launcher_pid)
@@ -113,7 +113,7 @@ def remains(rig: Rig) -> list[str]:
 
 def test_a_robot_whose_launcher_is_killed_starts_again_at_once() -> None:
     with Rig("zenoh") as rig:
-        for _ in range(5):
+        for _ in range(cases(3, 5)):
             children = rig.kill_launcher()
             rig.start()
             assert until(lambda pids=children: all(map(gone, pids)))  # type: ignore[misc]
@@ -142,9 +142,14 @@ def test_of_four_starts_at_once_one_runs() -> None:
         rig.ensure_stopped()
 
 
-@pytest.mark.parametrize("kind", ["mqtt", "zenoh"])
 @pytest.mark.parametrize(
-    ("options", "signals"), [({"shutdown_timeout_seconds": 0}, 1), ({}, 2)], ids=["no time", "two signals"]
+    ("kind", "options", "signals"),
+    [
+        ("mqtt", {"shutdown_timeout_seconds": 0}, 1),
+        ("zenoh", {}, 2),
+        further("zenoh", {"shutdown_timeout_seconds": 0}, 1),
+        further("mqtt", {}, 2),
+    ],
 )
 def test_a_hurried_stop_stops_the_wheels(kind: str, options: dict[str, Any], signals: int) -> None:
     with Rig(kind, launcher=options) as rig:

@@ -11,6 +11,7 @@ from pebble.contract import CHARGING_LEVEL, DRIVE, ESTOP_STATE, ONLINE, STATUS
 from pebble.runtime.by_name import EACH_S, MAX_ROBOTS, ByName
 from pebble.transports import Message
 from tests.client.estop_robot import Robot
+from tests.support import further
 
 GOOB = "pebble/robots/goob"
 ROBOT = Robot(GOOB, "left", "right")
@@ -116,10 +117,10 @@ def flood(count: int, *, lasting: bool, last: float = 100.0) -> Arriving:
 @pytest.mark.parametrize(
     ("invented", "known", "within_s"),
     [
-        (flood(1000, lasting=False), False, 2.0),
+        further(flood(1000, lasting=False), False, 2.0),
         (flood(5 * MAX_ROBOTS, lasting=False), False, 5.0),
-        (flood(1000, lasting=True), True, 2.0),
-        (flood(1000, lasting=True), False, 60.0),
+        further(flood(1000, lasting=True), True, 2.0),
+        further(flood(1000, lasting=True), False, 60.0),
         (flood(MAX_ROBOTS + 500, lasting=True, last=50.0), True, 2.0),
     ],
     ids=["1,000", "more than there is room for", "that last", "that last, and it is new", "the same, too many"],

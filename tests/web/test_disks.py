@@ -14,7 +14,7 @@ from pebble.fleet.audit import Audit
 from pebble.runtime.rate_limit import RateLimitedLog
 from pebble.web.access import login
 from tests.small_disk import SmallDisk
-from tests.support import Broker, needs_root, until
+from tests.support import Broker, needs_root, some, until
 from tests.web.attacker import PASSWORDS, Hall
 from tests.web.served import RecordingRobot
 
@@ -76,7 +76,7 @@ def disk(tmp_path: Path) -> Iterator[SmallDisk]:
     disk.close()
 
 
-@pytest.mark.parametrize("name", FAULTS)
+@pytest.mark.parametrize("name", some(FAULTS, 2))
 def test_a_login_names_what_is_wrong_and_what_is_driven_stays_so(
     broker: Broker, disk: SmallDisk, name: str, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -20,7 +20,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from tests.commands.command_line import program
-from tests.support import Broker, until
+from tests.support import Broker, some, until
 from tests.web.attacker import Everything
 from tests.web.served import FREE, Page, RecordingRobot, Served
 
@@ -225,10 +225,9 @@ def test_large_and_odd_values(server: ServerProcess, broker: Broker) -> None:
         )
         flood(broker.port, large)
         flood(broker.port, ((f"{VICTIM}/outgoing/{metric}", payload) for payload in ODD for metric in METRICS))
-        time.sleep(1)
+        assert until(lambda: drives(page, robot), 15, step=0.5)  # a gesture that began among 300 MB has ended
         assert until(lambda: server.memory() - before < 120 * MB, 10)
         assert not page.closed, page.bye
-        assert drives(page, robot)
 
 
 METRICS = ("status", "charging-status", "sensors/imu", "wheel-odometry", "logs", "mcu/x/describe", "autonomy-status")
@@ -339,7 +338,7 @@ def is_stopped(page: Page, robot: RecordingRobot, ref: str) -> bool:
     return stopped
 
 
-@pytest.mark.parametrize(("metric", "payload"), STRANGERS.values(), ids=STRANGERS)
+@pytest.mark.parametrize(("metric", "payload"), some(STRANGERS.values(), 2), ids=some(STRANGERS, 2))
 def test_a_crowd_of_strangers_hides_no_robot_and_keeps_no_stop_from_it(
     broker: Broker, server: ServerProcess, metric: str, payload: Callable[[], bytes]
 ) -> None:

@@ -21,7 +21,7 @@ def complaints(project: Path) -> list[str]:
         missing = pytest.fail if os.environ.get("CI") == "true" else pytest.skip
         missing("needs Node.js (apt install nodejs) and TypeScript (python tools/fetch_npm.py .venv typescript)")
     command = ["node", str(COMPILER), "-p", str(project), "--pretty", "false"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=110)
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=600)
     return [line for line in done.stdout.splitlines() if "error TS" in line and "/vendor/" not in line]
 
 

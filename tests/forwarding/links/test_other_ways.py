@@ -161,14 +161,14 @@ class TestWithoutBridgeMode:
             assert until(lambda: rig.gate is Gate.SHUT)
             way.bridgeless = False
             way.drop()
-            rig.wait_ready()
+            assert until(lambda: rig.gate is Gate.OPEN)
             for more in range(3):
                 way.lead_to(free_port())
                 attempts = way.connections + 2 + more
                 assert until(lambda: way.connections > attempts)  # noqa: B023
                 way.lead_to(end.broker.port)
                 assert until(lambda: rig.service.remote.state is State.CONNECTED)
-            rig.wait_ready()
+            assert until(lambda: rig.gate is Gate.OPEN and rig.synchronized)
             rig.remote.publish(DRIVE, b"1")
             assert until(lambda: rig.local.payloads(DRIVE) == [b"1"])
         assert len(errors(caplog)) == 1
@@ -218,7 +218,6 @@ class TestCycles:
         carried: str,
         mirroring: bytes,
     ) -> None:
-        monkeypatch.setattr(cycles, "UNANSWERED", 1)
         remote = MqttEnd(tmp_path)
         with TcpProxy(remote.broker.port) as other_way:
             connection = (
@@ -235,6 +234,7 @@ class TestCycles:
             assert until(lambda: errors(caplog))
             Quiet(rig.local, rig.remote).wait(0.2)
             assert len(errors(caplog)) == 1
+            monkeypatch.setattr(cycles, "UNANSWERED", 1)  # not before: an answer that is late would end it, too
             other_way.cut()
             assert until(lambda: not rig.service.status.circulating)
             before = self.moves(rig.local)

@@ -56,7 +56,7 @@ def make(tmp_path: Path) -> Iterator[Make]:
             end.close()
 
 
-@pytest.mark.parametrize(("link", "when", "history"), some(product(LINKS, WHEN, HISTORIES), 11))
+@pytest.mark.parametrize(("link", "when", "history"), some(product(LINKS, WHEN, HISTORIES), 23))
 def test_a_microphone_that_was_switched_off_stays_off_when_a_side_is_restored(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make: Make, link: str, when: str, history: str
 ) -> None:

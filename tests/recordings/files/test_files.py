@@ -26,7 +26,7 @@ from tests.support import cases, some
 
 MESSAGES = 2000
 #: How many times as many files are damaged as usual.
-TIMES = int(os.environ.get("PEBBLE_DAMAGES", cases(1, 3)))
+TIMES = int(os.environ.get("PEBBLE_DAMAGES", cases(1, 6)))
 
 
 class TestWhole:
@@ -110,7 +110,7 @@ class TestDamaged:
         again: dict[Path, Counted] = {}
         written = write(path, finish=finished, level=level)
         whole = path.read_bytes()
-        for number in range(4 * TIMES):
+        for number in range(2 * TIMES):
             raw, path = bytearray(whole), tmp_path / f"{number}.mcap"
             damage(raw, rng)
             path.write_bytes(raw)
@@ -135,7 +135,7 @@ class TestDamaged:
         if damage is not lose_a_part:  # where bytes are gone a chunk's index may have no room, which this reader needs
             assert by_mcap_core(list(again)) == list(again.values())
 
-    @pytest.mark.parametrize("op", [Op.CHUNK, Op.DATA_END, Op.METADATA, Op.PADDING])
+    @pytest.mark.parametrize("op", some([Op.CHUNK, Op.DATA_END, Op.METADATA, Op.PADDING], 2))
     def test_an_index_that_became_another_record_is_written_anew(self, tmp_path: Path, op: Op) -> None:
         written = write(tmp_path / "a.mcap", finish=False)
         whole = (tmp_path / "a.mcap").read_bytes()
@@ -155,7 +155,7 @@ class TestDamaged:
         rng, path = random.Random(level), tmp_path / "a.mcap"
         written = write(path, finish=False, level=level)
         whole = path.read_bytes()
-        for _ in range(50 * TIMES):
+        for _ in range(25 * TIMES):
             raw = bytearray(whole)
             flip(raw, rng, 1)
             path.write_bytes(raw)
@@ -165,12 +165,12 @@ class TestDamaged:
             assert found.missing + 200 >= len(written) - len(read)
 
     def test_bits_of_what_has_no_checksum(self, tmp_path: Path) -> None:
-        """A bit of each byte of opcodes and lengths: a wrong record must not hide the others."""
-        rng, path = random.Random(3), tmp_path / "a.mcap"
+        """A bit of opcodes and lengths of each record: a wrong one must not hide the others."""
+        rng, path, step = random.Random(3), tmp_path / "a.mcap", cases(4, 1)
         written = write(path, 600, finish=False)
         whole = path.read_bytes()
         for begin in _records(whole):
-            for at in range(begin, begin + 9):
+            for at in range(begin + rng.randrange(step), begin + 9, step):
                 raw = bytearray(whole)
                 raw[at] ^= 1 << rng.randrange(8)
                 path.write_bytes(raw)
@@ -188,7 +188,7 @@ class TestDamaged:
         read, size = contents(path), _finish_until_killed(path, math.inf)
         made = finish(path)
         assert size > 1000
-        for number in range(7 * TIMES):
+        for number in range(4 * TIMES):
             path = tmp_path / f"{number}.mcap"
             path.write_bytes(raw)
             _finish_until_killed(path, rng.randrange(size))

@@ -109,6 +109,7 @@ def receive(local: Broker, remote: Broker, recorder: Recorder) -> Iterator[Recei
         yield started
 
 
+@pytest.mark.alone  # what comes too late is not played
 def test_received_speech_is_played(receive: Receive, operator: Operator, recorder: Recorder) -> None:
     robot = receive(device="plug:x", latency_ms=300)
     operator.speak(seconds=2)
@@ -120,6 +121,7 @@ def test_received_speech_is_played(receive: Receive, operator: Operator, recorde
     assert until(lambda: (robot.newest.bitrate or 0) > 0)
 
 
+@pytest.mark.alone
 def test_opus_on_a_robot_with_zenoh_inside(receive: Receive, operator: Operator, recorder: Recorder) -> None:
     robot = receive("zenoh", latency_ms=300)
     operator.speak("opus", 2, bundle=2)

@@ -103,7 +103,7 @@ def test_half_a_line_of_a_killed_host_does_not_damage_the_stop(mcu: PtyMcu, conn
 
 
 def test_input_from_before_and_during_boot_is_thrown_away(mcu: PtyMcu, connect: Connect) -> None:
-    host = connect(mcu.symlink, boot_s=0.2)
+    host = connect(mcu.symlink, boot_s=1.0)
     assert until(lambda: mcu.host)
     mcu.reset()
     assert until(host.is_ready)

@@ -5,6 +5,8 @@ import pytest
 from tests.web.canned import CannedServer, Show, State
 from tests.web.states import GOOB, STATES, estop, robot
 
+pytestmark = pytest.mark.page
+
 #: Where the card is pressed, as parts of its width and height.
 PLACES = {"top left": (0.02, 0.02), "centre": (0.5, 0.5), "bottom left": (0.02, 0.98)}
 

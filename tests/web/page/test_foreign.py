@@ -95,6 +95,7 @@ def test_what_a_browser_denies_keeps_no_page_from_its_server(show: Show, server:
         assert opened.errors == []
 
 
+@_RARE
 @pytest.mark.parametrize("change", CHANGES)
 def test_state_is_shown_whatever_others_do_to_the_page(driving: Tab, change: str) -> None:
     driving.page.evaluate(_MINE, GOOB)
@@ -108,11 +109,12 @@ def test_state_is_shown_whatever_others_do_to_the_page(driving: Tab, change: str
     assert driving.errors == []
 
 
+@_RARE
 @pytest.mark.parametrize(
     "change",
     [
         "document.documentElement.replaceWith(document.createElement('html'))",
-        pytest.param("document.write('<p>to be read</p>')", marks=_RARE),
+        "document.write('<p>to be read</p>')",
     ],
 )
 def test_a_page_whose_document_was_replaced_is_loaded_again(show: Show, server: CannedServer, change: str) -> None:

@@ -12,6 +12,7 @@ import pytest
 from playwright.sync_api import Browser, Locator
 
 from pebble.contract.payloads import Heartbeat
+from tests.support import further
 from tests.web.browser import tab
 from tests.web.console import BACK, FORWARD, KEYS, LEFT, REST, RIGHT, Console, Wheels, Wire, console, used
 from tests.web.stage import Stage
@@ -35,7 +36,7 @@ def at_benjr(_benjr_page: Console) -> Iterator[Console]:
 # -- keys
 
 
-@pytest.mark.parametrize("page", ["at_lamp", "at_benjr"])
+@pytest.mark.parametrize("page", ["at_lamp", further("at_benjr")])
 def test_each_key_turns_the_wheels_while_it_is_held(request: pytest.FixtureRequest, page: str) -> None:
     robot: Console = request.getfixturevalue(page)
     for key, wheels in KEYS.items():
@@ -303,6 +304,7 @@ def test_the_settings_change_the_colours_and_end_a_gesture(at_lamp: Console) -> 
 # -- without a mouse
 
 
+@pytest.mark.page
 def test_the_tab_key_reaches_every_control_and_space_on_a_button_also_stops(at_lamp: Console) -> None:
     at_lamp.page.evaluate("document.activeElement.blur()")
     focusable = "a[href], button:enabled, input:enabled, select:enabled, summary, [tabindex='0']"

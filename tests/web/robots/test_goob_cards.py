@@ -1,6 +1,6 @@
 """The cards of a robot at the whole Goob: what its MCU and its relays do, and what its sensors sent.
 
-On a desktop and, by ``make page-tests``, on a phone, where the cards are behind tabs. Clips and scripts are tested at a
+On a desktop and on a phone, where the cards are behind tabs. Clips and scripts are tested at a
 robot that records what it is asked (test_lights_sounds_scripts).
 """
 
@@ -19,7 +19,7 @@ from pebble.transports import Message, MqttSettings, create
 from tests.web.console import Console, Wire, console
 from tests.web.stage import Stage
 
-pytestmark = pytest.mark.alone  # deadlines are checked
+pytestmark = [pytest.mark.alone, pytest.mark.page]  # deadlines are checked
 _REPORTS = ("charging-level", "sensors/imu", "wheel-odometry")
 _SWITCHES_S = 5.0
 
@@ -58,7 +58,7 @@ def reports(stage: Stage) -> Iterator[Reports]:
     running.close()
 
 
-@pytest.fixture(scope="module", params=["desktop", pytest.param("phone", marks=pytest.mark.page)])
+@pytest.fixture(scope="module", params=["desktop", "phone"])
 def goob(browser: Browser, stage: Stage, reports: Reports, request: pytest.FixtureRequest) -> Iterator[Console]:
     with console(browser, stage, "goob", request.param) as opened:
         yield opened

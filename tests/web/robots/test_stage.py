@@ -56,6 +56,7 @@ def test_the_server_can_be_frozen_killed_and_started_again_at_its_address(stage:
     assert status(url) == 200
 
 
+@pytest.mark.page
 @pytest.mark.parametrize("size", ["desktop", "phone"])
 def test_a_browser_opens_the_page_and_keeps_its_complaints(stage: Stage, browser: Browser, size: str) -> None:
     with tab(browser, stage.url, size, "dark") as opened:  # type: ignore[arg-type]
