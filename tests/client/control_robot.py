@@ -70,12 +70,14 @@ class KeepingRobot:
 
     def take(self, messages: list[Message], now: float) -> list[Message]:
         """Messages reach it, or only time; what it then publishes."""
-        before = self.states()
         for owner in self.owners:
             owner.lease.tick(round(1000 * now))
             for message in messages:
                 owner.receive(message, now)
-        return [one for one in self.states() if one not in before]
+        changed = [owner for owner in self.owners if owner.lease.changed]
+        for owner in changed:
+            owner.lease.changed = False
+        return [owner.state() for owner in changed]
 
     def states(self) -> list[Message]:
         return [one.state() for one in self.owners]
