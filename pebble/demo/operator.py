@@ -331,15 +331,16 @@ class Operator:
             self._complete(CompletedStop(robot.name, began, pressed, confirmed_s, reset_at, free, ended))
 
     def _show_trails(self, robots: Sequence[RobotView]) -> bool:
-        """Have each robot with the script for it that runs none publish where it is; whether all of them run one.
+        """Have each robot with the script for it publish where it is, if it runs no other; whether all run one.
 
         One that a person has, or that is stopped, refuses to start a script.
         """
-        idle = [one for one in robots if one.base in self._drawing and not (one.autonomy and one.autonomy.running)]
         now = time.monotonic()
-        for robot in [one for one in idle if not one.stopped_by and not self._visitors.taken(one, now)]:
-            self._command(robot, AutonomyCommand(action="start", file=TRAIL))
-        return not idle
+        running = {one.base: one.autonomy.file for one in robots if one.autonomy is not None and one.autonomy.running}
+        for robot in [one for one in robots if one.base in self._drawing and one.base not in running]:
+            if not (robot.stopped_by or self._visitors.taken(robot, now)):
+                self._command(robot, AutonomyCommand(action="start", file=TRAIL))
+        return all(running.get(base, FOLLOW) != FOLLOW for base in self._drawing)  # that one is about to end
 
     def _end_trails(self) -> None:
         """So that an emergency stop ends no script, which would be told of as a failure."""
