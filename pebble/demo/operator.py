@@ -222,9 +222,9 @@ class Operator:
                     self.until_right(BY_ITSELF, partial(self._take_over, robots))
                 self.rounds += 1
             self._doing = yours
-            while not self._show_trails(robots):
+            while True:
+                self._show_trails(robots)
                 self._wait(_TRAIL_S)
-            self._stopping.wait()
         self._begin("disconnecting", robots)
         self._drive(STOP)
 
@@ -330,16 +330,16 @@ class Operator:
             confirmed_s, free = sender.robots[robot.base].confirmed_s, bool(reset.shown) and reset.free
             self._complete(CompletedStop(robot.name, began, pressed, confirmed_s, reset_at, free, ended))
 
-    def _show_trails(self, robots: Sequence[RobotView]) -> bool:
-        """Have each robot with the script for it that runs none publish where it is; whether all of them run one.
+    def _show_trails(self, robots: Sequence[RobotView]) -> None:
+        """Have each robot with the script for it publish where it is, if it runs no other.
 
-        One that a person has, or that is stopped, refuses to start a script.
+        One that is stopped, or was driven a moment ago, refuses to start a script.
         """
-        idle = [one for one in robots if one.base in self._drawing and not (one.autonomy and one.autonomy.running)]
         now = time.monotonic()
-        for robot in [one for one in idle if not one.stopped_by and not self._visitors.taken(one, now)]:
-            self._command(robot, AutonomyCommand(action="start", file=TRAIL))
-        return not idle
+        for robot in [one for one in robots if one.base in self._drawing]:
+            runs = robot.autonomy is not None and robot.autonomy.running
+            if not runs and not robot.stopped_by and self._visitors.rests(robot, now):
+                self._command(robot, AutonomyCommand(action="start", file=TRAIL))
 
     def _end_trails(self) -> None:
         """So that an emergency stop ends no script, which would be told of as a failure."""

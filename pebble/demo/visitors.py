@@ -23,6 +23,7 @@ class Visitors:
         self.left_alone: set[str] = set()  # names of robots that were found to be taken
         self._name = name
         self._driven: dict[str, float] = {}  # by base topic: when somebody drove it, or was announced to
+        self._moved: dict[str, float] = {}  # by base topic: when a person's command came
         self._drivers: dict[str, tuple[str, float]] = {}  # those that were announced
         self._sent: defaultdict[str, deque[bytes]] = defaultdict(partial(deque, maxlen=_SENT))  # by topic
         self._step_began = 0.0
@@ -46,7 +47,7 @@ class Visitors:
         if sent and message.payload in sent:
             sent.remove(message.payload)
         elif address is not None and not message.retain:
-            self._driven[address.identity.base] = now
+            self._driven[address.identity.base] = self._moved[address.identity.base] = now
 
     def begin_step(self, now: float) -> None:
         """What people had before no longer counts."""
@@ -63,6 +64,10 @@ class Visitors:
             return ""
         who, at = self._drivers.get(robot.base, ("", -math.inf))
         return f"is driven by {who if now - at < VALID_S else 'another program'}"
+
+    def rests(self, robot: RobotView, now: float) -> bool:
+        """Whether no person has moved it for a moment, also if one has the control."""
+        return now - self._moved.get(robot.base, -math.inf) >= VALID_S
 
     def free(self, robot: RobotView, now: float) -> bool:
         """Whether it may be driven in the present step, in which no person has had it so far."""

@@ -168,7 +168,7 @@ def test_a_robot_that_another_program_drives_is_left_alone_as_well(
         visitor.publish(DRIVE.topic(BASE), b'{"x": 0, "z": 0.3}', qos=QoS.DELIVERED)
     assert until(lambda: operator.activity.endswith("; goob is driven by another program"))
     taken = time.monotonic()
-    assert operator.left_alone == {"goob"}
+    assert until(lambda: operator.left_alone == {"goob"})
     assert until(lambda: robot.driven_since(taken + 0.1), 2 * START_S)
     assert [one for one in operator.completed if one.ended > taken > one.began] == []
 
@@ -178,6 +178,5 @@ def test_a_robot_with_scripts_draws_its_trail_from_the_first_drive_on(robot: Rob
     assert until(lambda: robot.driven_since(0.0))
     assert robot.scripts == [TRAIL]
     robot.show_script()
-    robot.announce(BASE)  # so that the operator drives no more
-    assert until(lambda: operator.activity.startswith("yours"), 30.0)
-    assert robot.scripts == [TRAIL]
+    assert until(lambda: len(robot.scripts) > 1, 30.0)
+    assert robot.scripts[:2] == [TRAIL, None], "it is ended before the emergency stop, which would make it fail"

@@ -75,6 +75,6 @@ def test_a_robot_is_driven_by_whoever_sends_what_the_operator_has_not_sent(recei
     for message in received:
         (visitors.receive_drive if message.topic == TOPIC else visitors.receive)(message, 10.0)
     assert [visitors.taken(robot, 11.0) for robot in (GOOB, FRED)] == [taken, ""]
-    assert visitors.free(GOOB, 20.0)
-    visitors.begin_step(5.0)
     assert visitors.free(GOOB, 20.0) is (taken == "")
+    visitors.begin_step(20.0)
+    assert visitors.free(GOOB, 20.0)
