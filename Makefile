@@ -16,7 +16,7 @@ help:
 	@echo "make stops            400 random schedules of emergency stops and faults with whole robots, 40 minutes"
 	@echo "make soak             floods, kills, freezes, full disks and more while an operator drives; MINUTES=30 for each transport"
 	@echo "make floods           60,000 retained flags, 10,000 actions a second and more, also while a robot starts, four minutes"
-	@echo "make schedules        10,000 random schedules of persons, scripts and faults in virtual time, five minutes"
+	@echo "make schedules        10,000 random schedules of persons, control, scripts and faults in virtual time, six minutes"
 	@echo "make script-schedules  200 of them with whole robots, 30 minutes"
 	@echo "make page-tests       every state, card, interruption and finger at the operator page in Chromium, 20 minutes"
 	@echo "make page-schedules   200 random sequences of inputs and faults at the operator page in Chromium, 15 minutes"
@@ -149,6 +149,7 @@ floods: .venv/.ready-dev
 
 # The shortest schedule that violates a rule is printed.
 schedules: .venv/.ready-dev
+	@$(VENV) -m tests.kit.schedules motion --schedules 10000
 	@$(VENV) -m tests.kit.schedules lockstep --schedules 10000
 	@$(VENV) -m tests.kit.schedules lockstep --mutations --schedules 1000
 

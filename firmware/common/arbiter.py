@@ -5,8 +5,9 @@ its run, which grows with each start; a run that is barred never moves anything 
 LAST_RUN comes 1, so whatever number a stranger sends, the next one is newer.
 """
 
-HOLD_MS = 2000  # so long after a person's last command scripts are refused
-_START_MS = 2000  # so long after the start scripts are refused: their manager first sees that their owner restarted
+# So long after a person's last command scripts are refused; and after the start, so that their manager first sees that
+# their owner restarted.
+HOLD_MS = 2000
 
 LAST_RUN = (1 << 30) - 1  # the largest integer for which MicroPython allocates no memory on a 32-bit board
 
@@ -40,16 +41,17 @@ class Arbiter:
         self._script_from = now
         self._script_ms = 0
 
-    def judge(self, moves: bool, run: int, valid_ms: float, now: int, key: str = "", by: str = "") -> int:
+    def judge(self, moves: bool, run: int, valid_ms: float, now: int, key: str = "", by: str | None = "") -> int:
         """Return for how many milliseconds it moves, 0: it stops the motors, REFUSED: it has no effect.
 
         ``moves``: any axis is not 0. ``run`` may be PERSON, or UNKNOWN_RUN of a zero. ``valid_ms`` < 0: not given.
-        ``key`` and ``by`` are for the lease. A zero of somebody else than who has control ends a script, too, but is
-        nobody's letting go.
+        ``key`` and ``by`` are those of the lease; ``by`` None: a program of the robot, which needs no key. A zero of
+        somebody else than who has control ends a script, too, but is nobody's letting go.
         """
         self.tick(now)
         lease = self.lease
-        if lease.refuses(moves, run != PERSON, key, by, now):
+        own = by is None
+        if lease.refuses(moves, run != PERSON or own, key, "" if own else by, now):
             return REFUSED
         ours = run != PERSON or not lease.key or lease.holds(key, by)
         if newer(run, self.barred) and run != self._newest:  # it has begun, even if this command is refused
@@ -57,13 +59,11 @@ class Arbiter:
             self.bar(run - 1 or LAST_RUN)
         if self.latch.latched:
             self.bar(run)
-        if self.latch.refuses(moves, run != PERSON, now, ours):
+        if (moves or ours) and self.latch.refuses(moves, run != PERSON, now):
             return REFUSED
         limit = self._watchdog_ms if valid_ms < 0 or valid_ms > self._watchdog_ms else int(valid_ms)
         if run == PERSON:
             self._take(moves, valid_ms == 0 or not ours, now)
-            if moves:
-                lease.moved(key, now)
         elif self._held or self._starting or (run > 0 and not newer(run, self.barred)):
             return REFUSED
         else:
@@ -85,7 +85,7 @@ class Arbiter:
         diff = self._diff
         self.latch.tick(now)
         self.lease.tick(now)
-        if self._starting and diff(now, self._started) >= _START_MS:
+        if self._starting and diff(now, self._started) >= HOLD_MS:
             self._starting = False
         if self._scripted and diff(now, self._script_from) >= self._script_ms:
             self._scripted = False

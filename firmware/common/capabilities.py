@@ -6,7 +6,7 @@ from micropython import const
 _CAPABILITIES = const(
     b'{"schema":"pebble-capabilities/v1","t":%d,"value":{"identity":{"system":"%s","type":"%s","id":"%s"},'
     b'"transport":{"kind":"mqtt"},"drive":{"available":true,"controls":true,"arbitrates":true,'
-    b'"topic":"%s/incoming/drive-values"},"estop":{"available":%s,"topic":"%s/incoming/estop",'
+    b'"control":%s,"topic":"%s/incoming/drive-values"},"estop":{"available":%s,"topic":"%s/incoming/estop",'
     b'"reset_topic":"%s/incoming/estop-reset","owners":["mcu"],"status_topics":["%s/outgoing/estop/mcu"]},'
     b'"telemetry":{"touch_sensors":false,"charging_status":%s,"charging_topic":"%s/outgoing/charging-status",'
     b'"charging_level_topic":"%s/outgoing/charging-level"},"lights":{"solid":false,"flash":false},"video":%s,"audio":%s,'
@@ -14,8 +14,9 @@ _CAPABILITIES = const(
 )
 
 
-def describe(epoch_ms: int, root: bytes, stoppable: bool, charging: bytes) -> bytes:
+def describe(epoch_ms: int, root: bytes, stoppable: bool, controllable: bool, charging: bytes) -> bytes:
     """Make the payload; ``root`` is the base of the topics, ``charging``: whether it reports that status, in JSON."""
-    values = [epoch_ms] + root.split(b"/") + [root, b"true" if stoppable else b"false"]
+    can, cannot = b"true", b"false"
+    values = [epoch_ms] + root.split(b"/") + [can if controllable else cannot, root, can if stoppable else cannot]
     values += [root, root, root, charging, root, root]
     return _CAPABILITIES % tuple(values + [b'{"available":false,"controls":false}'] * 7)

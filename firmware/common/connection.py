@@ -4,7 +4,6 @@ from micropython import const
 
 from common.ticks import diff
 
-_LIMITS_MS = {"resolving": 3500, "connecting": 8000, "subscribing": 2000}
 _SILENCE_MS = const(2000)  # without an answer: queued commands may be as old, and are dropped with the connection
 _FIRST_WAIT_MS = const(500)
 _LONGEST_WAIT_MS = const(8000)
@@ -44,7 +43,7 @@ class Connection:
         elif state == "offline" or (state == "waiting" and age >= self._wait):
             self.move("resolving", now)
             return "resolve"
-        elif state != "waiting" and age >= _LIMITS_MS[state]:
+        elif state != "waiting" and age >= {"resolving": 3500, "connecting": 8000, "subscribing": 2000}[state]:
             self.reason = state + " took too long"
             return "drop"
         return ""

@@ -1,4 +1,4 @@
-"""The emergency stop of a board on Wi-Fi: its messages, its state, and the file that survives a power cut. A driver."""
+"""Emergency stop and control of a board on Wi-Fi: messages, states, and a file that survives a power cut. A driver."""
 
 import json
 import os
@@ -7,7 +7,8 @@ from binascii import hexlify
 from micropython import const
 
 from common.arbiter import Arbiter
-from common.latch import Latch, reset_of, stop_of
+from common.latch import Latch, fields, reset_of, stop_of
+from common.lease import Lease, request_of
 from common.payload import load
 from common.ticks import diff
 
@@ -18,6 +19,11 @@ _LONGEST_STATE = const(300)
 _PAUSE_MS = const(250)  # between two states
 _EROFS = const(30)  # not in every port's errno
 _ENODEV = const(19)
+_ESTOP = const(b"estop/mcu")
+_CONTROL = const(b"control/mcu")
+_HOLDER = const(
+    b'{"by":"%s","id":"%s","key":"%s","device":"%s","asks":"%s","asks_id":"%s","others":%s,"named":false,"boot":"%s"}'
+)
 
 
 class EmergencyStop:
@@ -25,9 +31,11 @@ class EmergencyStop:
 
     def __init__(self, now: int, watchdog_ms: int) -> None:
         self.latch = Latch(_random(4), _NAMES, diff)
-        self.arbiter = Arbiter(self.latch, now, diff, watchdog_ms)
+        self.lease = Lease(now, diff, _random, 0)
+        self.arbiter = Arbiter(self.latch, self.lease, now, diff, watchdog_ms)
         self.changed = True  # since the last state
-        self.due = False  # the state is to be published: at most four times a second, and not in the turn of a stop
+        self.due = b""  # the state to publish: at most four a second, and that of a stop not in its turn
+        self.stoppable = self.controllable = True  # the broker granted the topics of stops, and of control
         self._barred = 0  # of the last state
         self._paused = False
         self._since = now
@@ -42,7 +50,12 @@ class EmergencyStop:
             self._paused = False
         if self.arbiter.barred != self._barred:
             self.changed = True
-        self.due = self.changed and not self._paused
+        self.due = b""
+        if not self._paused:
+            if self.changed and self.stoppable:
+                self.due = _ESTOP
+            elif self.lease.changed and self.controllable:
+                self.due = _CONTROL
 
     # -- in
 
@@ -71,8 +84,27 @@ class EmergencyStop:
 
     # -- the state
 
+    def request(self, raw: memoryview, urgent: bool, now: int) -> None:
+        """A request for control, or the end of it; ``urgent``: without asking."""
+        try:
+            order = request_of(fields(load(raw)))
+        except (ValueError, OverflowError, MemoryError):
+            return
+        if order:
+            name, by, device, ms = order
+            if ms:
+                self.lease.hold(("", name, by, device), ms, urgent, now)
+            else:
+                self.lease.release(("", name), now)
+
     def state(self) -> bytes:
-        """The payload of outgoing/estop/mcu, at most 300 bytes: the reason is cut."""
+        """The payload of what is ``due``, at most 300 bytes: the reason of a stop is cut."""
+        if self.due == _CONTROL:
+            lease = self.lease
+            _, name, by, device = lease.holder or ("", "", "", "")
+            _, asks_id, asks, _ = lease.asker or ("", "", "", "")
+            others = b"true" if lease.others else b"false"
+            return _HOLDER % (by, name, lease.key, device, asks, asks_id, others, self.latch.boot)
         state = self.latch.state(self._saved == self.latch.latched if self._saves else None)
         if self.arbiter.barred:
             state["barred"] = self.arbiter.barred
@@ -84,8 +116,12 @@ class EmergencyStop:
         return text.encode()
 
     def published(self, now: int) -> None:
-        self.changed = self.due = False
-        self._barred = self.arbiter.barred
+        if self.due == _CONTROL:
+            self.lease.changed = False
+        else:
+            self.changed = False
+            self._barred = self.arbiter.barred
+        self.due = b""
         self._paused = True
         self._since = now
 

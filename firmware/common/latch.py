@@ -4,11 +4,6 @@ Stopped means latched: nothing moves until a reset, also after a power cut. Time
 ``diff`` subtracts two of them.
 """
 
-_QUIET_MS = 500  # after a reset persons are refused until one sends a zero, or all pause for so long
-_OLD_MS = 1000  # a reset that was read longer ago is refused
-_BY = 32
-_WHY = 40
-
 
 class Latch:
     """``latched``, and what others need to know of it. A restart begins with a new ``boot`` and a ``count`` of 0."""
@@ -23,7 +18,7 @@ class Latch:
         self.why = ""
         self.since = 0  # epoch milliseconds of the newest stop
         self.reset_refused: str | None = None  # "boot", "count" or "old"
-        self._names = names
+        self.names = names
         self._diff = diff
         self._waits = False  # after a reset, for persons to let go
         self._waits_from = 0
@@ -33,9 +28,9 @@ class Latch:
         recent = saved.get("recent") if isinstance(saved, dict) else None
         if isinstance(saved, dict) and isinstance(saved.get("latched"), bool) and isinstance(recent, list):
             self.latched = saved["latched"]
-            self.recent = [name for name in recent if is_name(name)][: self._names]
-            self.by = _text(saved.get("by"), _BY)
-            self.why = _text(saved.get("why"), _WHY)
+            self.recent = [name for name in recent if is_name(name)][: self.names]
+            self.by = _text(saved.get("by"), 32)
+            self.why = _text(saved.get("why"), 40)
             since = saved.get("since")
             self.since = since if isinstance(since, int) else 0
         else:
@@ -44,15 +39,19 @@ class Latch:
 
     def saved(self) -> dict:
         """What ``restore`` needs."""
-        names = ("latched", "recent", "by", "why", "since")
-        return {name: getattr(self, name) for name in names}
+        return self._fields("latched", "recent", "by", "why", "since")
 
     def state(self, persisted: bool | None) -> dict:
         """The payload of outgoing/estop/{owner}; ``persisted`` None: nothing can be saved."""
-        names = ("latched", "boot", "count", "recent", "by", "why", "since", "reset_refused")
-        state = {name: getattr(self, name) for name in names}
+        state = self._fields("latched", "boot", "count", "recent", "by", "why", "since", "reset_refused")
         state["persisted"] = persisted
         return state
+
+    def _fields(self, *names: str) -> dict:
+        found = {}
+        for name in names:
+            found[name] = getattr(self, name)
+        return found
 
     def stop(self, name: str, by: str, why: str, since: int) -> bool:
         """Latch, unless this stop is known already: then nothing changes, and the result is False.
@@ -61,7 +60,7 @@ class Latch:
         """
         if name in self.recent:
             return False
-        self.recent = ([name] + self.recent)[: self._names]
+        self.recent = ([name] + self.recent)[: self.names]
         self.latched = True
         self.count += 1
         self.by = by
@@ -72,9 +71,12 @@ class Latch:
         return True
 
     def reset(self, boot: str, count: int, age: int, now: int) -> bool:
-        """End the stop if the sender saw the newest state; ``age`` is how long ago the command was read."""
+        """End the stop if the sender saw the newest state, and if it was read, ``age`` ago, in the last second.
+
+        Then persons are refused until one sends a zero, or all pause for half a second.
+        """
         self.reset_refused = (
-            "boot" if boot != self.boot else "count" if count != self.count else "old" if age >= _OLD_MS else None
+            "boot" if boot != self.boot else "count" if count != self.count else "old" if age >= 1000 else None
         )
         if self.reset_refused or not self.latched:
             return False
@@ -83,25 +85,20 @@ class Latch:
         self._waits_from = now
         return True
 
-    def refuses(self, moves: bool, script: bool, now: int, ours: bool = True) -> bool:
-        """Whether a drive command has no effect. While latched a zero passes: it may end the run of a script.
-
-        ``ours`` False: somebody else has control, so this zero does not show that the one who drives lets go.
-        """
+    def refuses(self, moves: bool, script: bool, now: int) -> bool:
+        """Whether a drive command has no effect. While latched a zero passes: it may end the run of a script."""
         if self.latched:
             return moves
         if not self._waits or script:
             return False
         self.tick(now)
-        if not moves and not ours:
-            return False
         self._waits = self._waits and moves
         self._waits_from = now
         return self._waits
 
     def tick(self, now: int) -> None:
         """To be called at least every few minutes, because clocks of boards wrap."""
-        if self._waits and self._diff(now, self._waits_from) >= _QUIET_MS:
+        if self._waits and self._diff(now, self._waits_from) >= 500:
             self._waits = False
 
 
@@ -112,22 +109,23 @@ def is_name(name: object) -> bool:
 
 def stop_of(body: object) -> tuple[str, str, str]:
     """``(name, by, why)`` of a parsed stop, of whatever shape; the name is "" if it has none."""
-    fields = _fields(body)
-    name = fields.get("stop")
-    return str(name) if is_name(name) else "", _text(fields.get("by"), _BY), _text(fields.get("why"), _WHY)
+    found = fields(body)
+    name = found.get("stop")
+    return str(name) if is_name(name) else "", _text(found.get("by"), 32), _text(found.get("why"), 40)
 
 
 def reset_of(body: object) -> tuple[str, int] | None:
     """``(boot, count)`` of a parsed reset; None if it is none."""
-    fields = _fields(body)
-    boot = fields.get("boot")
-    count = fields.get("count")
+    found = fields(body)
+    boot = found.get("boot")
+    count = found.get("count")
     if isinstance(boot, str) and isinstance(count, int) and not isinstance(count, bool):
         return boot, count
     return None
 
 
-def _fields(body: object) -> dict:
+def fields(body: object) -> dict:
+    """What a command contains, bare or wrapped."""
     inner = body.get("value") if isinstance(body, dict) else None
     if isinstance(inner, dict):
         return inner

@@ -2,150 +2,128 @@
 
 Control orders people; it is no safety function. A stop and a zero need none. A drive command names the control under
 which it is sent by a key, which is new whenever another one gets control: so commands of before have no effect.
-``who`` is ``(by, id, device)``; ``by`` is an account, or a server and its person, ``page-1/ann``.
+A client is ``(account, id, by, device)``; the account is "" where names are not checked.
 """
-
-SHORTEST_MS = 1000
-USUAL_MS = 3000
-LONGEST_MS = 10_000
-BY = 40  # characters
-DEVICE = 20
-
-# Commands without a key move the motors, only while nobody has control, or never.
-DRIVE = "drive"
-FREE = "free"
-REFUSE = "refuse"
-
-_IDLE_MS = 5000  # so long after the last command that moved anything, control is given to others at once
-_OTHERS_MS = 2000
-_KEYS = 80  # characters, so that nobody can try many
-_NOBODY = ("", "", "")
-_LETTERS = "abcdefghijklmnopqrstuvwxyz0123456789_-/"
 
 
 class Lease:
     """``hold`` and ``release`` for requests; ``refuses`` for drive commands; ``tick`` regularly."""
 
-    def __init__(self, now: int, diff, random, strangers: str = DRIVE, named: bool = False) -> None:
-        """``random`` returns 8 hex digits. ``named``: of two who have the same id or key, the account decides."""
+    def __init__(self, now: int, diff, random, strangers: int) -> None:
+        """``random(4)`` returns 8 hex digits.
+
+        ``strangers``: commands without a key move the motors always (0), while nobody has control (1), or never (2).
+        """
         self.key = ""  # "": nobody has control
-        self.holder = _NOBODY
-        self.asker = _NOBODY
-        self.others = False  # a command without a key has moved something in the last 2 s
+        self.holder: tuple = ()  # nobody
+        self.asker: tuple = ()
+        self.others = False  # in the last 2 s a command without a key moved something, unless it was refused elsewhere
         self.changed = True  # since the last state
         self.halts = False  # another one has control, or nobody: the motors are to be stopped
+        self.strangers = strangers
         self._diff = diff
         self._random = random
-        self._strangers = strangers
-        self._named = named
-        self._since = self._moved = self._asked = self._other = now
-        self._for = self._asks_for = 0
-        self._idle = True
+        self._since = self._held_from = self._asked = self._received = now
+        self._limit_ms = self._wait = 0  # of the holder, and of the asker
+        self._held = False  # in the last 5 s the holder moved something: others have to ask
 
-    def hold(self, who: tuple, for_ms: int, over: bool, now: int) -> None:
-        """Request control, or renew it. ``over``: whoever has it is not asked."""
+    def hold(self, client: tuple, ms: int, urgent: bool, now: int) -> None:
+        """Request control, or renew it. ``urgent``: without asking whoever has it."""
         self.tick(now)
-        for_ms = min(max(for_ms, SHORTEST_MS), LONGEST_MS)
-        if self.key and self._same(who, self.holder):
+        ms = min(max(ms, 1000), 10_000)
+        if client[:2] == self.holder[:2]:
             self._since = now
-            self._for = for_ms
-        elif over or self._idle:
-            self._give(who, for_ms, now)
-        elif self.asker is _NOBODY or self._same(who, self.asker):
-            self.changed = self.changed or self.asker is _NOBODY
-            self.asker = who
-            self._asks_for = for_ms
+            self._limit_ms = ms
+        elif urgent or not self._held:
+            self.take(client, ms, now)
+        elif not self.asker or client[:2] == self.asker[:2]:
+            self.changed = self.changed or not self.asker
+            self.asker = client
+            self._wait = ms
             self._asked = now
 
-    def release(self, who: tuple, now: int) -> None:
+    def release(self, client: tuple, now: int) -> None:
         """End control, or the request for it."""
         self.tick(now)
-        if self.key and self._same(who, self.holder):
+        if client[:2] == self.holder[:2]:
             self._end(now)
-        elif self._same(who, self.asker):
-            self.asker = _NOBODY
+        elif client[:2] == self.asker[:2]:
+            self.asker = ()
             self.changed = True
 
     def holds(self, key: str, by: str) -> bool:
-        """Whether a command with this key is from who has control. For several motor owners it has the key of each."""
+        """Whether a command of this account is from who has control; its key has those of several motor owners."""
         own = self.key
-        if own == "" or (key != own and (len(key) > _KEYS or own not in key.split(" "))):
-            return False
-        return not self._named or _account(by) == _account(self.holder[0])
+        # nobody can try many keys at once
+        return own != "" and (key == own or (len(key) < 80 and own in key.split(" "))) and self.holder[:1] == (by,)
 
     def refuses(self, moves: bool, script: bool, key: str, by: str, now: int) -> bool:
         """Whether a drive command has no effect; one of who has control renews it. A zero always has an effect.
 
-        With names, a command from elsewhere has a ``by``; without one it is a program's of the robot. ``tick`` first.
+        ``script``: this sender needs no key. Call ``tick`` before.
         """
         if self.holds(key, by):
             self._since = now
-            return False
-        if not moves or (not key and (script or (self._named and not by))):
-            return False
-        return key != "" or self._strangers == REFUSE or (self._strangers == FREE and self.key != "")
-
-    def moved(self, key: str, now: int) -> None:
-        """A person's command that moves something was admitted."""
-        if key:
-            self._moved = now
-            self._idle = False
-        else:
-            self._other = now
-            self.changed = self.changed or not self.others
-            self.others = True
+            if moves:
+                self._held_from = now
+                self._held = True
+        elif moves:
+            if key:
+                return True
+            if not script:
+                if self.strangers == 2 or (self.strangers and self.key):
+                    return True
+                self._received = now
+                self.changed = self.changed or not self.others
+                self.others = True
+        return False
 
     def tick(self, now: int) -> None:
         """Let what is over end; at least every few minutes, because clocks of boards wrap."""
         diff = self._diff
-        if self.others and diff(now, self._other) >= _OTHERS_MS:
+        if self.others and diff(now, self._received) >= 2000:
             self.others = False
             self.changed = True
-        if self.asker is not _NOBODY and diff(now, self._asked) >= self._asks_for:
-            self.asker = _NOBODY
+        if self.asker and diff(now, self._asked) >= self._wait:
+            self.asker = ()
             self.changed = True
-        if not self._idle and diff(now, self._moved) >= _IDLE_MS:
-            self._idle = True
-        if self.key and (diff(now, self._since) >= self._for or (self._idle and self.asker is not _NOBODY)):
+        if self._held and diff(now, self._held_from) >= 5000:
+            self._held = False
+        if self.key and (diff(now, self._since) >= self._limit_ms or (self.asker and not self._held)):
             self._end(now)
 
-    def state(self, boot: str) -> dict:
-        """The payload of outgoing/control/{owner}."""
-        by, name, device = self.holder
-        asks, asks_id, _ = self.asker
-        return {
-            "by": by, "id": name, "key": self.key, "device": device, "asks": asks, "asks_id": asks_id,
-            "others": self.others, "named": self._named, "boot": boot,
-        }  # fmt: skip
-
-    def _same(self, who: tuple, other: tuple) -> bool:
-        return who[1] == other[1] and (not self._named or _account(who[0]) == _account(other[0]))
-
-    def _give(self, who: tuple, for_ms: int, now: int) -> None:
-        self._change(who, self._random())
-        self._for = for_ms
-        self._since = self._moved = now
-        self._idle = False
-
-    def _end(self, now: int) -> None:
-        if self.asker is _NOBODY:
-            self._change(_NOBODY, "")
-            self._idle = True
-        else:
-            self._give(self.asker, self._asks_for, now)
-
-    def _change(self, holder: tuple, key: str) -> None:
-        self.holder = holder
-        self.key = key
-        self.asker = _NOBODY
+    def take(self, client: tuple, ms: int, now: int) -> None:
+        """Control passes on to this client, or to nobody."""
+        self.holder = client
+        self.asker = ()
+        self.key = self._random(4) if ms else ""
+        self._since = self._held_from = now
+        self._limit_ms = ms
+        self._held = ms > 0
         self.changed = self.halts = True
 
+    def _end(self, now: int) -> None:
+        self.take(self.asker, self._wait if self.asker else 0, now)
 
-def _account(by: str) -> str:
-    return by.split("/")[0]
+
+def request_of(fields: dict) -> tuple[str, str, str, int] | None:
+    """``(id, by, device, for_ms)``; 0: it is a release. None: it is no request."""
+    name = fields.get("id")
+    want = fields.get("want", "hold")
+    by = fields.get("by", "")
+    device = fields.get("device", "")
+    ms = fields.get("for_ms", 3000)
+    if not (isinstance(name, str) and isinstance(by, str) and isinstance(device, str)) or len(name) != 8:
+        return None
+    for char in name:
+        if char not in "0123456789abcdefABCDEF":
+            return None
+    if want not in ("hold", "release") or type(ms) not in (int, float):
+        return None
+    return name, shown(by, 40), shown(device, 20), int(min(max(ms, 1), 10_000)) if want == "hold" else 0
 
 
 def shown(text: str, limit: int) -> str:
     """``text`` in the letters of names; "/" separates a server and its person."""
-    small = [char.lower() if "A" <= char <= "Z" else char for char in text[:limit]]
-    return "".join([char if char in _LETTERS else "_" for char in small])
+    letters = "abcdefghijklmnopqrstuvwxyz0123456789_-/"
+    return "".join([char if char in letters else "_" for char in text.lower()[:limit]])

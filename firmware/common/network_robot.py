@@ -22,7 +22,9 @@ from common.wifi import Wifi
 _DRIVE_LIMIT_MS = const(900)  # one second, including a slow turn of the loop
 _ESTOP = const(0)  # places of the topics in the subscription: stops come first
 _RESET = const(1)
-_DRIVE = const(2)
+_CONTROL = const(2)
+_TAKE = const(3)
+_DRIVE = const(4)
 _HEARTBEAT_MS = const(250)
 _REPORT_EVERY = const(20)  # heartbeats: 5 s
 
@@ -38,16 +40,15 @@ class NetworkRobot:
         now = time.ticks_ms()
         name = get(settings, "robot", "id")
         root = base(get(settings, "robot", "system", "pebble"), get(settings, "robot", "type", "robots"), name)
-        self._charging = charging
+        self.charging = charging
         self._wifi = Wifi(get(settings, "wifi", "ssid"), get(settings, "wifi", "password", ""))
         self._clock = Clock(settings.get("ntp", "pool.ntp.org"), now)
         incoming = root + b"/incoming/"
-        topics = incoming + b"estop", incoming + b"estop-reset", incoming + b"drive-values"
-        self.session = Session(settings, root, topics, wrap, self._take)
+        names = b"estop", b"estop-reset", b"control", b"control/take", b"drive-values"
+        self.session = Session(settings, root, tuple([incoming + name for name in names]), wrap, self._take)
         self.stops = EmergencyStop(now, _DRIVE_LIMIT_MS)
-        self._stoppable = True  # the broker granted both topics of stops
         self.deadman = DeadMan(_DRIVE_LIMIT_MS)
-        self._body = body
+        self.body = body
         self.refused = 0  # commands that were retained, and drive commands that were invalid or not admitted
         self._next: tuple | None = None  # the newest drive command that was admitted in this turn
         self._limit_ms = 0  # how long it moves the motors
@@ -67,13 +68,17 @@ class NetworkRobot:
         self._guard(time.ticks_ms())
 
     def stop(self) -> None:
-        self._body.stop()
+        self.body.stop()
 
     def _guard(self, now: int) -> None:
-        self.stops.tick(now)
+        stops = self.stops
+        stops.tick(now)
+        if stops.lease.halts:  # whoever gets control begins with wheels at rest
+            stops.lease.halts = False
+            self._halt()
         if self.deadman.expired(now):
-            self._body.stop()
-        self._body.refresh()
+            self.body.stop()
+        self.body.refresh()
 
     def _turn(self, now: int) -> None:
         server = self._wifi.step(now)
@@ -84,7 +89,7 @@ class NetworkRobot:
             session.write(now, session.connection.state == "online" and self._report(now))
 
     def _halt(self) -> None:
-        self._body.stop()
+        self.body.stop()
         self.deadman.rest()
         self._next = None
 
@@ -98,7 +103,7 @@ class NetworkRobot:
         self.session.read(now)
         self.stops.save()
         if self._next and not self._void:
-            if self._body.drive(*self._next[:3]):
+            if self.body.drive(*self._next[:3]):
                 self.deadman.limit_ms = self._limit_ms
                 self.deadman.feed(now)
             else:
@@ -111,7 +116,8 @@ class NetworkRobot:
             granted = bytes(raw)
             if granted[_DRIVE] > 127:
                 raise ValueError("subscription refused")
-            self._stoppable = granted[_ESTOP] <= 127 and granted[_RESET] <= 127
+            self.stops.stoppable = granted[_ESTOP] <= 127 and granted[_RESET] <= 127
+            self.stops.controllable = granted[_CONTROL] <= 127
             self._heartbeats = 0
             self._due = now
         elif client.retained:  # stale
@@ -127,7 +133,10 @@ class NetworkRobot:
             self._judge(raw, now)
         elif raw is not None and not len(raw):  # it removes a retained message
             pass
-        elif not self._stoppable:  # without a way to reset it, a stop is only a zero
+        elif topic == _CONTROL or topic == _TAKE:  # noqa: SIM109 - a tuple would need memory
+            if raw is not None:
+                stops.request(raw, topic == _TAKE, now)
+        elif not stops.stoppable:  # without a way to reset it, a stop is only a zero
             if topic == _ESTOP:
                 stops.arbiter.judge(False, PERSON, 0, now)
                 self._halt()
@@ -141,9 +150,9 @@ class NetworkRobot:
     def _judge(self, raw: memoryview | None, now: int) -> None:
         command = None if raw is None else parse(raw)
         if command:
-            x, z, y, run, valid_ms = command
+            x, z, y, run, valid_ms, key = command
             moves = x != 0.0 or z != 0.0 or y != 0.0
-            limit_ms = self.stops.arbiter.judge(moves, run, valid_ms, now)
+            limit_ms = self.stops.arbiter.judge(moves, run, valid_ms, now, key)
             if limit_ms != REFUSED:
                 self._next = command
                 self._limit_ms = limit_ms
@@ -161,16 +170,15 @@ class NetworkRobot:
         if session.stuck:
             return False
         stops = self.stops
-        due = stops.due and self._heartbeats and self._stoppable
-        if due and session.publish(b"estop/mcu", stops.state(), 1):
+        if stops.due and self._heartbeats and session.publish(stops.due, stops.state(), 1):
             stops.published(now)
             return True  # so the rest has room in the next turn
         if diff(now, self._due) < 0:
             return False
         if not self._heartbeats:
-            what = describe(self._clock.read(now), session.root, self._stoppable, self._charging)
+            what = describe(self._clock.read(now), session.root, stops.stoppable, stops.controllable, self.charging)
             session.publish(b"capabilities", what, 1)
-            stops.changed = True
+            stops.changed = stops.lease.changed = True
             self._due = now
         else:
             self._due = add(self._due, _HEARTBEAT_MS)
@@ -178,6 +186,6 @@ class NetworkRobot:
                 self._due = add(now, _HEARTBEAT_MS)
             session.publish(b"online", b'{"t": %d, "online": true}' % self._clock.read(now), 1)
             if self._heartbeats % _REPORT_EVERY == 1:
-                self._body.report(session.publish)
+                self.body.report(session.publish)
         self._heartbeats += 1
         return False

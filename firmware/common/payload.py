@@ -12,8 +12,6 @@ _MAX_BRACKETS = const(32)  # limits the parser's memory, which grows with depth
 
 _WATCHDOG_MS = const(60_000)  # longer than any: larger numbers are cut, because they would need memory
 
-_NUMBERS = int, float
-
 
 def load(raw: memoryview | bytes):
     """Parse JSON of limited size and depth. Raises ValueError, OverflowError or MemoryError.
@@ -45,12 +43,12 @@ def load(raw: memoryview | bytes):
     return json.loads(raw)  # type: ignore[type-var]  # any buffer will do (extmod/modjson.c)
 
 
-def parse(raw: memoryview | bytes) -> tuple[float, float, float, int, int] | None:
-    """Return ``(x, z, y, run, valid_ms)`` from bare or wrapped JSON. None: refused.
+def parse(raw: memoryview | bytes) -> tuple[float, float, float, int, int, str] | None:
+    """Return ``(x, z, y, run, valid_ms, key)`` from bare or wrapped JSON. None: refused.
 
-    Axes are within -1..1; missing ones, and those that are no number, are 0; NaN and infinity are refused. ``run`` and
-    ``valid_ms`` are as the arbiter needs them. Wrong ones, or a wrong ``source``, refuse a command that moves anything,
-    but never a stop.
+    Axes are within -1..1; missing ones, and those that are no number, are 0; NaN and infinity are refused. The others
+    are as the arbiter needs them. Wrong ones, or a wrong ``source``, refuse a command that moves anything, but never a
+    stop.
     """
     try:
         body = load(raw)
@@ -61,7 +59,10 @@ def parse(raw: memoryview | bytes) -> tuple[float, float, float, int, int] | Non
             x, z, y = _axis(body, "x"), _axis(body, "z"), _axis(body, "y")
             stops = x == 0.0 and z == 0.0 and y == 0.0
             run, valid_ms = _run(body, stops), _valid_ms(body, stops)
-            return x, z, y, run, valid_ms
+            key = body.get("key")
+            if not stops and not (key is None or isinstance(key, str)):
+                raise ValueError
+            return x, z, y, run, valid_ms, key if isinstance(key, str) else ""
     except (ValueError, OverflowError, MemoryError):  # not UTF-8, no JSON, no number
         pass
     return None
@@ -86,7 +87,7 @@ def _run(body: dict, stops: bool) -> int:
 def _valid_ms(body: dict, stops: bool) -> int:
     value = body.get("valid_ms")
     if value is not None:
-        if type(value) in _NUMBERS and 0 <= value < 1e12 and (stops or value >= 1):
+        if type(value) in (int, float) and 0 <= value < 1e12 and (stops or value >= 1):
             return int(min(value, _WATCHDOG_MS))
         if not stops:
             raise ValueError
@@ -97,7 +98,7 @@ def _axis(body: dict, name: str) -> float:
     value = body.get(name)
     if isinstance(value, str):
         value = _number(value.strip(" \t\n\r\v\f").lower())
-    elif type(value) not in _NUMBERS:
+    elif type(value) not in (int, float):
         return 0.0
     value = float(value)  # type: ignore[arg-type]
     if not -1e999 < value < 1e999:  # NaN or infinite; arithmetic would allocate memory

@@ -32,14 +32,14 @@ class Session:
         ``take(kind, now)`` is called for the SUBACK and for each publication, see `mqtt.Client.take`; it may raise
         ValueError.
         """
-        self._settings = settings
+        self.settings = settings
         self._host = host(settings)
         self.root = root
         # A broker disconnects a client when another one uses the same id: so it cannot be guessed, and is the same
         # until the next boot. A broker must accept 23 bytes of it, and may refuse more (3.1.3.1).
         self._name = b"pebble-" + hexlify(os.urandom(8))
         self.client = mqtt.Client(_LONGEST_PAYLOAD + len(topics[-1]) + 7, _OUTGOING + 3 * len(root), topics)
-        self._wrap = wrap
+        self.wrap = wrap
         self._take = take
         self.connection = Connection()
         self._open: Stream | None = None  # to the broker; before that, the query for its address
@@ -73,12 +73,12 @@ class Session:
             return
         self._open.socket.close()
         self._open = None
-        settings = self._settings
+        settings = self.settings
         if not address:
             raise OSError("no address for " + self._host)
-        if self._wrap:
-            self._wrap.set_time(clock.read(now))
-        self._open = Stream(address, get(settings, "mqtt", "port", 8883 if self._wrap else 1883), self._wrap)
+        if self.wrap:
+            self.wrap.set_time(clock.read(now))
+        self._open = Stream(address, get(settings, "mqtt", "port", 8883 if self.wrap else 1883), self.wrap)
         self.client.restart()
         packet = mqtt.login(
             self._name,

@@ -23,7 +23,7 @@ class Stream:
 
     def __init__(self, host: str, port: int, wrap) -> None:
         """``wrap`` puts TLS around the connected socket; None: none."""
-        self._wrap = wrap
+        self.wrap = wrap
         self._tried = 0
         self._poll: select.poll | None = select.poll()
         self.socket = socket.socket()
@@ -42,8 +42,8 @@ class Stream:
             if not self._poll.poll(0):
                 return False
             self._poll = None  # if it failed, reading and writing raise the error
-            if self._wrap:
-                self.socket = self._wrap(self.socket)
+            if self.wrap:
+                self.socket = self.wrap(self.socket)
         return True
 
     def read(self, data: memoryview) -> int:

@@ -10,7 +10,8 @@ from typing import Annotated, Any, Literal
 from msgspec import UNSET, Meta, Struct, UnsetType, field
 from msgspec.structs import force_setattr
 
-from pebble.motion import arbiter, lease
+from pebble.motion import arbiter
+from pebble.motion.lease import shown
 
 
 class Payload(Struct, frozen=True, kw_only=True, omit_defaults=False):
@@ -104,16 +105,15 @@ class ControlRequest(Payload, frozen=True, kw_only=True, omit_defaults=True):
 
     id: Annotated[str, Meta(pattern=r"\A[0-9A-Fa-f]{8}\Z")]  # new for each tab or process: 8 hex digits
     want: Literal["hold", "release"] = "hold"
-    for_ms: float = lease.USUAL_MS  # control ends so long after the last request or command; within 1,000 to 10,000
+    for_ms: float = 3000  # control ends so long after the last request or command: 1,000 to 10,000
     by: str = ""  # who, at most 40 characters
     device: str = ""  # with what, at most 20
     t: Annotated[int, Meta(ge=0, le=LARGEST_MS)] | UnsetType = UNSET  # the sender's clock, in milliseconds
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _clamp(self, lease.SHORTEST_MS, lease.LONGEST_MS, "for_ms")
-        force_setattr(self, "by", lease.shown(self.by, lease.BY))
-        force_setattr(self, "device", lease.shown(self.device, lease.DEVICE))
+        force_setattr(self, "by", shown(self.by, 40))
+        force_setattr(self, "device", shown(self.device, 20))
 
     def ends(self) -> bool:
         return self.want == "release"

@@ -20,7 +20,8 @@ class MotorPower:
 
     def __init__(self, watchdog_s: float, strangers: str, now: float) -> None:
         self._latch = Latch("", 1, operator.sub)
-        self._lease = Lease(0, lambda _later, _earlier: -1, str, strangers)  # only its owner ends it
+        rule = ("drive", "free", "refuse").index(strangers)
+        self._lease = Lease(0, lambda _later, _earlier: -1, str, rule)  # only its owner ends it
         began, watchdog_ms = _ms(now) - _LONG_AGO_MS, round(1000 * watchdog_s)
         self._arbiter = Arbiter(self._latch, self._lease, began, operator.sub, watchdog_ms)
         self._power = (0.0, 0.0)  # left, right, until _until

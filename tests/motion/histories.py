@@ -34,6 +34,11 @@ _SAVING = {
     "look_and_reset": 9, "write": 30, "cut": 5, "cut_all": 2, "cut_while_writing": 2, "start": 10, "drive": 4,
     "unwritable": 2, "corrupt": 1, "remove": 1, "restart_manager": 1, "lose": 1, "deaf": 1, "retain": 1, "nameless": 1,
 }  # fmt: skip
+_CONTROL = {
+    "wait": 30, "deliver": 6, "all": 30, "duplicate": 3, "lose": 1, "hold": 14, "let_go": 3, "learn": 8, "steer": 20,
+    "control": 8, "signed": 2, "drive": 5, "release": 3, "halt": 1, "press": 1, "look_and_reset": 4, "start_run": 4,
+    "script": 8, "rogue": 1, "retain": 1, "subscribe": 1, "restart": 1,
+}  # fmt: skip
 
 
 def _numbers(chance: random.Random, count: int) -> Iterator[tuple[int, int]]:
@@ -54,7 +59,10 @@ def _perform(what: tuple[type[World], Any], history: Steps) -> Outcome:
 
 ENGINE = Engine(
     draw=RandomSteps(
-        *(_EVERYTHING, _DRIVING, _RESETTING, _SAVING), length=LENGTH, layouts=len(LAYOUTS), numbers=_numbers
+        *(_EVERYTHING, _DRIVING, _CONTROL, _RESETTING, _SAVING, _CONTROL),
+        length=LENGTH,
+        layouts=len(LAYOUTS),
+        numbers=_numbers,
     ),
     world=lambda _kind, bug: shared(bug or (World, CORES)),
     perform=_perform,

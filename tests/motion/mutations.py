@@ -13,7 +13,7 @@ from pebble.simulation.micropython.loader import firmware_root
 from tests.kit.mutations import Mutation, in_copy
 from tests.motion import world
 
-_LATCH, _ARBITER, _TICKS = _CORES = ("common/latch.py", "common/arbiter.py", "common/ticks.py")
+_LATCH, _LEASE, _ARBITER, _TICKS = _CORES = tuple(f"common/{name}.py" for name in world.CORE_NAMES)
 _MODULES = {"world": world.__file__, "estop": estop.__file__}
 
 
@@ -37,7 +37,7 @@ MUTATIONS = {
     "persons ignore the latch": Mutation(_LATCH, "        if self.latched:\n", "        if self.latched and script:\n"),
     "a reset of another life is obeyed": Mutation(_LATCH, '"boot" if boot != self.boot else ', ""),
     "a reset of an earlier count is obeyed": Mutation(_LATCH, '"count" if count != self.count else ', ""),
-    "an old reset is obeyed": Mutation(_LATCH, "_OLD_MS = 1000", "_OLD_MS = 2000"),
+    "an old reset is obeyed": Mutation(_LATCH, "age >= 1000", "age >= 2000"),
     "a stop counts only while free": Mutation(
         _LATCH,
         "        self.latched = True\n        self.count += 1\n",
@@ -48,13 +48,13 @@ MUTATIONS = {
         "            return False\n        self.recent",
         "            self.latched = False\n        self.recent",
     ),
-    "names are not restored": Mutation(_LATCH, "if is_name(name)][: self._names]", "if not is_name(name)]"),
-    "one name is remembered": Mutation(_LATCH, "+ self.recent)[: self._names]", "+ self.recent)[:1]"),
+    "names are not restored": Mutation(_LATCH, "if is_name(name)][: self.names]", "if not is_name(name)]"),
+    "one name is remembered": Mutation(_LATCH, "+ self.recent)[: self.names]", "+ self.recent)[:1]"),
     "a damaged file is free": Mutation(
         _LATCH, "            self.latched = True\n", "            self.latched = False\n"
     ),
     "after a reset persons drive on": Mutation(_LATCH, "self._waits = True", "self._waits = False"),
-    "after a reset persons let go too shortly": Mutation(_LATCH, "_QUIET_MS = 500", "_QUIET_MS = 499"),
+    "after a reset persons let go too shortly": Mutation(_LATCH, "_waits_from) >= 500", "_waits_from) >= 499"),
     "commands do not prolong the wait after a reset": Mutation(
         _LATCH, "        self._waits_from = now\n        return self._waits\n", "        return self._waits\n"
     ),
@@ -67,7 +67,7 @@ MUTATIONS = {
     "a stop bars nothing": Mutation(_ARBITER, "        self.bar(self._newest)\n        self._scripted = False\n", ""),
     "a run is not barred while latched": Mutation(_ARBITER, "            self.bar(run)\n", "            pass\n"),
     "the hold is too short": Mutation(_ARBITER, "HOLD_MS = 2000", "HOLD_MS = 1999"),
-    "a start waits too shortly": Mutation(_ARBITER, "_START_MS = 2000", "_START_MS = 1999"),
+    "a start waits too shortly": Mutation(_ARBITER, "self._started) >= HOLD_MS", "self._started) >= HOLD_MS - 1"),
     "a script's zero takes the wheel from a person": Mutation(
         _ARBITER, "        if run == PERSON:\n", "        if run == PERSON or not moves:\n"
     ),
@@ -79,15 +79,64 @@ MUTATIONS = {
     "a release bars": Mutation(_ARBITER, "self._resumes = not moves and not final", "self._resumes = False"),
     "valid_ms has no effect": Mutation(_ARBITER, "else int(valid_ms)", "else self._watchdog_ms"),
     "valid_ms has no limit": Mutation(_ARBITER, "valid_ms < 0 or valid_ms > self._watchdog_ms", "valid_ms < 0"),
+    "the key of before moves": Mutation(_LEASE, "            if key:\n                return True\n", ""),
+    "a key stays when control passes on": Mutation(
+        _LEASE, "self._random(4) if ms", "self.key or self._random(4) if ms"
+    ),
+    "a zero needs a key": Mutation(
+        _LEASE, "        elif moves:\n            if key:", "        else:\n            if key:"
+    ),
+    "control never ends": Mutation(_LEASE, "diff(now, self._since) >= self._limit_ms or", "False or"),
+    "everybody takes over": Mutation(_LEASE, "elif urgent or not self._held:", "elif True:"),
+    "nobody takes over": Mutation(_LEASE, "elif urgent or not self._held:", "elif not self._held:"),
+    "anybody releases": Mutation(
+        _LEASE,
+        "if client[:2] == self.holder[:2]:\n            self._end",
+        "if self.key:\n            self._end",
+    ),
+    "the key of another account moves": Mutation(_LEASE, " and self.holder[:1] == (by,)", ""),
+    "another account with the same id has control": Mutation(
+        _LEASE,
+        "if client[:2] == self.holder[:2]:\n            self._since",
+        "if client[1:2] == self.holder[1:2]:\n            self._since",
+    ),
+    "strangers drive while somebody has control": Mutation(_LEASE, " or (self.strangers and self.key)", ""),
+    "strangers are not refused": Mutation(_LEASE, "self.strangers == 2 or", ""),
+    "programs of the robot are strangers": Mutation(_ARBITER, "run != PERSON or own", "run != PERSON"),
+    "scripts are strangers": Mutation(_ARBITER, "run != PERSON or own", "own"),
+    "the last one who asks gets control": Mutation(
+        _LEASE, "elif not self.asker or client[:2] == self.asker[:2]:", "else:"
+    ),
+    "who asks gets nothing": Mutation(
+        _LEASE, "self.take(self.asker, self._wait if self.asker else 0, now)", "self.take((), 0, now)"
+    ),
+    "who asked once asks for ever": Mutation(_LEASE, "diff(now, self._asked) >= self._wait", "False"),
+    "who drives counts as idle": Mutation(_LEASE, "                self._held = True\n", "                pass\n"),
+    "who only holds is idle too late": Mutation(_LEASE, "self._held_from) >= 5000", "self._held_from) >= 6000"),
+    "commands do not renew": Mutation(
+        _LEASE, "            self._since = now\n            if moves:", "            if moves:"
+    ),
+    "control has no longest time": Mutation(_LEASE, "min(max(ms, 1000), 10_000)", "max(ms, 1000)"),
+    "the wheels turn on when control passes on": Mutation(
+        _LEASE, "self.changed = self.halts = True", "self.changed = True"
+    ),
+    "it is not shown that others drive": Mutation(_LEASE, "                self.others = True\n", ""),
+    "a stranger's zero lets go after a reset": Mutation(_ARBITER, "if (moves or ours) and self", "if self"),
+    "a stranger's zero lets the run resume": Mutation(_ARBITER, "valid_ms == 0 or not ours", "valid_ms == 0"),
+    "what has no key of now begins a run": Mutation(
+        _ARBITER,
+        "return REFUSED\n        ours",
+        "self._newest = max(run, self._newest)\n            return REFUSED\n        ours",
+    ),
     "times do not wrap": Mutation(
         _TICKS, "return ahead if ahead < _HALF else ahead - _HALF - _HALF", "return later - earlier"
     ),
     "a zero is lost when it is replaced": Mutation("world", "if old is not None and not old[4]:", "if False:"),
     "a stop leaves a command in the slot": Mutation(
-        "world", "            self.slot = None\n            self.until = 0\n", "            self.until = 0\n"
+        "world", "        self.slot = None\n        self.until = 0\n", "        self.until = 0\n"
     ),
     "a stop leaves the wheels turning": Mutation(
-        "world", "            self.slot = None\n            self.until = 0\n", "            self.slot = None\n"
+        "world", "        self.slot = None\n        self.until = 0\n", "        self.slot = None\n"
     ),
     "saved is what is only renamed": Mutation(
         "world",

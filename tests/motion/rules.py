@@ -27,6 +27,7 @@ from __future__ import annotations
 from typing import Any
 
 from tests.kit.schedules import ViolatedError, check
+from tests.motion.control_rules import ControlRules
 
 WATCHDOG_MS = 750
 HOLD_MS = 2000
@@ -44,6 +45,8 @@ UNREADABLE = "unreadable"
 
 class Rules:
     """The rules of one owner. The events are called after the owner has executed them, with what it did."""
+
+    control: ControlRules  # of this life
 
     def __init__(self, names: int) -> None:
         self.names = names
@@ -80,6 +83,7 @@ class Rules:
         self.released = False
         self.script_until: int | None = None  # the last command is a script's
         self.quiet_from: int | None = None  # after a reset
+        self.key = ""  # of control
 
     def executes(self, copy: bool) -> None:
         """A command is executed; ``copy``: it was delivered as a retained one."""
@@ -136,9 +140,13 @@ class Rules:
         check(self.zeros <= 0, "a person's zero is not judged")
         self.zeros = 0
 
-    def judged(self, moves: bool, run: int, valid_ms: float, now: int, result: int) -> None:
+    def judged(self, moves: bool, run: int, valid_ms: float, key: str, by: str | None, now: int, result: int) -> None:
         """A drive command was judged; ``result`` is the milliseconds for which it moves, 0 or REFUSED."""
         self._end_hold(now)
+        permitted, ours = self.control.commanded(moves, run == PERSON, key, by, now)
+        if not permitted:
+            check(result == REFUSED, "something moves by a key of before, another's name or a stranger")
+            return
         limit = min(WATCHDOG_MS, int(valid_ms)) if valid_ms >= 0 else WATCHDOG_MS
         held = self.person_at is not None
         if run > self.newest:
@@ -148,7 +156,7 @@ class Rules:
             self.barred = max(self.barred, run)
             check(result <= 0, "a wheel turns while its owner is latched")
         if run == PERSON:
-            quiet = self._quiet(moves, now)
+            quiet = self._quiet(moves, ours, now)
             if not moves:
                 self.zeros -= 1
                 check(result == 0, "a person's zero is not judged")
@@ -157,7 +165,7 @@ class Rules:
                 return
             else:
                 check(result == limit, "a person's command is refused, or lasts too long or too short")
-            self._take(moves, valid_ms == 0, now)
+            self._take(moves, valid_ms == 0 or not ours, now)
             return
         if moves and 0 < run <= self.barred:
             check(result == REFUSED, "a barred run moves")
@@ -167,19 +175,24 @@ class Rules:
         check(result == (limit if moves else 0), "a script's command is refused, or lasts too long or too short")
         self.script_until = now + limit
 
+    def passed_on(self, key: str, moving: bool) -> None:
+        """``key`` is the owner's now; ``moving``: a wheel turns, or will."""
+        check(key == self.key or not moving, "a wheel turns on when control passes on")
+        self.key = key
+
     def moving(self, now: int, until: int) -> None:
         """A wheel turns at ``now``, by a command whose deadline is ``until``."""
         check(not self.latched, "a wheel turns while its owner is latched")
         check(now < until, "a wheel turns after its command's deadline")
 
-    def _quiet(self, moves: bool, now: int) -> bool:
-        """Whether persons have let go since the reset."""
+    def _quiet(self, moves: bool, ours: bool, now: int) -> bool:
+        """Whether persons have let go since the reset: who has control, if anybody has."""
         if self.latched or self.quiet_from is None:
             return True
-        if not moves or now - self.quiet_from >= QUIET_MS:
+        if (not moves and ours) or now - self.quiet_from >= QUIET_MS:
             self.quiet_from = None
             return True
-        self.quiet_from = now
+        self.quiet_from = now if moves else self.quiet_from
         return False
 
     def _take(self, moves: bool, final: bool, now: int) -> None:
@@ -199,6 +212,7 @@ class Rules:
     def ticked(self, now: int, barred: int) -> None:
         """Time has passed; ``barred`` is the owner's."""
         self._end_hold(now)
+        self.control.ticked(now)
         check(barred == self.barred, "a run is barred that is not, or the other way round")
 
     def file_removed(self, order: int) -> None:

@@ -49,8 +49,8 @@ def test_scripts_are_refused_twice_while_latched() -> None:
 def _judged(cores: Any, flags: tuple[bool, ...], barred: int, newest: int, command: Any, valid: int, now: int) -> Any:
     """The result of ``judge`` and the state after it, from any state."""
     latch = cores.Latch("00c0ffee", 4, operator.sub)
-    arbiter = cores.Arbiter(latch, 0, operator.sub, 750)
+    arbiter = cores.Arbiter(latch, cores.Lease(0, operator.sub, str, 0), 0, operator.sub, 750)
     latch.latched, latch._waits, arbiter._starting, arbiter._held, arbiter._resumes, arbiter._scripted = flags
     arbiter.barred, arbiter._newest, arbiter._script_ms = barred, newest, 750
     result = arbiter.judge(*command, valid, now)
-    return result, {**vars(arbiter), "latch": vars(latch)}
+    return result, {**vars(arbiter), "latch": vars(latch), "lease": None}

@@ -18,7 +18,7 @@ from pebble.flash.boards import FIRMWARE
 from pebble.motion.latch import is_name, reset_of, stop_of
 from tests.firmware.micropython import SCRIPTS, compile_module, run
 from tests.motion.histories import ENGINE
-from tests.motion.world import CORES, World
+from tests.motion.world import CORE_NAMES, CORES, World
 
 _BODIES: tuple[Any, ...] = (
     *(None, 0, True, "stop", [], [1], {}, {"stop": None}, {"stop": 7}, {"stop": "0" * 15}, {"stop": "0" * 17}),
@@ -42,6 +42,10 @@ def traces(seed: int, count: int) -> Iterator[str]:
         calls: list[Any] = []
         assert ENGINE.violation((World, _recording(calls)), ENGINE.draw("", seed, number)) == ""
         yield json.dumps(calls, separators=(",", ":"))
+
+
+def _all(lease: Any) -> list[Any]:
+    return [lease.key, list(lease.holder), list(lease.asker), lease.others, lease.changed, lease.halts]
 
 
 def _recording(calls: list[Any]) -> Any:
@@ -69,10 +73,24 @@ def _recording(calls: list[Any]) -> Any:
             calls.append([self.number, "state", [persisted], dict(result)])
             return result
 
+    class Lease(CORES.Lease):  # type: ignore[misc]
+        def __init__(self, now: int, diff: Any, keys: Any, strangers: int) -> None:
+            self.first = [now, keys.next, strangers]
+            super().__init__(now, diff, keys, strangers)
+
+        def hold(self, *arguments: Any) -> None:
+            super().hold(*arguments)
+            calls.append([self.number, "hold", arguments, _all(self)])
+
+        def release(self, *arguments: Any) -> None:
+            super().release(*arguments)
+            calls.append([self.number, "release", arguments, _all(self)])
+
     class Arbiter(CORES.Arbiter):  # type: ignore[misc]
-        def __init__(self, latch: Any, now: int, diff: Any, watchdog_ms: int) -> None:
-            super().__init__(latch, now, diff, watchdog_ms)
-            self.number = latch.number
+        def __init__(self, latch: Any, lease: Any, now: int, diff: Any, watchdog_ms: int) -> None:
+            super().__init__(latch, lease, now, diff, watchdog_ms)
+            self.number = lease.number = latch.number
+            calls.append([self.number, "lease", lease.first, None])
             calls.append([self.number, "arbiter", [now, watchdog_ms], None])
             self.outside = True
 
@@ -80,7 +98,7 @@ def _recording(calls: list[Any]) -> Any:
             self.outside = False
             result: int = super().judge(*arguments)
             self.outside = True
-            calls.append([self.number, "judge", arguments, [result, self.barred]])
+            calls.append([self.number, "judge", arguments, [result, self.barred, *_all(self.lease)]])
             return result
 
         def stop(self, *arguments: Any) -> bool:
@@ -93,16 +111,18 @@ def _recording(calls: list[Any]) -> Any:
             if self.outside:
                 calls.append([self.number, "tick", [now], self.barred])
 
-    return SimpleNamespace(Latch=Latch, Arbiter=Arbiter, diff=CORES.diff, StopSender=CORES.StopSender)
+    return SimpleNamespace(Latch=Latch, Lease=Lease, Arbiter=Arbiter, diff=CORES.diff, StopSender=CORES.StopSender)
 
 
-def repeat(folder: Path, lines: Iterable[str]) -> list[str]:
+def repeat(folder: Path, lines: Iterable[str], root: Path | None = None) -> list[str]:
     """Repeat the calls in MicroPython, on the cores as they are compiled for a board; the lines that it prints.
+
+    ``root``: firmware that is not Pebble's.
 
     The last one is ``[histories, calls, whether all results are the same]``.
     """
-    for name in ("latch", "arbiter", "ticks"):
-        compile_module(FIRMWARE["minilamp"], Path("common", f"{name}.py"), folder)
+    for name in CORE_NAMES:
+        compile_module(FIRMWARE["minilamp"], Path("common", f"{name}.py"), folder, root)
     with (folder / "traces.jsonl").open("w", encoding="utf-8") as file:
         file.writelines(line + "\n" for line in (bodies(), *lines))
     done = run(folder, SCRIPTS / "motion.py", heap=8 * 1024 * 1024, timeout_s=600.0)

@@ -17,6 +17,7 @@ from pebble.client.estop import StopSender
 from pebble.simulation.micropython.loader import FirmwareModules
 from pebble.transports import Message, QoS
 from tests.kit.schedules import Step, check
+from tests.motion.control_rules import Client, ControlRules
 from tests.motion.rules import (
     GIVE_UP_MS,
     MISSING,
@@ -31,14 +32,18 @@ from tests.motion.rules import (
 
 BASE = "pebble/robots/goob"
 
+CORE_NAMES = ("latch", "lease", "arbiter", "ticks")
+
 Command = tuple[Any, ...]  # (what, owner, when it was sent, whether it is a retained copy, ...)
 
 
 def load_cores(root: Path | None = None, sender: type = StopSender) -> Any:
     """The cores from the firmware below ``root``, and the sender of stops."""
     modules = FirmwareModules({"micropython": SimpleNamespace(const=lambda value: value)}, root=root)
-    latch, arbiter, ticks = (modules.module(f"common.{name}") for name in ("latch", "arbiter", "ticks"))
-    return SimpleNamespace(Latch=latch.Latch, Arbiter=arbiter.Arbiter, diff=ticks.diff, StopSender=sender)
+    latch, lease, arbiter, ticks = (modules.module(f"common.{name}") for name in CORE_NAMES)
+    return SimpleNamespace(
+        Latch=latch.Latch, Lease=lease.Lease, Arbiter=arbiter.Arbiter, diff=ticks.diff, StopSender=sender
+    )
 
 
 CORES = load_cores()
@@ -50,11 +55,20 @@ WAITS = (
     0, 1, 10, 49, 50, 100, 100, 250, 250, 499, 500, 501,
     749, 750, 999, 1000, 1999, 2000, 2001, 5000, 60_000, 290_000,
 )  # fmt: skip
+#: Who drives: ids may be copied, and people of one server have the same account.
+CLIENTS = (
+    *(Client("ann", "aaaaaaaa", "ann", "phone"), Client("ann", "bbbbbbbb", "ann"), Client("mia", "aaaaaaaa", "mia")),
+    *(Client("page-1", "dddddddd", "page-1/eve"), Client("page-1", "eeeeeeee", "page-1/bob")),
+    Client("otto", "cccccccc", "otto"),
+)  # fmt: skip
+FOR = (0, 1000, 3000, 3000, 3000, 10_000, 1 << 40)
+STRANGERS = (0, 1, 2, 0)
 VALID = (-1, -1, -1, 100, 400, 750, 751, 5000)
 STALE_MS = 2000  # a command that moves something and is older is dropped on its way
 INBOX_MS = 500
 STATE_MS = 250  # at most four states a second
 FOREVER = 1 << 60
+HOLDER = -2  # the place in the inbox of who has control
 WRITTEN, SYNCED, RENAMED = 1, 2, 3
 LAST_RUN = (1 << 30) - 1  # after it comes 1
 
@@ -63,6 +77,17 @@ CORRUPT: tuple[Any, ...] = (
     *(None, [], {}, 7, "latched", {"latched": 1, "recent": []}, {"latched": False}, {"recent": []}),
     *({"latched": False, "recent": {}}, {"latched": None, "recent": []}, {"latched": "false", "recent": []}),
 )
+
+
+class Keys:
+    """Makes keys of control: numbers, so that the same calls make the same keys in MicroPython."""
+
+    def __init__(self, first: int) -> None:
+        self.next = first
+
+    def __call__(self, _count: int) -> str:
+        self.next += 1
+        return f"{self.next - 1:08x}"
 
 
 class Owner:
@@ -103,10 +128,15 @@ class Owner:
         if self.visible != MISSING:
             self.latch.restore(self.visible[0])
             self.version = 1  # to be written again: an earlier process may have ended before the file was durable
-        self.arbiter = cores.Arbiter(self.latch, self.clock(now), self.diff, WATCHDOG_MS)
+        strangers = STRANGERS[self.world.layout % 4]
+        keys = Keys((self.index + 1 << 28) + (self.boots << 16))
+        self.lease = cores.Lease(self.clock(now), self.diff, keys, strangers)
+        self.rules.control = ControlRules(strangers, self.lease)
+        self.arbiter = cores.Arbiter(self.latch, self.lease, self.clock(now), self.diff, WATCHDOG_MS)
+        self.requests: list[Command] = []
         self.stage, self.writing_version = 0, 0
         self.writing: Any = None
-        self.inbox: dict[int, Command] = {}
+        self.inbox: dict[int, Command] = {}  # by run, PERSON, or HOLDER
         self.resets: list[Command] = []
         self.stops: list[Command] = []
         self.slot: tuple[bool, int] | None = None  # the newest admitted command: whether it moves, its deadline
@@ -137,9 +167,12 @@ class Owner:
             self.stops = [*self.stops, message][-8:]
         elif what == "reset":
             self.resets.append((*message, now))
+        elif what == "control":
+            self.requests.append(message)
         else:
-            moves, key = message[4:6]
-            self.rules.received(moves, key)
+            moves, run, _, keys, by = message[4:9]
+            self.rules.received(moves, run)
+            key = HOLDER if run == PERSON and self.lease.holds(keys, by or "") else run
             old = self.inbox.pop(key, None)
             if old is not None and not old[4]:
                 self._drive(old, now)
@@ -153,6 +186,9 @@ class Owner:
         for message in self.resets:
             self._reset(message, now - message[-1], now, order)
         self.resets = []
+        for message in self.requests:
+            self._request(message, now)
+        self.requests = []
         for message in self.inbox.values():
             if not message[4] or now - message[-1] < INBOX_MS:
                 self._drive(message, now)
@@ -171,6 +207,8 @@ class Owner:
             self._stop(message, now, order)
         elif message[0] == "reset":
             self._reset(message, now - read, now, order)
+        elif message[0] == "control":
+            self._request(message, now)
         else:
             self._drive(message, now)
             self.apply(now)
@@ -180,8 +218,7 @@ class Owner:
         self.rules.executes(copy)
         new = self.arbiter.stop(name, "anna", "", now)
         if new:
-            self.slot = None
-            self.until = 0
+            self._halt()
         self.rules.stopped(name, given, order, self.latch, now < self.until or self.slot is not None)
         if new:
             self._changed()
@@ -196,14 +233,37 @@ class Owner:
             self._changed()
         self.publish(now)
 
+    def _halt(self) -> None:
+        self.slot = None
+        self.until = 0
+
+    def _request(self, message: Command, now: int) -> None:
+        _, _, sent, copy, who, for_ms, over = message
+        self.rules.executes(copy)
+        if for_ms is None:
+            self.lease.release(who, self.clock(now))
+            self.rules.control.released(who, now)
+        elif now - sent < STALE_MS:
+            self.lease.hold(who, for_ms, over, self.clock(now))
+            self.rules.control.requested(who, for_ms, over, now)
+        self.halt_if_passed_on(now)
+
+    def halt_if_passed_on(self, now: int) -> None:
+        """The motors stop before anything else when another one has control."""
+        if self.lease.halts:
+            self.lease.halts = False
+            self._halt()
+        self.rules.passed_on(self.lease.key, now < self.until or self.slot is not None)
+
     def _drive(self, message: Command, now: int) -> None:
-        _, _, sent, copy, moves, run, valid = message[:7]
+        _, _, sent, copy, moves, run, valid, keys, by = message[:9]
         if moves and now - sent >= STALE_MS:
             return
         self.rules.executes(copy)
         number = (run - 1 + self.runs_from) % LAST_RUN + 1 if run > 0 else run
-        result = self.arbiter.judge(moves, number, valid, self.clock(now))
-        self.rules.judged(moves, run, valid, now, result)
+        result = self.arbiter.judge(moves, number, valid, self.clock(now), keys, by)
+        self.halt_if_passed_on(now)
+        self.rules.judged(moves, run, valid, keys, by, now, result)
         if result > 0 and 0 < run <= self.rules.barred_before and run not in self.world.rogues:
             check(now < self.managed_until, "a run moves that was barred before a restart its manager has received")
         if result != REFUSED:
@@ -348,10 +408,12 @@ class World:
         self.now = 0
         self.order = 0
         self.rogues: set[int] = set()
+        self.layout, self.named = layout, layout % 3 == 0
         self.owners = [Owner(self, index, kind, cores, 1 + layout * 997 % 9000) for index, kind in enumerate(kinds)]
         self.network: list[Command] = []
         self.retained: list[dict[str, Command]] = [{}]  # saves of the broker: by topic; the newest one counts
         self.seen: list[dict[int, dict[str, Any]]] = [{}, {}]  # by person, then owner
+        self.keys: list[dict[int, str]] = [{} for _ in CLIENTS]  # of control as each knows them, by owner
         self.senders: list[Sender] = []
         self.presses = 0
         # the manager of scripts, and their runs
@@ -376,6 +438,7 @@ class World:
                 if owner.until > self.now:
                     owner.rules.moving(self.now, owner.until)
                 owner.arbiter.tick(owner.clock(self.now))
+                owner.halt_if_passed_on(self.now)
                 owner.rules.ticked(self.now, owner.barred)
                 owner.flush(self.now)
 
@@ -400,6 +463,10 @@ class World:
             if owner.up:
                 owner.work(self.now, self.order)
                 owner.apply(self.now)
+
+    def _drive(self, moves: bool, run: int, valid: int, keys: str = "", by: str | None = None) -> None:
+        """Without a ``by`` it is from a program of the robot, where names are checked."""
+        self._send("drive", moves, run, valid, keys, by if self.named else "")
 
     def _send(self, what: str, *fields: Any) -> None:
         for owner in range(len(self.owners)):
@@ -439,13 +506,50 @@ class World:
     # -- persons
 
     def do_drive(self, a: int, b: int) -> None:
-        self._send("drive", True, PERSON, VALID[b % len(VALID)])
+        self._drive(True, PERSON, VALID[b % len(VALID)])
 
     def do_release(self, a: int, b: int) -> None:
-        self._send("drive", False, PERSON, VALID[b % len(VALID)])
+        self._drive(False, PERSON, VALID[b % len(VALID)])
 
     def do_halt(self, a: int, b: int) -> None:
-        self._send("drive", False, PERSON, 0)
+        self._drive(False, PERSON, 0)
+
+    # -- persons who have control, want it, or have had it
+
+    def _client(self, b: int) -> Client:
+        client = CLIENTS[b % len(CLIENTS)]
+        return client if self.named else client._replace(account="")
+
+    def do_hold(self, a: int, b: int) -> None:
+        self._send("control", self._client(b), FOR[b % len(FOR)], a == 0)
+
+    def do_let_go(self, a: int, b: int) -> None:
+        self._send("control", self._client(b), None, False)
+
+    def do_learn(self, a: int, b: int) -> None:
+        """A client receives who has control; one in four times it learns another's key."""
+        for index, owner in enumerate(self.owners):
+            if owner.up and (a % 4 == 0 or owner.lease.holder == self._client(b)):
+                self.keys[b % len(CLIENTS)][index] = owner.lease.key
+
+    def do_steer(self, a: int, b: int) -> None:
+        """A client drives by the keys that it knows, the ones of now or of before; one in eight is a zero."""
+        who = b % len(CLIENTS)
+        keys = " ".join(key for _, key in sorted(self.keys[who].items()) if key)
+        self._drive(a != 0, PERSON, VALID[b % len(VALID)], keys, CLIENTS[who].account)
+
+    def do_signed(self, a: int, b: int) -> None:
+        """A script elsewhere sends under a client's keys."""
+        if self.run:
+            keys = " ".join(key for key in self.keys[b % len(CLIENTS)].values() if key)
+            self._drive(a != 0, self.run, VALID[b % len(VALID)], keys, self._client(b).account)
+
+    def do_control(self, a: int, b: int) -> None:
+        """A client asks, is answered, and drives."""
+        self.do_hold(a, b)
+        self.do_all(a, b)
+        self.do_learn(1, b)
+        self.do_steer(1, b)
 
     def do_press(self, a: int, b: int) -> None:
         """A person gives a stop, with a sender that repeats it.
@@ -515,7 +619,7 @@ class World:
                 if stop:
                     self._send("stop", sender.name, sender.given)
                 else:
-                    self._send("drive", False, PERSON, 0)
+                    self._drive(False, PERSON, 0)
 
     def do_end_sender(self, a: int, b: int) -> None:
         if self.senders:
@@ -535,18 +639,18 @@ class World:
 
     def do_script(self, a: int, b: int) -> None:
         if self.run:
-            self._send("drive", a != 0, self.run, VALID[b % len(VALID)])
+            self._drive(a != 0, self.run, VALID[b % len(VALID)])
 
     def do_rogue(self, a: int, b: int) -> None:
         """A run that its manager has ended, or an unknown one, goes on sending."""
         run = b % (self.saved_run + 2)
         if run or a == 0:
             self.rogues.add(run)
-            self._send("drive", a != 0, run or UNKNOWN_RUN, VALID[b % len(VALID)])
+            self._drive(a != 0, run or UNKNOWN_RUN, VALID[b % len(VALID)])
 
     def do_end_run(self, a: int, b: int) -> None:
         if self.run:
-            self._send("drive", False, self.run, -1)
+            self._drive(False, self.run, -1)
             self.run = 0
 
     def do_restart_manager(self, a: int, b: int) -> None:

@@ -104,7 +104,7 @@ class Owner:
     """A motor owner, after the first seconds in which it refuses scripts; ``barred`` is from an earlier life."""
 
     def __init__(self, barred: int = 0) -> None:
-        self.arbiter = Arbiter(Latch("00c0ffee", 8, operator.sub), Lease(0, operator.sub, str), 0, operator.sub, 750)
+        self.arbiter = Arbiter(Latch("00c0ffee", 8, operator.sub), Lease(0, operator.sub, str, 0), 0, operator.sub, 750)
         self.arbiter.bar(barred)
 
     def moves(self, run: int) -> bool:

@@ -5,8 +5,6 @@ import operator
 import secrets
 from collections.abc import Callable
 
-from msgspec import UNSET
-
 from pebble.config import Security
 from pebble.contract.payloads import ControlRequest, ControlState, Drive
 from pebble.motion.lease import Lease
@@ -16,6 +14,7 @@ from pebble.services.serial_mcu_bridge.motion.paced import Paced
 log = logging.getLogger(__name__)
 
 _TICK_S = 0.25  # while somebody has control, or others drive: what is over ends so late at most
+_NOBODY = ("", "", "", "")
 
 
 class Control:
@@ -26,30 +25,46 @@ class Control:
 
     def __init__(self, security: Security, publish: Callable[[ControlState], object], now: float) -> None:
         self.boot = secrets.token_hex(4)  # of this life of the motor owner
-        self.lease = Lease(_ms(now), operator.sub, lambda: secrets.token_hex(4), security.unnamed, security.named)
+        self._named = security.named
+        strangers = ("drive", "free", "refuse").index(security.unnamed)
+        self.lease = Lease(_ms(now), operator.sub, secrets.token_hex, strangers)
         self._state = Paced(lambda: publish(self.state()))
         self._log = RateLimitedLog(log, burst=5)
         self._next: float | None = None  # the next tick
 
     def state(self) -> ControlState:
-        return ControlState(**self.lease.state(self.boot))
+        (_, name, by, device), (_, asks_id, asks, _) = self.lease.holder or _NOBODY, self.lease.asker or _NOBODY
+        return ControlState(
+            by=by, id=name, key=self.lease.key, device=device, asks=asks, asks_id=asks_id,
+            others=self.lease.others, named=self._named, boot=self.boot,
+        )  # fmt: skip
 
     def holds(self, drive: Drive) -> bool:
         """Whether this command is from who has control. Any thread may ask."""
-        return isinstance(drive.key, str) and self.lease.holds(drive.key, sender(drive))
+        return isinstance(drive.key, str) and self.lease.holds(drive.key, self.account(drive) or "")
 
     def knows(self, request: ControlRequest) -> bool:
         """Whether this one has control, or is the first who asks for it. Any thread may ask."""
-        who = request.by, request.id
-        return who in (self.lease.holder[:2], self.lease.asker[:2])
+        client = self._client(request)[:2]
+        return client == self.lease.holder[:2] or client == self.lease.asker[:2]
 
     def request(self, request: ControlRequest, over: bool, now: float) -> None:
         """Requests and releases; ``over``: without asking."""
-        who = request.by, request.id, request.device
+        client = self._client(request)
         if request.ends():
-            self.lease.release(who, _ms(now))
+            self.lease.release(client, _ms(now))
         else:
-            self.lease.hold(who, int(request.for_ms), over, _ms(now))
+            self.lease.hold(client, int(request.for_ms), over, _ms(now))
+
+    def account(self, drive: Drive) -> str | None:
+        """Of who sent this command, "" where names are not checked; None: it is from a program of the robot."""
+        if not self._named:
+            return ""
+        return drive.by.partition("/")[0] if isinstance(drive.by, str) else None
+
+    def _client(self, request: ControlRequest) -> tuple[str, str, str, str]:
+        account = request.by.partition("/")[0] if self._named else ""
+        return account, request.id, request.by, request.device
 
     def note(self, now: float) -> bool:
         """Publish what has changed; True: control has passed on, so halt the motors first."""
@@ -61,7 +76,7 @@ class Control:
             self._next = now + _TICK_S
         halts, lease.halts = lease.halts, False
         if halts:
-            by, _, device = lease.holder
+            _, _, by, device = lease.holder or _NOBODY
             shown = f"{by or 'somebody without a name'}{f' ({device})' if device else ''}" if lease.key else "nobody"
             self._log.log("control", logging.INFO, "%s has control", shown)
         return halts
@@ -80,11 +95,6 @@ class Control:
 
     def repeat_state(self, now: float) -> None:
         self._state.changed(now)
-
-
-def sender(drive: Drive) -> str:
-    """The account of a command from elsewhere; "" of a program of the robot, and where names are not checked."""
-    return "" if drive.by is UNSET else str(drive.by)
 
 
 def _ms(seconds: float) -> int:

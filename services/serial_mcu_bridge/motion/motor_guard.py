@@ -13,7 +13,7 @@ from pebble.contract.payloads import LAST_RUN, Drive, EstopCommand, EstopReset, 
 from pebble.motion.arbiter import HOLD_MS, PERSON, REFUSED, Arbiter, newer
 from pebble.motion.latch import Latch, stop_of
 from pebble.runtime.rate_limit import RateLimitedLog
-from pebble.services.serial_mcu_bridge.motion.control import Control, sender
+from pebble.services.serial_mcu_bridge.motion.control import Control
 from pebble.services.serial_mcu_bridge.motion.motion_inbox import run_of
 from pebble.services.serial_mcu_bridge.motion.paced import Paced
 from pebble.services.serial_mcu_bridge.motion.state_file import StateFile
@@ -113,11 +113,14 @@ class MotorGuard:
         valid_ms = drive.valid_ms if isinstance(drive.valid_ms, int) else -1
         run = run_of(drive)
         key = drive.key if isinstance(drive.key, str) else ""
-        limit: int = self._arbiter.judge(drive.moves, run, valid_ms, _ms(now), key, sender(drive))
+        account = self._control.account(drive)
+        limit: int = self._arbiter.judge(drive.moves, run, valid_ms, _ms(now), key, account)
         if self._arbiter.barred != self._barred:
             self._note_barred(now)
         if limit == REFUSED:
-            strange = self._control.lease.refuses(drive.moves, run != PERSON, key, sender(drive), _ms(now))
+            strange = self._control.lease.refuses(
+                drive.moves, run != PERSON or account is None, key, account or "", _ms(now)
+            )
             reason = "stranger" if strange else "latched" if self.latched else "overruled"
             self._counters.add(reason)
             if drive.moves or run == PERSON:  # a script's zero is only to bar older runs, which the arbiter has done

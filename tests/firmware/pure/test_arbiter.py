@@ -10,7 +10,7 @@ NAME = "00000000000000aa"
 
 
 def arbiter(now: int = 0) -> Arbiter:
-    return Arbiter(Latch("0badcafe", 4, diff), Lease(now, diff, str), now, diff, 900)
+    return Arbiter(Latch("0badcafe", 4, diff), Lease(now, diff, str, 0), now, diff, 900)
 
 
 def test_a_person_moves_at_once_and_for_as_long_as_it_asks_but_no_longer_than_the_watchdog() -> None:

@@ -2,24 +2,30 @@
 
 from common.arbiter import PERSON, REFUSED, Arbiter
 from common.latch import Latch
-from common.lease import BY, DRIVE, FREE, REFUSE, Lease, shown
+from common.lease import Lease, request_of, shown
 from common.ticks import add, diff
 
 NAME = "00000000000000aa"
-ANN, OTTO, MIA = ("ann", "aaaaaaaa", "phone"), ("otto", "00000001", "laptop"), ("mia", "00000002", "")
+DRIVE, FREE, REFUSE = 0, 1, 2
+ANN, OTTO, MIA = ("", "aaaaaaaa", "ann", "phone"), ("", "00000001", "otto", ""), ("", "00000002", "mia", "")
 WRAPS = (1 << 30) - 4000  # of a board's clock, within each test
 
 
 class Keys:
     made = 0
 
-    def __call__(self) -> str:
+    def __call__(self, count: int) -> str:
+        assert count == 4
         self.made += 1
         return f"{self.made:08x}"
 
 
-def lease(strangers: str = DRIVE, named: bool = False, now: int = WRAPS) -> Lease:
-    return Lease(now, diff, Keys(), strangers, named)
+def lease(strangers: int = DRIVE) -> Lease:
+    return Lease(WRAPS, diff, Keys(), strangers)
+
+
+def name_of(client: tuple) -> str:
+    return client[2] if client else ""
 
 
 def after(ms: int) -> int:
@@ -38,8 +44,6 @@ def perform(own: Lease, event: tuple) -> None:
     else:
         own.tick(now)
         assert not own.refuses(what == "moves", False, own.key, who[0], now)
-        if what == "moves":
-            own.moved(own.key, now)
 
 
 #: What happens, as (milliseconds, event, who); who has control then, who asks for it, and how many keys there were.
@@ -84,13 +88,11 @@ HISTORIES = (
 def test_the_table_of_states() -> None:
     for events, by, asks, keys in HISTORIES:
         random = Keys()
-        own = Lease(WRAPS, diff, random)
+        own = Lease(WRAPS, diff, random, DRIVE)
         for event in events:
             perform(own, event)
-        state = own.state("0badcafe")
-        assert (state["by"], state["asks"], random.made) == (by, asks, keys), events
-        assert (state["key"] != "") == (by != ""), events
-        assert state["boot"] == "0badcafe"
+        assert (name_of(own.holder), name_of(own.asker), random.made) == (by, asks, keys), events
+        assert (own.key != "") == (by != ""), events
 
 
 def test_a_state_changes_and_the_motors_are_halted_only_where_something_changes() -> None:
@@ -124,7 +126,7 @@ def test_clocks_that_wrap_make_nobody_busy_or_idle() -> None:
     assert own.key == ""
     perform(own, (4 * half, "hold", OTTO))
     perform(own, (4 * half + 10, "hold", MIA))
-    assert own.state("")["by"] == "otto"
+    assert own.holder == OTTO
 
 
 def test_only_the_key_of_now_moves_and_a_zero_needs_none() -> None:
@@ -139,7 +141,7 @@ def test_only_the_key_of_now_moves_and_a_zero_needs_none() -> None:
         for key in (old, "", "x", "00000003"):
             assert not own.refuses(False, False, key, "", WRAPS)
             assert own.refuses(True, False, key, "", WRAPS) is (key != "" or not held)
-        assert not own.refuses(True, False, own.key, "mia", WRAPS)  # below the level of names nobody vouches for them
+        assert not own.refuses(True, False, own.key, "", WRAPS)
 
 
 def test_a_command_for_several_owners_has_the_key_of_each() -> None:
@@ -162,33 +164,31 @@ def test_scripts_need_no_key_but_no_wrong_one_either() -> None:
     assert not own.refuses(True, True, own.key, "", WRAPS)
 
 
-def test_with_names_the_account_counts_and_programs_of_the_robot_are_no_strangers() -> None:
-    own = lease(REFUSE, True)
-    page, other = ("page-1/ann", "aaaaaaaa", ""), ("page-1/bob", "aaaaaaaa", "")
-    own.hold(page, 3000, False, WRAPS)
-    for by, moves in (("page-1", True), ("page-1/bob", True), ("page-2/ann", False), ("-", False), ("", False)):
+def test_with_names_the_account_counts_and_programs_of_the_robot_need_no_key() -> None:
+    own = lease(REFUSE)
+    judge = arbiter(own)
+    own.hold(("page-1", "aaaaaaaa", "page-1/ann", ""), 3000, False, WRAPS)
+    for by, moves in (("page-1", True), ("page-2", False), ("-", False), ("", False)):
         assert own.refuses(True, False, own.key, by, WRAPS) is not moves, by
-    assert own.refuses(True, False, "", "-", WRAPS)
-    assert not own.refuses(True, False, "", "", WRAPS)
-    own.release(("page-2/ann", "aaaaaaaa", ""), WRAPS)
-    assert own.state("")["by"] == "page-1/ann"
-    own.release(other, WRAPS)
+    assert judge.judge(True, PERSON, -1, WRAPS, "", "-") == REFUSED
+    assert judge.judge(True, PERSON, -1, WRAPS, "", None) == 900
+    assert judge.judge(True, PERSON, -1, WRAPS, own.key, None) == REFUSED
+    own.release(("page-2", "aaaaaaaa", "page-2/ann", ""), WRAPS)
+    assert own.key
+    own.release(("page-1", "aaaaaaaa", "page-1/bob", ""), WRAPS)
     assert own.key == ""
-    assert own.state("")["named"]
 
 
 def test_it_shows_that_others_drive_too_for_a_while() -> None:
     own = lease()
-    own.moved("", WRAPS)
+    assert not own.refuses(True, False, "", "", WRAPS)
     assert own.others
     own.changed = False
-    own.tick(after(1999))
-    assert own.others
-    assert not own.changed
-    own.moved("", after(1999))
-    own.tick(after(3998))
-    assert own.others
-    assert not own.changed
+    for now in (1999, 3998):
+        own.tick(after(now))
+        assert own.others
+        assert not own.changed
+        assert own.refuses(True, False, "", "", after(1999)) is False
     own.tick(after(3999))
     assert own.changed
     assert not own.others
@@ -249,7 +249,23 @@ def test_names_are_shown_in_their_letters_only() -> None:
         ("page-1/ann", "page-1/ann"),
         ("Ann B.", "ann_b_"),
         ('"\\\x00\x7f', "____"),
-        ("\u00e9\u212a\u0130", "___"),
-        ("a" * 50, "a" * BY),
+        ("\u00e9\u20ac", "__"),
+        ("a" * 50, "a" * 40),
     ):
-        assert shown(text, BY) == short
+        assert shown(text, 40) == short
+
+
+def test_what_a_request_is() -> None:
+    for fields, request in (
+        ({"id": "3f2a91c0"}, ("3f2a91c0", "", "", 3000)),
+        ({"id": "3F2A91C0", "want": "hold", "by": "Ann", "device": "x" * 30}, ("3F2A91C0", "ann", "x" * 20, 3000)),
+        ({"id": "3f2a91c0", "want": "release"}, ("3f2a91c0", "", "", 0)),
+        ({"id": "3f2a91c0", "for_ms": 0}, ("3f2a91c0", "", "", 1)),
+        ({"id": "3f2a91c0", "for_ms": 1500.5}, ("3f2a91c0", "", "", 1500)),
+        ({"id": "3f2a91c0", "for_ms": 1e30}, ("3f2a91c0", "", "", 10_000)),
+        ({}, None), ({"id": ""}, None), ({"id": 7}, None), ({"id": "3f2a91c"}, None), ({"id": "3f2a91cg"}, None),
+        ({"id": "3f2a91c0", "want": "drive"}, None), ({"id": "3f2a91c0", "want": None}, None),
+        ({"id": "3f2a91c0", "for_ms": "1"}, None), ({"id": "3f2a91c0", "for_ms": True}, None),
+        ({"id": "3f2a91c0", "by": 1}, None), ({"id": "3f2a91c0", "device": None}, None),
+    ):  # fmt: skip
+        assert request_of(fields) == request, fields

@@ -18,7 +18,7 @@ def parse(raw: bytes) -> "tuple | None":
 def order(raw: bytes) -> "tuple | None":
     """Run and validity."""
     command = parse_all(raw)
-    return command[3:] if command else None
+    return command[3:5] if command else None
 
 
 def test_bare_and_wrapped() -> None:
@@ -93,6 +93,16 @@ def test_a_command_may_be_valid_for_a_shorter_time() -> None:
     assert order(b'{"z": 0, "valid_ms": 0}') == (0, 0)
     assert order(b'{"z": 0, "valid_ms": 0.5}') == (0, 0)
     assert order(b'{"z": 1, "valid_ms": 999999999999}') == (0, 60_000)
+
+
+def test_a_command_may_name_the_control_it_is_sent_under() -> None:
+    for text, moving, zero in (("", "", ""), (', "key": "0badf00d"', "0badf00d", "0badf00d"), (', "key": null', "", ""),
+                               (', "key": 5', None, ""), (', "key": ["a"]', None, "")):  # fmt: skip
+        command = parse_all(('{"z": 0.5' + text + "}").encode())
+        assert (command[5] if command else None) == moving, text
+        command = parse_all(('{"z": 0' + text + "}").encode())
+        assert command is not None
+        assert command[5] == zero, text
 
 
 def test_a_wrong_field_refuses_what_moves_and_never_a_zero() -> None:

@@ -1,4 +1,4 @@
-"""In MicroPython: repeats the calls of /traces.jsonl on latch and arbiter, and compares every result."""
+"""In MicroPython: repeats the calls of /traces.jsonl on latch, lease and arbiter, and compares every result."""
 
 import gc
 import json
@@ -6,6 +6,7 @@ import json
 from common import ticks
 from common.arbiter import Arbiter
 from common.latch import Latch, is_name, reset_of, stop_of
+from common.lease import Lease
 
 traces = open("/traces.jsonl")  # noqa: SIM115 - read in turns
 count = calls = 0
@@ -16,9 +17,22 @@ def _subtract(later, earlier):
     return later - earlier
 
 
+class _Keys:
+    def __init__(self, first):
+        self.next = first
+
+    def __call__(self, _count):
+        self.next += 1
+        return f"{self.next - 1:08x}"
+
+
 def _plain(result):
     """The value as it is after JSON: tuples are lists."""
     return list(result) if isinstance(result, tuple) else result
+
+
+def _all(lease):
+    return [lease.key, list(lease.holder), list(lease.asker), lease.others, lease.changed, lease.halts]
 
 
 def bodies():
@@ -30,6 +44,7 @@ def bodies():
 def repeat(trace):
     global calls
     latches = {}
+    leases = {}
     arbiters = {}
     diffs = {}
     for number, method, arguments, expected in trace:
@@ -38,8 +53,16 @@ def repeat(trace):
         if method == "latch":
             diffs[number] = ticks.diff if arguments[1] == 4 else _subtract
             latches[number] = Latch(arguments[0], arguments[1], diffs[number])
+        elif method == "lease":
+            now, first, strangers = arguments
+            leases[number] = Lease(now, diffs[number], _Keys(first), strangers)
         elif method == "arbiter":
-            arbiters[number] = Arbiter(latches[number], arguments[0], diffs[number], arguments[1])
+            arbiters[number] = Arbiter(latches[number], leases[number], arguments[0], diffs[number], arguments[1])
+        elif method == "hold" or method == "release":
+            getattr(leases[number], method)(tuple(arguments[0]), *arguments[1:])
+            result = _all(leases[number])
+        elif method == "judge":
+            result = [arbiters[number].judge(*arguments), arbiters[number].barred, *_all(leases[number])]
         elif method == "restore":
             latches[number].restore(*arguments)
             result = latches[number].saved()
@@ -52,6 +75,8 @@ def repeat(trace):
             result = arbiters[number].barred
         else:
             result = [getattr(arbiters[number], method)(*arguments), arbiters[number].barred]
+        if number in leases:
+            leases[number].halts = False  # as whoever owns motors does, after halting them
         if result != expected:
             print("differs:", method, arguments, expected, result)
             return False

@@ -92,7 +92,7 @@ def test_every_owner_comes_to_obey_a_run_also_one_that_was_away_while_a_stranger
     table, arbiters = MotorOwners([]), []
     for owner, number in enumerate(barred):
         table.receive(f"o{owner}", state(barred=number))
-        arbiters.append(Arbiter(Latch("aa", 8, operator.sub), Lease(0, operator.sub, str), 0, operator.sub, 750))
+        arbiters.append(Arbiter(Latch("aa", 8, operator.sub), Lease(0, operator.sub, str, 0), 0, operator.sub, 750))
         arbiters[-1].bar(number)
     run, baseline = following(table.barred), table.baseline()
     zeros = list(table.steps_to(run))
