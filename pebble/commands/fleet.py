@@ -72,7 +72,7 @@ def init(
         pebble fleet init hall --host broker.lab
         pebble fleet init hall --level named --plain
     """
-    require_packages()
+    require_packages("pebble fleet")
     place = folder_.absolute()
     if level == "named" and not plain:
         raise PebbleError("--level named alone lets nobody drive: robots of this release need --plain, too")
@@ -203,7 +203,7 @@ def check_(
     \b
         pebble fleet check --live
     """
-    require_packages()
+    require_packages("pebble fleet")
     with _changing(folder_) as (place, fleet):
         found = check.compare(place, fleet)
         tried = check.attempt(place, fleet) if live else None
