@@ -12,6 +12,5 @@ def require_packages(what: str = "the operator page") -> None:
     missing = [name for name in _PACKAGES if find_spec(name) is None]
     if missing:
         raise PebbleError(
-            f"{what} needs packages that are not installed ({', '.join(missing)}): "
-            "pip install 'pebble-robot[web]'"
+            f"{what} needs packages that are not installed ({', '.join(missing)}): pip install 'pebble-robot[web]'"
         )
