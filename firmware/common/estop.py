@@ -22,7 +22,7 @@ _ENODEV = const(19)
 _ESTOP = const(b"estop/mcu")
 _CONTROL = const(b"control/mcu")
 _HOLDER = const(
-    b'{"by":"%s","id":"%s","key":"%s","device":"%s","asks":"%s","asks_id":"%s","others":%s,"named":false,"boot":"%s"}'
+    '{"by":"%s","id":"%s","key":"%s","device":"%s","asks":"%s","asks_id":"%s","others":%s,"named":false,"boot":"%s"}'
 )
 
 
@@ -103,8 +103,8 @@ class EmergencyStop:
             lease = self.lease
             _, name, by, device = lease.holder or ("", "", "", "")
             _, asks_id, asks, _ = lease.asker or ("", "", "", "")
-            others = b"true" if lease.others else b"false"
-            return _HOLDER % (by, name, lease.key, device, asks, asks_id, others, self.latch.boot)
+            others = json.dumps(lease.others)
+            return (_HOLDER % (by, name, lease.key, device, asks, asks_id, others, self.latch.boot)).encode()
         state = self.latch.state(self._saved == self.latch.latched if self._saves else None)
         if self.arbiter.barred:
             state["barred"] = self.arbiter.barred
