@@ -7,11 +7,10 @@ from pebble.errors import PebbleError
 _PACKAGES = ("cryptography", "starlette", "uvicorn", "websockets")
 
 
-def require_packages() -> None:
+def require_packages(what: str = "the operator page") -> None:
     """Raise PebbleError with the command that installs them, unless they are here."""
     missing = [name for name in _PACKAGES if find_spec(name) is None]
     if missing:
         raise PebbleError(
-            f"the operator page needs packages that are not installed ({', '.join(missing)}): "
-            "pip install 'pebble-robot[web]'"
+            f"{what} needs packages that are not installed ({', '.join(missing)}): pip install 'pebble-robot[web]'"
         )

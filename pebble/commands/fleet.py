@@ -72,7 +72,7 @@ def init(
         pebble fleet init hall --host broker.lab
         pebble fleet init hall --level named --plain
     """
-    require_packages()
+    require_packages("pebble fleet")
     place = folder_.absolute()
     if level == "named" and not plain:
         raise PebbleError("--level named alone lets nobody drive: robots of this release need --plain, too")
@@ -107,6 +107,7 @@ def add(
     plain: Annotated[
         bool, typer.Option("--plain", help="A robot that does not know names: its topics stay without them.")
     ] = False,
+    board: Annotated[bool, typer.Option("--board", help="A robot that is a board: print local_mqtt.")] = False,
     people: Annotated[
         Path | None,
         typer.Option(help="Of a page on this machine: its database of people; remove acts there, too.", metavar="FILE"),
@@ -118,7 +119,7 @@ def add(
     \b
         pebble fleet add ann --role driver,safety
         pebble fleet add goob --role robot
-        pebble fleet add lamp --role robot --base pebble/lamps/lamp --plain
+        pebble fleet add lamp --role robot --base pebble/lamps/lamp --plain --board
         pebble fleet add page-1 --role page
     """
     given = tuple(dict.fromkeys(split_names(roles)))
@@ -133,7 +134,7 @@ def add(
         after = fleet.with_account(name, account)
         secret = new_password()
         how = applying.apply(place, fleet, after, {name: secret})
-    _print_account(place, after, name, secret, how)
+    _print_account(place, after, name, secret, how, board=board)
     return 0
 
 
@@ -202,7 +203,7 @@ def check_(
     \b
         pebble fleet check --live
     """
-    require_packages()
+    require_packages("pebble fleet")
     with _changing(folder_) as (place, fleet):
         found = check.compare(place, fleet)
         tried = check.attempt(place, fleet) if live else None
@@ -280,15 +281,15 @@ def _keep_admin(name: str) -> None:
         raise FleetError(f"{ADMIN} is the account by which this command changes the broker: it stays as it is")
 
 
-def _print_account(place: Path, fleet: Fleet, name: str, secret: str, how: str) -> None:
+def _print_account(place: Path, fleet: Fleet, name: str, secret: str, how: str, *, board: bool = False) -> None:
     account, server = fleet.accounts[name], fleet.brokers[0]
     typer.echo(f"{name} may log in as {', '.join(account.roles)} ({how})")
     typer.echo(f"    password: {secret}")
     typer.echo("It is shown this once.")
     ca = _shown(place / certificates.CA_CERT)
     if ProgramRole.ROBOT in account.roles:
-        typer.echo(f"In its config, beside a copy of {ca}, which no other user can read (a board: as local_mqtt):")
-        typer.echo(json.dumps(piece_of_config(fleet, name, secret), indent=2))
+        typer.echo(f"For its config, which no other user may read, with a copy of {ca} beside it:")
+        typer.echo(json.dumps(piece_of_config(fleet, name, secret, board=board), indent=2))
         return
     url = f"mqtts://{name}@{server.host}:{server.port}"
     if ProgramRole.PAGE in account.roles:
@@ -297,13 +298,14 @@ def _print_account(place: Path, fleet: Fleet, name: str, secret: str, how: str) 
         typer.echo(f"    pebble drive ROBOT --url {url} --ca-cert {ca} --password-file FILE")
 
 
-def piece_of_config(fleet: Fleet, name: str, secret: str) -> dict[str, Any]:
+def piece_of_config(fleet: Fleet, name: str, secret: str, *, board: bool) -> dict[str, Any]:
     """What a robot's config needs, to be at this broker."""
     server = fleet.brokers[0]
     login = {"host": server.host, "port": server.port, "username": name, "password": secret}
     link = login | {"tls": {"enabled": True, "ca_cert": certificates.CA_CERT}}
     level = "login" if fleet.accounts[name].plain else fleet.level
-    return {"security": {"level": level}, "services": {"mqtt_bridge": {"enabled": True, "remote_mqtt": link}}}
+    found = {"local_mqtt": link} if board else {"services": {"mqtt_bridge": {"enabled": True, "remote_mqtt": link}}}
+    return {"security": {"level": level}, **found}
 
 
 def _remove_from_pages(fleet: Fleet, name: str) -> Iterator[str]:

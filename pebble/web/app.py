@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import re
+import time
 from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager
 from importlib.resources import files
@@ -30,7 +31,7 @@ from pebble.web.media import robot_streams
 from pebble.web.messages import EstopOp
 from pebble.web.recordings import routes as recordings
 from pebble.web.recordings.routes import Recordings
-from pebble.web.server import Server
+from pebble.web.server import PEOPLE_S, Server
 from pebble.web.static_files import FOREVER, NO_STORE, StaticFiles, root_of
 
 _ENCODINGS = frozenset({"json", "pbvd", "pbvz", "h264", "jpeg"})
@@ -186,9 +187,14 @@ async def _serve(
         return
     await websocket.accept()
     can = frozenset(re.findall(r"[a-z0-9]+", websocket.query_params.get("can", "")))
+    server: Server = websocket.app.state.server
+    people, check_at = server.people_version, time.monotonic() + CHECK_S
     serving = asyncio.ensure_future(serve(ref, can, session))
     try:
-        while not (await asyncio.wait({serving}, timeout=CHECK_S))[0]:
+        while not (await asyncio.wait({serving}, timeout=PEOPLE_S))[0]:
+            if people == server.people_version and time.monotonic() < check_at:
+                continue
+            people, check_at = server.people_version, time.monotonic() + CHECK_S
             now = await asyncio.to_thread(login.session_of, websocket)
             if now is None or now.role != session.role:
                 return  # it was revoked

@@ -105,8 +105,10 @@ def _robot_accepts(piece: dict[str, Any], folder: Path) -> None:
     """The piece that was printed and a copy of the authority make a valid config."""
     file = folder / "robot.json"
     (folder / "ca.pem").write_bytes((folder / "hall" / "ca.pem").read_bytes())
-    piece["services"]["mqtt_bridge"]["remote_mqtt"]["host"] = "broker.lab"
-    file.write_text(json.dumps({"robot": {"id": "goob"}, **piece}))
+    text = json.dumps(
+        {"robot": {"id": "goob", "platform": {True: "esp32", False: "linux"}["local_mqtt" in piece]}, **piece}
+    )
+    file.write_text(text.replace("127.0.0.1", "broker.lab"))
     file.chmod(0o600)
     config = load(file)
     assert (config.security.level, config.warnings) == ("login", ())

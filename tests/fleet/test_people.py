@@ -53,6 +53,10 @@ def test_rights_of_each_role() -> None:
     }
 
 
+def test_where_names_are_checked_only_safety_and_admin_reset() -> None:
+    assert [role.value for role in Role if "reset" in page_rights(role, "named")] == ["safety", "admin"]
+
+
 def test_the_local_session_is_admin() -> None:
     assert page_rights(LOCAL.role) == page_rights(Role.ADMIN)
 

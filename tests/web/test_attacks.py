@@ -217,7 +217,7 @@ def test_a_session_that_is_revoked_while_driving_ends(
         assert until(lambda: robot.drives()[-1]["z"] == 0, 1), "the wheels stop"
         if how != "role":
             with pytest.raises(ConnectionClosed):
-                pictures.recv(timeout=7)
+                pictures.recv(timeout=3)
             assert hall.refusal("/ws/control", cookie=cookie) == 403
         pictures.close()
     if how != "removed":
