@@ -11,9 +11,7 @@ from pebble.config.recorder import Recorder
 from pebble.config.transport import Mqtt, RemoteConnection, RemoteMqtt, TransportSection
 from pebble.config.types import (
     EMPTY,
-    Body,
     Cells,
-    Colour,
     Command,
     Device,
     File,
@@ -32,6 +30,7 @@ from pebble.config.types import (
     doc,
 )
 from pebble.config.web import WebHandler, WebInterface
+from pebble.contract.payloads import Body, Colour
 from pebble.contract.serial_protocols import SerialProtocolName
 
 
