@@ -5,7 +5,7 @@ VENV := .venv/bin/python
 
 .DEFAULT_GOAL := help
 unexport PYTHONDONTWRITEBYTECODE  # every test starts programs: compiling them each time would cost a third of the time
-.PHONY: help demo demo-options test quick thorough stops soak floods schedules script-schedules page-schedules page-tests gstreamer gstreamer-tests brokers check firmware report clean lock audit sbom check-types check-names check-collection quick-tests test-running test-robots test-computing test-checks test-demo
+.PHONY: help demo demo-options test quick thorough stops soak floods schedules script-schedules page-schedules page-tests looks gstreamer gstreamer-tests brokers check firmware report clean lock audit sbom check-types check-names check-collection quick-tests test-running test-robots test-computing test-checks test-demo
 
 help:
 	@echo "make demo             four simulated robots, on Zenoh, on MQTT and on MCUs, driven through a broker; Ctrl-C ends it"
@@ -20,6 +20,7 @@ help:
 	@echo "make schedules        10,000 random schedules of persons, control, scripts and faults in virtual time, six minutes"
 	@echo "make script-schedules  200 of them with whole robots, 30 minutes"
 	@echo "make page-tests       every state, card, interruption and finger at the operator page in Chromium, 20 minutes"
+	@echo "make looks            store anew how the page looks, for make page-tests to compare; look at the pictures, a minute"
 	@echo "make page-schedules   200 random sequences of inputs and faults at the operator page in Chromium, 15 minutes"
 	@echo "make gstreamer-tests  install GStreamer and OpenCV for the system's Python, and have the original's local media read by them, three minutes"
 	@echo "make brokers          install NATS, RabbitMQ and aedes where that is possible, and test robots with them, two minutes"
@@ -108,6 +109,11 @@ thorough: gstreamer
 page-tests: .venv/.ready-dev
 	@sh tools/debian-packages.sh mosquitto=mosquitto chromium=chromium
 	@$(TESTS) -m page tests/web
+
+# The pictures are as that browser draws them: another version of it may need new ones, too.
+looks: .venv/.ready-dev
+	@sh tools/debian-packages.sh chromium=chromium
+	@$(VENV) -m tests.web.looks
 
 # 250 MB, so only for those who ask for it: make test has a stand-in for shmsrc, which reads Debian's shmsink here.
 gstreamer:

@@ -12,9 +12,7 @@ from pebble.config.security import Security
 from pebble.config.transport import Mqtt, RemoteConnection, RemoteMqtt, TransportSection
 from pebble.config.types import (
     EMPTY,
-    Body,
     Cells,
-    Colour,
     Command,
     Device,
     File,
@@ -33,6 +31,7 @@ from pebble.config.types import (
     doc,
 )
 from pebble.config.web import WebHandler, WebInterface
+from pebble.contract.payloads import Body, Colour
 from pebble.contract.serial_protocols import SerialProtocolName
 
 

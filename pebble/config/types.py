@@ -56,11 +56,6 @@ ClientId = Annotated[
 _LINE = r"^[^\x00-\x1f\x7f-\x9f\u2028\u2029]{1,%d}$(?!\n)"
 Label = Annotated[str, Meta(pattern=_LINE % 32, extra={"expected": "a name in one line, 32 characters at most"})]
 Sentence = Annotated[str, Meta(pattern=_LINE % 60, extra={"expected": "one line, 60 characters at most"})]
-Colour = Literal["blue", "amber", "violet", "green", "coral", "rose", "teal", "slate"]
-# The drawings of the operator page: pebble/web/static/faces.svg.
-Body = Literal[
-    "goob", "fred", "minilamp", "benjr", "pitcam", "outlets", "wheeled", "walker", "arm", "drone", "boat", "unknown"
-]  # fmt: skip
 Cells = Annotated[int, Meta(ge=1, le=14)]
 LogLevel = Literal["DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL"]
 Port = Annotated[int, Meta(ge=1, le=65535)]

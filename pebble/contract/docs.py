@@ -13,7 +13,7 @@ from msgspec import NODEFAULT, UNSET, UnsetType
 from msgspec.structs import FieldInfo, fields
 
 from pebble.contract import CHANNELS, INCOMING, OUTGOING, Channel, Kind
-from pebble.contract.payloads import Payload
+from pebble.contract.payloads import SECTIONS, Capabilities, Payload
 from pebble.contract.schemas import schemas
 
 TOPICS, SCHEMAS = "topics.md", "payloads.schema.json"
@@ -123,7 +123,7 @@ def _structs() -> list[type[Payload]]:
 def _collect(kind: Any, found: dict[type[Payload], None]) -> None:
     if isinstance(kind, type) and issubclass(kind, Payload) and kind not in found:
         found[kind] = None
-        for member in get_type_hints(kind).values():
+        for member in [*get_type_hints(kind).values(), *(SECTIONS.values() if kind is Capabilities else ())]:
             _collect(member, found)
     for inner in get_args(kind):
         _collect(inner, found)

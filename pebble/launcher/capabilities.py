@@ -5,10 +5,13 @@ from __future__ import annotations
 from collections.abc import Collection
 from typing import Any
 
+import msgspec
+
 from pebble import contract as c
 from pebble.config import Config, SystemControl
 from pebble.config.types import ServiceSection
 from pebble.contract.encodings import ALL_SOUND, ALL_VIDEO
+from pebble.contract.payloads import RobotIdentity
 from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
 from pebble.media import pyav
 from pebble.runtime.addresses import Addresses
@@ -23,7 +26,7 @@ def capabilities(
     ``lacking`` and ``found`` are what its processes report at present (pebble.launcher.features).
     """
     return {
-        "identity": _identity(config),
+        "identity": msgspec.to_builtins(_identity(config)),
         "transport": {"kind": config.transport.kind},
         "video": _video(config, addresses),
         "audio": _audio(config, addresses),
@@ -41,12 +44,11 @@ def capabilities(
     }
 
 
-def _identity(config: Config) -> dict[str, Any]:
-    """Who it is, and how people shall see it: only what its config says, programs have their own defaults."""
+def _identity(config: Config) -> RobotIdentity:
     robot = config.robot
     looks = {key: getattr(robot, key) for key in ("name", "description", "colour", "picture", "battery_cells")}
-    given = {key: value for key, value in looks.items() if value is not None}
-    return {"system": robot.system, "type": robot.type, "id": robot.id, **given}
+    given: dict[str, Any] = {key: value for key, value in looks.items() if value is not None}
+    return RobotIdentity(system=robot.system, type=robot.type, id=robot.id, **given)
 
 
 def _video(config: Config, addresses: Addresses) -> dict[str, Any]:

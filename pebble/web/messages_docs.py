@@ -13,6 +13,7 @@ import msgspec
 from msgspec import inspect as types
 
 from pebble.contract.docs import filled
+from pebble.contract.payloads import RobotIdentity
 from pebble.web import messages
 
 _ROOT = Path(__file__).parents[2]
@@ -32,13 +33,14 @@ def markdown() -> str:
 
 
 def declarations() -> str:
-    """messages.d.ts: one interface for each struct."""
+    """messages.d.ts: one interface for each struct, and for what a robot reports of itself."""
     parts = ["// Generated from pebble/web/messages.py by python -m pebble.web.messages_docs.\n"]
     for struct in (
         *get_args(messages.FromPage),
         *get_args(messages.ToPage),
         messages.ShownOwner,
         messages.TalkAnswer,
+        RobotIdentity,
         *_views(),
     ):
         info: Any = types.type_info(struct)

@@ -18,11 +18,12 @@ _TYPES = {
     "html": "text/html; charset=utf-8",
     "js": "text/javascript; charset=utf-8",
     "mjs": "text/javascript; charset=utf-8",
+    "png": "image/png",
     "svg": "image/svg+xml",
     "webmanifest": "application/manifest+json",
     "woff2": "font/woff2",
 }
-_PACKED = {"woff2"}  # compressed already
+_PACKED = {"png", "woff2"}  # compressed already
 _VERSION = b"{version}"  # in the pages, replaced by that of the files
 _ROOT = b"{root}"  # replaced by root_of(): a proxy may show the server below a path that only browsers know
 _MODULES = b"{modules}"  # replaced by links to all that is imported: browsers need not discover them one by one

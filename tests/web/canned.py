@@ -63,10 +63,14 @@ class State:
     pictures: bool = True  # whether cameras send any
     freezes: bool = False  # pictures end a moment after the first
     silent: bool = False  # the server answers nothing any more once everything is shown
+    still: bool = False  # cameras show flat colours, and a few pictures only
+    at: int = 0  # ms epoch, at which the server's time stands still; 0: it does not
     logs: Callable[[int], list[Any]] = field(default=lambda _now: [])  # lines of the component that is open
-    series: Callable[[], dict[tuple[str, str], list[Any]]] = dict  # points of messages.Series, by component and metric
+    #: Points of messages.Series, by component and metric.
+    series: Callable[[int], dict[tuple[str, str], list[Any]]] = field(default=lambda _now: {})
     refused: str = ""  # why nothing that is asked of a robot is done
     recordings: bool = False  # those of tests.web.recorded are offered
+    days: tuple[int, str] | None = None  # status and text that a list of recorded days is answered with; status 0: none
     frames: str = ""  # origins that the page may show in a frame; {port} is the server's, here and in all values
 
 
@@ -86,7 +90,7 @@ class CannedServer:
                 Route("/r/{ref:path}", self._page),
                 Route("/replay", self._page),
                 Route("/replay/{ref:path}", self._page),
-                *recordings.routes(),
+                *(self._archive(route) for route in recordings.routes()),
                 Route("/static/{version}/{name:path}", self._static),
                 Route("/stream", self._stream),
                 Route("/api/snapshot.jpg", self._snapshot),
@@ -126,6 +130,10 @@ class CannedServer:
         self.received.clear()
         self.posted.clear()
 
+    def now(self) -> int:
+        """Milliseconds of the epoch."""
+        return self.state.at or int(1000 * time.time())
+
     def sent(self, op: str) -> list[dict[str, Any]]:
         """What pages sent of one kind, without the numbers of commands."""
         messages = [message for message in list(self.received) if message["op"] == op]
@@ -139,6 +147,19 @@ class CannedServer:
             await app.state.recordings.close()
 
     # -- http
+
+    def _archive(self, route: Route) -> Route:
+        """The real route, or the answer that the state has for it."""
+        if route.path != "/archive/days":
+            return route
+
+        async def days(request: Request) -> Response:
+            status, text = self.state.days or (200, "")
+            if not status:
+                await asyncio.Event().wait()
+            return Response(text, status) if self.state.days else await route.endpoint(request)
+
+        return Route(route.path, days)
 
     async def _page(self, request: Request) -> Response:
         headers = _headers()
@@ -159,7 +180,7 @@ class CannedServer:
         return self.static.answer(request, request.path_params["name"], _headers())
 
     async def _snapshot(self, _request: Request) -> Response:
-        return Response(picture(0), media_type="image/jpeg", headers=_headers())
+        return Response(flat() if self.state.still else picture(0), media_type="image/jpeg", headers=_headers())
 
     async def _post(self, request: Request) -> Response:
         self.posted.append((request.path_params["name"], await request.json()))
@@ -176,14 +197,14 @@ class CannedServer:
             await _until_closed(websocket)
             return
         await self._send(websocket, self._welcome(state))
-        await self._send(websocket, _state(state.values(_now())))
+        await self._send_state(websocket, state.values(self.now()))
         tasks = [asyncio.ensure_future(self._ping(websocket)), asyncio.ensure_future(self._repeat(websocket, state))]
         try:
             while True:
                 message = json.loads(await websocket.receive_text())
                 self._note(message)
                 if message["op"] == "read-logs" and message["on"]:
-                    lines = state.logs(_now())
+                    lines = state.logs(self.now())
                     logs = {"op": "logs", "ref": message["ref"], "origin": "canned", "first": 213, "lines": lines}
                     await self._send(websocket, logs)
                 if message["op"] == "watch" and message.get("series"):
@@ -215,7 +236,7 @@ class CannedServer:
             "rights": ["drive", "reset"],
             "login": True,
             "token": "canned",
-            "now": _now(),
+            "now": self.now(),
             "drives": True,
         }
         return usual | state.welcome
@@ -224,7 +245,7 @@ class CannedServer:
         number = 0
         while self.state.silent is False or number < 3:
             number += 1
-            await self._send(websocket, {"op": "ping", "n": number, "now": _now(), "round_trip_ms": 3.0})
+            await self._send(websocket, {"op": "ping", "n": number, "now": self.now(), "round_trip_ms": 3.0})
             await asyncio.sleep(PING_S)
 
     async def _repeat(self, websocket: WebSocket, state: State) -> None:
@@ -234,13 +255,16 @@ class CannedServer:
             now = time.monotonic()
             metrics = {metric for metric, at in due.items() if now >= at}
             due |= {metric: now + state.repeated[metric] for metric in metrics}
-            if metrics and (values := [value for value in state.values(_now()) if value[1] in metrics]):
-                await self._send(websocket, _state(values))
+            if metrics and (values := [value for value in state.values(self.now()) if value[1] in metrics]):
+                await self._send_state(websocket, values)
+
+    async def _send_state(self, websocket: WebSocket, values: list[Value]) -> None:
+        await self._send(websocket, {"op": "state", "now": self.now(), "set": values, "gone": []})
 
     async def _send_series(self, websocket: WebSocket, state: State, watched: str) -> None:
-        for (ref, metric), points in state.series().items():
+        for (ref, metric), points in state.series(self.now()).items():
             if ref == watched:
-                series = {"op": "series", "ref": ref, "metric": metric, "now": _now(), "points": points}
+                series = {"op": "series", "ref": ref, "metric": metric, "now": self.now(), "points": points}
                 await self._send(websocket, series)
 
     async def _send(self, websocket: WebSocket, message: dict[str, Any]) -> None:
@@ -252,11 +276,11 @@ class CannedServer:
         state = self.state
         with suppress(WebSocketDisconnect, RuntimeError):
             for number in range(sys.maxsize):
-                if not state.pictures or (state.freezes and number == 3):
+                if not state.pictures or (number == 3 and (state.freezes or state.still)):
                     await _until_closed(websocket)
                     return
-                body = zlib.compress(picture(number))
-                packet = Picture(PictureKind.ZLIB_JPEG, number + 1, _now() - 40, body).pack()
+                body = zlib.compress(flat() if state.still else picture(number))
+                packet = Picture(PictureKind.ZLIB_JPEG, number + 1, self.now() - 40, body).pack()
                 await websocket.send_bytes(struct.pack(">IB", number, 0) + packet)
                 await websocket.receive_bytes()  # drawn
                 await asyncio.sleep(PICTURE_S)
@@ -267,7 +291,7 @@ class CannedServer:
         with suppress(WebSocketDisconnect, RuntimeError):
             for number in itertools.count(1):
                 piece = Speech(16_000).samples(320 * number, 320).tobytes()
-                await websocket.send_bytes(Sound(Codec.PCM16LE, 1, 16_000, 320, number, _now(), piece).pack())
+                await websocket.send_bytes(Sound(Codec.PCM16LE, 1, 16_000, 320, number, self.now(), piece).pack())
                 await asyncio.sleep(0.02)
         reading.cancel()
 
@@ -280,14 +304,6 @@ async def _until_closed(websocket: WebSocket) -> None:
     with suppress(WebSocketDisconnect, RuntimeError):
         while True:
             await websocket.receive()
-
-
-def _now() -> int:
-    return int(1000 * time.time())
-
-
-def _state(values: list[Value]) -> dict[str, Any]:
-    return {"op": "state", "now": _now(), "set": values, "gone": []}
 
 
 _pictures: list[bytes] = []
@@ -303,6 +319,16 @@ def picture(number: int) -> bytes:
             part.save(target, "JPEG", quality=75)
             _pictures.append(target.getvalue())
     return _pictures[number // 10 % len(_pictures)]
+
+
+def flat() -> bytes:
+    """A JPEG picture of a wall, a floor and a box in few colours: its copies are small, and nothing in it is fine."""
+    drawn = Image.new("RGB", (640, 360), (205, 195, 184))
+    for colour, box in (((96, 104, 112), (0, 240, 640, 360)), ((196, 150, 84), (400, 150, 520, 290))):
+        drawn.paste(colour, box)
+    target = io.BytesIO()
+    drawn.save(target, "JPEG", quality=95)
+    return target.getvalue()
 
 
 @contextmanager

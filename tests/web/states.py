@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -268,9 +267,9 @@ def touch(now: int) -> dict[str, Any]:
     return {"value": value, "unit": "adc"}
 
 
-def past() -> dict[tuple[str, str], list[Any]]:
+def past(now_ms: int) -> dict[tuple[str, str], list[Any]]:
     """What the server remembers of goob; there was no connection to it for 20 s."""
-    now = time.time()
+    now = now_ms / 1000
 
     def points(made: Callable[[float], Any], every: float, span: float) -> list[Any]:
         ages = [every * number for number in range(int(span / every), 0, -1)]
@@ -299,17 +298,13 @@ OPERATING = replace(
 
 SQUARE = [[0.25, 0.25], [0.75, 0.25], [0.75, 0.75], [0.25, 0.75]]
 OVERLAYS = {"source": "apriltag-locations", "shapes": [SQUARE], "labels": [{"marker_id": 7, "center_norm": [0.5, 0.5]}]}
-SENSORS = replace(
-    DRIVING,
-    values=changed(
-        fleet,
-        MINE,
-        lambda now: (GOOB, "sensors/imu", attitude(now), 0),
-        lambda now: (GOOB, "touch-sensors", touch(now), 0),
-        lambda now: (GOOB, "wheel-odometry", odometry(now / 1000), 0),
-    ),
-    series=past,
+#: What the sensors of a robot that drives on a loop report.
+MOVING: tuple[Callable[[int], Value], ...] = (
+    lambda now: (GOOB, "sensors/imu", attitude(now), 0),
+    lambda now: (GOOB, "touch-sensors", touch(now), 0),
+    lambda now: (GOOB, "wheel-odometry", odometry(now / 1000), 0),
 )
+SENSORS = replace(DRIVING, values=changed(fleet, MINE, *MOVING), series=past)
 STREAM = "http://localhost:{port}"
 
 
@@ -365,6 +360,10 @@ STATES: dict[str, State] = {
     "recordings": REPLAYING,
     "replay": replace(REPLAYING, path=f"/replay/{GOOB}?at={START + 30_000}"),
     "replay-gap": replace(REPLAYING, path=f"/replay/{GOOB}?at={GAP[0] + 60_000}"),
+    "recordings-none": replace(REPLAYING, days=(200, "[]")),
+    "recordings-failed": replace(REPLAYING, days=(422, "/data/recordings: Permission denied")),
+    "recordings-loading": replace(REPLAYING, days=(0, "")),
+    "recordings-lost": replace(REPLAYING, days=(200, "[]"), silent=True),
     "driving-recorded": replace(DRIVING, welcome={"recordings": True}),
     "system-offline": replace(OPERATING, values=changed(fleet, SILENT)),
     "watching": of(f"{GOOB_PATH}?watch", stopped(FRED, "eve on phone")),
@@ -482,3 +481,7 @@ STATES |= {
     "asked-viewer": of(GOOB_PATH, base=ASKED, welcome=VIEWER),
     "script-drives": of(GOOB_PATH, MINE, NOT_ARBITRATED, lambda now: script(now), base=ASKED),
 }
+STATES["map-empty"] = replace(STATES["asked"], values=changed(ASKED, MINE, at(GOOB, "wheel-odometry", {"value": {}})))
+STATES["map-silent"] = replace(SENSORS, values=changed(fleet, *MOVING, SILENT), repeated={}, pictures=False)
+#: All cards that goob has.
+STATES["full"] = replace(SENSORS, values=changed(ASKED, MINE, *MOVING))

@@ -223,6 +223,17 @@ export interface TalkAnswer {
   why?: string;
 }
 
+export interface RobotIdentity {
+  system: string;
+  type: string;
+  id: string;
+  name?: string;
+  description?: string;
+  colour?: "amber" | "blue" | "coral" | "green" | "rose" | "slate" | "teal" | "violet";
+  picture?: "arm" | "benjr" | "boat" | "drone" | "fred" | "goob" | "minilamp" | "outlets" | "pitcam" | "unknown" | "walker" | "wheeled";
+  battery_cells?: number;
+}
+
 export interface OwnerState {
   owner: string;
   latched: boolean;

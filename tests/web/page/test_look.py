@@ -166,8 +166,13 @@ WHOLE = ("driving", "taken", "others-ask", "stopped", "lost")  # states that are
 #: Text that shows that a state has been reached, where it takes a while.
 WHEN = {
     "recordings": "Sunday, 22 November 2026",
+    "recordings-none": "Nothing is recorded yet",
+    "recordings-failed": "Permission denied",
+    "recordings-lost": "No connection to the server since",
+    "map-empty": "No trail yet",
+    "map-silent": "goob is silent since",
     "fleet": "4 robots",
-    "fleet-stopped": "is stopped",
+    "fleet-stopped": "2 stopped",
     "fleet-empty": "No robot has been seen",
     "fleet-undriveable": "Cannot be driven: serial",
     "undriveable": "Cannot be driven: serial",
@@ -201,11 +206,12 @@ SCREENS = [
     *(
         Screen(name, name, sizes=ALL if name in WHOLE else ("desktop", "phone"))
         for name in STATES
-        if not name.startswith("asked")  # below the picture
+        if not name.startswith(("asked", "full", "map"))  # below the picture
     ),
     Screen("plots", "odometry", hold=_show_card("plots"), sizes=("desktop",)),
     Screen("plots", "odometry", _press(".tabs button:nth-child(2)"), ("phone",), hold=_show_card("plots")),
     Screen("map", "odometry", _press(".tabs button:nth-child(2)"), ("phone",), hold=_show_card("map")),
+    *(Screen(name, name, hold=_show_card("map"), sizes=("desktop",)) for name in ("map-empty", "map-silent")),
     Screen("stream-open", "own-stream", _press("[data-test=gear]", "[data-test=open-stream]")),
     Screen("gear", "driving", _press("[data-test=gear]"), ("desktop",)),
     Screen("listening-now", "listening", _listen),

@@ -34,6 +34,7 @@ const COLOURS = { goob: "blue", fred: "amber", minilamp: "violet", benjr: "green
  */
 export function looksOf(ref, capabilities) {
   const value = inner(capabilities);
+  /** @type {Partial<import("../../messages.js").RobotIdentity>} */
   const identity = isObject(value) && isObject(value.identity) ? value.identity : {};
   const id = nameOf(ref);
   const body = Object.hasOwn(BODIES, id) ? BODIES[id] : id;
@@ -46,6 +47,9 @@ export function looksOf(ref, capabilities) {
     cells: Number.isInteger(identity.battery_cells) && identity.battery_cells > 0 ? identity.battery_cells : 0,
   };
 }
+
+/** @param {any} store @param {string} ref @returns {string} what people call it */
+export const nameIn = (store, ref) => looksOf(ref, store.get(ref, "capabilities")?.value).name;
 
 /** @param {string} picture @returns {string} the address of its drawing */
 export const drawing = (picture) => `${FACES}#face-${picture}`;
@@ -86,8 +90,11 @@ export function charge(level, cells) {
   return Math.round(from + ((to - from) * (volts - low)) / (high - low));
 }
 
-/** @param {any} level payload of charging-level @param {number} cells @returns {string} 81 %, or 7.92 V */
-export function chargeWords(level, cells) {
+/**
+ * @param {any} level payload of charging-level @param {number} cells @param {number} [digits] of volts
+ * @returns {string} 81 %, or 7.92 V
+ */
+export function chargeWords(level, cells, digits = 2) {
   const percent = charge(level, cells);
-  return percent === null ? battery(level) : `${percent} %`;
+  return percent === null ? battery(level, digits) : `${percent} %`;
 }
