@@ -14,7 +14,7 @@ import pytest
 
 from tests.robot.closed_loop.following import ORIGINAL_WITHIN_M, TARGET_M, Start
 from tests.robot.world_rig import FOLLOW, WorldRig
-from tests.support import cases, further, gone, until
+from tests.support import cases, gone, until
 
 pytestmark = pytest.mark.alone  # deadlines are checked
 
