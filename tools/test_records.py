@@ -11,14 +11,12 @@ from pathlib import Path
 import pytest
 
 COST = "cost"
+_TICK_S = 1 / os.sysconf("SC_CLK_TCK")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--failed-list", help="file for the names of failed tests, one per line")
     parser.addoption("--times", help="file to append to, per test: seconds, seconds of processor time, name")
-
-
-_TICK_S = 1 / os.sysconf("SC_CLK_TCK")
 
 
 def _processor_s() -> float:
@@ -91,5 +89,4 @@ def pytest_configure(config: pytest.Config) -> None:
     failed, times = config.getoption("--failed-list"), config.getoption("--times")
     if times:
         config.pluginmanager.register(Costs())
-    if not hasattr(config, "workerinput"):
-        config.pluginmanager.register(Records(failed, times), "records")
+    config.pluginmanager.register(Records(failed, times), "records")  # workers have none
