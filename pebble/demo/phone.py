@@ -55,13 +55,13 @@ class Phone:
         """Print the QR code, the person and the password."""
         for line in qr_lines(url):
             console.print(Text(line, style="#000000 on #ffffff", no_wrap=True, overflow="ignore", end="\n"), crop=False)
-        told = [
+        lines = [
             "All of this machine's network can open the page, but not the broker: for a phone in the same Wi-Fi.",
             f"Log in as {NAME} with the password {self._password}",
             "The browser warns of a certificate that it does not know: the demo has made it. Its SHA-256 is",
             certificates.show(self._tls / SERVER_CERT).sha256,
         ]
-        for line in told:
+        for line in lines:
             console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
