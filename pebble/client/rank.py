@@ -108,6 +108,6 @@ class RankedTable(dict[str, R]):
         self._shared = 0
 
     def _lowest(self, gives_way: Callable[[R], bool]) -> str | None:
-        """Of equal ranks the newest one; None: there is none."""
+        """Returns the newest one of equal ranks; None: there is none."""
         found = [base for base in reversed(self) if not self[base].rank.known and gives_way(self[base])]
         return min(found, key=lambda base: self[base].rank, default=None)
