@@ -146,7 +146,7 @@ def _run_demo(
 
 
 def _start_page(testbed: Testbed, ending: threading.Event, console: Console, opened: Phone | None) -> str:
-    """Start the page, with what it shows of the past. Returns its address; empty without the packages that it needs."""
+    """Start it with a recorder. Returns its address; empty without the packages that it needs."""
     try:
         require_packages()
     except PebbleError as error:

@@ -55,7 +55,7 @@ def test_no_crowd_of_strangers_gets_the_place_of_a_robot(crowd: str, robot: str)
 
 @pytest.mark.parametrize("robot", RANKS)
 @pytest.mark.parametrize("crowd", STRANGERS)
-def test_a_robot_gets_a_place_where_a_crowd_is_that_it_differs_from(crowd: str, robot: str) -> None:
+def test_a_robot_gets_a_place_where_a_crowd_differs_from_it(crowd: str, robot: str) -> None:
     assert let_in(crowded(crowd), "robot", RANKS[robot]) is (crowd != robot)
 
 

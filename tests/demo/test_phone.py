@@ -73,8 +73,8 @@ def login(url: str, password: str, authority: Path) -> int:
 def test_the_password_that_is_printed_opens_the_page(tmp_path: Path, phone: Phone, page: PageServer) -> None:
     printed = Console(file=io.StringIO(), width=80, force_terminal=True)
     phone.show(page.url, printed)
-    text = printed.file.getvalue()  # type: ignore[attr-defined]
-    (password,) = re.findall(rf"Log in as {NAME} with the password (\S+)", text)
+    shown = printed.file.getvalue()  # type: ignore[attr-defined]
+    (password,) = re.findall(rf"Log in as {NAME} with the password (\S+)", shown)
     authority = phone.settings["authority"]
     port = page.url.rstrip("/").rpartition(":")[2]
     for host in (page.url, f"https://localhost:{port}/"):

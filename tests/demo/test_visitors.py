@@ -69,9 +69,7 @@ TOPIC = DRIVE.topic(GOOB.base)
     ],
     ids=["own", "pasted", "own and the same", "retained", "then announced", "announced before"],
 )
-def test_a_robot_is_driven_by_a_program_that_sends_what_the_operator_has_not_sent(
-    received: list[Message], taken: str
-) -> None:
+def test_a_command_that_the_operator_has_not_sent_is_another_drivers(received: list[Message], taken: str) -> None:
     visitors = Visitors("me")
     visitors.note_sent(TOPIC, OURS)
     for message in received:
