@@ -102,7 +102,7 @@ class NetworkRobot:
         now = time.ticks_ms()
         self.session.read(now)
         self.stops.save()
-        if self._next and not self._void:
+        if self._next and not self._void and not self.stops.lease.halts:
             if self.body.drive(*self._next[:3]):
                 self.deadman.limit_ms = self._limit_ms
                 self.deadman.feed(now)

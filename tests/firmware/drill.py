@@ -38,6 +38,8 @@ DRIVE, ONLINE = f"{BASE}/incoming/drive-values", f"{BASE}/outgoing/online"
 NAME: Final = "00000000000000aa"  # of a stop
 ESTOP, RESET, STATE = f"{BASE}/incoming/estop", f"{BASE}/incoming/estop-reset", f"{BASE}/outgoing/estop/mcu"
 
+CONTROL, HOLDER = f"{BASE}/incoming/control", f"{BASE}/outgoing/control/mcu"
+
 _WRAP_MS = 1 << 30
 _FILE = "/estop.json"
 
@@ -241,6 +243,25 @@ class Drill:
         state: dict[str, Any] = json.loads(payloads[-1]) if payloads else {}
         return state
 
+    def request(self, name: str = "aaaaaaaa", *, take: bool = False, **more: Any) -> None:
+        """Request control."""
+        topic = f"{CONTROL}/take" if take else CONTROL
+        self.broker.publish(topic, json.dumps({"id": name, "by": f"drill-{name[0]}", **more}).encode(), qos=1)
+
+    def control(self) -> dict[str, Any]:
+        """The newest state of control that arrived; empty: none."""
+        payloads = self.received(HOLDER)
+        state: dict[str, Any] = json.loads(payloads[-1]) if payloads else {}
+        return state
+
+    def by_key(self, x: float, z: float, y: float) -> None:
+        """A command of who has control, if anybody has; and one by a key of before, which must not move anything."""
+        keys = [json.loads(payload)["key"] for payload in self.received(HOLDER)]
+        newest = keys[-1] if keys else ""
+        self.command(x, z, y, **({"key": newest} if newest else {}))
+        old = [key for key in keys if key not in (newest, "")] or ["0badf00d"]
+        self.nonsense(json.dumps({"x": -z, "z": 0.77, "y": 1, "key": self.random.choice(old)}).encode())
+
     # -- faults
 
     def drop_robot(self) -> None:
@@ -317,6 +338,8 @@ class Drill:
 
     def _take_drive(self, command: Command, arrived: float, now: float) -> None:
         drive = self._meant.get(command.payload)
+        if drive is not None and drive.key and drive.key != self.robot.stops.lease.key:
+            return  # control has passed on meanwhile
         valid_s = self.rules.admits(drive, now) if drive is not None else None
         if drive is not None and valid_s is not None:
             self._supersede(arrived)

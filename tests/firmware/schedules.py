@@ -12,7 +12,7 @@ from tests.firmware.drill import DRIVE, LIMIT_S, ONLINE, RESENT_S, Drill, Violat
 from tests.simulation.virtual_network import Answers
 
 _NETWORK: Final = ("wifi", "broker", "hole", "dns", "ntp", "frozen", "mute")
-_COMMANDS: Final = ("quiet", "flood", "retained", "stale", "limits", "script", "stops")
+_COMMANDS: Final = ("quiet", "flood", "retained", "stale", "limits", "script", "stops", "control")
 FAULTS: Final = (*_NETWORK, *_COMMANDS, "i2c", "power", "disk")
 ACT_S: Final = 8.0  # so long an operator drives and things go wrong
 STABLE_S: Final = 1.0  # a connection that lasts so long is none that is just about to be given up
@@ -231,6 +231,20 @@ def _script(drill: Drill, start: float, _length: float) -> None:
         at += random.uniform(0.03, 0.1)
 
 
+def _control(drill: Drill, start: float, _length: float) -> None:
+    """Two people take control from one another, let it go and come back; who has it drives, and a key of before."""
+    random, at = drill.random, start
+    while at < ACT_S:
+        name, event = random.choice(("aaaaaaaa", "bbbbbbbb")), random.random()
+        if event < 0.1:
+            drill.at(at, partial(drill.request, name, take=random.random() < 0.3, for_ms=random.choice((0, 3000))))
+        elif event < 0.12:
+            drill.at(at, partial(drill.request, name, want="release"))
+        else:
+            drill.at(at, partial(drill.by_key, _wish(drill), _wish(drill), _wish(drill)))
+        at += random.uniform(0.03, 0.1)
+
+
 def _stops(drill: Drill, start: float, length: float) -> None:
     """Presses, each repeated; then resets, of which some are made from an older state."""
     random = drill.random
@@ -261,6 +275,7 @@ def _disk(drill: Drill, start: float, length: float) -> None:
 _EVENTS: Final = {
     "limits": _limits,
     "script": _script,
+    "control": _control,
     "stops": _stops,
     "power": _power,
     "disk": _disk,

@@ -14,7 +14,7 @@ from pebble.services.serial_mcu_bridge.motion.paced import Paced
 log = logging.getLogger(__name__)
 
 _TICK_S = 0.25  # while somebody has control, or others drive: what is over ends so late at most
-_NOBODY = ("", "", "", "")
+_NO_CLIENT = ("", "", "", "")
 
 
 class Control:
@@ -33,7 +33,7 @@ class Control:
         self._next: float | None = None  # the next tick
 
     def state(self) -> ControlState:
-        (_, name, by, device), (_, asks_id, asks, _) = self.lease.holder or _NOBODY, self.lease.asker or _NOBODY
+        (_, name, by, device), (_, asks_id, asks, _) = self.lease.holder or _NO_CLIENT, self.lease.asker or _NO_CLIENT
         return ControlState(
             by=by, id=name, key=self.lease.key, device=device, asks=asks, asks_id=asks_id,
             others=self.lease.others, named=self._named, boot=self.boot,
@@ -57,7 +57,7 @@ class Control:
             self.lease.hold(client, int(request.for_ms), over, _ms(now))
 
     def account(self, drive: Drive) -> str | None:
-        """Of who sent this command, "" where names are not checked; None: it is from a program of the robot."""
+        """Return whose command this is, "" where names are not checked; None: it is from a program of the robot."""
         if not self._named:
             return ""
         return drive.by.partition("/")[0] if isinstance(drive.by, str) else None
@@ -76,7 +76,7 @@ class Control:
             self._next = now + _TICK_S
         halts, lease.halts = lease.halts, False
         if halts:
-            _, _, by, device = lease.holder or _NOBODY
+            _, _, by, device = lease.holder or _NO_CLIENT
             shown = f"{by or 'somebody without a name'}{f' ({device})' if device else ''}" if lease.key else "nobody"
             self._log.log("control", logging.INFO, "%s has control", shown)
         return halts

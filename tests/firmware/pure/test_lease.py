@@ -117,7 +117,7 @@ def test_a_state_changes_and_the_motors_are_halted_only_where_something_changes(
         assert (own.changed, own.halts) == (changed, halts), events
 
 
-def test_clocks_that_wrap_make_nobody_busy_or_idle() -> None:
+def test_clocks_that_wrap_make_no_client_busy_or_idle() -> None:
     half = 1 << 29  # a board's clock measures no longer times
     own = lease()
     perform(own, (0, "hold", ANN, 9999))

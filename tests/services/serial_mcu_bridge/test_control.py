@@ -94,7 +94,7 @@ def test_who_has_control_drives_and_keys_of_before_do_not(bench: Bench) -> None:
     assert bench.service.counters["stranger"] == 1
 
 
-def test_after_a_restart_nobody_has_control_and_its_key_is_void(bench: Bench) -> None:
+def test_a_restart_ends_control_and_its_key_is_void(bench: Bench) -> None:
     bench.send("control", ANN)
     key, boot = held(bench, "ann"), bench.world.newest("control/serial")["boot"]
     assert bench.moves(0.2, key=key)

@@ -17,7 +17,7 @@ RELEASE = ControlRequest(id="aaaaaaaa", by="ann", want="release")
 
 
 def control() -> Control:
-    """Of an owner of which ann has control, and otto asks for it."""
+    """Return that of an owner: ann has control, and otto asks for it."""
     made = Control(Security(), lambda _state: None, 0.0)
     for request in (ANN, OTTO):
         made.request(request, over=False, now=0.0)

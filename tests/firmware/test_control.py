@@ -1,0 +1,119 @@
+"""Control of a board: requests, its state, and what moves it, in virtual time."""
+
+from __future__ import annotations
+
+import json
+from random import Random
+
+import pytest
+
+from common.estop import fields
+from common.lease import request_of
+from pebble.contract import CONTROL, CONTROL_STATE, codec
+from pebble.errors import PayloadError
+from tests.firmware.drill import CONTROL as REQUESTS
+from tests.firmware.drill import HOLDER, Drill
+from tests.firmware.test_network_robot import online
+
+KINDS = ("minilamp", "benjr")
+
+
+def run(drill: Drill, seconds: float) -> None:
+    drill.run(drill.seconds + seconds)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_two_drivers_and_only_who_has_control_moves_by_a_key(kind: str) -> None:
+    drill = online(kind)
+    assert drill.control() == {
+        "by": "", "id": "", "key": "", "device": "", "asks": "", "asks_id": "", "others": False, "named": False,
+        "boot": drill.state()["boot"],
+    }  # fmt: skip
+    drill.request("aaaaaaaa", by="Ann", device="phone")
+    run(drill, 0.5)
+    ann = drill.control()
+    assert (ann["by"], ann["id"], ann["device"], len(ann["key"])) == ("ann", "aaaaaaaa", "phone", 8)
+    drill.command(0, 0.5, key=ann["key"])
+    run(drill, 0.2)
+    assert any(drill.outputs())
+    drill.request("bbbbbbbb", by="otto")
+    run(drill, 0.5)
+    assert (drill.control()["key"], drill.control()["asks"]) == (ann["key"], "otto")
+    drill.command(0, 0.5, key=ann["key"])
+    run(drill, 0.2)
+    drill.request("bbbbbbbb", by="otto", take=True)
+    run(drill, 0.1)
+    assert not any(drill.outputs())  # whoever gets control begins with wheels at rest
+    drill.nonsense(json.dumps({"z": 1, "key": ann["key"]}).encode())
+    run(drill, 0.5)
+    otto = drill.control()
+    assert not any(drill.outputs())
+    drill.command(0, 0.5, key=otto["key"])
+    run(drill, 0.2)
+    assert any(drill.outputs())
+    drill.command(0, 0.7)  # as ever without a key
+    run(drill, 0.5)
+    assert drill.control()["others"]
+    drill.request("bbbbbbbb", want="release")
+    run(drill, 0.5)
+    assert drill.control()["key"] == ""
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_control_ends_without_its_holder_and_outlives_a_connection(kind: str) -> None:
+    drill = online(kind)
+    drill.request(for_ms=10_000)
+    run(drill, 0.5)
+    drill.drop_robot()
+    states = len(drill.received(HOLDER))
+    run(drill, 6.0)
+    assert len(drill.received(HOLDER)) > states
+    assert drill.control()["id"] == "aaaaaaaa"
+    run(drill, 6.0)
+    assert drill.control()["key"] == ""
+
+
+def test_states_are_short_and_not_more_than_four_a_second() -> None:
+    drill = online("benjr")
+    began = drill.seconds
+    for number in range(400):
+        drill.at(began + number / 100, lambda number=number: drill.request(f"{number:08x}", by="z" * 60, take=True))
+    drill.run(began + 4.0)
+    states = drill.received(HOLDER, began)
+    assert 8 <= len(states) <= 17
+    assert max(map(len, states)) <= 300
+    assert codec.decode(CONTROL_STATE, states[-1]).by == "z" * 40
+
+
+def test_without_its_topic_a_board_has_no_control() -> None:
+    drill = online("benjr", refused={REQUESTS})
+    capabilities = json.loads(drill.received("pebble/robots/rover/outgoing/capabilities")[-1])
+    assert capabilities["value"]["drive"]["control"] is False
+    assert drill.control() == {}
+    drill.command(0, 0.5)
+    run(drill, 0.2)
+    assert any(drill.outputs())
+
+
+def test_a_board_reads_requests_as_linux_does() -> None:
+    random, accepted = Random(1), 0
+    values = {
+        "id": ["3f2a91c0", "3F2A91C0", "3f2a91c", "", 7, None],
+        "want": ["hold", "release", "drive", None],
+        "by": ["ann", "page-1/Ann B.", "a" * 60, 7, None],
+        "device": ["phone", "x" * 60, []],
+        "for_ms": [3000, 0, 1500.5, 99_999, "1", True, None],
+    }
+    for _ in range(3000):
+        names = [name for name in values if name == "id" or random.random() < 0.4]
+        body = {name: random.choice(values[name]) for name in names}
+        body = {"value": body, "by": "x"} if random.random() < 0.2 else body
+        try:
+            request = codec.decode(CONTROL, json.dumps(body).encode())
+            ms = 0 if request.ends() else int(min(max(request.for_ms, 1), 10_000))
+            expected = request.id, request.by, request.device, ms
+            accepted += 1
+        except PayloadError:
+            expected = None
+        assert request_of(fields(body)) == expected, body
+    assert accepted > 100
