@@ -248,29 +248,31 @@ def test_firmware_that_fails_stops_its_motors_and_boots_anew(broker: Broker) -> 
 
 
 def test_two_drivers_of_a_board_and_only_the_key_of_now_moves_it(start: Any, broker: Broker) -> None:
-    program = start("benjr", f"127.0.0.1:{broker.port}", "--id", "benjr")
+    program = start("benjr", f"127.0.0.1:{broker.port}", "--id", "benjr", "--report")
     base = "pebble/robots/benjr"
 
     def state() -> dict[str, Any]:
         found: dict[str, Any] = retained(broker.port, f"{base}/outgoing/control/mcu") or {}
         return found
 
-    def moves() -> bool:
+    def turns() -> bool:
         snapshots = program.snapshots()
         return bool(snapshots) and any(snapshots[-1].board.motors)
+
+    def moves(operator: Operator, key: str) -> bool:
+        operator.send("benjr", json.dumps({"z": 0.5, "key": key}))
+        return turns()
 
     with Operator(broker.port) as operator:
         assert until(lambda: state().get("key") == "", 15)
         operator.send("benjr", '{"id": "aaaaaaaa", "by": "otto", "for_ms": 10000}', metric="control")
         assert until(lambda: state().get("by") == "otto", 5)
         old = state()["key"]
-        operator.send("benjr", json.dumps({"z": 0.5, "key": old}))
-        assert until(moves, 5)
+        assert until(lambda: moves(operator, old), 5, step=0.05)
         operator.send("benjr", '{"id": "bbbbbbbb", "by": "mia", "for_ms": 10000}', metric="control/take")
-        assert until(lambda: state().get("by") == "mia" and not moves(), 5)
+        assert until(lambda: state().get("by") == "mia" and not turns(), 5)
         for _ in range(20):
-            operator.send("benjr", json.dumps({"z": 0.9, "key": old}))
+            assert not moves(operator, old)
             time.sleep(0.05)
-            assert not moves()
-        operator.send("benjr", json.dumps({"z": 0.5, "key": state()["key"]}))
-        assert until(moves, 5)
+        new = state()["key"]
+        assert until(lambda: moves(operator, new), 5, step=0.05)
