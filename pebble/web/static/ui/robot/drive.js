@@ -8,7 +8,7 @@ import { Stick } from "./stick.js";
 import { driverName } from "../parts/words.js";
 
 const FLASH_MS = 3000;
-const LONG = 12; // letters of a name on a button
+const LONG = 9; // letters of a name on a button
 
 export function DriveCard({ at }) {
   return html`<${Card} id="drive" title="Drive" icon="wheel" className="drive" place=${{ "data-at": "side" }}>
