@@ -15,7 +15,7 @@ from pebble.bench.page_rig import KEY, ROBOT, Rig, rig
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 WIDTH, QUALITY, MOST_BYTES = 1000, 78, 200_000
 SHARP_S, SMALL_PICTURES_S = 4.0, 4.0
-CARDS = {"x": 0, "y": 0, "width": 1280, "height": 535}
+CARDS = {"x": 0, "y": 0, "width": 1280, "height": 580}
 
 
 def driving(made: Rig) -> bytes:

@@ -28,7 +28,7 @@ FAILED = ROOT / "build" / "looks"
 MOST_BYTES = 600_000  # of all stored pictures
 LEVELS, SHARE = 12, 0.0003  # a pixel differs by more than so many of 255 levels; this share of them may
 AT = 1_795_341_630_000  # 22 November 2026, 10:00:30 UTC
-SIZES = {"desktop": (1440, 900), "phone": (390, 844), "landscape": (844, 390)}
+SIZES = {"desktop": (1440, 900), "tall": (1440, 1960), "phone": (390, 844), "landscape": (844, 390)}
 
 #: Both clocks of the page stand still; timers run.
 _FROZEN = f"""{{
@@ -81,7 +81,6 @@ class Look:
     theme: Theme = "light"
     act: Callable[[Page], None] = _nothing
     here: str = _HERE
-    whole: bool = False  # the whole page, not only what a window shows
     script: str = ""
 
 
@@ -96,10 +95,10 @@ LOOKS: dict[str, Look] = {
         here="!document.querySelector('.loading') && Boolean(document.querySelector('.key-place'))",
         script=UNANSWERED,
     ),
-    "robot": Look(STATES["full"], whole=True),
+    "robot": Look(STATES["full"], size="tall"),
     "free": Look(STATES["free"], theme="dark"),
     "gear": Look(STATES["driving"], act=_press("gear")),
-    "script": Look(STATES["asked"], act=_press("script-apriltag-follow"), whole=True, theme="dark"),
+    "script": Look(STATES["asked"], act=_press("script-apriltag-follow"), size="tall", theme="dark"),
     "stopped": Look(STATES["stopped"], theme="dark"),
     "reset": Look(STATES["stopped"], size="phone", act=_press("reset")),
     "taken": Look(STATES["taken"], size="phone", theme="dark"),
@@ -128,7 +127,7 @@ def taken(server: CannedServer, browser: Browser, look: Look, style: str = "") -
         server,
         browser,
         state,
-        "desktop" if look.size == "desktop" else "phone",
+        "desktop" if width == SIZES["desktop"][0] else "phone",
         viewport={"width": width, "height": height},
         theme=look.theme,
         script=_FROZEN + look.script,
@@ -137,15 +136,15 @@ def taken(server: CannedServer, browser: Browser, look: Look, style: str = "") -
         assert opened.until(look.here, 60), f"{state.path} is not shown"
         look.act(opened.page)
         opened.page.evaluate(_STYLED, style)
-        return _at_rest(opened, whole=look.whole)
+        return _at_rest(opened)
 
 
-def _at_rest(opened: Tab, *, whole: bool) -> Pixels:
+def _at_rest(opened: Tab) -> Pixels:
     """A picture, once three in a row are the same: what is fetched later has come, and cards have their places."""
     seen: list[Pixels] = []
 
     def same() -> bool:
-        picture = Image.open(io.BytesIO(opened.page.screenshot(full_page=whole, animations="disabled"))).convert("RGB")
+        picture = Image.open(io.BytesIO(opened.page.screenshot(animations="disabled"))).convert("RGB")
         half = picture.resize((picture.width // 2, picture.height // 2), Image.Resampling.BOX)
         seen.append(np.asarray(half))
         opened.page.wait_for_timeout(500)

@@ -7,6 +7,7 @@ import { Estop } from "./core/estop.js";
 import { Store } from "./core/store.js";
 import { App, PARTS } from "./ui/app.js";
 import { Boundary, Page, fetchPart, fetchRest, isHere, withRest } from "./ui/parts/hooks.js";
+import { nameIn } from "./ui/parts/looks.js";
 import { Connection, Panels, Route, Settings, WATCHES, read } from "./ui/parts/models.js";
 import { Video } from "./ui/robot/video-model.js";
 import { Pictures } from "./media/pictures.js";
@@ -49,6 +50,7 @@ function join() {
   const driver = new Driver({ socket, store, estop, reload: () => connection.isOld });
   connection.socket = socket;
   estop.onChange = () => connection.changed();
+  driver.nameOf = (ref) => nameIn(store, ref);
   driver.loading = () => !isHere(PARTS.robot);
   driver.pictureAge = () => (video.ref ? video.age().ms : null);
   video.pictures = new Pictures(

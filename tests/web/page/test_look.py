@@ -165,8 +165,13 @@ ALL: tuple[Size, ...] = ("desktop", "phone", "landscape")
 #: Text that shows that a state has been reached, where it takes a while.
 WHEN = {
     "recordings": "Sunday, 22 November 2026",
+    "recordings-none": "Nothing is recorded yet",
+    "recordings-failed": "Permission denied",
+    "recordings-lost": "No connection to the server since",
+    "map-empty": "No trail yet",
+    "map-silent": "goob is silent since",
     "fleet": "4 robots",
-    "fleet-stopped": "is stopped",
+    "fleet-stopped": "2 stopped",
     "fleet-empty": "No robot has been seen",
     "fleet-undriveable": "Cannot be driven: serial",
     "undriveable": "Cannot be driven: serial",
@@ -189,6 +194,8 @@ WHEN = {
     "other-camera": "seen from tower-1",
     "script-drives": "Stop apriltag-follow",
 }
+#: What browsers complain of where the server is meant to fail.
+MEANT = {"recordings-failed": "422"}
 _OUTLETS, _VALUES = (f'[data-card="{card}"]' for card in ("outlets", "values"))
 _SENSORS, _MORE = _press("[data-test=tab-sensors]"), _press("[data-test=tab-more]")
 _LAMP, _LUX = '[data-test="mcu-lamp-1"]', '[data-test="reading-lux"]'
@@ -196,11 +203,12 @@ SCREENS = [
     *(
         Screen(name, name, sizes=ALL if name in ("driving", "taken", "stopped", "lost") else ("desktop", "phone"))
         for name in STATES
-        if not name.startswith("asked")  # below the picture
+        if not name.startswith(("asked", "full", "map"))  # below the picture
     ),
     Screen("plots", "odometry", hold=_show_card("plots"), sizes=("desktop",)),
     Screen("plots", "odometry", _press(".tabs button:nth-child(2)"), ("phone",), hold=_show_card("plots")),
     Screen("map", "odometry", _press(".tabs button:nth-child(2)"), ("phone",), hold=_show_card("map")),
+    *(Screen(name, name, hold=_show_card("map"), sizes=("desktop",)) for name in ("map-empty", "map-silent")),
     Screen("stream-open", "own-stream", _press("[data-test=gear]", "[data-test=open-stream]")),
     Screen("gear", "driving", _press("[data-test=gear]"), ("desktop",)),
     Screen("listening-now", "listening", _listen),
@@ -279,7 +287,8 @@ def test_screen(show: Show, axe: str, screen: Screen, size: Size) -> None:
             _show(opened, theme)
             opened.page.screenshot(path=PICTURES / f"{screen.name}-{size}-{theme}.png")
             problems += [f"{theme}: {violation}" for violation in _violations(opened.page, axe)]
-        assert problems + opened.complaints() == []
+        problems += [one for one in opened.complaints() if MEANT.get(screen.state, "\0") not in one]
+        assert problems == []
 
 
 def _wait(opened: Tab, text: str) -> None:

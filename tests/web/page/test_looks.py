@@ -15,7 +15,7 @@ pytestmark = [pytest.mark.page, pytest.mark.timeout(180)]
 BREAKS = {
     "another font": "body, button { font-family: serif; }",
     "a thinner title": ".card-head h2 { font-weight: 400; }",
-    "another colour": "button.primary { background: #777; }",
+    "another colour": "button.primary { background: #777 !important; }",
     "a wider gap": ".picture-bar { gap: 8px; }",
 }
 

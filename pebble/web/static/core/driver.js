@@ -25,6 +25,8 @@ export class Driver {
     this.inSight = false; // the driver sees the robot itself
     /** @type {() => number|null} the age of the picture in ms; NaN: unknown; null: none is wanted here */
     this.pictureAge = () => null;
+    /** @type {(ref: string) => string} what people call it */
+    this.nameOf = (ref) => ref.split("/").pop() ?? "";
     /** @type {() => boolean} whether what shows the picture and the reasons is not here yet */
     this.loading = () => false;
     /** @type {(by: string, idleMs: number) => void} called when this page loses the lease: to ``by``, or "" */
@@ -119,8 +121,9 @@ export class Driver {
     const value = (metric) => this.store.get(this.ref, metric)?.value;
     const broker = this.store.get("", "web/broker")?.value;
     return {
-      name: this.ref.split("/").pop() ?? "",
+      name: this.nameOf(this.ref),
       open: this.socket.state === "open" && !this.socket.outdated, // what is known is of the last connection
+      connecting: this.socket.state === "connecting" || (this.socket.state === "open" && this.socket.outdated),
       broker: broker?.problem ?? "",
       reload: this.reload(),
       drives: this.socket.you?.drives !== false,

@@ -15,6 +15,7 @@ const RESET_MS = 600; // after a reset robots refuse whoever has not paused for 
  * @typedef {object} Situation
  * @property {string} name of the component
  * @property {boolean} open whether the control socket is
+ * @property {boolean} [connecting] for the first time
  * @property {string} broker why the server cannot reach the broker; "" it can
  * @property {boolean} reload the page is older than the server
  * @property {boolean} drives false: not over this connection
@@ -42,7 +43,7 @@ const RESET_MS = 600; // after a reset robots refuse whoever has not paused for 
 
 /** Why nothing may be commanded at all. @param {Situation} s @returns {Reason|null} */
 export function offReason(s) {
-  if (!s.open) return reason("server", "No connection to the server");
+  if (!s.open) return s.connecting ? reason("connecting", "Connecting to the server…") : reason("server", "No connection to the server");
   if (s.broker) return reason("broker", `The server cannot reach the broker: ${s.broker}`);
   return null;
 }

@@ -4,8 +4,7 @@ import * as browser from "../core/browser.js";
 import { Banners } from "./banner.js";
 import { Header } from "./header.js";
 import { Boundary, fetchRest, html, styled, useEffect, useMedia, useModel, usePage, useState } from "./parts/hooks.js";
-import { Part } from "./parts/parts.js";
-import { nameOf, visible } from "./parts/words.js";
+import { Part, useName } from "./parts/parts.js";
 
 /** What is fetched when it is first shown, so that the first screen is there soon; main.js fetches the rest later. */
 export const PARTS = {
@@ -37,12 +36,13 @@ export function App() {
   const { ref, replay } = useModel(route);
   useModel(settings);
   const layout = useLayout();
+  const name = useName(ref);
   const { shown } = useModel(panels);
   const [drawer, setDrawer] = useState(false);
   useEffect(() => {
-    document.title = ref ? `${visible(nameOf(ref))} – Pebble` : replay === null ? "Pebble" : "Recordings – Pebble";
+    document.title = ref ? `${name} – Pebble` : replay === null ? "Pebble" : "Recordings – Pebble";
     setDrawer(false);
-  }, [ref, replay]);
+  }, [ref, replay, name]);
   const toggle = () => panels.toggle("settings");
   return html`<div class=${`app ${layout} ${ref ? "at-robot" : "at-fleet"}`}>
     <a class="skip" href="#main">Skip to content</a>

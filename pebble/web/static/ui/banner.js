@@ -1,11 +1,12 @@
-// What must not be overlooked, over the picture or on top of a screen: stops, lost connections, and what was not done.
+// What must not be overlooked, over the picture or a title: stops, lost connections, and what was not done.
 
 import {
   html, useEffect, useLater, useLayoutEffect, useMetric, useModel, usePage, useRefs, useState, useTick, useValue,
 } from "./parts/hooks.js";
 import { Model } from "./parts/models.js";
-import { HoldButton, Icon, RouteLink, Why, useName } from "./parts/parts.js";
-import { clockTime, nameOf, roughly } from "./parts/words.js";
+import { nameIn } from "./parts/looks.js";
+import { Drop, HoldButton, Icon, RouteLink, Why, useName } from "./parts/parts.js";
+import { clockTime, roughly } from "./parts/words.js";
 
 const NOTICE_MS = 6000;
 const NO_ANSWER_MS = 1500;
@@ -26,10 +27,10 @@ const places = new (class extends Model {
 /** On top of a screen that has no place for them, and while the screen is not here, or has failed. */
 export function Banners({ at }) {
   useModel(places);
-  return at && places.count ? null : html`<${All} at=${at} />`;
+  return places.count ? null : html`<${All} at=${at} />`;
 }
 
-/** Over the picture, or what is in its place: nothing on the page moves. */
+/** Over the picture, or what is in its place, or a title: nothing on the page moves. */
 export function Bands({ at }) {
   useLayoutEffect(() => {
     places.add(1);
@@ -43,7 +44,7 @@ function All({ at }) {
   const { connection } = usePage();
   useModel(connection);
   return html`<section class="banners" aria-label="What to know now">
-    <${StopBanners} at=${at} />
+    ${at ? html`<div class="stop-banners"><${StopBanner} at=${at} /></div>` : html`<${Unconfirmed} />`}
     <${PressBanner} />
     <div role="alert"><${ServerBanner} />${at && html`<${SilentBanner} at=${at} />`}</div>
     ${at && html`<${AlsoStopped} at=${at} />`}
@@ -105,24 +106,44 @@ function SilentBanner({ at }) {
   useTick(1000);
   const entry = useMetric(at, "web/liveness");
   const heartbeat = useValue(at, "online");
+  const name = useName(at);
   if (!connection.isOpen || entry?.value?.online !== false) return null;
   const { silent_s: silent } = entry.value;
   const ms = silent === null ? null : 1000 * silent + entry.age;
   const since = ms !== null ? store.now() - ms : Number.isFinite(heartbeat?.t) ? heartbeat.t : null;
   return html`<${Banner} kind="bad">
     <p>
-      <b>${nameOf(at)} is ${silent === null ? "offline" : "silent"}${since ? ` since ${clockTime(since)}` : ""}.</b>
+      <b>${name} is ${silent === null ? "offline" : "silent"}${since ? ` since ${clockTime(since)}` : ""}.</b>
       ${ms !== null && html`<span aria-hidden="true"> Last heartbeat ${roughly(ms)} ago.</span>`}
     </p>
   <//>`;
 }
 
-/** One for the open component; on the fleet's screen one for each. */
-function StopBanners({ at }) {
-  const refs = useRefs().sort();
-  return html`<div class="stop-banners">
-    ${(at ? [at] : refs).map((ref) => html`<${StopBanner} key=${ref} at=${ref} />`)}
-  </div>`;
+/** How many are stopped, or should be, where no component is open; the list has what can be done about each. */
+export function StopChip() {
+  const { connection, store } = usePage();
+  useModel(connection, (one) => one.isOpen);
+  useTick(500);
+  const found = useStops(useRefs()).sort();
+  const refs = found.filter((ref) => wants(store.get(ref, "web/estop")));
+  if (!refs.length || !connection.isOpen) return null;
+  const bad = refs.filter((ref) => progressOf(store, ref)?.kind === "bad").length;
+  const latched = refs.filter((ref) => store.get(ref, "web/estop").value.latched).length;
+  const words = bad ? `${bad} not confirmed` : latched ? `${latched} stopped` : `${refs.length} stopping`;
+  const chip = html`<span class="chip stopped"><${Icon} name="stop" />${words}</span>`;
+  return html`<${Drop} test="stopped" className="stops" summary=${chip}>
+    ${refs.map((ref) => html`<${StopBanner} key=${ref} at=${ref} />`)}
+  <//>`;
+}
+
+/** Where no component is open: the first that does not confirm its stop. */
+function Unconfirmed() {
+  const { store } = usePage();
+  useTick(500);
+  const refs = useStops(useRefs()).filter((ref) => progressOf(store, ref)?.kind === "bad").sort();
+  if (!refs.length) return null;
+  const more = refs.length > 1 ? ` So for ${refs.length - 1} more.` : "";
+  return html`<${Banner} kind="bad" icon="stop"><p role="alert">${progressOf(store, refs[0]).text}${more}</p><//>`;
 }
 
 function StopBanner({ at }) {
@@ -137,9 +158,8 @@ function StopBanner({ at }) {
   useEffect(() => {
     if (!latched) ask(false);
   }, [latched]);
-  if (!view) return null;
+  if (!wants(entry)) return null;
   const progress = stopProgress(view, name, entry.age);
-  if (!latched && !progress) return null;
   const refused = (view.owners ?? []).map((one) => one.reset_refused).find(Boolean);
   const why = resetReason(connection);
   const id = `reset-${at}`;
@@ -188,6 +208,15 @@ function stopWords(view) {
   return `by ${view.by || "somebody"}${view.since > 0 ? `, at ${clockTime(view.since)}` : ""}${how}`;
 }
 
+/** Whether there is anything to know of its stop. */
+const wants = (entry) => Boolean(entry && (entry.value.latched === true || stopProgress(entry.value, "", entry.age)));
+
+/** @param {any} store @param {string} ref @returns {{kind: string, text: string} | null} what became of its stop */
+export function progressOf(store, ref) {
+  const entry = store.get(ref, "web/estop");
+  return entry ? stopProgress(entry.value, nameIn(store, ref), entry.age) : null;
+}
+
 /** What became of the stop that is, or was, sent. @returns {{kind: string, text: string} | null} */
 function stopProgress(view, name, age) {
   const more = view.sending_text ? ` ${view.sending_text}` : "";
@@ -224,17 +253,20 @@ function resetReason(connection) {
 
 /** Others than the open one. */
 function AlsoStopped({ at }) {
-  const stopped = useStopped(useRefs().filter((ref) => ref !== at)).sort();
+  const { store } = usePage();
+  const others = useStops(useRefs().filter((ref) => ref !== at));
+  const stopped = others.filter((ref) => store.get(ref, "web/estop")?.value?.latched === true).sort();
   if (!stopped.length) return null;
   return html`<p class="also links">
     <${Icon} name="stop" /><span>Also stopped:</span> ${stopped.slice(0, MOST_ALSO).map(
-      (ref) => html`<${RouteLink} key=${ref} to=${ref}>${nameOf(ref)}<//>`,
+      (ref) => html`<${RouteLink} key=${ref} to=${ref}>${nameIn(store, ref)}<//>`,
     )}
     ${stopped.length > MOST_ALSO && html`<${RouteLink} to="">${stopped.length - MOST_ALSO} more<//>`}
   </p>`;
 }
 
-function useStopped(refs) {
+/** Draw again when the stop of one of them changes. @param {string[]} refs @returns {string[]} */
+function useStops(refs) {
   const { store } = usePage();
   const [, redraw] = useState(0);
   const key = refs.join();
@@ -242,7 +274,7 @@ function useStopped(refs) {
     const stops = refs.map((ref) => store.subscribe(ref, "web/estop", () => redraw((n) => n + 1)));
     return () => stops.forEach((stop) => stop());
   }, [store, key]);
-  return refs.filter((ref) => store.get(ref, "web/estop")?.value?.latched === true);
+  return refs;
 }
 
 /** A stop that was pressed here and of which no robot shows anything yet. */
@@ -257,7 +289,7 @@ function PressBanner() {
     return view && (view.stop === pressed.stop || (view.latched && age > NO_ANSWER_MS));
   });
   if (known && connection.isOpen) return null;
-  const whom = pressed.ref ? nameOf(pressed.ref) : "all robots";
+  const whom = pressed.ref ? nameIn(store, pressed.ref) : "all robots";
   if (age < NO_ANSWER_MS) {
     return html`<${Banner} kind="warn" icon="stop"><p role="alert">STOP of ${whom}: sent…</p><//>`;
   }

@@ -1,15 +1,18 @@
 // The header of every screen: which robot, whether it is there, and STOP.
 
 import * as browser from "../core/browser.js";
+import { StopChip } from "./banner.js";
 import { Boundary, html, styled, useMetric, useModel, useOnline, usePage, usePart, useRefs, useTick, useValue } from "./parts/hooks.js";
+import { nameIn } from "./parts/looks.js";
 import { Charge, Face, Icon, RouteLink, StopButton, useName } from "./parts/parts.js";
-import { driverName, kindOf, nameOf, roughly, span, typeOf } from "./parts/words.js";
+import { driverName, kindOf, roughly, span, typeOf } from "./parts/words.js";
 
 const LATE_MS = 300; // of the way to the server and back
 
 export function Header({ at, layout, panel, onPanel, drawer, onDrawer }) {
   const { commands, driver, route } = usePage();
   const wide = layout === "desktop";
+  const name = useName(at);
   return html`<header class="top">
     <div class="where">
       ${at || route.replay !== null ? html`<${BackLink} />` : html`<${Brand} />`}
@@ -17,7 +20,7 @@ export function Header({ at, layout, panel, onPanel, drawer, onDrawer }) {
     </div>
     ${at && wide && html`<${Vital} at=${at} />`}
     <div class="top-space"></div>
-    ${wide && html`<${ConnectionState} />`}
+    ${!at && html`<${StopChip} />`} ${wide && html`<${ConnectionState} at=${at} />`}
     ${wide && at && html`<${AllButton} outlined /><span class="rule"></span>`}
     ${wide && at && html`<${HelpButton} />`}
     <${Boundary} what="Notices"><${Notices} at=${at} wide=${wide || (layout === "portrait" && at !== "")} room=${wide} /><//>
@@ -46,7 +49,7 @@ export function Header({ at, layout, panel, onPanel, drawer, onDrawer }) {
     html`<${StopButton}
       test="stop-one"
       onStop=${() => commands.stop(driver.ref)}
-      label=${`STOP: emergency stop of ${nameOf(at)}`}
+      label=${`STOP: emergency stop of ${name}`}
       className="stop-one"
     >
       <${Icon} name="stop" />STOP
@@ -88,7 +91,7 @@ const BackLink = () => html`<${RouteLink} to="" className="back" label="Fleet: a
 >`;
 
 function Picker({ at }) {
-  const { route } = usePage();
+  const { route, store } = usePage();
   const refs = [...new Set([at, ...useRefs()])].sort();
   return html`<label class="picker">
     <${Face} at=${at} />
@@ -102,7 +105,7 @@ function Picker({ at }) {
     >
       ${refs.map(
         (ref) => html`<option key=${ref} value=${ref}>
-          ${nameOf(ref)}${typeOf(ref) === "robots" ? "" : ` (${kindOf(ref)})`}
+          ${nameIn(store, ref)}${typeOf(ref) === "robots" ? "" : ` (${kindOf(ref)})`}
         </option>`,
       )}
     </select>
@@ -112,23 +115,25 @@ function Picker({ at }) {
 /** Where there are no chips. */
 function IsStopped({ at }) {
   const stopped = useValue(at, "web/estop")?.latched === true && usePage().connection.isOpen;
-  return stopped && html`<b class="is-stopped">Stopped</b>`;
+  return stopped && html`<b class="picker-stopped">Stopped</b>`;
 }
 
 function Volts({ at }) {
   const level = useMetric(at, "charging-level");
   const online = useOnline(at);
-  return level ? html`<span class="volts"><${Charge} at=${at} level=${level} online=${online} /></span>` : null;
+  return level && online ? html`<span class="volts"><${Charge} at=${at} level=${level} online digits=${1} /></span>` : null;
 }
 
 /** Whether a component is there, and how late its heartbeats are. @param {{at: string}} props */
 export function Liveness({ at }) {
   const { connection } = usePage();
-  useModel(connection, (one) => one.isOpen);
+  useModel(connection, (one) => one.state);
   const entry = useMetric(at, "web/liveness");
   const view = entry?.value;
   useTick(view?.online === false ? 1000 : 0);
-  if (!connection.isOpen) return html`<span class="state unknown">not connected</span>`;
+  if (!connection.isOpen) {
+    return html`<span class="state unknown">${connection.state === "connecting" ? "connecting…" : "not connected"}</span>`;
+  }
   if (!view || view.online === null) return html`<span class="state unknown">waiting</span>`;
   if (view.online === false) {
     const silent = view.silent_s === null ? "" : ` ${roughly(1000 * view.silent_s + entry.age)}`;
@@ -160,11 +165,11 @@ function Vital({ at }) {
   </div>`;
 }
 
-function ConnectionState() {
+function ConnectionState({ at }) {
   const { connection } = usePage();
   useModel(connection);
   const { socket, state } = connection;
-  if (state === "connecting") return html`<span class="chip plain">connecting…</span>`;
+  if (state === "connecting") return !at && html`<span class="chip plain">connecting…</span>`;
   if (state === "lost") return html`<span class="chip plain bad">not connected</span>`;
   return socket.roundTripMs > LATE_MS ? html`<span class="chip plain late">slow: ${span(socket.roundTripMs)}</span>` : null;
 }

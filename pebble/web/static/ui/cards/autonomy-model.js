@@ -1,7 +1,8 @@
 // Which script of a robot runs, since when, and why none can be started. Robots may report anything.
 
+import { nameIn } from "../parts/looks.js";
 import { sectionOf, whyNotMoved } from "../parts/why-not.js";
-import { inner, isObject, nameOf } from "../parts/words.js";
+import { inner, isObject } from "../parts/words.js";
 
 const MOST_DEPENDENCIES = 16;
 
@@ -67,7 +68,7 @@ export function handDriven({ store }, ref) {
 export function whyNotStarted(page, ref) {
   const why = whyNotMoved(page, ref, "autonomy");
   if (why) return why;
-  if (page.store.get(ref, "web/liveness")?.value.online !== true) return `${nameOf(ref)} has not been seen yet`;
+  if (page.store.get(ref, "web/liveness")?.value.online !== true) return `${nameIn(page.store, ref)} has not been seen yet`;
   const stop = page.store.get(ref, "web/estop")?.value;
   if (stop?.latched) return `Stopped by ${stop.by || "unknown"}`;
   const { by, waits } = handDriven(page, ref);

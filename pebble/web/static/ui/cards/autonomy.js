@@ -6,10 +6,10 @@ import { filled, lastScript, moreWords, remember, remembered, scripts, whyNotSen
 import { Form } from "./form.js";
 import { html, useMetric, useOnline, useState, useTick, useValue } from "../parts/hooks.js";
 import { Nothing } from "../parts/nothing.js";
-import { Icon, Why } from "../parts/parts.js";
+import { Icon, Why, useName } from "../parts/parts.js";
 import { useReasons, whyNotEnd } from "../parts/why-not.js";
 import { plain } from "../parts/more-words.js";
-import { clockTime, nameOf } from "../parts/words.js";
+import { clockTime } from "../parts/words.js";
 import { useMemo } from "../../vendor/hooks.mjs";
 
 const ASKED_MS = 10_000; // so long the page says that it has asked
@@ -23,6 +23,7 @@ export function Autonomy({ at }) {
   const entry = useMetric(at, "autonomy-status");
   const status = statusOf(entry?.value);
   const [chosen, choose] = useState(() => status.file || lastScript(at));
+  const name = useName(at);
   const find = (file) => listed?.find((one) => one.file === file);
   const script = find(chosen);
   const parts = { at, page, entry, status };
@@ -32,7 +33,7 @@ export function Autonomy({ at }) {
     ${!listed &&
     html`<${Nothing} icon="script" what="No list of scripts yet">Is autonomy_manager enabled in its config?<//>`}
     ${listed?.length === 0 &&
-    html`<${Nothing} icon="script" what=${`${nameOf(at)} has no scripts`}
+    html`<${Nothing} icon="script" what=${`${name} has no scripts`}
       >Put a folder with a run.py into its autonomy folder<//
     >`}
     ${Boolean(listed?.length) &&
@@ -127,7 +128,8 @@ function Starter({ at, page, entry, status, script }) {
   const form = filled(script.fields, texts);
   const why = whyNotStarted(page, at) || whyNotSent(form);
   const { by, waits } = handDriven(page, at);
-  const note = by && waits ? `${by} driving: the script will wait` : meaning(at, waits);
+  const name = useName(at);
+  const note = by && waits ? `${by} driving: the script will wait` : meaning(name, waits);
   const restore = (event) => {
     event.currentTarget.closest("li").querySelector("button").focus(); // the button vanishes
     change(new Map(), version + 1);
@@ -170,11 +172,12 @@ function Starter({ at, page, entry, status, script }) {
 }
 
 /** What a start means. */
-const meaning = (at, waits) => `${nameOf(at)} may move by itself${waits ? ". Drive by hand to interrupt it" : ""}`;
+const meaning = (name, waits) => `${name} may move by itself${waits ? ". Drive by hand to interrupt it" : ""}`;
 
 function StartButton({ at, page, entry, why, config, file, children }) {
   const [asked, setAsked] = useState(/** @type {{at: number, of: number | undefined, n: number} | null} */ (null));
   const answer = useAnswer(asked?.n);
+  const name = useName(at);
   const isAsked = asked !== null && Date.now() - asked.at < ASKED_MS && entry?.receivedAt === asked.of;
   useTick(isAsked ? 1000 : 0);
   const start = () => {
@@ -193,7 +196,7 @@ function StartButton({ at, page, entry, why, config, file, children }) {
       <${Icon} name="play" />${children}
     </button>
     <span role="status" class=${answer.op === "refused" ? "bad" : "dim"} data-test="asked"
-      >${isAsked && startedWords(answer, nameOf(at))}</span
+      >${isAsked && startedWords(answer, name)}</span
     >`;
 }
 

@@ -2,7 +2,7 @@
 
 import { Model, read, write } from "../parts/models.js";
 import { sectionOf, whyNot, whyNotEnd } from "../parts/why-not.js";
-import { nameOf } from "../parts/words.js";
+import { nameIn } from "../parts/looks.js";
 
 export const SHORTEST_S = 0.05;
 export const LONGEST_S = 10;
@@ -144,7 +144,7 @@ export function lightsOf(ref) {
 export function whyNotLights(page, ref, kind) {
   const why = whyNot(page, ref, "lights");
   if (why || supported(page.store.get(ref, "capabilities")?.value)[kind]) return why;
-  return `${nameOf(ref)} has no lights that ${kind === "flash" ? "flash" : "stay on"}`;
+  return `${nameIn(page.store, ref)} has no lights that ${kind === "flash" ? "flash" : "stay on"}`;
 }
 
 /**

@@ -2,9 +2,8 @@
 
 import { html, useModel } from "../parts/hooks.js";
 import { LONGEST_S, SHORTEST_S, lightsOf, toggleFlash, whyNotLights } from "./lights-model.js";
-import { Why } from "../parts/parts.js";
+import { Why, useName } from "../parts/parts.js";
 import { useReasons, whyNotEnd } from "../parts/why-not.js";
-import { nameOf } from "../parts/words.js";
 
 const COLOURS = {
   red: "#ff0000",
@@ -34,13 +33,14 @@ export function Lights({ at }) {
           key=${name}
           type="button"
           class="swatch"
+          title=${name}
           data-test=${`colour-${name}`}
           aria-pressed=${lights.colour === value}
           aria-describedby=${because}
           disabled=${off}
           onClick=${() => colour(value)}
         >
-          <i aria-hidden="true" style=${{ background: value }}></i>${name}
+          <i aria-hidden="true" style=${{ background: value }}></i><span class="sr">${name}</span>
         </button>`,
       )}
       <label class=${`swatch other ${off ? "off" : ""}`}>
@@ -52,7 +52,7 @@ export function Lights({ at }) {
           value=${lights.colour}
           onInput=${(event) => colour(event.currentTarget.value)}
         />
-        <span>other</span>
+        <span class="sr">other colour</span>
       </label>
     </div>
     <div class="ask-row">
@@ -64,7 +64,7 @@ export function Lights({ at }) {
       <${Period} page=${page} lights=${lights} why=${noFlash} />
     </div>
     ${why && html`<${Why} id="why-lights">${why}<//>`}
-    <p class="dim" data-test="lights-asked">${asked(lights)} ${nameOf(at)} does not report its lights.</p>
+    <p class="dim" data-test="lights-asked">${asked(lights)} ${useName(at)} does not report its lights.</p>
   </div>`;
 }
 

@@ -111,7 +111,8 @@ function Lines({ view, lines }) {
     if (view.follows && box.current) box.current.scrollTop = box.current.scrollHeight;
   });
   const scrolled = () => {
-    const { scrollTop, scrollHeight, clientHeight } = /** @type {HTMLElement} */ (box.current);
+    if (!box.current) return; // the card was left meanwhile
+    const { scrollTop, scrollHeight, clientHeight } = box.current;
     view.follow(scrollHeight - scrollTop - clientHeight < END_PX);
   };
   return html`<div

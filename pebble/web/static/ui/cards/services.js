@@ -3,7 +3,7 @@
 import { html, useOnline, usePage, useTick, useValue } from "../parts/hooks.js";
 import { logViewOf } from "../parts/log-view.js";
 import { plain } from "../parts/more-words.js";
-import { inner, isObject, roughly } from "../parts/words.js";
+import { inner, isObject, mediaOf, roughly } from "../parts/words.js";
 
 const MOST = 64;
 const RECENT_MS = 600_000;
@@ -15,6 +15,7 @@ export function Services({ at, view }) {
   const { services, mcu } = inner(useValue(at, "status")) ?? {};
   const times = useValue(at, "web/restarts")?.times ?? {};
   const online = useOnline(at);
+  const media = mediaOf(useValue(at, "media-status"));
   useTick(5000);
   if (!isObject(services)) return html`<p class="dim">It reports no services.</p>`;
   const names = Object.keys(services);
@@ -36,7 +37,20 @@ export function Services({ at, view }) {
     ${Object.entries(isObject(mcu) ? mcu : {})
       .slice(0, MOST)
       .map(([name, line]) => html`<${SerialLine} key=${`mcu ${name}`} name=${name} online=${online} line=${line} />`)}
+    ${media.map(
+      ([name, report]) => html`<li key=${`media ${name}`} class=${online ? "" : "dim"} data-test=${`media-${name}`}>
+        <i aria-hidden="true">${report?.running ? SIGNS.ready : SIGNS.init}</i>
+        <span class="services-name">${name.replaceAll("_", " ")}</span>
+        <span class="services-more">${online ? "" : "was: "}${mediaWords(report)}</span>
+      </li>`,
+    )}
   </ul>`;
+}
+
+function mediaWords(report) {
+  if (!isObject(report)) return plain(report);
+  if (report.last_error) return plain(report.last_error);
+  return report.running ? plain(report.doing ?? "running") : "rests";
 }
 
 function Service({ at, view, name, online, one, times }) {

@@ -1,11 +1,10 @@
 // The clips that a robot can play.
 
 import { html, useModel, useOnline, useValue } from "../parts/hooks.js";
-import { Icon, Why } from "../parts/parts.js";
+import { Icon, Why, useName } from "../parts/parts.js";
 import { clips, grouped, play, playing, repeatLast, soundsOf } from "./sounds-model.js";
 import { useReasons, whyNot, whyNotEnd } from "../parts/why-not.js";
 import { plain } from "../parts/more-words.js";
-import { nameOf } from "../parts/words.js";
 import { useMemo } from "../../vendor/hooks.mjs";
 
 const MOST = 60; // clips that are listed at a time
@@ -66,12 +65,13 @@ function NowPlaying({ at, page }) {
 
 function Clips({ at, page, sounds, why }) {
   const payload = useValue(at, "soundboard-files");
+  const name = useName(at);
   const files = useMemo(() => clips(payload), [payload]);
   const { filter } = sounds;
   const shown = useMemo(() => grouped(files ?? [], filter, MOST), [files, filter]);
   const now = playing(useValue(at, "soundboard-status")).file;
   if (!files) return html`<p class="dim">No list of clips was received yet: is soundboard_handler enabled in its config?</p>`;
-  if (!files.length) return html`<p class="dim">No clips: put sound files into ${nameOf(at)}'s folder of sounds.</p>`;
+  if (!files.length) return html`<p class="dim">No clips: put sound files into ${name}'s folder of sounds.</p>`;
   return html`<input
       type="search"
       class="wide"
@@ -99,6 +99,9 @@ function Clips({ at, page, sounds, why }) {
     </div>`;
 }
 
+/** Without what kind of file it is. @param {string} name */
+const called = (name) => plain(name).replace(/\.(wav|mp3|ogg|flac|opus)$/i, "");
+
 function Clip({ at, page, file, folder, plays, why: whyNotPlay }) {
   const why = plays ? whyNotEnd(page) : whyNotPlay;
   const press = () => {
@@ -115,6 +118,6 @@ function Clip({ at, page, file, folder, plays, why: whyNotPlay }) {
     aria-label=${`${plays ? "Stop" : "Play"} ${plain(file)}`}
     onClick=${press}
   >
-    <${Icon} name=${plays ? "halt" : "play"} /><span>${plain(file.slice(folder.length) || file)}</span>
+    <${Icon} name=${plays ? "halt" : "play"} /><span>${called(file.slice(folder.length) || file)}</span>
   </button>`;
 }

@@ -6,10 +6,10 @@ import { html, useEffect, useModel, usePage, useState, useTick, useValue } from 
 import { logViewOf } from "../parts/log-view.js";
 import { Model } from "../parts/models.js";
 import { Panel } from "../panels/panel.js";
-import { HoldButton, Icon, Why } from "../parts/parts.js";
+import { HoldButton, Icon, Why, useName } from "../parts/parts.js";
 import { useReasons, whyNot, whyNotEnd } from "../parts/why-not.js";
 import { plain } from "../parts/more-words.js";
-import { clockTime, driverName, nameOf } from "../parts/words.js";
+import { clockTime, driverName } from "../parts/words.js";
 
 /** @typedef {import("../../core/outcome.js").Action} Action */
 
@@ -73,7 +73,7 @@ const whyNotAct = (page, at, offers, action) =>
 
 function Ask({ at, action, offers, onClose }) {
   const page = useReasons(at);
-  const name = nameOf(at);
+  const name = useName(at);
   const { title, effects } = ACTIONS[action];
   const why = whyNotAct(page, at, offers, action);
   const held = () => {

@@ -4,9 +4,10 @@ import { html, useMetric, useOnline, useTick, useValue } from "../parts/hooks.js
 import { Live } from "../parts/parts.js";
 import { poseOf, poseWords } from "../../core/trail.js";
 import { charging, plain } from "../parts/more-words.js";
-import { battery, inner, isObject, number, roughly, span } from "../parts/words.js";
+import { battery, inner, isObject, mediaOf, number, roughly, span } from "../parts/words.js";
 
 const STREAM_MS = 1000;
+const LEVEL_DEG = 3;
 
 export function Telemetry({ at }) {
   const online = useOnline(at);
@@ -14,12 +15,12 @@ export function Telemetry({ at }) {
     <${Row} at=${at} metric="charging-level" name="Battery" online=${online}>${battery}<//>
     <${Row} at=${at} metric="charging-status" name="Charger" online=${online}>${charging}<//>
     <${Heartbeat} at=${at} />
-    <${Row} at=${at} metric="sensors/imu" name="Roll, pitch" online=${online} streams>${attitude}<//>
+    <${Row} at=${at} metric="sensors/imu" name="Tilt" online=${online} streams>${attitude}<//>
     <${Row} at=${at} metric="sensors/imu" name="Turn rate" online=${online} streams>${rate}<//>
     <${Row} at=${at} metric="sensors/imu" name="Acceleration" online=${online} streams>${acceleration}<//>
     <${Row} at=${at} metric="touch-sensors" name="Touch" online=${online} streams>${touch}<//>
     <${Row} at=${at} metric="wheel-odometry" name="Odometry" online=${online} streams>${odometry}<//>
-    <${Media} at=${at} online=${online} />
+    <${Troubles} at=${at} online=${online} />
   </dl>`;
 }
 
@@ -51,7 +52,7 @@ function Heartbeat({ at }) {
     ? "unknown: its clock counts whole seconds"
     : liveness.latency_ms === null
       ? "–"
-      : `${span(liveness.latency_ms)}${average === null ? "" : `, on average ${span(average)}`}`;
+      : `late by ${span(liveness.latency_ms)}${average === null ? "" : `, on average ${span(average)}`}`;
   return html`<div>
       <dt>Heartbeat</dt>
       <dd class=${liveness.online === false ? "bad" : ""}>${seen}</dd>
@@ -66,7 +67,8 @@ const degrees = (value) => `${number(value, 1)}°`;
 
 function attitude(payload) {
   const angles = inner(payload)?.orientation_deg;
-  return `${degrees(angles?.roll)}, ${degrees(angles?.pitch)}`;
+  const level = [angles?.roll, angles?.pitch].every((one) => Math.abs(one) < LEVEL_DEG);
+  return level ? "level" : `roll ${degrees(angles?.roll)}, pitch ${degrees(angles?.pitch)}`;
 }
 
 const rate = (payload) => `${number(inner(payload)?.gyro_dps?.z, 1)} °/s`;
@@ -84,23 +86,14 @@ function touch(payload) {
   return isObject(value) ? Object.values(value).slice(0, 8).map(plain).join(" · ") : plain(value);
 }
 
-function Media({ at, online }) {
-  const entry = useMetric(at, "media-status");
-  const streams = inner(entry?.value);
-  if (!isObject(streams)) return null;
-  return Object.entries(streams)
-    .slice(0, 8)
+/** What fails of camera and sound; how they run is with the services. */
+function Troubles({ at, online }) {
+  return mediaOf(useValue(at, "media-status"))
+    .filter(([, report]) => report?.last_error)
     .map(
       ([name, report]) => html`<div key=${name}>
         <dt>${name.replaceAll("_", " ")}</dt>
-        <dd class=${report?.last_error ? "bad" : ""}>
-          ${online ? "" : "was: "}${report?.last_error ? `✖ ${plain(report.last_error)}` : mediaWords(report)}
-        </dd>
+        <dd class="bad">${online ? "" : "was: "}✖ ${plain(report.last_error)}</dd>
       </div>`,
     );
-}
-
-function mediaWords(report) {
-  if (!isObject(report)) return plain(report);
-  return report.running ? plain(report.doing ?? "running") : "rests";
 }

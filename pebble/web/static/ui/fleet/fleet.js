@@ -2,6 +2,7 @@
 
 import { ROOT } from "../../core/browser.js";
 import { doubtOf } from "./doubt.js";
+import { Bands, progressOf } from "../banner.js";
 import { Liveness } from "../header.js";
 import {
   Boundary,
@@ -17,9 +18,9 @@ import {
   useValue,
 } from "../parts/hooks.js";
 import { Offers, Route, WATCHES } from "../parts/models.js";
-import { charge, hasFace, looksOf } from "../parts/looks.js";
+import { charge, hasFace, looksOf, nameIn } from "../parts/looks.js";
 import { plain, shortTime } from "../parts/more-words.js";
-import { Charge, Drawing, Icon, RouteLink, StopButton } from "../parts/parts.js";
+import { Charge, Drawing, Drop, Icon, RouteLink, StopButton } from "../parts/parts.js";
 import { RecordingsLink } from "./recordings-link.js";
 import { battery, driverName, inner, isObject, kindOf, nameOf, roughly, typeOf, visible } from "../parts/words.js";
 
@@ -28,6 +29,7 @@ const LIVE_MS = 12_000; // a thumbnail that young is of now
 const DENSE = 13; // so many components are shown in small cards, and by what they need
 const NEEDS_MS = 10_000; // so long a card stays among those that need a look
 const LOW_PERCENT = 20;
+const isRobot = (ref) => typeOf(ref) === "robots";
 const SORTS = { name: "name", type: "type", battery: "battery" };
 
 export function Fleet() {
@@ -43,29 +45,30 @@ export function Fleet() {
   useEffect(() => {
     online.forEach((ref) => settings.forgotten.has(ref) && settings.forget(ref, false));
   }, [online.join()]);
-  const matches = (ref) => ref.toLowerCase().includes(filter.trim().toLowerCase());
+  const matches = (ref) => `${ref} ${nameIn(store, ref)}`.toLowerCase().includes(filter.trim().toLowerCase());
   const shown = sorted(store, online.filter(matches), settings.sort);
   const shownAway = away.filter(matches).sort();
   const total = online.length + away.length;
-  const robots = refs.filter((ref) => typeOf(ref) === "robots" && (online.includes(ref) || away.includes(ref)));
+  const robots = refs.filter((ref) => isRobot(ref) && (online.includes(ref) || away.includes(ref)));
   const present = robots.filter((ref) => online.includes(ref));
   const others = total - robots.length;
-  const stopped = connection.isOpen ? present.filter((ref) => store.get(ref, "web/estop")?.value.latched) : [];
   const dense = total >= DENSE;
   const needing = useNeeding(store, dense ? shown : []);
   const groups = [
-    { title: dense ? "Need a look" : "", list: shown.filter((ref) => !dense || needing.has(ref)) },
-    { title: "Online", list: shown.filter((ref) => dense && !needing.has(ref)) },
+    { title: dense ? "Need a look" : "", list: shown.filter((ref) => dense ? needing.has(ref) : isRobot(ref)) },
+    { title: dense ? "Online" : "Others", list: shown.filter((ref) => dense ? !needing.has(ref) : !isRobot(ref)) },
   ].filter(({ list }) => list.length);
   return html`<div class="fleet">
     <div class="fleet-head">
-      <h1>
+      <div class="screen-title">
+        <h1>
         ${total === 0
           ? "Robots"
           : `${robots.length} ${robots.length === 1 ? "robot" : "robots"}${connection.isOpen ? `, ${present.length} online` : ""}`}
         ${others > 0 && html`<span class="dim"> and ${others} ${others === 1 ? "other" : "others"}</span>`}
-        ${stopped.length > 0 && html` <span class="chip stopped" data-test="stopped">${stopped.length} stopped</span>`}
-      </h1>
+        </h1>
+        <${Bands} at="" />
+      </div>
       ${total > 0 ? html`<${FleetTools} filter=${filter} onFilter=${setFilter} />` : html`<${RecordingsLink} />`}
     </div>
     ${omitted > 0 &&
@@ -75,7 +78,7 @@ export function Fleet() {
     </p>`}
     ${total === 0 && html`<${Empty} />`}
     ${total > 0 && !shown.length && !shownAway.length && html`<p class="empty">Nothing matches “${filter}”.</p>`}
-    ${groups.map(({ title, list }) => html`<${Group} key=${title} title=${title} refs=${list} />`)}
+    ${groups.map(({ title, list }) => html`<${Group} key=${title} title=${title} dense=${dense} refs=${list} />`)}
     ${total > 0 && !dense && !WATCHES && html`<${FirstTime} refs=${present} />`}
     ${shownAway.length > 0 &&
     html`<section class="away" aria-labelledby="away-title">
@@ -99,8 +102,8 @@ function sorted(store, refs, by) {
     const value = inner(store.get(ref, "charging-level")?.value);
     return typeof value === "number" ? value : Infinity;
   };
-  const robotsFirst = (ref) => `${typeOf(ref) === "robots" ? 0 : 1} ${nameOf(ref)}`;
-  const keys = { name: robotsFirst, type: (ref) => `${typeOf(ref)} ${nameOf(ref)}`, battery: level };
+  const robotsFirst = (ref) => `${typeOf(ref) === "robots" ? 0 : 1} ${nameIn(store, ref).toLowerCase()}`;
+  const keys = { name: robotsFirst, type: (ref) => `${typeOf(ref)} ${nameIn(store, ref).toLowerCase()}`, battery: level };
   const key = keys[by] ?? robotsFirst;
   return [...refs].sort((a, b) => (key(a) < key(b) ? -1 : key(a) > key(b) ? 1 : a < b ? -1 : 1));
 }
@@ -139,9 +142,7 @@ function FleetTools({ filter, onFilter }) {
     <button type="button" class="to-phone" data-test="phone" onClick=${() => panels.show("phone")}>
       <${Icon} name="phone" />Open on a phone
     </button>
-    <details class="fleet-more" onKeyDown=${closeByEscape} onFocusOut=${closeWhenLeft}>
-      <summary class="button" data-test="fleet-more">More</summary>
-      <div class="fleet-more-list">
+    <${Drop} test="fleet-more" look="button" summary="More">
         <label class="field"
           ><span>Sort by</span>
           <select
@@ -165,17 +166,8 @@ function FleetTools({ filter, onFilter }) {
         <a class="button" data-test="watch" href=${Route.path("", !WATCHES)}
           >${WATCHES ? "Show all controls" : "Only watch"}</a
         >
-      </div>
-    </details>
+    <//>
   </div>`;
-}
-
-function closeByEscape(event) {
-  if (event.key === "Escape") event.currentTarget.open = false;
-}
-
-function closeWhenLeft(event) {
-  if (event.relatedTarget && !event.currentTarget.contains(event.relatedTarget)) event.currentTarget.open = false;
 }
 
 /** What one can do in the first minutes; each is ticked when it was begun. */
@@ -185,7 +177,7 @@ function FirstTime({ refs }) {
   useModel(connection, (one) => one.you);
   if (settings.begun.includes("hidden")) return null;
   const offers = (ref) => new Offers(ref, store.get(ref, "capabilities")?.value);
-  const named = (ref) => looksOf(ref, store.get(ref, "capabilities")?.value).name;
+  const named = (ref) => nameIn(store, ref);
   const drives = refs.find((ref) => offers(ref).drives);
   const scripts = refs.find((ref) => offers(ref).section("autonomy").available);
   if (!drives) return null;
@@ -217,6 +209,13 @@ function FirstTime({ refs }) {
   </section>`;
 }
 
+/** To a first robot. */
+const WAYS = [
+  ["Try simulated ones", "Four drive in a room of their own, at a broker of their own.", "make demo"],
+  ["Start your robot", "Its config names this server's broker.", "pebble up my.json"],
+  ["In any other language", "A retained message with its heartbeat makes it known here.", "pebble/robots/ID/outgoing/online"],
+];
+
 function Empty() {
   const { connection } = usePage();
   return html`<div class="empty">
@@ -226,6 +225,10 @@ function Empty() {
         ? "No robot has been seen yet. It appears here as soon as it is switched on and reaches the broker."
         : "Connecting to the server…"}
     </p>
+    ${connection.state === "open" &&
+    html`<ul class="ways">
+      ${WAYS.map(([title, how, code]) => html`<li key=${title}><b>${title}</b><span class="dim">${how}</span><code>${code}</code></li>`)}
+    </ul>`}
   </div>`;
 }
 
@@ -265,16 +268,13 @@ function FleetCard({ at }) {
   const id = nameOf(at);
   const called = looks.name.toLowerCase() === id.toLowerCase() ? "" : visible(id);
   const what = hasFace(at) ? looks.description : kindOf(at);
+  const pictured = (settings.thumbnails || WATCHES) && hasFace(at);
   return html`<article
     class=${`fleet-card tint-${looks.colour} ${estop?.latched ? "is-stopped" : ""}`}
     data-test=${`card-${id}`}
     aria-label=${looks.name}
   >
-    ${(settings.thumbnails || WATCHES) && hasFace(at) && html`<${Thumbnail} at=${at} has=${offers.hasVideo} looks=${looks} />`}
-    ${estop?.latched &&
-    html`<p class="stripe">
-      <b>Stopped</b>${estop.by ? ` by ${estop.by}` : ""}${estop.since > 0 ? `, ${shortTime(estop.since)}` : ""}
-    </p>`}
+    ${pictured && html`<${Thumbnail} at=${at} has=${offers.hasVideo} looks=${looks} />`}
     <div class="fleet-card-head">
       <${Badge} at=${at} looks=${looks} />
       <${RouteLink} to=${at} className="fleet-card-link">
@@ -287,7 +287,7 @@ function FleetCard({ at }) {
       <ul class="facts">
         <${BatteryFact} at=${at} online=${connection.isOpen} />
         ${connection.isOpen && html`<${DoubtFact} at=${at} />`}
-        <${DriverFact} at=${at} offers=${offers} online=${connection.isOpen} stopped=${estop?.latched} />
+        <${DriverFact} at=${at} offers=${offers} online=${connection.isOpen} estop=${estop} pictured=${pictured} />
         <${ScriptFact} at=${at} online=${connection.isOpen} />
         ${typeOf(at) !== "robots" ? html`<${StatusFact} at=${at} />` : html`<${ServiceFact} at=${at} />`}
       </ul>
@@ -306,6 +306,17 @@ function FleetCard({ at }) {
   </article>`;
 }
 
+/** Over its picture: that it is stopped, or does not confirm it. */
+function Stripe({ at }) {
+  const estop = useValue(at, "web/estop");
+  useTick(estop?.sending ? 500 : 0);
+  const unconfirmed = progressOf(usePage().store, at)?.kind === "bad";
+  const words = unconfirmed ? "STOP not confirmed" : estop?.latched ? stopWords(estop) : "";
+  return words && html`<p class="stripe">${words}</p>`;
+}
+
+const stopWords = ({ by, since }) => `Stopped${by ? ` by ${by}` : ""}${since > 0 ? `, ${shortTime(since)}` : ""}`;
+
 /** The face of a robot, or the icon of what is none. */
 const Badge = ({ at, looks }) => html`<span class="badge"
   >${hasFace(at) ? html`<${Drawing} picture=${looks.picture} />` : html`<${Icon} name=${iconOf(at)} />`}</span
@@ -322,13 +333,14 @@ function BatteryFact({ at, online }) {
   </li>`;
 }
 
-function DriverFact({ at, offers, online, stopped }) {
+function DriverFact({ at, offers, online, estop, pictured }) {
   const view = useValue(at, "web/driver");
   const doubt = doubtOf(useValue(at, "status")).text;
-  if (!online) return null;
   if (!offers.known && !offers.drives) return null;
+  if (!online && offers.drives) return html`<li class="fact dim"><${Icon} name="wheel" />who drives is not known</li>`;
   if (!offers.drives) return html`<li class="fact dim"><${Icon} name="wheel" />does not drive</li>`;
-  if (!view?.by) return stopped || doubt ? null : html`<li class="fact dim"><${Icon} name="wheel" />nobody drives</li>`;
+  if (estop?.latched) return html`<li class="fact dim"><${Icon} name="stop" />${pictured ? "reset it to drive" : stopWords(estop)}</li>`;
+  if (!view?.by) return doubt ? null : html`<li class="fact dim"><${Icon} name="wheel" />nobody drives</li>`;
   return html`<li class="fact">
     <${Icon} name="wheel" />${view.you ? html`<b>driven by you</b>` : `driven by ${driverName(view)}`}
   </li>`;
@@ -336,7 +348,8 @@ function DriverFact({ at, offers, online, stopped }) {
 
 function ScriptFact({ at, online }) {
   const status = useValue(at, "autonomy-status");
-  if (!online || !status?.running) return null;
+  if (!status?.running) return null;
+  if (!online) return html`<li class="fact dim"><${Icon} name="script" />script: not known</li>`;
   return html`<li class="fact"><${Icon} name="script" />script: ${plain(status.file ?? "?")}${status.waiting_for ? ", waiting" : ""}</li>`;
 }
 
@@ -368,12 +381,13 @@ function Thumbnail({ at, has, looks }) {
     ${count > 0 &&
     html`<img
       hidden=${!takenAt}
-      alt=${`What ${visible(nameOf(at))} sees`}
+      alt=${`What ${looks.name} sees`}
       src=${`${ROOT}api/snapshot.jpg?ref=${encodeURIComponent(at)}&n=${count}`}
       onLoad=${() => setTakenAt(performance.now())}
     />`}
     ${!takenAt && html`<${Drawing} picture=${looks.picture} />`}
     <span class=${`tag ${words === "live" ? "live" : ""}`}>${words}</span>
+    <${Stripe} at=${at} />
   </div>`;
 }
 
@@ -400,7 +414,7 @@ function AwayRow({ at }) {
     <button
       type="button"
       data-test="forget"
-      aria-label=${`Forget ${nameOf(at)}`}
+      aria-label=${`Forget ${looks.name}`}
       onClick=${() => settings.forget(at)}
     >
       Forget
@@ -412,13 +426,13 @@ function AwayRow({ at }) {
  * One list of cards. Each card is drawn again only when it changes by itself: Preact passes over a node that it has drawn
  * before, in the same list.
  */
-function Group({ title, refs }) {
+function Group({ title, dense, refs }) {
   const cards = useRef(new Map());
   const old = cards.current;
   cards.current = new Map(refs.map((ref) => [ref, old.get(ref) ?? cardOf(ref)]));
   return html`<section aria-label=${title || "Robots"}>
     ${title && html`<h2 class="fleet-group">${title}</h2>`}
-    <ul class=${`fleet-cards ${title ? "dense" : ""}`}>
+    <ul class=${`fleet-cards ${dense ? "dense" : ""}`}>
       ${[...cards.current.values()]}
     </ul>
   </section>`;

@@ -5,7 +5,8 @@ import { DoubtMark } from "./doubt.js";
 import { html, useCalm, useEffect, useModel, usePage, useRefs, useState, useValue } from "../parts/hooks.js";
 import { Model, read, write } from "../parts/models.js";
 import { Panel } from "../panels/panel.js";
-import { Icon, RouteLink } from "../parts/parts.js";
+import { nameIn } from "../parts/looks.js";
+import { Icon, RouteLink, useName } from "../parts/parts.js";
 import { RecordingsLink } from "./recordings-link.js";
 import { shortTime } from "../parts/more-words.js";
 import { battery, inner, isObject, nameOf } from "../parts/words.js";
@@ -164,9 +165,9 @@ export function Bell({ at, wide, room = wide }) {
 
 /** Read aloud, at most one a second. Of the component that is open the banners are read. */
 function Announcement({ newest }) {
-  const { route } = usePage();
+  const { route, store } = usePage();
   const banner = newest && newest.ref === route.ref && ["offline", "stop", "undriveable"].includes(newest.kind);
-  const text = useCalm(newest?.unread && !banner ? `${nameOf(newest.ref)} ${newest.text}` : "");
+  const text = useCalm(newest?.unread && !banner ? `${nameIn(store, newest.ref)} ${newest.text}` : "");
   return html`<span class="sr" role="status" data-test="announcement">${text}</span>`;
 }
 
@@ -193,7 +194,7 @@ function Row({ one, isNew, onGo }) {
     <${RouteLink} to=${ref} className="notice-link">
       <i aria-hidden="true">${SIGNS[kind]}</i>
       <span class="notice-text">
-        <b>${nameOf(ref)}</b> ${text}${count > 1 && html` <small>${count}× since ${shortTime(since)}</small>`}
+        <b>${useName(ref)}</b> ${text}${count > 1 && html` <small>${count}× since ${shortTime(since)}</small>`}
       </span>
       <time>${shortTime(at)}</time>
     <//>
@@ -225,7 +226,7 @@ function Limit({ at, model }) {
   };
   return html`<li>
     <label class="limit"
-      ><span>${nameOf(at)} <small>now ${battery(level)}</small></span
+      ><span>${useName(at)} <small>now ${battery(level)}</small></span
       ><span>below</span
       ><input
         type="number"

@@ -5,7 +5,7 @@ import { qrCode, pathOf } from "../../core/qr.js";
 import { html, useModel, usePage } from "../parts/hooks.js";
 import { Route } from "../parts/models.js";
 import { Panel } from "./panel.js";
-import { nameOf } from "../parts/words.js";
+import { useName } from "../parts/parts.js";
 
 const QUIET = 4; // modules around the code
 
@@ -20,6 +20,7 @@ export function PhonePanel({ onClose }) {
 export const isLoopback = (host) => /^(127\.[\d.]+|0\.0\.0\.0|\[::1?\]|localhost|.*\.localhost)$/.test(host);
 
 function Code({ at }) {
+  const name = useName(at);
   const whole = location.origin + Route.path(at, false);
   const grid = qrCode(whole);
   const address = grid ? whole : location.origin + ROOT;
@@ -27,7 +28,7 @@ function Code({ at }) {
     <${Drawn} grid=${grid ?? qrCode(address)} text=${address} />
     <p class="address" data-test="address">${address}</p>
     <p>
-      ${at && grid ? `Opens ${nameOf(at)}.` : "Opens the list of all robots."} The phone has to be in this network, and
+      ${at && grid ? `Opens ${name}.` : "Opens the list of all robots."} The phone has to be in this network, and
       its user logs in; there is no password in the code.
     </p>
     ${location.protocol === "https:" &&

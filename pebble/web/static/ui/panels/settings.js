@@ -4,9 +4,8 @@ import { html, useModel, usePage } from "../parts/hooks.js";
 import { lacks } from "../parts/lacks.js";
 import { NoticeList } from "../fleet/notices.js";
 import { Panel } from "./panel.js";
-import { Icon } from "../parts/parts.js";
+import { Icon, useName } from "../parts/parts.js";
 import { RecordingsLink } from "../fleet/recordings-link.js";
-import { nameOf } from "../parts/words.js";
 
 const THEMES = { auto: "as the system", light: "light", dark: "dark" };
 const SIDES = { left: "on the left", right: "on the right" };
@@ -21,6 +20,7 @@ export function SettingsPanel({ onClose }) {
   const { settings, driver, panels } = usePage();
   useModel(settings);
   useModel(driver);
+  const name = useName(driver.ref);
   const narrow = !document.querySelector(".bell"); // else the list is behind a button of its own
   return html`<${Panel} id="settings" title="Settings" onClose=${onClose}>
     <${WhoAmI} />
@@ -46,10 +46,14 @@ export function SettingsPanel({ onClose }) {
           driver.changed();
         }}
       >
-        I can see ${nameOf(driver.ref)}: drive with an old picture, too. In this tab
+        I can see ${name}: drive with an old picture, too. In this tab
       <//>`}
     </fieldset>
     <div class="panel-links">
+      ${settings.cards &&
+      html`<button type="button" class="wide" data-test="arrange" onClick=${() => (settings.cards.reset(), onClose())}>
+        <${Icon} name="list" />Arrange the cards as new
+      </button>`}
       <div onClick=${onClose}><${RecordingsLink} at=${driver.ref} className="button wide" /></div>
       ${MORE.map(
         ({ name, icon, text }) => html`<button

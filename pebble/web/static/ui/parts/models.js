@@ -126,6 +126,8 @@ function below(folder) {
 export class Settings extends Model {
   constructor() {
     super();
+    /** @type {CardView | null} those of the component that is open */
+    this.cards = null;
     this.theme = read("theme", "auto");
     this.thumbnails = read("thumbnails", true) === true;
     this.begun = list(read("begun", [])); // of what is shown to who is here for the first time

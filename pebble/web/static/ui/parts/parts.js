@@ -194,6 +194,25 @@ function CardMenu({ title, id, view, isFirst, ids }) {
   </div>`;
 }
 
+/** A list below a button, closed by Escape and when the focus leaves it. @param {any} props */
+export function Drop({ summary, test, look = "", className = "", children }) {
+  const place = useRef(/** @type {HTMLDetailsElement | null} */ (null));
+  const close = () => (place.current.open = false);
+  useEffect(() => {
+    const end = (event) => event.key === "Escape" && close();
+    addEventListener("keydown", end);
+    return () => removeEventListener("keydown", end);
+  }, []);
+  return html`<details
+    class=${`drop ${className}`}
+    ref=${place}
+    onFocusOut=${(event) => event.relatedTarget && !event.currentTarget.contains(event.relatedTarget) && close()}
+  >
+    <summary class=${look} data-test=${test}>${summary}</summary>
+    <div class="drop-list">${children}</div>
+  </details>`;
+}
+
 /** A part of the page that is fetched when it is first shown; ``now``: even before the first picture. */
 export function Part({ part, now = false, lines = 3, ...props }) {
   const { body, failed } = usePart(part, now);
@@ -229,10 +248,13 @@ export function useStream(at) {
 /** What people call it. @param {string} at @returns {string} */
 export const useName = (at) => looksOf(at, useValue(at, "capabilities")).name;
 
-/** In percent where its cells are known. @param {{at: string, level: any, online: boolean}} props ``level``: its entry */
-export function Charge({ at, level, online }) {
+/**
+ * In percent where its cells are known. ``level``: its entry. ``digits``: of volts
+ * @param {{at: string, level: any, online: boolean, digits?: number}} props
+ */
+export function Charge({ at, level, online, digits = 2 }) {
   const { cells } = looksOf(at, useValue(at, "capabilities"));
-  return html`<${Live} entry=${level} online=${online}>${chargeWords(level.value, cells)}<//>`;
+  return html`<${Live} entry=${level} online=${online}>${chargeWords(level.value, cells, digits)}<//>`;
 }
 
 /** The drawing of a robot, in its colour; nothing of a component that is none. @param {{at: string}} props */

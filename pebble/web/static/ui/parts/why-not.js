@@ -1,7 +1,8 @@
 // Why nothing can be asked of a component now, besides driving: the first reason counts.
 
 import { useModel, usePage, useValue } from "./hooks.js";
-import { inner, isObject, nameOf } from "./words.js";
+import { nameIn } from "./looks.js";
+import { inner, isObject } from "./words.js";
 
 /** @typedef {{store: import("../../core/store.js").Store, connection: import("./models.js").Connection}} Services */
 
@@ -27,9 +28,9 @@ export function whyNot(page, ref, section = "", right = "drive") {
   if (why) return why;
   const { store } = page;
   if (store.get("", "web/broker")?.value.problem) return "The server cannot reach the broker";
-  if (store.get(ref, "web/liveness")?.value.online === false) return `${nameOf(ref)} is silent`;
+  if (store.get(ref, "web/liveness")?.value.online === false) return `${nameIn(store, ref)} is silent`;
   return sectionOf(store.get(ref, "capabilities")?.value, section).controls === false
-    ? `${nameOf(ref)} takes no such commands`
+    ? `${nameIn(store, ref)} takes no such commands`
     : "";
 }
 

@@ -6,7 +6,7 @@ export { isObject, visible };
 
 const time = new Intl.DateTimeFormat("en-GB", { hour: "2-digit", minute: "2-digit", second: "2-digit" });
 
-/** @param {string} ref @returns {string} the last level: what people call it */
+/** @param {string} ref @returns {string} the last level, its id: nameIn of looks.js is what people call it */
 export const nameOf = (ref) => ref.slice(ref.lastIndexOf("/") + 1);
 
 /** @param {string} ref @returns {string} "robots", "towers", … */
@@ -46,12 +46,18 @@ export function reported(status) {
   return key && typeof value[key] === "string" ? value[key] : "";
 }
 
-/** @param {unknown} payload of charging-level @returns {string} 7.92 V, 81 % */
-export function battery(payload) {
+/** @param {unknown} payload of charging-level @param {number} [digits] of volts @returns {string} 7.92 V, 81 % */
+export function battery(payload, digits = 2) {
   const value = inner(payload);
   const unit = isObject(payload) && typeof payload.unit === "string" ? payload.unit : "";
-  if (unit.toLowerCase() === "v") return `${number(value, 2)} V`;
+  if (unit.toLowerCase() === "v") return `${number(value, digits)} V`;
   return `${number(value, 1)}${unit ? ` ${unit}` : ""}`;
+}
+
+/** @param {unknown} payload of media-status @returns {[string, any][]} what each of them reports */
+export function mediaOf(payload) {
+  const streams = inner(payload);
+  return isObject(streams) ? Object.entries(streams).slice(0, 8) : [];
 }
 
 /** @param {any} view DriverView @returns {string} "bob (phone)", "bob at fair-1" */

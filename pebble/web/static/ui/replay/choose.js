@@ -1,13 +1,15 @@
 // Which day and which robot.
 
 import { Archive } from "../../core/replay/archive.js";
+import { Bands } from "../banner.js";
 import { ROOT } from "../../core/browser.js";
 import { html, useEffect, useModel, usePage, useState } from "../parts/hooks.js";
 import { Icon, RouteLink } from "../parts/parts.js";
 import { recordingsOf } from "../fleet/recordings-link.js";
 import { iconOf } from "../fleet/fleet.js";
+import { nameIn } from "../parts/looks.js";
 import { shortTime } from "../parts/more-words.js";
-import { clockTime, nameOf } from "../parts/words.js";
+import { clockTime } from "../parts/words.js";
 
 const date = new Intl.DateTimeFormat("en-GB", { weekday: "short", day: "numeric", month: "short", year: "numeric" });
 const short = new Intl.DateTimeFormat("en-GB", { day: "numeric", month: "short" });
@@ -66,7 +68,7 @@ export function Choose() {
     route.changed();
   }, [shown]);
   return html`<div class="replay-choose">
-    <h1>Recordings</h1>
+    <div class="screen-title"><h1>Recordings</h1><${Bands} at="" /></div>
     ${problem &&
     html`<p class="failed" role="alert">
       The recordings cannot be listed: ${problem} <button type="button" onClick=${again}>Try again</button>
@@ -90,6 +92,7 @@ export function Choose() {
 const mostDriven = ({ robots, driven = {} }) => [...robots].sort((a, b) => (driven[b] ?? 0) - (driven[a] ?? 0))[0];
 
 function Day({ one: { day, robots, bytes, first, last, gaps, unread } }) {
+  const { store } = usePage();
   const facts = [`${shortTime(first)} to ${shortTime(last)}`, sizeWords(bytes), gaps ? `${gaps} ${gaps === 1 ? "gap" : "gaps"}` : ""];
   return html`<li class="replay-day" data-test=${`day-${day}`}>
     <div>
@@ -100,8 +103,8 @@ function Day({ one: { day, robots, bytes, first, last, gaps, unread } }) {
     <ul class="replay-robots">
       ${robots.map(
         (ref) => html`<li key=${ref}>
-          <${RouteLink} path=${addressOf(ref, day)} className="button" label=${`${nameOf(ref)} on ${longDay(day)}`}
-            ><${Icon} name=${iconOf(ref)} />${nameOf(ref)}<//
+          <${RouteLink} path=${addressOf(ref, day)} className="button" label=${`${nameIn(store, ref)} on ${longDay(day)}`}
+            ><${Icon} name=${iconOf(ref)} />${nameIn(store, ref)}<//
           >
         </li>`,
       )}
@@ -111,7 +114,7 @@ function Day({ one: { day, robots, bytes, first, last, gaps, unread } }) {
 
 /** Another robot, or another day. */
 export function Elsewhere({ at, replay }) {
-  const { route } = usePage();
+  const { route, store } = usePage();
   const { days } = useDays();
   useModel(replay);
   const { day } = replay;
@@ -133,7 +136,7 @@ export function Elsewhere({ at, replay }) {
           value=${at}
           onChange=${(event) => route.open(`${recordingsOf(event.currentTarget.value)}?at=${Math.round(replay.player.position)}`)}
         >
-          ${robots.map((ref) => html`<option key=${ref} value=${ref}>${nameOf(ref)}</option>`)}
+          ${robots.map((ref) => html`<option key=${ref} value=${ref}>${nameIn(store, ref)}</option>`)}
         </select></label
       >
       <${RouteLink} path=${ALL_DAYS} className="button" label="All days with recordings">All days<//>

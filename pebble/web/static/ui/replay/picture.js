@@ -1,32 +1,36 @@
 // The recorded picture, and what plays it.
 
 import * as browser from "../../core/browser.js";
+import { Bands } from "../banner.js";
 import { SPEEDS } from "../../core/replay/player.js";
 import { whyOf } from "../../core/replay/timeline.js";
-import { html, useEffect, useModel, useRef, useTick } from "../parts/hooks.js";
-import { Icon, Why } from "../parts/parts.js";
+import { Page, html, useEffect, useModel, useRef, useTick } from "../parts/hooks.js";
+import { Icon, Why, useName } from "../parts/parts.js";
 import { Drawn, StillTools } from "../robot/picture-extras.js";
-import { clockTime, nameOf, span } from "../parts/words.js";
+import { clockTime, span } from "../parts/words.js";
 
 const WAIT_SHOWN_MS = 400;
 const OLD_MS = 2000; // as of a live picture
 
-export function Picture({ at, replay }) {
+/** ``live``: the services of the page itself: what must not be overlooked is of now. */
+export function Picture({ at, replay, live }) {
   useModel(replay);
   useTick(100);
   const place = useRef(null);
   const { video, player } = replay;
+  const name = useName(at);
   useEffect(() => {
     place.current.append(video.canvas);
     return () => video.canvas.remove();
   }, [video]);
   video.canvas.setAttribute("role", "img");
-  video.canvas.setAttribute("aria-label", `What ${nameOf(at)} saw`);
+  video.canvas.setAttribute("aria-label", `What ${name} saw`);
   const { info } = video;
   const cover = coverOf(replay);
   return html`<section class=${`stage ${cover ? "stale" : ""} ${info ? "" : "blank"}`} aria-label="Recorded picture">
     <div class="picture">
       <div class="canvas" ref=${place}></div>
+      <${Page.Provider} value=${live}><${Bands} at="" /><//>
       <${Drawn} source=${at} />
       ${cover && html`<p class="cover" data-test="cover">${cover}</p>`}
       ${info && html`<span class="tag tag-how">${`${info.encoding} ${info.width}×${info.height}`}</span>`}

@@ -15,8 +15,8 @@ import {
   useValue,
 } from "../parts/hooks.js";
 import { CardView, Offers } from "../parts/models.js";
-import { Card, Icon, Part, RouteLink } from "../parts/parts.js";
-import { nameOf } from "../parts/words.js";
+import { nameIn } from "../parts/looks.js";
+import { Card, Icon, Part, RouteLink, useName } from "../parts/parts.js";
 import { Choose, Elsewhere, timeWords } from "./choose.js";
 import { Download } from "./download.js";
 import { Replay as Model } from "./model.js";
@@ -68,7 +68,7 @@ async function newestDay(replay) {
   try {
     const days = await replay.archive.days(replay.dayAbort.signal);
     const found = days.find(({ robots }) => robots.includes(replay.ref));
-    if (!found) replay.dayProblem = `There is no recording of ${nameOf(replay.ref)}`;
+    if (!found) replay.dayProblem = `There is no recording of ${nameIn(replay.store, replay.ref)}`;
     replay.changed();
     return found?.day ?? "";
   } catch (error) {
@@ -129,20 +129,22 @@ function act(replay, key, step) {
 }
 
 function Shown({ at, replay }) {
+  const name = useName(at);
+  const live = usePage();
   return html`<div class="replay">
-    <h1 class="sr">Recording of ${nameOf(at)}</h1>
+    <h1 class="sr">Recording of ${name}</h1>
     <${Boundary} what="The time"><${Badge} at=${at} replay=${replay} /><//>
     <${Page.Provider} value=${replay.page}>
       <div class="replay-body">
         <div class="replay-bench">
           <div class="replay-main">
-            <${Boundary} what="The picture"><${Picture} at=${at} replay=${replay} /><//>
+            <${Boundary} what="The picture"><${Picture} at=${at} replay=${replay} live=${live} /><//>
             <${Boundary} what="The timeline"><${TimelineCard} replay=${replay} /><//>
           </div>
           <div class="replay-side">
             <${Elsewhere} at=${at} replay=${replay} />
             <${Card} id="sessions" title="Sessions" icon="list"><${Sessions} replay=${replay} /><//>
-            <${Card} id="sent" title=${`Was sent to ${nameOf(at)}`} icon="wheel"><${Sent} replay=${replay} /><//>
+            <${Card} id="sent" title=${`Was sent to ${name}`} icon="wheel"><${Sent} replay=${replay} /><//>
             <${Card} id="download" title="Download" icon="save"><${Download} replay=${replay} /><//>
           </div>
         </div>
@@ -154,14 +156,15 @@ function Shown({ at, replay }) {
 
 /** What must not be overlooked: that this is the past. */
 function Badge({ at, replay }) {
+  const name = useName(at);
   useModel(replay);
   useTick(100);
   const { seeks, position } = replay.player;
   const time = seeks ? timeWords(position) : "…";
   return html`<div class="replay-badge" data-test="badge">
     <${Icon} name="recordings" />
-    <p><b>Recording of ${time}</b> <span>The past of ${nameOf(at)}: nothing here reaches the robot.</span></p>
-    <${RouteLink} to=${at} className="replay-live" label=${`Live page of ${nameOf(at)}`}>Live page<//>
+    <p><b>Recording of ${time}</b> <span>The past of ${name}: nothing here reaches the robot.</span></p>
+    <${RouteLink} to=${at} className="replay-live" label=${`Live page of ${name}`}>Live page<//>
   </div>`;
 }
 

@@ -92,11 +92,15 @@ class Columns {
       return { id, rows, span: /** @type {any} */ (span), side: at === "side", card };
     });
     const places = placed(known, count, hasSide, homes); // all was read before anything is written
+    let moved = false;
     for (const { id, rows, card } of known) {
       const [top, at, wide] = places.get(id) ?? [0, 0, 1];
       const area = `${top + 1} / ${at + 1} / span ${Math.max(1, rows)} / span ${wide}`;
-      if (card.style.gridArea !== area) card.style.gridArea = area;
+      if (card.style.gridArea === area) continue;
+      card.style.gridArea = area;
+      moved = true;
     }
+    if (!moved) return; // this runs with each message, too
     clearTimeout(this.timer);
     this.timer = setTimeout(() => this.remember(), REMEMBER_MS);
   }

@@ -49,6 +49,7 @@ export function Slot({ at }) {
     </div>
     <span class="sr" role="status">${useCalm(text)}</span>
     <div class="why-actions">
+      ${reason?.code === "connecting" && html`<button type="button" disabled aria-describedby="why-drive">Connecting…</button>`}
       <${ReasonAction} action=${reason?.action} />
       ${mine && html`<button type="button" data-test="release" onClick=${() => driver.release()}>Release</button>`}
     </div>
@@ -61,6 +62,8 @@ function slotWords(reason, text, view, typing, script) {
   switch (reason?.code) {
     case undefined:
       return ["You drive", typing ? "Keys go to the field you have chosen: click beside it." : "Let go, and it stops."];
+    case "connecting":
+      return ["One moment", "Who drives is not known yet."];
     case "free":
       return ["Nobody drives", script ? `${script} runs. Take control to drive` : "One person at a time"];
     case "stopped":

@@ -4,7 +4,7 @@ import * as more from "../../core/browser-more.js";
 import { MIXED, refusal } from "../../core/stream.js";
 import { html, useEffect, useMetrics, useModel, usePage, useRef, useState, useValue } from "../parts/hooks.js";
 import { Model, read, write } from "../parts/models.js";
-import { Icon, Why, useStream } from "../parts/parts.js";
+import { Icon, Why, useName, useStream } from "../parts/parts.js";
 import { NewestOverlays, STALE_MS, contained, drawOverlays } from "../../media/overlays.js";
 import { nameOf, visible } from "../parts/words.js";
 
@@ -29,6 +29,7 @@ export function Layer({ source }) {
   const { video, driver } = usePage();
   useModel(video);
   const address = useStream(source);
+  const name = useName(source);
   const moved = video.stream !== "" && address !== "" && address !== video.stream;
   useEffect(() => {
     if (moved) show(video, driver, "");
@@ -38,7 +39,7 @@ export function Layer({ source }) {
   html`<iframe
     class="stream"
     data-test="stream"
-    title=${`The own stream of ${nameOf(source)}`}
+    title=${`The own stream of ${name}`}
     sandbox="allow-scripts allow-same-origin"
     referrerpolicy="no-referrer"
     src=${video.stream}

@@ -5,7 +5,7 @@ import { html, usePage, useRefs, useState, useTick, useValue } from "../parts/ho
 import { Offers } from "../parts/models.js";
 import { Extra, Face, Why, useName } from "../parts/parts.js";
 import { useReasons, whyNotEnd } from "../parts/why-not.js";
-import { nameOf } from "../parts/words.js";
+import { nameIn } from "../parts/looks.js";
 
 const ENCODINGS = ["h264", "pbvz", "pbvd", "json", "jpeg"];
 
@@ -70,7 +70,7 @@ export function NoCamera({ at, offers }) {
 }
 
 function PictureFrom({ at, source, offers, more }) {
-  const { commands } = usePage();
+  const { commands, store } = usePage();
   const cameras = useCameras(at);
   if (!cameras.length) return null;
   return html`<label class="field"
@@ -82,7 +82,7 @@ function PictureFrom({ at, source, offers, more }) {
       onChange=${(event) => commands.setPictureFrom(at, event.currentTarget.value)}
     >
       <option value="">${offers.hasVideo ? "its own camera" : "nowhere"}</option>
-      ${cameras.map((ref) => html`<option key=${ref} value=${ref}>${nameOf(ref)}</option>`)}
+      ${cameras.map((ref) => html`<option key=${ref} value=${ref}>${nameIn(store, ref)}</option>`)}
     </select></label
   >`;
 }

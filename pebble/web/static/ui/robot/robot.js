@@ -6,10 +6,11 @@ import { CARDS, DRIVE, EXTRAS, HUD, NO_CAMERA, PICTURE, TABS, VOICE, hasMap } fr
 import { expected, useColumns } from "./columns.js";
 import { DriveCard, DrivePad, Slot, Speed } from "./drive.js";
 import {
-  Boundary, fetchRest, html, useEffect, useMemo, useMetric, useMetrics, useModel, usePage, usePart, useState, useValue,
+  Boundary, fetchRest, html, useEffect, useMemo, useMetric, useMetrics, useModel, usePage, usePart, useState, useTick, useValue,
 } from "../parts/hooks.js";
 import { CardView, Offers, WATCHES } from "../parts/models.js";
-import { Card, Icon, Part, StopButton, useName, useStream } from "../parts/parts.js";
+import { hasFace } from "../parts/looks.js";
+import { Card, Face, Icon, Part, StopButton, useName, useStream } from "../parts/parts.js";
 import { Stage, useVideo } from "./video.js";
 import { typeOf } from "../parts/words.js";
 
@@ -18,6 +19,11 @@ export function Robot({ at, layout, drawer, onPanel }) {
   const { kind } = offers;
   const view = useMemo(() => new CardView(kind, at), [kind]);
   useModel(view);
+  const { settings } = usePage();
+  useEffect(() => {
+    settings.cards = view;
+    return () => (settings.cards = null);
+  }, [view]);
   const source = useValue(at, "web/picture-from")?.source || at;
   const stream = useStream(at);
   const hasVideo = offers.hasVideo || source !== at || stream !== "";
@@ -29,7 +35,7 @@ export function Robot({ at, layout, drawer, onPanel }) {
     if (!awaits) fetchRest();
   }, [awaits]);
   const parts = { at, offers, view, video: hasVideo ? video : null, source };
-  if (!known) return html`<${Unknown} at=${at} />`;
+  if (!known) return html`<${Unknown} at=${at} layout=${layout} />`;
   if (layout === "immersive") return html`<${Immersive} ...${parts} drawer=${drawer} onPanel=${onPanel} />`;
   if (layout === "portrait") return html`<${Portrait} ...${parts} onPanel=${onPanel} />`;
   return html`<${Desktop} ...${parts} />`;
@@ -42,11 +48,33 @@ function useKnown(at) {
   return Boolean(liveness) || store.metrics(at).some((metric) => !metric.startsWith("web/"));
 }
 
-function Unknown({ at }) {
+/** While the page connects it has the shape of most robots' pages. */
+function Unknown({ at, layout }) {
   const { connection } = usePage();
   useModel(connection);
-  const text = connection.isOpen ? `Nothing was received from ${at} yet.` : "Connecting to the server…";
-  return html`<div class="empty"><${Icon} name="robot" /><h1 class="sr">${useName(at)}</h1><p>${text}</p></div>`;
+  useTick(500); // the first state may have nothing of it
+  const name = useName(at);
+  const isOpen = connection.isOpen && !connection.socket.outdated;
+  if (isOpen || layout === "immersive" || !hasFace(at)) {
+    const text = isOpen ? `Nothing was received from ${at} yet.` : "Connecting to the server…";
+    return html`<div class="empty"><${Icon} name="robot" /><h1 class="sr">${name}</h1><p>${text}</p></div>`;
+  }
+  return html`<div class="robot" aria-busy="true">
+    <h1 class="sr">${name}</h1>
+    <div class=${layout === "desktop" ? "bench connecting" : "phone-drive"}>
+      <div class="stage" data-span="main">
+        <div class="picture">
+          <div class="canvas"><canvas width="640" height="360" aria-hidden="true"></canvas></div>
+          <p class="cover"><${Face} at=${at} />Connecting to the server…</p>
+          <${Bands} at=${at} />
+        </div>
+        <div class="picture-bar"></div>
+      </div>
+      ${layout === "desktop"
+        ? html`<${DriveCard} at=${at} />`
+        : html`<section class="phone-pad" aria-label="Drive"><${Slot} at=${at} /><${DrivePad} /><${Speed} /></section>`}
+    </div>
+  </div>`;
 }
 
 function Desktop({ at, offers, view, video, source }) {
@@ -198,7 +226,6 @@ function Extras({ at, offers }) {
 const MoreSettings = ({ onPanel, view }) => html`<button type="button" class="wide" data-test="settings" onClick=${onPanel}>
     <${Icon} name="settings" /><${SettingsWords} />
   </button>
-  <button type="button" class="wide" data-test="arrange" onClick=${() => view.reset()}>Arrange the cards as new</button>
   ${browser.fullScreen.on &&
   html`<button type="button" class="wide" onClick=${() => browser.fullScreen.toggle()}>
     <${Icon} name="small" />Leave full screen

@@ -6,7 +6,7 @@ import { device } from "../../core/control-socket.js";
 import { Microphone } from "../../media/microphone.js";
 import { makeSpeaker } from "../../media/speaker.js";
 import { Model, Offers } from "../parts/models.js";
-import { nameOf } from "../parts/words.js";
+import { nameIn } from "../parts/looks.js";
 
 const WORKER = new URL("../../media/sound-worker.js", import.meta.url).href;
 const STEP_MS = 200; // while a person talks: the page tells the worker that it is alive
@@ -238,7 +238,7 @@ export class Sound extends Model {
   listenReason() {
     if (!this.connection.isOpen) return "No connection to the server";
     if (this.store.get("", "web/broker")?.value.connected === false) return "The server cannot reach the broker";
-    if (!this.offers.has("audio")) return `${nameOf(this.route.ref)} has no sound`;
+    if (!this.offers.has("audio")) return `${nameIn(this.store, this.route.ref)} has no sound`;
     return browser.find("AudioContext") ? "" : "This browser plays no sound";
   }
 
@@ -249,7 +249,7 @@ export class Sound extends Model {
     if (!this.connection.may("drive")) return "Log in as driver to talk";
     if (!more.microphone.possible) return "Needs https";
     const { ref } = this.route;
-    if (this.store.get(ref, "web/liveness")?.value.online === false) return `${nameOf(ref)} is silent`;
+    if (this.store.get(ref, "web/liveness")?.value.online === false) return `${nameIn(this.store, ref)} is silent`;
     const view = this.store.get(ref, "web/sound")?.value;
     if (view?.state === "refused") return view.why;
     return this.talker ? `${this.talker} is talking` : "";

@@ -2,9 +2,8 @@
 
 import * as browser from "../../core/browser.js";
 import { html, useCalm, useEffect, useModel, usePage, useValue } from "../parts/hooks.js";
-import { Icon, Why } from "../parts/parts.js";
+import { Icon, Why, useName } from "../parts/parts.js";
 import { Sound } from "./sound-model.js";
-import { nameOf } from "../parts/words.js";
 
 /** @param {{at: string, place?: "card" | "bar" | "short" | "over"}} props "short": in a bar with little room */
 export function SoundControls({ at, place = "card" }) {
@@ -20,7 +19,7 @@ export function SoundControls({ at, place = "card" }) {
   const noListening = listening ? "" : sound.listenReason();
   const inBar = place !== "card";
   const short = place === "short";
-  const text = words(sound, view, nameOf(at));
+  const text = words(sound, view, useName(at));
   return html`<div class=${`sound ${inBar ? "in-bar" : ""}`} role="group" aria-label="Sound">
     <div class="sound-buttons">
       <button
@@ -67,7 +66,7 @@ export function SoundFacts({ at }) {
   const sound = (page.sound.model ??= new Sound(page));
   useModel(sound);
   const view = useValue(at, "web/sound");
-  return html`<p class="facts" data-test="sound-state">${words(sound, view, nameOf(at))}</p>`;
+  return html`<p class="facts" data-test="sound-state">${words(sound, view, useName(at))}</p>`;
 }
 
 /** Numbers are not read aloud. */
