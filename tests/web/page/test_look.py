@@ -199,6 +199,8 @@ WHEN = {
     "other-camera": "seen from tower-1",
     "script-drives": "Stop apriltag-follow",
 }
+#: What browsers complain of where the server is meant to fail.
+MEANT = {"recordings-failed": "422"}
 _OUTLETS, _VALUES = (f'[data-card="{card}"]' for card in ("outlets", "values"))
 _SENSORS, _MORE = _press("[data-test=tab-sensors]"), _press("[data-test=tab-more]")
 _LAMP, _LUX = '[data-test="mcu-lamp-1"]', '[data-test="reading-lux"]'
@@ -290,7 +292,8 @@ def test_screen(show: Show, axe: str, screen: Screen, size: Size) -> None:
             _show(opened, theme)
             opened.page.screenshot(path=PICTURES / f"{screen.name}-{size}-{theme}.png")
             problems += [f"{theme}: {violation}" for violation in _violations(opened.page, axe)]
-        assert problems + opened.complaints() == []
+        problems += [one for one in opened.complaints() if MEANT.get(screen.state, "\0") not in one]
+        assert problems == []
 
 
 def _wait(opened: Tab, text: str) -> None:
