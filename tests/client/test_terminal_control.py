@@ -177,3 +177,4 @@ def test_the_end_stops_the_robot_and_gives_control_back() -> None:
     assert json.loads(zero.payload)["valid_ms"] == 0
     assert (released.topic, json.loads(released.payload)["want"]) == (CONTROL, "release")
     assert json.loads(announced.payload)["robots"] == {}
+    assert cab.run(0.2) == [{"x": 0, "z": 0, "y": 0, "valid_ms": 0}] * 2

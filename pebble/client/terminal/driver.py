@@ -152,7 +152,7 @@ class TerminalDriver:
     def leave(self, now: float, wall: float) -> list[Message]:
         """The terminal is gone, or the driver leaves: stop, and give the lease back. Then :meth:`tick` twice more."""
         self._drive(self.gesture.interrupt(now))
-        self._wants_until = now
+        self._wants_until, self._decided = now, ""  # the zero is repeated all the same
         self.control.release()
         self._out += self.control.tick(now)
         self.lease.release()
