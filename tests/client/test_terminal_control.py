@@ -92,6 +92,16 @@ def test_who_drives_is_asked_by_a_key_and_lets_this_terminal_drive() -> None:
     assert cab.moves()
 
 
+def test_control_that_another_has_at_the_start_is_taken_once_it_is_free() -> None:
+    cab = KeepingCab()
+    cab.bob_has_it()
+    cab.ready()
+    assert not cab.mine
+    cab.bob.release()
+    cab.run(0.2)
+    assert cab.mine
+
+
 def test_it_is_taken_over_by_a_key_or_at_the_start() -> None:
     for over in (False, True):
         cab = KeepingCab(take_over=over)
@@ -167,3 +177,4 @@ def test_the_end_stops_the_robot_and_gives_control_back() -> None:
     assert json.loads(zero.payload)["valid_ms"] == 0
     assert (released.topic, json.loads(released.payload)["want"]) == (CONTROL, "release")
     assert json.loads(announced.payload)["robots"] == {}
+    assert cab.run(0.2) == [{"x": 0, "z": 0, "y": 0, "valid_ms": 0}] * 2

@@ -34,13 +34,12 @@ class Lamp:
 
     def __init__(self, folder: Path, broker: Broker) -> None:
         self.commands: list[tuple[float, Any]] = []  # when they reached the broker
-        self.announced: list[Any] = []
+        self.control: dict[str, Any] = {}  # who has it
         self.stops = 0
         self._trace, self._begin = folder / "trace", 0
         self._transport = create("mqtt", "observer", MqttSettings(host="127.0.0.1", port=broker.port)).open()
         self.capabilities = threading.Event()
         self._transport.subscribe(f"{BASE}/#", self._take)
-        self._transport.subscribe("+/servers/+/outgoing/driving", self._take)
         command = [*(sys.executable, "-m", "pebble.simulation.networked"), *("--kind", "minilamp")]
         address = [*("--broker", f"127.0.0.1:{broker.port}"), *("--trace", str(self._trace))]
         self._process = Child([*command, *address], cwd=ROOT, stderr=subprocess.DEVNULL)
@@ -54,7 +53,6 @@ class Lamp:
     def forget(self) -> None:
         """Forget what was recorded, while the motors rest."""
         self.commands.clear()
-        self.announced.clear()
         self.stops = 0
         self._begin = complete_lines(self._trace, self._begin)[1]
 
@@ -82,9 +80,11 @@ class Lamp:
     def _take(self, message: Message) -> None:
         metric = message.topic.rpartition("/")[2]
         if metric == "drive-values":
-            self.commands.append((time.monotonic(), json.loads(message.payload)))
-        elif metric == "driving":
-            self.announced.append(json.loads(message.payload)["robots"])
+            command = json.loads(message.payload)
+            assert command.pop("key", "") or not (command["x"] or command["z"] or command["y"])
+            self.commands.append((time.monotonic(), command))
+        elif "/outgoing/control/" in message.topic:
+            self.control = json.loads(message.payload)
         elif message.topic.endswith("incoming/estop"):
             self.stops += 1
         elif metric == "capabilities":
@@ -226,11 +226,11 @@ def test_a_held_key_drives_and_its_release_stops(drive: Drive, lamp: Lamp) -> No
     assert sent[0] == {"x": 0, "z": 0.5, "y": 0, "valid_ms": 400}
     assert until(lambda: [command for _, command in lamp.commands[-3:]] == [ZERO] * 3)
     assert 15 <= len([command for command in sent if command["z"]]) <= 45
-    assert next(filter(None, lamp.announced))[BASE]["device"].startswith("terminal on ")
+    assert lamp.control["device"].startswith("terminal_on_")
     console.type(b"\x03")
     assert console.process.wait(5) == 0
     assert console.restored
-    assert until(lambda: lamp.announced[-1] == {})
+    assert until(lambda: lamp.control["key"] == "")
 
 
 def test_an_arrow_and_ctrl_d(drive: Drive, lamp: Lamp) -> None:
@@ -351,24 +351,24 @@ def test_an_emergency_stop_is_sent_on_after_the_terminal_has_ended(
 
 
 def test_a_driver_elsewhere_is_respected_until_it_is_taken_over(drive: Drive, lamp: Lamp) -> None:
-    fair = "pebble/servers/fair-1/outgoing/driving"
-    ending = threading.Event()
+    bob = {"id": "b0b0b0b0", "by": "bob", "device": "phone"}
+    control, ending, wants = f"{BASE}/incoming/control", threading.Event(), threading.Event()
 
-    def announce() -> None:
+    def repeat() -> None:
         while not ending.wait(0.5):
-            robots = {BASE: {"by": "bob", "device": "phone", "since": int(1000 * began)}}
-            lamp.publish(fair, {"t": int(1000 * time.time()), "robots": robots})
+            lamp.publish(control, bob if wants.is_set() else bob | {"want": "release"})
 
-    began = time.time()
-    thread = threading.Thread(target=announce, daemon=True)
+    thread = threading.Thread(target=repeat, daemon=True)
     thread.start()
     try:
-        url_options = ("--take-over",)
-        console = drive(*url_options)
+        lamp.publish(f"{control}/take", bob)
+        assert until(lambda: lamp.control["by"] == "bob")
+        console = drive("--take-over")
         driving(console, lamp)
         console.hold(b"")
-        began = time.time() + 60  # bob takes it back
-        assert console.sees("bob (phone) at fair-1 is driving")
+        wants.set()
+        lamp.publish(f"{control}/take", bob)
+        assert console.sees("bob (phone, name not checked) drives")
         resumed = time.monotonic()
         time.sleep(0.6)
         console.hold(b"w")

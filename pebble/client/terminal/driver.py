@@ -30,6 +30,7 @@ from pebble.contract.payloads import Drive
 from pebble.transports import Message, QoS
 
 TWICE_S = 0.6  # between two presses of Escape
+_WANTS_S = 1.0  # after a key that drives
 
 TAKE, TAKE_OVER, LET, KEEP = "t", "o", "l", "k"  # keys
 
@@ -68,7 +69,7 @@ class TerminalDriver:
         self.stopping: StopSender | None = None  # the newest emergency stop from here
         self._by, self._take_over, self._heartbeat = by, take_over, heartbeat
         self._began = self._used_at = now
-        self._wants_control = True
+        self._wants_until = float("inf")  # until then control is taken as soon as it is free
         self._decided = ""  # the key of control, as far as the gesture knows of it
         self._escape_at = float("-inf")
         self._reason = "connecting"
@@ -112,7 +113,8 @@ class TerminalDriver:
                 self._drive(self.gesture.stop(now))
             elif self.robot.controlled:
                 self._press_control(key, now)
-        self._wants_control = self._wants_control or not AXES.keys().isdisjoint(keys)
+        if not AXES.keys().isdisjoint(keys):
+            self._wants_until = max(self._wants_until, now + _WANTS_S)
         self.gesture.press(keys, now)
 
     # -- what follows
@@ -150,7 +152,7 @@ class TerminalDriver:
     def leave(self, now: float, wall: float) -> list[Message]:
         """The terminal is gone, or the driver leaves: stop, and give the lease back. Then :meth:`tick` twice more."""
         self._drive(self.gesture.interrupt(now))
-        self._wants_control = False
+        self._wants_until, self._decided = now, ""  # the zero is repeated all the same
         self.control.release()
         self._out += self.control.tick(now)
         self.lease.release()
@@ -285,10 +287,14 @@ class TerminalDriver:
             self._used_at = now
         if self.control.held and now - self._used_at > IDLE_S:
             self.control.release()
-        elif self._wants_control and not problem and self.robot.control.state is not None:
-            if not self.control.wanted and (self._take_over or not self.robot.control.who):
-                self.control.ask(now, over=self._take_over)
-            self._wants_control = self._take_over = False
+        elif (
+            now < self._wants_until
+            and not (problem or self.control.wanted)
+            and self.robot.control.state is not None
+            and (self._take_over or not self.robot.control.who)
+        ):
+            self.control.ask(now, over=self._take_over)
+            self._take_over, self._wants_until = False, now
         self._out += self.control.tick(now)
         self._check_control(now)
         if self.control.held and not self.lease.held:
@@ -301,7 +307,7 @@ class TerminalDriver:
         """Whoever gets control, begins from rest; so does this terminal."""
         self.control.update(now)
         if self.control.decided != self._decided:
-            self._decided = self.control.decided
+            self._decided, self._wants_until = self.control.decided, now
             self._drive(self.gesture.interrupt(now, repeat=False))
 
     def _estop(self, now: float) -> None:
@@ -316,6 +322,7 @@ class TerminalDriver:
         self._out += map(self._message, commands)
 
     def _message(self, command: Drive) -> Message:
-        if key := self.control.key:
+        key = self.control.key
+        if key and command.valid_ms != 0:  # a final zero is no letting go
             command = msgspec.structs.replace(command, key=key)
         return Message(self.robot.estop.drive_topic, codec.encode(DRIVE, command), QoS(DRIVE.default_qos))

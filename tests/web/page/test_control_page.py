@@ -40,7 +40,7 @@ def moves(opened: Tab, robot: RecordingRobot) -> bool:
 
 
 @pytest.mark.parametrize("size", ["desktop", "phone"])
-def test_control_is_taken_asked_for_given_retained_and_taken_over(browser: Browser, broker: Broker, size: Size) -> None:
+def test_two_people_take_ask_let_keep_and_take_over(browser: Browser, broker: Broker, size: Size) -> None:
     with (
         RecordingRobot(broker.port, GOOB, keeps=True) as robot,
         Served(broker.port) as hall,
