@@ -48,7 +48,7 @@ def _check_links(notes: Notes, root: Root) -> None:
             )
         if mqtt.tls.enabled and mqtt.tls.insecure:
             notes.problem((*path, "tls", "insecure"), f'must be false at security.level "{level}"')
-        if mqtt.username is None:
+        if not mqtt.username:
             notes.problem(
                 (*path, "username"),
                 f'is missing at security.level "{level}": `pebble fleet add NAME --role robot` makes an account',

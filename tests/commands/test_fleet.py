@@ -28,6 +28,7 @@ PAGE = (ROOT / "docs" / "fleet.md").read_text()
 #: The first block of the page: what a newcomer types, one after the other.
 FIRST = re.findall(r"^    (\S.*)$", PAGE.partition("## ")[2].partition("## ")[0], re.MULTILINE)
 LAMP = "pebble/robots/minilamp"
+MOVES = re.compile(rb'"z": ?0\.[1-9]')
 PASSWORD = re.compile(r"password: ((?:[a-z0-9]{4}-){3}[a-z0-9]{4})")
 
 
@@ -71,8 +72,9 @@ def test_the_first_page_as_a_newcomer_types_it(tmp_path: Path) -> None:
         with BrokerClient(place, "minilamp", passwords["minilamp"]) as robot, typed(simulate, tmp_path):
             robot.subscribe([f"{LAMP}/incoming/drive-values", f"{LAMP}/outgoing/estop/#"])
             with closing(Console(*python("pebble.cli", *shlex.split(drive)[1:]), cwd=tmp_path)) as console:
+                assert console.sees("ready"), console.shown
                 console.hold(b"w")
-                assert until(lambda: robot.listen(0.05) or any(b'"z":' in one for _, one in robot.received), 20)
+                assert until(lambda: robot.listen(0.05) or any(MOVES.search(one) for _, one in robot.received), 20)
             assert "stopped and confirmed" in run(stop, tmp_path)
             assert until(lambda: robot.listen(0.05) or any(b'"latched":true' in one for _, one in robot.received), 5)
         for line in later:
@@ -195,5 +197,5 @@ def test_removing_a_person_acts_on_pages_here_and_names_those_elsewhere(hall: Pa
     pebble("pebble fleet add page-2 --role page", hall)
     done = pebble("pebble fleet remove ann", hall)
     assert done.returncode == 1
-    assert "run on that machine `pebble web user remove ann`" in done.stderr
+    assert "page-2 has people of its own: if ann is one, `pebble web user remove ann` on its machine" in done.stderr
     assert pebble("pebble fleet remove page-2", hall).returncode == 0

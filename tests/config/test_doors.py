@@ -50,9 +50,8 @@ def problems(level: str, *changes: dict[str, Any]) -> list[str]:
         ({}, []),
         (at(f"{REMOTE}.tls.enabled", False), [f"{REMOTE}.tls.enabled"]),
         (at(f"{REMOTE}.tls.insecure", True), [f"{REMOTE}.tls.insecure"]),
-        (at(f"{REMOTE}.username", None), [f"{REMOTE}.username"]),
-        (at(REMOTE, {"host": "127.0.0.1", "username": None, "tls": {"enabled": False}}), []),
-        (at(REMOTE, {"host": "localhost", "username": None, "tls": {"enabled": False}}), []),
+        (at(REMOTE, {"host": "127.0.0.1", "tls": {"enabled": False}}), []),
+        (at(REMOTE, {"host": "localhost", "tls": {"enabled": False}}), []),
         (at("local_mqtt.host", "10.0.0.2"), []),  # not used: the transport is Zenoh
         (at(MIRROR, {"host": "10.0.0.2"}), [f"{MIRROR}.tls.enabled", f"{MIRROR}.username"]),
         (at(MIRROR, {"host": "127.0.0.1"}), []),
@@ -70,6 +69,14 @@ def test_a_login_and_tls_are_needed_beyond_this_machine(change: dict[str, Any], 
     assert problems("login", change) == refused
     assert problems("named", change)[: len(refused)] == refused
     assert problems("open", change) == []
+
+
+def test_a_link_without_a_user_name_is_refused() -> None:
+    anonymous = GOOD | {
+        "services": {"mqtt_bridge": {"enabled": True, "remote_mqtt": {"host": "broker.lab", "tls": TLS}}}
+    }
+    with pytest.raises(ConfigError, match=f"{REMOTE}.username: is missing at security.level"):
+        parse(anonymous | at("security.level", "login"), folder=Path("/nowhere"), env={})
 
 
 @pytest.mark.parametrize(
@@ -132,7 +139,7 @@ def test_one_warning_of_a_robot_that_asks_for_no_name(change: dict[str, Any], wh
 
 
 def test_the_demo_and_simulations_are_not_warned() -> None:
-    loopback = deep_merge(GOOD, at(REMOTE, {"host": "127.0.0.1", "port": 41883, "username": None, "tls": {}}))
+    loopback = deep_merge(GOOD, at(REMOTE, {"host": "127.0.0.1", "port": 41883, "tls": {}}))
     assert warning_of_open(parse(loopback, folder=Path("/nowhere"), env={})) == ""
     assert warning_of_open(load(ROOT / "configs" / "goob.json", env={})) != ""
 
