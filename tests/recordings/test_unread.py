@@ -169,7 +169,8 @@ def _no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_what_cannot_be_read_is_named_and_not_touched(tmp_path: Path, run: Run, name: str) -> None:
     data, wanted = DAMAGED[name]
     path = stored(tmp_path, data)
-    for number, command in enumerate(some([*READERS, *WRITERS][[*DAMAGED].index(name) % 3 :], 3)):
+    each = cases(3, 1)  # of the commands, for a damage others than for the next one
+    for number, command in enumerate([*READERS, *WRITERS][[*DAMAGED].index(name) % each :: each]):
         code = run(*on(tmp_path / "rec", command, tmp_path / str(number)))
         assert (code, NAME in run.err, wanted in run.err) == (1, True, True), (command, run.out, run.err)
         assert path.read_bytes() == data

@@ -142,14 +142,14 @@ def check_numbers(film: Film, first: int = 0) -> None:
     assert wrong == []
 
 
+FORMS = [("json", "pcm", 16_000), ("pbvd", "opus", 16_000), ("pbvz", "pcm", 44_100), ("h264", "opus", 48_000)]
+
+
 @pytest.mark.parametrize(
     ("ending", "encoding", "codec", "rate"),
     [
-        (".mp4", "json", "pcm", 16_000),
-        (".mkv", "pbvd", "opus", 16_000),
-        (".mkv", "pbvz", "pcm", 44_100),
-        (".mp4", "h264", "opus", 48_000),
-        further(".mkv", "h264", "opus", 48_000),
+        *((ending, *form) for ending, form in zip((".mp4", ".mkv", ".mkv", ".mp4"), FORMS, strict=True)),
+        *(further(ending, *form) for ending, form in zip((".mkv", ".mp4", ".mp4", ".mkv"), FORMS, strict=True)),
     ],
 )
 def test_pictures_and_sound_are_where_their_stamps_are(
