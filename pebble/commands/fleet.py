@@ -12,7 +12,6 @@ from msgspec.structs import replace
 
 from pebble.client.page_packages import require_packages
 from pebble.commands.options import host_of, split_names
-from pebble.config.security import SecurityLevel
 from pebble.errors import PebbleError
 from pebble.fleet import applying, certificates, check, folder
 from pebble.fleet.broker_files import new_password
@@ -25,8 +24,8 @@ _HELP = """The accounts of a broker: robots, people and page servers, and what e
 \b
     pebble fleet init hall --host broker.lab       all files of a broker
     mosquitto -c hall/mosquitto.conf               the broker
-    pebble fleet add ann --role driver             a person; prints a password once
-    pebble fleet add goob --role robot             a robot; prints the piece of its config
+    pebble fleet add ann --role driver             prints a password once
+    pebble fleet add goob --role robot             prints a piece of config
     pebble fleet role ann maintainer
     pebble fleet remove ann
     pebble fleet check --live
@@ -43,7 +42,7 @@ _Roles = Annotated[
         metavar="ROLE[,ROLE]",
     ),
 ]
-_LEVELS: dict[str, SecurityLevel] = {"login": "login", "named": "named"}
+_LEVELS: dict[str, Literal["login", "named"]] = {"login": "login", "named": "named"}
 
 
 def init(
@@ -119,7 +118,7 @@ def add(
     \b
         pebble fleet add ann --role driver,safety
         pebble fleet add goob --role robot
-        pebble fleet add lamp --role robot --base pebble/lamps/lamp --plain --board
+        pebble fleet add lamp --role robot --base a/b/lamp --plain --board
         pebble fleet add page-1 --role page
     """
     given = tuple(dict.fromkeys(split_names(roles)))

@@ -12,7 +12,6 @@ import msgspec
 from msgspec import Meta, Struct
 from msgspec.structs import replace
 
-from pebble.config.security import SecurityLevel
 from pebble.contract.identity import SERVERS, Identity
 from pebble.errors import ConfigError, PebbleError
 from pebble.fleet.people import NAME
@@ -47,7 +46,7 @@ class Fleet(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     ``plain``: all robots keep their topics without names beside those with names.
     """
 
-    level: SecurityLevel
+    level: Literal["login", "named"]
     brokers: Annotated[tuple[Server, ...], Meta(min_length=1)]
     rules: Literal["plugin", "files"] = "plugin"
     plain: bool = False

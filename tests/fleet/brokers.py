@@ -7,7 +7,6 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Literal
 
-from pebble.config.security import SecurityLevel
 from pebble.fleet import applying
 from pebble.fleet.broker_client import BrokerClient, Place
 from pebble.fleet.broker_files import new_password
@@ -28,7 +27,7 @@ class FleetBroker:
         folder: Path,
         accounts: Mapping[str, Account],
         *,
-        level: SecurityLevel = "login",
+        level: Literal["login", "named"] = "login",
         rules: Literal["plugin", "files"] = "plugin",
     ) -> None:
         folder.mkdir(exist_ok=True)
