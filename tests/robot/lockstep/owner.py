@@ -13,7 +13,7 @@ import msgspec
 from pebble.config import Config
 from pebble.services.serial_mcu_bridge.line.outbox import Outbox
 from pebble.services.serial_mcu_bridge.line.serial_line import LineState
-from pebble.services.serial_mcu_bridge.motion import motor_guard
+from pebble.services.serial_mcu_bridge.motion import control, motor_guard
 from pebble.services.serial_mcu_bridge.text import motor_bridge
 from pebble.services.serial_mcu_bridge.text.motor_bridge import MotorBridge
 from tests.robot.lockstep.network import Connection, Network
@@ -154,7 +154,11 @@ class Owner(ServiceProcess):
             return MemoryFile(disk, self, path, *on_saved)
 
         random = SimpleNamespace(token_hex=lambda size: f"{self.lives:0{2 * size}x}")
-        with patch.object(motor_bridge, "StateFile", file), patch.object(motor_guard, "secrets", random):
+        with (
+            patch.object(motor_bridge, "StateFile", file),
+            patch.object(motor_guard, "secrets", random),
+            patch.object(control, "secrets", random),
+        ):
             service = MotorBridge(config, Connection(self, network), clock=self.scheduler.clock)
         service.line.close()
         service.line = RecordedLine(self.wheels, self, self.scheduler)  # type: ignore[assignment]
