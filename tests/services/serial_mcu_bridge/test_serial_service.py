@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from pebble.config import parse
-from pebble.contract import DRIVE, ESTOP, ESTOP_RESET
+from pebble.contract import CONTROL, CONTROL_TAKE, DRIVE, ESTOP, ESTOP_RESET
 from pebble.contract.payloads import Drive
 from pebble.services.serial_mcu_bridge.text.motor_bridge import MotorBridge
 from pebble.transports.memory import MemoryHub, MemoryTransport
@@ -268,7 +268,7 @@ def test_a_script_waits_for_a_person_who_ends_it_and_moves_nothing_after_a_resta
 
 
 def test_stops_are_subscribed_to_before_drive_commands() -> None:
-    assert MotorBridge.handles()[:3] == (ESTOP, ESTOP_RESET, DRIVE)
+    assert MotorBridge.handles()[:5] == (ESTOP, ESTOP_RESET, CONTROL, CONTROL_TAKE, DRIVE)
 
 
 def test_robots_with_one_state_directory_do_not_share_a_stop(tmp_path: Path) -> None:
