@@ -52,7 +52,7 @@ class LinuxRobot(Robot):
     has_media = True
 
     def __init__(self, running: Testbed, name: str) -> None:
-        own = json.loads((files("pebble") / "configs" / f"{name}.json").read_text())
+        own = _config(name)
         remote, folder = (HOST, running.broker_port), running.folder / name
         super().__init__(running, own["transport"]["kind"], remote, name=name, folder=folder)
         self.has_imu, self.local_port = name == "goob", running.local_broker.port
@@ -117,6 +117,10 @@ class RoomRobot(LinuxRobot):
         self.mcu_reports.append(Snapshot(seen.ns, True, True, seen.robots[self.name]))
 
 
+def _config(name: str) -> Any:
+    return json.loads((files("pebble") / "configs" / f"{name}.json").read_text())
+
+
 def _loudspeaker(record: Path) -> list[str]:
     return python("pebble.simulation.loudspeaker", "--record", record)
 
@@ -129,10 +133,11 @@ class McuRobot(SimulatedRobot):
     def __init__(self, running: Testbed, name: str) -> None:
         super().__init__(running, name, running.folder / name)
         self.runs_on, self._broker = _BOARDS[name], f"{HOST}:{running.broker_port}"
+        self._called = _config(name)["robot"]["name"]
 
     def bring_up(self, ending: threading.Event) -> None:
-        options = ("--kind", self.name, "--trace", self._trace, "--broker", self._broker, "--report")
-        mcu = self._start_mcu("pebble.simulation.networked", *options, each=self._collect)
+        options = ("--kind", self.name, "--name", self._called, "--broker", self._broker, "--trace", self._trace)
+        mcu = self._start_mcu("pebble.simulation.networked", *options, "--report", each=self._collect)
         mcu.wait_until(lambda: bool(self.mcu_reports), START_S, ending)
 
 

@@ -44,7 +44,7 @@ def main(arguments: list[str] | None = None) -> int:
         broker = broker_address(options)
         identity = Identity("pebble", "robots", options.id or options.kind)
         files, trace = options.files, options.trace
-        return run(options.kind, identity, broker, trace=trace, report=options.report, files=files)
+        return run(options.kind, identity, broker, name=options.name, trace=trace, report=options.report, files=files)
     except PebbleError as error:
         sys.stderr.write(f"{error}\n")
         return 1
@@ -55,15 +55,16 @@ def run(
     identity: Identity,
     broker: BrokerAddress,
     *,
+    name: str = "",
     trace: Path | None = None,
     report: bool = False,
     files: Path | None = None,
 ) -> int:
-    """Run one robot until a signal."""
+    """Run one robot until a signal; ``name``: what people call it."""
     stop_signal = StopSignal()
     record = Trace(trace)
     with Fleet(broker) as fleet:
-        robot = fleet.add(kind, identity, moving_s=_MOVING_S, on_motors=_recorder(record), files=files)
+        robot = fleet.add(kind, identity, name=name, moving_s=_MOVING_S, on_motors=_recorder(record), files=files)
         reporter = ConnectionReporter([robot], lambda line: print(line, file=sys.stderr, flush=True))  # noqa: T201
 
         def job() -> None:
@@ -112,6 +113,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m pebble.simulation.networked", description=__doc__)
     parser.add_argument("--kind", choices=KINDS, required=True)
     parser.add_argument("--id", help="the robot's id; by default its kind")
+    parser.add_argument("--name", default="", help="what people call it")
     parser.add_argument("--trace", type=Path, help="file to append every change of the motors to, with its time")
     parser.add_argument("--files", type=Path, help="folder of the board's files, which survive the program")
     parser.add_argument("--report", action="store_true", help="write the state to standard output at 10 Hz")

@@ -51,7 +51,8 @@ class WirelessRobot:
     """One robot; ``step`` is a turn of its loop. ``on_motors(seconds, (left, right))`` is called when motors change.
 
     ``pause_s`` is the longest time until its next turn while its sockets are idle. ``files`` is the folder of its
-    board's files, which survive the program; None: they are in memory.
+    board's files, which survive the program; None: they are in memory. ``name``: what people call it; empty: nothing
+    else than its id.
     """
 
     def __init__(
@@ -61,13 +62,14 @@ class WirelessRobot:
         broker: BrokerAddress,
         servers: LoopbackServers,
         *,
+        name: str = "",
         on_motors: Callable[[float, Motors], None] | None = None,
         moving_s: float = _MOVING_S,
         files: Path | None = None,
     ) -> None:
         if kind not in KINDS:
             raise ConfigError(f"unknown simulated robot with Wi-Fi {kind!r}; known: {', '.join(KINDS)}")
-        self.kind, self.identity, self.broker = kind, identity, broker
+        self.kind, self.identity, self.broker, self.name = kind, identity, broker, name
         clock = RealClock()
         uid = hashlib.sha256(identity.base.encode()).digest()[:6]
         self.network = HostNetwork(clock, platform=OF_ROBOT[kind].platform, routes=servers.routes, uid=uid)
@@ -131,7 +133,7 @@ class WirelessRobot:
         return self.body.state()
 
     def _settings(self) -> dict[str, Any]:
-        robot = {"system": self.identity.system, "type": self.identity.type, "id": self.identity.id}
+        robot = {"system": self.identity.system, "type": self.identity.type, "id": self.identity.id, "name": self.name}
         wifi = {"ssid": "simulated", "password": "simulated"}
         return {"robot": robot, "wifi": wifi, "mqtt": self.broker.settings()}
 

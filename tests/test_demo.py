@@ -104,7 +104,7 @@ def test_what_is_printed_can_be_pasted_and_a_signal_ends_everything_within_five_
 def recorded_robots(page: str) -> list[str]:
     """The robots of the newest day of the page's Recordings."""
     days = json.loads(requested(f"{page}archive/days"))
-    return sorted(one["ref"].rpartition("/")[2] for one in days[0]["robots"]) if days else []
+    return sorted(base.rpartition("/")[2] for base in days[0]["robots"]) if days else []
 
 
 def shell(line: str) -> str:

@@ -1,10 +1,12 @@
 """What a robot on Wi-Fi announces about itself (paper A.8.6). Pure."""
 
+import json
+
 from micropython import const
 
 # It also lists what the robot does not offer, because readers assume the presence of what is missing.
 _CAPABILITIES = const(
-    b'{"schema":"pebble-capabilities/v1","t":%d,"value":{"identity":{"system":"%s","type":"%s","id":"%s"},'
+    b'{"schema":"pebble-capabilities/v1","t":%d,"value":{"identity":{"system":"%s","type":"%s","id":"%s"%s},'
     b'"transport":{"kind":"mqtt"},"drive":{"available":true,"controls":true,"arbitrates":true,'
     b'"control":%s,"topic":"%s/incoming/drive-values"},"estop":{"available":%s,"topic":"%s/incoming/estop",'
     b'"reset_topic":"%s/incoming/estop-reset","owners":["mcu"],"status_topics":["%s/outgoing/estop/mcu"]},'
@@ -14,9 +16,15 @@ _CAPABILITIES = const(
 )
 
 
-def describe(epoch_ms: int, root: bytes, stoppable: bool, controllable: bool, charging: bytes) -> bytes:
-    """Make the payload; ``root`` is the base of the topics, ``charging``: whether it reports that status, in JSON."""
+def describe(epoch_ms: int, root: bytes, name: str, stoppable: bool, controllable: bool, charging: bytes) -> bytes:
+    """Make the payload; ``root`` is the base of the topics, ``name`` what people call it; empty: nothing else.
+
+    ``charging``: whether it reports that status, in JSON.
+    """
     can, cannot = b"true", b"false"
-    values = [epoch_ms] + root.split(b"/") + [can if controllable else cannot, root, can if stoppable else cannot]
+    named = b',"name":' + json.dumps(name).encode() if name else b""
+    values = (
+        [epoch_ms] + root.split(b"/") + [named, can if controllable else cannot, root, can if stoppable else cannot]
+    )
     values += [root, root, root, charging, root, root]
     return _CAPABILITIES % tuple(values + [b'{"available":false,"controls":false}'] * 7)

@@ -40,6 +40,7 @@ class NetworkRobot:
         now = time.ticks_ms()
         name = get(settings, "robot", "id")
         root = base(get(settings, "robot", "system", "pebble"), get(settings, "robot", "type", "robots"), name)
+        self.name = get(settings, "robot", "name", "")
         self.charging = charging
         self._wifi = Wifi(get(settings, "wifi", "ssid"), get(settings, "wifi", "password", ""))
         self._clock = Clock(settings.get("ntp", "pool.ntp.org"), now)
@@ -176,7 +177,9 @@ class NetworkRobot:
         if diff(now, self._due) < 0:
             return False
         if not self._heartbeats:
-            what = describe(self._clock.read(now), session.root, stops.stoppable, stops.controllable, self.charging)
+            what = describe(
+                self._clock.read(now), session.root, self.name, stops.stoppable, stops.controllable, self.charging
+            )
             session.publish(b"capabilities", what, 1)
             stops.changed = stops.lease.changed = True
             self._due = now

@@ -10,7 +10,7 @@ import typer
 from pebble.commands.options import CaCert, PasswordFile
 
 if TYPE_CHECKING:
-    from pebble.contract.identity import Identity
+    from pebble.config.tree import Robot
     from pebble.simulation.wireless import BrokerAddress
 
 _GROUP_HELP = """The real firmware of a robot's MCU on simulated pins.
@@ -233,14 +233,14 @@ def _wireless(kind: str, id_: str | None, broker: str, password_file: Path | Non
     from pebble.simulation.networked import run
 
     address, named = _address(broker, password_file, ca_cert)
-    identity = named or Identity("pebble", "robots", id_ or kind)
-    if named is not None and id_ is not None:
-        identity = Identity(named.system, named.type, id_)
+    identity = Identity("pebble", "robots", id_ or kind)
+    if named is not None:
+        identity = Identity(named.system, named.type, id_ or named.id)
     typer.echo(f"{identity} connects to the broker at {address}; Ctrl-C ends it")
-    return run(kind, identity, address)
+    return run(kind, identity, address, name=named.name or "" if named is not None else "")
 
 
-def _address(broker: str, password_file: Path | None, ca_cert: Path | None) -> tuple[BrokerAddress, Identity | None]:
+def _address(broker: str, password_file: Path | None, ca_cert: Path | None) -> tuple[BrokerAddress, Robot | None]:
     """The broker that a URL or a config file names, and the robot of the config. Raises PebbleError."""
     from pebble.client.connection import password
     from pebble.client.url import UrlError, settings_of
@@ -254,7 +254,7 @@ def _address(broker: str, password_file: Path | None, ca_cert: Path | None) -> t
     named = None
     if "://" not in broker and not broker.startswith("zenoh:"):
         config = load(Path(broker))
-        settings, named = mqtt_settings(config.local_mqtt, reconnect_max_s=LOCAL_RECONNECT_S), config.identity
+        settings, named = mqtt_settings(config.local_mqtt, reconnect_max_s=LOCAL_RECONNECT_S), config.robot
     else:
         try:
             _, settings = settings_of(broker, password=password(password_file), ca_cert=ca_cert)

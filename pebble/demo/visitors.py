@@ -12,7 +12,7 @@ from pebble.contract.identity import parse_topic
 from pebble.errors import PayloadError
 from pebble.transports import Message
 
-_SENT = 100  # drive commands of the operator that are on their way back: five seconds of a held stick
+_SENT = 1000  # drive commands of the operator that are on their way back: 50 s of a held stick, on a busy machine
 
 
 class Visitors:

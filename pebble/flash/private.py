@@ -47,7 +47,12 @@ def private_files(config: Config, firmware: Firmware, *, ssid: str, wifi_passwor
     tls, ca = _tls(broker, firmware)
     return PrivateFiles(
         settings={
-            "robot": {"system": config.robot.system, "type": config.robot.type, "id": config.robot.id},
+            "robot": {
+                "system": config.robot.system,
+                "type": config.robot.type,
+                "id": config.robot.id,
+                **({"name": config.robot.name} if config.robot.name is not None else {}),
+            },
             "wifi": {"ssid": ssid, "password": Secret(wifi_password)},
             "mqtt": {
                 "host": broker.host,

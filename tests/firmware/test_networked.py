@@ -26,6 +26,7 @@ from tests.support import ROOT, Broker, Child, free_port, until
 
 TLS = ROOT / "tests" / "data" / "tls"
 END_S = 1.0
+NAME = 'The "lamp", naïve'  # as JSON must escape it
 
 
 class Program:
@@ -89,7 +90,10 @@ def test_both_are_driven_report_their_state_and_end_at_once_by_a_signal_with_mot
 ) -> None:
     address = f"127.0.0.1:{broker.port}"
     traces = {kind: tmp_path / f"{kind}.jsonl" for kind in KINDS}
-    programs = {kind: start(kind, address, "--id", kind, "--report", "--trace", str(traces[kind])) for kind in KINDS}
+    programs = {
+        kind: start(kind, address, "--id", kind, "--name", NAME, "--report", "--trace", str(traces[kind]))
+        for kind in KINDS
+    }
 
     def motors(kind: str) -> list[Any]:
         return [entry.motors for entry in read_trace(traces[kind])]
@@ -108,7 +112,7 @@ def test_both_are_driven_report_their_state_and_end_at_once_by_a_signal_with_mot
             assert 0.8 <= (ended.ns - began.ns) / 1e9 <= 1.2  # after the last command
             assert f"connected to the broker at {address}" in program.err
             capabilities = retained(broker.port, f"pebble/robots/{kind}/outgoing/capabilities")["value"]
-            assert capabilities["identity"]["id"] == kind
+            assert capabilities["identity"] == {"system": "pebble", "type": "robots", "id": kind, "name": NAME}
             assert capabilities["drive"]["topic"] == f"pebble/robots/{kind}/incoming/drive-values"
             operator.drive(kind, 0.0, 1.0)
             assert until(lambda kind=kind: motors(kind)[-1] == (1.0, 1.0))  # type: ignore[misc]

@@ -19,14 +19,14 @@ C6, D1 = FIRMWARE["minilamp"], FIRMWARE["benjr"]
 
 
 def config(env: dict[str, str] | None = None, **broker: Any) -> Config:
-    raw = {"robot": {"id": "lamp", "type": "lamps"}, "local_mqtt": {"host": "broker.lab", **broker}}
+    raw = {"robot": {"id": "lamp", "type": "lamps", "name": "Lamp"}, "local_mqtt": {"host": "broker.lab", **broker}}
     return parse(raw, folder=Path("/"), env=env or {})
 
 
 def test_the_settings_hold_identity_wifi_and_broker() -> None:
     private = private_files(config(port=1884), C6, ssid="Lab", wifi_password="geheim123")
     assert private.settings == {
-        "robot": {"system": "pebble", "type": "lamps", "id": "lamp"},
+        "robot": {"system": "pebble", "type": "lamps", "id": "lamp", "name": "Lamp"},
         "wifi": {"ssid": "Lab", "password": "geheim123"},
         "mqtt": {"host": "broker.lab", "port": 1884, "tls": False},
     }

@@ -101,7 +101,7 @@ class Page:
         self._reader.start()
         version = served.version if version is None else version
         self.send("hello", version=version, device=device, name=name, token=token)
-        assert until(lambda: self.welcome or self.closed, 5)
+        assert until(lambda: self.welcome or self.closed, 30)
 
     def send(self, op: str, **fields: Any) -> None:
         self._socket.send(json.dumps({"op": op, **fields}))

@@ -333,7 +333,7 @@ def is_stopped(page: Page, robot: RecordingRobot, ref: str) -> bool:
     """Whether the stop of a robot, or of all, reaches this one, which was not stopped before."""
     assert not robot.latched
     page.send("estop", ref=ref, stop=(name := f"{next(NUMBERS):016x}"), why="x")
-    stopped = until(lambda: robot.latched, 10)
+    stopped = until(lambda: robot.latched, 30)
     page.send("estop-end", stop=name)  # one of all would collect robots of later tests
     return stopped
 
@@ -345,10 +345,10 @@ def test_a_crowd_of_strangers_hides_no_robot_and_keeps_no_stop_from_it(
     with closing(Crowd(broker.port, metric, payload())), server.page() as page:
         with new_robot(broker) as robot:
             robot.publish("estop/serial", FREE, retain=True)  # as its motor owner does when it begins
-            assert page.knows(robot.base, 15)
+            assert page.knows(robot.base, 30)
             assert is_stopped(page, robot, ""), "by a stop of all"
         with new_robot(broker) as robot:
-            assert page.knows(robot.base, 15), "without a state of a stop, as what has no motors"
+            assert page.knows(robot.base, 30), "without a state of a stop, as what has no motors"
             assert until(lambda: page.value(robot.base, "capabilities"))
         with new_robot(broker, capabilities={}) as robot:
             assert is_stopped(page, robot, robot.base), "by its own stop, known or not"
@@ -363,7 +363,7 @@ def test_a_robot_is_shown_whole_by_a_server_that_finds_what_strangers_have_left(
     flood(broker.port, ((topic, LEFT[topic.split("outgoing/")[1]]()) for topic in topics), retain=True)
     try:
         with new_robot(broker) as robot, Served(broker.port) as served, served.page() as page:
-            assert page.knows(robot.base, 15)
+            assert page.knows(robot.base, 30)
             assert until(lambda: page.value(robot.base, "capabilities"), 10), (
                 "asked for again: there was no place for it"
             )
@@ -382,7 +382,7 @@ def test_a_robot_known_from_before_is_shown_and_stopped_at_once(broker: Broker, 
             Served(broker.port, people=tmp_path / "people.sqlite") as served,
             served.page() as page,
         ):
-            assert page.knows(robot.base, 15)
+            assert page.knows(robot.base, 30)
             assert is_stopped(page, robot, "")
 
 
