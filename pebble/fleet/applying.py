@@ -6,6 +6,7 @@ The plugin writes its own copy over its file, so that one is never touched while
 import getpass
 import os
 import signal
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
@@ -33,6 +34,7 @@ _LOOPBACK = "127.0.0.1"
 _ANEW = f"(stop mosquitto, then `pebble fleet password {ADMIN}`)"
 PLUGINS = ("/usr/lib", "/usr/local/lib", "/opt/homebrew/lib")
 PLUGIN = "mosquitto_dynamic_security.so"
+_STARTING_S = 3.0  # a small board loads many accounts
 
 
 def found_plugin() -> Path | None:
@@ -213,10 +215,22 @@ def _apply_files(folder: Path, before: Fleet, after: Fleet, new: Mapping[str, st
     if pid is None:
         return f"in {folder / ACL}: mosquitto does not run"
     try:
+        _await_handler(pid)
         os.kill(pid, signal.SIGHUP)
     except OSError as error:
         raise FleetError(f"mosquitto (process {pid}): {error.strerror}; send it SIGHUP: sudo kill -HUP {pid}") from None
     return "at once"
+
+
+def _await_handler(pid: int) -> None:
+    """A mosquitto that is starting listens before it handles SIGHUP, which would end it until then (2.0.11, measured)."""
+    deadline = time.monotonic() + _STARTING_S
+    while time.monotonic() < deadline:
+        status = Path(f"/proc/{pid}/status").read_text(encoding="ascii")
+        caught = next((line.split()[1] for line in status.splitlines() if line.startswith("SigCgt:")), "0")
+        if int(caught, 16) >> (signal.SIGHUP - 1) & 1:
+            return
+        time.sleep(0.01)
 
 
 def _write_rules(folder: Path, fleet: Fleet, passwords: Mapping[str, broker_files.Hashed]) -> None:

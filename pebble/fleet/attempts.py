@@ -52,7 +52,7 @@ ROWS = (
     Row(
         "sounds, outlets, devices",
         Form.OWN,
-        (c.SOUNDBOARD_COMMAND.metric, "outlets/o1/power", "mcu/u1/led", c.MIP_RAW.metric),
+        (c.SOUNDBOARD_COMMAND.metric, "outlets/a/power", "mcu/u1/led", c.MIP_RAW.metric),
     ),
     Row("ask for pictures", Form.OWN, (c.VIDEO_CONTROL.metric,)),
     Row("listen and speak", Form.OWN, (c.AUDIO_CONTROL.metric, c.AUDIO_STREAM.metric)),

@@ -1,6 +1,5 @@
 """The folder of one broker, and `fleet.json` in it: who has an account, as what. There is no secret in that file."""
 
-import fcntl
 import os
 import re
 from collections.abc import Iterator, Sequence
@@ -142,6 +141,8 @@ def locked(folder: Path) -> Iterator[None]:
     except OSError as error:
         raise FleetError(f"{folder}: {error.strerror}") from None
     try:
+        import fcntl  # the command explains itself where there is none
+
         fcntl.flock(descriptor, fcntl.LOCK_EX)
         yield
     finally:

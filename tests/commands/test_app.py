@@ -151,11 +151,11 @@ def test_a_reader_that_goes_away_is_no_error() -> None:
 def test_demo_hands_over(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     from pebble.demo import main
 
-    asked: list[float | None] = []
-    monkeypatch.setattr(main, "run", lambda seconds: asked.append(seconds) or 3)
+    asked: list[tuple[float | None, bool]] = []
+    monkeypatch.setattr(main, "run", lambda seconds, *, for_phones: asked.append((seconds, for_phones)) or 3)
     assert run("demo") == 3
-    assert run("demo", "--seconds", "20") == 3
-    assert asked == [None, 20.0]
+    assert run("demo", "--seconds", "20", "--phone") == 3
+    assert asked == [(None, False), (20.0, True)]
 
 
 def test_sim_is_there_until_ctrl_c(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from pebble.fleet.roles import Role, rights
+from pebble.fleet.roles import Role, page_rights
 from pebble.transports import MqttSettings, QoS, create
 from tests.support import until
 from tests.web.attacker import Hall
@@ -186,5 +186,5 @@ def test_only_who_has_the_right_takes_over(broker, robot, tmp_path):
             with hall.page(role.value) as page:
                 assert page.knows(robot.base)
                 page.send("lease", ref=robot.base, take=True, over=True)
-                may = "take" in rights(role)
+                may = "take" in page_rights(role)
                 assert until(lambda page=page, may=may: view(page, robot)["you"] if may else page.refused), role
