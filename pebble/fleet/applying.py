@@ -223,7 +223,7 @@ def _apply_files(folder: Path, before: Fleet, after: Fleet, new: Mapping[str, st
 
 
 def _await_handler(pid: int) -> None:
-    """A mosquitto that is starting listens before it handles SIGHUP, which would end it until then (2.0.11, measured)."""
+    """Wait while mosquitto starts: it listens before it handles SIGHUP, which would end it (2.0.11, measured)."""
     deadline = time.monotonic() + _STARTING_S
     while time.monotonic() < deadline:
         status = Path(f"/proc/{pid}/status").read_text(encoding="ascii")

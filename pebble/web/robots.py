@@ -26,7 +26,7 @@ from pebble.web.recent import Recent
 from pebble.web.restarts import Restarts
 
 MAX_COMPONENTS, MAX_METRICS, MAX_VALUE_BYTES = 500, 200, 64 * 1024
-_RANKS = 16  # shares of a rank: of eight, so half of the places are left for what is known from before
+_SHARES = 16  # shares of a rank: of eight, so half of the places are left for what is known from before
 _MAX_CLIPS_BYTES = 400 * 1024  # of the list of clips, which has up to 256 KiB of names
 LARGE_BYTES = 16 * 1024  # a value beyond holds up a slow connection: one is sent, then the page has to answer
 MAX_BYTES = 32 * 1024 * 1024  # of all values together
@@ -111,7 +111,7 @@ class Robots:
     """All components. Only the event loop calls it."""
 
     def __init__(self) -> None:
-        self.components = RankedTable[Component](MAX_COMPONENTS, MAX_COMPONENTS // _RANKS)
+        self.components = RankedTable[Component](MAX_COMPONENTS, MAX_COMPONENTS // _SHARES)
         self.before: Collection[str] = ()  # robots that are known from before
         self.omitted = 0  # messages of components, metrics and values beyond the limits
         self.interests: set[Interest] = set()
