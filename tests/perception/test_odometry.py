@@ -120,7 +120,7 @@ def test_commands_that_the_robot_refuses_change_no_direction() -> None:
     assert rig.error_mm() < 3
 
 
-def test_while_somebody_has_control_commands_with_the_key_of_now_count() -> None:
+def test_under_control_only_commands_with_the_present_key_count() -> None:
     rig = WheelsRig(geometry=ONE_SENSOR)
     for key, power in (("0badf00d", 0.5), ("91f3d869", -0.5)):
         rig.odometry.control(ControlState(boot="b", by="ann", id="3f2a91c0", key=key))
