@@ -7,7 +7,7 @@ import random
 
 import pytest
 
-from pebble.contract.payloads import Drive, EstopState
+from pebble.contract.payloads import ControlState, Drive, EstopState
 from pebble.perception.odometry import WheelGeometry
 from pebble.simulation.motion import FULL_SPEED_MM_S, TRACK_MM
 from tests.perception.wheels_rig import WheelsRig
@@ -118,6 +118,19 @@ def test_commands_that_the_robot_refuses_change_no_direction() -> None:
         rig.wait(0.1)
     rig.stop()
     assert rig.error_mm() < 3
+
+
+def test_under_control_only_commands_with_the_present_key_count() -> None:
+    rig = WheelsRig(geometry=ONE_SENSOR)
+    for key, power in (("0badf00d", 0.5), ("91f3d869", -0.5)):
+        rig.odometry.control(ControlState(boot="b", by="ann", id="3f2a91c0", key=key))
+        for _ in range(10):
+            rig.command(Drive(z=power, key=key))
+            rig.odometry.drive(Drive(z=-power, key="00000000"), rig.now)  # of a driver before
+            rig.wait(0.1)
+        rig.stop()
+        assert rig.error_mm() < 3
+    assert rig.odometry.value()["distance_mm"] > 100
 
 
 def test_while_the_robot_is_stopped_no_command_counts() -> None:
