@@ -22,7 +22,15 @@ from pebble.client.driver_lease import FILTER
 from pebble.client.estop import StopSender, new_name
 from pebble.client.estop_states import Reset
 from pebble.client.robot_view import RobotView
-from pebble.contract import APRILTAG_DATA, AUTONOMY_COMMAND, AUTONOMY_FILES, DRIVE, SOUNDBOARD_COMMAND, codec
+from pebble.contract import (
+    APRILTAG_DATA,
+    AUTONOMY_COMMAND,
+    AUTONOMY_FILES,
+    DRIVE,
+    SOUNDBOARD_COMMAND,
+    WHEEL_ODOMETRY,
+    codec,
+)
 from pebble.contract.identity import parse_topic
 from pebble.contract.payloads import AutonomyCommand, Drive, LightsFlash, LightsSolid, SoundboardCommand, TagData
 from pebble.demo.visitors import Visitors
@@ -75,7 +83,7 @@ _FORWARD = Drive(z=0.5)
 
 BY_ITSELF = "by itself"  # a robot follows a tag by a script, and is driven for a moment in between
 FOLLOW = "apriltag-follow"
-TRAIL = "wheel-odometry"  # draws the map of the operator page
+TRAIL = WHEEL_ODOMETRY.metric  # the script of this name; it draws the map of the operator page
 TAG_SIZE_M = 0.25
 DISTANCE_M, TOLERANCE_M = 0.9, 0.05
 HOLD_S = HOLD_MS / 1000  # scripts are refused this long after a person's last command

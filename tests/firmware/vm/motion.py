@@ -62,7 +62,8 @@ def repeat(trace):
             getattr(leases[number], method)(tuple(arguments[0]), *arguments[1:])
             result = _all(leases[number])
         elif method == "judge":
-            result = [arbiters[number].judge(*arguments), arbiters[number].barred, *_all(leases[number])]
+            result = [arbiters[number].judge(*arguments), arbiters[number].barred]
+            result += _all(leases[number])  # MicroPython has no star in a list
         elif method == "restore":
             latches[number].restore(*arguments)
             result = latches[number].saved()

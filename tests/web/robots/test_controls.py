@@ -258,12 +258,12 @@ def test_the_fleet_stops_robots(browser: Browser, stage: Stage, wire: Wire) -> N
         assert fleet.until(lambda: wire.latched("benjr"), 2)
         assert not wire.latched("minilamp")
         names = "[...document.querySelectorAll('.fleet-card h2')].map((one) => one.textContent).join()"
-        assert fleet.page.evaluate(names) == "benjr,minilamp"
+        assert fleet.page.evaluate(names) == "BenJr,MiniLAMP"
         fleet.test("fleet-more").click()
         fleet.test("sort").select_option("battery")
-        assert fleet.until(f"{names} === 'minilamp,benjr'", 2)
+        assert fleet.until(f"{names} === 'MiniLAMP,BenJr'", 2)
         fleet.test("filter").fill("LAMP")
-        assert fleet.until(f"{names} === 'minilamp'", 2)
+        assert fleet.until(f"{names} === 'MiniLAMP'", 2)
         fleet.test("card-minilamp").click(position={"x": 4, "y": 4})  # the whole card is the link, but for its Stop
         assert fleet.until("window.pebble.driver.ref === 'pebble/robots/minilamp'", 2)
         assert fleet.complaints() == []
