@@ -129,9 +129,11 @@ def test_what_strangers_may_do(tmp_path: Path, strangers: Any, free: bool, held_
     bench = Bench(tmp_path, "goob", security={"strangers": strangers})
     try:
         bench.drive(0.1)
+        assert not free or bench.line("M 0.100 0.100")
         bench.send("control", ANN)
         key = held(bench, "ann")
         bench.drive(0.2)
+        assert not held_by_ann or bench.line("M 0.200 0.200")  # else the zero may replace it
         bench.drive(0.0)
         assert bench.moves(0.3, key=key)
         assert ("M 0.100 0.100" in bench.lines, "M 0.200 0.200" in bench.lines) == (free, held_by_ann)
