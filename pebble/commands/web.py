@@ -22,9 +22,9 @@ from pebble.commands.web_people import PEOPLE, TLS, PeopleOption, default_folder
 from pebble.config import load
 from pebble.config.hosts import name_of_page
 from pebble.config.web import WebTls, is_loopback
+from pebble.contract.names import NAME
 from pebble.errors import PebbleError
 from pebble.fleet.certificates import CA_CERT, SERVER_CERT, SERVER_KEY, own_names
-from pebble.fleet.people import NAME
 from pebble.runtime.connections import REMOTE_RECONNECT_S
 from pebble.transports import MqttSettings
 

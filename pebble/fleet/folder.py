@@ -12,8 +12,8 @@ from msgspec import Meta, Struct
 from msgspec.structs import replace
 
 from pebble.contract.identity import SERVERS, Identity
+from pebble.contract.names import NAME
 from pebble.errors import ConfigError, PebbleError
-from pebble.fleet.people import NAME
 from pebble.fleet.roles import GATEWAYS, Account, Extra, ProgramRole, Rule, add_up, rules
 from pebble.fleet.whole_file import write
 

@@ -3,7 +3,6 @@
 import hashlib
 import hmac
 import logging
-import re
 import secrets
 import sqlite3
 import threading
@@ -14,6 +13,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from pebble.contract.names import NAME
 from pebble.errors import PebbleError
 from pebble.fleet.database import Database, DatabaseError
 from pebble.fleet.roles import Role, Session
@@ -23,7 +23,6 @@ from pebble.transports.bounds import BoundedTable
 
 log = logging.getLogger(__name__)
 
-NAME = re.compile(r"[a-z0-9_-]{1,32}")
 SESSION_S = 7 * 24 * 3600.0  # a session ends after this long, whether it is used or not
 MIN_PASSWORD = 8
 MAX_PASSWORD = 256  # longer ones are refused unread: hashing them costs time

@@ -15,6 +15,7 @@ from pebble.config.security import SecurityLevel
 from pebble.contract import INCOMING, OUTGOING, Channel, Kind
 from pebble.contract import channels as c
 from pebble.contract.identity import SERVERS
+from pebble.contract.names import BY
 
 GATEWAYS = "gateways"  # the type of programs that carry the topics of several robots to a broker
 CONTROL_TOPIC, CONTROL_ANSWERS = "$CONTROL/dynamic-security/v1", "$CONTROL/dynamic-security/#"
@@ -205,7 +206,7 @@ def _of_rights(
         if right in held:
             for metric in metrics(right, extra):
                 if level == "named":
-                    yield Rule("write", f"{_ANY}/{INCOMING}/by/{name}/{metric}")
+                    yield Rule("write", f"{_ANY}/{INCOMING}/{BY}/{name}/{metric}")
                 for base in plain if level == "named" else (_ANY,):
                     yield Rule("write", f"{base}/{INCOMING}/{metric}")
     if Right.DRIVE in held:
