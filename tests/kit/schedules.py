@@ -29,6 +29,7 @@ ENGINES = {
     "motion": "tests.motion.histories",
     "lockstep": "tests.robot.lockstep.schedules",
     "driving_lockstep": "tests.web.driving_lockstep.schedules",
+    "control": "tests.robot.control_schedules",
 }
 
 Step = tuple[str, int, int]  # the world's method do_<action> is called with two small numbers

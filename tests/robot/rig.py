@@ -98,7 +98,7 @@ class Rig:
     The robot reaches the remote broker through ``uplink``, a proxy that can fail. With ``direct`` it connects without
     the proxy, because a proxy acknowledges TCP segments itself and so changes the timing. ``remote`` and ``local``
     replace its own brokers; ``login`` is the robot's user name there. ``motors`` replaces its own MCU. ``listens``:
-    what the operator subscribes to, below the robot's base.
+    what the operator subscribes to, below the robot's base. ``top``: more sections of the config; others are services'.
     """
 
     def __init__(
@@ -115,9 +115,10 @@ class Rig:
         local: Broker | None = None,
         login: str | None = None,
         listens: str = "#",
+        top: dict[str, Any] | None = None,
         **config: Any,
     ) -> None:
-        self.kind, self.name, self._extra, self._direct = kind, name, config, direct
+        self.kind, self.name, self._extra, self._direct, self._top = kind, name, config, direct, top or {}
         self._login = {} if login is None else {"username": login}
         self.charge_later = "charge"  # the MCU command in the middle of a fault
         self._folder = tempfile.TemporaryDirectory(prefix="pbl")
@@ -214,6 +215,14 @@ class Rig:
         os.kill(pid, signal.SIGKILL)
         return time.monotonic()
 
+    def freeze(self, program: str, seconds: float) -> None:
+        """Let one process of the robot, if it runs, do nothing for so long."""
+        pid = self.processes().get(program)
+        if pid is not None:
+            os.kill(pid, signal.SIGSTOP)
+            time.sleep(seconds)
+            os.kill(pid, signal.SIGCONT)
+
     def kill_local_broker(self) -> None:
         """Kill the robot's own broker; it starts again after a second, without its retained messages."""
         assert self.local is not None
@@ -274,7 +283,7 @@ class Rig:
         }
         for name, more in self._extra.items():
             services[name] = {**services.get(name, {}), **more}
-        return {"robot": {"id": self.name}, **self._transport(), "services": services}
+        return {"robot": {"id": self.name}, **self._transport(), **self._top, "services": services}
 
     def _transport(self) -> dict[str, Any]:
         if self.kind == "zenoh":

@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 
+from tests.robot.control_schedules import ENGINE
 from tests.robot.operator import Operator
 from tests.robot.rig import BASE, STOP, Rig
 from tests.support import beside, cases, until
@@ -150,3 +151,11 @@ def test_where_strangers_are_refused_only_a_key_moves() -> None:
         rig.operator.send(DRIVE, {"x": 0, "z": 0.5, "key": key})
         assert until(lambda: lines(rig, 0.5), 5)
         assert lines(rig, 0.3) == lines(rig, 0.4) == []
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("kind", ENGINE.kinds)
+def test_random_schedules_of_people_a_script_and_faults(kind: str) -> None:
+    """``python -m tests.kit.schedules control`` runs hundreds."""
+    for one in ENGINE.run(kind, 1, range(5)):
+        assert not one.problems, one.log

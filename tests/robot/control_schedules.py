@@ -1,0 +1,302 @@
+"""Random schedules of two people who take control of a whole robot from each other, of its script, and of faults.
+
+``python -m tests.kit.schedules control``: real processes, so a violated schedule need not be violated again. Whose a
+line of the MCU is shows in its speed. The robot refuses strangers, so that each line of a person had a key.
+"""
+
+from __future__ import annotations
+
+import secrets
+import shutil
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, closing, contextmanager
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+from pebble.client.estop import new_name
+from tests.kit.schedules import Engine, Outcome, RandomSteps, Steps
+from tests.robot.operator import Operator
+from tests.robot.rig import BASE, Rig
+from tests.robot.script_schedules.alive import Alive
+from tests.robot.script_schedules.rules import by_script, problems
+from tests.robot.stop_schedules.history import History
+from tests.support import ROOT, until
+
+STATE = "outgoing/control/serial"
+SPEEDS = {"ann": 0.3, "otto": 0.5}
+_PERIOD_S = 0.06
+_WAITS_S = (0.02, 0.05, 0.1, 0.1, 0.2, 0.3, 0.5, 1.0)
+_FAULTS = ("serial_mcu_bridge", "mqtt_bridge")
+_WEIGHTS = {
+    "hold": 4, "take": 4, "release": 2, "drive": 6, "let_go": 2, "lose": 1, "stop": 1, "reset": 2,
+    "start": 2, "end": 1, "kill": 1, "freeze": 1, "go_silent": 1, "restart_broker": 1,
+}  # fmt: skip
+
+
+class Person:
+    """Repeats a request for control and a drive command, each while it is wanted; a key is used for ever."""
+
+    def __init__(self, name: str, port: int) -> None:
+        self.name, self.id = name, secrets.token_hex(4)
+        self.operator = Operator(port, BASE, STATE)
+        self.key = ""
+        self.wants = self.drives = False
+        self._changed, self._ended = threading.Event(), False
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        self._ended = True
+        self._changed.set()
+        self._thread.join()
+        self.operator.close()
+
+    def request(self, topic: str = "control", want: str = "hold") -> None:
+        self.wants = want == "hold"
+        self.operator.send(f"incoming/{topic}", {"want": want, "id": self.id, "by": self.name, "device": "desk"})
+
+    def drive(self, speed: float) -> None:
+        self.operator.send("incoming/drive-values", {"x": 0, "z": speed, "key": self.key})
+
+    @property
+    def holds(self) -> bool:
+        seen = self.operator.last(STATE)
+        return seen is not None and seen.json["id"] == self.id
+
+    def _run(self) -> None:
+        asked = 0.0
+        while not self._ended:
+            seen = self.operator.last(STATE)
+            if seen is not None and seen.json["id"] == self.id:
+                self.key = seen.json["key"]
+            if self.wants and time.monotonic() > asked + 1.0:
+                asked = time.monotonic()
+                self.request()
+            if self.drives and self.key:
+                self.drive(SPEEDS[self.name])
+            self._changed.wait(_PERIOD_S)
+
+
+class World:
+    """A robot, its brokers and two people; ``history`` is that of the present schedule."""
+
+    def __init__(self, transport: str) -> None:
+        self.history = History()
+        with ExitStack() as opened:
+            scripts = Path(opened.enter_context(tempfile.TemporaryDirectory(prefix="pbls")))
+            shutil.copytree(ROOT / "tests" / "robot" / "scripts" / "cruise", scripts / "cruise")
+            manager = {"enabled": True, "autonomy_root": str(scripts), "stop_timeout_seconds": 1.5}
+            config = {"security": {"strangers": "refuse"}}
+            self.rig = opened.enter_context(
+                Rig(transport, mirror=transport == "zenoh", top=config, autonomy_manager=manager)
+            )
+            assert self.rig.local is not None
+            self.watcher = opened.enter_context(closing(Operator(self.rig.local.port, BASE, STATE)))
+            self.people = [opened.enter_context(closing(Person(name, self.rig.remote.port))) for name in SPEEDS]
+            self.alive = opened.enter_context(closing(Alive(self.rig.folder)))
+            self._opened = opened.pop_all()
+
+    def close(self) -> None:
+        self._opened.close()
+
+    def perform(self, schedule: Steps) -> Outcome:
+        self.history = History()
+        self.alive.overlaps.clear()
+        began = self.history.began
+        for action, a, b in schedule[1]:
+            getattr(self, "do_" + action)(self.people[a % 2], b)
+            time.sleep(_WAITS_S[b % len(_WAITS_S)])
+        ended = time.monotonic()
+        left = self._rest()
+        lines = self.rig.mcu.drives(began)
+        found = problems(self.history, lines, self.rig.mcu.motors(began), list(self.alive.overlaps))
+        found += self._out_of_turn(began)
+        counts = {"lines": float(len(lines)), "passed on": float(len(self._holders(began, ended)))}
+        return Outcome(found + left, counts, log=lambda: self._log(began))
+
+    # -- what people do; what is short or long with the number ``b``
+
+    def do_hold(self, person: Person, _: int) -> None:
+        self._note("hold", person)
+        person.request()
+
+    def do_take(self, person: Person, _: int) -> None:
+        self._note("take", person)
+        person.request("control/take")
+
+    def do_release(self, person: Person, _: int) -> None:
+        self._note("release", person)
+        person.request(want="release")
+
+    def do_drive(self, person: Person, _: int) -> None:
+        self._note("drives", person)
+        person.drives = True
+
+    def do_let_go(self, person: Person, b: int) -> None:
+        person.drives = False
+        self.history.add("zero", final=b % 3 == 0, by=person.name)
+        person.operator.send("incoming/drive-values", {"x": 0, "z": 0, **({"valid_ms": 0} if b % 3 == 0 else {})})
+
+    def do_lose(self, person: Person, _: int) -> None:
+        self._note("lose", person)
+        person.drives = person.wants = False
+
+    def do_stop(self, person: Person, _: int) -> None:
+        for one in self.people:
+            one.drives = False
+        self._note("estop", person)
+        person.operator.send("incoming/estop", {"stop": new_name(), "by": person.name})
+
+    def do_reset(self, person: Person, _: int) -> None:
+        state = self.rig.operator.last("outgoing/estop/serial")
+        if state is not None and state.payload:
+            shown = {"boot": state.json["boot"], "count": state.json["count"]}
+            person.operator.send("incoming/estop-reset", {**shown, "by": person.name})
+
+    def do_start(self, person: Person, _: int) -> None:
+        self._note("start", person)
+        options = {"x": 0.0, "z": -0.3}
+        person.operator.send("incoming/autonomy-command", {"action": "start", "file": "cruise", "config": options})
+
+    def do_end(self, person: Person, _: int) -> None:
+        self._note("end", person)
+        person.operator.send("incoming/autonomy-command", {"action": "stop"})
+
+    # -- faults
+
+    def do_kill(self, _: Person, b: int) -> None:
+        with self._fault(f"kill {_FAULTS[b % 2]}", 1.5):
+            if _FAULTS[b % 2] in self.rig.processes():
+                self.rig.kill(_FAULTS[b % 2])
+
+    def do_freeze(self, _: Person, b: int) -> None:
+        with self._fault(f"freeze {_FAULTS[b % 2]}"):
+            self.rig.freeze(_FAULTS[b % 2], _WAITS_S[b % 8])
+
+    def do_go_silent(self, _: Person, b: int) -> None:
+        with self._fault("the uplink is silent"):
+            self.rig.uplink.blackhole()
+            time.sleep(_WAITS_S[b % 8])
+            self.rig.uplink.resume()
+
+    def do_restart_broker(self, _: Person, b: int) -> None:
+        with self._fault("the broker is away", 1.5):
+            self.rig.remote.kill()
+            time.sleep(_WAITS_S[b % 8])
+            self.rig.remote.start()
+
+    @contextmanager
+    def _fault(self, which: str, after: float = 0.0) -> Iterator[None]:
+        began = time.monotonic()
+        yield
+        self.history.add("fault", at=began, which=which, until=time.monotonic() + after)
+
+    def _note(self, what: str, person: Person) -> None:
+        self.history.add(what, by=person.name)
+
+    # -- rules
+
+    def _holders(self, since: float, until_: float = float("inf")) -> list[str]:
+        """Who had control, in turn, as the robot has published it on its own side."""
+        seen = [one for one in self.watcher.on(STATE) if one.payload]
+        before = [one for one in seen if one.at < since][-1:]
+        names = [one.json["by"] for one in (*before, *(one for one in seen if since <= one.at < until_))]
+        return [name for name, _ in groupby(names)]
+
+    def _out_of_turn(self, since: float) -> Iterator[str]:
+        """A line of somebody who had no control then, by order alone: the clocks of two processes prove nothing."""
+        turns = iter(self._holders(since))
+        speeds = {(speed, speed): name for name, speed in SPEEDS.items()}
+        driven = [speeds[wheels] for _, wheels in self.rig.mcu.drives(since) if wheels in speeds]
+        for name, _ in groupby(driven):
+            if name not in turns:
+                yield f"the wheels obey {name} out of turn: {driven[-5:]}, control of {self._holders(since)}"
+                return
+
+    # -- the end: each of the two gets control and drives, the other does not
+
+    def _rest(self) -> list[str]:
+        for person in self.people:
+            person.wants = person.drives = False
+        if not until(self._up, 20.0):
+            return ["the robot does not come back"]
+        self.do_end(self.people[0], 0)
+        if not until(self._is_reset, 5.0, step=0.4):
+            return ["a stop cannot be reset"]
+        for person in self.people:
+            if problem := self._drives(person):
+                return [problem]
+        zero = time.monotonic()
+        self.do_let_go(self.people[0], 0)
+        if not until(lambda: self.rig.mcu.drives(zero) and not self.rig.mcu.moving(zero), 2.0):
+            return ["a zero does not stop the wheels"]
+        if not until(lambda: not self.alive.groups, 5.0):
+            return ["a script does not end"]
+        return self._script_drives()
+
+    def _drives(self, person: Person) -> str:
+        """Why not; empty: it gets control and drives, while the other one sends keys of before."""
+        person.request("control/take")
+        if not until(lambda: person.holds and person.key, 5.0):
+            return f"{person.name} does not get control"
+        person.drive(0)  # after a reset, and after a zero with which another lets go
+        self._note("drives", person)
+        began, wheels = time.monotonic(), (SPEEDS[person.name],) * 2
+        for one in self.people:
+            one.drives = True
+        obeyed = until(lambda: wheels in [driven for _, driven in self.rig.mcu.drives(began)], 5.0)
+        for one in self.people:
+            one.drives = False
+        person.request(want="release")
+        return "" if obeyed else f"{person.name} has control, and the wheels do not obey"
+
+    def _script_drives(self) -> list[str]:
+        time.sleep(2.2)  # a person's command holds a script for two seconds
+        began = time.monotonic()
+        self.do_start(self.people[0], 0)
+        drives = until(lambda: any(by_script(wheels) for _, wheels in self.rig.mcu.drives(began)), 15.0)
+        self.do_end(self.people[0], 0)
+        ends = until(lambda: not self.alive.groups, 5.0)
+        return [] if drives and ends else ["a script does not drive" if ends else "a script does not end"]
+
+    def _up(self) -> bool:
+        seen, now = self.rig.operator.last("outgoing/online"), time.monotonic()
+        running = set(self.rig.processes())
+        return seen is not None and now - seen.at < 0.6 and {"autonomy_manager", *_FAULTS} <= running
+
+    def _is_reset(self) -> bool:
+        state = self.rig.operator.last("outgoing/estop/serial")
+        self.do_reset(self.people[0], 0)
+        return state is not None and bool(state.payload) and not state.json["latched"]
+
+    def _log(self, since: float) -> str:
+        events = [(event.at, f"{event.what} {event.details or ''}") for event in self.history.events()]
+        events += [(at, f"    M {wheels}") for at, wheels in self.rig.mcu.drives(since)]
+        events += [(one.at, f"  control {one.payload!r}") for one in self.watcher.on(STATE, since)]
+        return "\n".join(
+            [
+                *(f"{at:.3f} {text}" for at, text in sorted(events, key=lambda event: event[0])),
+                self.rig.log.read_text()[-3000:],
+            ]
+        )
+
+
+@contextmanager
+def _world(kind: str, _bug: Any) -> Iterator[World]:
+    with closing(World(kind)) as world:
+        yield world
+
+
+ENGINE = Engine(
+    draw=RandomSteps(_WEIGHTS, length=22, layouts=1, begin=(("take", 0, None), ("drive", 0, None))),
+    world=_world,
+    perform=lambda world, schedule: world.perform(schedule),
+    kinds=("mqtt", "zenoh"),
+    schedules=200,
+    per_world=20,
+    repeats=False,
+)
