@@ -62,17 +62,18 @@ class Person:
     def drive(self, speed: float) -> None:
         self.operator.send("incoming/drive-values", {"x": 0, "z": speed, "key": self.key})
 
-    @property
-    def holds(self) -> bool:
+    def has_control(self) -> bool:
+        """Whether it has control, and the key of now."""
         seen = self.operator.last(STATE)
-        return seen is not None and seen.json["id"] == self.id
+        if seen is None or seen.json["id"] != self.id:
+            return False
+        self.key = seen.json["key"]
+        return True
 
     def _run(self) -> None:
         asked = 0.0
         while not self._ended:
-            seen = self.operator.last(STATE)
-            if seen is not None and seen.json["id"] == self.id:
-                self.key = seen.json["key"]
+            self.has_control()
             if self.wants and time.monotonic() > asked + 1.0:
                 asked = time.monotonic()
                 self.request()
@@ -241,7 +242,7 @@ class World:
     def _drives(self, person: Person) -> str:
         """Why not; empty: it gets control and drives, while the other one sends keys of before."""
         person.request("control/take")
-        if not until(lambda: person.holds and person.key, 5.0):
+        if not until(person.has_control, 5.0):
             return f"{person.name} does not get control"
         person.drive(0)  # after a reset, and after a zero with which another lets go
         self._note("drives", person)
