@@ -29,6 +29,7 @@ from tests.support import ROOT, until
 STATE = "outgoing/control/serial"
 SPEEDS = {"ann": 0.3, "otto": 0.5}
 _PERIOD_S = 0.06
+_ANSWER_S = 0.5
 _WAITS_S = (0.02, 0.05, 0.1, 0.1, 0.2, 0.3, 0.5, 1.0)
 _FAULTS = ("serial_mcu_bridge", "mqtt_bridge")
 _WEIGHTS = {
@@ -96,7 +97,7 @@ class World:
                 Rig(transport, mirror=transport == "zenoh", top=config, autonomy_manager=manager)
             )
             assert self.rig.local is not None
-            self.watcher = opened.enter_context(closing(Operator(self.rig.local.port, BASE, STATE)))
+            self.watcher = opened.enter_context(closing(Operator(self.rig.local.port, BASE, "outgoing/+/serial")))
             self.people = [opened.enter_context(closing(Person(name, self.rig.remote.port))) for name in SPEEDS]
             self.alive = opened.enter_context(closing(Alive(self.rig.folder)))
             self._opened = opened.pop_all()
@@ -153,7 +154,7 @@ class World:
         person.operator.send("incoming/estop", {"stop": new_name(), "by": person.name})
 
     def do_reset(self, person: Person, _: int) -> None:
-        state = self.rig.operator.last("outgoing/estop/serial")
+        state = self.watcher.last("outgoing/estop/serial")
         if state is not None and state.payload:
             shown = {"boot": state.json["boot"], "count": state.json["count"]}
             person.operator.send("incoming/estop-reset", {**shown, "by": person.name})
@@ -226,6 +227,7 @@ class World:
         if not until(self._up, 20.0):
             return ["the robot does not come back"]
         self.do_end(self.people[0], 0)
+        time.sleep(_ANSWER_S)  # the state after the last stop may still be on its way
         if not until(self._is_reset, 5.0, step=0.4):
             return ["a stop cannot be reset"]
         for person in self.people:
@@ -270,7 +272,7 @@ class World:
         return seen is not None and now - seen.at < 0.6 and {"autonomy_manager", *_FAULTS} <= running
 
     def _is_reset(self) -> bool:
-        state = self.rig.operator.last("outgoing/estop/serial")
+        state = self.watcher.last("outgoing/estop/serial")
         self.do_reset(self.people[0], 0)
         return state is not None and bool(state.payload) and not state.json["latched"]
 

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -219,9 +220,10 @@ class Rig:
         """Let one process of the robot, if it runs, do nothing for so long."""
         pid = self.processes().get(program)
         if pid is not None:
-            os.kill(pid, signal.SIGSTOP)
-            time.sleep(seconds)
-            os.kill(pid, signal.SIGCONT)
+            with suppress(ProcessLookupError):  # killed before, and not started again yet
+                os.kill(pid, signal.SIGSTOP)
+                time.sleep(seconds)
+                os.kill(pid, signal.SIGCONT)
 
     def kill_local_broker(self) -> None:
         """Kill the robot's own broker; it starts again after a second, without its retained messages."""
