@@ -130,7 +130,6 @@ def hall(tmp_path: Path) -> Path:
         ("pebble fleet init hall --host x.lab", "hall is a fleet already, so leave out --host"),
         ("pebble fleet init other", "--host is missing: the name or address by which robots and people reach"),
         ("pebble fleet init other --host x.lab --level open", '--level must be "login" or "named", not "open"'),
-        ("pebble fleet init hall --level named", "robots of this release need --plain"),
         ("pebble fleet add Ann --role driver", "'Ann' is no name: use 1 to 32 of a-z, 0-9, _ and -"),
         ("pebble fleet add ann --role boss", "'boss' is no role: use viewer, driver"),
         ("pebble fleet add ann --role robot,driver", "robot goes with no other role"),

@@ -146,7 +146,13 @@ def test_the_demo_and_simulations_are_not_warned() -> None:
 
 @pytest.mark.parametrize(
     ("security", "unnamed"),
-    [({}, "drive"), ({"level": "login"}, "drive"), ({"level": "login", "strangers": "free"}, "free")],
+    [
+        ({}, "drive"),
+        ({"level": "login"}, "drive"),
+        ({"level": "login", "strangers": "free"}, "free"),
+        ({"level": "named"}, "refuse"),
+        ({"level": "named", "strangers": "free"}, "free"),
+    ],
 )
 def test_drive_commands_without_control(security: dict[str, str], unnamed: str) -> None:
     config = parse(GOOD | {"security": security}, folder=Path("/nowhere"), env={})

@@ -21,6 +21,7 @@ def test_a_name_stands_behind_incoming(metric: str) -> None:
         f"{BASE}/incoming/by/ann/by/otto/drive-values",
         f"{BASE}/incoming/by/Ann/drive-values",
         f"{BASE}/incoming/by//drive-values",
+        f"{BASE}/incoming/by/-/drive-values",
         f"{BASE}/incoming/by/{'a' * 33}/drive-values",
         f"{BASE}/incoming/by/ann",
         f"{BASE}/incoming/by/ann/",

@@ -31,6 +31,17 @@ def test_people_see_it_as_its_config_describes_it() -> None:
     }
 
 
+def test_a_robot_that_reads_names_tells_so() -> None:
+    raw = {
+        "robot": {"id": "rover"},
+        "transport": {"kind": "zenoh"},
+        "security": {"level": "named"},
+        "services": {"mqtt_bridge": {"enabled": True, "remote_mqtt": {"host": "127.0.0.1"}}},
+    }
+    config = parse(raw, folder=Path("/robots"), env={})
+    assert capabilities(config, Addresses(config))["named"] is True
+
+
 def test_a_robot_without_services_still_lists_everything() -> None:
     assert of() == {
         "identity": {"system": "pebble", "type": "robots", "id": "rover"},

@@ -9,8 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+from msgspec.structs import replace
 
-from pebble.contract.payloads import EstopState
+from pebble.config import Security
+from pebble.contract.payloads import ControlState, EstopState
 from pebble.services.autonomy_manager.child import Launch
 from pebble.services.autonomy_manager.script import Script
 from pebble.services.autonomy_manager.service import AutonomyManager
@@ -71,9 +73,11 @@ class Clock:
 class Bench:
     """The service with ``scripts``, and a client that sees and sends what operators and motor owners do."""
 
-    def __init__(self, folder: Path, scripts: Mapping[str, Script], **section: Any) -> None:
+    def __init__(self, folder: Path, scripts: Mapping[str, Script], *, named: bool = False, **section: Any) -> None:
         network = LocalNetwork("memory", folder)
         config = network.config(folder, MOTORS, autonomy_manager={"enabled": True, **section})
+        if named:
+            config = replace(config, security=Security(level="named"))
         self.clock, self.children = Clock(), FakeProcesses()
         self.world = Listener(network.client("world"))
         self.drives: list[dict[str, Any]] = []
@@ -108,6 +112,11 @@ class Bench:
         """Command a stop, and wait until a process is asked to end."""
         self.command({"action": "stop"})
         assert until(lambda: child.signals == [signal.SIGTERM])
+
+    def holder(self, by: str) -> None:
+        """Publish who has control; empty: nobody."""
+        raw = msgspec.json.encode(ControlState(by=by, id="aaaaaaaa", key="0badf00d" if by else ""))
+        self.world.transport.publish(f"{BASE}/outgoing/control/serial", raw, qos=QoS.DELIVERED, retain=True)
 
     def owner(self, **fields: Any) -> None:
         """Publish the state of the motor owner."""

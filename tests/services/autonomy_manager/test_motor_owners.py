@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from pebble.contract.payloads import EstopState
+from pebble.contract.payloads import ControlState, EstopState
 from pebble.motion.arbiter import Arbiter
 from pebble.motion.latch import Latch
 from pebble.motion.lease import Lease
@@ -101,3 +101,24 @@ def test_every_owner_comes_to_obey_a_run_also_one_that_was_away_while_a_stranger
             arbiter.judge(False, number, -1, 3000)
         assert arbiter.judge(True, run, -1, 3000) == 750
     assert table.ending(run, baseline) == "", "what was barred before the start ends nothing"
+
+
+@pytest.mark.parametrize(
+    ("states", "by", "holder"),
+    [
+        ({}, "ann", ""),
+        ({"serial": ("", "")}, "ann", ""),
+        ({"serial": ("ann", "0badf00d")}, "ann", ""),
+        ({"serial": ("ann", "0badf00d")}, "otto", "ann"),
+        ({"serial": ("ann", "0badf00d")}, "-", "ann"),
+        ({"serial": ("page-1/ann", "0badf00d")}, "page-1/bob", ""),  # the page asks its own people
+        ({"serial": ("page-1/ann", "0badf00d")}, "ann", "page-1/ann"),
+        ({"left": ("otto", "0badf00d"), "arm": ("ann", "1badf00d")}, "ann", ""),  # the first owner by name decides
+    ],
+)
+def test_who_has_control_beside_the_one_who_asks(states: dict[str, tuple[str, str]], by: str, holder: str) -> None:
+    owners = MotorOwners(list(states))
+    for owner, (name, key) in states.items():
+        owners.receive_control(owner, ControlState(by=name, id="aaaaaaaa", key=key))
+        owners.receive_control(f"forged-{owner}", ControlState(by="mia", id="bbbbbbbb", key="2badf00d"))
+    assert owners.holder_beside(by) == holder

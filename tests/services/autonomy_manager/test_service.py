@@ -363,6 +363,30 @@ def test_a_start_right_after_a_persons_final_zero_is_refused_instead_of_ended_tw
     bench.start("walk")
 
 
+def test_where_names_are_checked_only_who_has_control_starts_a_script(tmp_path: Path) -> None:
+    """Anybody ends one, and a program of the robot, which has no name, starts one."""
+    bench = Bench(tmp_path, SCRIPTS, named=True)
+    try:
+        bench.holder("page-1/ann")
+        for by in ("otto", "-"):
+            bench.command({"action": "start", "file": "walk", "by": by})
+            assert bench.becomes(error="Failed to start walk: page-1/ann has control, and starts scripts")
+            bench.command({"action": "start", "file": "none", "by": "page-1"})
+            assert bench.becomes(error="Unknown autonomy file: none")
+        bench.command({"action": "start", "file": "walk", "by": "page-1/bob"})
+        assert bench.becomes(running=True, file="walk")
+        bench.command({"action": "stop", "by": "otto"})
+        assert until(lambda: bench.children.all[-1].signals == [TERM])
+        bench.children.all[-1].end(0)
+        bench.start("sing")
+        bench.holder("")
+        bench.quiet()
+        bench.command({"action": "start", "file": "eyes", "by": "otto"})
+        assert until(lambda: bench.children.all[-1].signals == [TERM])
+    finally:
+        bench.close()
+
+
 # -- its own end
 
 

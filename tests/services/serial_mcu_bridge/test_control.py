@@ -10,7 +10,7 @@ import pytest
 
 from pebble.config import Security
 from pebble.contract import CONTROL_STATE, codec
-from pebble.contract.payloads import ControlRequest, ControlState
+from pebble.contract.payloads import ControlRequest, ControlState, Drive
 from pebble.services.serial_mcu_bridge.motion.control import Control
 from tests.services.serial_mcu_bridge.motor_rig import STOPPED, Bench
 from tests.support import until
@@ -51,6 +51,18 @@ def test_a_state_is_short() -> None:
     assert states[-1].asks == "z" * 40
     assert len(raw) <= 300
     assert codec.decode(CONTROL_STATE, raw) == states[-1]
+
+
+def test_where_names_are_checked_the_key_counts_with_its_account() -> None:
+    control = Control(Security(level="named"), lambda _state: None, 0.0)
+    control.request(ControlRequest(id="aaaaaaaa", by="page-1/ann"), over=False, now=0.0)
+    state = control.state()
+    assert (state.by, state.named) == ("page-1/ann", True)
+    senders = {"page-1/ann": True, "page-1/bob": True, "page-1": True, "ann": False, "otto/page-1": False, "-": False}
+    assert {by: control.holds(Drive(z=0.5, key=state.key, by=by)) for by in senders} == senders
+    assert not control.holds(Drive(z=0.5, key=state.key))  # of a program of the robot
+    control.request(ControlRequest(id="aaaaaaaa", by="otto", want="release"), over=False, now=0.0)  # another's id
+    assert control.state().key == state.key
 
 
 # -- a service, an MCU and operators
