@@ -20,7 +20,10 @@ HOST = "127.0.0.1"
 
 
 class FleetBroker:
-    """A folder with accounts, and its broker; ``start`` and ``stop`` it. ``passwords``: of all accounts."""
+    """A folder with accounts, and its broker; ``start`` and ``stop`` it. ``passwords``: of all accounts.
+
+    ``unencrypted``: a port without TLS, as boards need it.
+    """
 
     def __init__(
         self,
@@ -29,10 +32,12 @@ class FleetBroker:
         *,
         level: Literal["login", "named"] = "login",
         rules: Literal["plugin", "files"] = "plugin",
+        unencrypted: int | None = None,
     ) -> None:
         folder.mkdir(exist_ok=True)
-        self.folder, self.port = folder, free_port()
-        fleet = Fleet(level=level, rules=rules, brokers=(Server(host=HOST, port=self.port),))
+        self.folder, self.port, self.unencrypted = folder, free_port(), unencrypted
+        server = Server(host=HOST, port=self.port, unencrypted=unencrypted)
+        fleet = Fleet(level=level, rules=rules, brokers=(server,))
         plugin = applying.found_plugin() if rules == "plugin" else None
         self.passwords = {"admin": applying.make(folder, fleet, plugin)}
         before = load(folder)
@@ -67,7 +72,8 @@ class FleetBroker:
         command = [str(mosquitto_path()), "-c", str(self.folder / CONF)]
         log = (self.folder / "log").open("ab")
         self._process = Child(command, stdout=log, stderr=log)
-        assert until(lambda: listening(self.port), 10), (self.folder / "log").read_text()
+        ports = [port for port in (self.port, self.unencrypted) if port is not None]
+        assert until(lambda: all(map(listening, ports)), 10), (self.folder / "log").read_text()
 
     def stop(self) -> None:
         """By SIGKILL: with its plugin it has been seen to hang at its end, once."""

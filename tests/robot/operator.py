@@ -30,12 +30,27 @@ class ReceivedMessage:
 
 
 class Operator:
-    """Connects to one broker, subscribes to one robot, records every message, and publishes on request."""
+    """Connects to one broker, subscribes to one robot, records every message, and publishes on request.
 
-    def __init__(self, port: int, base: str, listens: str = "#") -> None:
+    ``login``: a user name and its password. ``will``: what the broker publishes when the connection is lost.
+    """
+
+    def __init__(
+        self,
+        port: int,
+        base: str,
+        listens: str = "#",
+        *,
+        login: tuple[str, str] | None = None,
+        will: tuple[str, Any] | None = None,
+    ) -> None:
         self.base, self._listens = base, listens
         self.seen: list[ReceivedMessage] = []
         self._client = paho.Client(CallbackAPIVersion.VERSION2)
+        if login is not None:
+            self._client.username_pw_set(*login)
+        if will is not None:
+            self._client.will_set(f"{base}/{will[0]}", json.dumps(will[1]), qos=1)
         self._client.on_connect = self._subscribe
         self._client.on_message = self._remember
         self._client.on_socket_open = _send_at_once

@@ -99,7 +99,7 @@ class Rig:
     The robot reaches the remote broker through ``uplink``, a proxy that can fail. With ``direct`` it connects without
     the proxy, because a proxy acknowledges TCP segments itself and so changes the timing. ``remote`` and ``local``
     replace its own brokers; ``login`` is the robot's user name there. ``motors`` replaces its own MCU. ``listens``:
-    what the operator subscribes to, below the robot's base. ``top``: more sections of the config; others are services'.
+    what the operator subscribes to, below the robot's base; ``operator`` replaces it. ``top``: more sections of the config; others are services'.
     """
 
     def __init__(
@@ -116,6 +116,7 @@ class Rig:
         local: Broker | None = None,
         login: str | None = None,
         listens: str = "#",
+        operator: Operator | None = None,
         top: dict[str, Any] | None = None,
         **config: Any,
     ) -> None:
@@ -133,7 +134,7 @@ class Rig:
         self.config.write_text(json.dumps(self._config(), indent=1))
         self.log = self.folder / "robot.log"
         self._robot: subprocess.Popen[bytes] | None = None
-        self.operator = Operator(self.remote.port, f"pebble/robots/{name}", listens)
+        self.operator = operator or Operator(self.remote.port, f"pebble/robots/{name}", listens)
         if start:
             try:
                 self.start()

@@ -370,7 +370,7 @@ def test_where_names_are_checked_only_who_has_control_starts_a_script(tmp_path: 
         bench.holder("page-1/ann")
         for by in ("otto", "-"):
             bench.command({"action": "start", "file": "walk", "by": by})
-            assert bench.becomes(error="Failed to start walk: page-1/ann has control, and starts scripts")
+            assert bench.becomes(error="page-1/ann has control, and starts scripts")
             bench.command({"action": "start", "file": "none", "by": "page-1"})
             assert bench.becomes(error="Unknown autonomy file: none")
         bench.command({"action": "start", "file": "walk", "by": "page-1/bob"})

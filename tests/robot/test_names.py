@@ -1,0 +1,264 @@
+"""A whole robot at the level named, behind a broker that knows roles: who drives it, and what else has no effect."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any, Literal
+
+import pytest
+
+from pebble.config import load
+from pebble.fleet.roles import Account
+from pebble.runtime.connections import local_transport
+from pebble.transports import Message
+from tests.fleet.brokers import FleetBroker
+from tests.robot.operator import Operator
+from tests.robot.rig import BASE, STOP, Rig
+from tests.robot.test_control import driving, lines
+from tests.support import free_port, until
+
+pytestmark = pytest.mark.alone  # lines are counted
+
+DRIVE, CONTROL, STATE, ESTOP = "drive-values", "control", "outgoing/control/serial", "outgoing/estop/serial"
+FLAG = "flags/mqtt-video"
+_ids = itertools.count()
+PEOPLE = {"otto": "driver", "mia": "driver", "zoe": "driver", "vera": "viewer", "boss": "driver,safety,maintainer"}
+
+
+class Hall(FleetBroker):
+    """The broker of a fleet, as a robot's remote broker: without TLS, because it is on loopback."""
+
+    def __init__(self, folder: Path, level: Literal["login", "named"] = "named") -> None:
+        people = {name: Account(roles=tuple(roles.split(","))) for name, roles in PEOPLE.items()}
+        robot = {"rover": Account(roles=("robot",), bases=(BASE,))}
+        super().__init__(folder, people | robot, level=level, unencrypted=free_port())
+
+    def client(self, name: str, **options: Any) -> Operator:
+        assert self.unencrypted is not None
+        return Operator(self.unencrypted, BASE, "outgoing/#", login=(name, self.passwords[name]), **options)
+
+
+class Remote:
+    """What a rig needs of its remote broker, which is not its own."""
+
+    def __init__(self, port: int) -> None:
+        self.port = port
+
+    def stop(self) -> None:
+        """Others end it."""
+
+
+class Named(Rig):
+    """A robot with an account. ``person`` and ``send`` are for people with accounts of their own."""
+
+    def __init__(self, kind: str, hall: Hall, start: bool = True, **security: str) -> None:
+        self.hall, self._people = hall, dict[str, Operator]()
+        port = hall.unencrypted
+        assert port is not None
+        login = {"host": "127.0.0.1", "username": "rover", "password": hall.passwords["rover"]}
+        super().__init__(
+            kind, remote=Remote(port), operator=hall.client("boss"), own={"security": security}, start=False,  # type: ignore[arg-type]
+            mqtt_bridge={"remote_mqtt": login | {"port": port}}, autonomy_manager={"enabled": True},
+        )  # fmt: skip
+        self._people["boss"] = self.operator
+        self.config.chmod(0o600)
+        if start:
+            self.start()
+
+    def person(self, name: str) -> Operator:
+        if name not in self._people:
+            self._people[name] = self.hall.client(name)
+        return self._people[name]
+
+    def send(self, name: str, metric: str, body: Any, **options: Any) -> None:
+        """Publish under one's own name."""
+        self.person(name).send(f"incoming/by/{name}/{metric}", body, **options)
+
+    def state(self) -> dict[str, Any]:
+        last = self.operator.last(STATE)
+        return {} if last is None else last.json
+
+    @contextmanager
+    def held(self, name: str, metric: str = CONTROL, for_ms: int = 10_000) -> Iterator[str]:
+        """The key of this person's control, which is released at the end."""
+        client = {"id": f"{next(_ids):08x}", "for_ms": for_ms}
+        self.send(name, metric, client)
+        assert until(lambda: self.state().get("id") == client["id"], 5), self.state()
+        assert (self.state()["by"], self.state()["named"]) == (name, True)
+        try:
+            yield self.state()["key"]
+        finally:
+            self.send(name, CONTROL, client | {"want": "release"})
+
+    def settled(self, name: str, key: str, z: float) -> None:
+        """What was sent before has been judged: the holder's command, which moves so, has come after it."""
+        assert until(lambda: self.send(name, DRIVE, {"x": 0, "z": z, "key": key}) or lines(self, z), 5, step=0.05)
+
+    def close(self) -> None:
+        for name, client in self._people.items():
+            if name != "boss":
+                client.close()
+        super().close()
+
+
+@pytest.fixture(scope="module", params=["mqtt", "zenoh"])
+def rig(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Named]:
+    with Hall(tmp_path_factory.mktemp("hall") / "hall") as hall, Named(request.param, hall, level="named") as one:
+        yield one
+
+
+def test_only_who_has_control_drives(rig: Named) -> None:
+    """Not another with the holder's key, nor without, nor without a name, nor with an old key."""
+    with rig.held("otto") as old:
+        rig.send("otto", DRIVE, {"x": 0, "z": 0.11, "key": old})
+        assert until(lambda: lines(rig, 0.11), 5)
+    robot = rig.person("rover")  # whose account may publish everything below its base
+    with rig.held("mia") as key:
+        rig.send("otto", DRIVE, {"x": 0, "z": 0.12, "key": key})
+        rig.send("otto", DRIVE, {"x": 0, "z": 0.12, "key": key, "by": "mia"})
+        rig.send("mia", DRIVE, {"x": 0, "z": 0.13})
+        rig.send("mia", DRIVE, {"x": 0, "z": 0.14, "key": old})
+        rig.person("mia").send(f"incoming/{DRIVE}", {"x": 0, "z": 0.15, "key": key})
+        rig.person("otto").send(f"incoming/by/mia/{DRIVE}", {"x": 0, "z": 0.16, "key": key})
+        robot.send(f"incoming/{DRIVE}", {"x": 0, "z": 0.17, "key": key, "by": "mia"})
+        robot.send(f"incoming/by/otto/by/mia/{DRIVE}", {"x": 0, "z": 0.18, "key": key})
+        rig.send("mia", DRIVE, {"x": 0, "z": 0.19, "key": key, "source": "autonomy", "run": 7})
+        rig.send("mia", DRIVE, {"x": 0, "z": 0.19, "key": key}, retain=True)
+        wanted = [round(0.2 + number / 1000, 3) for number in range(10)]
+        for z in wanted:
+            rig.send("mia", DRIVE, {"x": 0, "z": z, "key": key})
+            assert until(lambda z=z: lines(rig, z), 5), z
+        for name, suffix, more in (
+            ("otto", f"incoming/by/otto/{DRIVE}", {"key": "ffffffff"}),
+            ("rover", f"incoming/{DRIVE}", {}),
+            ("otto", f"incoming/by/otto/{DRIVE}", {"source": "autonomy", "run": 9}),
+        ):
+            rig.settled("mia", key, 0.3)
+            zeroed = time.monotonic()
+            rig.person(name).send(suffix, {"x": 0, "z": 0, **more})
+            assert until(lambda since=zeroed: lines(rig, 0.0, since), 5), (name, suffix)
+            assert until(lambda: not rig.mcu.moving(), 5)
+    assert [z for z in (0.12, 0.13, 0.14, 0.15, 0.16, 0.17, 0.18, 0.19) if lines(rig, z)] == []
+    capabilities = rig.operator.last("outgoing/capabilities")
+    assert capabilities is not None
+    assert capabilities.json["value"]["named"] is True
+
+
+def test_who_takes_control_over_drives_and_only_they_start_scripts(rig: Named) -> None:
+    start = {"action": "start", "file": "no-such-script"}
+    with rig.held("otto") as old, driving(_By(rig, "otto"), 0.5, key=old):
+        assert until(lambda: lines(rig, 0.5), 5)
+        rig.send("mia", "control/take", {"id": "bbbbbbbb", "for_ms": 10_000})  # a driver has no right to
+        with rig.held("boss", "control/take") as key:
+            taken = time.monotonic()
+            rig.settled("boss", key, 0.6)
+            assert not [at for at in lines(rig, 0.5) if at > taken + 0.5]
+            for name, error in (("otto", "boss has control"), ("boss", "Unknown autonomy file")):
+                rig.send(name, "autonomy-command", start)
+                found = lambda e=error: e in str(rig.operator.last("outgoing/autonomy-status").json["error"])  # type: ignore[union-attr]  # noqa: E731
+                assert until(found, 5), error
+
+
+def test_anybody_stops_it_and_only_a_safety_officer_resets_it(rig: Named) -> None:
+    with rig.held("otto") as key, driving(_By(rig, "otto"), 0.7, key=key):
+        for suffix, by in (("incoming/by/vera/estop", "vera"), ("incoming/estop", "somebody")):
+            assert until(lambda: rig.mcu.moving(), 5)
+            pressed = time.monotonic()
+            rig.person("vera").send(suffix, {"stop": f"{len(suffix):016x}", "by": by})
+            assert until(lambda: not rig.mcu.moving(), 5)
+            stopped = rig.operator.wait_for(ESTOP, since=pressed).json
+            assert (stopped["latched"], stopped["by"].split("/")[0]) == (True, by)
+            reset = {one: stopped[one] for one in ("boot", "count")}
+            rig.send("otto", "estop-reset", reset)
+            rig.person("rover").send("incoming/estop-reset", reset)
+            assert state_of(rig)["latched"]
+            rig.send("boss", "estop-reset", reset | {"by": "ann"})
+            assert until(lambda: not state_of(rig)["latched"], 5)
+            rig.send("otto", DRIVE, {"x": 0, "z": 0, "key": key})  # lets go
+
+
+def state_of(rig: Named) -> dict[str, Any]:
+    last = rig.operator.last(ESTOP)
+    return {} if last is None else last.json
+
+
+def test_wills_move_nothing(rig: Named) -> None:
+    with rig.held("zoe") as old:
+        rig.settled("zoe", old, 0.31)
+    parked = [
+        rig.hall.client(name, will=(f"incoming/{by}{DRIVE}", {"x": 0, "z": 0.41, "key": old}))
+        for name, by in (("zoe", ""), ("zoe", "by/zoe/"), ("otto", "by/zoe/"), ("rover", ""))
+    ]
+    with rig.held("zoe") as key:
+        for client in parked:
+            client.drop()
+        rig.settled("zoe", key, 0.42)
+    assert lines(rig, 0.41) == []
+
+
+def test_who_is_removed_while_driving_stands_within_a_second(rig: Named) -> None:
+    with ExitStack() as ends:
+        key = ends.enter_context(rig.held("zoe", for_ms=2000))
+        ends.enter_context(driving(_By(rig, "zoe"), 0.8, key=key))
+        assert until(lambda: lines(rig, 0.8), 5)
+        removed = time.monotonic()
+        rig.hall.remove("zoe")
+        assert until(lambda: not rig.mcu.moving(), 5)
+        assert max(lines(rig, 0.8)) - removed < 0.5
+        assert next(at for at, wheels in rig.mcu.drives(removed) if wheels == STOP) - removed < 1.0
+    assert until(lambda: rig.state()["key"] == "", 15)
+
+
+class _By:
+    """An operator who publishes under a name."""
+
+    def __init__(self, rig: Named, name: str) -> None:
+        self._rig, self._name = rig, name
+
+    def send(self, suffix: str, body: Any) -> None:
+        self._rig.send(self._name, suffix.removeprefix("incoming/"), body)
+
+
+# -- flags
+
+
+def retained(rig: Named) -> list[bytes]:
+    """What both sides retain of the flag: the robot's own, then its remote broker."""
+    topic = f"{BASE}/incoming/{FLAG}"
+    with ExitStack() as ends:
+        here = ends.enter_context(local_transport(load(rig.config), "flags"))
+        there = ends.enter_context(rig.hall.login("rover"))
+        values: list[Message] = []
+        here.subscribe(topic, values.append, direct=True)
+        there.subscribe([topic])
+        until(lambda: values, 1)
+        until(lambda: there.listen(0.01) or there.received, 1)
+        return [one.payload for one in values[-1:]] + [payload for _, payload in there.received[-1:]]
+
+
+@pytest.mark.parametrize("order", ["bridge, broker", "broker, bridge", "robot, broker", "older"])
+def test_a_flag_by_name_stays_on_both_sides(rig: Named, order: str) -> None:
+    """After restarts in each order; and where the broker retains an older value, as it was killed before it saved."""
+    for value in (b"true", b"false", b"true"):
+        rig.send("mia", FLAG, value)
+        assert until(lambda v=value: retained(rig) == [v, v], 10), retained(rig)
+    rig.person("mia").send(f"incoming/{FLAG}", b"false", retain=True)  # the broker refuses it
+    steps: dict[str, Callable[[], object]] = {
+        "bridge": lambda: rig.kill("mqtt_bridge"),
+        "broker": lambda: (rig.hall.stop(), rig.hall.start()),
+        "robot": lambda: (rig.stop(), rig.start(ready=False)),
+        "older": lambda: (
+            rig.stop(),
+            rig.person("rover").send(f"incoming/{FLAG}", b"false", retain=True),
+            rig.start(ready=False),
+        ),
+    }
+    for step in order.split(", "):
+        began = time.monotonic()
+        steps[step]()
+        rig.wait_until_up(began, 30)
+    assert until(lambda: retained(rig) == [b"true", b"true"], 15), retained(rig)
