@@ -99,7 +99,8 @@ class Rig:
     The robot reaches the remote broker through ``uplink``, a proxy that can fail. With ``direct`` it connects without
     the proxy, because a proxy acknowledges TCP segments itself and so changes the timing. ``remote`` and ``local``
     replace its own brokers; ``login`` is the robot's user name there. ``motors`` replaces its own MCU. ``listens``:
-    what the operator subscribes to, below the robot's base; ``operator`` replaces it. ``top``: more sections of the config; others are services'.
+    what the operator subscribes to, below the robot's base; ``operator`` replaces it. ``top``: more sections of the
+    config; others are services'.
     """
 
     def __init__(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import pytest
+from msgspec.structs import replace
 
 from pebble.config import load
 from pebble.fleet.roles import Account
@@ -61,13 +63,20 @@ class Named(Rig):
         assert port is not None
         login = {"host": "127.0.0.1", "username": "rover", "password": hall.passwords["rover"]}
         super().__init__(
-            kind, remote=Remote(port), operator=hall.client("boss"), own={"security": security}, start=False,  # type: ignore[arg-type]
+            kind, remote=Remote(port), operator=hall.client("boss"), start=False,  # type: ignore[arg-type]
             mqtt_bridge={"remote_mqtt": login | {"port": port}}, autonomy_manager={"enabled": True},
         )  # fmt: skip
         self._people["boss"] = self.operator
-        self.config.chmod(0o600)
+        self.configure(**security)
         if start:
             self.start()
+
+    def configure(self, **security: str) -> None:
+        """Write the config anew; a hub's journal outlives the robot's restart, as the local broker does."""
+        raw = json.loads(self.config.read_text()) | {"security": security}
+        raw["transport"] |= {"zenoh": {"journal": str(self.folder / "journal")}}.get(self.kind, {})
+        self.config.write_text(json.dumps(raw))
+        self.config.chmod(0o600)
 
     def person(self, name: str) -> Operator:
         if name not in self._people:
@@ -262,3 +271,77 @@ def test_a_flag_by_name_stays_on_both_sides(rig: Named, order: str) -> None:
         steps[step]()
         rig.wait_until_up(began, 30)
     assert until(lambda: retained(rig) == [b"true", b"true"], 15), retained(rig)
+
+
+# -- from a broker with logins to names, as docs/fleet.md has it
+
+
+class Old(Operator):
+    """A client of the original's shape: it logs in, and knows neither names nor control.
+
+    Its account has all rights of people; the broker has passed on what it sent before the next message is sent.
+    """
+
+    def __init__(self, hall: Hall) -> None:
+        port = hall.unencrypted
+        assert port is not None
+        super().__init__(port, BASE, "outgoing/#", login=("boss", hall.passwords["boss"]))
+
+    def send(self, suffix: str, body: Any, *, qos: int = 1, retain: bool = False) -> None:
+        self._client.publish(f"{self.base}/{suffix}", json.dumps(body), qos=qos, retain=retain).wait_for_publish(5)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("kind", ["mqtt", "zenoh"])
+def test_an_original_client_lives_through_the_migration(kind: str, tmp_path: Path) -> None:
+    """Lights, scripts, flags, pictures and wheels: until the robot insists on names, and again when it does not."""
+    with Hall(tmp_path / "hall", "login") as hall, Named(kind, hall, level="login") as rig:
+        old, numbers = Old(hall), itertools.count(110)
+
+        def stage(plain: bool, level: Literal["login", "named"], **security: str) -> None:
+            hall.change(replace(hall.fleet, level=level, plain=plain))
+            rig.stop()
+            rig.configure(level=level, **security)
+            rig.start()
+
+        def has_effect(*expected: str) -> bool:
+            """Whether just this of what an old client sends has an effect on the robot."""
+            number, got = next(numbers), list[Message]()
+            z = number / 1000
+            sent: dict[str, Any] = {
+                "lights-solid": {"r": z}, "flags/mqtt-video": {"value": True, "n": z},
+                "flags/reboot": {"value": True, "n": z},
+                "autonomy-command": {"action": "start", "file": f"s{z}"}, "front-camera": {"enabled": True, "n": z},
+                "control/take": {"id": f"{number:08x}", "n": z}, "estop-reset": {"boot": "", "count": number, "n": z},
+            }  # fmt: skip
+            with local_transport(load(rig.config), "watcher") as here:
+                here.subscribe(f"{BASE}/incoming/#", got.append, direct=True)
+                for metric, body in sent.items():
+                    old.send(f"incoming/{metric}", body, retain=metric == "flags/mqtt-video")
+                old.send(f"incoming/{DRIVE}", {"x": 0, "z": z})
+                assert until(lambda: DRIVE not in expected or lines(rig, z), 5)
+                zeroed = time.monotonic()
+                rig.person("rover").send(f"incoming/{DRIVE}", {"x": 0, "z": 0, "n": number})  # passes always
+                assert until(lambda: any(b'"n":%d' % number in one.payload.replace(b" ", b"") for one in got), 5)
+                assert until(lambda: lines(rig, 0.0, zeroed), 5)
+            found = {one.topic.removeprefix(f"{BASE}/incoming/") for one in got if str(z).encode() in one.payload}
+            found = (found - {DRIVE}) | ({DRIVE} if lines(rig, z) else set())
+            assert found == set(expected)
+            return True
+
+        known = ("lights-solid", "flags/mqtt-video", "autonomy-command", "front-camera")
+        try:
+            assert has_effect(DRIVE, *known, "flags/reboot", "control/take", "estop-reset")
+            stage(True, "named", strangers="free")
+            assert has_effect(DRIVE, *known)
+            with rig.held("mia") as key:
+                rig.settled("mia", key, 0.9)
+                assert has_effect(*known)
+            stage(False, "named")
+            assert has_effect()
+            stage(True, "named", strangers="free")
+            assert has_effect(DRIVE, *known)
+            stage(False, "login")
+            assert has_effect(DRIVE, *known, "flags/reboot", "control/take", "estop-reset")
+        finally:
+            old.close()
