@@ -31,7 +31,7 @@ def test_people_see_it_as_its_config_describes_it() -> None:
     }
 
 
-def test_a_robot_that_reads_names_tells_so() -> None:
+def test_a_robot_that_reads_names_lists_it() -> None:
     raw = {
         "robot": {"id": "rover"},
         "transport": {"kind": "zenoh"},

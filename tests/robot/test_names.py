@@ -103,7 +103,7 @@ class Named(Rig):
         finally:
             self.send(name, CONTROL, client | {"want": "release"})
 
-    def settled(self, name: str, key: str, z: float) -> None:
+    def judged(self, name: str, key: str, z: float) -> None:
         """What was sent before has been judged: the holder's command, which moves so, has come after it."""
         assert until(lambda: self.send(name, DRIVE, {"x": 0, "z": z, "key": key}) or lines(self, z), 5, step=0.05)
 
@@ -146,7 +146,7 @@ def test_only_who_has_control_drives(rig: Named) -> None:
             ("rover", f"incoming/{DRIVE}", {}),
             ("otto", f"incoming/by/otto/{DRIVE}", {"source": "autonomy", "run": 9}),
         ):
-            rig.settled("mia", key, 0.3)
+            rig.judged("mia", key, 0.3)
             zeroed = time.monotonic()
             rig.person(name).send(suffix, {"x": 0, "z": 0, **more})
             assert until(lambda since=zeroed: lines(rig, 0.0, since), 5), (name, suffix)
@@ -164,7 +164,7 @@ def test_who_takes_control_over_drives_and_only_they_start_scripts(rig: Named) -
         rig.send("mia", "control/take", {"id": "bbbbbbbb", "for_ms": 10_000})  # a driver has no right to
         with rig.held("boss", "control/take") as key:
             taken = time.monotonic()
-            rig.settled("boss", key, 0.6)
+            rig.judged("boss", key, 0.6)
             assert not [at for at in lines(rig, 0.5) if at > taken + 0.5]
             for name, error in (("otto", "boss has control"), ("boss", "Unknown autonomy file")):
                 rig.send(name, "autonomy-command", start)
@@ -172,7 +172,7 @@ def test_who_takes_control_over_drives_and_only_they_start_scripts(rig: Named) -
                 assert until(found, 5), error
 
 
-def test_anybody_stops_it_and_only_a_safety_officer_resets_it(rig: Named) -> None:
+def test_everybody_stops_it_and_only_a_safety_officer_resets_it(rig: Named) -> None:
     with rig.held("otto") as key, driving(_By(rig, "otto"), 0.7, key=key):
         for suffix, by in (("incoming/by/vera/estop", "vera"), ("incoming/estop", "somebody")):
             assert until(lambda: rig.mcu.moving(), 5)
@@ -197,15 +197,15 @@ def state_of(rig: Named) -> dict[str, Any]:
 
 def test_wills_move_nothing(rig: Named) -> None:
     with rig.held("zoe") as old:
-        rig.settled("zoe", old, 0.31)
-    parked = [
+        rig.judged("zoe", old, 0.31)
+    waiting = [
         rig.hall.client(name, will=(f"incoming/{by}{DRIVE}", {"x": 0, "z": 0.41, "key": old}))
         for name, by in (("zoe", ""), ("zoe", "by/zoe/"), ("otto", "by/zoe/"), ("rover", ""))
     ]
     with rig.held("zoe") as key:
-        for client in parked:
+        for client in waiting:
             client.drop()
-        rig.settled("zoe", key, 0.42)
+        rig.judged("zoe", key, 0.42)
     assert lines(rig, 0.41) == []
 
 
@@ -335,7 +335,7 @@ def test_an_original_client_lives_through_the_migration(kind: str, tmp_path: Pat
             stage(True, "named", strangers="free")
             assert has_effect(DRIVE, *known)
             with rig.held("mia") as key:
-                rig.settled("mia", key, 0.9)
+                rig.judged("mia", key, 0.9)
                 assert has_effect(*known)
             stage(False, "named")
             assert has_effect()
