@@ -11,7 +11,7 @@ from pebble.contract.codec import MAX_DEPTH
 from pebble.contract.payloads import AutonomyCommand
 from pebble.contract.rights import WRITES, Right
 from pebble.forwarding.names import Names, Signed
-from pebble.forwarding.routing import TABLE_A1, Drop
+from pebble.forwarding.routing import TABLE_A1, Drop, Side
 from pebble.forwarding.subjects import Subjects
 from pebble.services.mqtt_bridge.actions import SystemActions
 from pebble.transports import Message
@@ -228,6 +228,13 @@ class TestStops:
         named = b'{"stop":"00000000000000a1","by":"ann/otto"}'
         assert received(world, "by/ann/estop", press, b"?") == [named, b"?"]
         assert received(world, "by/ann/estop", press, retain=True) == [named]  # live, although it asks to be retained
+
+    def test_no_transport_skips_one_below_a_name(self, world: World) -> None:
+        start(world)
+        for metric, skipped in (("by/ann/estop", False), ("by/ann/x", True), ("by/a/by/b/estop", True)):
+            topic = f"{BASE}/incoming/{metric}".encode()
+            assert world.service.forwarder.skips_retained(Side.REMOTE, topic) == skipped, metric
+            assert world.uplink.is_stop(topic.decode()) == (not skipped)
 
     def test_a_retained_one_stops_nothing(self, world: World) -> None:
         for suffix in ("incoming/estop", "incoming/by/ann/estop"):

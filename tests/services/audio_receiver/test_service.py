@@ -16,12 +16,17 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pebble.config import parse
 from pebble.contract.packets import Codec, Sound
 from pebble.demo.media_assessment import best_match, envelope
 from pebble.media.pcm import to_bytes
 from pebble.media.sound import make_sound_encoder, sequence_numbers
 from pebble.media.speech import Speech
-from pebble.transports import QoS
+from pebble.services.audio_receiver import service as service_module
+from pebble.services.audio_receiver.service import AudioReceiver
+from pebble.transports import QoS, Subscription
+from pebble.transports.memory import MemoryHub, MemoryTransport
+from tests.kit.robot import Running
 from tests.services.audio_rig import RECORDER, Program
 from tests.services.media_rig import BASE, client
 from tests.support import Broker, until
@@ -207,3 +212,30 @@ def test_delay_from_the_operator_to_the_player(receive: Receive, operator: Opera
         played = recorder.samples()
         behind.append(number - (played[-1] if len(played) else 0))
     assert median(behind[50:]) < 45  # 0.9 s, on a busy machine; the usual is 5
+
+
+@pytest.mark.parametrize(
+    ("security", "topics"),
+    [
+        ({}, ["audio-stream"]),
+        ({"level": "named"}, ["by/+/audio-stream"]),
+        ({"level": "named", "strangers": "free"}, ["by/+/audio-stream", "audio-stream"]),
+    ],
+)
+def test_whose_voice_it_receives(monkeypatch: pytest.MonkeyPatch, security: dict[str, str], topics: list[str]) -> None:
+    filters: list[str] = []
+
+    class Remote(MemoryTransport):
+        def subscribe(self, filter_: str, *arguments: Any, **options: Any) -> Subscription:
+            filters.append(filter_)
+            return super().subscribe(filter_, *arguments, **options)
+
+    monkeypatch.setattr(service_module, "remote_transport", lambda _config, name: Remote(name, MemoryHub()))
+    bridge = {"enabled": True, "remote_mqtt": {"host": "127.0.0.1", "port": 1884}}
+    raw = {"robot": {"id": "rover"}, "security": security, "services": {"mqtt_bridge": bridge}}
+    config = parse(raw, folder=Path.cwd(), env={})
+    running = Running(AudioReceiver(config, MemoryTransport("local", MemoryHub())))
+    try:
+        assert until(lambda: filters == [f"{config.base}/incoming/{topic}" for topic in topics])
+    finally:
+        running.stop()
