@@ -39,7 +39,7 @@ class MotorOwners:
         state = self._controls[min(self._controls)] if self._controls else None
         if state is None or not state.key or state.by.partition("/")[0] == by.partition("/")[0]:
             return ""
-        return state.by
+        return state.by or "a program of the robot"
 
     def note_run(self, run: int) -> None:
         """A drive command carries ``run``."""

@@ -111,6 +111,7 @@ def test_every_owner_comes_to_obey_a_run_also_one_that_was_away_while_a_stranger
         ({"serial": ("ann", "0badf00d")}, "ann", ""),
         ({"serial": ("ann", "0badf00d")}, "otto", "ann"),
         ({"serial": ("ann", "0badf00d")}, "-", "ann"),
+        ({"serial": ("", "0badf00d")}, "ann", "a program of the robot"),
         ({"serial": ("page-1/ann", "0badf00d")}, "page-1/bob", ""),  # the page asks its own people
         ({"serial": ("page-1/ann", "0badf00d")}, "ann", "page-1/ann"),
         ({"left": ("otto", "0badf00d"), "arm": ("ann", "1badf00d")}, "ann", ""),  # the first owner by name decides
