@@ -234,6 +234,7 @@ class Operator:
                     self.until_right(EMERGENCY_STOP, partial(self._stop_all, robots))
                     self.until_right(BY_ITSELF, partial(self._take_over, robots))
                 self.rounds += 1
+            self._release_control()
             self._doing = yours
             while True:
                 self._show_trails(robots)
@@ -287,6 +288,8 @@ class Operator:
         control = self._controls.get(robot.base)
         if control is None:
             return drive
+        if control.asked_by:
+            control.release()
         self._publish_all(control.tick(time.monotonic()))
         return replace(drive, key=control.key) if control.key else drive
 
@@ -300,6 +303,9 @@ class Operator:
             if not control.wanted:
                 control.ask(time.monotonic())
         self._until(self._has_control, _CONTROL_S)
+        for control in self._controls.values():
+            if not control.held:  # a person was faster
+                control.release()
 
     def _has_control(self) -> bool:
         wanted = [one for one in self._controls.values() if one.wanted]

@@ -358,8 +358,8 @@ def _encryption(what: str, settings: MqttSettings, answer: ProbeResult, now: flo
         return warn(what, f"its certificate expires in {days:.0f} days", "renew the broker's certificate")
     if settings.tls.insecure:
         return warn(what, "encrypted, but the name in its certificate is not checked", "set tls.insecure to false")
-    days = "" if answer.expires is None else f", its certificate for {(answer.expires - now) / 86400:.0f} more days"
-    return ok(what, f"encrypted{days}")
+    left = "" if answer.expires is None else f", its certificate for {(answer.expires - now) / 86400:.0f} more days"
+    return ok(what, f"encrypted{left}")
 
 
 def is_loopback(host: str) -> bool:
