@@ -9,7 +9,7 @@ from pebble.doctor import Finding, ok, warn
 from pebble.fleet.folder import FLEET, Fleet, FleetError, load
 from pebble.fleet.roles import ProgramRole, Right, rights
 
-_MOST = 12  # names in one line
+_SHOWN = 12  # names in one line
 _WORDS = {
     "open": "every program that reaches its broker, which here only this machine's do",
     "login": "every account of its broker with a role that drives; which one sent a command is not checked",
@@ -45,8 +45,8 @@ def _accounts(fleet: Fleet) -> str:
         for name, account in fleet.accounts.items()
         if Right.DRIVE in rights(account.roles, fleet.level)
     ]
-    more = f", and {len(found) - _MOST} more" if len(found) > _MOST else ""
-    return f"{', '.join(found[:_MOST]) or 'no account'}{more}; programs on the robot itself, too"
+    more = f", and {len(found) - _SHOWN} more" if len(found) > _SHOWN else ""
+    return f"{', '.join(found[:_SHOWN]) or 'no account'}{more}; programs on the robot itself, too"
 
 
 def _folders(config: Config) -> list[Path]:

@@ -47,7 +47,7 @@ def test_each_message_has_the_topic_that_its_robot_reads(
 
 @pytest.mark.parametrize("account", ["", "Ann Smith"])
 @pytest.mark.parametrize("metric", ["drive-values", "control", "lights-solid", "estop-reset"])
-def test_without_a_name_one_line_tells_what_to_type(account: str, metric: str) -> None:
+def test_without_a_name_one_line_shows_what_to_type(account: str, metric: str) -> None:
     with pytest.raises(
         NoNameError, match=r"^goob takes commands only with a name, .*: log in .* --url mqtts://"
     ) as one:
@@ -72,7 +72,7 @@ def test_a_person_stands_in_what_has_room_for_it(topic: str, payload: object, pe
     assert json.loads(topics("page-1", GOOB).signed(topic, raw, person)) == signed
 
 
-def test_the_clients_own_name_is_not_told_twice() -> None:
+def test_the_clients_own_name_is_not_sent_twice() -> None:
     for claim in ("ann", "ann@desk"):
         (named,) = topics("ann", GOOB).forms(
             Message(f"{GOOB}/incoming/control", b'{"id":"1","by":"%s"}' % claim.encode())

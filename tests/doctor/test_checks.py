@@ -333,7 +333,7 @@ LOGIN = (
         ),
     ],
 )
-def test_who_can_drive_is_told_by_the_level_and_by_the_fleet_beside_the_config(
+def test_who_can_drive_is_shown_by_the_level_and_by_the_fleet_beside_the_config(
     tmp_path: Path, security: dict[str, str], accounts: dict[str, str], expected: list[str]
 ) -> None:
     config = tmp_path / "goob.json"

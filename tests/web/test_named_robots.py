@@ -61,7 +61,7 @@ def test_everything_has_the_servers_account_in_its_topic_and_the_person_beside_i
         assert {one for one in robot.wire if not one.startswith(by_name)} == {f"{ref}/incoming/estop"}
 
 
-def test_two_servers_never_share_a_robot_and_each_is_told_who_drives_under_a_checked_name(broker, robot):
+def test_two_servers_never_share_a_robot_and_each_shows_who_drives_under_a_checked_name(broker, robot):
     ref = robot.base
     with (
         server(broker, "page-1") as hall,
@@ -87,7 +87,7 @@ def test_two_servers_never_share_a_robot_and_each_is_told_who_drives_under_a_che
         assert until(lambda: otto.value(ref, "web/driver", "by") == "page-1/ann")
 
 
-def test_a_server_without_an_account_stops_and_else_tells_why_it_may_do_nothing(broker, robot):
+def test_a_server_without_an_account_stops_and_else_shows_why_it_may_do_nothing(broker, robot):
     ref = robot.base
     with server(broker, None) as hall, hall.page() as page:
         assert page.knows(ref)

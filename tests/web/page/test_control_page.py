@@ -51,7 +51,6 @@ def server(broker: Broker, name: str, account: str) -> Served:
         ("desktop", False, "ann", "name not checked"),
         ("phone", False, "ann", "name not checked"),
         ("desktop", True, "page-1/ann", "name checked"),
-        ("phone", True, "page-1/ann", "name checked"),
     ],
 )
 def test_two_people_take_ask_let_keep_and_take_over(
