@@ -9,7 +9,7 @@ import logging
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass
 from enum import Enum
 from types import TracebackType
@@ -220,6 +220,8 @@ class Transport(ABC):
     is_invented: Callable[[str], bool] = staticmethod(lambda _topic: False)
     #: Whether a topic is one of stops: where a backend refuses messages because too many wait, it still takes these.
     is_stop: Callable[[str], bool] = staticmethod(lambda _topic: False)
+    #: What is published in place of a message, in this order; the first one counts as it. None: the message itself.
+    forms: Callable[[Message], Iterable[Message]] | None = None
 
     def __init__(self, client_id: str, *, will: Message | None = None) -> None:
         if will is not None:
@@ -263,10 +265,12 @@ class Transport(ABC):
         is_invented: Callable[[str], bool] | None = None,
         skips_retained: Callable[[bytes], bool] | None = None,
         delivers_late: bool | None = None,
+        forms: Callable[[Message], Iterable[Message]] | None = None,
     ) -> None:
         """Set what the owner knows of topics and wants of retained messages, before :meth:`open`; None: as it was."""
         self.is_stop, self.is_invented = is_stop or self.is_stop, is_invented or self.is_invented
         self.skips_retained = skips_retained or self.skips_retained
+        self.forms = forms or self.forms
         self.delivers_late = self.delivers_late if delivers_late is None else delivers_late
 
     def on_state(self, watcher: Watcher) -> None:
@@ -333,13 +337,19 @@ class Transport(ABC):
         if not isinstance(payload, bytes):
             raise TransportError(f"payload of {topic} must be bytes, not {type(payload).__name__}")
         message = Message(topic, payload, qos if type(qos) is QoS else QoS(qos), retain)
+        if self.forms is None:
+            return self._publish(message, urgent=urgent, remember=remember, shared=shared)
+        each = [self._publish(one, urgent=urgent, remember=remember, shared=shared) for one in self.forms(message)]
+        return each[0]
+
+    def _publish(self, message: Message, *, urgent: bool, remember: bool, shared: bool) -> bool:
         with self._publishing:
             if self._state is State.CLOSED:
                 self.counters.add("refused")
                 return False
             accepted = self._send(message, urgent)
             sent = accepted and self._state is State.CONNECTED
-            stored = retain and remember and self._own.remember(message, sent=sent, shared=shared)
+            stored = message.retain and remember and self._own.remember(message, sent=sent, shared=shared)
             if accepted:
                 self._count_sent()
             else:  # "parked" is the published name of the counter of pending messages

@@ -11,6 +11,7 @@ from typing import Final
 
 from pebble.client.arrived import Arrived, Handler
 from pebble.client.driver_lease import ANSWER_S
+from pebble.client.named_topics import NamedTopics
 from pebble.errors import TransportError
 from pebble.runtime.by_name import EACH_S, ByName
 from pebble.transports import Message, MqttSettings, QoS, State, Subscription, Transport, create
@@ -32,6 +33,10 @@ class Broker:
         self._woken = False  # deliver is about to be called
         #: Whether a topic is one of a robot known from before, for which room is reserved.
         self.is_known: Callable[[str], bool] = lambda _topic: True
+        #: Whether a robot, by its base, takes commands only with a name.
+        self.is_named: Callable[[str], bool] = lambda _base: False
+        self.names = NamedTopics(settings.username or "", lambda base: self.is_named(base))
+        self.transport.judge_topics(forms=self.names.forms)
 
     @property
     def loop(self) -> asyncio.AbstractEventLoop:
@@ -68,14 +73,23 @@ class Broker:
         self._watchers.append(watcher)
 
     def publish(
-        self, topic: str, payload: bytes, *, retain: bool = False, remember: bool = True, qos: QoS = QoS.DELIVERED
+        self,
+        topic: str,
+        payload: bytes,
+        *,
+        retain: bool = False,
+        remember: bool = True,
+        qos: QoS = QoS.DELIVERED,
+        by: str = "",
     ) -> bool:
         """Publish now, ahead of streams; False if there is no connection, or no topic may be called so.
 
         ``remember`` False: what is retained belongs to whoever publishes it next; a broker that has lost it, has.
+        ``by``: the person who wants it. Robots that take commands only with a name learn of it.
         """
         try:
-            return self.transport.publish(topic, payload, qos=qos, retain=retain, urgent=True, remember=remember)
+            signed = self.names.signed(topic, payload, by)
+            return self.transport.publish(topic, signed, qos=qos, retain=retain, urgent=True, remember=remember)
         except TransportError as error:  # parts of topics come from robots and pages: what else is due must go on
             log.warning("not published: %s", error)
             return False

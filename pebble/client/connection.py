@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from pebble.client.named_topics import NamedTopics
 from pebble.client.names import ANY_ROBOT, Names, base_of
 from pebble.client.url import settings_of
 from pebble.config import Config, load
@@ -17,7 +18,7 @@ from pebble.errors import ConfigError, PebbleError, TransportError
 from pebble.runtime.addresses import Addresses
 from pebble.runtime.connections import REMOTE_RECONNECT_S, local_settings, mqtt_settings, zenoh_settings
 from pebble.runtime.robot_estop import RobotEstop
-from pebble.transports import Message, QoS, State, Transport, create
+from pebble.transports import Message, MqttSettings, QoS, State, Transport, create
 
 _LATE_S = 0.25  # some brokers send what is retained so long after they have acknowledged a subscription
 _OPEN_TIMEOUT_S = 3.0
@@ -73,14 +74,27 @@ def resolve(target: Target) -> tuple[str, Any, Names, str]:
         raise PebbleError("--remote needs --config; with --url name the remote broker itself")
     file = target.password_file
     kind, settings = settings_of(url, password=password(file), password_file=file, ca_cert=target.ca_cert)
-    return kind, settings, Names(ANY_ROBOT if target.robot is None else base_of(target.robot)), url
+    base = ANY_ROBOT if target.robot is None else base_of(target.robot)
+    return kind, settings, Names(base, account=_account(settings)), url
+
+
+def _account(settings: Any) -> str | None:
+    return settings.username or "" if isinstance(settings, MqttSettings) else None
+
+
+def put_names(transport: Transport, names: Names, is_named: Callable[[str], bool]) -> None:
+    """From now on commands have this client's name in their topics, to robots that take them only so."""
+    if names.account is not None:
+        transport.judge_topics(forms=NamedTopics(names.account, is_named).forms)
 
 
 def _of_config(config: Config, target: Target) -> tuple[str, Any, Names, str]:
     base = config.base if target.robot is None else base_of(target.robot)
-    names = Names(base, Addresses(config) if base == config.base else None)
+    addresses = Addresses(config) if base == config.base else None
     if target.remote:
-        return *_remote(config, target.program), names, f"the remote side of {config.base}"
+        kind, settings = _remote(config, target.program)
+        return kind, settings, Names(base, addresses, _account(settings)), f"the remote side of {config.base}"
+    names = Names(base, addresses)
     if config.transport.kind == "zenoh":
         where = f"the hub of {config.base} in {config.run_dir()} (is the robot up?)"
         return "zenoh", zenoh_settings(config, client=True), names, where

@@ -59,6 +59,7 @@ class RobotStop:
         self._sent_at = float("-inf")
         self._script_ended = False
         self._given_up = False
+        self._names_due = False  # it was sent before it was known that the robot reads topics with a name
         self._status_topic = STATUS.topic(base)
         self._boots: dict[str, str] = {}  # by owner, the newest one in which it has listed this stop
 
@@ -105,7 +106,7 @@ class RobotStop:
     @property
     def sending(self) -> bool:
         """Whether the stop is repeated."""
-        return not self._given_up and self.progress in (Progress.WAITING, Progress.OLD)
+        return not self._given_up and (self._names_due or self.progress in (Progress.WAITING, Progress.OLD))
 
     def receive(self, message: Message, now: float) -> None:
         if not (self.live or message.retain):
@@ -118,7 +119,7 @@ class RobotStop:
             return
         self.rank = max(self.rank, Rank.of(self.estop, known=self.rank.known, live=self.live))
         if self.estop.has_capabilities and not known:
-            self.next = now  # its drive topic may be another one
+            self.next, self._names_due = now, self.estop.named  # its topics may be others
         self._boots.update(
             {owner: self.estop.states[owner].boot for owner in self.estop.owners if self._lists_it(owner)}
         )
@@ -133,7 +134,7 @@ class RobotStop:
     def tick(self, now: float) -> list[Message]:
         if not self.sending or now < self.next:
             return []
-        self._sent_at, self.next = now, now + REPEAT_S
+        self._sent_at, self.next, self._names_due = now, now + REPEAT_S, False
         messages = []
         if not self.estop.old:
             messages.append(_message(ESTOP, ESTOP.topic(self.estop.base), self._payload))

@@ -20,8 +20,9 @@ class NamingError(PebbleError):
 class Names:
     """Resolves names to the topics of one robot, including those its config renames, or of every robot."""
 
-    def __init__(self, base: str = ANY_ROBOT, addresses: Addresses | None = None) -> None:
-        self.base = base
+    def __init__(self, base: str = ANY_ROBOT, addresses: Addresses | None = None, account: str | None = None) -> None:
+        """``account``: the user name at the broker, "" for none; None within a robot, where commands have no name."""
+        self.base, self.account = base, account
         self._addresses = addresses
 
     def filters(self, name: str) -> list[str]:

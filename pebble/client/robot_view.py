@@ -186,6 +186,11 @@ class RobotView:
         return section_of(self.capabilities, "drive").get("control") is True
 
     @property
+    def named(self) -> bool:
+        """Whether it takes commands only with the name of their sender in the topic."""
+        return self.estop.named
+
+    @property
     def drive_topic(self) -> str | None:
         """The topic of its drive commands; None until its capabilities have arrived."""
         return self._topic("drive", "topic")

@@ -5,12 +5,13 @@ from collections.abc import Sequence
 from typing import Any
 
 from pebble.client.names import Names
-from pebble.contract import AUTONOMY_COMMAND, AUTONOMY_FILES, AUTONOMY_STATUS, codec
+from pebble.contract import AUTONOMY_COMMAND, AUTONOMY_FILES, AUTONOMY_STATUS, CAPABILITIES, codec
 from pebble.contract.payloads import AutonomyCommand, AutonomyStatus
 from pebble.errors import PayloadError, PebbleError
 from pebble.transports import Message, QoS, Transport
 
 _BYTES = 512 * 1024  # of a list of scripts
+_RECEIVED = (CAPABILITIES, AUTONOMY_FILES, AUTONOMY_STATUS)
 
 Entry = dict[str, Any]
 
@@ -22,7 +23,8 @@ class RobotScripts:
         self.files: dict[str, Entry] | None = None  # by name; None: the robot has not published any list
         self.status: AutonomyStatus | None = None
         self.answers = 0  # statuses that arrived live
-        self._topics = {channel.metric: names.topic(channel.metric) for channel in (AUTONOMY_FILES, AUTONOMY_STATUS)}
+        self.named = False  # it takes commands only with the name of their sender
+        self._topics = {channel.metric: names.topic(channel.metric) for channel in _RECEIVED}
         self._command_topic = names.topic(AUTONOMY_COMMAND.metric)
 
     def subscribe(self, transport: Transport) -> None:
@@ -38,6 +40,8 @@ class RobotScripts:
             if message.topic == self._topics[AUTONOMY_FILES.metric]:
                 listed = codec.decode(AUTONOMY_FILES, message.payload).files
                 self.files = {entry["file"]: entry for entry in listed if isinstance(entry.get("file"), str)}
+            elif message.topic == self._topics[CAPABILITIES.metric]:
+                self.named = codec.decode(CAPABILITIES, message.payload).value.get("named") is True
             elif message.topic == self._topics[AUTONOMY_STATUS.metric]:
                 self.status = codec.decode(AUTONOMY_STATUS, message.payload)
                 self.answers += not message.retain

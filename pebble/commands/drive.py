@@ -9,8 +9,9 @@ from typing import Annotated
 
 import typer
 
-from pebble.client.connection import Target, connected, target_of
+from pebble.client.connection import Target, connected, put_names, target_of
 from pebble.client.driver_lease import ANSWER_S, DriverLease
+from pebble.client.named_topics import NoNameError
 from pebble.client.terminal.driver import TerminalDriver
 from pebble.client.terminal.key_decoder import END
 from pebble.client.terminal.key_gesture import PERIOD_S, KeyGesture
@@ -68,12 +69,13 @@ def drive(
     check_terminal()
     target = target_of(robot, target)
     with connected(target) as (transport, names):
-        device = f"terminal on {socket.gethostname()}"
-        lease = DriverLease(names.base, f"drive-{secrets.token_hex(4)}", by=me(), device=device)
+        by, device = me(names.account), f"terminal on {socket.gethostname()}"
+        lease = DriverLease(names.base, f"drive-{secrets.token_hex(4)}", by=by, device=device)
         heartbeat = target.remote or str(target.url).startswith("mqtt")  # within a robot there is none
         driver = TerminalDriver(
-            names.base, KeyGesture(speed, turn), lease, by=me(), now=clock(), take_over=take_over, heartbeat=heartbeat
+            names.base, KeyGesture(speed, turn), lease, by=by, now=clock(), take_over=take_over, heartbeat=heartbeat
         )
+        put_names(transport, names, lambda base: base == names.base and driver.robot.named)
         driving = _Driving(transport, driver)
         typer.echo(_KEYS)
         with opened() as terminal:
@@ -88,13 +90,14 @@ class _Driving:
         self._transport, self._driver = transport, driver
         self._in_flight = InFlight(_OVERHEAD)
         self._arrived: deque[tuple[Message, float, float]] = deque(maxlen=_ARRIVED)
+        self._nameless: NoNameError | None = None  # the robot takes no commands from here
         for filter_ in driver.filters:
             transport.subscribe(filter_, self._take, qos=QoS.DELIVERED, direct=True)
 
     def run(self, loop: TerminalLoop) -> int:
         """Until a signal, Ctrl-D, or the end of the terminal."""
         try:
-            while not loop.ended:
+            while not (loop.ended or self._nameless):
                 keys, now = loop.keys(PERIOD_S), clock()
                 self._driver.press(keys, now)
                 self._tick(now)
@@ -103,6 +106,8 @@ class _Driving:
         finally:
             self._halt(self._driver.leave(clock(), time.time()))
             self._finish_stop()
+        if self._nameless:
+            raise self._nameless
         return 0 if loop.ended in ("SIGINT", END) else 1
 
     def _take(self, message: Message) -> None:
@@ -122,10 +127,17 @@ class _Driving:
 
     def _publish(self, messages: list[Message], now: float) -> None:
         for message in messages:
-            if self._transport.publish(message.topic, message.payload, qos=message.qos, urgent=True):
+            if self._accepts(message):
                 self._in_flight.sent(len(message.topic) + len(message.payload) + _OVERHEAD, now)
             else:
                 self._driver.refused(now)
+
+    def _accepts(self, message: Message) -> bool:
+        try:
+            return self._transport.publish(message.topic, message.payload, qos=message.qos, urgent=True)
+        except NoNameError as error:
+            self._nameless = error
+            return False
 
     def _problem(self) -> str:
         return "" if self._transport.state is State.CONNECTED else self._transport.problem or "it was lost"

@@ -15,7 +15,7 @@ from typing import Annotated
 
 import typer
 
-from pebble.client.connection import Listener, Target, connected, target_of
+from pebble.client.connection import Listener, Target, connected, put_names, target_of
 from pebble.client.discovery import ALL_OUTGOING, Discovery
 from pebble.client.driveable import Driveable
 from pebble.client.estop import Progress, RobotStop, StopSender, new_name, send
@@ -102,10 +102,10 @@ def _parse(words: list[str]) -> tuple[str, str | None]:
     return verb, robots[0] if robots else None
 
 
-def me() -> str:
-    """Who gives this command, and from which machine: ``ann@desk``."""
+def me(account: str | None = None) -> str:
+    """Who gives this command, at the broker or else on this machine, and from which machine: ``ann@desk``."""
     try:
-        user = getpass.getuser()
+        user = account or getpass.getuser()
     except (ImportError, KeyError, OSError):  # no name for this user id, or no such ids
         user = "unknown"
     return f"{user}@{socket.gethostname()}"
@@ -117,7 +117,8 @@ def me() -> str:
 def _stop(target: Target, why: str, *, every: bool, hold: bool) -> int:
     with interrupted_by_signals(), connected(target) as (transport, names):
         robots = None if every else [names.base]
-        sender = StopSender(new_name(), by=me(), why=why, now=time.monotonic(), robots=robots, hold=hold)
+        sender = StopSender(new_name(), by=me(names.account), why=why, now=time.monotonic(), robots=robots, hold=hold)
+        put_names(transport, names, lambda base: base in sender.robots and sender.robots[base].estop.named)
         report = _Report(sender)
         try:
             _publish(transport, sender)
@@ -240,13 +241,14 @@ def _line(robot: RobotStop, *, patient: bool) -> str:
 def _reset(target: Target) -> int:
     with connected(target) as (transport, names):
         robot, name = RobotEstop(names.base), shown(id_of(names.base))
+        put_names(transport, names, lambda base: base == robot.base and robot.named)
         robot.subscribe(transport)
         _wait(lambda: robot.has_capabilities)
         transport.ask(robot.missing)  # the capabilities may have come after the subscription
         _wait(lambda: not robot.missing)
         if not robot.states:
             raise PebbleError(f"{name} publishes no emergency stop: {_absent(robot)}")
-        reset = Reset(robot, me())
+        reset = Reset(robot, me(names.account))
         _print_states(robot)
         if not reset.shown:
             return 0

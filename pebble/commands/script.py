@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from pebble.client.connection import Target, connected, target_of
+from pebble.client.connection import Target, connected, put_names, target_of
 from pebble.client.names import id_of
 from pebble.client.scripts import RobotScripts, options_of
 from pebble.commands.options import with_target
@@ -134,6 +134,7 @@ def _scripts(robot: str, target: Target) -> Iterator[tuple[Transport, RobotScrip
     """The connection, what the robot has published about its scripts, and its name."""
     with connected(target_of(robot, target)) as (transport, names):
         scripts = RobotScripts(names)
+        put_names(transport, names, lambda base: base == names.base and scripts.named)
         scripts.subscribe(transport)
         _wait(lambda: scripts.files is not None and scripts.status is not None, 1.0)
         yield transport, scripts, shown(id_of(names.base))

@@ -6,11 +6,12 @@ import math
 import shutil
 import sys
 import time
+from functools import cache
 from typing import Annotated
 
 import typer
 
-from pebble.client.connection import Listener, Target, connected, subscribed_stop
+from pebble.client.connection import Listener, Target, connected, put_names, subscribed_stop
 from pebble.client.estop_states import RobotEstop
 from pebble.client.names import Names, id_of
 from pebble.commands import show
@@ -163,7 +164,10 @@ def pub(
         message = draft(names, topic, payload, retain=retain, qos=qos, force=force)
         for warning in message.warnings:
             typer.echo(f"pebble: warning: {warning}", err=True)
-        estop = None if force else _estop_of_driven(transport, names, message)
+        robot = cache(lambda: _estop(transport, names, message.topic))
+        estop = robot() if not force and _moves(names, message) else None
+        if not force:
+            put_names(transport, names, lambda _base: (one := robot()) is not None and one.named)
         for number in range(1 if rate is None else count or sys.maxsize):
             if number:
                 time.sleep(1 / (rate or 1))
@@ -223,16 +227,14 @@ def _print_rate(meter: RateMeter, what: str, *, silent: bool) -> None:
     sys.stdout.flush()
 
 
-def _estop_of_driven(transport: Transport, names: Names, message: Draft) -> RobotEstop | None:
-    """The emergency stop of the robot that ``message`` would move; None if it moves none."""
+def _moves(names: Names, message: Draft) -> bool:
+    """Whether it would move a robot."""
     if names.channel(message.topic) is not DRIVE:
-        return None
+        return False
     try:
-        if not codec.decode(DRIVE, message.payload).moves:
-            return None
+        return bool(codec.decode(DRIVE, message.payload).moves)
     except PayloadError:  # robots refuse it, or have other rules: treat it as a command that moves
-        pass
-    return _estop(transport, names, message.topic)
+        return True
 
 
 def _refuse_stopped(robot: RobotEstop | None) -> None:

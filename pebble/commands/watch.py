@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pebble.client.connection import Target, connected
+from pebble.client.connection import Target, connected, put_names
 from pebble.commands.options import CaCert, PasswordFile
 from pebble.config import load
 from pebble.errors import PebbleError
@@ -116,6 +116,8 @@ def _receiver(robot: str, url: str | None, password_file: Path | None, ca_cert: 
             receiver: MediaReceiver = LocalReceiver(transport, names.base, target.config)
         else:
             receiver = MediaReceiver(transport, names.base)
+            estop = receiver.estop
+            put_names(transport, names, lambda base: base == estop.base and estop.named)
         try:
             receiver.wait_for_capabilities(_CAPABILITIES_TIMEOUT_S)
             yield receiver

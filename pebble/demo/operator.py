@@ -16,7 +16,10 @@ from contextlib import ExitStack, closing, suppress
 from functools import partial
 from typing import NamedTuple
 
+from msgspec.structs import replace
+
 from pebble import contract
+from pebble.client.control import ControlClient
 from pebble.client.discovery import ALL_OUTGOING, Discovery
 from pebble.client.driver_lease import FILTER
 from pebble.client.estop import StopSender, new_name
@@ -44,6 +47,7 @@ NAME = "the demo's operator"
 STOP = Drive()
 OBSERVING = ": observing"  # after the name of a step
 _POLL_S = 0.02
+_CONTROL_S = 1.0  # until every robot has given it, on the smallest machine
 _MOST_TIMES = 3  # for the emergency stop and for the script
 _MOST_WAITING = 1000  # events and completed steps; beyond them the oldest is dropped
 _ASSESSED_S = 5.0  # until what was completed is assessed, on the smallest machine
@@ -154,6 +158,7 @@ class Operator:
         self.completed: deque[CompletedStep | CompletedStop | CompletedFollow] = deque(maxlen=_MOST_WAITING)
         self._doing = "discovering robots"
         self._visitors = Visitors(NAME)
+        self._controls: dict[str, ControlClient] = {}  # by base topic, of robots that keep control themselves
         self._drawing: set[str] = set()  # base topics of robots that have listed the script for their trail
         self._robots: list[RobotView] = []  # that take part in the present step
         self._scripted: RobotView | None = None  # if a person takes it, the present step ends
@@ -229,6 +234,7 @@ class Operator:
                     self.until_right(EMERGENCY_STOP, partial(self._stop_all, robots))
                     self.until_right(BY_ITSELF, partial(self._take_over, robots))
                 self.rounds += 1
+            self._release_control()
             self._doing = yours
             while True:
                 self._show_trails(robots)
@@ -247,6 +253,7 @@ class Operator:
     def _begin(self, step: str, robots: Sequence[RobotView]) -> None:
         """Chooses among those that are free."""
         self._doing = step
+        self._release_control()
         self._visitors.begin_step(time.monotonic())
         self._robots = [robot for robot in robots if self._mine(robot)]
 
@@ -273,11 +280,48 @@ class Operator:
         """Send one command to all robots that are free; returns when."""
         for robot in filter(self._mine, self._robots):
             self.commands[robot.base] = drive, time.monotonic()
-            self._publish(robot.drive_topic, codec.encode(DRIVE, drive))
+            self._publish(robot.drive_topic, codec.encode(DRIVE, self._signed(robot, drive)))
         return time.monotonic()
+
+    def _signed(self, robot: RobotView, drive: Drive) -> Drive:
+        """The command with the key of control, which it renews if it has it."""
+        control = self._controls.get(robot.base)
+        if control is None:
+            return drive
+        if control.asked_by:
+            control.release()
+        self._publish_all(control.tick(time.monotonic()))
+        return replace(drive, key=control.key) if control.key else drive
+
+    def _take_control(self) -> None:
+        """Have control of the robots of this step that keep it themselves, as a person would."""
+        for robot in [one for one in self._robots if one.controlled and self._mine(one)]:
+            control = self._controls.get(robot.base)
+            if control is None or control.robot is not robot.control:
+                control = self._controls[robot.base] = ControlClient(robot.control, by=NAME, device="demo")
+                self._visitors.own_ids.add(control.id)
+            if not control.wanted:
+                control.ask(time.monotonic())
+        self._until(self._has_control, _CONTROL_S)
+        for control in self._controls.values():
+            if not control.held:  # a person was faster
+                control.release()
+
+    def _has_control(self) -> bool:
+        wanted = [one for one in self._controls.values() if one.wanted]
+        for control in wanted:
+            self._publish_all(control.tick(time.monotonic()))
+        return all(one.held or not one.wanted for one in wanted)
+
+    def _release_control(self) -> None:
+        """Whoever asks, or wants it now, has it."""
+        for control in self._controls.values():
+            control.release()
+            self._publish_all(control.tick(time.monotonic()))
 
     def _hold(self, drive: Drive, seconds: float) -> float:
         """Send a command again and again, as a held stick does; returns when it was last sent."""
+        self._take_control()
         began = due = sent = time.monotonic()
         while due < began + seconds:
             sent = self._drive(drive)

@@ -21,6 +21,7 @@ class Visitors:
     def __init__(self, name: str) -> None:
         """``name``: that of the operator, whose own stops are none of a person."""
         self.left_alone: set[str] = set()  # names of robots that were found to be taken
+        self.own_ids: set[str] = set()  # under which the operator itself has control
         self._name = name
         self._driven: dict[str, float] = {}  # by base topic: when somebody drove it, or was announced to
         self._moved: dict[str, float] = {}  # by base topic: when a person's command came
@@ -55,7 +56,8 @@ class Visitors:
 
     def taken(self, robot: RobotView, now: float) -> str:
         """Why people have the control of it now; empty: they have not."""
-        if robot.controlled and robot.control.who:  # as it tells itself
+        state = robot.control.state if robot.controlled else None
+        if state is not None and state.id and state.id not in self.own_ids:  # as it tells itself
             self._drivers[robot.base], self._driven[robot.base] = (robot.control.who, now), now
         stop = robot.stopped_by
         if stop is not None and stop.by != self._name:

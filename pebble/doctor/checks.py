@@ -18,7 +18,6 @@ from pathlib import Path
 from pebble.client.page_from_config import settings_of
 from pebble.client.page_packages import require_packages
 from pebble.config import Config, Mqtt
-from pebble.config.doors import warning_of_open
 from pebble.config.secret_text import shown_user
 from pebble.doctor import Finding, Level, device_names, fail, ok, warn
 from pebble.doctor.broker_probe import REFUSED_ID, REFUSED_LOGINS, ProbeResult, probe
@@ -28,7 +27,9 @@ from pebble.doctor.media import media
 from pebble.doctor.publishing import publishing
 from pebble.doctor.reachable import beyond_loopback, own_addresses
 from pebble.doctor.recordings import recorder
+from pebble.doctor.who import who_drives
 from pebble.errors import PebbleError
+from pebble.fleet import certificates
 from pebble.runtime.connections import REMOTE_RECONNECT_S, mqtt_settings
 from pebble.transports.settings import MqttSettings
 from pebble.transports.socket_paths import FRAMES_SOCKET, fits_socket
@@ -56,10 +57,7 @@ def run_checks(config: Config | None) -> Iterator[Finding]:
 
 def _robot(config: Config) -> Iterator[Finding]:
     run_dir = config.run_dir()
-    if open_ := warning_of_open(config):
-        yield warn("security", open_, "pebble fleet init, then the account of this robot")
-    else:
-        yield ok("security", f"level {config.security.level}")
+    yield from who_drives(config)
     yield run_directory(run_dir, os.geteuid())
     yield leftover_sockets(run_dir, is_listening)
     yield state_directory(config.state_dir())
@@ -95,6 +93,17 @@ def operator_page(config: Config) -> Iterator[Finding]:
         yield warn("operator page", "is not encrypted: passwords can be read", "pebble cert init")
     else:
         yield ok("operator page", f"port {settings.port} of {settings.host}")
+    if settings.certificate is not None:
+        yield _page_certificate(settings.certificate, time.time())
+
+
+def _page_certificate(file: Path, now: float) -> Finding:
+    try:
+        left_s = certificates.show(file).until.timestamp() - now
+    except certificates.CertificateError as error:
+        return fail("operator page", str(error), "pebble cert init")
+    text = f"its certificate ends in {left_s / 86400:.0f} days"
+    return ok("operator page", text) if left_s >= _SOON_S else warn("operator page", text, "pebble cert renew")
 
 
 def _brokers(config: Config) -> Iterator[tuple[str, Mqtt]]:
@@ -349,7 +358,8 @@ def _encryption(what: str, settings: MqttSettings, answer: ProbeResult, now: flo
         return warn(what, f"its certificate expires in {days:.0f} days", "renew the broker's certificate")
     if settings.tls.insecure:
         return warn(what, "encrypted, but the name in its certificate is not checked", "set tls.insecure to false")
-    return ok(what, "encrypted")
+    left = "" if answer.expires is None else f", its certificate for {(answer.expires - now) / 86400:.0f} more days"
+    return ok(what, f"encrypted{left}")
 
 
 def is_loopback(host: str) -> bool:

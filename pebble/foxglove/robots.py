@@ -44,6 +44,8 @@ class Robots:
         self._feeds: dict[tuple[str, Medium], MediaFeed] = {}
         self._by_channel: dict[str, MediaFeed] = {}
         self._tasks: set[asyncio.Task[None]] = set()
+        self._named: set[str] = set()  # robots that take requests only with a name
+        broker.is_named = self._named.__contains__
 
     @property
     def dropped(self) -> int:
@@ -123,6 +125,7 @@ class Robots:
             capabilities: dict[str, Any] = codec.decode(CAPABILITIES, payload).value
         except PayloadError:  # the last valid ones stay
             return
+        (self._named.add if capabilities.get("named") is True else self._named.discard)(base)
         for medium in _MEDIA:
             feed = self._feeds.get((base, medium)) or self._start(base, medium)
             self._by_channel.update(dict.fromkeys(feed.update(capabilities), feed))

@@ -37,6 +37,7 @@ class RobotEstop:
         self.announces = False  # its capabilities have a section about emergency stops
         self.available = False  # it can be stopped by an emergency stop
         self.keeps_control = False  # it decides itself which person drives it
+        self.named = False  # it takes commands only with the name of their sender in the topic
         self.drives = True  # False: its capabilities exclude drive commands. Readers assume what is missing
         self.drive_topic = DRIVE.topic(base)
         self.script_topic = AUTONOMY_COMMAND.topic(base)
@@ -111,7 +112,7 @@ class RobotEstop:
         estop, drive = _section(value, "estop"), _section(value, "drive")
         self.announces, self.available = bool(estop), estop.get("available") is True
         self.owners = _owners(estop.get("owners"))
-        self.keeps_control = drive.get("control") is True
+        self.keeps_control, self.named = drive.get("control") is True, value.get("named") is True
         self.drives = drive.get("available") is not False
         self.drive_topic = self._topic(drive.get("topic"), DRIVE)
         self.script_topic = self._topic(_section(value, "autonomy").get("command_topic"), AUTONOMY_COMMAND)

@@ -121,6 +121,7 @@ class Control:
                 user=self._session.user,
                 role=self._session.role,
                 rights=tuple(sorted(self._rights())),
+                named_rights=tuple(sorted(page_rights(self._session.role, "named"))),
                 login=settings.login,
                 token=self._tab.token,
                 now=1000 * time.time(),
@@ -235,7 +236,12 @@ class Control:
             return
         message = robot_commands.publication(op, self._server.robots.topic)
         if not self._server.broker.publish(
-            message.topic, message.payload, retain=message.retain, remember=False, qos=message.qos
+            message.topic,
+            message.payload,
+            retain=message.retain,
+            remember=False,
+            qos=message.qos,
+            by=self._session.user,
         ):
             self._refuse(op, "The server cannot reach the broker")
             return
@@ -251,7 +257,7 @@ class Control:
             self._refuse(op, "unknown component")
             return
         outcome = server.driving.drive(self._tab, op, now, self._why_not or server.blocked(op.ref))
-        accepted = server.publish(outcome.commands)
+        accepted = server.publish(outcome.commands, self._session.user)
         if outcome.refused:
             self._refuse(op, outcome.refused)
         elif not accepted:
@@ -264,7 +270,7 @@ class Control:
     def _stop(self, op: m.StopOp) -> None:
         component = self._server.robots.components.get(op.ref)
         if component is not None and (component.robot.drives or not component.robot.capabilities):
-            self._server.publish(self._server.driving.stop(op.ref, clock()))
+            self._server.publish(self._server.driving.stop(op.ref, clock()), self._session.user)
 
     def _end_stop(self, op: m.EstopEndOp) -> None:
         """One's own, or with the right to reset: a viewer must not end the stop of another person."""
@@ -322,11 +328,11 @@ class Control:
             self._audit("ask", op.ref)
         server.take(self._tab, component.robot, granted, lambda why: self._refuse(op, why), over=op.over)
 
-    def _rights(self) -> frozenset[str]:
-        return page_rights(self._session.role, self._server.settings.level)
+    def _rights(self, ref: str = "") -> frozenset[str]:
+        return page_rights(self._session.role, self._server.level(ref))
 
     def _may(self, right: str, op: m.FromPage) -> bool:
-        if right in self._rights():
+        if right in self._rights(getattr(op, "ref", "")):
             return True
         self._refuse(op, f"The role {self._session.role} may not do this")
         return False

@@ -218,13 +218,14 @@ class _ToPage(Struct, frozen=True, kw_only=True, tag_field="op"):
 
 
 class Welcome(_ToPage, frozen=True, kw_only=True, tag="welcome"):
-    """The answer to Hello. ``rights``: of drive, reset, take, system, people."""
+    """The answer to Hello. ``rights``: of drive, reset, take, system, people; ``named_rights``: at level named."""
 
     server: str
     version: str
     user: str
     role: str
     rights: tuple[str, ...]
+    named_rights: tuple[str, ...]
     login: bool  # whether there is anything to log out of
     token: str
     now: float

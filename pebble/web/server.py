@@ -13,9 +13,11 @@ import msgspec
 from pebble.client.broker import Broker
 from pebble.client.drive_reasons import SCRIPT_ORDER, SERVER_ORDER, Code, Situation, first_reason
 from pebble.client.estop import send
+from pebble.client.named_topics import why_not
 from pebble.client.page_settings import WebSettings
 from pebble.client.robot_topics import FLEET, SYNONYMS
 from pebble.client.robot_view import RobotView
+from pebble.config.security import SecurityLevel
 from pebble.contract import CAPABILITIES, CONTROL_STATE, DRIVE, DRIVING, ONLINE, channel_of, codec
 from pebble.contract.identity import Identity, parse_topic
 from pebble.errors import ConfigError
@@ -62,6 +64,7 @@ class Server:
         self.saved = SavedRobots(people)
         known = self.robots.before = self.saved.robots
         self.own_hosts = OwnHosts(settings)
+        self.broker.is_named = self._is_named
         self.broker.is_known = lambda topic: "/".join(topic.split("/", 3)[:3]) in known
         self.robots.streams.update(people.all(_STREAM_ADDRESS))
         self.media = MediaHub(self.broker, self.robots)
@@ -142,12 +145,12 @@ class Server:
 
     # -- to the broker
 
-    def publish(self, commands: list[Command]) -> bool:
-        """Publish drive commands, each to the robot's own topic; False if one was not accepted."""
+    def publish(self, commands: list[Command], by: str = "") -> bool:
+        """Publish drive commands of a person, each to the robot's own topic; False if one was not accepted."""
         accepted = True
         for ref, drive in commands:
             topic = self.robots.topic(ref, "drive", "topic", DRIVE)
-            accepted = self.broker.publish(topic, codec.encode(DRIVE, drive)) and accepted
+            accepted = self.broker.publish(topic, codec.encode(DRIVE, drive), by=by) and accepted
         self._show_drivers()
         return accepted
 
@@ -178,6 +181,9 @@ class Server:
     ) -> None:
         """A page wants control; ``granted``, or ``failed`` with the reason, is called as soon as that is known."""
         ref, now = robot.base, clock()
+        if why := self._nameless(robot):
+            failed(why)
+            return
         if robot.controlled:
             why = self.controls.ask(tab, robot, now, granted, failed, over=over)
             self.send_control()
@@ -228,7 +234,22 @@ class Server:
     def blocked(self, ref: str) -> str:
         """Why this component may not be moved by any page; empty if it may."""
         robot = self._robot(ref) or RobotView(ref)
-        return self._words(robot, first_reason(self._situation(robot), SERVER_ORDER))
+        return self._words(robot, first_reason(self._situation(robot), SERVER_ORDER)) or self._nameless(robot)
+
+    def level(self, ref: str) -> SecurityLevel:
+        """How strictly that robot checks names, as far as it tells; of others it is as in the server's config."""
+        robot = self._robot(ref)
+        if robot is None or not robot.estop.has_capabilities:
+            return self.settings.level
+        return "named" if robot.named else "open"
+
+    def _is_named(self, ref: str) -> bool:
+        robot = self._robot(ref)
+        return robot is not None and robot.named
+
+    def _nameless(self, robot: RobotView) -> str:
+        """Why it takes no commands of this server, which has no name; empty if it does."""
+        return why_not(robot.name, self.broker.names.account) if robot.named else ""
 
     def refuses(self, op: m.RobotOp) -> str:
         """Why this is not asked of a robot now; empty if it is. What ends something is always asked."""
@@ -239,7 +260,7 @@ class Server:
             return "" if self.broker.connected else "The server cannot reach the broker"
         order = (Code.BROKER,) if isinstance(op, m.FlagOp) else (Code.BROKER, Code.SILENT)  # a broker remembers flags
         why = self._words(robot, first_reason(self._situation(robot), order))
-        why = why or robot_commands.refusal(op, robot.capabilities)
+        why = why or self._nameless(robot) or robot_commands.refusal(op, robot.capabilities)
         return self._script_refused(robot) if isinstance(op, m.AutonomyOp) and not why else why
 
     def _script_refused(self, robot: RobotView) -> str:

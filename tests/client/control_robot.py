@@ -22,6 +22,7 @@ class Owner:
     def __init__(self, base: str, name: str) -> None:
         self.base, self.name = base, name
         self.receives = True
+        self.named = False  # its names are checked
         self.start(0.0)
 
     def start(self, now: float) -> None:
@@ -58,7 +59,7 @@ class Owner:
         lease = self.lease
         (_, name, by, device), (_, asks_id, asks, _) = lease.holder or _NOT, lease.asker or _NOT
         state = {"by": by, "id": name, "key": lease.key, "device": device, "asks": asks, "asks_id": asks_id}
-        more = {"others": lease.others, "named": False, "boot": "5f0c2a91"}
+        more = {"others": lease.others, "named": self.named, "boot": "5f0c2a91"}
         return outgoing(self.base, f"control/{self.name}", state | more, retain=True)
 
 

@@ -19,6 +19,7 @@ from pebble.doctor import Finding, Level
 from pebble.doctor import checks as doctor
 from pebble.doctor.broker_probe import ProbeResult, connect_packet, probe
 from pebble.doctor.publishing import publishing
+from pebble.doctor.who import who_drives
 from pebble.transports.settings import MqttSettings, TlsSettings
 from tests.support import Broker, free_port
 from tests.tcp_proxy import ForbiddingProxy
@@ -296,3 +297,58 @@ def test_a_whole_robot_is_examined(tmp_path: Path, open_broker: Broker) -> None:
         finding.what for finding in findings
     }
     assert [finding for finding in findings if finding.level is not Level.OK and not finding.fix] == []
+
+
+# -- who may drive
+
+LOGIN = (
+    "ok level login: it is driven by every account of its broker with a role that drives; "
+    "which one sent a command is not checked"
+)
+
+
+@pytest.mark.parametrize(
+    ("security", "accounts", "expected"),
+    [
+        (
+            {},
+            {},
+            ["ok level open: it is driven by every program that reaches its broker, which here only this machine's do"],
+        ),
+        (
+            {"level": "login"},
+            {"ann": "driver", "otto": "viewer", "page-1": "page"},
+            [
+                LOGIN,
+                "ok ann, page-1 (a page server: its people, too); programs on the robot itself, too",
+            ],
+        ),
+        (
+            {"level": "login"},
+            {f"p{n}": "driver" for n in range(20)},
+            [
+                LOGIN,
+                f"ok {', '.join(f'p{n}' for n in range(12))}, and 8 more; programs on the robot itself, too",
+            ],
+        ),
+    ],
+)
+def test_who_can_drive_is_shown_by_the_level_and_by_the_fleet_beside_the_config(
+    tmp_path: Path, security: dict[str, str], accounts: dict[str, str], expected: list[str]
+) -> None:
+    config = tmp_path / "goob.json"
+    config.write_text(json.dumps({"robot": {"id": "goob"}, "security": security}))
+    roles = {name: {"roles": [role]} for name, role in accounts.items()}
+    fleet = {"level": "login", "brokers": [{"host": "broker.lab", "port": 8883}], "accounts": roles}
+    (tmp_path / "fleet.json").write_text(json.dumps(fleet))
+    found = list(who_drives(load(config)))
+    assert [f"{one.level.value} {one.text}" for one in found] == expected
+
+
+def test_a_fleet_that_cannot_be_read_is_named(tmp_path: Path) -> None:
+    config = tmp_path / "goob.json"
+    config.write_text(json.dumps({"robot": {"id": "goob"}, "security": {"level": "login"}}))
+    (tmp_path / "fleet.json").write_text("{")
+    (finding,) = list(who_drives(load(config)))[1:]
+    assert finding.level is Level.WARN
+    assert "fleet.json" in finding.text

@@ -15,7 +15,8 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
 from pebble.client.page_settings import WebSettings
-from pebble.contract import CAPABILITIES, ESTOP_STATE, ONLINE, codec
+from pebble.contract import ESTOP_STATE, ONLINE, codec
+from pebble.contract.names import without_name
 from pebble.contract.payloads import EstopState, Heartbeat
 from pebble.transports import Message, MqttSettings, QoS, create
 from pebble.web.access.connections import Loop
@@ -181,18 +182,28 @@ def now_ms() -> float:
 class RecordingRobot:
     """Publishes heartbeats and capabilities, and records what arrives; it also takes stops.
 
-    ``keeps``: it keeps control itself, as ``keeping`` does.
+    ``keeps``: it keeps control itself, as ``keeping`` does. ``named``: it takes commands with names, as a bridge gives
+    them to a robot, and drive commands of strangers; ``wire`` has the topics as they arrived.
     """
 
     def __init__(
-        self, broker_port: int, base: str, *, capabilities: dict[str, Any] | None = None, keeps: bool = False
+        self,
+        broker_port: int,
+        base: str,
+        *,
+        capabilities: dict[str, Any] | None = None,
+        keeps: bool = False,
+        named: bool = False,
     ) -> None:
-        self.base = base
+        self.base, self.named = base, named
+        self.wire: set[str] = set()
         self.received: list[tuple[float, str, Any]] = []
         self.latched = False
         self._count = 0
         self._recent: list[str] = []
         self.keeping = KeepingRobot(base, "serial") if keeps else None
+        for owner in self.keeping.owners if self.keeping else ():
+            owner.named = named
         self._answering = threading.Lock()
         self._transport = create(
             "mqtt", f"robot-{base.replace('/', '-')}", MqttSettings(host="127.0.0.1", port=broker_port)
@@ -204,12 +215,14 @@ class RecordingRobot:
         estop = {"available": True, "owners": ["serial"]}
         value = {"drive": drive, "estop": estop} if capabilities is None else capabilities
         if value:
-            payload = msgspec.json.encode({"schema": "pebble-capabilities/v1", "t": 1, "value": value})
-            self._transport.publish(CAPABILITIES.topic(base), payload, qos=QoS.DELIVERED, retain=True)
+            self.publish_capabilities(value | ({"named": True} if named else {}))
         self._publish_all(self.keeping.states() if self.keeping else [])
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._heartbeats, daemon=True)
         self._thread.start()
+
+    def publish_capabilities(self, value: dict[str, Any]) -> None:
+        self.publish("capabilities", {"schema": "pebble-capabilities/v1", "t": 1, "value": value}, retain=True)
 
     def drives(self, since: float = 0.0) -> list[dict[str, Any]]:
         """The drive commands that have arrived."""
@@ -272,6 +285,14 @@ class RecordingRobot:
             payload = json.loads(message.payload)
         except ValueError:
             payload = message.payload
+        self.wire.add(message.topic)
+        if (named := without_name(message.topic)) is not None and self.named:
+            person = payload.get("by") if isinstance(payload, dict) else None
+            by = f"{named.account}/{person}" if person else named.account
+            payload = payload | {"by": by} if isinstance(payload, dict) else payload
+            message = Message(named.topic, msgspec.json.encode(payload), message.qos)
+        elif self.named and not message.topic.endswith(("/drive-values", "/estop")):
+            return
         self.received.append((time.monotonic(), message.topic, payload))
         self.answer([message])
         if message.topic.endswith("/incoming/estop"):

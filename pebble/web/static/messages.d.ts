@@ -152,6 +152,7 @@ export interface Welcome {
   user: string;
   role: string;
   rights: string[];
+  named_rights: string[];
   login: boolean;
   token: string;
   now: number;

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 import pytest
 from playwright.sync_api import Browser
 
+from pebble.transports import MqttSettings
 from tests.support import Broker, until
 from tests.web.browser import Size, Tab, tab
 from tests.web.served import RecordingRobot, Served
@@ -39,12 +40,26 @@ def moves(opened: Tab, robot: RecordingRobot) -> bool:
     return moved
 
 
-@pytest.mark.parametrize("size", ["desktop", "phone"])
-def test_two_people_take_ask_let_keep_and_take_over(browser: Browser, broker: Broker, size: Size) -> None:
+def server(broker: Broker, name: str, account: str) -> Served:
+    """A page server with its own login."""
+    return Served(broker.port, server=name, broker=MqttSettings(host="127.0.0.1", port=broker.port, username=account))
+
+
+@pytest.mark.parametrize(
+    ("size", "named", "by", "vouched"),
+    [
+        ("desktop", False, "ann", "name not checked"),
+        ("phone", False, "ann", "name not checked"),
+        ("desktop", True, "page-1/ann", "name checked"),
+    ],
+)
+def test_two_people_take_ask_let_keep_and_take_over(
+    browser: Browser, broker: Broker, size: Size, named: bool, by: str, vouched: str
+) -> None:
     with (
-        RecordingRobot(broker.port, GOOB, keeps=True) as robot,
-        Served(broker.port) as hall,
-        Served(broker.port, server="attic") as attic,
+        RecordingRobot(broker.port, GOOB, keeps=True, named=named) as robot,
+        server(broker, "hall", "page-1") as hall,
+        server(broker, "attic", "page-2") as attic,
         person(browser, hall, "ann", size) as ann,
         person(browser, attic, "otto", size) as otto,
     ):
@@ -54,7 +69,7 @@ def test_two_people_take_ask_let_keep_and_take_over(browser: Browser, broker: Br
         ann.test("take").click()
         assert ann.until(f"{SLOT}.includes('You drive')")
         assert moves(ann, robot)
-        assert otto.until(f"{SLOT}.includes('ann drives') && {SLOT}.includes('name not checked')")
+        assert otto.until(f"{SLOT}.includes('ann drives') && {SLOT}.includes('{vouched}')")
         assert not moves(otto, robot)
 
         otto.test("ask").click()
@@ -83,7 +98,7 @@ def test_two_people_take_ask_let_keep_and_take_over(browser: Browser, broker: Br
         assert ann.until(f"{SLOT}.includes('You drive')")
         ann.page.mouse.up()
         assert otto.until(f"{SLOT}.includes('ann drives')")
-        assert until(lambda: owner.by == "ann")
+        assert until(lambda: owner.by == by)
         assert not otto.page.evaluate("pebble.driver.gestureActive"), "what is held moves nothing any more"
         otto.page.keyboard.up("KeyW")
         assert moves(ann, robot)

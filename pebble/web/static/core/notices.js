@@ -9,7 +9,7 @@ const LOW_PERCENT = 20;
 const HYSTERESIS = 1.02; // times the limit: a battery above it is no longer low
 const LONGEST = 160; // characters of what a robot reports of itself
 
-/** @typedef {"offline" | "online" | "stop" | "battery" | "script" | "service" | "undriveable" | "driveable"} Kind */
+/** @typedef {"offline" | "online" | "stop" | "battery" | "script" | "service" | "undriveable" | "driveable" | "asks"} Kind */
 /**
  * One line of the list: what happens again and again is one line with a count. Times are epoch ms.
  * @typedef {{key: string, ref: string, kind: Kind, text: string, at: number, since: number, count: number,
@@ -46,7 +46,7 @@ export class Notices {
 }
 
 /** The last state of one component. @typedef {{online?: boolean, latched?: boolean, failure?: string, low?: boolean,
- *  driveable?: string, undriveable?: boolean, services?: Map<string, {failed: boolean, restarts: number}>}} Known */
+ *  asks?: string, driveable?: string, undriveable?: boolean, services?: Map<string, {failed: boolean, restarts: number}>}} Known */
 
 /** Compares the states of components with those before. The first state of each is only remembered. */
 export class Watcher {
@@ -93,6 +93,14 @@ export class Watcher {
     else if (state === "yes" && known.undriveable) this.notices.add({ key: "driveable", ref, kind: "driveable", text: "can be driven again", at });
     else return;
     known.undriveable = lost;
+  }
+
+  /** Who asks this page for control. @param {string} ref @param {unknown} view of web/driver @param {number} at */
+  asked(ref, view, at) {
+    const asks = isObject(view) && view.you === true ? short(view.asks) : "";
+    const known = this.known(ref);
+    if (asks && asks !== known.asks) this.notices.add({ ref, kind: "asks", text: `is wanted: ${asks} asks to drive`, at });
+    known.asks = asks;
   }
 
   /** @param {string} ref @param {unknown} status of autonomy @param {number} at */

@@ -154,6 +154,7 @@ function StopBanner({ at }) {
   const view = entry?.value;
   const name = useName(at);
   const [asked, ask] = useState(false);
+  const named = useValue(at, "capabilities")?.value?.named === true;
   const latched = view?.latched === true;
   useEffect(() => {
     if (!latched) ask(false);
@@ -161,7 +162,7 @@ function StopBanner({ at }) {
   if (!wants(entry)) return null;
   const progress = stopProgress(view, name, entry.age);
   const refused = (view.owners ?? []).map((one) => one.reset_refused).find(Boolean);
-  const why = resetReason(connection);
+  const why = resetReason(connection, named);
   const id = `reset-${at}`;
   const asks = latched && asked;
   return html`<div class=${`banner ${latched || progress?.kind === "bad" ? "stopped" : "warn"}`}>
@@ -246,9 +247,9 @@ const REFUSED = {
 
 const refusedWords = (refused) => REFUSED[refused] ?? String(refused);
 
-function resetReason(connection) {
+function resetReason(connection, named) {
   if (!connection.isOpen) return "No connection to the server";
-  return connection.may("reset") ? "" : "Log in as driver to reset";
+  return connection.may("reset", named) ? "" : `Log in as ${named ? "safety" : "driver"} to reset`;
 }
 
 /** Others than the open one. */

@@ -12,13 +12,14 @@ import { shortTime } from "../parts/more-words.js";
 import { battery, inner, isObject, nameOf } from "../parts/words.js";
 
 const LIMITS = "battery limits"; // by component, in the unit that it reports
-const METRICS = ["web/liveness", "web/estop", "autonomy-status", "status", "charging-level", "charging-status"];
-const SIGNS = { offline: "✖", online: "●", stop: "■", battery: "▲", script: "✖", service: "▲", undriveable: "▲", driveable: "●" };
+const METRICS = ["web/liveness", "web/estop", "web/driver", "autonomy-status", "status", "charging-level", "charging-status"];
+const SIGNS = { offline: "✖", online: "●", stop: "■", battery: "▲", script: "✖", service: "▲", undriveable: "▲", driveable: "●", asks: "?" };
 
 /** Follows all components, from when it is made. */
 class NoticeModel extends Model {
-  constructor({ store, connection }) {
+  constructor({ driver, store, connection }) {
     super();
+    this.driver = driver;
     this.store = store;
     this.connection = connection;
     this.notices = new Notices();
@@ -60,6 +61,9 @@ class NoticeModel extends Model {
         break;
       case "web/estop":
         this.watcher.stop(ref, value(metric), now);
+        break;
+      case "web/driver":
+        if (ref !== this.driver.ref) this.watcher.asked(ref, value(metric), now); // else the page shows it
         break;
       case "autonomy-status":
         this.watcher.script(ref, value(metric), now);

@@ -62,8 +62,9 @@ export class Connection extends Model {
     return this.you !== null && this.you.version !== this.version;
   }
 
-  may(right) {
-    return this.isOpen && !WATCHES && (this.you?.rights ?? []).includes(right);
+  /** @param {string} right @param {boolean} [named] at a robot that checks names */
+  may(right, named) {
+    return this.isOpen && !WATCHES && ((named ? this.you?.named_rights : this.you?.rights) ?? []).includes(right);
   }
 
   /** @param {Answer} message what the server did or refused to do */

@@ -40,6 +40,7 @@ export function Slot({ at }) {
   const script = useValue(at, "autonomy-status");
   const why = reason?.code === "broker" && !connected ? "The server cannot reach the broker" : reason?.text;
   const asks = mine ? driver.asks : "";
+  const person = asks.slice(asks.lastIndexOf("/") + 1); // without the account of the server
   const also = view?.others && view.by ? "Someone else drives, too" : "";
   const text = [why ?? (mine ? `You are driving ${name}` : ""), asks && `${asks} asks to drive`, also].filter(Boolean).join(". ");
   const words = slotWords(reason, why ?? "", view, driver.typing, script?.running === true ? String(script.file).slice(0, 40) : "");
@@ -58,7 +59,7 @@ export function Slot({ at }) {
       ${reason?.also && html`<${ReasonAction} action=${reason.also} />`}
       ${asks
         ? html`<button type="button" data-test="let" class="primary" title=${`Let ${asks} drive`} onClick=${() => driver.release()}>
-              Let ${asks.length > LONG ? "them" : asks} drive
+              Let ${person.length > LONG ? "them" : person} drive
             </button>
             <button type="button" data-test="keep" onClick=${() => driver.keep()}>Keep</button>`
         : mine && html`<button type="button" data-test="release" onClick=${() => driver.release()}>Release</button>`}
@@ -91,7 +92,7 @@ function slotWords(reason, text, view, typing, script) {
 }
 
 /** By which device and server, and whether the name may be trusted. */
-const origin = (view) => [view?.device, view?.server, view?.keeps && !view.checked && "name not checked"].filter(Boolean).join(", ");
+const origin = (view) => [view?.device, view?.server, view?.keeps && `name ${view.checked ? "" : "not "}checked`].filter(Boolean).join(", ");
 
 function ReasonAction({ action }) {
   const { commands, driver } = usePage();

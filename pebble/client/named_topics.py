@@ -1,0 +1,106 @@
+"""Puts a client's account into the topics of its commands, for robots that take commands only so. Pure.
+
+A robot's capabilities say whether it does (``named``). Set :meth:`NamedTopics.forms` as those of a transport: then
+whatever is published there has the topic that its robot reads now.
+"""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import msgspec
+
+from pebble.contract import DRIVE, ESTOP, codec
+from pebble.contract.identity import Direction, ParsedTopic, parse_topic
+from pebble.contract.names import BY, NAME, with_name
+from pebble.errors import PayloadError, TransportError
+from pebble.transports import Message
+
+_decoder = msgspec.json.Decoder()
+
+
+class NoNameError(TransportError):
+    """A command without a name. Example: ``goob takes commands only with a name: log in at its broker, …``."""
+
+    def __init__(self, name: str, account: str) -> None:
+        super().__init__(why_not(name, account))
+
+
+def why_not(name: str, account: str) -> str:
+    """Why a robot does not take commands of this account, and what to do; empty if it does."""
+    if NAME.fullmatch(account):
+        return ""
+    lacks = f"{account!r} is none that it knows" if account else "there is none here"
+    return f"{name} takes commands only with a name, and {lacks}: log in at its broker, as in --url mqtts://ANN@BROKER"
+
+
+class NamedTopics:
+    """The topics of one client. ``account``: its user name at the broker; ``is_named``: of a robot, by its base."""
+
+    def __init__(self, account: str, is_named: Callable[[str], bool]) -> None:
+        self.account = account
+        self._is_named = is_named
+
+    def forms(self, message: Message) -> Iterator[Message]:
+        """The messages that are published in place of this one. Raises NoNameError.
+
+        A stop goes out as ever, too, and before anything is asked: it needs no name. Nothing is retained at a topic
+        with a name, because the robot itself publishes its flags.
+        """
+        command = _command(message.topic)
+        is_stop = command is not None and command.metric == ESTOP.metric
+        if is_stop:
+            yield message
+        if command is None or not self._is_named(command.identity.base):
+            if not is_stop:
+                yield message
+        elif not why_not("", self.account):
+            payload = _without_claim(message.payload, self.account)
+            yield Message(with_name(message.topic, self.account), payload, message.qos)
+        elif command.metric == DRIVE.metric and not _moves(message.payload):
+            yield message
+        elif not is_stop:
+            raise NoNameError(command.identity.id, self.account)
+
+    def signed(self, topic: str, payload: bytes, person: str) -> bytes:
+        """The payload with the person for whom this client acts, where the robot puts the account before that name."""
+        command = _command(topic) if person else None
+        if command is None or not self._is_named(command.identity.base):
+            return payload
+        found = _object(payload)
+        body = found.get("value") if found is not None and isinstance(found.get("value"), dict) else found
+        if found is None or body is None or "by" in body:
+            return payload
+        body["by"] = person
+        return msgspec.json.encode(found)
+
+
+def _command(topic: str) -> ParsedTopic | None:
+    """The parts of a topic to a component, if it has no name yet."""
+    parsed = parse_topic(topic)
+    incoming = parsed is not None and parsed.direction is Direction.INCOMING
+    return parsed if parsed is not None and incoming and not parsed.metric.startswith(f"{BY}/") else None
+
+
+def _moves(payload: bytes) -> bool:
+    try:
+        return bool(codec.decode(DRIVE, payload).moves)
+    except PayloadError:  # the robot refuses it, or has other rules
+        return True
+
+
+def _without_claim(payload: bytes, account: str) -> bytes:
+    """The account alone tells who it is: its own name in the payload would be shown twice."""
+    if f'"{account}'.encode() not in payload:
+        return payload
+    found = _object(payload)
+    if found is None or str(found.get("by")).partition("@")[0] != account:
+        return payload
+    return msgspec.json.encode({key: one for key, one in found.items() if key != "by"})
+
+
+def _object(payload: bytes) -> dict[str, Any] | None:
+    try:
+        found = _decoder.decode(payload)
+    except (msgspec.MsgspecError, RecursionError, UnicodeDecodeError):
+        return None
+    return found if isinstance(found, dict) else None

@@ -1,0 +1,56 @@
+"""Who can drive a robot now: in words, and by name where the folder of its fleet is at hand."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from pebble.config import Config
+from pebble.config.doors import warning_of_open
+from pebble.doctor import Finding, ok, warn
+from pebble.fleet.folder import FLEET, Fleet, FleetError, load
+from pebble.fleet.roles import ProgramRole, Right, rights
+
+_SHOWN = 12  # names in one line
+_WORDS = {
+    "open": "every program that reaches its broker, which here only this machine's do",
+    "login": "every account of its broker with a role that drives; which one sent a command is not checked",
+    "named": "every account of its broker with a role that drives, under its own name",
+}
+
+
+def who_drives(config: Config) -> Iterator[Finding]:
+    """Its level, and who may drive it at that."""
+    level = config.security.level
+    if open_ := warning_of_open(config):
+        yield warn("security", open_, "pebble fleet init, then the account of this robot")
+        return
+    yield ok("security", f"level {level}: it is driven by {_WORDS[level]}")
+    for folder in _folders(config) if level != "open" else ():
+        try:
+            yield ok("who can drive", _accounts(load(folder)))
+        except FleetError as error:
+            yield warn("who can drive", str(error))
+    if level == "named" and config.security.unnamed != "refuse":
+        while_ = " while nobody has control" if config.security.unnamed == "free" else ""
+        yield warn(
+            "who can drive",
+            f'also senders without a name{while_}, because security.strangers is "{config.security.unnamed}"',
+            "leave out security.strangers once all clients have names",
+        )
+
+
+def _accounts(fleet: Fleet) -> str:
+    """Those whose roles let them drive, servers of the page with a word more."""
+    found = [
+        f"{name} (a page server: its people, too)" if ProgramRole.PAGE in account.roles else name
+        for name, account in fleet.accounts.items()
+        if Right.DRIVE in rights(account.roles, fleet.level)
+    ]
+    more = f", and {len(found) - _SHOWN} more" if len(found) > _SHOWN else ""
+    return f"{', '.join(found[:_SHOWN]) or 'no account'}{more}; programs on the robot itself, too"
+
+
+def _folders(config: Config) -> list[Path]:
+    """Where the files of its fleet are: beside its config, or the authority that it trusts."""
+    ca_cert = config.services.mqtt_bridge.remote_mqtt.tls.ca_cert
+    places = [config.folder, *([] if ca_cert is None else [Path(ca_cert).parent])]
+    return [one for one in dict.fromkeys(place.absolute() for place in places) if (one / FLEET).is_file()][:1]
