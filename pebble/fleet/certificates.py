@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ec import EllipticCurvePrivateKey
 
 CA_CERT, CA_KEY, SERVER_CERT, SERVER_KEY = "ca.pem", "ca.key", "server.pem", "server.key"
+ACCOUNTS = "accounts"  # folder of the certificates with names of accounts
 SERVER_DAYS = 397  # the longest that browsers accept
 AUTHORITY_DAYS = 3650
 _HOST = re.compile(r"(?=.{1,253}$)([a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?)(\.[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?)*")
@@ -89,7 +90,9 @@ def of_account(folder: Path, account: str, hosts: Sequence[str] = ()) -> tuple[P
     ``hosts``: where it listens itself, as the hub of a robot does.
     """
     key, authority = _existing(folder)
-    files = folder / f"{account}.pem", folder / f"{account}.key"
+    place = folder / ACCOUNTS
+    place.mkdir(mode=0o700, exist_ok=True)
+    files = place / f"{account}.pem", place / f"{account}.key"
     _write_signed(folder, key, authority, account, _hosts(hosts) if hosts else (), files, client=True)
     return files
 

@@ -37,9 +37,10 @@ def _grants(name: str, held: Sequence[Rule], retains: Iterable[str]) -> Iterator
     asks = [wire.asked(one, name) for one in (wire.HELLO, wire.BYE)]
     retained = [wire.RETAINED + key for key in reads]
     hubs, sessions = f"{wire.UP}*", f"{wire.LIVE}{name}{wire.OF}$*"
-    yield Grant(OUT, ("put", "delete"), reads)
+    yield Grant(OUT, ("put",), reads)
     yield Grant(IN, ("declare_subscriber",), reads)
-    yield Grant(IN, ("put", "delete"), [*writes, *(wire.RETAINED + key for key in _keys(retains))])
+    yield Grant(IN, ("put",), [*writes, *(wire.RETAINED + key for key in _keys(retains))])
+    # Zenoh lets a declaration through only if the rule covers all that it asks for, here what local programs do.
     yield Grant(OUT, ("declare_subscriber",), ["**", f"{wire.RETAINED}**"])
     yield Grant(IN, ("query",), [*retained, *asks, f"{wire.SYNC}*"])
     yield Grant(OUT, ("reply", "declare_queryable"), [*retained, *asks, f"{wire.SYNC}*"])
