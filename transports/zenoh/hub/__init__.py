@@ -106,7 +106,7 @@ class ZenohHub:
         return self
 
     def look(self) -> None:
-        """Listen again, with all that is stored, if the socket was removed or a certificate or a rule changed; call it regularly.
+        """Listen again, with all that is stored, if the socket is gone or a certificate or rule changed; call often.
 
         A cleaner of old files removes sockets, or a logout. Zenoh reads certificates and rules when a session begins.
         Raises TransportError if it cannot listen there again.
