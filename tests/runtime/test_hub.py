@@ -98,7 +98,7 @@ def test_those_of_clients_that_are_killed(settings: ZenohSettings) -> None:
     assert printed.count("refused the will of") == len(REFUSED)
 
 
-@pytest.mark.parametrize("topic", [f"{BASE}/incoming/drive-values", "arm/drive"])
+@pytest.mark.parametrize("topic", [f"{BASE}/incoming/drive-values", f"{BASE}/incoming/by/a/drive-values", "arm/drive"])
 def test_those_of_a_journal(settings: ZenohSettings, topic: str) -> None:
     """An earlier hub of another version may have stored it."""
     assert settings.journal is not None
