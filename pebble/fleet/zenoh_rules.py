@@ -34,20 +34,24 @@ def _hub_account(account: Account, held: Iterable[Rule]) -> HubAccount:
 def _grants(name: str, held: Sequence[Rule], retains: Iterable[str]) -> Iterator[Grant]:
     """Only what its client needs; so it cannot pose as a hub, nor answer queries of others."""
     reads, writes = (_keys(rule.filter for rule in held if rule.access == one) for one in ("read", "write"))
-    asks = [wire.asked(one, name) for one in (wire.HELLO, wire.BYE)]
-    retained = [wire.RETAINED + key for key in reads]
-    hubs, sessions = f"{wire.UP}*", f"{wire.LIVE}{name}{wire.OF}$*"
+    asks = tuple(wire.asked(one, name) for one in (wire.HELLO, wire.BYE))
+    retained, hubs, counts = _retained(reads), (f"{wire.UP}*",), (f"{wire.SYNC}*",)
     yield Grant(OUT, ("put",), reads)
     yield Grant(IN, ("declare_subscriber",), reads)
-    yield Grant(IN, ("put",), [*writes, *(wire.RETAINED + key for key in _keys(retains))])
+    yield Grant(IN, ("put",), (*writes, *_retained(_keys(retains))))
     # Zenoh lets a declaration through only if the rule covers all that it asks for, here what local programs do.
-    yield Grant(OUT, ("declare_subscriber",), ["**", f"{wire.RETAINED}**"])
-    yield Grant(IN, ("query",), [*retained, *asks, f"{wire.SYNC}*"])
-    yield Grant(OUT, ("reply", "declare_queryable"), [*retained, *asks, f"{wire.SYNC}*"])
-    yield Grant(IN, ("liveliness_token",), [sessions])
-    yield Grant(IN, ("liveliness_query", "declare_liveliness_subscriber"), [hubs])
-    yield Grant(OUT, ("liveliness_token",), [hubs])
+    yield Grant(OUT, ("declare_subscriber",), ("**", f"{wire.RETAINED}**"))
+    for keys in (retained, asks, counts):
+        yield Grant(IN, ("query",), keys)
+        yield Grant(OUT, ("reply", "declare_queryable"), keys)
+    yield Grant(IN, ("liveliness_token",), (f"{wire.LIVE}{name}{wire.OF}$*",))
+    yield Grant(IN, ("liveliness_query", "declare_liveliness_subscriber"), hubs)
+    yield Grant(OUT, ("liveliness_token",), hubs)
 
 
-def _keys(filters: Iterable[str]) -> list[str]:
-    return [filter_to_key(one) for one in filters if not one.startswith("$")]
+def _retained(keys: Iterable[str]) -> tuple[str, ...]:
+    return tuple(wire.RETAINED + key for key in keys)
+
+
+def _keys(filters: Iterable[str]) -> tuple[str, ...]:
+    return tuple(filter_to_key(one) for one in filters if not one.startswith("$"))
