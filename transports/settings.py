@@ -58,3 +58,6 @@ class ZenohSettings:
     reserved: tuple[str, ...] = ()  # topics below these have room of their own in the hub
     #: Whether the hub takes a will, by filters of its topic: the last one that matches decides; without one it does.
     wills: tuple[tuple[str, bool], ...] = ()
+    unretained: tuple[str, ...] = ()  # filters of topics on which the hub retains nothing
+    access: Path | None = None  # of a hub: what each name of a certificate may do, from `pebble fleet zenoh`
+    account: str = ""  # of a client: the name in its certificate, under which a hub with ``access`` knows it

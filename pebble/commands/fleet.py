@@ -15,7 +15,7 @@ from pebble.commands.options import host_of, split_names
 from pebble.errors import PebbleError
 from pebble.fleet import applying, certificates, check, folder
 from pebble.fleet.broker_files import new_password
-from pebble.fleet.folder import ADMIN, CONF, Fleet, FleetError, Server
+from pebble.fleet.folder import ADMIN, CONF, ZENOH, Fleet, FleetError, Server
 from pebble.fleet.people import People
 from pebble.fleet.roles import Account, ProgramRole
 
@@ -42,6 +42,7 @@ _Roles = Annotated[
         metavar="ROLE[,ROLE]",
     ),
 ]
+_ZENOH_PORT = 7447
 _LEVELS: dict[str, Literal["login", "named"]] = {"login": "login", "named": "named"}
 
 
@@ -171,9 +172,70 @@ def remove(name: _Name, folder_: _Folder = None) -> int:
         how = applying.apply(place, fleet, fleet.without(name))
         typer.echo(f"{name} is removed and disconnected ({how})")
         left = list(_remove_from_pages(fleet, name)) if not set(account.roles) & set(ProgramRole) else []
+        if fleet.hubs == "elsewhere":
+            left.append(
+                f"Zenoh hubs with a copy of {_shown(place / ZENOH)} admit {name} until they have the new one, "
+                "within two seconds of it"
+            )
     for line in left:
         typer.echo(f"pebble: {line}", err=True)
     return 1 if left else 0
+
+
+def zenoh(
+    only_here: Annotated[
+        bool, typer.Option("--only-here", help="All hubs run on this machine and read the file in the folder.")
+    ] = False,
+    folder_: _Folder = None,
+) -> int:
+    """Write the same rules for Zenoh hubs, and write them again at each later change.
+
+    \b
+        pebble fleet zenoh --only-here
+    """
+    require_packages("pebble fleet")
+    with _changing(folder_) as (place, fleet):
+        after = replace(fleet, hubs="here" if only_here else "elsewhere")
+        applying.write_zenoh(place, after)
+        folder.save(place, after)
+    file = place / ZENOH
+    typer.echo(f"{_shown(file)} has the rules of {len(after.accounts)} accounts. For a robot's hub, in its config:")
+    typer.echo(f'    "transport": {{"access": "{file}", …}}')
+    typer.echo("For a hub of its own, in the settings that it is started with:")
+    typer.echo(f'    "access": "{file}"')
+    if not only_here:
+        typer.echo("On other machines: a copy of it, after each change (hubs read it again when it changes).")
+    return 0
+
+
+def certificate(
+    name: _Name,
+    hosts: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="HOST…", help="Where it listens itself, as a robot's hub does.", show_default=False),
+    ] = None,
+    folder_: _Folder = None,
+) -> int:
+    """Write a certificate with the name of an account, for Zenoh, and print what belongs into its config.
+
+    \b
+        pebble fleet certificate goob
+        pebble fleet certificate goob goob.local 192.168.1.7
+    """
+    require_packages("pebble fleet")
+    with _changing(folder_) as (place, fleet):
+        account = _account(place, fleet, name)
+        files = certificates.of_account(place, name, hosts or ())
+        until = certificates.show(files[0]).until
+    typer.echo(f"{' and '.join(map(_shown, files))} are for {name}, until {until:%Y-%m-%d}.")
+    typer.echo(f"Move them to its machine, with a copy of {_shown(place / certificates.CA_CERT)} beside them.")
+    if ProgramRole.ROBOT in account.roles:
+        tls = {"enabled": True, "ca_cert": certificates.CA_CERT, "client_cert": f"{name}.pem"}
+        link = {"kind": "zenoh", "account": name, "connect": [f"tls/{fleet.brokers[0].host}:{_ZENOH_PORT}"]}
+        remote = {**link, "tls": {**tls, "client_key": f"{name}.key"}}
+        piece = {"services": {"mqtt_bridge": {"enabled": True, "remote": remote}}}
+        typer.echo(json.dumps({"security": {"level": _level(fleet, account)}, **piece}, indent=2))
+    return 0
 
 
 def list_(folder_: _Folder = None) -> int:
@@ -219,7 +281,8 @@ def check_(
 def register(app: typer.Typer) -> None:
     group = typer.Typer(help=_HELP, rich_markup_mode=None)
     commands: dict[str, Any] = {"init": init, "add": add, "role": role_, "password": password, "remove": remove}
-    for name, command in (commands | {"list": list_, "check": check_}).items():
+    commands |= {"list": list_, "check": check_, "zenoh": zenoh, "certificate": certificate}
+    for name, command in commands.items():
         group.command(name)(command)
     app.add_typer(group, name="fleet")
 
@@ -300,9 +363,12 @@ def piece_of_config(fleet: Fleet, name: str, secret: str, *, board: bool) -> dic
     server = fleet.brokers[0]
     login = {"host": server.host, "port": server.port, "username": name, "password": secret}
     link = login | {"tls": {"enabled": True, "ca_cert": certificates.CA_CERT}}
-    level = "login" if fleet.accounts[name].plain else fleet.level
     found = {"local_mqtt": link} if board else {"services": {"mqtt_bridge": {"enabled": True, "remote_mqtt": link}}}
-    return {"security": {"level": level}, **found}
+    return {"security": {"level": _level(fleet, fleet.accounts[name])}, **found}
+
+
+def _level(fleet: Fleet, account: Account) -> str:
+    return "login" if account.plain else fleet.level
 
 
 def _remove_from_pages(fleet: Fleet, name: str) -> Iterator[str]:

@@ -55,6 +55,8 @@ def _transport(reader: Reader, transport: TransportSection, path: Path) -> Trans
         one.startswith(_TLS) for one in (*transport.listen, *transport.connect)
     ):
         reader.notes.warning((*path, "allowed_names"), "has no effect: no tls/ or quic/ endpoint is listed")
+    if transport.allowed_names is not None and transport.access is not None:
+        reader.notes.problem((*path, "allowed_names"), "must be left out: access says what each name may do")
     if transport.kind != "zenoh" or encrypted is None:
         return transport
     if not transport.tls.enabled:
@@ -114,6 +116,8 @@ def _bridge(reader: Reader, bridge: MqttBridge, path: Path) -> MqttBridge:
             notes.doubt((*path, "remote", "connect"), "is missing, write the endpoint of the operators' hub")
         if remote.kind == "zenoh" and remote.listen:
             notes.problem((*path, "remote", "listen"), "an uplink only connects: leave it out")
+        if remote.account and (not remote.tls.enabled or remote.tls.client_cert is None):
+            notes.problem((*path, "remote", "account"), "needs tls.client_cert, in which it is the name")
     elif bridge.enabled and not bridge.remote_mqtt.host:
         notes.doubt((*path, "remote_mqtt", "host"), "is missing, write the name of the remote broker")
     return bridge

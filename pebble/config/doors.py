@@ -56,6 +56,12 @@ def _check_links(notes: Notes, root: Root) -> None:
     for path, endpoint in _endpoints(root):
         if not endpoint.startswith(_ZENOH_ENCRYPTED):
             notes.problem(path, f'{endpoint} is not encrypted: write tls/… at security.level "{level}"')
+    remote = root.services.mqtt_bridge.remote
+    if remote is not None and not remote.account and any("remote" in path for path, _ in _endpoints(root)):
+        notes.problem(
+            ("services", "mqtt_bridge", "remote", "account"),
+            f'is missing at security.level "{level}": `pebble fleet certificate NAME` prints what belongs there',
+        )
 
 
 def _endpoints(root: Root) -> Iterator[tuple[Path, str]]:

@@ -4,7 +4,19 @@ from typing import Annotated, Any, Literal
 
 from msgspec import Meta, field
 
-from pebble.config.types import BrokerHost, ClientId, CommonName, Endpoint, File, Password, Port, Section, Silence, doc
+from pebble.config.types import (
+    Account,
+    BrokerHost,
+    ClientId,
+    CommonName,
+    Endpoint,
+    File,
+    Password,
+    Port,
+    Section,
+    Silence,
+    doc,
+)
 
 
 class Tls(Section, frozen=True, kw_only=True):
@@ -88,6 +100,10 @@ class TransportSection(ZenohSection, frozen=True, kw_only=True):
             "unset: every one that tls.ca_cert signed."
         ),
     ] = None
+    access: Annotated[
+        File | None,
+        doc("File of `pebble fleet zenoh`: what each of these names may do. It is read again when it changes."),
+    ] = None
     journal: Annotated[File | None, doc("File for a Zenoh robot's retained messages; unset: memory only.")] = None
     mqtt_mirror: Annotated[Mqtt | None, doc("Zenoh robots only: offer all topics on this MQTT broker, too.")] = None
 
@@ -96,3 +112,6 @@ class RemoteConnection(ZenohSection, frozen=True, kw_only=True):
     """A connection to operators by another transport than MQTT."""
 
     kind: Annotated[str, doc('"zenoh", or the name of a transport that another package offers.')]
+    account: Annotated[
+        Account, doc("The robot's account at a hub with `transport.access`: the name (CN) in tls.client_cert.")
+    ] = ""

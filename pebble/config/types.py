@@ -43,6 +43,9 @@ NameOfPage = Annotated[str, Meta(extra={"parse": hosts.name_of_page})]
 CommonName = Annotated[
     str, Meta(min_length=1, max_length=64, extra={"expected": "the name in a certificate", "parse": hosts.no_login})
 ]
+Account = Annotated[
+    str, Meta(pattern=r"^[a-z0-9_-]{0,32}$(?!\n)", extra={"expected": "the name of an account: a-z, 0-9, _ and -"})
+]
 ClientId = Annotated[
     str,
     Meta(

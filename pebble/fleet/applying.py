@@ -22,6 +22,7 @@ from pebble.fleet.folder import (
     PASSWORDS,
     PID,
     SECURITY,
+    ZENOH,
     Fleet,
     FleetError,
     Server,
@@ -95,8 +96,26 @@ def apply(folder: Path, before: Fleet, after: Fleet, passwords: Mapping[str, str
     how = change_brokers(folder, before, after, new)
     if ADMIN in new:
         write(folder / ADMIN_PASSWORD, f"{new[ADMIN]}\n".encode(), 0o600, FleetError)
+    if after.hubs != "none":
+        write_zenoh(folder, after)
     save(folder, after)
     return how
+
+
+def write_zenoh(folder: Path, fleet: Fleet) -> None:
+    """Write the rules for Zenoh hubs; one that reads them here obeys within a second or two. Raises FleetError."""
+    from pebble.fleet.zenoh_rules import zenoh_text  # Zenoh, which few fleets need
+
+    write(folder / ZENOH, zenoh_text(fleet), 0o644, FleetError)
+
+
+def zenoh_differences(folder: Path, fleet: Fleet) -> Iterator[str]:
+    """Whether the rules for Zenoh hubs are not those of the table."""
+    from pebble.fleet.zenoh_rules import zenoh_text
+
+    file = folder / ZENOH
+    if fleet.hubs != "none" and not (file.is_file() and file.read_bytes() == zenoh_text(fleet)):
+        yield f"{file} does not hold the rules of the table"
 
 
 def change_brokers(folder: Path, before: Fleet, after: Fleet, passwords: Mapping[str, str]) -> str:

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ec import EllipticCurvePrivateKey
 
 CA_CERT, CA_KEY, SERVER_CERT, SERVER_KEY = "ca.pem", "ca.key", "server.pem", "server.key"
+ACCOUNTS = "accounts"  # folder of the certificates with names of accounts
 SERVER_DAYS = 397  # the longest that browsers accept
 AUTHORITY_DAYS = 3650
 _HOST = re.compile(r"(?=.{1,253}$)([a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?)(\.[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?)*")
@@ -79,16 +80,21 @@ def renew(folder: Path, names: Sequence[str] = ()) -> None:
 
     Raises CertificateError.
     """
-    from cryptography.hazmat.primitives.serialization import load_pem_private_key
+    key, authority = _existing(folder)
+    _sign(folder, key, authority, _hosts(names or show(folder / SERVER_CERT).names))
 
-    authority = _read(folder / CA_CERT)
-    try:
-        key = load_pem_private_key((folder / CA_KEY).read_bytes(), None)
-    except (OSError, ValueError, TypeError) as error:
-        raise CertificateError(f"{folder / CA_KEY}: {getattr(error, 'strerror', error)}") from None
-    if key.public_key() != authority.public_key():
-        raise CertificateError(f"{folder / CA_KEY} is not the key of {folder / CA_CERT}")
-    _sign(folder, key, authority, _hosts(names or show(folder / SERVER_CERT).names))  # type: ignore[arg-type]
+
+def of_account(folder: Path, account: str, hosts: Sequence[str] = ()) -> tuple[Path, Path]:
+    """Write a certificate with the name of an account, and its key. Raises CertificateError.
+
+    ``hosts``: where it listens itself, as the hub of a robot does.
+    """
+    key, authority = _existing(folder)
+    place = folder / ACCOUNTS
+    place.mkdir(mode=0o700, exist_ok=True)
+    files = place / f"{account}.pem", place / f"{account}.key"
+    _write_signed(folder, key, authority, account, _hosts(hosts) if hosts else (), files, client=True)
+    return files
 
 
 def show(file: Path) -> Shown:
@@ -114,6 +120,20 @@ def own_names() -> list[str]:
 
 
 # -- inside
+
+
+def _existing(folder: Path) -> tuple[EllipticCurvePrivateKey, x509.Certificate]:
+    """The authority of a folder. Raises CertificateError."""
+    from cryptography.hazmat.primitives.serialization import load_pem_private_key
+
+    authority = _read(folder / CA_CERT)
+    try:
+        key = load_pem_private_key((folder / CA_KEY).read_bytes(), None)
+    except (OSError, ValueError, TypeError) as error:
+        raise CertificateError(f"{folder / CA_KEY}: {getattr(error, 'strerror', error)}") from None
+    if key.public_key() != authority.public_key():
+        raise CertificateError(f"{folder / CA_KEY} is not the key of {folder / CA_CERT}")
+    return key, authority  # type: ignore[return-value]
 
 
 def _hosts(names: Iterable[str]) -> list[str]:
@@ -154,27 +174,46 @@ def _authority(hosts: Sequence[str]) -> tuple[EllipticCurvePrivateKey, x509.Cert
 
 
 def _sign(folder: Path, key: EllipticCurvePrivateKey, authority: x509.Certificate, hosts: Sequence[str]) -> None:
+    # no host name: OpenSSL applies the constraints for names to one that is an address
+    _write_signed(
+        folder, key, authority, "Pebble operator page", hosts, (folder / SERVER_CERT, folder / SERVER_KEY), client=False
+    )
+
+
+def _write_signed(
+    folder: Path,
+    key: EllipticCurvePrivateKey,
+    authority: x509.Certificate,
+    name: str,
+    hosts: Sequence[str],
+    files: tuple[Path, Path],
+    *,
+    client: bool,
+) -> None:
     from cryptography import x509
     from cryptography.hazmat.primitives.asymmetric import ec
 
     _check_permitted(folder, authority, hosts)
     own = ec.generate_private_key(ec.SECP256R1())
-    # no host name: OpenSSL applies the constraints for names to one that is an address
-    subject = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "Pebble operator page")])
-    names = [x509.DNSName(host) if _is_name(host) else x509.IPAddress(ipaddress.ip_address(host)) for host in hosts]
+    subject = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, name)])
+    usages = ([x509.oid.ExtendedKeyUsageOID.SERVER_AUTH] if hosts else []) + (
+        [x509.oid.ExtendedKeyUsageOID.CLIENT_AUTH] if client else []
+    )
     public = authority.public_key()
     builder = (
         _builder(subject, authority.subject, own, SERVER_DAYS, authority.not_valid_after_utc)
         .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
         .add_extension(_key_usage(signs_certificates=False), critical=True)
-        .add_extension(x509.ExtendedKeyUsage([x509.oid.ExtendedKeyUsageOID.SERVER_AUTH]), critical=False)
-        .add_extension(x509.SubjectAlternativeName(names), critical=False)
+        .add_extension(x509.ExtendedKeyUsage(usages), critical=False)
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(own.public_key()), critical=False)
         .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(public), critical=False)  # type: ignore[arg-type]
     )
+    if hosts:
+        names = [x509.DNSName(host) if _is_name(host) else x509.IPAddress(ipaddress.ip_address(host)) for host in hosts]
+        builder = builder.add_extension(x509.SubjectAlternativeName(names), critical=False)
     certificate = _signed(builder, key)
-    _write_key(folder / SERVER_KEY, own)
-    write(folder / SERVER_CERT, _pem(certificate), 0o644, CertificateError)
+    _write_key(files[1], own)
+    write(files[0], _pem(certificate), 0o644, CertificateError)
 
 
 def _check_permitted(folder: Path, authority: x509.Certificate, hosts: Iterable[str]) -> None:

@@ -13,7 +13,7 @@ from typing import Any
 from msgspec.structs import replace
 
 from pebble.fleet import broker_files, certificates, dynsec
-from pebble.fleet.applying import admin_password, change_brokers, conf_differences, control, places
+from pebble.fleet.applying import admin_password, change_brokers, conf_differences, control, places, zenoh_differences
 from pebble.fleet.attempts import READS, ROWS, Row, may, topics
 from pebble.fleet.broker_client import BrokerClient, Place, RefusedError, UnreachableError
 from pebble.fleet.folder import ACL, ADMIN, PASSWORDS, SECURITY, Fleet, FleetError, Server
@@ -30,7 +30,7 @@ _OTHER = "check-other"  # whose name others take
 
 def compare(folder: Path, fleet: Fleet) -> list[str]:
     """What a broker has too much or too little, and what will not do for long; one line each. Raises FleetError."""
-    found = [*conf_differences(folder, fleet), *_certificate(folder)]
+    found = [*conf_differences(folder, fleet), *zenoh_differences(folder, fleet), *_certificate(folder)]
     if fleet.rules == "files":
         return [*found, *_of_files(folder, fleet)]
     for number, server in enumerate(fleet.brokers):

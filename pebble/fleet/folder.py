@@ -18,7 +18,7 @@ from pebble.fleet.roles import GATEWAYS, Account, Extra, ProgramRole, Rule, add_
 from pebble.fleet.whole_file import write
 
 FLEET, ADMIN_PASSWORD, CONF, PID = "fleet.json", "admin.password", "mosquitto.conf", "mosquitto.pid"
-SECURITY, ACL, PASSWORDS = "dynamic-security.json", "acl", "passwords"
+SECURITY, ACL, PASSWORDS, ZENOH = "dynamic-security.json", "acl", "passwords", "zenoh.json"
 ADMIN = "admin"  # the account by which `pebble fleet` changes a running broker
 PORT = 8883  # of MQTT over TLS
 MAX_ACCOUNTS = 10_000
@@ -42,13 +42,15 @@ class Fleet(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The content of `fleet.json`. The first broker is the one whose files are in this folder.
 
     ``rules``: whether the broker knows them by its dynamic-security plugin, or by `acl` and `passwords`.
-    ``plain``: all robots keep their topics without names beside those with names.
+    ``plain``: all robots keep their topics without names beside those with names. ``hubs``: where Zenoh hubs run that
+    read the rules for them, on this machine in this folder or elsewhere from copies.
     """
 
     level: Literal["login", "named"]
     brokers: Annotated[tuple[Server, ...], Meta(min_length=1)]
     rules: Literal["plugin", "files"] = "plugin"
     plain: bool = False
+    hubs: Literal["none", "here", "elsewhere"] = "none"
     accounts: dict[str, Account] = msgspec.field(default_factory=dict)
     extra: Extra = Extra()
 

@@ -108,6 +108,7 @@ def _remote_settings(config: Config, remote: RemoteConnection) -> Any:
         tls=tls_settings(remote.tls),
         lease_ms=remote.lease_ms,
         client=True,
+        account=remote.account,
     )
 
 
@@ -125,6 +126,7 @@ def hub_settings(config: Config) -> ZenohSettings:
         connect=tuple(transport.connect),
         tls=tls_settings(transport.tls),
         allowed_names=transport.allowed_names,
+        access=transport.access,
         lease_ms=transport.lease_ms,
         journal=transport.journal,
         reserved=(f"{config.base}/{c.OUTGOING}",),

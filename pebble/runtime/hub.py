@@ -17,6 +17,7 @@ from typing import Final
 import msgspec
 
 from pebble.contract import CHANNELS, INCOMING, Kind
+from pebble.contract.names import BY
 from pebble.errors import PebbleError
 from pebble.runtime.parent import ALIVE_PERIOD_S, DROPPED_PERIOD_S, DroppedMessages, Notifier, set_up_logging
 from pebble.transports.settings import ZenohSettings
@@ -31,6 +32,8 @@ WILLS: Final = (
     (f"{_ANY}/{INCOMING}/flags/#", True),
     *((channel.filter(_ANY), False) for channel in CHANNELS if channel.kind is Kind.ACTION),
 )
+#: Nothing is retained where the sender's account stands in the topic.
+UNRETAINED: Final = (f"{_ANY}/{INCOMING}/{BY}/#",)
 
 # Made where the launcher imports this module: what msgspec finds out about the fields is then in memory that is shared.
 _decoder = msgspec.json.Decoder(ZenohSettings, dec_hook=lambda _kind, text: Path(text))
@@ -53,7 +56,7 @@ def run_hub(settings: ZenohSettings, stop: threading.Event) -> None:
     """Run a hub until ``stop`` is set. Raises TransportError if it cannot open."""
     notify = Notifier()
     dropped, due = DroppedMessages(notify), time.monotonic()
-    hub = ZenohHub(replace(settings, wills=(*WILLS, *settings.wills))).open()
+    hub = ZenohHub(replace(settings, wills=(*WILLS, *settings.wills), unretained=UNRETAINED)).open()
     try:
         notify.ready()
         while not stop.wait(ALIVE_PERIOD_S):

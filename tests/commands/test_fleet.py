@@ -17,10 +17,11 @@ import pytest
 
 from pebble.config import load
 from pebble.fleet.broker_client import BrokerClient, Place
-from pebble.fleet.folder import CONF
+from pebble.fleet.folder import CONF, ZENOH
 from pebble.fleet.people import People
 from pebble.fleet.roles import Role
 from pebble.rig.processes import mosquitto_path, python
+from pebble.transports.zenoh.access import read_access
 from tests.commands.test_drive import Console
 from tests.support import ROOT, Child, free_port, listening, until
 
@@ -198,3 +199,23 @@ def test_removing_a_person_acts_on_pages_here_and_names_those_elsewhere(hall: Pa
     assert done.returncode == 1
     assert "page-2 has people of its own: if ann is one, `pebble web user remove ann` on its machine" in done.stderr
     assert pebble("pebble fleet remove page-2", hall).returncode == 0
+
+
+def test_zenoh_hubs_have_the_same_accounts(hall: Path) -> None:
+    """What is printed for a robot makes a valid config."""
+    rules = hall / "hall" / ZENOH
+    for line in ("add ann --role driver", "add goob --role robot", "zenoh", "certificate ann"):
+        run(f"pebble fleet {line}", hall)
+    printed = run("pebble fleet certificate goob goob.local 10.0.0.7", hall)
+    for name in ("goob.pem", "goob.key"):
+        (hall / "hall" / "accounts" / name).rename(hall / name)
+    _robot_accepts(json.loads(printed[printed.index("{") :]), hall)
+    assert set(read_access(rules).accounts) == {"admin", "ann", "goob"}
+    done = pebble("pebble fleet remove ann", hall)
+    assert (done.returncode, set(read_access(rules).accounts)) == (1, {"admin", "goob"})
+    assert "Zenoh hubs with a copy of hall/zenoh.json admit ann until they have the new one" in done.stderr
+    run("pebble fleet zenoh --only-here", hall)
+    run("pebble fleet remove goob", hall)
+    assert set(read_access(rules).accounts) == {"admin"}
+    rules.write_bytes(rules.read_bytes().replace(b"incoming/estop", b"incoming/#"))
+    assert "zenoh.json does not hold the rules of the table" in pebble("pebble fleet check", hall).stderr

@@ -555,6 +555,19 @@ class TestMistakes:
         assert only_problem(at("transport", {"kind": "zenoh", "allowed_names": [""]})).startswith(
             "transport.allowed_names[0]: must be the name in a certificate"
         )
+        both = at("transport", names | endpoints | {"access": "file"})
+        assert only_problem(both, folder=tmp_path).startswith("transport.allowed_names: must be left out: access says")
+        config = read(at("transport", {"kind": "zenoh", "access": "file"} | endpoints), folder=tmp_path)
+        assert hub_settings(config).access == tmp_path / "file"
+
+    def test_an_account_is_the_name_in_a_certificate(self) -> None:
+        remote = {"kind": "zenoh", "connect": ["tls/hub.lab:7447"], "account": "goob"}
+        assert only_problem(at("services.mqtt_bridge.remote", remote)).startswith(
+            "services.mqtt_bridge.remote.account: needs tls.client_cert, in which it is the name"
+        )
+        assert "must be the name of an account" in only_problem(
+            at("services.mqtt_bridge.remote", remote | {"account": "Goob"})
+        )
 
     def test_ten_mistakes_are_reported_in_one_run(self, tmp_path: Path) -> None:
         raw = json.loads(ORIGINAL.read_text())

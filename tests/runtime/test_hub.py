@@ -14,7 +14,7 @@ from pebble.config import parse
 from pebble.runtime.connections import hub_settings
 from pebble.runtime.hub import WILLS
 from pebble.transports import Message, QoS, ZenohSettings, create
-from pebble.transports.zenoh.hub.admission import WillAdmission
+from pebble.transports.zenoh.hub.admission import Admission
 from pebble.transports.zenoh.hub.journal import Journal
 from pebble.transports.zenoh.hub.store import StoredWill
 from pebble.transports.zenoh.wire import Will
@@ -77,9 +77,9 @@ def die(settings: ZenohSettings, *topics: str) -> None:
 
 
 def test_by_topic(settings: ZenohSettings) -> None:
-    admission = WillAdmission((*WILLS, *settings.wills))
+    admission = Admission((*WILLS, *settings.wills))
     assert [topic for topic in (*REFUSED, *RAW, *TAKEN) if admission.takes(topic)] == list(TAKEN)
-    assert [topic for topic in TAKEN if not WillAdmission(WILLS).takes(topic)] == [], "as a hub without a config"
+    assert [topic for topic in TAKEN if not Admission(WILLS).takes(topic)] == [], "as a hub without a config"
 
 
 def test_those_of_clients_that_are_killed(settings: ZenohSettings) -> None:
@@ -98,7 +98,7 @@ def test_those_of_clients_that_are_killed(settings: ZenohSettings) -> None:
     assert printed.count("refused the will of") == len(REFUSED)
 
 
-@pytest.mark.parametrize("topic", [f"{BASE}/incoming/drive-values", "arm/drive"])
+@pytest.mark.parametrize("topic", [f"{BASE}/incoming/drive-values", f"{BASE}/incoming/by/a/drive-values", "arm/drive"])
 def test_those_of_a_journal(settings: ZenohSettings, topic: str) -> None:
     """An earlier hub of another version may have stored it."""
     assert settings.journal is not None
@@ -126,7 +126,7 @@ def test_those_of_a_journal(settings: ZenohSettings, topic: str) -> None:
 
 
 def test_each_client_is_logged_once_and_a_flood_of_them_not_without_end(caplog: pytest.LogCaptureFixture) -> None:
-    admission = WillAdmission(WILLS)
+    admission = Admission(WILLS)
     will = Will(f"{BASE}/incoming/drive-values", b"{}", QoS.DELIVERED, False)
     for number in range(1000):
         admission.admitted(StoredWill("session", msgspec.structs.replace(will, client=f"evil-{number // 2}")))

@@ -25,7 +25,10 @@ GOODBYE_S = 0.3  # the longest wait for an answer when closing
 class HubConnection:
     """A new connection begins every time a hub appears: `watch` says when. ``name`` is this client's in a session."""
 
-    def __init__(self, client_id: str, will: Message | None, own: OwnRetained, count: Callable[[], object]) -> None:
+    def __init__(
+        self, client_id: str, will: Message | None, own: OwnRetained, count: Callable[[], object], account: str = ""
+    ) -> None:
+        self._account = account
         self._will = None if will is None else wire.Will.of(will, client_id)
         self._own, self._count_received = own, count
         # Retained topics we have removed, in case a hub that was ending did not receive the removal.
@@ -80,12 +83,12 @@ class HubConnection:
 
     def greet(self, session: zenoh.Session, hello: bytes, timeout: float) -> set[str] | None:
         """The topics that the hub lacks; None: no hub answers in time."""
-        answers = self._ask(session, wire.HELLO, hello, timeout)
+        answers = self._ask(session, wire.asked(wire.HELLO, self._account), hello, timeout)
         return {key_to_topic(key) for answer in answers for key in wire.decode_keys(answer)} if answers else None
 
     def leave(self, session: zenoh.Session) -> None:
         """Have our will forgotten."""
-        self._ask(session, wire.BYE, wire.encode(self.name), GOODBYE_S)
+        self._ask(session, wire.asked(wire.BYE, self._account), wire.encode(self.name), GOODBYE_S)
 
     def _ask(self, session: zenoh.Session, what: str, payload: bytes, timeout: float) -> list[bytes]:
         replies = session.get(

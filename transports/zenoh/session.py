@@ -16,7 +16,8 @@ import zenoh
 
 from pebble.errors import TransportError
 from pebble.transports.settings import TlsSettings, ZenohSettings
-from pebble.transports.zenoh import callbacks, wire
+from pebble.transports.zenoh import callbacks
+from pebble.transports.zenoh.access import EVERYTHING, Access, access_control
 
 # By default connections are accepted, opened and read on separate runtimes: a received message wakes a thread that only
 # wakes another one; docs/transports.md has what that costs. Sending has its own runtime, because a callback may send.
@@ -36,18 +37,6 @@ _TLS_SCHEMES = ("tls/", "quic/")
 _SAFE_SCHEMES = (*_TLS_SCHEMES, "unixsock-stream/")
 _LOOPBACK = ("tcp/127.0.0.1:", "tcp/localhost:", "tcp/[::1]:")
 
-_MESSAGES = [
-    "put",
-    "delete",
-    "declare_subscriber",
-    "query",
-    "reply",
-    "declare_queryable",
-    "liveliness_token",
-    "liveliness_query",
-    "declare_liveliness_subscriber",
-]
-
 
 class _Closable(Protocol):
     def close(self) -> None: ...
@@ -57,15 +46,18 @@ def unix_endpoint(socket: Path) -> str:
     return f"unixsock-stream/{socket}"
 
 
-def session_config(settings: ZenohSettings, mode: str, *, listen: list[Path], connect: list[Path]) -> str:
+def session_config(
+    settings: ZenohSettings, mode: str, *, listen: list[Path], connect: list[Path], access: Access | None = None
+) -> str:
     """The configuration of a ``mode`` (router, peer or client) on unix sockets plus the settings' own endpoints.
 
-    Raises TransportError for endpoints or certificates that can never work.
+    ``access``: of a hub, what certificates allow. Raises TransportError for endpoints or certificates that can never
+    work.
     """
     for name, endpoints in (("listen", settings.listen), ("connect", settings.connect)):
         for endpoint in endpoints:
             _check_endpoint(name, endpoint, settings.tls)
-    config = json.dumps(_config(settings, mode, listen, connect))
+    config = json.dumps(_config(settings, mode, listen, connect) | _access_control(settings.allowed_names, access))
     try:
         zenoh.Config.from_json5(config)
     except zenoh.ZError as error:
@@ -96,7 +88,6 @@ def close_session(session: zenoh.Session) -> None:
 
 def _config(settings: ZenohSettings, mode: str, listen: list[Path], connect: list[Path]) -> dict[str, Any]:
     return {
-        **_access_control(settings.allowed_names),
         "mode": mode,
         "listen": {"endpoints": [*map(unix_endpoint, listen), *settings.listen]},
         "connect": {"endpoints": [*map(unix_endpoint, connect), *settings.connect], "retry": _RETRY},
@@ -152,33 +143,10 @@ def _tls(tls: TlsSettings | None) -> dict[str, Any]:
     return {"tls": link}
 
 
-def _access_control(names: tuple[str, ...] | None) -> dict[str, Any]:
-    """Let connections of this machine do everything, and of those with a certificate the ones with these names.
-
-    Zenoh does not refuse the others, but drops whatever they send, and sends them nothing. It reads this once.
-    """
-    if names is None:
-        return {}
-    subjects: list[dict[str, Any]] = [{"id": "this machine", "link_protocols": ["unixsock-stream", "tcp"]}]
-    if names:
-        subjects.append({"id": "allowed", "link_protocols": ["tls", "quic"], "cert_common_names": list(names)})
-    return {
-        "access_control": {
-            "enabled": True,
-            "default_permission": "deny",
-            "rules": [
-                {
-                    "id": "everything",
-                    "permission": "allow",
-                    "flows": ["ingress", "egress"],
-                    "messages": _MESSAGES,
-                    "key_exprs": wire.ALL_KEYS,
-                }
-            ],
-            "subjects": subjects,
-            "policies": [{"rules": ["everything"], "subjects": [subject["id"] for subject in subjects]}],
-        }
-    }
+def _access_control(names: tuple[str, ...] | None, access: Access | None) -> dict[str, Any]:
+    if access is not None:
+        return {"access_control": access.control}
+    return {} if names is None else {"access_control": access_control([(names, EVERYTHING)])}
 
 
 # -- forks and exits

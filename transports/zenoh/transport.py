@@ -56,7 +56,7 @@ class ZenohTransport(Transport):
         self._connecting = threading.RLock()  # held while subscribing, and while a connection is made
         self._subscribers: dict[Subscription, zenoh.Subscriber[None]] = {}
         self._publishers = Publishers(lambda topic: self.is_invented(topic))
-        self._hub = HubConnection(client_id, will, self._own, self.count_received)
+        self._hub = HubConnection(client_id, will, self._own, self.count_received, settings.account)
         self._reset()
 
     def _reset(self) -> None:
@@ -115,6 +115,7 @@ class ZenohTransport(Transport):
 
     def _start_client(self) -> bool:
         """Try until a hub answers: a session in client mode cannot open without one."""
+        account = self.settings.account
         hub = [] if self.settings.connect else [self.settings.run_dir / HUB_SOCKET]
         config = session_config(self.settings, "client", listen=[], connect=hub)
         while not self._hub.watch.closed:
@@ -126,7 +127,7 @@ class ZenohTransport(Transport):
                 self.problem = f"no hub answers at {hubs}"
                 self._hub.watch.wait_closed(_RETRY_S)
                 continue
-            if self._begin(session, new_name()):
+            if self._begin(session, f"{account}{wire.OF}{new_name()}" if account else new_name()):
                 return True
         return False
 

@@ -26,6 +26,9 @@ UP = "@up/"  # + name: liveliness token of a hub
 LIVE = "@live/"  # + name: liveliness token of a client
 HELLO = "@hub/hello"  # query: name, digests of retained messages, will; the answer lists the keys the hub lacks
 BYE = "@hub/bye"  # query: remove my will, I have published it myself
+# Clients from other machines that have an account say hello and goodbye under it: @hub/hello/<account>. Their sessions
+# are named <account>~…
+OF = "~"
 ALL_KEYS = ("**", *(f"{prefix}**" for prefix in (RETAINED, SYNC, UP, LIVE, "@hub/")))
 
 # How put() and get() treat a message. Not `express`: it is no faster here (64 B at 200 Hz: p50 108 against 112 us), and
@@ -113,7 +116,10 @@ class Will(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Hello(msgspec.Struct, frozen=True, array_like=True):
-    """``own`` has a digest for each retained key of this client, None for one it has removed."""
+    """``own`` has a digest for each retained key of this client, None for one it has removed.
+
+    A field may be added at the end: msgspec skips what it does not know.
+    """
 
     name: str
     retained_count: int
@@ -127,6 +133,19 @@ decode_hello = msgspec.msgpack.Decoder(Hello).decode
 decode_name = msgspec.msgpack.Decoder(str).decode
 decode_keys = msgspec.msgpack.Decoder(list[str]).decode
 decode_counts = msgspec.msgpack.Decoder(dict[str, int]).decode
+
+
+def asked(what: str, account: str) -> str:
+    """The key of a query to the hub, from an account or from this machine."""
+    return f"{what}/{account}" if account else what
+
+
+def account_of(key: str, what: str) -> str:
+    """The account that a query to the hub is of; empty: this machine. Raises ValueError for what no account asks."""
+    account = key.removeprefix(what).removeprefix("/")
+    if not key.startswith(what) or "*" in account or "/" in account or OF in account:
+        raise ValueError(f"{key} is no query of an account")
+    return account
 
 
 def pack_count(count: int) -> bytes:

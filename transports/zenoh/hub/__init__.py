@@ -30,8 +30,9 @@ from pebble.transports.renewed import Renewed
 from pebble.transports.settings import TlsSettings, ZenohSettings
 from pebble.transports.socket_holders import why_not
 from pebble.transports.zenoh import wire
+from pebble.transports.zenoh.access import Access, read_access
 from pebble.transports.zenoh.callbacks import direct
-from pebble.transports.zenoh.hub.admission import WillAdmission
+from pebble.transports.zenoh.hub.admission import Admission
 from pebble.transports.zenoh.hub.journal import Journal
 from pebble.transports.zenoh.hub.store import HubStore, Record, Retained, StoredWill
 from pebble.transports.zenoh.keymap import topic_to_key
@@ -43,6 +44,7 @@ log = logging.getLogger(__name__)
 QUEUE_LIMIT = 10_000  # events waiting for the hub's thread; beyond it their senders wait
 WILL_DELAY_S = 0.1  # before a dead client's will is published, so that its last messages come first
 RETURN_S = 2.5  # after a restart clients have this long to reconnect before their wills are published
+QUERIES = 1000  # that wait; further ones are answered at once
 PATIENCE_S = 0.5  # a query waits this long for retained messages that are known to be on their way
 
 _Task = Callable[[], None]
@@ -60,10 +62,11 @@ class ZenohHub:
         self._worker: HubWorker | None = None
         self._token: zenoh.LivelinessToken | None = None
         self._store: HubStore | None = None
-        self._admission = WillAdmission(settings.wills)
+        self._admission = Admission(settings.wills, settings.unretained)
         self._listening = OwnFile(self._socket)
         self._certificates = None if settings.tls is None else _renewed(settings.tls)
-        self._used = None if self._certificates is None else self._certificates.get()
+        self._access = None if (file := settings.access) is None else Renewed([file], lambda: read_access(file))
+        self._used = self._newest
         self._problem = ""  # why clients that start now do not reach this hub
 
     @property
@@ -103,9 +106,9 @@ class ZenohHub:
         return self
 
     def look(self) -> None:
-        """Listen again, with all that is stored, if the socket was removed or a certificate renewed; call it regularly.
+        """Listen again, with all that is stored, if the socket is gone or a certificate or rule changed; call often.
 
-        A cleaner of old files removes sockets, or a logout. Zenoh reads certificates when a session begins to listen.
+        A cleaner of old files removes sockets, or a logout. Zenoh reads certificates and rules when a session begins.
         Raises TransportError if it cannot listen there again.
         """
         lock, worker = self._lock, self._worker
@@ -125,19 +128,26 @@ class ZenohHub:
         found = self._listening.in_place
         if found and not self._is_renewed():
             return
-        if self._certificates is not None:
-            self._used = self._certificates.get()
+        self._used = self._newest
         if self._session is not None:
             close_session(self._session)
         self._problem = ""
         self._listen(worker)
         if found:
-            log.info("the hub uses renewed certificates")
+            log.info("the hub uses renewed certificates or rules")
         else:
             log.warning("the socket of the hub was removed from %s, it has made a new one", self._settings.run_dir)
 
+    @property
+    def _newest(self) -> tuple[object, Access | None]:
+        """The certificates and rules, as their files are now."""
+        return (
+            None if self._certificates is None else self._certificates.get(),
+            None if self._access is None else self._access.get(),
+        )
+
     def _is_renewed(self) -> bool:
-        return self._certificates is not None and self._certificates.get() is not self._used
+        return any(new is not old for new, old in zip(self._newest, self._used, strict=True))
 
     def close(self) -> None:
         if self._session is not None:
@@ -170,7 +180,9 @@ class ZenohHub:
         siblings = PeerRegistry(self._settings.run_dir).sockets()  # they would connect within 0.5 s; we connect at once
         try:
             settings = replace(self._settings, listen=tuple(filter(self._is_free, self._settings.listen)))
-            config = session_config(settings, "router", listen=[self._socket], connect=siblings)
+            _, access = self._used
+            self._admission.accounts = {} if access is None else access.accounts
+            config = session_config(settings, "router", listen=[self._socket], connect=siblings, access=access)
             self._session = open_session(config)
         except zenoh.ZError as error:
             raise TransportError(f"the hub cannot open {self._socket}: {error}") from None
@@ -203,7 +215,7 @@ class HubWorker:
     """One thread and one queue for all messages and queries of the hub, so that the order of arrival decides (T8)."""
 
     def __init__(
-        self, name: str, store: HubStore, admission: WillAdmission, journal: Journal | None, counters: Counters
+        self, name: str, store: HubStore, admission: Admission, journal: Journal | None, counters: Counters
     ) -> None:
         self._name, self._store, self._journal, self._counters = name, store, journal, counters
         self._admission = admission
@@ -229,8 +241,9 @@ class HubWorker:
         self._session = session
         session.declare_subscriber(wire.RETAINED + "**", self._queued(self._store_retained))
         session.declare_queryable(wire.RETAINED + "**", self._queued(self._query), complete=True)
-        session.declare_queryable(wire.HELLO, self._queued(self._on_hello))
-        session.declare_queryable(wire.BYE, self._queued(self._on_bye))
+        for what, work in ((wire.HELLO, self._on_hello), (wire.BYE, self._on_bye)):
+            session.declare_queryable(what, self._queued(work))
+            session.declare_queryable(f"{what}/*", self._queued(work))
         session.liveliness().declare_subscriber(wire.LIVE + "*", self._queued(self._on_client), history=True)
         if not self._thread.is_alive():
             self._thread.start()
@@ -298,6 +311,8 @@ class HubWorker:
         except (ValueError, msgspec.DecodeError):
             query.drop()  # type: ignore[no-untyped-call]
             raise
+        if len(self._waiting_queries) >= QUERIES:
+            needs = {}
         self._waiting_queries.append((time.monotonic() + PATIENCE_S, needs, query))
 
     def _answer_waiting(self) -> None:
@@ -327,7 +342,11 @@ class HubWorker:
 
     def _on_hello(self, query: zenoh.Query) -> None:
         with query:
-            hello = wire.decode_hello(_payload(query))
+            account = wire.account_of(str(query.key_expr), wire.HELLO)
+            admitted = self._admission.hello(account, wire.decode_hello(_payload(query)), self._store.wills())
+            if admitted is None:
+                return
+            hello = admitted
             self._end_predecessor(hello)
             self._apply(StoredWill(hello.name, hello.will))
             if hello.name in self._alive_clients:
@@ -338,9 +357,9 @@ class HubWorker:
             lacking = self._store.lacks(hello)
             if lacking:
                 self._received.pop(hello.name, None)
-            else:
+            elif not account:  # no subscriber waits for what other machines retain
                 self._received[hello.name] = hello.retained_count
-            query.reply(wire.HELLO, wire.encode(lacking))
+            query.reply(wire.asked(wire.HELLO, account), wire.encode(lacking))
 
     def _end_predecessor(self, hello: wire.Hello) -> None:
         """Publish the pending will of a restarted client's former session now, unless it has published there since."""
@@ -356,13 +375,17 @@ class HubWorker:
 
     def _on_bye(self, query: zenoh.Query) -> None:
         with query:
-            self._apply(StoredWill(wire.decode_name(_payload(query)), None))
-            query.reply(wire.BYE, b"")
+            account = wire.account_of(str(query.key_expr), wire.BYE)
+            name = wire.decode_name(_payload(query))
+            if self._admission.owns(account, name):
+                self._apply(StoredWill(name, None))
+                query.reply(wire.asked(wire.BYE, account), b"")
 
     def _on_client(self, sample: zenoh.Sample) -> None:
         name = str(sample.key_expr).removeprefix(wire.LIVE)
         if sample.kind == zenoh.SampleKind.PUT:
-            self._alive_clients.add(name)
+            if self._admission.sessions(name, self._alive_clients):
+                self._alive_clients.add(name)
             self._will_due.pop(name, None)
             return
         self._alive_clients.discard(name)
@@ -392,9 +415,9 @@ class HubWorker:
     # -- store and journal
 
     def _apply(self, record: Record) -> None:
-        record = self._admission.admitted(record)
-        if self._store.apply(record) and self._journal is not None:
-            self._journal.append(wire.encode(record))
+        admitted = self._admission.admitted(record)
+        if admitted is not None and self._store.apply(admitted) and self._journal is not None:
+            self._journal.append(wire.encode(admitted))
 
     def _write_journal(self, journal: Journal) -> None:
         """Write all records anew, together with those of an earlier hub: these are read once, as soon as they can be.
@@ -414,7 +437,8 @@ class HubWorker:
         earlier, decode = self._store.empty(), msgspec.msgpack.Decoder(Record).decode
         for data in loaded:
             try:
-                earlier.apply(self._admission.admitted(decode(data)))
+                if (record := self._admission.admitted(decode(data))) is not None:
+                    earlier.apply(record)
             except msgspec.DecodeError as error:
                 log.warning("journal %s has a record of another kind: %s", journal.path, error)
         for record in self._store.records():

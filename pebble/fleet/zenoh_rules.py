@@ -1,0 +1,57 @@
+"""Rules for a Zenoh hub, of the same table as a broker's: what each account, named in its certificate, may do there."""
+
+from collections.abc import Iterable, Iterator, Sequence
+
+from pebble.contract import CHANNELS, OUTGOING, Kind
+from pebble.contract.channels import ONLINE
+from pebble.fleet.folder import Fleet
+from pebble.fleet.roles import Account, Rule
+from pebble.transports.zenoh import wire
+from pebble.transports.zenoh.access import IN, OUT, Access, Grant, HubAccount, access_control, written
+from pebble.transports.zenoh.keymap import filter_to_key
+
+_FLAGS = tuple(f"/{one.suffix}" for one in CHANNELS if one.kind is Kind.FLAG)
+
+
+def zenoh_text(fleet: Fleet) -> bytes:
+    """The file that a hub reads as ``transport.access``."""
+    rules = {name: fleet.rules_of(name) for name in fleet.accounts}
+    accounts = {name: _hub_account(fleet.accounts[name], held) for name, held in rules.items()}
+    rows = (([name], _grants(name, held, accounts[name].retains)) for name, held in rules.items())
+    return written(Access(access_control(rows), accounts))
+
+
+def _hub_account(account: Account, held: Iterable[Rule]) -> HubAccount:
+    """Of a robot or a gateway what it publishes, and its will there; of others flags, where these have no name."""
+    writes = [rule.filter for rule in held if rule.access == "write"]
+    wills = [f"{base}/{OUTGOING}/#" for base in account.bases]
+    wills += [one for one in writes if account.bases and one.endswith(f"/{ONLINE.suffix}")]
+    whole = [one for one in writes if one.endswith("/#")]
+    flags = [one for one in writes if one.endswith(_FLAGS)]
+    return HubAccount(tuple(wills), tuple(dict.fromkeys((*wills, *whole, *flags))))
+
+
+def _grants(name: str, held: Sequence[Rule], retains: Iterable[str]) -> Iterator[Grant]:
+    """Only what its client needs; so it cannot pose as a hub, nor answer queries of others."""
+    reads, writes = (_keys(rule.filter for rule in held if rule.access == one) for one in ("read", "write"))
+    asks = tuple(wire.asked(one, name) for one in (wire.HELLO, wire.BYE))
+    retained, hubs, counts = _retained(reads), (f"{wire.UP}*",), (f"{wire.SYNC}*",)
+    yield Grant(OUT, ("put",), reads)
+    yield Grant(IN, ("declare_subscriber",), reads)
+    yield Grant(IN, ("put",), (*writes, *_retained(_keys(retains))))
+    # Zenoh lets a declaration through only if the rule covers all that it asks for, here what local programs do.
+    yield Grant(OUT, ("declare_subscriber",), ("**", f"{wire.RETAINED}**"))
+    for keys in (retained, asks, counts):
+        yield Grant(IN, ("query",), keys)
+        yield Grant(OUT, ("reply", "declare_queryable"), keys)
+    yield Grant(IN, ("liveliness_token",), (f"{wire.LIVE}{name}{wire.OF}$*",))
+    yield Grant(IN, ("liveliness_query", "declare_liveliness_subscriber"), hubs)
+    yield Grant(OUT, ("liveliness_token",), hubs)
+
+
+def _retained(keys: Iterable[str]) -> tuple[str, ...]:
+    return tuple(wire.RETAINED + key for key in keys)
+
+
+def _keys(filters: Iterable[str]) -> tuple[str, ...]:
+    return tuple(filter_to_key(one) for one in filters if not one.startswith("$"))

@@ -1,0 +1,84 @@
+"""What a hub takes from an account of another machine."""
+
+from __future__ import annotations
+
+import logging
+
+import pytest
+
+from pebble.transports import QoS
+from pebble.transports.zenoh.access import HubAccount
+from pebble.transports.zenoh.hub.admission import SESSIONS, Admission
+from pebble.transports.zenoh.hub.store import Retained
+from pebble.transports.zenoh.wire import Hello, Stamp, Will, account_of, asked
+
+GOOB = "pebble/robots/goob"
+WILL = Will(f"{GOOB}/outgoing/online", b"0", QoS.DELIVERED, True, "goob-bridge")
+OWN = {f"{GOOB}/outgoing/online": 1, "pebble/robots/fred/outgoing/online": 2, "@%24SYS/x": None}
+
+
+@pytest.fixture
+def admission() -> Admission:
+    admission = Admission([], ("+/+/+/incoming/by/#",))
+    admission.accounts = {
+        "goob": HubAccount((f"{GOOB}/outgoing/#",), (f"{GOOB}/#",)),
+        "otto": HubAccount(),
+    }
+    return admission
+
+
+def test_a_robot_leaves_its_will_and_learns_what_the_hub_lacks_of_it(admission: Admission) -> None:
+    hello = admission.hello("goob", Hello("goob~1", 3, WILL, OWN), [])
+    assert hello is not None
+    assert hello.will == Will(WILL.topic, b"0", QoS.DELIVERED, True, "goob~goob-bridge"), "nobody else's predecessor"
+    assert (hello.retained_count, hello.own) == (3, {f"{GOOB}/outgoing/online": 1})
+
+
+def test_a_person_leaves_nothing(admission: Admission, caplog: pytest.LogCaptureFixture) -> None:
+    hello = admission.hello("otto", Hello("otto~1", 0, WILL, OWN), [])
+    assert hello == Hello("otto~1", 0, None, {})
+    assert admission.refused == 1
+    assert caplog.messages == [
+        "refused the will of 'otto~goob-bridge': an account leaves a will for its own robot only "
+        f"({GOOB}/outgoing/online)"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("account", "name"), [("otto", "goob~1"), ("otto", "otto"), ("otto", "0badf00d"), ("x", "x~1")]
+)
+def test_a_session_is_named_after_its_account(admission: Admission, account: str, name: str) -> None:
+    assert admission.hello(account, Hello(name, 0, None, {}), []) is None
+    assert admission.hello("", Hello(name, 0, WILL, OWN), []) == Hello(name, 0, WILL, OWN), "from this machine"
+
+
+def test_an_account_fills_neither_the_sessions_nor_the_wills(
+    admission: Admission, caplog: pytest.LogCaptureFixture
+) -> None:
+    alive, stored = {"fred~1", "0badf00d"}, {"fred~1", "0badf00d"}
+    with caplog.at_level(logging.ERROR):
+        for number in range(5 * SESSIONS):
+            name = f"goob~{number}"
+            alive |= {name} if admission.sessions(name, alive) else set()
+            hello = admission.hello("goob", Hello(name, 0, WILL, {}), stored)
+            stored |= {name} if hello is not None and hello.will is not None else set()
+    assert (len(alive), len(stored)) == (SESSIONS + 2, SESSIONS + 2)
+    assert admission.sessions("goob~0", alive)
+    assert admission.sessions("fred~2", alive)
+    assert admission.sessions("another", alive | {f"local-{number}" for number in range(100)})
+
+
+def test_nothing_is_retained_under_a_name(admission: Admission) -> None:
+    def taken(key: str) -> bool:
+        return admission.admitted(Retained(key, b"{}", Stamp(QoS.DELIVERED, 1, "x"))) is not None
+
+    refused = [f"{GOOB}/incoming/by/otto/flags/mqtt-video", f"{GOOB}/incoming/by", f"{GOOB}/incoming/by/a/by/b/estop"]
+    allowed = [f"{GOOB}/incoming/flags/mqtt-video", f"{GOOB}/outgoing/by/otto", "by/otto"]
+    assert [key for key in (*refused, *allowed) if taken(key)] == allowed
+
+
+def test_the_account_stands_in_the_key() -> None:
+    assert [account_of(asked("@hub/hello", name), "@hub/hello") for name in ("", "otto")] == ["", "otto"]
+    for key in ("@hub/hello/*", "@hub/hello/a/b", "@hub/hello/a~b", "@hub/bye/otto"):
+        with pytest.raises(ValueError, match="is no query"):
+            account_of(key, "@hub/hello")
