@@ -10,7 +10,8 @@ from typing import NamedTuple
 from pebble.contract.channels import INCOMING
 
 BY = "by"
-NAME = re.compile(r"[a-z0-9_-]{1,32}")  # of an account
+NAME = re.compile(r"[a-z0-9_][a-z0-9_-]{0,31}")  # of an account
+NO_ACCOUNT = "-"  # in place of an account: the topic has no name
 _PLAIN = re.compile(rf"((?:[^/]+/){{3}}{INCOMING}/)(.+)", re.DOTALL)
 _NAMED = re.compile(rf"((?:[^/]+/){{3}}{INCOMING}/){BY}/({NAME.pattern})/(?!{BY}/)(.+)", re.DOTALL)
 
