@@ -24,9 +24,9 @@ class Named(NamedTuple):
 
 
 def with_name(topic: str, account: str) -> str:
-    """``topic``, which is one of a component's ``incoming/``, with the name of the sender."""
+    """``topic``, which is one of a component's ``incoming/``, with the name of the sender; ``+``: of any."""
     found = _PLAIN.fullmatch(topic)
-    if found is None or not NAME.fullmatch(account):
+    if found is None or not (account == "+" or NAME.fullmatch(account)):
         raise ValueError(f"{topic!r} takes no name {account!r}")
     return f"{found[1]}{BY}/{account}/{found[2]}"
 

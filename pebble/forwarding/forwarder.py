@@ -44,8 +44,8 @@ _WARNED = (Drop.TOO_LARGE, Drop.TOO_MANY, Drop.TOO_OFTEN)
 class Routed(msgspec.Struct, frozen=True):
     """What became of a received message; ``subject`` is None for a topic that is not this robot's.
 
-    ``by`` is the sender where names are checked: the account of the topic, ``account/person``, or ``-`` (names.NO_ACCOUNT).
-    Elsewhere, and of what comes from the robot itself, it is None. Of what is refused the account stands alone.
+    ``by`` is the sender where names are checked: the topic's account, ``account/person``, or ``-`` (NO_ACCOUNT).
+    Of what is refused the account stands alone. Elsewhere, and of what comes from the robot itself, it is None.
     """
 
     subject: Subject | None
