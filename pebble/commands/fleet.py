@@ -73,8 +73,6 @@ def init(
     """
     require_packages("pebble fleet")
     place = folder_.absolute()
-    if level == "named" and not plain:
-        raise PebbleError("--level named alone lets nobody drive: robots of this release need --plain, too")
     if level is not None and level not in _LEVELS:
         raise PebbleError(f'--level must be "login" or "named", not "{level}"')
     if (place / folder.FLEET).exists():

@@ -10,7 +10,8 @@ from typing import NamedTuple
 from pebble.contract.channels import INCOMING
 
 BY = "by"
-NAME = re.compile(r"[a-z0-9_-]{1,32}")  # of an account
+NAME = re.compile(r"[a-z0-9_][a-z0-9_-]{0,31}")  # of an account
+NO_ACCOUNT = "-"  # in place of an account: the topic has no name
 _PLAIN = re.compile(rf"((?:[^/]+/){{3}}{INCOMING}/)(.+)", re.DOTALL)
 _NAMED = re.compile(rf"((?:[^/]+/){{3}}{INCOMING}/){BY}/({NAME.pattern})/(?!{BY}/)(.+)", re.DOTALL)
 
@@ -23,9 +24,9 @@ class Named(NamedTuple):
 
 
 def with_name(topic: str, account: str) -> str:
-    """``topic``, which is one of a component's ``incoming/``, with the name of the sender."""
+    """``topic``, which is one of a component's ``incoming/``, with the name of the sender; ``+``: of any."""
     found = _PLAIN.fullmatch(topic)
-    if found is None or not NAME.fullmatch(account):
+    if found is None or not (account == "+" or NAME.fullmatch(account)):
         raise ValueError(f"{topic!r} takes no name {account!r}")
     return f"{found[1]}{BY}/{account}/{found[2]}"
 

@@ -168,6 +168,7 @@ class AutonomyCommand(Switch, frozen=True, kw_only=True, omit_defaults=True):
     """Start or stop one script (paper A.8.11)."""
 
     config: dict[str, Any] | None = None
+    by: str | UnsetType = UNSET  # as of a drive command
 
 
 class MediaRequest(Payload, frozen=True, kw_only=True, omit_defaults=True):

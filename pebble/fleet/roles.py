@@ -1,4 +1,4 @@
-"""The one table of who may do what: roles, the rights of each, and the channels of each right.
+"""The one table of who may do what: roles, and the rights of each (pebble/contract/rights.py has their channels).
 
 Rules for brokers, the rights of people on the operator page, and the tables of docs/fleet.md are made from it.
 """
@@ -16,6 +16,8 @@ from pebble.contract import INCOMING, OUTGOING, Channel, Kind
 from pebble.contract import channels as c
 from pebble.contract.identity import SERVERS
 from pebble.contract.names import BY
+from pebble.contract.rights import WRITES as WRITES
+from pebble.contract.rights import Right as Right
 
 GATEWAYS = "gateways"  # the type of programs that carry the topics of several robots to a broker
 CONTROL_TOPIC, CONTROL_ANSWERS = "$CONTROL/dynamic-security/v1", "$CONTROL/dynamic-security/#"
@@ -40,16 +42,6 @@ class ProgramRole(StrEnum):
     GATEWAY = "gateway"
 
 
-class Right(StrEnum):
-    LOOK = "look"
-    STOP = "stop"
-    DRIVE = "drive"
-    RESET = "reset"
-    TAKE = "take"
-    SYSTEM = "system"
-    PEOPLE = "people"
-
-
 _EVERYBODY = frozenset({Right.LOOK, Right.STOP})
 _DRIVING = _EVERYBODY | {Right.DRIVE}
 _RIGHTS: Mapping[str, frozenset[Right]] = {
@@ -65,29 +57,6 @@ _RIGHTS: Mapping[str, frozenset[Right]] = {
 ROLES = tuple(_RIGHTS)
 #: Roles that go with no other one.
 _ALONE = frozenset(ProgramRole)
-#: What each right may write to a robot: channels of the contract, or metrics below ``incoming/``.
-WRITES: Mapping[Right, tuple[Channel | str, ...]] = {
-    Right.LOOK: (c.VIDEO_CONTROL,),
-    Right.STOP: (c.ESTOP,),
-    Right.DRIVE: (
-        c.DRIVE,
-        c.CONTROL,
-        c.LIGHTS_SOLID,
-        c.LIGHTS_FLASH,
-        c.AUDIO_CONTROL,
-        c.AUDIO_STREAM,
-        c.SOUNDBOARD_COMMAND,
-        c.AUTONOMY_COMMAND,
-        c.MCU_COMMAND,
-        c.OUTLET_COMMAND,
-        c.MIP_RAW,
-        c.MQTT_AUDIO,
-        c.MQTT_VIDEO,
-    ),
-    Right.RESET: (c.ESTOP_RESET,),
-    Right.TAKE: (c.CONTROL_TAKE,),
-    Right.SYSTEM: (c.REBOOT, c.SERVICE_RESTART, c.GIT_PULL, c.REMOTE_MIRROR, "audit-read"),
-}
 
 
 class Rule(NamedTuple):

@@ -31,27 +31,27 @@ class Admission:
     def __len__(self) -> int:
         return len(self._flags)
 
-    def refuse(self, side: Side, subject: Subject, message: Message) -> Drop | None:
-        """Why this message may not pass; None if it may. Hot."""
+    def refuse(self, side: Side, subject: Subject, message: Message, topic: str) -> Drop | None:
+        """Why this message may not pass to ``topic``; None if it may. Hot."""
         if side is Side.REMOTE and len(message.payload) > MAX_COMMAND_BYTES and _is_bounded(subject):
             return Drop.TOO_LARGE
-        if subject.counted and (drop := self._count(side, subject, message)):
+        if subject.counted and (drop := self._count(side, subject, message, topic)):
             return drop
         if subject.kind.one_shot and message.waited_s > subject.waits_s and not _ends_something(subject, message):
             return Drop.LATE
         return None
 
-    def _count(self, side: Side, subject: Subject, message: Message) -> Drop | None:
+    def _count(self, side: Side, subject: Subject, message: Message, topic: str) -> Drop | None:
         if side is Side.REMOTE and self._is_too_often(subject, message):
             return Drop.TOO_OFTEN
         if subject.kind is not Kind.FLAG or subject.channel is not None:
             return None
         if not message.payload:  # removed; who removes a million others costs the robot nothing
-            if side is Side.REMOTE and message.topic not in self._flags:
+            if side is Side.REMOTE and topic not in self._flags:
                 return Drop.KNOWN
-            self._flags.discard(message.topic)
-        elif side is Side.LOCAL or message.topic in self._flags or len(self._flags) < MAX_UNKNOWN_FLAGS:
-            self._flags.add(message.topic)
+            self._flags.discard(topic)
+        elif side is Side.LOCAL or topic in self._flags or len(self._flags) < MAX_UNKNOWN_FLAGS:
+            self._flags.add(topic)
         else:
             return Drop.TOO_MANY
         return None

@@ -17,9 +17,11 @@ from collections.abc import Callable, Mapping
 
 import msgspec
 
-from pebble.contract import Kind
+from pebble.contract import ESTOP, Kind
+from pebble.contract.names import NO_ACCOUNT
 from pebble.forwarding.admission import Admission
 from pebble.forwarding.cycles import Cycles, Finding
+from pebble.forwarding.names import Names, Signed
 from pebble.forwarding.publisher import Publisher
 from pebble.forwarding.retained_topics import RetainedTopics
 from pebble.forwarding.routing import Drop, Forward, Rules, Side, route
@@ -33,15 +35,22 @@ from pebble.transports.counters import Counters, bounds_reached
 log = logging.getLogger(__name__)
 
 _LOGGED = 200  # characters of a topic
-_BOUNDS = (Drop.TOO_LARGE, Drop.TOO_MANY, Drop.TOO_OFTEN, Drop.LATE, Drop.CIRCULATES, Drop.SIGNED)
+_STOP = f"/{ESTOP.metric}".encode()
+_NAMES = (Drop.UNNAMED, Drop.MISNAMED, Drop.UNREADABLE)
+_BOUNDS = (Drop.TOO_LARGE, Drop.TOO_MANY, Drop.TOO_OFTEN, Drop.LATE, Drop.CIRCULATES, Drop.SIGNED, *_NAMES)
 _WARNED = (Drop.TOO_LARGE, Drop.TOO_MANY, Drop.TOO_OFTEN)
 
 
 class Routed(msgspec.Struct, frozen=True):
-    """What became of a received message; ``subject`` is None for a topic that is not this robot's."""
+    """What became of a received message; ``subject`` is None for a topic that is not this robot's.
+
+    ``by`` is the sender where names are checked: the topic's account, ``account/person``, or ``-`` (NO_ACCOUNT).
+    Of what is refused the account stands alone. Elsewhere, and of what comes from the robot itself, it is None.
+    """
 
     subject: Subject | None
     outcome: Forward | Drop
+    by: str | None = None
 
 
 class Forwarder:
@@ -50,6 +59,7 @@ class Forwarder:
     Its owner passes on the state of each in :attr:`sides`, subscribes, and has :attr:`retained` synchronized
     INITIAL_SYNC_S after each subscription.
     ``winner`` is the side whose retained messages count where they differ (see .reconciliation).
+    ``names`` knows the senders of messages on the remote side, where they are checked.
     ``on_value(subject, payload)`` is called, on any thread and with a lock held, with each new value of a two-way
     retained topic.
     """
@@ -61,11 +71,12 @@ class Forwarder:
         transports: Mapping[Side, Transport],
         *,
         winner: Side,
+        names: Names | None = None,
         on_value: Callable[[Subject, bytes], None] = lambda _subject, _payload: None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.counters = Counters()
-        self._subjects, self._rules = subjects, rules
+        self._subjects, self._rules, self._names = subjects, rules, names
         self.sides = Sides(
             (side, SideState(side, transport, self.counters, clock, wins=side is winner))
             for side, transport in transports.items()
@@ -133,6 +144,8 @@ class Forwarder:
     def skips_retained(self, side: Side, topic: bytes) -> bool:
         """Whether a retained message of ``topic`` does not pass, whatever it is: for Transport.skips_retained."""
         kind = self._subjects.invented(topic)
+        if self._names is not None and topic.endswith(_STOP) and self._is_stop(topic.decode(errors="replace")):
+            return False  # it may be a live one
         if kind is None or (kind is Kind.FLAG and not self._admission.refuses_flag(topic)):
             return False
         drop = Drop.TOO_MANY if kind is Kind.FLAG else Drop.STALE
@@ -142,16 +155,47 @@ class Forwarder:
         return True
 
     def receive(self, side: Side, message: Message) -> Routed:
-        subject, here = self._subjects[message.topic], self.sides[side]
-        outcome = self._receive(here, subject, message)
-        if isinstance(outcome, Drop):
-            self.counters.add(f"{side.value}: {outcome.value}")
+        here = self.sides[side]
+        if self._names is not None and side is Side.REMOTE:
+            routed = self._receive_named(here, self._names, message)
+        else:
+            subject = self._subjects[message.topic]
+            outcome = self._admit(here, subject, message, message.topic)
+            if subject is not None and isinstance(outcome, Forward):
+                outcome = self._pass(here, subject, message, outcome)
+            routed = Routed(subject, outcome)
+        if isinstance(routed.outcome, Drop):
+            self.counters.add(f"{side.value}: {routed.outcome.value}")
         else:
             here.count_forwarded()
-        return Routed(subject, outcome)
+        return routed
 
-    def _receive(self, here: SideState, subject: Subject | None, message: Message) -> Forward | Drop:
-        """Hot: what nearly no message needs is asked for here, and done elsewhere."""
+    def _receive_named(self, here: SideState, names: Names, message: Message) -> Routed:
+        """What arrives where names are checked: it passes on the topic without the name, with its sender in it."""
+        sender = names[message.topic]
+        subject, by = sender.subject, sender.account
+        outcome = self._admit(here, subject, message, sender.topic)
+        if subject is None:
+            outcome = sender.foreign
+        elif isinstance(outcome, Forward):
+            match names.sign(sender, message):
+                case Signed(message, by) if by != NO_ACCOUNT and subject.kind is Kind.FLAG:
+                    outcome = self.retained.change(subject, message)
+                case Signed(message, by):
+                    outcome = self._pass(here, subject, message, outcome)
+                case Drop.UNNAMED if outcome.retain:  # the broker may retain what the robot itself has published
+                    outcome = self.retained.receive(here, subject, message, outcome, old=True)
+                case drop:
+                    outcome = drop
+        if isinstance(outcome, Drop) and outcome in _NAMES:
+            self._warn(outcome, message.topic[:_LOGGED])
+        return Routed(subject, outcome, by)
+
+    def _admit(self, here: SideState, subject: Subject | None, message: Message, topic: str) -> Forward | Drop:
+        """How to forward it, or why not. Hot: what nearly no message needs is asked for here, and done elsewhere.
+
+        ``topic`` is the one on which it passes, and would be retained.
+        """
         if subject is None or not subject.is_stop:
             if message.retain:  # they still arrive: a stop may be among them, which does not count: it may be repeated
                 here.window.note()
@@ -166,7 +210,7 @@ class Forwarder:
             forward = self._routes[key] = route(self._rules, side, subject, message, mirroring=mirroring)
         if isinstance(forward, Drop):
             return forward
-        refused = self._admission.refuse(side, subject, message)
+        refused = self._admission.refuse(side, subject, message, topic)
         if refused is not None:
             if refused in _WARNED:
                 self._warn(refused, message.topic[:_LOGGED])
@@ -179,6 +223,10 @@ class Forwarder:
             finding = self.cycles.examine(side, subject, message)
             if finding is not Finding.PASS and (drop := self._act_on(finding, side, subject, message, forward)):
                 return drop
+        return forward
+
+    def _pass(self, here: SideState, subject: Subject, message: Message, forward: Forward) -> Forward | Drop:
+        """Publish it on the other side, or say why not. Hot."""
         if forward.unsigned:
             passing = unsigned(message.payload)
             if passing is not message.payload:
@@ -186,10 +234,10 @@ class Forwarder:
                 if passing is None:
                     return Drop.SIGNED
                 message = Message(message.topic, passing, message.qos)
-                self.counters.add(f"{side.value}: zeros of a script, passed as a person's")
+                self.counters.add(f"{here.side.value}: zeros of a script, passed as a person's")
         if forward.retain:
             return self.retained.receive(here, subject, message, forward)
-        there = self.sides[side.other]
+        there = self.sides[here.side.other]
         is_event = subject.kind is Kind.EVENT and message.qos is QoS.DELIVERED
         if self.sides.gate is not Gate.OPEN:
             return self._hold_event(there, message) if is_event else Drop.CLOSED
@@ -224,7 +272,7 @@ class Forwarder:
         return Drop.HELD
 
     def _is_stop(self, topic: str) -> bool:
-        subject = self._subjects[topic]
+        subject = self._subjects[topic] if self._names is None else self._names[topic].subject
         return subject is not None and subject.is_stop
 
     def _may_mirror(self) -> bool:

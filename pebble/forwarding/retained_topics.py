@@ -36,12 +36,14 @@ class RetainedTopics:
         self._reconciliation = Reconciliation(winner)
         self._waiting: dict[str, tuple[Subject, Message, Forward]] = {}
 
-    def receive(self, here: SideState, subject: Subject, message: Message, forward: Forward) -> Forward | Drop:
-        """Forward ``message``, which will be retained, or say why not."""
+    def receive(
+        self, here: SideState, subject: Subject, message: Message, forward: Forward, *, old: bool = False
+    ) -> Forward | Drop:
+        """Forward ``message``, which will be retained, or say why not. ``old``: not if it was published just now."""
         with self._lock:
             self._begin_restarted()
             if subject.kind in self._both_ways:
-                drop = self._reconcile(here, subject, message)
+                drop = self._reconcile(here, subject, message, old=old)
                 if drop is not None:
                     return drop
             gate = self._sides.gate
@@ -53,6 +55,19 @@ class RetainedTopics:
                     self._waiting[message.topic] = subject, message, forward
                 return Drop.HELD
             return Drop.CLOSED
+
+    def change(self, subject: Subject, message: Message) -> Forward | Drop:
+        """Publish a new value on both sides, as if it had been changed on the robot."""
+        with self._lock:
+            self._begin_restarted()
+            if self._sides.gate is not Gate.OPEN:
+                return Drop.CLOSED
+            self._reconciliation.receive(Side.LOCAL, message.topic, message.payload, retained=False)
+            self._on_value(subject, message.payload)
+            forward = Forward(QoS.DELIVERED, True, subject.kind in URGENT)
+            for side in Side:
+                self._publish(side, subject, message, forward)
+            return forward
 
     def open(self) -> None:
         """Open the gate, and publish what has waited."""
@@ -101,7 +116,7 @@ class RetainedTopics:
 
     # -- with the lock held
 
-    def _reconcile(self, here: SideState, subject: Subject, message: Message) -> Drop | None:
+    def _reconcile(self, here: SideState, subject: Subject, message: Message, *, old: bool) -> Drop | None:
         """Why a two-way message must not pass; None if it may."""
         side, topic, payload, transport = here.side, message.topic, message.payload, here.transport
         if message.retain and topic in here.seen and transport.delivers_late and not transport.as_published:
@@ -109,6 +124,8 @@ class RetainedTopics:
         if len(here.seen) < _MAX_WAITING:
             here.seen.add(topic)
         retained = self._sides.gate is not Gate.SHUT and self._is_retained(here, message)
+        if old and not retained:
+            return Drop.UNNAMED
         if not retained and self._own_return and self._reconciliation.value(topic) == payload:
             return Drop.KNOWN
         resolution = self._reconciliation.receive(

@@ -49,6 +49,10 @@ class Drop(Enum):
     CLOSED = "nothing is forwarded now"
     LATE = "waited too long, here or at the broker"
     SIGNED = "only programs on the robot may sign as a script"
+    # found in its topic, where names are checked (see .names)
+    UNNAMED = "has no name of a sender"
+    MISNAMED = "has a name that no account can have, or more than one"
+    UNREADABLE = "no JSON object, so it takes no name"
 
 
 class Forward(Struct, frozen=True):

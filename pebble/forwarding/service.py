@@ -11,6 +11,7 @@ from msgspec import Struct
 from pebble.contract import BRIDGE_PROBE, INCOMING, OUTGOING
 from pebble.forwarding.cycles import PROBE_PERIOD_S
 from pebble.forwarding.forwarder import Forwarder
+from pebble.forwarding.names import Names
 from pebble.forwarding.retained_window import INITIAL_SYNC_S, QUIET_S
 from pebble.forwarding.routing import Rules, Side
 from pebble.forwarding.side import Gate
@@ -42,7 +43,6 @@ class ForwardingService(Service, ABC):
 
     as_published = True
     rules: ClassVar[Rules]
-    winner: ClassVar[Side]
     probed_sides: ClassVar[tuple[Side, ...]]  # whose commands could circulate
     arriving_s: ClassVar[float] = 0.0  # longest wait for retained messages that still come after the subscription
 
@@ -50,11 +50,13 @@ class ForwardingService(Service, ABC):
         super().__init__(*arguments, **options)
         self.remote = self.make_remote()
         self.subjects = Subjects(self.config)
+        self.names = self.make_names()
         self.forwarder = Forwarder(
             self.subjects,
             self.rules,
             {Side.LOCAL: self.transport, Side.REMOTE: self.remote},
             winner=self.winner,
+            names=self.names,
             on_value=self.on_value,
             clock=self.clock,
         )
@@ -79,6 +81,15 @@ class ForwardingService(Service, ABC):
     @abstractmethod
     def make_remote(self) -> Transport:
         """The remote side's transport, not yet open; called while the service is made."""
+
+    @property
+    @abstractmethod
+    def winner(self) -> Side:
+        """The side whose retained messages count where those of the two differ."""
+
+    def make_names(self) -> Names | None:
+        """What checks the names of senders on the remote side; None: nothing does."""
+        return None
 
     def on_value(self, subject: Subject, payload: bytes) -> None:
         """React to the value on which both sides agree; on any thread, with a lock held."""

@@ -41,6 +41,7 @@ def capabilities(
         "system": _system(config, addresses),
         **_motor(config, addresses, lacking, found),
         "outlets": _outlets(config, found),
+        **({"named": True} if config.security.named else {}),
     }
 
 

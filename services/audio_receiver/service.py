@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from pebble.contract import AUDIO_STREAM, MEDIA_REPORT
+from pebble.contract.names import with_name
 from pebble.contract.payloads import MediaReport
 from pebble.errors import DeviceError
 from pebble.media.jitter import JitterBuffer
@@ -108,8 +109,12 @@ class AudioReceiver(Service):
         self.on_stop(self._playback.close)
         self._remote.open(timeout=0.0)
         self.on_stop(self._remote.close)
-        address = self.addresses[AUDIO_STREAM]
-        self._remote.subscribe(address.topic, self._on_packet, qos=QoS(address.qos), echo=False, direct=True)
+        address, security = self.addresses[AUDIO_STREAM], self.config.security
+        topics = [with_name(address.topic, "+")] if security.named else []
+        if not security.named or security.unnamed != "refuse":
+            topics.append(address.topic)
+        for topic in topics:
+            self._remote.subscribe(topic, self._on_packet, qos=QoS(address.qos), echo=False, direct=True)
 
     def stop(self) -> None:
         self._stopping = True

@@ -2,7 +2,7 @@
 
 from collections.abc import Collection, Iterator
 
-from pebble.contract.payloads import LAST_RUN, EstopState
+from pebble.contract.payloads import LAST_RUN, ControlState, EstopState
 from pebble.motion.arbiter import newer
 from pebble.runtime.runs import SUPERSEDED, newest
 
@@ -21,10 +21,25 @@ class MotorOwners:
         self.newest_run = 0  # of all that were received or used; an owner bars the run before it
         self._names = names
         self._states: dict[str, EstopState] = {}
+        self._controls: dict[str, ControlState] = {}
 
     def receive(self, owner: str, state: EstopState) -> None:
-        if owner in self._names or (not self._names and (owner in self._states or len(self._states) < _MOST)):
+        if self._takes(owner, self._states):
             self._states[owner] = state
+
+    def receive_control(self, owner: str, state: ControlState) -> None:
+        if self._takes(owner, self._controls):
+            self._controls[owner] = state
+
+    def _takes(self, owner: str, known: Collection[str]) -> bool:
+        return owner in self._names or (not self._names and (owner in known or len(known) < _MOST))
+
+    def holder_beside(self, by: str) -> str:
+        """Who has control, unless it is the account of ``by``; empty: nobody else has. The first owner decides."""
+        state = self._controls[min(self._controls)] if self._controls else None
+        if state is None or not state.key or state.by.partition("/")[0] == by.partition("/")[0]:
+            return ""
+        return state.by
 
     def note_run(self, run: int) -> None:
         """A drive command carries ``run``."""

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 from msgspec.structs import replace
 
-from pebble.contract import AUTONOMY_COMMAND, AUTONOMY_FILES, AUTONOMY_STATUS, DRIVE, ESTOP_STATE
+from pebble.contract import AUTONOMY_COMMAND, AUTONOMY_FILES, AUTONOMY_STATUS, CONTROL_STATE, DRIVE, ESTOP_STATE
 from pebble.contract.payloads import (
     SCRIPT,
     STOP_WORDS,
@@ -20,6 +20,7 @@ from pebble.contract.payloads import (
     AutonomyDependency,
     AutonomyFiles,
     AutonomyStatus,
+    ControlState,
     Drive,
     EstopState,
 )
@@ -84,6 +85,8 @@ class AutonomyManager(Service):
         return self._section.retained_publish_interval_seconds
 
     def start(self) -> None:
+        if self.config.security.named:
+            self.listen(CONTROL_STATE, self._control)
         if self._fixed:
             self._found(self._scripts)
         else:
@@ -115,27 +118,30 @@ class AutonomyManager(Service):
         if begin is None:
             self.log_limited.warning("command", "ignored a command that neither starts nor stops a script")
         elif begin:
-            self._start_script((command.file or "").strip(), command.config or {})
+            by = command.by if isinstance(command.by, str) else None
+            self._start_script((command.file or "").strip(), command.config or {}, by)
         else:
             self._runner.stop()
 
-    def _start_script(self, file: str, config: Mapping[str, Any]) -> None:
+    def _start_script(self, file: str, config: Mapping[str, Any], by: str | None) -> None:
         try:
             if not file:
                 raise StartError("Start command missing file")
             if file not in self._scripts and not self._listed:
                 raise StartError(f"Unknown autonomy file: {shown(file)}: scripts are still being listed, try again")
             wanted = plan(self._scripts, file, config)
-            self._check(wanted)
+            self._check(wanted, by)
         except StartError as error:
             self.log_limited.log("refused", logging.WARNING, "%s", error)
             self._runner.refuse(str(error))
         else:
             self._runner.start(wanted)
 
-    def _check(self, wanted: Plan) -> None:
-        """Raise StartError if this robot cannot run ``wanted`` at present."""
+    def _check(self, wanted: Plan, by: str | None) -> None:
+        """Raise StartError if this robot cannot run ``wanted`` at present. ``by`` None: a program of the robot asks."""
         problem = self._owners.refusal
+        if by is not None and self.config.security.named and (holder := self._owners.holder_beside(by)):
+            problem = problem or f"{holder} has control, and starts scripts"
         if not problem and self.clock() < self._refused_until:
             problem = f"{OVERRIDDEN} just now: start it again in {_HOLD_S:g} s"
         if any(step.script.needs_gate for step in (wanted.main, *wanted.dependencies)):
@@ -154,6 +160,9 @@ class AutonomyManager(Service):
         run = self._runner.unfinished
         if run is not None and (why := self._owners.ending(run.number, run.baseline)):
             self._runner.stop(why)
+
+    def _control(self, state: ControlState, owner: str) -> None:
+        self._owners.receive_control(owner, state)
 
     @on(DRIVE, direct=True)
     def drive(self, drive: Drive, _arrived: float) -> None:

@@ -8,6 +8,7 @@ from pebble.contract import BRIDGE_PROBE, DRIVE, ONLINE, REMOTE_MIRROR, Channel,
 from pebble.contract.payloads import MediaRequest
 from pebble.errors import PayloadError
 from pebble.forwarding.forwarder import Routed, barrier
+from pebble.forwarding.names import Names
 from pebble.forwarding.retained_window import INITIAL_SYNC_S
 from pebble.forwarding.routing import TABLE_A1, Drop, Forward, Side
 from pebble.forwarding.service import ForwardingService
@@ -42,7 +43,6 @@ class MqttBridge(ForwardingService):
     publishes = (ONLINE, BRIDGE_PROBE)
     client_name = "local-bridge"
     rules = TABLE_A1
-    winner = Side.REMOTE
     probed_sides = (Side.REMOTE,)
     arriving_s = 2.0
 
@@ -75,6 +75,15 @@ class MqttBridge(ForwardingService):
             **{row.flag.suffix: partial(self._on_media_flag, row.flag) for row in MEDIA},
             REMOTE_MIRROR.suffix: self._on_remote_mirror,
         }
+
+    @property
+    def winner(self) -> Side:
+        """Where names are checked, nothing on the remote side but the robot itself can have left a flag there."""
+        return Side.LOCAL if self.config.security.named else Side.REMOTE
+
+    def make_names(self) -> Names | None:
+        security = self.config.security
+        return Names(self.config.base, self.subjects, security.unnamed) if security.named else None
 
     def make_remote(self) -> Transport:
         enabled = self.config.services.mqtt_bridge.heartbeat.enabled
@@ -226,7 +235,8 @@ class MqttBridge(ForwardingService):
             self.post_message(BRIDGE_PROBE, self._same_broker.answer_request, newest_of="request")
 
     def receive_remote(self, epoch: int, message: Message) -> None:
-        if epoch != self.epoch or self._private.is_known(message.topic):
+        topic = message.topic if self.names is None else self.names[message.topic].topic
+        if epoch != self.epoch or self._private.is_known(topic):
             return
         self._react(Side.REMOTE, message, self.forwarder.receive(Side.REMOTE, message))
 

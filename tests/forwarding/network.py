@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Callable, Collection
 
 from pebble.forwarding.forwarder import Forwarder
+from pebble.forwarding.names import Names
 from pebble.forwarding.routing import Rules, Side
 from pebble.forwarding.subjects import Subjects
 from pebble.transports import Message, QoS, State
@@ -90,10 +91,13 @@ class Client(MemoryTransport):
         return [m.payload for m in self.seen if m.topic == f"{BASE}/{suffix}" and not is_probe(m.payload)]
 
 
-def bridge(local: Node, remote: Node, rules: Rules, *, mirroring: bool = False) -> Forwarder:
+def bridge(
+    local: Node, remote: Node, rules: Rules, *, mirroring: bool = False, names: Names | None = None
+) -> Forwarder:
     """A bridge, or a mirror, that has just connected."""
     clients = {Side.LOCAL: Client(local), Side.REMOTE: Client(remote)}
-    forwarder = Forwarder(Subjects(make_config()), rules, dict(clients), winner=Side.REMOTE, clock=local.network.clock)
+    subjects, clock = Subjects(make_config()), local.network.clock
+    forwarder = Forwarder(subjects, rules, dict(clients), winner=Side.REMOTE, names=names, clock=clock)
     forwarder.mirroring = mirroring
     leaving = (f"{BASE}/incoming/#", f"{BASE}/outgoing/#")
     entering = leaving[:1] if rules.leaves_robot else leaving

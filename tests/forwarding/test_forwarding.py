@@ -109,7 +109,7 @@ class TestAdmission:
     def refuse(self, admission: Admission, topic: str, payload: bytes = b"1", side: Side = REMOTE) -> Drop | None:
         subject = self.SUBJECTS[f"{BASE}/{topic}"]
         assert subject is not None
-        return admission.refuse(side, subject, Message(f"{BASE}/{topic}", payload, retain=True))
+        return admission.refuse(side, subject, Message(f"{BASE}/{topic}", payload, retain=True), f"{BASE}/{topic}")
 
     def test_unknown_flags_are_bounded_and_a_removed_one_makes_room(self) -> None:
         admission = Admission()

@@ -28,12 +28,14 @@ def make_config(
     local_mqtt: dict[str, Any] | None = None,
     av_daemon: dict[str, Any] | None = None,
     transport: dict[str, Any] | None = None,
+    security: dict[str, Any] | None = None,
     **bridge: Any,
 ) -> Config:
     """A robot with a bridge; further keywords are keys of services.mqtt_bridge."""
     raw = {
         "robot": {"id": robot},
         **({} if transport is None else {"transport": transport}),
+        **({} if security is None else {"security": security}),
         "local_mqtt": local_mqtt or {},
         "services": {
             "av_daemon": av_daemon or {},

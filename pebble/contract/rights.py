@@ -1,0 +1,45 @@
+"""What may be done to a robot, by kinds: the rights, and what each of them writes.
+
+pebble/fleet/roles.py says who has them. A robot asks only what they write, where it takes commands without a name.
+"""
+
+from collections.abc import Mapping
+from enum import StrEnum
+
+from pebble.contract import Channel
+from pebble.contract import channels as c
+
+
+class Right(StrEnum):
+    LOOK = "look"
+    STOP = "stop"
+    DRIVE = "drive"
+    RESET = "reset"
+    TAKE = "take"
+    SYSTEM = "system"
+    PEOPLE = "people"
+
+
+#: What each right may write to a robot: channels of the contract, or metrics below ``incoming/``.
+WRITES: Mapping[Right, tuple[Channel | str, ...]] = {
+    Right.LOOK: (c.VIDEO_CONTROL,),
+    Right.STOP: (c.ESTOP,),
+    Right.DRIVE: (
+        c.DRIVE,
+        c.CONTROL,
+        c.LIGHTS_SOLID,
+        c.LIGHTS_FLASH,
+        c.AUDIO_CONTROL,
+        c.AUDIO_STREAM,
+        c.SOUNDBOARD_COMMAND,
+        c.AUTONOMY_COMMAND,
+        c.MCU_COMMAND,
+        c.OUTLET_COMMAND,
+        c.MIP_RAW,
+        c.MQTT_AUDIO,
+        c.MQTT_VIDEO,
+    ),
+    Right.RESET: (c.ESTOP_RESET,),
+    Right.TAKE: (c.CONTROL_TAKE,),
+    Right.SYSTEM: (c.REBOOT, c.SERVICE_RESTART, c.GIT_PULL, c.REMOTE_MIRROR, "audit-read"),
+}

@@ -1,0 +1,330 @@
+"""The level named: who sent a message to the robot, by its topic; and what passes without a name."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from pebble.contract import AUTONOMY_COMMAND, CHANNELS, CONTROL, DRIVE, ESTOP, INCOMING, Channel, codec
+from pebble.contract.codec import MAX_DEPTH
+from pebble.contract.payloads import AutonomyCommand
+from pebble.contract.rights import WRITES, Right
+from pebble.forwarding.names import Names, Signed
+from pebble.forwarding.routing import TABLE_A1, Drop
+from pebble.forwarding.subjects import Subjects
+from pebble.services.mqtt_bridge.actions import SystemActions
+from pebble.transports import Message
+from tests.forwarding.network import Client, Network, Node, Way, bridge
+from tests.forwarding.virtual import World
+from tests.services.mqtt_bridge.bridge_rig import BASE, make_config
+
+SUBJECTS = Subjects(make_config())
+NAMES = {strangers: Names(BASE, SUBJECTS, strangers) for strangers in ("drive", "free", "refuse")}
+KEYED = '{"x":0,"z":0.5,"key":"0badf00d"%s}'
+MOVE, ZERO = b'{"x":0,"z":0.5}', b'{"x":0,"z":0}'
+
+
+def sign(suffix: str, payload: bytes, strangers: str = "refuse", **flags: bool) -> Signed | Drop:
+    names = NAMES[strangers]
+    message = Message(f"{BASE}/incoming/{suffix}", payload, **flags)
+    return names.sign(names[message.topic], message)
+
+
+def passes(suffix: str, payload: bytes, strangers: str = "refuse") -> bool:
+    return isinstance(sign(suffix, payload, strangers), Signed)
+
+
+class TestSign:
+    @pytest.mark.parametrize(
+        ("suffix", "payload", "signed", "by"),
+        [
+            ("drive-values", KEYED % "", KEYED % ',"by":"ann"', "ann"),
+            ("drive-values", KEYED % ',"by":"otto"', KEYED % ',"by":"ann/otto"', "ann/otto"),
+            ("drive-values", KEYED % ',"by":"Zoë <b>/"', KEYED % ',"by":"ann/zo___b_/"', "ann/zo___b_/"),
+            ("drive-values", KEYED % ',"by":""', KEYED % ',"by":"ann"', "ann"),
+            ("drive-values", KEYED % ',"by":["otto"]', KEYED % ',"by":"ann"', "ann"),
+            ("drive-values", KEYED % ',"by":"otto","b\\u0079":"ada"', KEYED % ',"by":"ann/ada"', "ann/ada"),
+            ("drive-values", '{"by":"otto","value":{"z":1}}', '{"value":{"z":1,"by":"ann"}}', "ann"),
+            ("drive-values", '\ufeff {"z":1}\0 }', '{"z":1,"by":"ann"}', "ann"),
+            ("drive-values", "{}", '{"by":"ann"}', "ann"),
+            ("control", '{"id":"3f2a91c0","by":"%s"}' % ("x" * 1000), '{"id":"3f2a91c0","by":"ann/%s"}' % ("x" * 36),
+             "ann/" + "x" * 36),
+            ("estop", '{"stop":"0123456789abcdef","by":"otto"}', '{"stop":"0123456789abcdef","by":"ann/otto"}',
+             "ann/otto"),
+            *(("estop", garbage, garbage, "ann") for garbage in ("stop!", "[1]", "")),
+            ("autonomy-command", '{"value":true,"file":"a"}', '{"value":true,"file":"a","by":"ann"}', "ann"),
+            *((media, bare, bare, "ann") for media in ("front-camera", "audio", "soundboard-command")
+              for bare in ("true", "false")),
+            ("flags/mqtt-video", '{"value": true, "by": "otto"}', '{"value": true, "by": "otto"}', "ann/otto"),
+            ("mip-raw", '{"by": "otto"}', '{"by": "otto"}', "ann/otto"),
+            ("flags/reboot", " true", " true", "ann"),
+            ("arm/wave", '{"a":1}', '{"a":1,"by":"ann"}', "ann"),
+            ("arm/wave", "hello", "hello", "ann"),
+        ],
+    )  # fmt: skip
+    def test_an_accounts_message_has_its_sender_in_it_and_no_name_in_its_topic(
+        self, suffix: str, payload: str, signed: str, by: str
+    ) -> None:
+        found = sign(f"by/ann/{suffix}", payload.encode())
+        assert isinstance(found, Signed)
+        assert (found.message.topic, found.message.payload.decode(), found.by) == (
+            f"{BASE}/incoming/{suffix}", signed, by
+        )  # fmt: skip
+
+    @pytest.mark.parametrize("channel", [one for one in CHANNELS if one.direction == INCOMING])
+    @pytest.mark.parametrize("payload", [b"true", b"[]", b'"x"', b"", b"{", b"{}garbage", b'{"a":1}\xff'])
+    def test_what_no_reader_takes_for_an_object_does_not_pass_as_one(self, channel: Channel, payload: bytes) -> None:
+        """What would pass without a name in it is either no object for any reader, or refused by all of them."""
+        found = sign(f"by/ann/{channel.metric.replace('{', '').replace('}', '')}", payload)
+        assert found is Drop.UNREADABLE or (isinstance(found, Signed) and found.message.payload == payload)
+        assert (found is Drop.UNREADABLE) >= (channel in (DRIVE, CONTROL))
+
+    def test_what_is_nested_too_deep_takes_no_name(self) -> None:
+        deep = b'{"a":' * MAX_DEPTH + b"{}" + b"}" * MAX_DEPTH
+        assert sign("by/ann/drive-values", deep.ljust(300)) is Drop.UNREADABLE
+
+    def test_numbers_stay_as_they_are(self) -> None:
+        sent = {"x": 0.1 + 0.2, "z": -1e-300, "t": 2**53 - 1, "y": -0.0}
+        found = sign("by/ann/drive-values", json.dumps(sent).encode())
+        assert isinstance(found, Signed)
+        assert json.loads(found.message.payload) == sent | {"by": "ann"}
+
+    @pytest.mark.parametrize("suffix", ["drive-values", "flags/mqtt-video", "flags/reboot", "arm/wave"])
+    @pytest.mark.parametrize("flag", ["retain", "retain_requested"])
+    def test_nothing_is_retained_below_a_name(self, suffix: str, flag: str) -> None:
+        assert sign(f"by/ann/{suffix}", b'{"z":0}', **{flag: True}) is Drop.STALE
+
+    def test_a_script_that_an_account_starts_is_its_own(self) -> None:
+        found = sign("by/ann/autonomy-command", b'{"file":"a","value":{"action":"start","by":"otto"},"by":"ada"}')
+        assert isinstance(found, Signed)
+        command: AutonomyCommand = codec.decode(AUTONOMY_COMMAND, found.message.payload)
+        assert (command.file, command.by) == ("a", "ann/otto")
+
+
+class TestWithoutName:
+    @pytest.mark.parametrize("strangers", ["drive", "free"])
+    def test_strangers_may_do_what_drivers_and_viewers_do(self, strangers: str) -> None:
+        may = {one for right in (Right.LOOK, Right.DRIVE) for one in WRITES[right]}
+        incoming = [one for one in CHANNELS if one.direction == INCOMING and one is not ESTOP]
+        plain = {one: one.metric.replace("{", "").replace("}", "") for one in incoming}
+        assert {one for one in incoming if passes(plain[one], b'{"z":1}', strangers)} == may
+        assert not [one for one in incoming if one is not DRIVE and passes(plain[one], b'{"z":1}')]
+
+    @pytest.mark.parametrize(
+        ("suffix", "payload", "strangers", "signed"),
+        [
+            ("drive-values", '{"z":1,"by":"otto"}', "free", '{"z":1,"by":"-"}'),
+            ("drive-values", '{"z":0,"by":"otto","valid_ms":0}', "refuse", '{"z":0,"valid_ms":0,"by":"-"}'),
+            ("drive-values", '{"value":{"x":"0"}}', "refuse", '{"value":{"x":"0","by":"-"}}'),
+            ("drive-values", "{}", "refuse", '{"by":"-"}'),
+            ("drive-values", '{"z":0.001}', "refuse", None),
+            ("drive-values", "nothing", "refuse", None),
+            ("control", '{"id":"3f2a91c0","by":"ann"}', "free", '{"id":"3f2a91c0","by":"-"}'),
+            ("control", '{"id":"3f2a91c0","want":"release"}', "refuse", None),
+            ("estop", '{"by":"otto"}', "refuse", '{"by":"otto"}'),
+            ("estop", "?", "refuse", "?"),
+            ("estop-reset", '{"boot":"a","count":1}', "drive", None),
+            ("arm/wave", '{"z":0}', "drive", None),
+        ],
+    )
+    def test_what_passes_is_nobodys(self, suffix: str, payload: str, strangers: str, signed: str | None) -> None:
+        found = sign(suffix, payload.encode(), strangers)
+        expected = Drop.UNNAMED if signed is None else (signed.encode(), "-")
+        assert expected == (found if isinstance(found, Drop) else (found.message.payload, found.by))
+
+
+class TestTopics:
+    @pytest.mark.parametrize(
+        "suffix",
+        ["by/ann/by/otto/drive-values", "by/Ann/drive-values", "by/-/drive-values", "by//estop", "by/ann", "by/ann/"],
+    )
+    def test_a_name_that_no_account_can_have_is_none(self, suffix: str) -> None:
+        sender = NAMES["drive"][f"{BASE}/incoming/{suffix}"]
+        assert (sender.account, sender.subject, sender.foreign) == ("-", None, Drop.MISNAMED)
+
+    @pytest.mark.parametrize("topic", ["pebble/robots/other/incoming/by/ann/estop", "pebble/robots/rover/x"])
+    def test_other_topics_are_not_this_robots(self, topic: str) -> None:
+        sender = NAMES["drive"][topic]
+        assert (sender.subject, sender.foreign) == (None, Drop.FOREIGN)
+
+    def test_what_is_remembered_of_invented_topics_is_bounded(self) -> None:
+        names = Names(BASE, SUBJECTS, "refuse")
+        for number in range(10_000):
+            assert names[f"{BASE}/incoming/by/ann/junk{number}"].account == "ann"
+        assert len(names) <= 4096
+
+
+# -- the bridge in virtual time
+
+WHEELS, STOP, REBOOT, CAMERA = "drive-values", "estop", "flags/reboot", "front-camera"
+FLAG, NAMED_FLAG = "incoming/flags/mqtt-video", "incoming/by/ann/flags/mqtt-video"
+
+
+@pytest.fixture
+def world(monkeypatch: pytest.MonkeyPatch) -> World:
+    return World("bridge", monkeypatch)
+
+
+def start(world: World, strangers: str = "refuse") -> None:
+    world.run()
+    world.start(security={"level": "named", "strangers": strangers}, remote_mqtt={"host": "127.0.0.1", "port": 1884})
+    world.run()
+
+
+def received(world: World, suffix: str, *payloads: bytes, retain: bool = False) -> list[bytes]:
+    """What the robot's programs receive of it, on the topic without a name."""
+    plain = f"incoming/{suffix.removeprefix('by/ann/')}"
+    before = len(world.local.on(plain))
+    for payload in payloads:
+        world.remote.publish(f"incoming/{suffix}", payload, retain=retain)
+    world.run(1)
+    return world.local.payloads(plain)[before:]
+
+
+def test_what_passes_and_what_does_not(world: World) -> None:
+    start(world)
+    assert received(world, "by/ann/drive-values", MOVE) == [b'{"x":0,"z":0.5,"by":"ann"}']
+    assert received(world, "drive-values", MOVE, ZERO) == [b'{"x":0,"z":0,"by":"-"}']
+    for signed, passing in ((MOVE, []), (ZERO, [b'{"x":0,"z":0,"by":"ann"}'])):
+        body = json.loads(signed) | {"source": "autonomy", "run": 5}
+        found = [json.loads(one) for one in received(world, "by/ann/drive-values", json.dumps(body).encode())]
+        assert [{key: one[key] for key in ("z", "by")} for one in found] == [
+            {key: json.loads(one)[key] for key in ("z", "by")} for one in passing
+        ]
+        assert not [one for one in found if "run" in one or "source" in one]
+    assert received(world, "by/ann/lights-solid", b'{"g":1}') == [b'{"g":1,"by":"ann"}']
+    assert received(world, "lights-solid", b'{"g":1}') == []
+    assert [message.topic for message in world.local.seen if "/by/" in message.topic] == []
+    dropped = world.service.dropped()
+    assert (dropped["unnamed"], dropped["signed"], dropped["misnamed"]) == (2, 1, 0)
+
+
+def test_actions_and_requests_of_the_bridge_itself_need_a_name(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    ran: list[str] = []
+    monkeypatch.setattr(SystemActions, "request", lambda _actions, channel: bool(ran.append(channel.metric)) or True)
+    start(world)
+    for suffix in (REBOOT, "by/ann/by/otto/flags/reboot", "by/Ann/flags/reboot"):
+        assert received(world, suffix, b"true") == []
+    world.remote.publish("incoming/by/ann/flags/reboot", b"true", retain=True)
+    world.local.publish("incoming/by/ann/flags/reboot", b"true")
+    world.run()
+    assert ran == []
+    assert received(world, "by/ann/flags/reboot", b"true") == [b"true"]
+    assert ran == [REBOOT]
+
+
+def test_private_interfaces_stay_private_under_a_name(world: World) -> None:
+    start(world)
+    assert received(world, "by/ann/mcu/u1/describe", b"{}") == []
+    assert received(world, "by/ann/mcu/u1/blink", b"{}") == [b'{"by":"ann"}']
+
+
+class TestStops:
+    def test_each_passes_with_and_without_a_name(self, world: World) -> None:
+        start(world)
+        press = b'{"stop":"00000000000000a1","by":"otto"}'
+        assert received(world, STOP, press, b"?") == [press, b"?"]
+        named = b'{"stop":"00000000000000a1","by":"ann/otto"}'
+        assert received(world, "by/ann/estop", press, b"?") == [named, b"?"]
+        assert received(world, "by/ann/estop", press, retain=True) == [named]  # live, although it asks to be retained
+
+    def test_a_retained_one_stops_nothing(self, world: World) -> None:
+        for suffix in ("incoming/estop", "incoming/by/ann/estop"):
+            world.remote.publish(suffix, b"old", retain=True)
+        start(world)
+        assert world.local.payloads("incoming/estop") == []
+
+    def test_many_of_many_accounts_all_arrive(self, world: World) -> None:
+        start(world)
+        for number in range(200):
+            world.remote.publish(f"incoming/by/a{number}/estop", b"{}")
+        world.run(1)
+        assert len(world.local.payloads("incoming/estop")) == 200
+
+
+class TestFlags:
+    """A flag by name is changed as if it had been changed on the robot: on both sides, where the robot's own counts."""
+
+    @pytest.mark.parametrize(
+        "history",
+        [
+            "",
+            "stop start",
+            "cut mend",
+            "away back",
+            "local-forgets",
+            "remote-forgets",
+            "stop local-forgets start",
+            "stop remote-forgets start",
+            "remote-forgets stop start",
+            "local-forgets stop start remote-forgets",
+            "cut remote-forgets mend",
+            "stop older start",
+            "cut older mend",
+            "older cut mend",
+        ],
+    )
+    def test_it_stays_on_both_sides(self, world: World, history: str) -> None:
+        start(world)
+        for value in (b"false", b"true"):
+            world.remote.publish(NAMED_FLAG, value)
+            world.run()
+            assert world.retained(FLAG) == (value, value)
+        words = {
+            "start": lambda: start(world),
+            "stop": world.stop,
+            "cut": lambda: world.uplink.cut(),
+            "mend": lambda: world.uplink.mend(),
+            "away": lambda: world.here.cut(),
+            "back": lambda: world.here.mend(),
+            "local-forgets": lambda: (world.local_hub.stop(forget=True), world.run(1), world.local_hub.start()),
+            "remote-forgets": lambda: (world.remote_hub.stop(forget=True), world.run(1), world.remote_hub.start()),
+            #: The remote broker was restored from an earlier save: it retains the older value.
+            "older": lambda: world.remote.publish(FLAG, b"false", retain=True, remember=False),
+        }
+        for word in history.split():
+            words[word]()
+            world.run(35)
+        assert world.retained(FLAG) == (b"true", b"true")
+
+    def test_each_change_reaches_both_sides_once(self, world: World) -> None:
+        start(world)
+        for value in (b"false", b"true", b"false"):
+            world.remote.publish(NAMED_FLAG, value)
+            world.run()
+        assert world.local.payloads(FLAG) == world.remote.payloads(FLAG) == [b"false", b"true", b"false"]
+
+    def test_without_a_name_it_changes_nothing_unless_strangers_may(self, world: World) -> None:
+        start(world)
+        world.remote.publish(FLAG, b"true", retain=True)
+        world.run()
+        assert world.retained(FLAG)[0] is None
+        world.stop()
+        start(world, "free")
+        world.remote.publish(FLAG, b"false", retain=True)
+        world.remote.publish("incoming/flags/remote-mirror", b"true", retain=True)
+        world.run()
+        assert world.retained(FLAG) == (b"false", b"false")
+        assert world.retained("incoming/flags/remote-mirror")[0] is None
+        assert not world.service.status.mirroring
+
+
+def test_what_leaves_by_another_way_and_comes_back_without_its_name_comes_to_rest() -> None:
+    """Where strangers drive, a command that came with a name returns without one."""
+    network = Network()
+    local, remote = Node(network), Node(network)
+    names = Names(BASE, SUBJECTS, "drive")
+    forwarder = bridge(local, remote, TABLE_A1, names=names)
+    robot, operator = Client(local).listen(f"{BASE}/#"), Client(remote)
+    Way(local, remote, "out", "incoming/#")
+    for _ in range(20):
+        operator.publish(f"{BASE}/incoming/by/ann/drive-values", MOVE)
+        assert network.rests_within(500)
+        network.now += 0.05
+    assert len(robot.payloads("incoming/drive-values")) < 45
+    assert forwarder.cycles.closed_ways
+    for number in range(30):
+        operator.publish(f"{BASE}/incoming/by/a{number}/estop", b"{}")
+    assert network.rests_within(5000)
+    assert len(robot.payloads("incoming/estop")) >= 30
