@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-CHAINS = ("acts", "refused")  # what people did; what anybody can cause
 _DIGITS = 32
 BEGIN = "0" * _DIGITS  # before the first line
 _END = len(',"h":""}') + _DIGITS
