@@ -59,27 +59,23 @@ def parse(raw: bytes) -> Line | None:
     return found if raw.endswith(b',"h":"' + found.h.encode() + b'"}') and len(found.h) == _DIGITS else None
 
 
-def verify(lines: Iterable[bytes], mark: Mark | None = None) -> str:
-    """What is wrong with the first bad line; empty if all are whole, and if ``mark`` is among them or older.
+def verify(lines: Iterable[bytes], marks: Iterable[Mark] = ()) -> str:
+    """What is wrong with the first bad line; empty if all are whole, and none differs from ``marks``.
 
-    A part of a chain may be verified: its first line, without ``after``, is believed.
+    ``lines`` may be the newest part of a chain: its first line, without ``after``, is believed.
     """
+    noted = {mark.n: mark.h for mark in marks}
     before: Mark | None = None
-    oldest: int | None = None
     for raw in lines:
         found = parse(raw)
         problem = _problem(before, found, raw)
         if problem or found is None:
             return problem
-        if mark is not None and found.n == mark.n and found.h != mark.h:
+        if noted.get(found.n, found.h) != found.h:
             return f"line {found.n} is not the one that was noted elsewhere: it was written anew"
-        oldest = found.n if oldest is None else oldest
         before = found.mark
-    newest = 0 if before is None else before.n
-    if mark is not None and newest < mark.n:
-        lost = f"line {mark.n} is" if mark.n == newest + 1 else f"lines {newest + 1} to {mark.n} are"
-        return f"{lost} missing: the end was cut off"
-    return ""
+    newest, last = 0 if before is None else before.n, max(noted, default=0)
+    return "" if newest >= last else f"{_span(newest + 1, last)} missing: the end was cut off"
 
 
 def _problem(before: Mark | None, found: Line | None, raw: bytes) -> str:
@@ -90,13 +86,16 @@ def _problem(before: Mark | None, found: Line | None, raw: bytes) -> str:
             return ""
         before = Mark(found.n - 1, BEGIN if found.after is None else found.after)
     elif found.n > before.n + 1:
-        gap = f"line {before.n + 1} is" if found.n == before.n + 2 else f"lines {before.n + 1} to {found.n - 1} are"
-        return f"{gap} missing"
+        return f"{_span(before.n + 1, found.n - 1)} missing"
     elif found.n <= before.n:
         return f"after line {before.n} a line with the number {found.n} was inserted"
     if found.h != _hash(before.h, raw[:-_END] + b"}"):
         return f"line {found.n} was changed, or does not follow from the one before"
     return "" if found.after in (None, before.h) else f"line {found.n} begins a file that follows another line"
+
+
+def _span(first: int, last: int) -> str:
+    return f"line {first} is" if first == last else f"lines {first} to {last} are"
 
 
 def _hash(before: str, body: bytes) -> str:

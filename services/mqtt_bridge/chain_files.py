@@ -2,13 +2,14 @@
 
 import os
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from itertools import islice
 from pathlib import Path
 
 from pebble.contract import chain
 from pebble.contract.chain import Mark
 from pebble.services.mqtt_bridge.audit_rows import ROBOT, Row
+from pebble.transports.own_file import identity
 
 _BLOCK = 65536  # bytes that are read at a time, from the end
 
@@ -58,8 +59,13 @@ class ChainFiles:
 
     def lines(self) -> Iterator[bytes]:
         """All that are whole, the oldest first. Only this may run in another process."""
-        for path in (self.older, self.path):
-            with suppress(FileNotFoundError), path.open("rb") as file:
+        with ExitStack() as stack:
+            files = {}
+            for path in (self.path, self.older):  # the newer one first: it may become the older one meanwhile
+                with suppress(FileNotFoundError):
+                    file = stack.enter_context(path.open("rb"))
+                    files[identity(file.fileno())] = file
+            for file in reversed(files.values()):
                 yield from (raw[:-1] for raw in file if raw.endswith(b"\n"))
 
     def _write(self, file: int, content: bytes, size: int) -> None:

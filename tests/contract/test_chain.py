@@ -62,7 +62,7 @@ def test_the_first_bad_line_is_named(change: Callable[[list[bytes]], list[bytes]
     ],
 )
 def test_a_mark_tells_what_was_cut_off(lines: list[bytes], problem: str) -> None:
-    assert verify(lines, NEWEST).startswith(problem)
+    assert verify(lines, [NEWEST]).startswith(problem)
 
 
 def test_an_end_that_was_written_anew_is_not_the_one_that_was_noted() -> None:
@@ -72,7 +72,7 @@ def test_an_end_that_was_written_anew_is_not_the_one_that_was_noted() -> None:
         raw, mark = line(mark, {"what": "nothing"})
         forged.append(raw)
     assert verify(forged) == ""
-    assert verify(forged, NEWEST).startswith("line 20 is not the one that was noted elsewhere")
+    assert verify(forged, [NEWEST]).startswith("line 20 is not the one that was noted elsewhere")
 
 
 def test_the_first_line_of_a_file_is_verified_by_what_it_follows() -> None:

@@ -194,7 +194,7 @@ def test_a_chain_goes_on_in_the_next_file_and_process(tmp_path: Path) -> None:
     assert files.older.stat().st_size < 1300
     whole = list(files.lines())
     assert len(whole) < 25  # older ones are gone
-    assert chain.verify(whole, files.mark) == ""
+    assert chain.verify(whole, [files.mark]) == ""
     assert files.newest(0, 1000) == whole
     assert [json.loads(raw)["n"] for raw in files.newest(48, 3)] == [45, 46, 47]
 
@@ -210,7 +210,7 @@ def test_a_torn_end_is_dropped_with_a_note(tmp_path: Path, end: bytes) -> None:
     written = [json.loads(raw) for raw in files.lines()]
     assert [one["what"] for one in written] == ["stop"] * 3 + ["torn", "stop"]
     assert written[3]["bytes"] == len(end)
-    assert chain.verify(files.lines(), files.mark) == ""
+    assert chain.verify(files.lines(), [files.mark]) == ""
 
 
 def test_a_disk_that_takes_nothing_leaves_the_chain_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -226,7 +226,7 @@ def test_a_disk_that_takes_nothing_leaves_the_chain_whole(tmp_path: Path, monkey
             files.append([row(2)])
     assert files.mark == mark
     files.append([row(3)])
-    assert chain.verify(files.lines(), files.mark) == ""
+    assert chain.verify(files.lines(), [files.mark]) == ""
 
 
 def test_a_bridge_writes_and_answers(monkeypatch: pytest.MonkeyPatch) -> None:
