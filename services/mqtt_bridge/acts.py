@@ -38,7 +38,7 @@ _UNKNOWN = "?"  # in place of an account: nobody checked the name
 _MOST, _WHY, _NAME = 64, 40, 40  # characters of a file, a reason, a sender
 _REMEMBERED = 256  # stops, and requests for control
 _STATES = 64  # that wait, of each owner: they come ten times a second at most
-_SETTLE_S = 0.2  # a state may arrive before the command that brought it about has been noted
+_AFTER_S = 0.2  # a state may arrive before the command that brought it about has been noted
 _RECENT_S = 5.0  # so long a request explains a change of control, or a reset
 _REFUSALS = {
     Drop.UNNAMED: "unnamed",
@@ -130,12 +130,12 @@ class Acts:
         with self.lock:
             self._act(what, ROBOT, ROBOT, more)
 
-    def settle(self) -> None:
+    def follow_states(self) -> None:
         """Find what has changed in the states; call it about once a second."""
         now = self._clock()
         with self.lock:
             for topic, waiting in self._states.items():
-                while waiting and now - waiting[0][0] >= _SETTLE_S:
+                while waiting and now - waiting[0][0] >= _AFTER_S:
                     at, payload = waiting.pop(0)
                     self._follow(topic, payload, at)
 

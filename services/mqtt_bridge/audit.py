@@ -73,7 +73,7 @@ class Audit(Acts):
         ends = False
         while not ends:
             ends = self._closing.wait(_ROUND_S)
-            self.settle()
+            self.follow_states()
             self._write(all_of_them=ends)
             self._publish()
             if self._asked and not ends:

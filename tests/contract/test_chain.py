@@ -61,7 +61,7 @@ def test_the_first_bad_line_is_named(change: Callable[[list[bytes]], list[bytes]
         ([*WHOLE[:15], *(line(mark_of(WHOLE[14]), {"what": "x"})[0],)], "lines 17 to 20 are missing"),
     ],
 )
-def test_a_mark_tells_what_was_cut_off(lines: list[bytes], problem: str) -> None:
+def test_by_a_mark_a_cut_end_is_found(lines: list[bytes], problem: str) -> None:
     assert verify(lines, [NEWEST]).startswith(problem)
 
 

@@ -44,7 +44,7 @@ class Watched:
     def rows(self) -> list[dict[str, Any]]:
         """The acts since the last call, without their times."""
         self.now += 1.0
-        self.acts.settle()
+        self.acts.follow_states()
         self.now += 1.0
         return [{key: value for key, value in row.items() if key != "t"} for row in self.acts.acts.take(self.now)]
 
@@ -126,7 +126,7 @@ def test_a_stop_is_one_row_with_the_name_that_was_checked(watched: Watched) -> N
     assert watched.rows() == [{"what": "stop", "who": "button?"}]
 
 
-def test_a_command_with_a_key_of_nobody_is_refused(watched: Watched) -> None:
+def test_a_command_with_an_old_key_is_refused(watched: Watched) -> None:
     watched.control(by="otto", id="00000001", key="aa")
     for key, x in (("aa", 1), ("bb", 0), ("bb aa", 1)):
         watched.send(DRIVE, "otto", x=x, key=key)
@@ -254,7 +254,7 @@ def test_a_bridge_writes_and_answers(monkeypatch: pytest.MonkeyPatch) -> None:
         rig.close()
 
 
-def test_a_robot_whose_disk_is_full_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_robot_whose_disk_is_full_drives_on(monkeypatch: pytest.MonkeyPatch) -> None:
     def full(_self: ChainFiles, _rows: list[Any]) -> None:
         raise OSError(28, "No space left on device")
 
