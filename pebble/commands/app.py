@@ -35,6 +35,7 @@ COMMANDS = {
     "analyse": "recordings.analyse",
     "cert": "cert",
     "fleet": "fleet",
+    "audit": "audit",
     "flash": "flash",
     "bench": "bench",
     "impair": "impair",
@@ -62,6 +63,7 @@ _HELP = """Runs and inspects Pebble robots.
     pebble record --url URL    record robots; for recordings, replay, analyse
     pebble cert init NAME      make certificates, so that phones can, too
     pebble fleet init hall     give robots and people accounts at a broker
+    pebble audit goob.json     show who did what to the robot
     pebble flash lamp.json     install a robot's firmware on its board
     pebble bench control       compare MQTT and Zenoh on this machine
     pebble impair              measure robots behind an impaired network

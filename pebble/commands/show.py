@@ -4,6 +4,7 @@ import json
 import math
 import os
 import statistics
+from collections.abc import Iterable, Sequence
 from itertools import pairwise
 from typing import Any, TextIO
 
@@ -22,6 +23,20 @@ _WINDOW = 1000
 _DUMPED = 32  # bytes of a binary payload that are shown
 #: Binary payloads by their first bytes.
 RECOGNISERS = {b"PBAT": "PBAT sound", b"PBVD": "PBVD picture", b"\xff\xd8": "JPEG picture"}
+
+
+def print_table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    """Rows of text that may come from anybody; a column called ``time`` is never folded."""
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(box=None, pad_edge=False, header_style="dim")
+    for column in columns:
+        table.add_column(column, no_wrap=column == "time", overflow="fold")
+    for row in rows:
+        table.add_row(*(Text(shown(text).replace("\n", "\\u000a")) for text in row))
+    Console(highlight=False).print(table)
 
 
 def discard_output(stream: TextIO) -> None:

@@ -10,11 +10,12 @@ from typing import Annotated
 
 import typer
 
+from pebble.commands.show import print_table
 from pebble.config import load
 from pebble.config.config import default_state_folder
-from pebble.config.visible import shown
 from pebble.errors import PebbleError
 from pebble.fleet.audit import Audit
+from pebble.fleet.audit_rows import Entry
 from pebble.fleet.people import People
 from pebble.fleet.roles import Role
 
@@ -60,21 +61,16 @@ def audit(
     if not entries:
         typer.echo(f"{file} has no entries yet")
         return 0
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table(box=None, pad_edge=False, header_style="dim")
-    for column in ("time", "what", "robot", "user", "device", "address", "detail"):
-        table.add_column(column, no_wrap=column == "time", overflow="fold")
-    for entry in entries:
-        at = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(entry.at))
-        until = time.strftime("%H:%M:%S", time.localtime(entry.last))
-        what = entry.what if entry.count == 1 else f"{entry.what} × {entry.count:,} until {until}"
-        texts = (what, entry.ref, entry.user, entry.device, entry.address, entry.detail)
-        table.add_row(at, *(Text(shown(text).replace("\n", "\\u000a")) for text in texts))
-    Console(highlight=False).print(table)
+    columns = ("time", "what", "robot", "user", "device", "address", "detail")
+    print_table(columns, (_columns(entry) for entry in entries))
     return 0
+
+
+def _columns(entry: Entry) -> tuple[str, ...]:
+    at = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(entry.at))
+    until = time.strftime("%H:%M:%S", time.localtime(entry.last))
+    what = entry.what if entry.count == 1 else f"{entry.what} × {entry.count:,} until {until}"
+    return at, what, entry.ref, entry.user, entry.device, entry.address, entry.detail
 
 
 # -- people

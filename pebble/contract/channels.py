@@ -171,6 +171,7 @@ REBOOT = _c("flags/reboot", Kind.ACTION, bool, "Restart the computer.", override
 SERVICE_RESTART = _c("flags/service-restart", Kind.ACTION, bool, "Restart Pebble.",
                      override=_bridge("service_restart"))  # fmt: skip
 GIT_PULL = _c("flags/git-pull", Kind.ACTION, bool, "Update the software.", override=_bridge("git_pull"))
+AUDIT_READ = _c("audit-read", Kind.COMMAND, p.AuditRead, "Requests lines of the robot's audit.", waits_s=_PATIENT_S)
 
 # -- incoming: devices
 OUTLET_COMMAND = _c("outlets/{outlet}/power", Kind.COMMAND, p.OutletCommand, "Switch an outlet.")
@@ -188,6 +189,8 @@ ESTOP_STATE = _c("estop/{owner}", Kind.STATE, p.EstopState, "Whether a motor own
 CONTROL_STATE = _c(
     "control/{owner}", Kind.STATE, p.ControlState, "Who has control of a motor owner, and who asks for it."
 )
+AUDIT = _c("audit", Kind.STATE, p.AuditState, "The newest line of each chain of the audit, for others to note.")
+AUDIT_LINES = _c("audit-lines", Kind.EVENT, p.AuditLines, "Lines of the audit that were requested, as stored.")
 BRIDGE_PROBE = _c("bridge-probe", Kind.EVENT, p.AnyObject,
                   "By it the bridge detects that two of the robot's connections lead to one broker.")  # fmt: skip
 LOGS = _c("logs", Kind.STREAM, p.LogRecord, "Log lines of all services.", override=_full("services.launcher.logs"))
@@ -259,7 +262,7 @@ _PATTERNS = [
 def is_reserved(metric: str) -> bool:
     """Whether only the robot itself may define ``metric``, in either direction: who stops it, and who drives it."""
     family = metric.partition("/")[0]
-    return family.startswith("estop") or family in ("by", "control")
+    return family.startswith(("estop", "audit-")) or family in ("audit", "by", "control")
 
 
 def channel_of(suffix: str) -> Channel | None:

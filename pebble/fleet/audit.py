@@ -7,6 +7,7 @@ import time
 from dataclasses import astuple
 from pathlib import Path
 
+from pebble.contract.chain import Mark
 from pebble.fleet.audit_rows import Entry, Merging, new
 from pebble.fleet.database import Database, DatabaseError
 
@@ -25,6 +26,21 @@ _TABLES = "".join(
     + ");"
     for table in ("audit", "refused")
 )
+_TABLES += (
+    "CREATE TABLE IF NOT EXISTS marks (ref TEXT NOT NULL, chain TEXT NOT NULL, hour INTEGER NOT NULL, "
+    "n INTEGER NOT NULL, h TEXT NOT NULL, PRIMARY KEY (ref, chain, hour)) WITHOUT ROWID;"
+)
+MAX_MARKS = 200  # of a robot's chain
+_TRIM_MARKS = """
+DELETE FROM marks WHERE (ref, chain, hour) IN (
+    SELECT ref, chain, hour FROM (
+        SELECT *, ROW_NUMBER() OVER (PARTITION BY ref, chain ORDER BY hour DESC) AS newer FROM marks)
+    WHERE newer > ?)
+"""
+_PUT_MARK = (
+    "INSERT INTO marks VALUES (?, ?, ?, ?, ?) ON CONFLICT DO UPDATE SET n = excluded.n, h = excluded.h "
+    "WHERE excluded.n > marks.n"
+)
 #: The oldest of whoever has the most rows of a kind: many of one person displace none of another.
 _TRIM = """
 DELETE FROM {table} WHERE number IN (
@@ -38,7 +54,8 @@ class Audit:
     """Thread-safe. ``write`` never blocks. What anybody can cause is in a table of its own.
 
     Repeated rows are merged before they wait (:class:`Merging`); rows that do not fit are counted, and the count is
-    written later.
+    written later. What robots tell of their own audits is noted beside it, the newest line of each hour, so that none
+    can lose the end of its audit unnoticed.
     """
 
     def __init__(self, path: Path | None) -> None:
@@ -47,6 +64,7 @@ class Audit:
         self._lock = threading.Lock()
         self._changed = threading.Condition()  # guards what follows
         self._rows = Merging()
+        self._marks: dict[tuple[str, str], Mark] = {}  # that wait
         self._closing = threading.Event()
         self._written = 0
         self._thread = threading.Thread(target=self._run, name="audit", daemon=True)
@@ -73,6 +91,20 @@ class Audit:
             self._rows.add(entry, time.monotonic())
             self._changed.notify()
 
+    def note(self, ref: str, chain: str, mark: Mark) -> None:
+        """The newest line of a robot's own audit. ``ref`` is of a bounded set."""
+        with self._changed:
+            self._marks[ref, chain] = mark
+            self._changed.notify()
+
+    def marks(self, ref: str, chain: str) -> list[Mark]:
+        """What was noted of a robot's audit, the oldest first. Raises DatabaseError."""
+        with self._changed:
+            waiting = self._marks.get((ref, chain))
+        with self._lock:
+            rows = self._database.rows("SELECT n, h FROM marks WHERE ref = ? AND chain = ? ORDER BY hour", (ref, chain))
+        return [Mark(*row) for row in rows] + ([waiting] if waiting is not None else [])
+
     def read(self, limit: int) -> list[Entry]:
         """The newest rows of both tables in the order of their first time, the newest last."""
         with self._lock:
@@ -98,9 +130,10 @@ class Audit:
         dropped, failed = 0, False
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._closing.is_set() or self._rows.waits)
+                self._changed.wait_for(lambda: self._closing.is_set() or self._rows.waits or self._marks)
                 ends, rows = self._closing.is_set(), self._rows.take()
-            error = self._store(rows)
+                marks = dict(self._marks)
+            error = self._store(rows, marks)
             lost = self.dropped - dropped
             if error is not None and ends and (rows or lost):
                 log.error("audit: %d entries are lost: %s", len(rows) + lost, error)
@@ -118,7 +151,7 @@ class Audit:
                 self.write("audit-dropped", count=lost)
             self._closing.wait(_ROUND_S)
 
-    def _store(self, rows: list[Entry]) -> object:
+    def _store(self, rows: list[Entry], marks: dict[tuple[str, str], Mark]) -> object:
         """All rows or, when this returns why not, none: a full disk must not end the thread."""
         try:
             with self._lock:
@@ -129,15 +162,22 @@ class Audit:
                         self._opened = self._database.opened
                         self._begin_again(rows)
                     numbers = [self._put(connection, row) for row in rows]
-                    self._written += len(rows)
+                    hour = int(time.time() // 3600)
+                    connection.executemany(_PUT_MARK, [(*of, hour, *mark) for of, mark in marks.items()])
+                    self._written += len(rows) + len(marks)
                     if self._written >= _TRIM_PERIOD:
                         self._written = 0
                         connection.execute(_TRIM.format(table="audit", who="user"), (MAX_ACTS,))
                         connection.execute(_TRIM.format(table="refused", who="address"), (MAX_REFUSED,))
+                        connection.execute(_TRIM_MARKS, (MAX_MARKS,))
         except (DatabaseError, sqlite3.Error, OSError) as error:
             return error
         for row, number in zip(rows, numbers, strict=True):
             row.number = number
+        with self._changed:
+            for of, mark in marks.items():
+                if self._marks.get(of) == mark:
+                    del self._marks[of]
         return None
 
     def _begin_again(self, rows: list[Entry]) -> None:

@@ -21,9 +21,10 @@ from starlette.types import Lifespan
 from starlette.websockets import WebSocket
 
 from pebble.client.page_settings import WebSettings
+from pebble.errors import PebbleError
 from pebble.fleet.audit import Audit
 from pebble.fleet.people import People
-from pebble.fleet.roles import Session
+from pebble.fleet.roles import Session, page_rights
 from pebble.web.access import login
 from pebble.web.access.guard import CONTENT_SECURITY_POLICY, Guard
 from pebble.web.control import CHECK_S, Control
@@ -79,6 +80,7 @@ def _app(settings: WebSettings, lifespan: Lifespan[Starlette]) -> Starlette:
             Route("/healthz", _health),
             Route("/api/snapshot.jpg", _snapshot),
             Route("/api/estop", _estop, methods=["POST"]),
+            Route("/api/robot-audit", _robot_audit),
             *login.routes(),
             *recordings.routes(),
             WebSocketRoute("/ws/control", _control),
@@ -152,8 +154,32 @@ async def _estop(request: Request) -> Response:
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         return PlainTextResponse(str(error), 400)
     address = "" if request.client is None else request.client.host
+    await asyncio.sleep(_server_of(request).stop_waits_s(session.user))
     request.app.state.server.stop(op.ref, op.stop, session, "", op.why, address)
     return PlainTextResponse("sent", 202)
+
+
+async def _robot_audit(request: Request) -> Response:
+    """Lines of the audit that a robot keeps, for those who look after robots; compared with what was noted here."""
+    session, server = login.session_of(request), _server_of(request)
+    if session is None:
+        return PlainTextResponse("log in first", 401)
+    if "system" not in page_rights(session.role, server.settings.level):
+        return PlainTextResponse(f"The role {session.role} may not do this", 403)
+    ref, name = request.query_params.get("ref", ""), request.query_params.get("chain", "acts")
+    before = request.query_params.get("before", "0")
+    if ref not in server.robots.components or name not in ("acts", "refused") or not before.isdecimal():
+        return PlainTextResponse("unknown component, or no such lines", 404)
+    try:
+        found = await server.robot_audits.read(ref, "acts" if name == "acts" else "refused", int(before[:15]))
+    except PebbleError as error:
+        return PlainTextResponse(str(error), 503, headers=NO_STORE)
+    return Response(msgspec.json.encode(found), media_type="application/json", headers=NO_STORE)
+
+
+def _server_of(request: Request) -> Server:
+    server: Server = request.app.state.server
+    return server
 
 
 async def _control(websocket: WebSocket) -> None:

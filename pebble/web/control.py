@@ -22,7 +22,7 @@ from pebble.web import robot_commands
 from pebble.web.access.login import named, printable
 from pebble.web.driving import Tab
 from pebble.web.log_lines import LogReader
-from pebble.web.pace import Pace
+from pebble.web.pace import STOP_WAITS_S, Pace
 from pebble.web.page_clock import PING_S, ClockJumpError
 from pebble.web.robots import Interest
 from pebble.web.server import Server, encode
@@ -32,7 +32,6 @@ log = logging.getLogger(__name__)
 FLUSH_S = 0.05  # between two states
 HELLO_S = 5.0  # to begin with
 CHECK_S = 5.0  # between two looks at whether the session still exists, while no person and no session changes
-_STOP_WAITS_S = 0.05  # at most, however much the page has sent
 _WATCH_COST = 20  # it subscribes to so many topics
 _WAITING = 64  # messages that wait to be sent, besides the state
 _RELOAD = "This page is older than the server: reload it"
@@ -77,7 +76,7 @@ class Control:
                 op = await self._receive()
                 wait_s = self._pace.take(_WATCH_COST if isinstance(op, m.Watch) else 1, time.monotonic())
                 if wait_s:
-                    await asyncio.sleep(min(wait_s, _STOP_WAITS_S) if isinstance(op, m.EstopOp | m.StopOp) else wait_s)
+                    await asyncio.sleep(min(wait_s, STOP_WAITS_S) if isinstance(op, m.EstopOp | m.StopOp) else wait_s)
                 try:
                     self._handle(op)
                 except DatabaseError as error:

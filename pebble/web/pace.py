@@ -2,6 +2,7 @@
 
 PER_S = 100.0  # a page that drives sends 25 messages a second
 BURST = 200.0
+STOP_WAITS_S = 0.05  # a stop at most, however much was sent
 
 
 class Pace:

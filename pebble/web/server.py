@@ -18,7 +18,7 @@ from pebble.client.page_settings import WebSettings
 from pebble.client.robot_topics import FLEET, SYNONYMS
 from pebble.client.robot_view import RobotView
 from pebble.config.security import SecurityLevel
-from pebble.contract import CAPABILITIES, CONTROL_STATE, DRIVE, DRIVING, ONLINE, channel_of, codec
+from pebble.contract import AUDIT, CAPABILITIES, CONTROL_STATE, DRIVE, DRIVING, ONLINE, channel_of, codec
 from pebble.contract.identity import Identity, parse_topic
 from pebble.errors import ConfigError
 from pebble.fleet.audit import Audit
@@ -38,6 +38,8 @@ from pebble.web.media.pictures import MediaHub
 from pebble.web.media.robot_streams import OwnHosts, origin
 from pebble.web.media.sound import SoundHub
 from pebble.web.open_components import OpenComponents
+from pebble.web.pace import STOP_WAITS_S, Pace
+from pebble.web.robot_audits import RobotAudits
 from pebble.web.robots import Robots
 from pebble.web.stops import Stops
 
@@ -73,7 +75,9 @@ class Server:
         self.by_name = ByName(FLEET, lambda ref: ref in known or ref in self.open_components)
         self.robots.on_forget = self.by_name.forget
         self.driven_here = DrivenHere(server)
+        self.robot_audits = RobotAudits(self.broker, audit, known.__contains__, self.robots.components.__contains__)
         self.people_version = (0, 0, 0)
+        self._stop_paces: dict[str, Pace] = {}  # by person
         self._tasks: set[asyncio.Task[None]] = set()
 
     async def open(self) -> None:
@@ -84,6 +88,7 @@ class Server:
         for channel in (*FLEET, *SYNONYMS):
             deferred = channel is ONLINE or channel in SYNONYMS
             await self.broker.subscribe(channel.filter("+/+/+"), self.receive, deferred=deferred)
+        await self.broker.subscribe(AUDIT.filter("+/+/+"), self.robot_audits.receive, deferred=True)
         await self.broker.subscribe(DRIVING.filter("+/+/+"), self._announced)
         self.spawn(self._tick())
         if self.settings.login:
@@ -168,6 +173,11 @@ class Server:
         )
         self.show_stops()
         self.audit.write("stop", ref=ref or "all", user=session.user, device=device, address=address, detail=why)
+
+    def stop_waits_s(self, user: str) -> float:
+        """How long a stop of this person waits that comes without a control socket, as it would on one."""
+        pace = self._stop_paces.setdefault(user, Pace(time.monotonic()))
+        return min(pace.take(1, time.monotonic()), STOP_WAITS_S)
 
     # -- control
 
@@ -365,6 +375,7 @@ class Server:
                     self.robots.refresh(time.monotonic())
                     self._show_broker()
                     self._remember_robots()
+                    self.robot_audits.tick(now)
                 self._announce(now)
 
     async def _watch_people(self) -> None:

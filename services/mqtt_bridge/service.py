@@ -4,8 +4,8 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from pebble.contract import BRIDGE_PROBE, DRIVE, ONLINE, REMOTE_MIRROR, Channel, codec
-from pebble.contract.payloads import MediaRequest
+from pebble.contract import AUDIT_READ, BRIDGE_PROBE, DRIVE, ONLINE, REMOTE_MIRROR, Channel, codec
+from pebble.contract.payloads import AuditRead, MediaRequest
 from pebble.errors import PayloadError
 from pebble.forwarding.forwarder import Routed, barrier
 from pebble.forwarding.names import Names
@@ -19,6 +19,8 @@ from pebble.runtime.parent import Notifier, earlier_requests
 from pebble.runtime.service import every
 from pebble.runtime.timers import Timer
 from pebble.services.mqtt_bridge.actions import ACTIONS, SystemActions
+from pebble.services.mqtt_bridge.audit import Audit
+from pebble.services.mqtt_bridge.audit_rows import ROBOT
 from pebble.services.mqtt_bridge.heartbeat import Heartbeat
 from pebble.services.mqtt_bridge.leftovers import Leftovers
 from pebble.services.mqtt_bridge.media import MEDIA, Media, MediaRequests
@@ -49,7 +51,7 @@ class MqttBridge(ForwardingService):
     @classmethod
     def handles(cls) -> tuple[Channel, ...]:
         media = (channel for row in MEDIA for channel in (row.flag, row.request))
-        return (REMOTE_MIRROR, *media, *(row.channel for row in ACTIONS))
+        return (REMOTE_MIRROR, AUDIT_READ, *media, *(row.channel for row in ACTIONS))
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
@@ -61,6 +63,7 @@ class MqttBridge(ForwardingService):
         self._media = MediaRequests(Media(self.config.on_demand_programs(), earlier_requests()), notifier.request)
         owners = map(self.config.motor_owner, self.config.motor_lines())
         self._owners = MotorOwners(self.config.base, owners, notifier)
+        self._audit = Audit(self.config, self.remote, self.clock)
         self._private = PrivateTopics(self.config.base)
         self._leftovers = Leftovers(self.config.base, self.subjects, self.remote)
         self._leftover_timer: Timer | None = None
@@ -70,6 +73,7 @@ class MqttBridge(ForwardingService):
         self._message_reactions: dict[str, Callable[[bytes], None]] = {
             **{row.request.suffix: partial(self._on_media_request, row.request) for row in MEDIA},
             **{row.channel.suffix: partial(self._on_action, row.channel) for row in ACTIONS},
+            AUDIT_READ.suffix: self._on_audit_read,
         }
         self._flag_reactions: dict[str, Callable[[bytes], None]] = {
             **{row.flag.suffix: partial(self._on_media_flag, row.flag) for row in MEDIA},
@@ -92,6 +96,8 @@ class MqttBridge(ForwardingService):
 
     def start(self) -> None:
         super().start()
+        self._audit.start()
+        self.on_stop(self._audit.close)
         if self._heartbeat is not None:
             interval = self.config.services.mqtt_bridge.heartbeat.interval_seconds
             self.timers.add(self.clock(), self._publish_heartbeat, period=interval)
@@ -224,6 +230,8 @@ class MqttBridge(ForwardingService):
             return
         if message.topic in self._owners.topics:
             self._owners.receive(message.topic)
+        if message.topic in self._audit.topics:
+            self._audit.state(message.topic, message.payload)
         self._leftovers.note_local(message)
         for admitted in self._private.admit(message):
             self._react(Side.LOCAL, admitted, self.forwarder.receive(Side.LOCAL, admitted))
@@ -247,14 +255,21 @@ class MqttBridge(ForwardingService):
         """
         channel = routed.subject.channel if routed.subject is not None else None
         local = side is Side.LOCAL
+        if not local and isinstance(routed.outcome, Drop):
+            self._audit.drop(routed.outcome, routed.by)
         if routed.outcome is Drop.STALE:
             if channel is None or not (local and self._actions.accepts_retained(channel)):
                 self.refusals.stale("a command" if channel is None else channel.metric)
                 return
         elif not isinstance(routed.outcome, Forward) and (routed.outcome in _IGNORED or not local):
             return
-        reaction = self._message_reactions.get(channel.suffix) if channel is not None else None
-        if reaction is not None and not codec.is_blank(message.payload):
+        if channel is None or codec.is_blank(message.payload):
+            return
+        if not message.retain and routed.outcome is not Drop.KNOWN:
+            own = local and self.forwarder.gate is Gate.OPEN
+            self._audit.passed(channel, ROBOT if own else routed.by, message.payload)
+        reaction = self._message_reactions.get(channel.suffix)
+        if reaction is not None:
             reaction(message.payload)
 
     def on_value(self, subject: Subject, payload: bytes) -> None:
@@ -275,6 +290,14 @@ class MqttBridge(ForwardingService):
             self.refusals.malformed(channel, error)
         else:
             self.post_message(channel, partial(self._media.request, channel, request), newest_of=channel.metric)
+
+    def _on_audit_read(self, payload: bytes) -> None:
+        try:
+            request: AuditRead = codec.decode(AUDIT_READ, payload)
+        except PayloadError as error:
+            self.refusals.malformed(AUDIT_READ, error)
+        else:
+            self._audit.ask(request)
 
     def _on_action(self, channel: Channel, payload: bytes) -> None:
         if self._boolean(channel, payload):

@@ -61,9 +61,29 @@ export function System({ at, offers, view }) {
         </div>`;
       })}
     </div>
+    <${AuditButton} at=${at} />
     ${asked && html`<${Ask} at=${at} action=${asked} offers=${offers} onClose=${() => ask("")} />`}
     <${LastOutcome} at=${at} view=${view} />
     <${Flags} at=${at} offers=${offers} />
+  </div>`;
+}
+
+/** Who did what: fetched when it is asked for. */
+function AuditButton({ at }) {
+  const page = useReasons(at);
+  const [part, show] = useState(/** @type {any} */ (null));
+  useEffect(() => show(null), [at]);
+  const open = async () => {
+    const { Audit } = await import("./audit.js");
+    show(() => Audit);
+  };
+  const why = whyNotEnd(page, "system");
+  return html`<div>
+    <button type="button" data-test="audit" disabled=${Boolean(why)} aria-describedby=${why ? "why-audit" : undefined} onClick=${open}>
+      <${Icon} name="list" />Who did what…
+    </button>
+    ${why && html`<${Why} id="why-audit">${why}<//>`}
+    ${part && html`<${part} at=${at} onClose=${() => show(null)} />`}
   </div>`;
 }
 
