@@ -62,7 +62,7 @@ MUTATIONS = {
     "an older run moves": Mutation(_ARBITER, "            self.bar(run - 1 or LAST_RUN)\n", ""),
     "the newest run may fall": Mutation(_ARBITER, "if newer(run, self.barred) and", "if run > 0 and"),
     "a new run bars itself": Mutation(_ARBITER, "self.bar(run - 1 or LAST_RUN)", "self.bar(run)"),
-    "numbers of runs end": Mutation(_ARBITER, "0 < (run - than) & LAST_RUN < 1 << 29", "run > than"),
+    "numbers of runs end": Mutation(_ARBITER, "0 < (run - last) & LAST_RUN < 1 << 29", "run > last"),
     "the last run moves after run 1": Mutation(_ARBITER, "self.bar(run - 1 or LAST_RUN)", "self.bar(run - 1)"),
     "a stop bars nothing": Mutation(_ARBITER, "        self.bar(self._newest)\n        self._scripted = False\n", ""),
     "a run is not barred while latched": Mutation(_ARBITER, "            self.bar(run)\n", "            pass\n"),
@@ -129,7 +129,7 @@ MUTATIONS = {
         "self._newest = max(run, self._newest)\n            return REFUSED\n        ours",
     ),
     "times do not wrap": Mutation(
-        _TICKS, "return ahead if ahead < _HALF else ahead - _HALF - _HALF", "return later - earlier"
+        _TICKS, "return ahead if ahead < _HALF else ahead - _HALF - _HALF", "return now - since"
     ),
     "a zero is lost when it is replaced": Mutation("world", "if old is not None and not old[4]:", "if False:"),
     "a stop leaves a command in the slot": Mutation(
