@@ -19,7 +19,7 @@ _CAPABILITIES = const(
 def describe(epoch_ms: int, root: bytes, name: str, stops, charging: bytes) -> bytes:
     """Make the payload; ``root`` is the base of the topics, ``name`` what people call it; empty: nothing else.
 
-    ``stops`` tells whether it is ``stoppable``, ``controllable`` and ``named``, see `EmergencyStop`. ``charging``: whether it reports that status, in JSON.
+    ``stops`` is the `EmergencyStop`. ``charging``: whether it reports that status, in JSON.
     """
     can, cannot = b"true", b"false"
     named = b',"name":' + json.dumps(name).encode() if name else b""

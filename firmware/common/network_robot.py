@@ -47,8 +47,8 @@ class NetworkRobot:
         self.charging = charging
         self._wifi = Wifi(get(settings, "wifi", "ssid"), get(settings, "wifi", "password", ""))
         self._clock = Clock(settings.get("ntp", "pool.ntp.org"), now)
-        named = "open login named".split().index(get(settings, "security", "level", "open")) == 2
-        words = "drive free refuse".split()
+        named = ("open", "login", "named").index(get(settings, "security", "level", "open")) == 2
+        words = "drive", "free", "refuse"
         strangers = words.index(get(settings, "security", "strangers", words[2 if named else 0]))
         topics = b"estop", b"drive-values", b"control", b"control/take", b"estop-reset"
         plain = _TOPICS if not named else _DRIVE + 1 if strangers == 2 else _CONTROL + 1

@@ -31,6 +31,11 @@ class Security(Section, frozen=True, kw_only=True):
         """What becomes of drive commands without a key of control."""
         return self.strangers or ("refuse" if self.level == "named" else "drive")
 
+    def on_board(self) -> dict[str, str]:
+        """The section `security` of a board's private_config.json; empty: what it does without one."""
+        done = {"level": self.level, "strangers": self.unnamed}
+        return {} if done == {"level": "open", "strangers": "drive"} else done
+
     @property
     def named(self) -> bool:
         """Whether the names of senders are checked."""
