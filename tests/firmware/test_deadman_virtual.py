@@ -157,7 +157,7 @@ def _perform_all(mutation: Mutation, root: Path) -> None:
 
 
 def _performed(kind: str, seed: int, *faults: str) -> Drill:
-    drill = Drill(kind, seed)
+    drill = Drill(kind, seed, named=seed % 2 == 1)
     try:
         perform(drill, *([faults] if faults else []))
     except ViolatedError as error:

@@ -103,6 +103,10 @@ MUTATIONS = {
     "strangers drive while somebody has control": Mutation(_LEASE, " or (self.strangers and self.key)", ""),
     "strangers are not refused": Mutation(_LEASE, "self.strangers == 2 or", ""),
     "programs of the robot are strangers": Mutation(_ARBITER, "run != PERSON or own", "run != PERSON"),
+    "scripts elsewhere need no key": Mutation(_ARBITER, "if by and run != PERSON", "if False and run != PERSON"),
+    "a zero of a script elsewhere is a script's": Mutation(
+        _ARBITER, "            run = PERSON\n", "            pass\n"
+    ),
     "scripts are strangers": Mutation(_ARBITER, "run != PERSON or own", "own"),
     "the last one who asks gets control": Mutation(
         _LEASE, "elif not self.asker or client[:2] == self.asker[:2]:", "else:"
