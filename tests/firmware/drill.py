@@ -241,13 +241,11 @@ class Drill:
     ) -> None:
         payload, topic = json.dumps({"x": x, "z": z, "y": y, **more}).encode(), self.topic("drive-values", account)
         drive = codec.decode(c.DRIVE, payload)
-        if (
-            self.named and drive.signed and drive.key is UNSET
-        ):  # of a script elsewhere only a zero counts, as a person's
-            drive = replace(drive, source=UNSET, run=UNSET)
-            if drive.moves:
-                return self.broker.publish(topic, payload, qos=qos, retain=retain)
-        self._meant[topic, payload] = drive
+        elsewhere = self.named and drive.signed and drive.key is UNSET  # a script of which only a zero counts
+        if not elsewhere:
+            self._meant[topic, payload] = drive
+        elif not drive.moves:
+            self._meant[topic, payload] = replace(drive, source=UNSET, run=UNSET)
         self.broker.publish(topic, payload, qos=qos, retain=retain)
 
     def nonsense(self, payload: bytes, *, account: str = "bob", qos: int = 1, retain: bool = False) -> None:

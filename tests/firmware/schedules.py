@@ -8,7 +8,7 @@ from functools import partial
 from typing import Final
 
 from pebble.simulation.micropython.faults import failure
-from tests.firmware.drill import DRIVE, LIMIT_S, ONLINE, RESENT_S, Drill, ViolatedError
+from tests.firmware.drill import LIMIT_S, ONLINE, RESENT_S, Drill, ViolatedError
 from tests.simulation.virtual_network import Answers
 
 _NETWORK: Final = ("wifi", "broker", "hole", "dns", "ntp", "frozen", "mute")
