@@ -33,8 +33,9 @@ class Security(Section, frozen=True, kw_only=True):
 
     def on_board(self) -> dict[str, str]:
         """The section `security` of a board's private_config.json; empty: what it does without one."""
-        done = {"level": self.level, "strangers": self.unnamed}
-        return {} if done == {"level": "open", "strangers": "drive"} else done
+        if self.level == "open" and self.unnamed == "drive":
+            return {}
+        return {"level": self.level, "strangers": self.unnamed}
 
     @property
     def named(self) -> bool:
