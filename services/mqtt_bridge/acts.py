@@ -96,7 +96,8 @@ class Acts:
         """A command or a changed flag. ``by`` is the checked sender, ROBOT, or None. Hot for drive commands."""
         if channel is DRIVE:
             self._commands += 1
-            if self._keys is not None and b'"key"' in payload:
+            keys = self._keys
+            if keys is not None and b'"key"' in payload and not any(key in payload for key in keys):
                 self._check_key(by, payload)
             return
         handler = self._handlers.get(channel.suffix)
