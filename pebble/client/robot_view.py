@@ -27,22 +27,19 @@ class Liveness:
         self.reported_offline = False
         self._intervals: deque[float] = deque(maxlen=_HISTORY)
         self._latencies: deque[float] = deque(maxlen=_HISTORY)
+        self.latency_s: float | None = None  # of the newest heartbeat; None if its clock is wrong
 
     def heartbeat(self, now: float, latency_s: float, *, online: bool = True) -> None:
         if self.received_at is not None and 0.05 <= now - self.received_at <= 10.0:
             self._intervals.append(now - self.received_at)
-        if -1.0 <= latency_s <= 10.0:
-            self._latencies.append(max(0.0, latency_s))
+        self.latency_s = max(0.0, latency_s) if -1.0 <= latency_s <= 10.0 else None
+        if self.latency_s is not None:
+            self._latencies.append(self.latency_s)
         self.received_at, self.reported_offline = now, not online
 
     @property
-    def latency_s(self) -> float | None:
-        """It is that of the newest heartbeat; correct only if both clocks are synchronised, as on one machine."""
-        return self._latencies[-1] if self._latencies else None
-
-    @property
     def average_latency_s(self) -> float | None:
-        """It is the mean of the last ten heartbeats."""
+        """It is the mean of the last ten heartbeats that tell it; correct only if both clocks are synchronised."""
         return _mean(self._latencies)
 
     @property
@@ -57,11 +54,11 @@ class Liveness:
         """None while there are too few heartbeats to decide; a silence of less than ``at_least_s`` is none."""
         if self.reported_offline:
             return False
-        interval, latency = self.interval_s, self.average_latency_s
-        if self.received_at is None or len(self._intervals) < 2 or interval is None or latency is None:
+        interval = self.interval_s
+        if self.received_at is None or len(self._intervals) < 2 or interval is None:
             return None
         age = now - self.received_at
-        return age <= max(2 * interval, 4 * latency) or age < at_least_s
+        return age <= max(2 * interval, 4 * (self.average_latency_s or 0.0)) or age < at_least_s
 
 
 def _mean(values: deque[float]) -> float | None:

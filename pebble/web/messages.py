@@ -317,8 +317,8 @@ class Liveness(Struct, frozen=True, kw_only=True):
 
     online: bool | None  # None: not known yet
     silent_s: float | None  # since its last sign of life; None: only retained messages were received
-    latency_ms: float | None  # of the newest heartbeat
-    average_latency_ms: float | None  # of the last ten
+    latency_ms: float | None  # of the newest heartbeat; null: its clock is more than 10 s wrong
+    average_latency_ms: float | None  # of those of the last ten
     interval_ms: float | None  # between heartbeats: the mean of the last ten
     whole_seconds: bool  # its clock counts whole seconds: latency says nothing
 

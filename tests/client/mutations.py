@@ -216,12 +216,12 @@ pebble/client/robot_view.py
 
 robot view, a slow link is a silence: client/test_discovery.py
 pebble/client/robot_view.py
-- age <= max(2 * interval, 4 * latency)
+- age <= max(2 * interval, 4 * (self.average_latency_s or 0.0))
 + age <= 2 * interval
 
 robot view, a silent robot is online: client/test_discovery.py
 pebble/client/robot_view.py
-- return age <= max(2 * interval, 4 * latency) or age < at_least_s
+- return age <= max(2 * interval, 4 * (self.average_latency_s or 0.0)) or age < at_least_s
 + return True
 
 robot view, one late heartbeat is a silence for people: client/test_discovery.py client/test_terminal_driver.py
@@ -236,8 +236,13 @@ pebble/client/robot_view.py
 
 robot view, a wrong clock counts as a slow link: client/test_discovery.py
 pebble/client/robot_view.py
-- if -1.0 <= latency_s <= 10.0:
-+ if True:
+- max(0.0, latency_s) if -1.0 <= latency_s <= 10.0 else None
++ max(0.0, latency_s)
+
+robot view, a robot with a wrong clock is never online: client/test_discovery.py
+pebble/client/robot_view.py
+- or interval is None:
++ or interval is None or self.average_latency_s is None:
 
 robot view, topics of another robot are used: client/test_discovery.py
 pebble/client/robot_view.py

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from itertools import chain
+from typing import Any
 
 import pytest
 
@@ -10,9 +12,12 @@ from pebble.client.discovery import Discovery
 from pebble.client.robot_view import MAX_REMEMBERED, Liveness, RobotView
 from pebble.transports import Message
 from tests.recordings.demo_robots import DRIVE, GOOB, MINILAMP, ROBOTS, messages, received, values
+from tests.support import ROOT
+from tests.web.in_node import evaluate
 
 BASE = "pebble/robots/goob"
 WALL = 1_760_000_000.0
+LIVENESS = json.loads((ROOT / "tests" / "vectors" / "liveness.json").read_text())["rows"]
 
 
 def publish(discovery: Discovery, metric: str, body: object, *, now: float = 0.0, retain: bool = False) -> None:
@@ -64,28 +69,31 @@ def test_a_server_is_no_robot() -> None:
     assert discovery.all_robots() == []
 
 
-def test_a_slow_link_widens_the_window() -> None:
+@pytest.mark.parametrize("row", LIVENESS.values(), ids=LIVENESS)
+def test_what_heartbeats_show(row: dict[str, Any]) -> None:
     liveness = Liveness()
-    for now in (0.0, 0.25, 0.5):
-        liveness.heartbeat(now, 0.5)
-    assert liveness.online(2.4) is True
-    assert liveness.online(2.6) is False
+    for at, late_s in row["heartbeats"]:
+        liveness.heartbeat(at, late_s)
+    found = [(at, liveness.online(at), liveness.latency_s, liveness.average_latency_s) for at, *_ in row["seen"]]
+    assert [*chain(*found)] == pytest.approx([*chain(*row["seen"])], abs=1e-6)
 
 
-@pytest.mark.parametrize(
-    "heartbeats",
-    [
-        [(0.0, 0.01), (0.25, 0.01), (0.5, 0.01), (40.0, 0.01)],
-        [(39.5, 0.01), (39.75, 3600.0), (40.0, 0.01)],
-        [(39.5, 0.01), (39.75, -3600.0), (40.0, 0.01)],
-    ],
-    ids=["a pause", "a clock that is late", "a clock that is early"],
-)
-def test_what_is_no_interval_and_no_latency_does_not_widen_the_window(heartbeats: list[tuple[float, float]]) -> None:
-    liveness = Liveness()
-    for now, latency_s in heartbeats:
-        liveness.heartbeat(now, latency_s)
-    assert (liveness.online(40.4), liveness.online(40.6)) == (True, False)
+def test_recorded_heartbeats_show_the_same() -> None:
+    steps = (
+        f"const rows = {json.dumps([*LIVENESS.values()])};"
+        + """
+    result = rows.map(({ heartbeats, seen }) => {
+      const beats = new Heartbeats(), start = 1e12, seconds = (ms) => (ms === null ? null : ms / 1000);
+      for (const [at, late] of heartbeats) beats.receive(start + 1000 * at, { t: start + 1000 * (at - late) });
+      return seen.flatMap(([at]) => {
+        const { online, latency_ms, average_latency_ms } = beats.view(start + 1000 * at);
+        return [at, online, seconds(latency_ms), seconds(average_latency_ms)];
+      });
+    });"""
+    )
+    found = evaluate({"core/replay/liveness.js": "Heartbeats"}, steps)
+    for row, seen in zip(LIVENESS.values(), found, strict=True):
+        assert seen == pytest.approx([*chain(*row["seen"])], abs=1e-6), row
 
 
 def test_strangers_fill_no_memory_and_keep_no_capabilities_out() -> None:

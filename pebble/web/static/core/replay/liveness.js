@@ -1,4 +1,4 @@
-/** Whether a component was online, by its recorded heartbeats: the rules of pebble.client.discovery. Pure. */
+/** Whether a component was online, by its recorded heartbeats: the rules of pebble.client.robot_view. Pure. */
 
 import { isObject } from "../json.js";
 
@@ -15,6 +15,8 @@ export class Heartbeats {
     this.intervals = [];
     /** @type {number[]} */
     this.latencies = [];
+    /** @type {number | null} */
+    this.latency = null; // of the newest heartbeat; null if its clock is wrong
     /** @type {number[]} */
     this.stamps = [];
   }
@@ -25,7 +27,8 @@ export class Heartbeats {
     if (interval >= LEAST_MS && interval <= LONGEST_MS) push(this.intervals, interval, HISTORY);
     const t = isObject(payload) && Number.isFinite(payload.t) ? payload.t : NaN;
     const late = at - t;
-    if (late >= -1000 && late <= LONGEST_MS) push(this.latencies, Math.max(0, late), HISTORY);
+    this.latency = late >= -1000 && late <= LONGEST_MS ? Math.max(0, late) : null;
+    if (this.latency !== null) push(this.latencies, this.latency, HISTORY);
     if (t > 0) push(this.stamps, t, STAMPS);
     this.receivedAt = at;
     this.offline = isObject(payload) && payload.online === false;
@@ -36,7 +39,7 @@ export class Heartbeats {
     return {
       online: this.online(now),
       silent_s: this.receivedAt === -Infinity ? null : Math.max(0, now - this.receivedAt) / 1000,
-      latency_ms: this.latencies.at(-1) ?? null,
+      latency_ms: this.latency,
       average_latency_ms: mean(this.latencies),
       interval_ms: mean(this.intervals),
       whole_seconds: this.stamps.length === STAMPS && this.stamps.every((stamp) => stamp % 1000 === 0),
@@ -47,9 +50,8 @@ export class Heartbeats {
   online(now) {
     if (this.offline) return false;
     const interval = mean(this.intervals);
-    const latency = mean(this.latencies);
-    if (this.intervals.length < 2 || interval === null || latency === null) return null;
-    return now - this.receivedAt <= Math.max(2 * interval, 4 * latency);
+    if (this.intervals.length < 2 || interval === null) return null;
+    return now - this.receivedAt <= Math.max(2 * interval, 4 * (mean(this.latencies) ?? 0));
   }
 }
 

@@ -51,7 +51,9 @@ function Heartbeat({ at }) {
   const late = liveness.whole_seconds
     ? "unknown: its clock counts whole seconds"
     : liveness.latency_ms === null
-      ? "–"
+      ? age === null
+        ? "–"
+        : "unknown: its clock is wrong"
       : `late by ${span(liveness.latency_ms)}${average === null ? "" : `, on average ${span(average)}`}`;
   return html`<div>
       <dt>Heartbeat</dt>
