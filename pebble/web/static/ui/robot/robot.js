@@ -239,7 +239,7 @@ function StopAll() {
     <${StopButton}
       test="stop-all"
       onStop=${() => commands.stop("")}
-      label="STOP ALL: emergency stop of all robots"
+      label="Stop all robots: emergency stop"
       className="stop-all outlined"
     >
       <${Icon} name="stop" />Stop all robots

@@ -127,7 +127,7 @@ function SnapshotButton({ source, short = false }) {
     return `Saved as ${await snapshot(video, store, source)}`;
   };
   const press = () => save().then((text) => connection.show(text), (error) => connection.show(`Not saved: ${error.message}`));
-  return html`<button type="button" data-test="snapshot" disabled=${off} title=${why} aria-label="Snapshot" onClick=${press}>
+  return html`<button type="button" data-test="snapshot" disabled=${off} title=${why} onClick=${press}>
     <${Icon} name="photo" /><span>${short ? "Photo" : "Snapshot"}</span>
   </button>`;
 }
