@@ -129,7 +129,7 @@ def test_the_state_of_an_earlier_connection_allows_no_driving(show: Show, server
     with show(state) as opened:
         assert opened.until(f"window.pebble && {reason} === undefined", 10)
         # another server answers, and what it knows comes a moment later
-        assert opened.page.evaluate(f"pebble.driver.socket.welcome(pebble.driver.socket.you), {reason}") == "server"
+        assert opened.page.evaluate(f"pebble.driver.socket.welcome(pebble.driver.socket.you), {reason}") == "connecting"
 
 
 # -- colours, and what still loads
