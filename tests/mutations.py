@@ -50,7 +50,7 @@ def found_by(mutation: Mutation, tree: Path, tests: str) -> str:
     assert text.count(mutation.old) == 1, f"{mutation.file} has changed: {mutation.bug}"
     file.write_text(text.replace(mutation.old, mutation.new))
     first, *more = mutation.tests.split(" -k ")
-    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "-p", "no:xdist"]
+    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider"]
     command += ["-m", "not thorough", *(f"{tests}/{path}" for path in first.split())]
     command += [word for words in more for word in ("-k", words)]
     ran = subprocess.run(command, cwd=tree, capture_output=True, text=True, check=False)

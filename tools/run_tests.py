@@ -50,7 +50,7 @@ def run(arguments: list[str]) -> int:
 
 
 def pytest(arguments: list[str], list_: Path) -> int:
-    records = ["-p", "tools.test_records", "-p", "tools.test_workers", "-p", "no:xdist", f"--failed-list={list_}"]
+    records = ["-p", "tools.test_records", "-p", "tools.test_workers", f"--failed-list={list_}"]
     if times := os.environ.get("PEBBLE_TEST_TIMES"):
         records.append(f"--times={times}")
     command = [sys.executable, "-m", "pytest", *records, *arguments]
