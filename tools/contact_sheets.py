@@ -23,7 +23,8 @@ MOST_BYTES = 1_000_000  # both together
 def sheet(size: str) -> int:
     """Write one sheet, light beside dark for each state; its size in bytes."""
     (width, height), scale, columns, quality, others = SHEETS[size]
-    paths = [path for kind in (size, *others) for path in sorted(PICTURES.glob(f"*-{kind}-*.png"))]
+    named = [(path, *path.stem.rsplit("-", 2)) for path in sorted(PICTURES.glob("*.png"))]
+    paths = [(path, f"{name} {theme}") for kind in (size, *others) for path, name, of, theme in named if of == kind]
     if not paths:
         sys.exit(f"{PICTURES} has no pictures: run pytest tests/web/page/test_look.py first")
     tile = int(width * scale), int(height * scale)
@@ -31,11 +32,11 @@ def sheet(size: str) -> int:
     rows = -(-len(paths) // columns)
     whole = Image.new("RGB", (GAP + columns * step[0], GAP + rows * step[1]), BACKGROUND)
     draw, font = ImageDraw.Draw(whole), ImageFont.load_default(min(13, tile[0] // 10))
-    for number, path in enumerate(paths):
+    for number, (path, label) in enumerate(paths):
         left, top = GAP + number % columns * step[0], GAP + number // columns * step[1]
         picture = Image.open(path).convert("RGB")
         picture.thumbnail(tile, Image.Resampling.LANCZOS)
-        draw.text((left, top + 2), path.stem.replace(f"-{size}-", " ")[: tile[0] // 5], INK, font)
+        draw.text((left, top + 2), label[: tile[0] // 5], INK, font)
         whole.paste(picture, (left, top + LABEL))
     target = DOCS / f"page-states-{size}.jpg"
     whole.save(target, quality=quality, optimize=True)

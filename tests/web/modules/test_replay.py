@@ -121,7 +121,7 @@ RUN: Rows = {
     "little is loaded ahead": ("""
         const it = await playing(); let most = 0;
         for (let i = 0; i < 200; i++) { await it.pass(20); most = Math.max(most, it.player.ahead); }
-        return [most <= 6000, most > 3000, it.asked.length < 8];""", [True, True, True]),
+        return [most <= 12_000, most > 9000, it.asked.length < 11];""", [True, True, True]),
     "less is loaded ahead of what is large": ("""
         const it = await playing({ size: 400_000 });
         let most = 0;

@@ -96,7 +96,7 @@ def test_the_service_that_keeps_restarting_is_found(at_goob: Console, stage: Sta
     at_goob.test("bell").click()
     notice = at_goob.page.locator(".notice-service")
     assert notice.count() == 1
-    assert re.search(rf"goob service {SERVICE} .* \(signal 9\) 2×", notice.inner_text()), notice.inner_text()
+    assert re.search(rf"Goob service {SERVICE} .* \(signal 9\) 2×", notice.inner_text()), notice.inner_text()
     at_goob.page.keyboard.press("Escape")
     assert at_goob.tab.until("document.querySelector('dialog[open]') === null", 2)
 
@@ -145,14 +145,14 @@ def test_troubles_of_another_robot_are_listed(at_goob: Console, stage: Stage, wi
     """All of it is about robots that are not open, in the browser."""
     wire.publish("minilamp/incoming/estop", {"stop": "00112233445566cc", "by": "eve", "why": "test"})
     spoken = at_goob.page.locator("[data-test=announcement]")
-    assert at_goob.tab.until(lambda: spoken.inner_text() == "minilamp was stopped by eve", 5), spoken.inner_text()
+    assert at_goob.tab.until(lambda: spoken.inner_text() == "MiniLAMP was stopped by eve", 5), spoken.inner_text()
     mcu = stage.robots["minilamp"].programs[0]
     os.kill(mcu.pid, signal.SIGKILL)
-    assert at_goob.tab.until(lambda: spoken.inner_text() == "minilamp is offline", 10), spoken.inner_text()
+    assert at_goob.tab.until(lambda: spoken.inner_text() == "MiniLAMP is offline", 10), spoken.inner_text()
     at_goob.test("bell").click()
     newest = [" ".join(text.split()) for text in at_goob.page.locator(".notice").all_inner_texts()[:2]]
-    assert re.fullmatch(r"✖ minilamp is offline \d\d:\d\d", newest[0])
-    assert re.fullmatch(r"■ minilamp was stopped by eve \d\d:\d\d", newest[1])
+    assert re.fullmatch(r"✖ MiniLAMP is offline \d\d:\d\d", newest[0])
+    assert re.fullmatch(r"■ MiniLAMP was stopped by eve \d\d:\d\d", newest[1])
     at_goob.page.locator(".notice-link").first.click()
     assert at_goob.tab.until("window.pebble.driver.ref === 'pebble/robots/minilamp'", 2)
 

@@ -7,7 +7,7 @@ export const SPEEDS = [0.25, 0.5, 1, 2, 4, 8];
 
 const SEGMENT_MS = 2000;
 const SEEK_MS = 500; // the first segment after a seek is short, so that its picture is soon there
-const AHEAD_MS = 6000; // of the recording
+const AHEAD_MS = 12_000; // of the recording: more than a step of the timeline, which says that it has a picture
 const AHEAD_BYTES = 16_000_000;
 const SKIP_MS = 2000; // a shorter time without messages is played
 const REST_MS = 400; // after a seek, before more is loaded for a player that is paused

@@ -20,7 +20,7 @@ const TICK_MS = 20;
 const LIVENESS_MS = 500;
 const END_MS = 2000; // before the last message
 const ADDRESS_MS = 400; // browsers limit how often it may change
-const PICTURE_WITHIN_MS = 3000; // a picture that was asked for and is not loaded by then is not shown
+const PICTURE_WITHIN_MS = 10_000; // a picture that was asked for and is not loaded by then is not shown
 const text = new TextDecoder();
 
 /** The connection of a recording: always there, and nothing is sent by it. */
@@ -162,7 +162,8 @@ export class Replay extends Model {
     if (this.wantedAt === -Infinity || this.player.seeking) return;
     const next = this.player.nextPicture;
     if (next) this.player.go(next.at);
-    if (next || performance.now() - this.wantedAt > PICTURE_WITHIN_MS) this.wantedAt = -Infinity;
+    const { complete, playing } = this.player;
+    if (next || complete || playing || performance.now() - this.wantedAt > PICTURE_WITHIN_MS) this.wantedAt = -Infinity;
   }
 
   /** @param {1 | -1} steps */
