@@ -13,6 +13,7 @@ from pathlib import Path
 import msgspec
 
 from pebble.config.hosts import HostError, split
+from pebble.config.security import Security
 from pebble.config.text_files import PASSWORD, password
 from pebble.contract.identity import Identity
 from pebble.errors import ConfigError, PebbleError
@@ -56,15 +57,17 @@ def run(
     broker: BrokerAddress,
     *,
     name: str = "",
+    security: Security | None = None,
     trace: Path | None = None,
     report: bool = False,
     files: Path | None = None,
 ) -> int:
-    """Run one robot until a signal; ``name``: what people call it."""
+    """Run one robot until a signal; ``name``: what people call it. ``security``: of its config; None: open."""
     stop_signal = StopSignal()
     record = Trace(trace)
     with Fleet(broker) as fleet:
-        robot = fleet.add(kind, identity, name=name, moving_s=_MOVING_S, on_motors=_recorder(record), files=files)
+        options = {"name": name, "security": security or Security(), "files": files}
+        robot = fleet.add(kind, identity, moving_s=_MOVING_S, on_motors=_recorder(record), **options)
         reporter = ConnectionReporter([robot], lambda line: print(line, file=sys.stderr, flush=True))  # noqa: T201
 
         def job() -> None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+from pebble.config.security import Security
 from pebble.contract.identity import Identity
 from pebble.errors import ConfigError
 from pebble.simulation.bodies import BoardState, body_of
@@ -22,6 +23,7 @@ KINDS: Final = ("minilamp", "benjr")
 
 _MOVING_S, _RESTING_S = 0.01, 0.05  # period of turns while sockets are idle
 _CA_FILE = "/ca.der"
+_OPEN = Security()
 
 Motors = tuple[float, float]
 
@@ -52,7 +54,7 @@ class WirelessRobot:
 
     ``pause_s`` is the longest time until its next turn while its sockets are idle. ``files`` is the folder of its
     board's files, which survive the program; None: they are in memory. ``name``: what people call it; empty: nothing
-    else than its id.
+    else than its id. ``security``: of its config.
     """
 
     def __init__(
@@ -63,6 +65,7 @@ class WirelessRobot:
         servers: LoopbackServers,
         *,
         name: str = "",
+        security: Security = _OPEN,
         on_motors: Callable[[float, Motors], None] | None = None,
         moving_s: float = _MOVING_S,
         files: Path | None = None,
@@ -70,6 +73,7 @@ class WirelessRobot:
         if kind not in KINDS:
             raise ConfigError(f"unknown simulated robot with Wi-Fi {kind!r}; known: {', '.join(KINDS)}")
         self.kind, self.identity, self.broker, self.name = kind, identity, broker, name
+        self._security = security.on_board()
         clock = RealClock()
         uid = hashlib.sha256(identity.base.encode()).digest()[:6]
         self.network = HostNetwork(clock, platform=OF_ROBOT[kind].platform, routes=servers.routes, uid=uid)
@@ -135,7 +139,8 @@ class WirelessRobot:
     def _settings(self) -> dict[str, Any]:
         robot = {"system": self.identity.system, "type": self.identity.type, "id": self.identity.id, "name": self.name}
         wifi = {"ssid": "simulated", "password": "simulated"}
-        return {"robot": robot, "wifi": wifi, "mqtt": self.broker.settings()}
+        security = {"security": self._security} if self._security else {}
+        return {"robot": robot, "wifi": wifi, "mqtt": self.broker.settings(), **security}
 
     def _moved(self, now: float, motors: Motors) -> None:
         self._motors = motors

@@ -16,9 +16,9 @@ UNKNOWN_RUN = -1  # a script's zero without a valid number
 REFUSED = -1
 
 
-def newer(run: int, than: int) -> bool:
-    """Whether ``run`` began after ``than``: it is ahead by less than half of all numbers. 0, or less, is no run."""
-    return run > 0 and (than == 0 or 0 < (run - than) & LAST_RUN < 1 << 29)
+def newer(run: int, last: int) -> bool:
+    """Whether ``run`` began after ``last``: it is ahead by less than half of all numbers. 0, or less, is no run."""
+    return run > 0 and (last == 0 or 0 < (run - last) & LAST_RUN < 1 << 29)
 
 
 class Arbiter:
@@ -45,12 +45,17 @@ class Arbiter:
         """Return for how many milliseconds it moves, 0: it stops the motors, REFUSED: it has no effect.
 
         ``moves``: any axis is not 0. ``run`` may be PERSON, or UNKNOWN_RUN of a zero. ``valid_ms`` < 0: not given.
-        ``key`` and ``by`` are those of the lease; ``by`` None: a program of the robot, which needs no key. A zero of
-        somebody else than who has control ends a script, too, but is nobody's letting go.
+        ``key`` and ``by`` are those of the lease; ``by`` None: a program of the robot, which needs no key, as no script
+        does where names are not checked. A zero of somebody else than who has control ends a script, too, but is
+        nobody's letting go.
         """
         self.tick(now)
         lease = self.lease
         own = by is None
+        if by and run != PERSON and not lease.holds(key, by):  # of a script elsewhere only a zero counts
+            if moves:
+                return REFUSED
+            run = PERSON
         if lease.refuses(moves, run != PERSON or own, key, "" if own else by, now):
             return REFUSED
         ours = run != PERSON or not lease.key or lease.holds(key, by)

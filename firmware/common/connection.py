@@ -58,13 +58,13 @@ class Connection:
         """The broker has answered. Other bytes do not count, because their delay is unknown."""
         self._received = now
 
-    def lost(self, now: int, noise: int) -> None:
-        """The connection was lost or not made; ``noise`` 0..255 spreads the next attempts of many robots."""
+    def lost(self, now: int, random: int) -> None:
+        """The connection was lost or not made; ``random`` 0..255 spreads the next attempts of many robots."""
         self.losses += 1
         if self.state != "offline" and (self.state != "online" or self._next_wait != _FIRST_WAIT_MS):
             self.failures += 1
         wait = self._next_wait
         self._next_wait = min(2 * wait, _LONGEST_WAIT_MS)
-        self._wait = wait - (wait >> 2) + (wait * noise >> 9)  # 0.75 to 1.25 of it
+        self._wait = wait - (wait >> 2) + (wait * random >> 9)  # 0.75 to 1.25 of it
         if self.state != "offline":
             self.move("waiting", now)

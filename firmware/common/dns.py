@@ -1,10 +1,10 @@
 """DNS queries for IPv4 addresses (RFC 1035; one-shot mDNS, RFC 6762 section 5.1): bytes out, bytes in. Pure."""
 
 
-def query(host: str, ident: bytes) -> bytes:
-    """Make the query for ``host``; ``ident`` is two random bytes. Raises ValueError for an invalid name."""
+def query(host: str, nonce: bytes) -> bytes:
+    """Make the query for ``host``; ``nonce`` is two random bytes. Raises ValueError for an invalid name."""
     # recursion desired; one question
-    data = ident + b"\1\0\0\1\0\0\0\0\0\0"
+    data = nonce + b"\1\0\0\1\0\0\0\0\0\0"
     for label in host.lower().encode().rstrip(b".").split(b"."):
         if not 0 < len(label) < 64:
             raise ValueError("not a host name: " + host)

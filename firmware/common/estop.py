@@ -8,7 +8,7 @@ from micropython import const
 
 from common.arbiter import Arbiter
 from common.latch import Latch, fields, reset_of, stop_of
-from common.lease import Lease, request_of
+from common.lease import Lease, request_of, shown
 from common.payload import load
 from common.ticks import diff
 
@@ -22,19 +22,21 @@ _ENODEV = const(19)
 _ESTOP = const(b"estop/mcu")
 _CONTROL = const(b"control/mcu")
 _HOLDER = const(
-    '{"by":"%s","id":"%s","key":"%s","device":"%s","asks":"%s","asks_id":"%s","others":%s,"named":false,"boot":"%s"}'
+    '{"by":"%s","id":"%s","key":"%s","device":"%s","asks":"%s","asks_id":"%s","others":%s,"named":%s,"boot":"%s"}'
 )
 
 
 class EmergencyStop:
     """``stop`` and ``reset`` for their messages, then ``save`` while the motors are off; ``tick`` every turn."""
 
-    def __init__(self, now: int, watchdog_ms: int) -> None:
+    def __init__(self, now: int, watchdog_ms: int, strangers: int, named: bool) -> None:
+        """``strangers``: see `Lease`. ``named``: names are checked; else the accounts of senders are ""."""
         self.latch = Latch(_random(4), _NAMES, diff)
-        self.lease = Lease(now, diff, _random, 0)
+        self.lease = Lease(now, diff, _random, strangers)
         self.arbiter = Arbiter(self.latch, self.lease, now, diff, watchdog_ms)
         self.changed = True  # since the last state
         self.due = b""  # the state to publish: at most four a second, and that of a stop not in its turn
+        self.named = named
         self.stoppable = self.controllable = True  # the broker granted the topics of stops, and of control
         self._barred = 0  # of the last state
         self._paused = False
@@ -59,12 +61,12 @@ class EmergencyStop:
 
     # -- in
 
-    def stop(self, raw: memoryview | None, since: int) -> bool:
+    def stop(self, raw: memoryview | None, by: str, since: int) -> bool:
         """Latch; False: this stop is known already. None, like what cannot be parsed, is a stop without a name."""
-        name = by = why = ""
+        name = why = ""
         if raw is not None:
             try:
-                name, by, why = stop_of(load(raw))
+                name, by, why = stop_of(_signed(raw, by))
             except (ValueError, OverflowError, MemoryError):
                 pass
         self.changed = True
@@ -84,18 +86,18 @@ class EmergencyStop:
 
     # -- the state
 
-    def request(self, raw: memoryview, urgent: bool, now: int) -> None:
+    def request(self, raw: memoryview, by: str, urgent: bool, now: int) -> None:
         """A request for control, or the end of it; ``urgent``: without asking."""
         try:
-            order = request_of(fields(load(raw)))
+            order = request_of(fields(_signed(raw, by)))
         except (ValueError, OverflowError, MemoryError):
             return
         if order:
-            name, by, device, ms = order
+            name, person, device, ms = order
             if ms:
-                self.lease.hold(("", name, by, device), ms, urgent, now)
+                self.lease.hold((by, name, person, device), ms, urgent, now)
             else:
-                self.lease.release(("", name), now)
+                self.lease.release((by, name), now)
 
     def state(self) -> bytes:
         """The payload of what is ``due``, at most 300 bytes: the reason of a stop is cut."""
@@ -103,8 +105,8 @@ class EmergencyStop:
             lease = self.lease
             _, name, by, device = lease.holder or ("", "", "", "")
             _, asks_id, asks, _ = lease.asker or ("", "", "", "")
-            others = json.dumps(lease.others)
-            return (_HOLDER % (by, name, lease.key, device, asks, asks_id, others, self.latch.boot)).encode()
+            others, named = json.dumps(lease.others), json.dumps(self.named)
+            return (_HOLDER % (by, name, lease.key, device, asks, asks_id, others, named, self.latch.boot)).encode()
         state = self.latch.state(self._saved == self.latch.latched if self._saves else None)
         if self.arbiter.barred:
             state["barred"] = self.arbiter.barred
@@ -161,6 +163,16 @@ class EmergencyStop:
             pass
         self.latch.restore(saved)
         self._saved = self.latch.latched
+
+
+def _signed(raw: memoryview, by: str):
+    """The command, with the account ``by`` instead of its own ``by``, or in front of it. A stranger's has no effect."""
+    body = load(raw)
+    if by:
+        found = fields(body)
+        person = found.get("by")
+        found["by"] = shown(by + "/" + person, 40) if isinstance(person, str) and person and by != "-" else by
+    return body
 
 
 def _random(count: int) -> str:

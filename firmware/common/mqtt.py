@@ -9,12 +9,19 @@ of the OASIS standard of 2014.
 class Client:
     """``space`` and ``take`` are for input; ``send``, ``out``, ``waiting`` and ``sent`` for output."""
 
-    def __init__(self, incoming: int, outgoing: int, topics: tuple) -> None:
-        """Sizes in bytes: of the longest packet to read, and of the output buffer. ``topics``: to subscribe to."""
+    def __init__(self, incoming: int, outgoing: int, root: bytes, topics: tuple, plain: int) -> None:
+        """Sizes in bytes: of the longest packet to read, and of the output buffer.
+
+        ``topics``: to subscribe to, below ``root``. If only the first ``plain`` ones are, then all are a second time,
+        with the account of the sender: ``{root}by/{account}/{topic}``.
+        """
         self.data = memoryview(bytearray(incoming))
         self.out = memoryview(bytearray(outgoing))
+        self.root = root
         self.topics = topics
+        self.plain = plain
         self.topic = -1  # of the publication: its place in ``topics``, -1: it is none of them
+        self.by = ""  # the account in its topic; "": there is none
         self.first = self.last = self.retained = 0  # of the publication
         self.restart()
 
@@ -37,9 +44,10 @@ class Client:
     def take(self, count: int = 0) -> str:
         """Return the kind of the next packet: "welcome", "subscribed", "publication" or "pong"; "": there is none.
 
-        ``count`` bytes were received since the last call. A publication is on ``topics[topic]``, ``retained`` or not;
-        its payload is ``data[first:last]`` until the next call of ``space``. The kind of one whose payload is too long
-        to be stored is "too long". "subscribed": that range has a byte for each topic, above 127 if it is refused.
+        ``count`` bytes were received since the last call. A publication is on ``topics[topic]``, ``retained`` or not,
+        of the account ``by``; its payload is ``data[first:last]`` until the next call of ``space``. The kind of one
+        whose payload is too long to be stored is "too long". "subscribed": that range has a byte for each topic of
+        ``subscription``, above 127 if it is refused.
         """
         data = self.data
         self._end += count
@@ -72,7 +80,8 @@ class Client:
                 if code:  # 3.2.2.3: 1 protocol, 2 client id, 3 broker unavailable, 4 user or password, 5 rights
                     raise ValueError("refused by the broker: %d" % code)
                 return "welcome"
-            if first == 0x90 and length == 2 + len(self.topics):  # SUBACK
+            count = len(self.topics)
+            if first == 0x90 and length == 2 + self.plain + (count if self.plain < count else 0):  # SUBACK
                 self.first = at + 3
                 self.last = stop
                 return "subscribed"
@@ -95,13 +104,33 @@ class Client:
             out[end + 2] = data[topic]
             out[end + 3] = data[topic + 1]
             self.waiting = end + 4
-        name = data[at + 2 : topic]
-        self.topic = len(self.topics) - 1
-        while self.topic >= 0 and name != self.topics[self.topic]:
-            self.topic -= 1
+        self._match(at + 2, topic)
         self.first = body
         self.last = stop
         self.retained = first & 1
+
+    def _match(self, at: int, stop: int) -> None:
+        """Set ``topic`` and ``by`` for the topic in this range."""
+        data, topics, count = self.data, self.topics, self.plain
+        self.by = ""
+        self.topic = -1
+        first = at + len(self.root)
+        if first > stop or data[at:first] != self.root:
+            return
+        if count < len(topics) and data[first : first + 3] == b"by/":
+            count = len(topics)
+            at = first = first + 3
+            # of a-z, 0-9, _ and -, which is none by itself or in front
+            while first < stop and (96 < data[first] < 123 or 47 < data[first] < 58 or data[first] in (45, 95)):
+                first += 1
+            if first >= stop or data[first] != 47 or not at < first <= at + 32 or data[at] == 45:
+                return
+            self.by = bytes(data[at:first]).decode()
+            first += 1
+        name = data[first:stop]
+        while count and name != topics[count - 1]:
+            count -= 1
+        self.topic = count - 1
 
     # -- out
 
@@ -152,6 +181,9 @@ def login(name: bytes, user: bytes, password: bytes, topic: bytes, will: bytes, 
     return 0x10, head, text(name), text(topic), text(will), secrets
 
 
-def subscription(topics: tuple) -> tuple:
-    """SUBSCRIBE for ``send``: packet 1, each of ``topics`` with QoS 1, in this order (3.8)."""
-    return (0x82, b"\x00\x01") + tuple([text(topic) + b"\x01" for topic in topics])
+def subscription(root: bytes, topics: tuple, plain: int) -> tuple:
+    """SUBSCRIBE for ``send``: packet 1, each topic with QoS 1, those without an account first (3.8); see `Client`."""
+    both = [root + topic for topic in topics[:plain]]
+    if plain < len(topics):
+        both += [root + b"by/+/" + topic for topic in topics]
+    return (0x82, b"\x00\x01") + tuple([text(topic) + b"\x01" for topic in both])

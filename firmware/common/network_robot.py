@@ -20,11 +20,14 @@ from common.ticks import add, diff
 from common.wifi import Wifi
 
 _DRIVE_LIMIT_MS = const(900)  # one second, including a slow turn of the loop
-_ESTOP = const(0)  # places of the topics in the subscription: stops come first
-_RESET = const(1)
+# Places of the topics, stops first. Where names are checked, the topics without one are the first two, or three if
+# strangers may drive: they may have control, too.
+_ESTOP = const(0)
+_DRIVE = const(1)
 _CONTROL = const(2)
 _TAKE = const(3)
-_DRIVE = const(4)
+_RESET = const(4)
+_TOPICS = const(5)
 _HEARTBEAT_MS = const(250)
 _REPORT_EVERY = const(20)  # heartbeats: 5 s
 
@@ -44,10 +47,13 @@ class NetworkRobot:
         self.charging = charging
         self._wifi = Wifi(get(settings, "wifi", "ssid"), get(settings, "wifi", "password", ""))
         self._clock = Clock(settings.get("ntp", "pool.ntp.org"), now)
-        incoming = root + b"/incoming/"
-        names = b"estop", b"estop-reset", b"control", b"control/take", b"drive-values"
-        self.session = Session(settings, root, tuple([incoming + name for name in names]), wrap, self._take)
-        self.stops = EmergencyStop(now, _DRIVE_LIMIT_MS)
+        named = ("open", "login", "named").index(get(settings, "security", "level", "open")) == 2
+        words = "drive", "free", "refuse"
+        strangers = words.index(get(settings, "security", "strangers", words[2 if named else 0]))
+        topics = b"estop", b"drive-values", b"control", b"control/take", b"estop-reset"
+        plain = _TOPICS if not named else _DRIVE + 1 if strangers == 2 else _CONTROL + 1
+        self.session = Session(settings, root, topics, plain, wrap, self._take)
+        self.stops = EmergencyStop(now, _DRIVE_LIMIT_MS, strangers, named)
         self.deadman = DeadMan(_DRIVE_LIMIT_MS)
         self.body = body
         self.refused = 0  # commands that were retained, and drive commands that were invalid or not admitted
@@ -114,11 +120,11 @@ class NetworkRobot:
         client = self.session.client
         raw = client.data[client.first : client.last]
         if kind == "subscribed":
-            granted = bytes(raw)
-            if granted[_DRIVE] > 127:
+            granted = bytes(raw)  # the last five are all topics, with names if those are checked
+            if granted[_DRIVE - _TOPICS] > 127:
                 raise ValueError("subscription refused")
-            self.stops.stoppable = granted[_ESTOP] <= 127 and granted[_RESET] <= 127
-            self.stops.controllable = granted[_CONTROL] <= 127
+            self.stops.stoppable = granted[_ESTOP] <= 127 and granted[_RESET - _TOPICS] <= 127
+            self.stops.controllable = granted[_CONTROL - _TOPICS] <= 127
             self._heartbeats = 0
             self._due = now
         elif client.retained:  # stale
@@ -130,30 +136,32 @@ class NetworkRobot:
         """``raw`` None: the payload is too long."""
         topic = self.session.client.topic
         stops = self.stops
+        by = self.session.client.by
+        sender = by or ("-" if stops.named else "")  # as Linux robots show whoever has no name
         if topic == _DRIVE:
-            self._judge(raw, now)
+            self._judge(raw, sender, now)
         elif raw is not None and not len(raw):  # it removes a retained message
             pass
         elif topic == _CONTROL or topic == _TAKE:  # noqa: SIM109 - a tuple would need memory
             if raw is not None:
-                stops.request(raw, topic == _TAKE, now)
+                stops.request(raw, sender, topic == _TAKE, now)
         elif not stops.stoppable:  # without a way to reset it, a stop is only a zero
             if topic == _ESTOP:
                 stops.arbiter.judge(False, PERSON, 0, now)
                 self._halt()
         elif topic == _ESTOP:
-            if stops.stop(raw, self._clock.read(now)):
+            if stops.stop(raw, by, self._clock.read(now)):
                 self._halt()
                 self._void = True
         elif topic == _RESET and raw is not None:
             stops.reset(raw, now)
 
-    def _judge(self, raw: memoryview | None, now: int) -> None:
+    def _judge(self, raw: memoryview | None, by: str, now: int) -> None:
         command = None if raw is None else parse(raw)
         if command:
             x, z, y, run, valid_ms, key = command
             moves = x != 0.0 or z != 0.0 or y != 0.0
-            limit_ms = self.stops.arbiter.judge(moves, run, valid_ms, now, key)
+            limit_ms = self.stops.arbiter.judge(moves, run, valid_ms, now, key, by)
             if limit_ms != REFUSED:
                 self._next = command
                 self._limit_ms = limit_ms
@@ -177,10 +185,8 @@ class NetworkRobot:
         if diff(now, self._due) < 0:
             return False
         if not self._heartbeats:
-            what = describe(
-                self._clock.read(now), session.root, self.name, stops.stoppable, stops.controllable, self.charging
-            )
-            session.publish(b"capabilities", what, 1)
+            now_ms = self._clock.read(now)
+            session.publish(b"capabilities", describe(now_ms, session.root, self.name, stops, self.charging), 1)
             stops.changed = stops.lease.changed = True
             self._due = now
         else:

@@ -15,6 +15,7 @@ from common.ticks import diff
 
 _ALIVE_S = const(15)  # MQTT's keepalive: the broker publishes the will after 1.5 times of it
 _LONGEST_PAYLOAD = const(512)
+_LONGEST_TOPIC = const(58)  # below the base: /incoming/by/{account}/drive-values
 _OUTGOING = const(420)  # plus three topics: room for a state and the 20 PUBACKs that a broker waits for
 _CHUNKS = const(4)  # reads per turn, at most
 _PACE_MS = const(30)  # between two writes, so that acknowledgements share packets
@@ -26,8 +27,8 @@ _IN_FLIGHT = const(7)
 class Session:
     """Each turn ``step``, and if it is True ``read`` and ``write``; ``drop`` it after any OSError or ValueError."""
 
-    def __init__(self, settings: dict, root: bytes, topics: tuple, wrap, take) -> None:
-        """``topics``: to subscribe to, the longest one last. ``wrap`` wraps a socket in TLS; None: no TLS.
+    def __init__(self, settings: dict, root: bytes, topics: tuple, plain: int, wrap, take) -> None:
+        """``topics``, ``plain``: as of `mqtt.Client`. ``wrap`` wraps a socket in TLS; None: no TLS.
 
         ``take(kind, now)`` is called for the SUBACK and for each publication, see `mqtt.Client.take`; it may raise
         ValueError.
@@ -38,7 +39,8 @@ class Session:
         # A broker disconnects a client when another one uses the same id: so it cannot be guessed, and is the same
         # until the next boot. A broker must accept 23 bytes of it, and may refuse more (3.1.3.1).
         self._name = b"pebble-" + hexlify(os.urandom(8))
-        self.client = mqtt.Client(_LONGEST_PAYLOAD + len(topics[-1]) + 7, _OUTGOING + 3 * len(root), topics)
+        size = _LONGEST_PAYLOAD + len(root) + _LONGEST_TOPIC + 7
+        self.client = mqtt.Client(size, _OUTGOING + 3 * len(root), root + b"/incoming/", topics, plain)
         self.wrap = wrap
         self._take = take
         self.connection = Connection()
@@ -115,7 +117,7 @@ class Session:
             kind = client.take(count)
             while kind:
                 if kind == "welcome":
-                    client.send(*mqtt.subscription(client.topics))
+                    client.send(*mqtt.subscription(client.root, client.topics, client.plain))
                     self.connection.move("subscribing", now)
                 elif kind == "pong":
                     self._in_flight = self._behind

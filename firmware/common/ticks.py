@@ -10,15 +10,15 @@ _MASK = const((1 << 30) - 1)
 _HALF = const(1 << 29)
 
 
-def diff(later: int, earlier: int) -> int:
-    """Milliseconds from ``earlier`` to ``later``; correct while they are less than 6.2 days apart."""
-    ahead = (later - earlier) & _MASK
+def diff(now: int, since: int) -> int:
+    """Milliseconds from ``since`` to ``now``; correct while they are less than 6.2 days apart."""
+    ahead = (now - since) & _MASK
     return ahead if ahead < _HALF else ahead - _HALF - _HALF
 
 
-def add(moment: int, ms: int) -> int:
-    """The moment ``ms`` after ``moment``."""
-    return (moment + ms) & _MASK
+def add(since: int, ms: int) -> int:
+    """The time ``ms`` after ``since``."""
+    return (since + ms) & _MASK
 
 
 class Grid:

@@ -10,7 +10,7 @@ import typer
 from pebble.commands.options import CaCert, PasswordFile
 
 if TYPE_CHECKING:
-    from pebble.config.tree import Robot
+    from pebble.config import Config
     from pebble.simulation.wireless import BrokerAddress
 
 _GROUP_HELP = """The real firmware of a robot's MCU on simulated pins.
@@ -232,16 +232,18 @@ def _wireless(kind: str, id_: str | None, broker: str, password_file: Path | Non
     from pebble.contract.identity import Identity
     from pebble.simulation.networked import run
 
-    address, named = _address(broker, password_file, ca_cert)
+    address, config = _address(broker, password_file, ca_cert)
     identity = Identity("pebble", "robots", id_ or kind)
-    if named is not None:
-        identity = Identity(named.system, named.type, id_ or named.id)
+    if config is not None:
+        identity = Identity(config.robot.system, config.robot.type, id_ or config.robot.id)
     typer.echo(f"{identity} connects to the broker at {address}; Ctrl-C ends it")
-    return run(kind, identity, address, name=named.name or "" if named is not None else "")
+    if config is None:
+        return run(kind, identity, address)
+    return run(kind, identity, address, name=config.robot.name or "", security=config.security)
 
 
-def _address(broker: str, password_file: Path | None, ca_cert: Path | None) -> tuple[BrokerAddress, Robot | None]:
-    """The broker that a URL or a config file names, and the robot of the config. Raises PebbleError."""
+def _address(broker: str, password_file: Path | None, ca_cert: Path | None) -> tuple[BrokerAddress, Config | None]:
+    """The broker that a URL or a config file names, and the config. Raises PebbleError."""
     from pebble.client.connection import password
     from pebble.client.url import UrlError, settings_of
     from pebble.config import load
@@ -251,10 +253,10 @@ def _address(broker: str, password_file: Path | None, ca_cert: Path | None) -> t
     from pebble.transports import MqttSettings, ZenohSettings
 
     settings: MqttSettings | ZenohSettings
-    named = None
+    config = None
     if "://" not in broker and not broker.startswith("zenoh:"):
         config = load(Path(broker))
-        settings, named = mqtt_settings(config.local_mqtt, reconnect_max_s=LOCAL_RECONNECT_S), config.robot
+        settings = mqtt_settings(config.local_mqtt, reconnect_max_s=LOCAL_RECONNECT_S)
     else:
         try:
             _, settings = settings_of(broker, password=password(password_file), ca_cert=ca_cert)
@@ -272,7 +274,7 @@ def _address(broker: str, password_file: Path | None, ca_cert: Path | None) -> t
             tls=tls is not None,
             ca=None if tls is None else tls.ca_cert,
         ),
-        named,
+        config,
     )
 
 

@@ -38,8 +38,6 @@ def _root(reader: Reader, root: Root, _path: Path) -> Root:
         )
     if root.robot.type == SERVERS:
         reader.notes.problem(("robot", "type"), f'must not be "{SERVERS}": those are operators\' servers, not robots')
-    if root.security.named:
-        reader.notes.problem(("security", "level"), 'must not be "named" in this release, write "login"')
     if platform != "linux" and kind != "mqtt":
         reader.notes.doubt(("transport", "kind"), f'must be "mqtt" where robot.platform is "{platform}"')
     if not reader.notes.problems:

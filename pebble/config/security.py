@@ -31,6 +31,12 @@ class Security(Section, frozen=True, kw_only=True):
         """What becomes of drive commands without a key of control."""
         return self.strangers or ("refuse" if self.level == "named" else "drive")
 
+    def on_board(self) -> dict[str, str]:
+        """The section `security` of a board's private_config.json; empty: what it does without one."""
+        if self.level == "open" and self.unnamed == "drive":
+            return {}
+        return {"level": self.level, "strangers": self.unnamed}
+
     @property
     def named(self) -> bool:
         """Whether the names of senders are checked."""

@@ -61,6 +61,7 @@ def private_files(config: Config, firmware: Firmware, *, ssid: str, wifi_passwor
                 **({"password": Secret(broker.password)} if broker.password is not None else {}),
                 "tls": tls,
             },
+            **({"security": security} if (security := config.security.on_board()) else {}),
         },
         ca=ca,
     )

@@ -17,6 +17,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+from msgspec import UNSET
+from msgspec.structs import replace
+
 from pebble import contract as c
 from pebble.contract import codec
 from pebble.contract.payloads import Drive
@@ -39,6 +42,7 @@ NAME: Final = "00000000000000aa"  # of a stop
 ESTOP, RESET, STATE = f"{BASE}/incoming/estop", f"{BASE}/incoming/estop-reset", f"{BASE}/outgoing/estop/mcu"
 
 CONTROL, HOLDER = f"{BASE}/incoming/control", f"{BASE}/outgoing/control/mcu"
+ACCOUNTS: Final = {"a": "ann", "b": "bob"}  # by the first letter of an id
 
 _WRAP_MS = 1 << 30
 _FILE = "/estop.json"
@@ -104,10 +108,13 @@ class Seen:
 
 
 class Drill:
-    """One robot and its environment; ``seed`` is that of all randomness. ``root``: firmware that is not Pebble's."""
+    """One robot and its environment; ``seed`` is that of all randomness. ``root``: firmware that is not Pebble's.
 
-    def __init__(self, kind: str, seed: int, *, root: Path | None = None) -> None:
-        self.kind, self.random = kind, random.Random(f"{kind} {seed}")
+    ``named``: the board checks names; its operators are of the accounts ann, who drives, and bob.
+    """
+
+    def __init__(self, kind: str, seed: int, *, root: Path | None = None, named: bool = False) -> None:
+        self.kind, self.random, self.named = kind, random.Random(f"{kind} {seed}"), named
         self.clock = WatchedClock(START_S)
         self.broker = VirtualBroker(self.clock.now)
         port = OF_ROBOT[kind]
@@ -135,7 +142,7 @@ class Drill:
         self._before: Outputs = ()
         self._commands: list[Arrived] = []
         self._arrived: dict[int, float] = {}  # of each command on its way through the board's buffers, by its id
-        self._meant: dict[bytes, Drive] = {}
+        self._meant: dict[tuple[str, bytes], Drive] = {}
         self.rules = Rules(START_S)
         self._events: list[tuple[float, int, Callable[[], object]]] = []
         self._count = itertools.count()
@@ -160,6 +167,8 @@ class Drill:
         self._pairs = [getattr(pins, name, None) for name in ("LEFT", "RIGHT", "GROUSERS")]
         host = self.random.choice(("10.0.0.2", "broker.test", "broker.local"))
         settings = {"robot": {"id": "rover"}, "wifi": {"ssid": "home", "password": "secret"}, "mqtt": {"host": host}}
+        if self.named:
+            settings["security"] = {"level": "named", "strangers": "drive"}
         return self.board.load(self.kind, settings)
 
     def cut_power(self) -> None:
@@ -219,23 +228,44 @@ class Drill:
 
     # -- the operator
 
-    def command(self, x: float, z: float, y: float = 0.0, *, qos: int = 1, retain: bool = False, **more: Any) -> None:
-        payload = json.dumps({"x": x, "z": z, "y": y, **more}).encode()
-        self._meant[payload] = codec.decode(c.DRIVE, payload)
-        self.broker.publish(DRIVE, payload, qos=qos, retain=retain)
+    def command(
+        self,
+        x: float,
+        z: float,
+        y: float = 0.0,
+        *,
+        account: str = "ann",
+        qos: int = 1,
+        retain: bool = False,
+        **more: Any,
+    ) -> None:
+        payload, topic = json.dumps({"x": x, "z": z, "y": y, **more}).encode(), self.topic("drive-values", account)
+        drive = codec.decode(c.DRIVE, payload)
+        elsewhere = self.named and drive.signed and drive.key is UNSET  # a script of which only a zero counts
+        if not elsewhere:
+            self._meant[topic, payload] = drive
+        elif not drive.moves:
+            self._meant[topic, payload] = replace(drive, source=UNSET, run=UNSET)
+        self.broker.publish(topic, payload, qos=qos, retain=retain)
 
-    def nonsense(self, payload: bytes, *, qos: int = 1, retain: bool = False) -> None:
+    def nonsense(self, payload: bytes, *, account: str = "bob", qos: int = 1, retain: bool = False) -> None:
         """Publish a command that must not move a robot."""
-        self.broker.publish(DRIVE, payload, qos=qos, retain=retain)
+        self.broker.publish(self.topic("drive-values", account), payload, qos=qos, retain=retain)
+
+    def topic(self, metric: str, account: str) -> str:
+        """Where this account publishes; "": under no name."""
+        return f"{BASE}/incoming/{f'by/{account}/' if self.named and account else ''}{metric}"
 
     def stop(self, name: str = NAME, **more: str) -> None:
-        self.broker.publish(ESTOP, json.dumps({"stop": name, "by": "drill", **more}).encode(), qos=1)
+        """One in two has a name where names are checked: both forms stop."""
+        payload = json.dumps({"stop": name, "by": "drill", **more}).encode()
+        self.broker.publish(self.topic("estop", ("", "bob")[name[-1:] in "13579bdf"]), payload, qos=1)
 
     def reset(self, *, behind: int = 0, **changes: Any) -> None:
         """Reset by the newest state that arrived, or one that is so many stops older, or with other ``changes``."""
         if state := self.state():
             order = {"boot": state["boot"], "count": state["count"] - behind, "by": "drill", **changes}
-            self.broker.publish(RESET, json.dumps(order).encode(), qos=1)
+            self.broker.publish(self.topic("estop-reset", "ann"), json.dumps(order).encode(), qos=1)
 
     def state(self) -> dict[str, Any]:
         """The newest state of the emergency stop that arrived; empty: none."""
@@ -244,8 +274,8 @@ class Drill:
         return state
 
     def request(self, name: str = "aaaaaaaa", *, take: bool = False, **more: Any) -> None:
-        """Request control."""
-        topic = f"{CONTROL}/take" if take else CONTROL
+        """Request control, as ann or bob."""
+        topic = self.topic("control/take" if take else "control", ACCOUNTS.get(name[:1], "ann"))
         self.broker.publish(topic, json.dumps({"id": name, "by": f"drill-{name[0]}", **more}).encode(), qos=1)
 
     def control(self) -> dict[str, Any]:
@@ -255,10 +285,19 @@ class Drill:
         return state
 
     def by_key(self, x: float, z: float, y: float) -> None:
-        """A command of who has control, if anybody has; and one by a key of before, which must not move anything."""
-        keys = [json.loads(payload)["key"] for payload in self.received(HOLDER)]
+        """A command of who has control, if anybody has; and one by a key of before, which must not move anything.
+
+        Nor must the key of now under another's name.
+        """
+        states = [json.loads(payload) for payload in self.received(HOLDER)]
+        keys = [state["key"] for state in states]
         newest = keys[-1] if keys else ""
-        self.command(x, z, y, **({"key": newest} if newest else {}))
+        holder = states[-1]["by"].partition("/")[0] if newest else "ann"
+        self.command(x, z, y, **({"key": newest} if newest else {}), account=holder)
+        if self.named and newest:
+            other = "bob" if holder == "ann" else "ann"
+            self.nonsense(json.dumps({"x": -x, "z": 0.76, "y": 1, "key": newest}).encode(), account=other)
+            self.broker.publish(DRIVE, json.dumps({"x": -x, "z": 0.75, "y": 1, "key": newest}).encode(), qos=1)
         old = [key for key in keys if key not in (newest, "")] or ["0badf00d"]
         self.nonsense(json.dumps({"x": -z, "z": 0.77, "y": 1, "key": self.random.choice(old)}).encode())
 
@@ -328,16 +367,17 @@ class Drill:
             arrived = self._arrived.pop(id(command), now)
             if command.retained:
                 continue
-            if command.topic == DRIVE:
+            metric = command.topic.rpartition("/")[2]
+            if metric == "drive-values":
                 self._take_drive(command, arrived, now)
-            elif command.topic == ESTOP and self.rules.stop(command.payload):
+            elif metric == "estop" and self.rules.stop(command.payload):
                 self._supersede(arrived)
-            elif command.topic == RESET:
+            elif metric == "estop-reset":
                 self.rules.reset(command.payload, self.robot.stops.latch.boot, now)
         self.network.reads.clear()
 
     def _take_drive(self, command: Command, arrived: float, now: float) -> None:
-        drive = self._meant.get(command.payload)
+        drive = self._meant.get((command.topic, command.payload))
         if drive is not None and drive.key and drive.key != self.robot.stops.lease.key:
             return  # control has passed on meanwhile
         valid_s = self.rules.admits(drive, now) if drive is not None else None

@@ -8,7 +8,7 @@ from functools import partial
 from typing import Final
 
 from pebble.simulation.micropython.faults import failure
-from tests.firmware.drill import DRIVE, LIMIT_S, ONLINE, RESENT_S, Drill, ViolatedError
+from tests.firmware.drill import LIMIT_S, ONLINE, RESENT_S, Drill, ViolatedError
 from tests.simulation.virtual_network import Answers
 
 _NETWORK: Final = ("wifi", "broker", "hole", "dns", "ntp", "frozen", "mute")
@@ -185,7 +185,7 @@ def _retained(drill: Drill, start: float, length: float) -> None:
     payload = b'{"x": 0, "z": 0.77, "y": 1}'
     drill.at(0.0, lambda: drill.nonsense(payload, retain=True))
     drill.at(start, drill.drop_robot)
-    drill.at(start + length, lambda: drill.broker.publish(DRIVE, b"", retain=True))
+    drill.at(start + length, lambda: drill.nonsense(b"", retain=True))
 
 
 def _stale(drill: Drill, start: float, length: float) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from random import Random
+from typing import Any
 
 import pytest
 
@@ -11,8 +12,8 @@ from common.estop import fields
 from common.lease import request_of
 from pebble.contract import CONTROL, CONTROL_STATE, codec
 from pebble.errors import PayloadError
+from tests.firmware.drill import BASE, HOLDER, Drill
 from tests.firmware.drill import CONTROL as REQUESTS
-from tests.firmware.drill import HOLDER, Drill
 from tests.firmware.test_network_robot import online
 
 KINDS = ("minilamp", "benjr")
@@ -93,6 +94,135 @@ def test_without_its_topic_a_board_has_no_control() -> None:
     drill.command(0, 0.5)
     run(drill, 0.2)
     assert any(drill.outputs())
+
+
+def at_named(kind: str, strangers: str = "refuse") -> Drill:
+    """A board that checks names, and page-1/ann has control of it."""
+    drill = online(kind, security={"level": "named", "strangers": strangers}, named=True)
+    send(drill, "by/page-1/control", id="aaaaaaaa", by="Ann", device="phone", for_ms=10_000)
+    run(drill, 0.5)
+    return drill
+
+
+def send(drill: Drill, metric: str, *, retain: bool = False, **body: Any) -> None:
+    drill.broker.publish(f"{BASE}/incoming/{metric}", json.dumps(body).encode(), qos=1, retain=retain)
+
+
+def moves(drill: Drill, metric: str, **body: Any) -> bool:
+    """Whether this drive command moves a board that stands; the rule of drills knows no strangers."""
+    drill.clock.watch = drill.check = lambda: None  # type: ignore[method-assign]
+    send(drill, metric, **body)
+    run(drill, 0.3)
+    moving = any(drill.outputs())
+    send(drill, "drive-values", z=0)
+    run(drill, 0.2)
+    assert not any(drill.outputs())  # a zero needs no name
+    return moving
+
+
+HOLDERS, WRONG = "the key of now", "0badf00d"
+ATTEMPTS = [  # strangers, topic, key, a script's run, whether it moves
+    ("refuse", "by/page-1/drive-values", HOLDERS, 0, True),
+    ("refuse", "by/page-1/drive-values", HOLDERS, 1, True),
+    ("refuse", "by/page-1/drive-values", WRONG, 0, False),
+    ("refuse", "by/page-1/drive-values", "", 0, False),
+    ("refuse", "by/otto/drive-values", HOLDERS, 0, False),
+    ("refuse", "by/otto/drive-values", "", 0, False),
+    ("refuse", "by/otto/drive-values", "", 1, False),
+    ("refuse", "drive-values", HOLDERS, 0, False),
+    ("refuse", "drive-values", "", 0, False),
+    ("refuse", "drive-values", "", 1, False),
+    ("free", "by/otto/drive-values", "", 0, False),
+    ("free", "drive-values", "", 0, False),
+    ("drive", "by/otto/drive-values", "", 0, True),
+    ("drive", "by/otto/drive-values", HOLDERS, 0, False),
+    ("drive", "by/otto/drive-values", "", 1, False),
+    ("drive", "drive-values", "", 0, True),
+    ("drive", "drive-values", HOLDERS, 0, False),
+    ("drive", "drive-values", "", 1, False),
+    *(
+        ("drive", f"by/{name}drive-values", HOLDERS, 0, False)
+        for name in (
+            "page-1/by/page-1/",
+            "otto/by/page-1/",
+            "Page-1/",
+            "page-1//",
+            "-/",
+            "",
+            f"{'a' * 33}/",
+            "page-1/x/",
+        )
+    ),
+]
+
+
+@pytest.mark.parametrize("strangers", ["refuse", "free", "drive"])
+def test_where_names_are_checked_a_key_counts_for_its_account_only(strangers: str) -> None:
+    drill = at_named("benjr", strangers)
+    state = drill.control()
+    assert (state["by"], state["id"], state["named"]) == ("page-1/ann", "aaaaaaaa", True)
+    run(drill, 2.0)  # a script waits after the start
+    for _, topic, key, number, expected in [row for row in ATTEMPTS if row[0] == strangers]:
+        keys = {"": {}, HOLDERS: {"key": state["key"]}}.get(key, {"key": key})
+        script = {"source": "autonomy", "run": number} if number else {}
+        send(drill, "by/page-1/control", id="aaaaaaaa", by="ann", for_ms=10_000)
+        assert moves(drill, topic, z=0.5, **keys, **script) is expected, (topic, key, number)
+        run(drill, 2.2)  # and after a person
+    assert drill.control()["key"] == state["key"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_of_what_has_no_name_or_is_retained_only_stops_and_zeros_count(kind: str) -> None:
+    drill = at_named(kind)
+    key = drill.control()["key"]
+    for metric in (
+        "control",
+        "control/take",
+        "by/otto/control/x",
+        "by/by/otto/control/take",
+        "by/otto/by/otto/control",
+    ):
+        send(drill, metric, id="bbbbbbbb", by="otto")
+    send(drill, "by/otto/control/take", id="bbbbbbbb", retain=True)  # live: it counts, and again as a retained one not
+    run(drill, 0.5)
+    assert (drill.control()["by"], drill.control()["id"]) == ("otto", "bbbbbbbb")
+    send(drill, "by/page-1/control/take", id="aaaaaaaa", by="ann")
+    run(drill, 0.5)
+    drill.drop_robot()
+    run(drill, 5.0)
+    assert drill.control()["by"] in ("page-1/ann", "")
+    assert drill.control()["key"] != key
+    send(drill, "estop", stop="00000000000000aa", by="anybody")
+    run(drill, 0.3)
+    assert drill.state()["latched"]
+    state = drill.state()
+    for metric in ("estop-reset", "by/otto/by/otto/estop-reset"):
+        send(drill, metric, boot=state["boot"], count=state["count"])
+    run(drill, 0.5)
+    assert drill.state()["latched"]
+    send(drill, "by/sam/estop-reset", boot=state["boot"], count=state["count"])
+    run(drill, 0.5)
+    assert not drill.state()["latched"]
+    send(drill, "by/otto/estop", stop="00000000000000bb", by="Eve")
+    run(drill, 0.3)
+    assert (drill.state()["latched"], drill.state()["by"]) == (True, "otto/eve")
+
+
+def test_a_topic_that_fits_nowhere_ends_the_connection_and_moves_nothing() -> None:
+    drill = at_named("benjr")
+    drill.command(0, 0.5, key=drill.control()["key"], account="page-1")
+    run(drill, 0.1)
+    send(drill, f"by/{'a' * 5000}/drive-values", z=1)
+    run(drill, 0.5)
+    assert not any(drill.outputs())
+    run(drill, 5.0)
+    assert drill.robot.session.connection.state == "online"
+
+
+@pytest.mark.parametrize("security", [{"level": "nmaed"}, {"level": "named", "strangers": "all"}])
+def test_a_level_that_is_unknown_is_refused(security: dict[str, str]) -> None:
+    with pytest.raises(ValueError, match="not in"):
+        online("benjr", security=security)
 
 
 def test_a_board_reads_requests_as_linux_does() -> None:

@@ -37,6 +37,7 @@ class Mutation:
     original: str = ""
     faults: tuple[str, ...] | None = None
     kind: str = "minilamp"
+    named: bool = False  # the board checks names
 
     def apply(self, root: Path) -> None:
         text = (root / self.file).read_text()
@@ -109,12 +110,18 @@ MUTATIONS = {
     ),
     "only the last command of a batch is judged": Mutation(
         _ROBOT,
-        "\n\n_judge, _read = NetworkRobot._judge, Session.read\n\n\ndef judge(self, raw, now):\n"
+        "\n\n_judge, _read = NetworkRobot._judge, Session.read\n\n\ndef judge(self, raw, by, now):\n"
         "    self._last = None if raw is None else bytes(raw)\n\n\ndef read(self, now):\n"
         "    robot = self._take.__self__\n    robot._last = b'-'\n    _read(self, now)\n"
-        "    if robot._last != b'-':\n        _judge(robot, robot._last, now)\n\n\n"
+        "    if robot._last != b'-':\n        _judge(robot, robot._last, '', now)\n\n\n"
         "NetworkRobot._judge, Session.read = judge, read\n",
         faults=("script",),
+    ),
+    "names do not count": Mutation(
+        "common/mqtt.py", 'self.by = "ann"', "self.by = bytes(data[at:first]).decode()", ("control",), named=True
+    ),
+    "without a name one is whoever has control": Mutation(
+        _ROBOT, 'by or (stops.lease.holder or [""])[0]', 'by or ("-" if stops.named else "")', ("control",), named=True
     ),
     "more writes than lwIP takes": Mutation(
         _SESSION, "_IN_FLIGHT = const(70)", "_IN_FLIGHT = const(7)", ("hole", "hole"), kind="benjr"
@@ -153,11 +160,11 @@ def test_mutated_firmware_violates_the_rule(tmp_path: Path, name: str) -> None:
 
 def _perform_all(mutation: Mutation, root: Path) -> None:
     for seed in range(MUTATED):
-        perform(Drill(mutation.kind, seed, root=root), mutation.faults)
+        perform(Drill(mutation.kind, seed, root=root, named=mutation.named), mutation.faults)
 
 
 def _performed(kind: str, seed: int, *faults: str) -> Drill:
-    drill = Drill(kind, seed)
+    drill = Drill(kind, seed, named=seed % 2 == 1)
     try:
         perform(drill, *([faults] if faults else []))
     except ViolatedError as error:

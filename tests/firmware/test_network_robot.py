@@ -23,10 +23,16 @@ AHEAD = {"minilamp": (1.0, 1.0, 0.0), "benjr": (-0.5, -0.5)}
 
 
 def online(
-    kind: str, seed: int = 1, *, time: Answers = "answers", refused: Iterable[str] = (), **settings: Any
+    kind: str,
+    seed: int = 1,
+    *,
+    time: Answers = "answers",
+    refused: Iterable[str] = (),
+    named: bool = False,
+    **settings: Any,
 ) -> Drill:
     """A robot that is connected; ``refused`` topics cannot be subscribed to, ``settings`` change those of its board."""
-    drill = Drill(kind, seed)
+    drill = Drill(kind, seed, named=named)
     drill.network.conditions.ntp = time
     drill.broker.refused = set(refused)
     if settings:

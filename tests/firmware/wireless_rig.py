@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import threading
 import time
+from collections.abc import Iterable
 from functools import partial
 from types import TracebackType
 from typing import Any, Self
@@ -12,6 +13,7 @@ from typing import Any, Self
 from paho.mqtt.client import Client, MQTTMessageInfo
 from paho.mqtt.enums import CallbackAPIVersion
 
+from pebble.config import Security
 from pebble.contract.identity import Identity
 from pebble.simulation.fleet import Fleet
 from pebble.simulation.wireless import KINDS, BrokerAddress, WirelessRobot
@@ -21,15 +23,19 @@ START_S = 10.0
 
 
 class Robots:
-    """One of each kind, running. ``moves[kind]`` has each change of its motors, with its time.monotonic()."""
+    """One of each of these kinds, running. ``moves[kind]`` has each change of its motors, with its time.monotonic()."""
 
-    def __init__(self, host: str, port: int, **options: Any) -> None:
+    def __init__(
+        self, host: str, port: int, *, kinds: Iterable[str] = KINDS, security: Security | None = None, **options: Any
+    ) -> None:
         self.fleet = Fleet(BrokerAddress(host=host, port=port, **options))
-        self.moves: dict[str, list[tuple[float, tuple[float, float]]]] = {kind: [] for kind in KINDS}
+        self.moves: dict[str, list[tuple[float, tuple[float, float]]]] = {kind: [] for kind in kinds}
         self.robots: dict[str, WirelessRobot] = {}
-        for kind in KINDS:
-            moved = partial(_note, self.moves[kind])
-            self.robots[kind] = self.fleet.add(kind, Identity("pebble", "robots", kind), moving_s=0.01, on_motors=moved)
+        for kind, moves in self.moves.items():
+            identity, moved = Identity("pebble", "robots", kind), partial(_note, moves)
+            self.robots[kind] = self.fleet.add(
+                kind, identity, moving_s=0.01, on_motors=moved, security=security or Security()
+            )
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
 

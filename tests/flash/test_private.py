@@ -18,8 +18,10 @@ CA = ROOT / "tests" / "data" / "tls" / "ca.crt"
 C6, D1 = FIRMWARE["minilamp"], FIRMWARE["benjr"]
 
 
-def config(env: dict[str, str] | None = None, **broker: Any) -> Config:
-    raw = {"robot": {"id": "lamp", "type": "lamps", "name": "Lamp"}, "local_mqtt": {"host": "broker.lab", **broker}}
+def config(env: dict[str, str] | None = None, *, security: Any = None, **broker: Any) -> Config:
+    robot = {"id": "lamp", "type": "lamps", "name": "Lamp", "platform": "esp32"}
+    raw = {"robot": robot, "local_mqtt": {"host": "broker.lab", **broker}}
+    raw |= {"security": security} if security else {}
     return parse(raw, folder=Path("/"), env=env or {})
 
 
@@ -31,6 +33,22 @@ def test_the_settings_hold_identity_wifi_and_broker() -> None:
         "mqtt": {"host": "broker.lab", "port": 1884, "tls": False},
     }
     assert private.ca is None
+
+
+@pytest.mark.parametrize(
+    ("security", "section"),
+    [
+        ({"level": "open"}, None),
+        ({"strangers": "free"}, {"level": "open", "strangers": "free"}),
+        ({"level": "login"}, {"level": "login", "strangers": "drive"}),
+        ({"level": "named"}, {"level": "named", "strangers": "refuse"}),
+        ({"level": "named", "strangers": "drive"}, {"level": "named", "strangers": "drive"}),
+    ],
+)
+def test_the_level_goes_along(security: dict[str, str], section: dict[str, str] | None) -> None:
+    login = {"username": "lamp", "password": "geheim", "tls": {"enabled": True, "ca_cert": str(CA)}}
+    private = private_files(config(security=security, **login), C6, ssid="Lab", wifi_password="")
+    assert private.settings.get("security") == section
 
 
 def test_names_that_the_firmware_refuses_never_get_to_a_board() -> None:

@@ -5,6 +5,7 @@ What is promised, exactly:
 * At most one client has control. Its key is new whenever control passes on, and halts the motors.
 * A command that moves anything and has a key moves it only if that is the newest key and, with names, its account is
   that of who has control. A command without a key moves as strangers may. A zero is never refused.
+* A script elsewhere moves nothing without the key of its account; where names are not checked, it needs none.
 * Control ends by a release, by another who takes it, by the first who asks for it once 5 s are over in which it has
   moved nothing, or when neither request nor command came for ``for_ms``; then the first who asks gets it.
 * After a restart nobody has control.
@@ -61,21 +62,22 @@ class ControlRules:
             self._asker = None
         self._compare()
 
-    def commanded(self, moves: bool, person: bool, key: str, by: str | None, now: int) -> tuple[bool, bool]:
-        """Whether a command is permitted, and whether it is from who drives: then its zero is a letting go."""
+    def commanded(self, moves: bool, person: bool, key: str, by: str | None, now: int) -> tuple[bool, bool, bool]:
+        """Whether a command is permitted; is from who drives: then its zero is a letting go; and is a person's."""
         self._pass(now)
         self._learn_key()
         mine = self._holder is not None and self._keys[-1] in key.split(" ") and by == self._holder.account
         if mine:
             self._until = now + self._for
-        local = not person or by is None
-        stranger = self.strangers == 0 or (self.strangers == 1 and self._holder is None)
+        script = not person and (mine or not by)  # elsewhere it needs the key; else its zero is as a person's
+        local = by is None or script
+        stranger = person and (self.strangers == 0 or (self.strangers == 1 and self._holder is None))
         permitted = not moves or mine or (not key and (local or stranger))
         if moves and mine:
             self._idle_at = now + IDLE_MS
         elif moves and permitted and not local:
             self._others_until = now + OTHERS_MS
-        return permitted, not person or mine or self._holder is None
+        return permitted, script or mine or self._holder is None, not script
 
     def ticked(self, now: int) -> None:
         self._pass(now)

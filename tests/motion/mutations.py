@@ -62,7 +62,7 @@ MUTATIONS = {
     "an older run moves": Mutation(_ARBITER, "            self.bar(run - 1 or LAST_RUN)\n", ""),
     "the newest run may fall": Mutation(_ARBITER, "if newer(run, self.barred) and", "if run > 0 and"),
     "a new run bars itself": Mutation(_ARBITER, "self.bar(run - 1 or LAST_RUN)", "self.bar(run)"),
-    "numbers of runs end": Mutation(_ARBITER, "0 < (run - than) & LAST_RUN < 1 << 29", "run > than"),
+    "numbers of runs end": Mutation(_ARBITER, "0 < (run - last) & LAST_RUN < 1 << 29", "run > last"),
     "the last run moves after run 1": Mutation(_ARBITER, "self.bar(run - 1 or LAST_RUN)", "self.bar(run - 1)"),
     "a stop bars nothing": Mutation(_ARBITER, "        self.bar(self._newest)\n        self._scripted = False\n", ""),
     "a run is not barred while latched": Mutation(_ARBITER, "            self.bar(run)\n", "            pass\n"),
@@ -103,6 +103,10 @@ MUTATIONS = {
     "strangers drive while somebody has control": Mutation(_LEASE, " or (self.strangers and self.key)", ""),
     "strangers are not refused": Mutation(_LEASE, "self.strangers == 2 or", ""),
     "programs of the robot are strangers": Mutation(_ARBITER, "run != PERSON or own", "run != PERSON"),
+    "scripts elsewhere need no key": Mutation(_ARBITER, "if by and run != PERSON", "if False and run != PERSON"),
+    "a zero of a script elsewhere is a script's": Mutation(
+        _ARBITER, "            run = PERSON\n", "            pass\n"
+    ),
     "scripts are strangers": Mutation(_ARBITER, "run != PERSON or own", "own"),
     "the last one who asks gets control": Mutation(
         _LEASE, "elif not self.asker or client[:2] == self.asker[:2]:", "else:"
@@ -129,7 +133,7 @@ MUTATIONS = {
         "self._newest = max(run, self._newest)\n            return REFUSED\n        ours",
     ),
     "times do not wrap": Mutation(
-        _TICKS, "return ahead if ahead < _HALF else ahead - _HALF - _HALF", "return later - earlier"
+        _TICKS, "return ahead if ahead < _HALF else ahead - _HALF - _HALF", "return now - since"
     ),
     "a zero is lost when it is replaced": Mutation("world", "if old is not None and not old[4]:", "if False:"),
     "a stop leaves a command in the slot": Mutation(

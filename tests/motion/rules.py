@@ -143,7 +143,9 @@ class Rules:
     def judged(self, moves: bool, run: int, valid_ms: float, key: str, by: str | None, now: int, result: int) -> None:
         """A drive command was judged; ``result`` is the milliseconds for which it moves, 0 or REFUSED."""
         self._end_hold(now)
-        permitted, ours = self.control.commanded(moves, run == PERSON, key, by, now)
+        self.zeros -= not moves and run == PERSON
+        permitted, ours, person = self.control.commanded(moves, run == PERSON, key, by, now)
+        run = PERSON if person else run
         if not permitted:
             check(result == REFUSED, "something moves by a key of before, another's name or a stranger")
             return
@@ -158,7 +160,6 @@ class Rules:
         if run == PERSON:
             quiet = self._quiet(moves, ours, now)
             if not moves:
-                self.zeros -= 1
                 check(result == 0, "a person's zero is not judged")
             elif self.latched or not quiet:
                 check(result == REFUSED, "a person moves wheels before letting go after a reset")

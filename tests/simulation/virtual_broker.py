@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Protocol
 
+from pebble.transports.topics import matches
 from tests.simulation import virtual_mqtt as mqtt
 
 _IN_FLIGHT = 20  # mosquitto's max_inflight_messages
@@ -142,6 +143,7 @@ class Session:
         self._buffer = bytearray()
         self._will: mqtt.Publish | None = None
         self._wanted: dict[str, int] = {}
+        self._patterns: list[str] = []  # those with wildcards
         self._limit_s = 10.0  # for the CONNECT; then the keepalive
         self._received_at = broker.now()
         self._number = 0
@@ -178,7 +180,7 @@ class Session:
             self._publish(will)
 
     def offer(self, message: mqtt.Publish, command: Command) -> None:
-        granted = self._wanted.get(message.topic)
+        granted = self._granted(message.topic)
         if granted is None:
             return
         message = replace(message, qos=min(granted, message.qos))
@@ -187,6 +189,12 @@ class Session:
                 self._queue.append((message, command))
         else:
             self._deliver(message, command)
+
+    def _granted(self, topic: str) -> int | None:
+        exact = self._wanted.get(topic)
+        if exact is not None or not self._patterns:
+            return exact
+        return max((self._wanted[one] for one in self._patterns if matches(one, topic)), default=None)
 
     def _deliver(self, message: mqtt.Publish, command: Command) -> None:
         if message.qos:
@@ -229,13 +237,14 @@ class Session:
 
     def _subscribe(self, number: int, wanted: list[tuple[str, int]]) -> None:
         refused = self._broker.refused
+        self._patterns += [topic for topic, _ in wanted if "+" in topic and topic not in refused]
         codes = bytes(0x80 if topic in refused else min(qos, 1) for topic, qos in wanted)
         self._wanted.update((topic, qos) for topic, qos in wanted if topic not in refused)
         self.line.send(mqtt.packet(mqtt.SUBACK, struct.pack("!H", number) + codes))
         for topic, qos in wanted:
-            if (retained := self._broker.retained.get(topic)) is not None:
+            for retained in [one for one in self._broker.retained.values() if matches(topic, one.topic)]:
                 copy = replace(retained, qos=min(qos, retained.qos), retain=True)
-                self._deliver(copy, Command(self._broker.now(), retained.payload, retained=True, topic=topic))
+                self._deliver(copy, Command(self._broker.now(), retained.payload, retained=True, topic=retained.topic))
 
     def _acknowledged(self, number: int) -> None:
         if number not in self._in_flight:

@@ -4,13 +4,14 @@ import random
 
 from common.mqtt import Client, login, subscription
 
-STOP = b"pebble/robots/r/incoming/estop"
-TOPIC = b"pebble/robots/r/incoming/drive-values"
-TOPICS = (STOP, TOPIC)
+ROOT = b"pebble/robots/r/incoming/"
+TOPICS = (b"estop", b"drive-values")
+STOP, TOPIC = ROOT + TOPICS[0], ROOT + TOPICS[1]
+CONTROL = (b"estop", b"drive-values", b"control", b"control/take")
 
 
 def client_of(incoming: int, outgoing: int) -> Client:
-    return Client(incoming, outgoing, TOPICS)
+    return Client(incoming, outgoing, ROOT, TOPICS, 2)
 
 
 def publication(payload: bytes, topic: bytes = TOPIC, first: int = 0x32) -> bytes:
@@ -85,9 +86,11 @@ def test_a_password_alone_comes_with_a_user_without_a_name() -> None:
 
 def test_subscribe_and_ping() -> None:
     client = client_of(100, 200)
-    client.send(*subscription((b"a/b", b"c")))
+    client.send(*subscription(b"a/", (b"b", b"cd"), 2))
     client.send(0xC0)
-    assert sent(client) == b"\x82\x0c\0\1\0\3a/b\1\0\1c\1" + b"\xc0\0"
+    assert sent(client) == b"\x82\x0f\0\1\0\3a/b\1\0\4a/cd\1" + b"\xc0\0"
+    client.send(*subscription(b"a/", (b"b", b"c"), 1))
+    assert sent(client) == b"\x82\x1e\0\1\0\3a/b\1\0\x08a/by/+/b\1\0\x08a/by/+/c\1"
 
 
 def test_publish_short_and_long() -> None:
@@ -124,6 +127,43 @@ def test_the_topic_of_a_publication_is_known() -> None:
             client = client_of(200, 50)
             assert receive(client, publication(b"x" * 1000, topic, 0x33), step) == ["too long"]
             assert (client.topic, client.retained) == (place, 1)
+
+
+def test_the_account_in_a_topic_is_known() -> None:
+    longest = b"a" * 32
+    for rest, topic, by in (
+        (b"estop", 0, ""),
+        (b"drive-values", 1, ""),
+        (b"control", -1, ""),  # not among the first two
+        (b"by/otto/estop", 0, "otto"),
+        (b"by/otto/control", 2, "otto"),
+        (b"by/page-1/control/take", 3, "page-1"),
+        (b"by/_/drive-values", 1, "_"),
+        (b"by/" + longest + b"/control/take", 3, "a" * 32),
+        (b"by/otto/control/", -1, "otto"),
+        (b"by/otto/lights", -1, "otto"),
+        (b"by/otto/by/otto/estop", -1, "otto"),
+        (b"by/otto/", -1, "otto"),
+        (b"by/" + longest + b"a/estop", -1, ""),
+        (b"by//estop", -1, ""),
+        (b"by/-/estop", -1, ""),
+        (b"by/-a/estop", -1, ""),
+        (b"by/Otto/estop", -1, ""),
+        (b"by/o.t/estop", -1, ""),
+        (b"by/\xc3\xb6/estop", -1, ""),
+        (b"by/otto", -1, ""),
+        (b"by/", -1, ""),
+        (b"by", -1, ""),
+        (b"", -1, ""),
+    ):
+        client = Client(200, 50, ROOT, CONTROL, 2)
+        assert receive(client, publication(b"/estop", ROOT + rest)) == [(b"/estop", 0)]
+        assert (client.topic, client.by) == (topic, by), rest
+        assert receive(client, publication(b"", b"pebble/robots/s/incoming/" + rest)) == [(b"", 0)]
+        assert (client.topic, client.by) == (-1, "")
+    client = Client(200, 50, ROOT, CONTROL, 4)  # names are not checked
+    assert receive(client, publication(b"x", ROOT + b"by/otto/estop")) == [(b"x", 0)]
+    assert (client.topic, client.by) == (-1, "")
 
 
 def test_publications_of_both_qualities() -> None:

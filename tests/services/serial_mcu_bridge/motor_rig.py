@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from pebble.config import parse
+from pebble.runtime.process import view_of
 from pebble.services.serial_mcu_bridge.text.motor_bridge import MotorBridge
 from pebble.simulation.pty import PtyMcu
 from pebble.transports import MqttSettings, create
@@ -22,26 +23,44 @@ STOPPED = "M 0.000 0.000"
 
 
 class Bench:
-    """The service in a thread of its own, an MCU, and an operator on the same network: in memory, or at a broker."""
+    """The service in a thread of its own, an MCU, and an operator on the same network: in memory, or at a broker.
+
+    Several share a ``hub``: each is one motor owner of the robot, the ``instance``.
+    """
 
     service: MotorBridge
     running: Running
 
     def __init__(
-        self, folder: Path, kind: str, *, broker: Broker | None = None, security: Any = None, **section: Any
+        self,
+        folder: Path,
+        kind: str,
+        *,
+        broker: Broker | None = None,
+        hub: MemoryHub | None = None,
+        instance: str = "",
+        security: Any = None,
+        **section: Any,
     ) -> None:
+        folder.mkdir(exist_ok=True)
+        self._owner = instance or "serial"
         self.mcu = PtyMcu(kind, folder / "tty")
         self.mcu.__enter__()
         serial = {"enabled": True, "serial": {"port": str(folder / "tty")}, **section}
+        serial = {"instances": {instance: serial}} if instance else serial
         transport = {"kind": "mqtt", "state_dir": str(folder / "state"), "run_dir": str(folder / "run")}
-        raw = {"robot": {"id": ROBOT}, "transport": transport, "services": {"serial_mcu_bridge": serial}}
+        bridge = {"enabled": True, "remote_mqtt": {"host": "localhost", "port": 1}}  # needed where names are checked
+        services = {"serial_mcu_bridge": serial, "mqtt_bridge": bridge}
+        raw = {"robot": {"id": ROBOT}, "transport": transport, "services": services}
         raw |= {"security": security or {}}
         config = parse(raw, folder=folder, env={})
-        settings = MemoryHub() if broker is None else MqttSettings(host="127.0.0.1", port=broker.port)
+        config = view_of(config, instance) if instance else config
+        settings = hub or MemoryHub() if broker is None else MqttSettings(host="127.0.0.1", port=broker.port)
         network = "memory" if broker is None else "mqtt"
         self.world = Listener(create(network, "operator", settings))
         self.operator = self.world.transport
-        self._new_service = lambda: MotorBridge(config, create(network, "robot", settings))
+        name = f"robot-{instance}"
+        self._new_service = lambda: MotorBridge(config, create(network, name, settings), instance=instance)
         self.start()
 
     def start(self) -> None:
@@ -95,7 +114,7 @@ class Bench:
     @property
     def state(self) -> dict[str, Any]:
         """The newest state of the emergency stop."""
-        state: dict[str, Any] = self.world.newest("estop/serial")
+        state: dict[str, Any] = self.world.newest(f"estop/{self._owner}")
         return state
 
     def stopped(self) -> bool:

@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from pebble.client.control import ControlClient, RobotControl
 from pebble.config import Security
 from pebble.contract import CONTROL_STATE, codec
 from pebble.contract.payloads import ControlRequest, ControlState
+from pebble.runtime.robot_estop import RobotEstop
 from pebble.services.serial_mcu_bridge.motion.control import Control
-from tests.services.serial_mcu_bridge.motor_rig import STOPPED, Bench
+from pebble.transports.memory import MemoryHub
+from tests.services.serial_mcu_bridge.motor_rig import BASE, STOPPED, Bench
 from tests.support import until
 
 ANN, OTTO = {"id": "aaaaaaaa", "by": "ann", "device": "phone"}, {"id": "00000001", "by": "otto"}
 LONGEST = "z" * 50
+NAMED_INSIDE = {"level": "named"}  # the bridge has put the account into ``by``
 
 
 # -- on a clock that the test moves
@@ -139,3 +144,48 @@ def test_what_strangers_may_do(tmp_path: Path, strangers: Any, free: bool, held_
         assert ("M 0.100 0.100" in bench.lines, "M 0.200 0.200" in bench.lines) == (free, held_by_ann)
     finally:
         bench.close()
+
+
+def test_of_two_motor_owners_that_answer_differently_the_first_by_name_decides(tmp_path: Path) -> None:
+    """One is started again while another client has both: that one gives the second back, and asks anew."""
+    hub = MemoryHub()
+    left = Bench(tmp_path / "left", "goob", hub=hub, instance="left", security=NAMED_INSIDE)
+    right = Bench(tmp_path / "right", "goob", hub=hub, instance="right", security=NAMED_INSIDE)
+    clients = {by: ControlClient(RobotControl(RobotEstop(BASE)), by=by, device="desk") for by in ("ann", "otto")}
+
+    def turn() -> None:
+        """What both hear and send: each state, once."""
+        for client in clients.values():
+            for name in ("left", "right"):
+                for message in left.world.on(f"control/{name}")[-1:]:
+                    client.robot.receive(message)
+            for message in client.tick(time.monotonic()):
+                left.operator.publish(message.topic, message.payload)
+
+    def became(by_left: str, by_right: str) -> bool:
+        def reached() -> bool:
+            turn()
+            names = [left.world.newest(f"control/{one}").get("by") for one in ("left", "right")]
+            return names == [by_left, by_right]
+
+        return until(reached, 10)
+
+    try:
+        clients["otto"].ask(time.monotonic())
+        assert became("otto", "otto")
+        left.restart()  # free: whoever asks first has this one
+        left.send("control", {"id": clients["ann"].id, "by": "ann", "device": "desk"})
+        assert until(lambda: left.world.newest("control/left").get("by") == "ann", 5)
+        assert right.world.newest("control/right")["by"] == "otto"
+        clients["ann"].ask(time.monotonic())
+        assert became("ann", "ann")
+        assert clients["otto"].failed == "ann has control now"
+        keys = " ".join(left.world.newest(f"control/{one}")["key"] for one in ("left", "right"))
+        for by, speed in (("otto", 0.2), ("ann", 0.4)):
+            left.drive(speed, key=keys, by=by)
+        assert left.line("M 0.400 0.400")
+        assert right.line("M 0.400 0.400")
+        assert "M 0.200 0.200" not in left.lines + right.lines
+    finally:
+        left.close()
+        right.close()
