@@ -129,7 +129,7 @@ def test_the_topic_of_a_publication_is_known() -> None:
             assert (client.topic, client.retained) == (place, 1)
 
 
-def test_the_account_in_a_topic_is_kept() -> None:
+def test_the_account_in_a_topic_is_known() -> None:
     longest = b"a" * 32
     for rest, topic, by in (
         (b"estop", 0, ""),
