@@ -22,7 +22,7 @@ def zenoh_text(fleet: Fleet) -> bytes:
 
 
 def _hub_account(account: Account, held: Iterable[Rule]) -> HubAccount:
-    """Of a robot or a gateway what it publishes, and its will there; of others flags, where these have no name."""
+    """A robot or a gateway retains what it publishes and leaves its will there; others retain flags without a name."""
     writes = [rule.filter for rule in held if rule.access == "write"]
     wills = [f"{base}/{OUTGOING}/#" for base in account.bases]
     wills += [one for one in writes if account.bases and one.endswith(f"/{ONLINE.suffix}")]

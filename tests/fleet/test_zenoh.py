@@ -35,7 +35,7 @@ NAMED = f"{GOOB}/incoming/by/otto/drive-values"
 
 
 class Hall:
-    """A fleet's folder with its Zenoh hub; ``received``: what a local program heard, by who sent it."""
+    """A fleet's folder with its Zenoh hub; ``received``: what a local program received, by who sent it."""
 
     def __init__(self, folder: Path, level: Literal["login", "named"]) -> None:
         certificates.init(folder, ["127.0.0.1", "localhost"])
@@ -165,7 +165,7 @@ def test_only_state_and_flags_are_retained_and_never_under_a_name(hall: Hall) ->
             hall.eye.publish(topic, b"", qos=QoS.DELIVERED, retain=True)
 
 
-def test_a_robot_leaves_a_will_for_itself_and_nobody_else_leaves_any(hall: Hall) -> None:
+def test_a_robot_leaves_a_will_for_itself_and_no_one_else_leaves_any(hall: Hall) -> None:
     name_of_will = {
         **dict.fromkeys(("vera", "otto"), f"{GOOB}/incoming/{'by/otto/' * (hall.fleet.level == 'named')}drive-values"),
         "mia": "pebble/servers/x1/outgoing/driving",
@@ -194,12 +194,12 @@ def raw(settings: ZenohSettings) -> Iterator[zenoh.Session]:
         zenoh_session.close_session(session)
 
 
-def test_a_program_with_a_certificate_poses_as_nobody_else(hall: Hall) -> None:
+def test_a_program_with_a_certificate_poses_as_no_one_else(hall: Hall) -> None:
     """Neither as another account, nor as the hub, nor as a program of the robot."""
-    heard: list[str] = []
+    received: list[str] = []
     local = zenoh_session.session_config(hall.local, "client", listen=[], connect=[hall.folder / "run" / "hub.sock"])
     seen = zenoh_session.open_session(local)
-    take = zenoh.handlers.Callback(lambda sample: heard.append(str(sample.key_expr)), indirect=False)
+    take = zenoh.handlers.Callback(lambda sample: received.append(str(sample.key_expr)), indirect=False)
     for prefix in (wire.UP, wire.LIVE):
         seen.liveliness().declare_subscriber(f"{prefix}*", take)
     will = wire.Will(STATE, b"otto", QoS.DELIVERED, False, "robot")
@@ -227,9 +227,9 @@ def test_a_program_with_a_certificate_poses_as_nobody_else(hall: Hall) -> None:
         asked: list[str] = []
         for key in (wire.HELLO, wire.SYNC + "*", f"{wire.RETAINED}**"):
             session.declare_queryable(key, zenoh.handlers.Callback(lambda one: asked.append(str(one)), indirect=False))
-        assert until(lambda: wire.LIVE + "otto~1" in heard)
+        assert until(lambda: wire.LIVE + "otto~1" in received)
         list(seen.get(wire.SYNC + "*", timeout=0.3, target=zenoh.QueryTarget.ALL))
-        assert (asked, [one for one in heard if one in posing]) == ([], [])
+        assert (asked, [one for one in received if one in posing]) == ([], [])
         del tokens
     zenoh_session.close_session(seen)
 
