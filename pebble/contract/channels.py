@@ -260,7 +260,7 @@ _PATTERNS = [
 
 
 def is_reserved(metric: str) -> bool:
-    """Whether only the robot itself may define ``metric``, in either direction: who stops it, and who drives it."""
+    """Whether only the robot itself may define ``metric``, in either direction: who stops and drives it, or did."""
     family = metric.partition("/")[0]
     return family.startswith(("estop", "audit-")) or family in ("audit", "by", "control")
 

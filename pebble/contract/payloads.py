@@ -195,7 +195,7 @@ class OutletCommand(Payload, frozen=True, kw_only=True):
 class AuditRead(Payload, frozen=True, kw_only=True):
     """Requests ``count`` lines of one chain of the audit: those before a number, or the newest."""
 
-    chain: AuditChain = "acts"
+    chain: AuditChain
     before: Annotated[int, Meta(ge=0, le=LARGEST_MS)] = 0  # 0: the newest
     count: Annotated[int, Meta(ge=1, le=1000)] = 50
 

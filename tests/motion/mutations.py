@@ -179,7 +179,9 @@ MUTATIONS = {
     "a stop that cannot be saved counts as saved": Mutation("estop", "persisted is True", "persisted is not False"),
     "a sender repeats what is confirmed": Mutation("estop", "(Progress.WAITING, Progress.OLD)", "Progress"),
     "a sender does not repeat": Mutation(
-        "estop", "self._sent_at, self.next = now, now + REPEAT_S", 'self._sent_at, self.next = now, float("inf")'
+        "estop",
+        "self.next, self._names_due = now, now + REPEAT_S, False",
+        'self.next, self._names_due = now, float("inf"), False',
     ),
     "a sender repeats without zeros": Mutation(
         "estop", "messages.append(_message(DRIVE,", "self.estop.old and messages.append(_message(DRIVE,"

@@ -144,7 +144,7 @@ class Rules:
     def _allowed(self, parsed: ParsedTopic, declared: Declared | None, retained: bool) -> bool:
         if parsed.direction != c.INCOMING:
             return self._allowed_outgoing(parsed.metric, declared, retained)
-        if retained or is_reserved(parsed.metric):  # stale; or who may stop and drive the robot, and who resets it
+        if retained or is_reserved(parsed.metric):  # stale; or who stops, resets and drives the robot, or did
             return False
         return self._options.incoming and (self._options.actions or declared in _MILD)
 

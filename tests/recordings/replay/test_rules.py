@@ -173,7 +173,7 @@ def test_probes_of_bridges_stay_away(options: Options) -> None:
 # -- rule 4
 
 MILD = {"drive-values", "lights-solid", "lights-flash", "audio-stream", "soundboard-command"}
-NEVER = {"estop", "estop-reset", "control", "control/take"}
+NEVER = {"estop", "estop-reset", "control", "control/take", "audit-read"}
 INCOMING_TOPICS = [channel.suffix for channel in CHANNELS if channel.direction == INCOMING and not channel.is_pattern]
 
 
