@@ -154,11 +154,11 @@ def test_malformed_messages(rig: Rig) -> None:
     received = {channel.metric for service in SERVICES for channel in service.handles()}
     expected = {metric: number for metric, number in sent.items() if metric in received}
     assert refused.keys() == expected.keys()
-    # QoS 0: a connection that is reset on a busy machine loses what is on its way. A kind of garbage that was accepted
-    # would be a seventh of a channel's messages. Of actions the bridge lets few pass in a second.
+    # QoS 0: a connection that is reset on a busy machine loses what is on its way, and there drive commands are late. A
+    # kind of garbage that was accepted would be a seventh of a channel's messages. Of actions few pass in a second.
     lost = {metric: number - refused[metric] for metric, number in expected.items()}
     assert all(lost[metric] >= 0 for metric in expected), lost
-    assert all(lost[metric] < 0.02 * number for metric, number in expected.items() if metric not in _ACTIONS), lost
+    assert all(lost[metric] < 0.05 * number for metric, number in expected.items() if metric not in _ACTIONS), lost
 
 
 @pytest.mark.timeout(180)

@@ -25,6 +25,9 @@ LOCAL, REMOTE = Side.LOCAL, Side.REMOTE
 _numbers = count(1)
 
 
+_BRIDGES_OWN = ("outgoing/online", "outgoing/audit")
+
+
 class End(ABC):
     """One side: a broker or a hub. The service can lose it, and it can lose what it retains, or get an older save back.
 
@@ -205,12 +208,12 @@ class Rig:
         return self.transport(side).counters["connected"] * (self.transport(side).state is State.CONNECTED)
 
     def retained(self, side: Side) -> dict[str, bytes]:
-        """What a late subscriber finds on that side, but the heartbeat."""
+        """What a late subscriber finds on that side, but what the bridge itself publishes there."""
         late = self.client(side)
         Quiet(late).wait(0.2)
         late.transport.close()
         retained = {m.topic.removeprefix(f"{self.base}/"): m.payload for m in late.seen if m.retain}
-        return {suffix: payload for suffix, payload in retained.items() if suffix != "outgoing/online"}
+        return {suffix: payload for suffix, payload in retained.items() if suffix not in _BRIDGES_OWN}
 
     def after_all(self, speaker: Side, suffix: str = "incoming/lights-solid") -> None:
         """Wait until earlier messages of the client on that side have passed, if they do."""

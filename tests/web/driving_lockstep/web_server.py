@@ -16,6 +16,7 @@ from pebble.client import broker
 from pebble.client.page_settings import WebSettings
 from pebble.contract import DRIVE, codec
 from pebble.fleet.roles import Role, Session
+from pebble.transports import MqttSettings
 from pebble.transports import clock as message_clock
 from pebble.web import control, robots, server
 from tests.robot.lockstep.network import Connection, Network
@@ -159,7 +160,9 @@ class WebServer(Process):
         connection = BrokerConnection(self, self._network)
         connection.rewrite = self._rewrite
         with patch.object(broker, "create", lambda *_: connection):
-            self.server = server.Server(WebSettings(broker=None, server="fair"), _Nothing(), _Nothing())  # type: ignore[arg-type]
+            self.server = server.Server(
+                WebSettings(broker=MqttSettings(host="fair"), server="fair"), _Nothing(), _Nothing()
+            )  # type: ignore[arg-type]
         self.server.driving.announced = self._announced(self.server.driving)
         self.server.driving.revoke = self._revoked(self.server.driving)
         self.loop.create_task(self.server.open())
