@@ -104,8 +104,6 @@ class AutonomyManager(Service):
     def on_connected(self) -> None:
         if not self._connected_before:  # a predecessor may have been killed together with its script
             self._connected_before = True
-            if self.config.security.named:
-                self.listen(CONTROL_STATE, self._control)
             try:
                 self.halt(next_run(self.config, self._owners.barred))
             except PebbleError as error:
@@ -135,18 +133,16 @@ class AutonomyManager(Service):
             if file not in self._scripts and not self._listed:
                 raise StartError(f"Unknown autonomy file: {shown(file)}: scripts are still being listed, try again")
             wanted = plan(self._scripts, file, config)
-            self._check(wanted, by)
+            self._check(wanted)
         except StartError as error:
             self.log_limited.log("refused", logging.WARNING, "%s", error)
             self._runner.refuse(str(error))
         else:
             self._runner.start(wanted)
 
-    def _check(self, wanted: Plan, by: str | None) -> None:
-        """Raise StartError if this robot cannot run ``wanted`` at present. ``by`` None: a program of the robot asks."""
+    def _check(self, wanted: Plan) -> None:
+        """Raise StartError if this robot cannot run ``wanted`` at present."""
         problem = self._owners.refusal
-        if by is not None and self.config.security.named and (holder := self._owners.holder_beside(by)):
-            problem = problem or f"{holder} has control, and starts scripts"
         if not problem and self.clock() < self._refused_until:
             problem = f"{OVERRIDDEN} just now: start it again in {_HOLD_S:g} s"
         if any(step.script.needs_gate for step in (wanted.main, *wanted.dependencies)):
