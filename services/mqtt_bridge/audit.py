@@ -92,6 +92,9 @@ class Audit(Acts):
                 problem = error
                 with self.lock:
                     waiting.give_back(rows, self._clock())
+            else:
+                with self.lock:
+                    waiting.written()
         if problem is not None and self._saved:
             log.error("the audit cannot be written, it waits: %s: %s", problem.filename or "disk", problem.strerror)
         elif problem is None and not self._saved:
