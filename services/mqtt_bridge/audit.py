@@ -126,5 +126,5 @@ class Audit(Acts):
                 lines = lines[len(lines) - number :]
                 break
         address = self._addresses[AUDIT_LINES]
-        payload = codec.encode(AUDIT_LINES, AuditLines(chain=request.chain, lines=lines))
+        payload = codec.encode(AUDIT_LINES, AuditLines(chain=request.chain, before=request.before, lines=lines))
         self._remote.publish(address.topic, payload, qos=QoS(address.qos), retain=address.retain)

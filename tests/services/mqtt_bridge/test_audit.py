@@ -274,6 +274,7 @@ def test_a_bridge_writes_and_answers(monkeypatch: pytest.MonkeyPatch) -> None:
         assert until(lambda: rig.remote.payloads("outgoing/audit-lines"))
         [answer] = rig.remote.payloads("outgoing/audit-lines")
         assert len(answer) <= LINES_BYTES + 100
+        assert json.loads(answer)["before"] == 3
         assert [one.encode() for one in json.loads(answer)["lines"]] == list(written.lines())[:2]
         assert bridge.status.counts
     finally:
