@@ -85,8 +85,6 @@ class AutonomyManager(Service):
         return self._section.retained_publish_interval_seconds
 
     def start(self) -> None:
-        if self.config.security.named:
-            self.listen(CONTROL_STATE, self._control)
         if self._fixed:
             self._found(self._scripts)
         else:
@@ -104,6 +102,8 @@ class AutonomyManager(Service):
     def on_connected(self) -> None:
         if not self._connected_before:  # a predecessor may have been killed together with its script
             self._connected_before = True
+            if self.config.security.named:
+                self.listen(CONTROL_STATE, self._control)
             try:
                 self.halt(next_run(self.config, self._owners.barred))
             except PebbleError as error:
