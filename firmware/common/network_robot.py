@@ -137,7 +137,7 @@ class NetworkRobot:
         topic = self.session.client.topic
         stops = self.stops
         by = self.session.client.by
-        sender = by or ("-" if stops.named else "")  # as Linux robots show whoever has no name
+        sender = by or ("-" if stops.named else "")  # as Linux robots show a sender without a name
         if topic == _DRIVE:
             self._judge(raw, sender, now)
         elif raw is not None and not len(raw):  # it removes a retained message

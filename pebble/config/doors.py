@@ -92,10 +92,10 @@ def _check_sides(notes: Notes, root: Root) -> None:
         notes.problem(path, f"cannot be renamed: {why}, by the contract's topics")
     for path, mqtt in _robots_brokers(root):
         if path[-1] != "remote_mqtt" and not is_loopback(mqtt.host):
-            notes.problem((*path, "host"), f"must be on loopback: {why}, and nobody does at {mqtt.host}")
+            notes.problem((*path, "host"), f"must be on loopback: {why}, which are not checked at {mqtt.host}")
     for path, endpoint in _endpoints(root):
-        if path == ("transport", "listen"):
-            notes.problem(path, f"{endpoint}: must be on loopback: {why}, and nobody does there")
+        if path[0] == "transport":
+            notes.problem(path, f"{endpoint}: must be on loopback: {why}, which are not checked there")
     remote, local = bridge.remote_mqtt, root.local_mqtt
     if bridge.enabled and transport.kind == "mqtt" and bridge.remote is None and place_of(remote) == place_of(local):
         place = ("services", "mqtt_bridge", "remote_mqtt", "host")

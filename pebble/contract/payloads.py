@@ -317,6 +317,7 @@ class AuditLines(Payload, frozen=True, kw_only=True):
     """Lines as stored, the oldest first, 16 KB at most; each is a JSON object with a hash (docs/fleet.md)."""
 
     chain: AuditChain
+    before: int = 0  # as in the request that this answers
     lines: list[str]
 
 

@@ -314,7 +314,7 @@ class Operator:
         return all(one.held or not one.wanted for one in wanted)
 
     def _release_control(self) -> None:
-        """Whoever asks, or wants it now, has it."""
+        """Leave control to people."""
         for control in self._controls.values():
             control.release()
             self._publish_all(control.tick(time.monotonic()))

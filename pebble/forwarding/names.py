@@ -25,7 +25,7 @@ from pebble.transports import Message
 _REMEMBERED = 4096  # topics
 _USUAL_BYTES = 256  # of a drive command
 _LONGEST = 40  # characters of a sender
-_UNSIGNED = (bool, bytes)  # payloads that take no name: a flag has the same bytes, whoever changes it
+_UNSIGNED = (bool, bytes)  # payloads that take no name: a flag has the same bytes from every sender
 #: Payloads that need not be objects; of all others only objects are commands.
 _BARE = (*_UNSIGNED, AutonomyCommand, EstopCommand, MediaRequest, SoundboardCommand)
 

@@ -70,8 +70,7 @@ class RobotAudits:
             self._reading -= 1
         marks = await asyncio.to_thread(self._audit.marks, ref, name)
         noted = max((mark.n for mark in marks), default=0)
-        problem = chain.verify(lines, [mark for mark in marks if not before or mark.n < before])
-        return RobotAudit(lines=[_plain(raw) for raw in lines], problem=problem, noted=noted)
+        return RobotAudit(lines=[_plain(raw) for raw in lines], problem=_problem(lines, before, marks), noted=noted)
 
     async def _ask(self, ref: str, request: AuditRead) -> list[bytes]:
         answered: asyncio.Future[list[bytes]] = asyncio.get_running_loop().create_future()
@@ -92,16 +91,25 @@ class RobotAudits:
             await self._broker.unsubscribe(subscription)
 
 
+def _problem(lines: list[bytes], before: int, marks: list[Mark]) -> str:
+    """What is wrong with the lines before a number; there may be none, because a robot replaces its oldest ones."""
+    if before and not lines:
+        return ""
+    problem = chain.verify(lines, [mark for mark in marks if not before or mark.n < before])
+    newest = chain.parse(lines[-1]) if lines else None
+    if problem or not before or newest is None or newest.n == before - 1:
+        return problem
+    return f"lines are missing between {newest.n} and {before}"
+
+
 def _answer(message: Message, request: AuditRead) -> list[bytes] | None:
-    """None: it answers somebody else."""
+    """None: it answers another request."""
     try:
         answer: AuditLines = codec.decode(AUDIT_LINES, message.payload[:_MOST_BYTES])
     except PayloadError:
         return None
-    lines = [one.encode() for one in answer.lines]
-    newest = chain.parse(lines[-1]) if lines else None
-    fits = not request.before or newest is None or newest.n == request.before - 1
-    return lines if answer.chain == request.chain and fits else None
+    fits = (answer.chain, answer.before) == (request.chain, request.before)
+    return [one.encode() for one in answer.lines] if fits else None
 
 
 def _plain(raw: bytes) -> dict[str, Any]:

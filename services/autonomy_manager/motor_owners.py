@@ -35,7 +35,7 @@ class MotorOwners:
         return owner in self._names or (not self._names and (owner in known or len(known) < _MOST))
 
     def holder_beside(self, by: str) -> str:
-        """Who has control, unless it is the account of ``by``; empty: nobody else has. The first owner decides."""
+        """Who has control, if it is not the account of ``by``; else empty. The first owner decides."""
         state = self._controls[min(self._controls)] if self._controls else None
         if state is None or not state.key or state.by.partition("/")[0] == by.partition("/")[0]:
             return ""

@@ -34,7 +34,7 @@ from pebble.services.mqtt_bridge.audit_rows import ROBOT, AuditRows, Row
 #: Quotas: of one account 200 acts of a kind at once, then 12 an hour: in all kinds a week's flood in 4 MB.
 _ACTS, _ACTS_S = 200, 300.0
 _REFUSED, _REFUSED_S = 1, 60.0
-_UNKNOWN = "?"  # in place of an account: nobody checked the name
+_UNKNOWN = "?"  # in place of an account: the name was not checked
 _MOST, _WHY, _NAME = 64, 40, 40  # characters of a file, a reason, a sender
 _REMEMBERED = 256  # stops, and requests for control
 _STATES = 64  # that wait, of each owner: they come ten times a second at most

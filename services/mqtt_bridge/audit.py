@@ -92,6 +92,9 @@ class Audit(Acts):
                 problem = error
                 with self.lock:
                     waiting.give_back(rows, self._clock())
+            else:
+                with self.lock:
+                    waiting.written()
         if problem is not None and self._saved:
             log.error("the audit cannot be written, it waits: %s: %s", problem.filename or "disk", problem.strerror)
         elif problem is None and not self._saved:
@@ -123,5 +126,5 @@ class Audit(Acts):
                 lines = lines[len(lines) - number :]
                 break
         address = self._addresses[AUDIT_LINES]
-        payload = codec.encode(AUDIT_LINES, AuditLines(chain=request.chain, lines=lines))
+        payload = codec.encode(AUDIT_LINES, AuditLines(chain=request.chain, before=request.before, lines=lines))
         self._remote.publish(address.topic, payload, qos=QoS(address.qos), retain=address.retain)

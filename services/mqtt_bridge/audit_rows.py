@@ -24,13 +24,15 @@ class _Room:
 class AuditRows:
     """At most ``burst`` rows at once of each account and kind, then one each ``period_s`` with the ``count`` of all.
 
-    So nobody can write so much that it displaces what others did. Times are seconds of the caller's clock.
+    So no account can write so much that it displaces what others did. Times are seconds of the caller's clock. What
+    was taken is to be confirmed (``written``) or given back before more is taken.
     """
 
     def __init__(self, burst: int, period_s: float) -> None:
         self._burst, self._period_s = burst, period_s
         self._rooms: dict[str, dict[object, _Room]] = {}  # by account, then kind
         self._waiting: list[tuple[float, Row]] = []
+        self._taken = 0  # rows that are being written, and may come back
 
     def add(self, row: Row, account: str, now: float) -> bool:
         """Whether ``row`` will be written as it is; ``row["what"]`` is its kind."""
@@ -39,7 +41,7 @@ class AuditRows:
             row["who"], rooms = OTHERS, self._rooms.setdefault(OTHERS, {})
         room = rooms.setdefault(row["what"], _Room(self._burst, now))
         self._fill(room, now)
-        if room.left >= 1 and room.merged is None and len(self._waiting) < WAITING:
+        if room.left >= 1 and room.merged is None and self._taken + len(self._waiting) < WAITING:
             room.left -= 1
             self._waiting.append((now, row))
             return True
@@ -60,15 +62,21 @@ class AuditRows:
         for rooms in self._rooms.values():
             for room in rooms.values():
                 self._fill(room, now)
-                if room.merged is not None and (room.left >= 1 or all_of_them):
+                if room.merged is not None and (all_of_them or (room.left >= 1 and len(ready) < WAITING)):
                     room.left -= 1
                     ready.append(room.merged)
                     room.merged = None
+        self._taken = len(ready)
         return ready
+
+    def written(self) -> None:
+        """What was taken has been written."""
+        self._taken = 0
 
     def give_back(self, rows: list[Row], now: float) -> None:
         """They could not be written: they wait, before what came meanwhile."""
         self._waiting = [(now - _HOLD_S, row) for row in rows] + self._waiting
+        self._taken = 0
 
     def _fill(self, room: _Room, now: float) -> None:
         room.left = min(self._burst, room.left + (now - room.at) / self._period_s)

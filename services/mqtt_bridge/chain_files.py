@@ -15,7 +15,7 @@ _BLOCK = 65536  # bytes that are read at a time, from the end
 
 
 class ChainFiles:
-    """Appends to a chain, and reads it. Every method may raise OSError, and then has changed nothing.
+    """Appends to a chain, and reads it. Every method may raise OSError, and then the chain is as before.
 
     After a power cut the last line may be half of one: it is removed, and the next line tells so.
     """
@@ -39,8 +39,9 @@ class ChainFiles:
                 os.ftruncate(file, size)
             if size >= self._most_bytes:
                 self.path.replace(self.older)
-                os.close(file)
-                file, size = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o600), 0
+                full, size = file, 0
+                file = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o600)
+                os.close(full)
             parts: list[bytes] = []
             note = {"t": rows[0]["t"], "what": "torn", "who": ROBOT, "bytes": torn}
             for row in [note, *rows] if torn else rows:

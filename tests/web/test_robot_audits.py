@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -42,7 +43,7 @@ def hall(broker: Broker, tmp_path: Path) -> Iterator[Hall]:
 
 
 class AuditedRobot(RecordingRobot):
-    """Answers with the lines that it has."""
+    """Answers with the lines that it has, each time after an answer to another reader."""
 
     lines: list[bytes]
 
@@ -50,7 +51,12 @@ class AuditedRobot(RecordingRobot):
         super().answer(messages)
         for message in messages:
             if message.topic.endswith("/audit-read"):
-                self.publish("audit-lines", {"chain": "acts", "lines": [raw.decode() for raw in self.lines]})
+                self._answer(5)
+                self._answer(json.loads(message.payload)["before"])
+
+    def _answer(self, before: int) -> None:
+        found = [raw.decode() for raw in self.lines if not before or json.loads(raw)["n"] < before]
+        self.publish("audit-lines", {"chain": "acts", "before": before, "lines": found})
 
 
 @pytest.fixture
@@ -60,8 +66,9 @@ def robot(broker: Broker) -> Iterator[AuditedRobot]:
         yield one
 
 
-def read(served: Served, robot: AuditedRobot) -> dict[str, Any]:
-    answer = httpx.get(f"{served.origin}/api/robot-audit", params={"ref": robot.base, "chain": "acts"}, timeout=20)
+def read(served: Served, robot: AuditedRobot, before: int = 0) -> dict[str, Any]:
+    query: dict[str, str | int] = {"ref": robot.base, "chain": "acts", "before": before}
+    answer = httpx.get(f"{served.origin}/api/robot-audit", params=query, timeout=20)
     assert answer.status_code == 200, answer.text
     found: dict[str, Any] = answer.json()
     return found
@@ -74,6 +81,13 @@ def test_what_a_server_has_noted_shows_what_is_missing(served: Served, robot: Au
         assert until(lambda: read(served, robot)["noted"] == 20, 10)
         found = read(served, robot)
         assert (found["problem"], found["lines"][-1]["number"]) == ("", 19)
+        robot.lines = robot.lines[10:]  # the older file was replaced
+        older = read(served, robot, before=15)
+        assert (older["problem"], [line["n"] for line in older["lines"]]) == ("", [11, 12, 13, 14])
+        assert (read(served, robot, before=11)["problem"], read(served, robot, before=11)["lines"]) == ("", [])
+        del robot.lines[3]
+        assert read(served, robot, before=15)["problem"] == "lines are missing between 13 and 15"
+        robot.lines = lines(20)
         robot.lines = robot.lines[:-2]
         assert read(served, robot)["problem"] == "lines 19 to 20 are missing: the end was cut off"
         robot.lines[4] = robot.lines[4].replace(b"ann", b"bob")

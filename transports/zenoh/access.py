@@ -23,8 +23,6 @@ _MESSAGES = (
     "declare_liveliness_subscriber",
 )
 IN, OUT = ("ingress",), ("egress",)  # as the hub sees it
-
-
 _FIELDS = ("flows", "messages", "key_exprs")
 
 
@@ -86,8 +84,8 @@ def written(access: Access) -> bytes:
 def access_control(rows: Iterable[tuple[Sequence[str], Iterable[Grant]]]) -> dict[str, Any]:
     """Let connections of this machine do everything, and those with a certificate what the row of their name grants.
 
-    Equal grants become one rule, because Zenoh reads 1 MB a second. It does not refuse the
-    others, but drops whatever they send, and sends them nothing. It reads this once.
+    Equal grants become one rule, because Zenoh reads 1 MB a second. It does not refuse the others, but drops all that
+    they send, and sends them nothing. It reads this once.
     """
     local = {"id": "this machine", "link_protocols": ["unixsock-stream", "tcp"]}
     rules: dict[Grant, dict[str, Any]] = {}
@@ -111,4 +109,4 @@ def _rule(number: int, grant: Grant) -> dict[str, Any]:
 
 
 def _named(names: Sequence[str]) -> dict[str, Any]:
-    return {"id": f"{names[0]}", "link_protocols": ["tls", "quic"], "cert_common_names": list(names)}
+    return {"id": names[0], "link_protocols": ["tls", "quic"], "cert_common_names": list(names)}

@@ -170,13 +170,17 @@ def flooded(rows: AuditRows, now: float) -> list[dict[str, Any]]:
 
 
 def test_what_cannot_be_written_waits_within_bounds() -> None:
-    rows = AuditRows(5000, 1.0)
-    for number in range(3 * WAITING):
-        rows.add({"t": 0.0, "what": "stop", "who": "ann", "number": number}, "ann", 0.0)
-    taken = rows.take(1.0)
-    assert sum(row.get("count", 1) for row in taken) == 3 * WAITING
-    rows.give_back(taken, 1.0)
-    assert rows.take(1.0) == taken
+    rows = AuditRows(10 * WAITING, 1.0)
+    for now in range(3):  # also what comes while it is tried
+        taken = rows.take(float(now))
+        for number in range(WAITING):
+            rows.add({"t": 0.0, "what": "stop", "who": "ann", "number": number}, "ann", float(now))
+            rows.add({"t": 0.0, "what": "stop", "who": "ben", "number": number}, "ben", float(now))
+        rows.give_back(taken, float(now))
+    taken = rows.take(3.0)
+    assert len(taken) == WAITING
+    rows.written()
+    assert sum(row.get("count", 1) for row in [*taken, *rows.take(4.0)]) == 6 * WAITING
 
 
 def row(number: int) -> dict[str, Any]:
@@ -229,6 +233,28 @@ def test_a_disk_that_takes_nothing_leaves_the_chain_whole(tmp_path: Path, monkey
     assert chain.verify(files.lines(), [files.mark]) == ""
 
 
+def test_a_disk_that_takes_no_new_file_costs_no_file_of_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    files = ChainFiles(tmp_path / "acts.jsonl", 100)
+    files.append([row(1)])
+    files.append([row(2)])
+    real, closed = os.open, list[int]()
+
+    def full(path: Any, flags: int, mode: int = 0o777) -> int:
+        if flags & os.O_EXCL:
+            raise OSError(28, "No space left on device")
+        return real(path, flags, mode)
+
+    with monkeypatch.context() as patched:
+        patched.setattr("os.open", full)
+        patched.setattr("os.close", closed.append)
+        with pytest.raises(OSError, match="space"):
+            files.append([row(3)])
+    assert len(closed) == 1
+    os.close(closed[0])
+    files.append([row(4)])
+    assert chain.verify(files.lines(), [files.mark]) == ""
+
+
 def test_a_bridge_writes_and_answers(monkeypatch: pytest.MonkeyPatch) -> None:
     rig = MemoryRig(monkeypatch)
     try:
@@ -248,6 +274,7 @@ def test_a_bridge_writes_and_answers(monkeypatch: pytest.MonkeyPatch) -> None:
         assert until(lambda: rig.remote.payloads("outgoing/audit-lines"))
         [answer] = rig.remote.payloads("outgoing/audit-lines")
         assert len(answer) <= LINES_BYTES + 100
+        assert json.loads(answer)["before"] == 3
         assert [one.encode() for one in json.loads(answer)["lines"]] == list(written.lines())[:2]
         assert bridge.status.counts
     finally:
