@@ -58,12 +58,16 @@ def _row(raw: bytes) -> tuple[str, ...]:
     if line is None:
         return ()
     fields = msgspec.json.decode(raw)
-    count = fields.get("count", 1)
-    since = _time(fields.get("since", line.t), "%H:%M:%S")
-    what = line.what if count == 1 else f"{line.what} × {count:,} since {since}"
+    count, since = fields.get("count", 1), fields.get("since", line.t)
+    what = line.what
+    if count != 1 and isinstance(count, int) and isinstance(since, int | float):  # a file may have been edited
+        what = f"{what} × {count:,} since {_time(since, '%H:%M:%S')}"
     more = ", ".join(f"{key} {value}" for key, value in fields.items() if key not in _KNOWN)
     return str(line.n), _time(line.t, "%Y-%m-%d %H:%M:%S"), what, line.who, more
 
 
 def _time(t: float, form: str) -> str:
-    return time.strftime(form, time.localtime(t))
+    try:
+        return time.strftime(form, time.localtime(t))
+    except (OverflowError, ValueError, OSError):
+        return f"{t:g}"

@@ -73,11 +73,20 @@ class Audit(Acts):
         ends = False
         while not ends:
             ends = self._closing.wait(_ROUND_S)
-            self.follow_states()
-            self._write(all_of_them=ends)
-            self._publish()
-            if self._asked and not ends:
-                self._answer(self._asked.popleft())
+            try:
+                self._do_round(ends=ends)
+            except Exception:  # else nothing would be written from now on, and nothing would show it
+                if self._saved:
+                    log.exception("the audit cannot be written")
+                self._saved = False
+                self._publish()
+
+    def _do_round(self, *, ends: bool) -> None:
+        self.follow_states()
+        self._write(all_of_them=ends)
+        self._publish()
+        if self._asked and not ends:
+            self._answer(self._asked.popleft())
 
     def _write(self, *, all_of_them: bool) -> None:
         problem: OSError | None = None
