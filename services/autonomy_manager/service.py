@@ -85,8 +85,6 @@ class AutonomyManager(Service):
         return self._section.retained_publish_interval_seconds
 
     def start(self) -> None:
-        if self.config.security.named:
-            self.listen(CONTROL_STATE, self._control)
         if self._fixed:
             self._found(self._scripts)
         else:
