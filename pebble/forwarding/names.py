@@ -123,7 +123,8 @@ def _is_zero(channel: Channel, payload: bytes) -> bool:
 def _object(payload: bytes) -> dict[str, Any] | None:
     """The JSON object in ``payload``, as all readers of the contract find it; None: they find none."""
     try:
-        if len(payload) <= _USUAL_BYTES and payload.isascii() and b"\0" not in payload:
+        usual = payload[:1] == b"{" and payload[-1:] == b"}" and len(payload) <= _USUAL_BYTES
+        if usual and payload.isascii() and b"\0" not in payload:  # else there may be something around it
             found = _decoder.decode(payload)
         else:
             found = codec.plain(DRIVE, payload)

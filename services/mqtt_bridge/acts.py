@@ -77,7 +77,7 @@ class Acts:
         self._holder: _Holder | None = None
         self._stops: OrderedDict[str, tuple[Row, bool]] = OrderedDict()  # by name; whether the sender's was checked
         self._estops: dict[str, EstopState] = {}
-        self._requests: OrderedDict[tuple[str, str], float] = OrderedDict()
+        self._requests: OrderedDict[tuple[str, tuple[str, str]], float] = OrderedDict()  # by what, and which client
         self._reset: tuple[str, str, float] = ("", "", float("-inf"))
         self._nameless_stop_at = float("-inf")
         self._keys: frozenset[bytes] | None = None  # of control; None: there is no owner that gives any
@@ -158,19 +158,25 @@ class Acts:
         if any(one.boot == reset.boot and one.count == reset.count for one in self._estops.values()):
             self._reset = (*self._sender(by, reset.by), self._clock())
 
-    def _on_request(self, channel: Channel, _by: str | None, payload: bytes) -> None:
-        """What explains a change of control; a request that is only repeated is not remembered again."""
+    def _on_request(self, channel: Channel, by: str | None, payload: bytes) -> None:
+        """What explains a change of control; a request that is only repeated is not remembered again.
+
+        Ids are public: where names are checked, only the account's own request explains what becomes of its control.
+        """
         try:
             request: ControlRequest = codec.decode(channel, payload)
         except PayloadError:
             return
-        holds = self._holder is not None and self._holder.state.id == request.id
+        state = None if self._holder is None else self._holder.state
+        sender = request.by if by is None or by == ROBOT else by
+        client = (sender.partition("/")[0] if state is not None and state.named else "", request.id)
+        holds = state is not None and client == _client(state)
         if request.want == "release":
             if not holds:
                 return
-            name = "release", request.id
+            name = "release", client
         elif channel is CONTROL_TAKE and not holds:
-            name = "take", request.id
+            name = "take", client
         else:
             return
         _remember(self._requests, name, self._clock())
@@ -231,7 +237,7 @@ class Acts:
             if before.state.key:
                 self._lost(before, state, at)
             if state.key:
-                self._named("control-taken" if self._lately("take", state.id, at) else "control-given", state, state.by)
+                self._named("control-taken" if self._lately("take", state, at) else "control-given", state, state.by)
             self._holder = _Holder(state, at, self._commands)
         else:
             before.state = state
@@ -241,7 +247,7 @@ class Acts:
     def _lost(self, before: _Holder, state: ControlState, at: float) -> None:
         if state.boot != before.state.boot:
             what, why = "control-ended", {"why": "restart"}
-        elif self._lately("release", before.state.id, at):
+        elif self._lately("release", before.state, at):
             what, why = "control-released", {}
         else:
             what, why = "control-ended", {"why": "another" if state.key else "silent"}
@@ -253,8 +259,8 @@ class Acts:
         device = {"device": state.device} if state.device and by == state.by else {}
         self._act(what, who, account, {**device, **(more or {})})
 
-    def _lately(self, want: str, id_: str, at: float) -> bool:
-        return at - self._requests.get((want, id_), float("-inf")) < _RECENT_S
+    def _lately(self, want: str, holder: ControlState, at: float) -> bool:
+        return at - self._requests.get((want, _client(holder)), float("-inf")) < _RECENT_S
 
     def _follow_stop(self, topic: str, state: EstopState) -> None:
         before = self._estops.get(topic)
@@ -309,6 +315,11 @@ class Acts:
         who, account = self._sender(by, None)
         with self.lock:
             self.refused.add({"t": round(self._wall(), 3), "what": reason, "who": who}, account, self._clock())
+
+
+def _client(state: ControlState) -> tuple[str, str]:
+    """The account, "" where names are not checked, and the id of who has control."""
+    return state.by.partition("/")[0] if state.named else "", state.id
 
 
 def _remember(table: OrderedDict[Any, Any], name: object, value: object) -> None:

@@ -54,6 +54,7 @@ class TestSign:
              "ann/otto"),
             *(("estop", garbage, garbage, "ann") for garbage in ("stop!", "[1]", "")),
             ("autonomy-command", '{"value":true,"file":"a"}', '{"value":true,"file":"a","by":"ann"}', "ann"),
+            ("autonomy-command", '\x01{"file":"a"}\x7f', '{"file":"a","by":"ann"}', "ann"),
             *((media, bare, bare, "ann") for media in ("front-camera", "audio", "soundboard-command")
               for bare in ("true", "false")),
             ("flags/mqtt-video", '{"value": true, "by": "otto"}', '{"value": true, "by": "otto"}', "ann/otto"),

@@ -45,8 +45,12 @@ class Control:
 
     def knows(self, request: ControlRequest) -> bool:
         """Whether this one has control, or is the first who asks for it. Any thread may ask."""
-        client = self._client(request)[:2]
+        client = self.sender(request)
         return client == self.lease.holder[:2] or client == self.lease.asker[:2]
+
+    def sender(self, request: ControlRequest) -> tuple[str, str]:
+        """What the lease tells clients apart by: the account and the id. Any thread may ask."""
+        return self._client(request)[:2]
 
     def request(self, request: ControlRequest, over: bool, now: float) -> None:
         """Requests and releases; ``over``: without asking."""

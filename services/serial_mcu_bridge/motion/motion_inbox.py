@@ -51,7 +51,8 @@ class MotionInbox:
     """Bounded. Any thread puts, one takes; a ``put`` returns True if nothing was waiting before: wake the one up then.
 
     Of drive commands the newest of each sender waits, and before it the zero that it replaced: a zero is always judged.
-    Who has control is a sender of its own, whom others do not replace. So is whoever requests it, by id.
+    Who has control is a sender of its own, whom others do not replace. So is whoever requests it, by account and id, as
+    the lease has it: one account may name any number of persons.
     """
 
     def __init__(self, control: Control) -> None:
@@ -83,7 +84,7 @@ class MotionInbox:
     def put_request(self, request: ControlRequest, over: bool, now: float) -> bool:
         with self._lock:
             was_empty = self._empty
-            sender = request.by, request.id
+            sender = self._control.sender(request)
             waiting = self._requests.pop(sender, None)
             if len(self._requests) >= _REQUESTS:
                 known = [key for key, one in self._requests.items() if not self._control.knows(one.request)]

@@ -85,6 +85,15 @@ def test_control_is_given_asked_for_taken_released_and_ends(watched: Watched) ->
     assert [row["what"] for row in watched.rows()] == ["control-given", "control-ended"]
 
 
+def test_a_request_with_the_id_of_another_account_explains_nothing(watched: Watched) -> None:
+    watched.control(by="mia", id="00000001", key="aa")
+    watched.rows()
+    watched.send(c.CONTROL, "otto", id="00000001", by="mia", want="release")
+    watched.send(CONTROL_TAKE, "boss", id="00000002", by="otto")
+    watched.control(by="otto", id="00000002", key="bb")
+    assert [row["what"] for row in watched.rows()] == ["control-ended", "control-given"]
+
+
 @pytest.mark.parametrize(
     ("channel", "by", "payload", "row"),
     [

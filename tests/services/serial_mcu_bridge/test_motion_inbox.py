@@ -127,6 +127,17 @@ def test_strangers_displace_nothing_of_who_has_control_or_asks_for_it() -> None:
     assert len(batch.requests) == 8
 
 
+def test_an_account_with_many_persons_has_one_place_for_each_id() -> None:
+    owner = Control(Security(level="named"), lambda _state: None, 0.0)
+    inbox = MotionInbox(owner)
+    owner.request(ANN, over=False, now=0.0)
+    owner.request(ControlRequest(id="00000001", by="otto/0"), over=False, now=0.0)
+    inbox.put_request(ANN, False, 0.0)
+    for person in range(20):
+        inbox.put_request(ControlRequest(id="00000001", by=f"otto/{person}"), False, 0.0)
+    assert [one.request.by for one in inbox.take().requests] == ["ann", "otto/19"]
+
+
 #: What one client sends, and what waits then: whether it is a release, and whether it takes control over.
 REQUESTS = {
     "the newest": ([(ANN, False), (ANN, False)], [(False, False)]),
