@@ -9,10 +9,12 @@ import math
 import random
 import re
 import string
+import timeit
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 from msgspec import UNSET
 from msgspec.structs import replace
@@ -427,6 +429,25 @@ def test_nesting_may_be_32_deep() -> None:
     deepest = b'{"x": 1, "k": ' + b"[" * 31 + b"]" * 31 + b"}"
     assert codec.decode(c.DRIVE, deepest) == Drive(x=1)
     assert "deeper than 32" in refused(c.DRIVE, deepest.replace(b"[]", b"[[]]"))
+
+
+def test_brackets_in_strings_are_none() -> None:
+    strings = [b'"%s"' % (b"[{" * 20), b'"\\\\"', b'"\\\\\\"%s"' % (b"[" * 40), b'"]\\""', b"[" * 30 + b"]" * 30]
+    for order in itertools.permutations(strings):
+        text = b"[" + b",".join(order) + b"]"
+        assert json.loads(text)
+        assert not codec.too_deep(text)
+        assert codec.too_deep(b"[" + text.replace(b"]" * 30, b"[]" + b"]" * 30) + b"]")
+
+
+def test_how_deep_a_message_is_takes_no_longer_than_to_parse_it() -> None:
+    """Anybody may send many that are as long as a command may be."""
+
+    def shortest(work: Callable[[bytes], object]) -> float:
+        return min(timeit.repeat(lambda: work(long), number=1, repeat=9))
+
+    long = b"[" + b",".join([b"[]"] * 20_000) + b"]"
+    assert shortest(codec.too_deep) < 3 * shortest(msgspec.json.decode)
 
 
 def test_brackets_in_strings_and_side_by_side_are_not_depth() -> None:
