@@ -117,7 +117,7 @@ class Client:
         first = at + len(self.root)
         if first > stop or data[at:first] != self.root:
             return
-        if count < len(topics) and data[first : first + 3] == b"by/":
+        if count < len(topics) and data[first : first + 3] == b"by/":  # type: ignore[comparison-overlap]
             count = len(topics)
             at = first = first + 3
             # of a-z, 0-9, _ and -, which is none by itself or in front
