@@ -253,24 +253,6 @@ def test_retained_messages_and_pieces_of_long_ones_are_signs_of_life(link: Link)
     assert link.counters["silences"] == 0
 
 
-@pytest.mark.parametrize("retain", [False, True])
-def test_a_flood_of_long_or_retained_messages_does_not_put_off_a_silence_for_ever(link: Link, retain: bool) -> None:
-    """A stop would be behind it."""
-    link.connection.incoming.settled = True
-    link.sends(sent(bytes(100_000), retain=retain)[:1000])
-
-    def goes_on(seconds: int) -> None:
-        for _ in range(2 * seconds):
-            link.now += 0.5
-            link.connection.pump(0.0, link.messages.extend)
-            link.sends(sent(b"x", retain=True) if retain else bytes(1000))
-
-    goes_on(6)
-    assert link.counters["silences"] == 0
-    with pytest.raises(Silent):
-        goes_on(2)
-
-
 def test_the_time_in_which_retained_messages_are_handled_is_no_silence(link: Link) -> None:
     def handle(messages: list[Message]) -> None:
         link.messages += messages

@@ -20,9 +20,6 @@ log = logging.getLogger(__name__)
 
 OVERSLEPT_S = 0.1  # poll took so much longer than asked for: the process was stopped, or the machine suspended
 _LOGGED = 200  # bytes of a topic
-#: So long after an answer a long message may arrive. Without end, whoever sends one after the other would keep what is
-#: behind them, also a stop, from ever arriving: a new connection leaves them behind.
-_LONGEST_S = 5.0
 _BATCH = 64  # messages read in a row before they are delivered
 
 
@@ -54,7 +51,6 @@ class Incoming:
         self.as_published = as_published
         self.accepted: Accepted | None = None  # what the broker said when it accepted us
         self.ending = Ending(where, settings)
-        self.settled = False  # what was retained when we subscribed has arrived, however long that took
         self.messages: list[Message] = []  # read, and not delivered yet
         self.answers: dict[str, bool] = {}  # filters answered since that was last looked at: refused?
         self.more = False  # a batch ended before the socket was empty
@@ -69,8 +65,7 @@ class Incoming:
         """Raises Silent if the broker has not answered for too long."""
         if self.accepted is None:
             return  # `connect` has its own deadline, and gives the first round trip
-        arriving_at = min(self.age.arriving_at, self.answered_at + _LONGEST_S) if self.settled else self.age.arriving_at
-        silence_s = now - max(self.answered_at, arriving_at)
+        silence_s = now - max(self.answered_at, self.age.arriving_at)
         if silence_s > self.silence_s and silence_s > (limit := self.pings.silence_limit_s):
             self._counters.add("silences")
             raise Silent(f"{self.ending.where} has not answered for {limit:.1f} s")

@@ -307,7 +307,6 @@ class MqttTransport(Transport):
             copied = connection.ping()
         self._await(connection, subscribed, stopping, self._deliver_all)
         self._await(connection, copied, stopping, self._deliver_all)
-        connection.incoming.settled = True
         now = time.monotonic()
         with self._publishing:
             self._refused.suspects.connected(now)
