@@ -148,6 +148,8 @@ class BrokerClient(packets.Listener, packets.Quota):
         for address in addresses:
             try:
                 return self._dialled(address)
+            except (ssl.SSLEOFError, ssl.SSLZeroReturnError):
+                why = ConnectionError("closes new connections: perhaps it has as many as it takes")
             except ssl.SSLError as error:
                 raise FleetError(f"broker {place} is another one: {error.reason or error}") from None
             except OSError as error:

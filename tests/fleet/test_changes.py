@@ -6,13 +6,14 @@ import json
 import os
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import pytest
 from msgspec.structs import replace
 
-from pebble.fleet import applying, check
+from pebble.fleet import applying, broker_files, check
 from pebble.fleet.broker_client import BrokerClient, RefusedError
 from pebble.fleet.dynsec import Control
 from pebble.fleet.folder import ACL, CONF, FLEET, PASSWORDS, SECURITY, Extra, FleetError, Server, load, locked, refused
@@ -93,6 +94,24 @@ def _gets_in(broker: FleetBroker, name: str) -> bool:
     except RefusedError:
         return False
     return True
+
+
+def test_who_takes_all_connections_is_removed_while_mosquitto_is_down(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The command says what to do, and not that it is another broker."""
+    monkeypatch.setattr(broker_files, "MAX_CONNECTIONS", 10)
+    with FleetBroker(tmp_path / "hall", {"otto": DRIVER}) as broker, ExitStack() as all_of_them:
+        for _ in range(10):
+            all_of_them.enter_context(broker.login("otto"))
+        with pytest.raises(FleetError, match=f"mosquitto runs there .process {broker.pid}.: end it"):
+            broker.remove("otto")
+        assert "otto" in broker.fleet.accounts
+        broker.stop()
+        assert "does not run" in broker.remove("otto")
+        broker.start()
+        with pytest.raises(RefusedError):
+            broker.login("otto")
 
 
 def test_a_change_while_mosquitto_is_down_counts_when_it_runs(broker: FleetBroker) -> None:
