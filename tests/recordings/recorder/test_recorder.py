@@ -138,10 +138,12 @@ class TestFiles:
         receive(STATUS, b"gone", None, True, retained=True, source="two")
         running.recorder.forget_retained("two")
         receive(ONLINE, b"three", None, True, retained=True, source="two")
+        receive(STATUS, b"newer", 1, True, source="one")
+        receive(STATUS, b"older", None, True, retained=True, source="one")  # fetched meanwhile by another connection
         time.sleep(1.5)
         running.stop()
         carried = {m.payload for m in recorded(running.root) if m.channel.metadata.get("retained") == "carried"}
-        assert carried == {b"false" if retain is None else b"true", b"one", b"three"}
+        assert carried == {b"false" if retain is None else b"true", b"one", b"three", b"newer"}
 
     def test_no_media(self, tmp_path: Path) -> None:
         running = Running(tmp_path / "rec", Options(free_bytes=0, media=False))
