@@ -281,13 +281,7 @@ class TestFlags:
             assert world.retained(FLAG) == (value, value)
         words = {
             "start": lambda: start(world),
-            "stop": world.stop,
-            "cut": lambda: world.uplink.cut(),
-            "mend": lambda: world.uplink.mend(),
-            "away": lambda: world.here.cut(),
-            "back": lambda: world.here.mend(),
-            "local-forgets": lambda: (world.local_hub.stop(forget=True), world.run(1), world.local_hub.start()),
-            "remote-forgets": lambda: (world.remote_hub.stop(forget=True), world.run(1), world.remote_hub.start()),
+            **world.interruptions(),
             #: The remote broker was restored from an earlier save: it retains the older value.
             "older": lambda: world.remote.publish(FLAG, b"false", retain=True, remember=False),
         }

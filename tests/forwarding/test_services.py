@@ -68,13 +68,7 @@ def do(world: World, history: str) -> None:
     words: dict[str, Callable[[], object]] = {
         "start": world.start,
         "alone": lambda: (world.start(), world.uplink.cut()),
-        "stop": world.stop,
-        "cut": lambda: world.uplink.cut(),
-        "mend": lambda: world.uplink.mend(),
-        "away": lambda: world.here.cut(),
-        "back": lambda: world.here.mend(),
-        "local-forgets": lambda: (world.local_hub.stop(forget=True), world.run(1), world.local_hub.start()),
-        "remote-forgets": lambda: (world.remote_hub.stop(forget=True), world.run(1), world.remote_hub.start()),
+        **world.interruptions(),
     }
     for word in history.split():
         who, colon, value = word.partition(":")

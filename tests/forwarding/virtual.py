@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from math import inf
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -139,6 +139,18 @@ class World:
                 break
             self.now = max(self.now, due)
         self.now = end
+
+    def interruptions(self) -> dict[str, Callable[[], object]]:
+        """What a service meets, by the words of histories."""
+        return {
+            "stop": self.stop,
+            "cut": lambda: self.uplink.cut(),
+            "mend": lambda: self.uplink.mend(),
+            "away": lambda: self.here.cut(),
+            "back": lambda: self.here.mend(),
+            "local-forgets": lambda: (self.local_hub.stop(forget=True), self.run(1), self.local_hub.start()),
+            "remote-forgets": lambda: (self.remote_hub.stop(forget=True), self.run(1), self.remote_hub.start()),
+        }
 
     def retained(self, suffix: str) -> tuple[bytes | None, bytes | None]:
         """What both sides retain: local, remote."""
