@@ -172,6 +172,15 @@ class MediaControl(Section, frozen=True, kw_only=True):
     )
 
 
+class Link(Section, frozen=True, kw_only=True):
+    """What the way to the remote broker carries, and what is sent accordingly; `docs/thin-links.md` explains it."""
+
+    profile: Annotated[
+        Literal["wide", "thin", "auto"], doc("`wide`: it carries everything; `thin`: little; `auto`: by measurement.")
+    ] = "wide"
+    kbit: Annotated[Annotated[float, Meta(gt=0)] | None, doc("What it carries, in kbit/s, if that is known.")] = None
+
+
 class MqttBridge(ServiceSection, frozen=True, kw_only=True):
     """The robot's connection to its operators: heartbeat, forwarding, flags and system commands."""
 
@@ -179,6 +188,7 @@ class MqttBridge(ServiceSection, frozen=True, kw_only=True):
     remote: Annotated[RemoteConnection | None, doc("Used instead of remote_mqtt when set.")] = None
     topics: Annotated[BridgeTopics, doc("Other names for topics.")] = BridgeTopics()
     heartbeat: Annotated[Heartbeat, doc("Sign of life.")] = Heartbeat()
+    link: Annotated[Link, doc("A thin link.")] = Link()
     media: Annotated[Media, doc("Pictures and sound, to and from operators.")] = Media()
     video_control: Annotated[MediaControl, doc("Running the camera publisher.")] = MediaControl()
     audio_control: Annotated[MediaControl, doc("Running the audio programs.")] = MediaControl()

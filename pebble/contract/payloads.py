@@ -39,6 +39,7 @@ def _clamp(payload: Payload, low: float, high: float, *names: str) -> None:
 SCRIPT = "autonomy"  # the source of a script's drive command; any other source is a person
 LAST_RUN = arbiter.LAST_RUN
 AuditChain = Literal["acts", "refused"]  # what people did; what anybody can cause
+LinkLevel = Literal["wide", "narrow", "thin"]
 LARGEST_MS = (1 << 53) - 1  # of a clock: the largest number that every JSON reader knows exactly
 
 
@@ -336,6 +337,16 @@ class ControlState(Payload, frozen=True, kw_only=True):
     others: bool = False  # a command without a key has moved something in the last 2 s, while somebody has control
     named: bool = False  # the broker vouches for the names
     boot: str = ""  # random at each start of the owner, as in its emergency stop
+
+
+class LinkState(Payload, frozen=True, kw_only=True):
+    """What the way between a robot and its remote broker carries now, as its bridge measures it."""
+
+    level: LinkLevel
+    drive_hz: float  # commands of one operator, a second
+    rtt_ms: int  # the shortest round trip of the last minutes
+    queue_ms: int  # by so much the newest one was longer: what waits on the way
+    t: int  # epoch milliseconds
 
 
 class LogRecord(Payload, frozen=True, kw_only=True):

@@ -1,0 +1,29 @@
+"""What a robot and its operators send on a link of each level: the robot publishes the level as ``outgoing/link``.
+
+Source: measured over 64, 19.2 and 9.6 kbit/s (docs/thin-links.md).
+"""
+
+from collections.abc import Mapping
+
+from msgspec import Struct
+
+from pebble.contract.payloads import LinkLevel
+
+
+class Level(Struct, frozen=True, kw_only=True):
+    """``drive_qos`` and ``heartbeat_qos`` None: as without levels. What ends something is QoS 1, at once, at each."""
+
+    drive_hz: float  # commands of one operator, a second
+    drive_qos: int | None = None
+    valid_ms: int = 400  # of a drive command, in milliseconds
+    heartbeat_s: float = 0.0  # at least, between two
+    heartbeat_qos: int | None = None
+    stream_hz: float | None = None  # of each stream at most, the newest; None: all of it
+    stamped: bool = False  # drive commands tell their own age, by ``t`` and ``key``
+
+
+LEVELS: Mapping[LinkLevel, Level] = {
+    "wide": Level(drive_hz=20),
+    "narrow": Level(drive_hz=10, drive_qos=0, heartbeat_s=1.0, stream_hz=5, stamped=True),
+    "thin": Level(drive_hz=4, drive_qos=0, valid_ms=750, heartbeat_s=1.0, heartbeat_qos=0, stream_hz=1, stamped=True),
+}
