@@ -74,7 +74,7 @@ def _robot(config: Config) -> Iterator[Finding]:
         found = list(broker(name, settings))
         yield from found
         if mqtt is config.services.mqtt_bridge.remote_mqtt and found[0].level is Level.OK:
-            yield publishing(found[0].what, settings, config.base)
+            yield from publishing(found[0].what, settings, config.base)
         if is_loopback(mqtt.host):
             yield from beyond_loopback(name, settings, own_addresses())
 

@@ -1,10 +1,13 @@
-"""Tries whether an account may publish a robot's messages at a broker, as that robot would."""
+"""Tries what an account may publish at a broker, and whether that broker holds small messages back."""
 
 from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable, Iterator
 from contextlib import closing
+from dataclasses import replace
+from statistics import median
 
 from pebble.contract import BRIDGE_PROBE
 from pebble.doctor import Finding, fail, ok, warn
@@ -15,35 +18,97 @@ from pebble.transports.mqtt.transport import MqttTransport
 _OPEN_S = 5.0
 _ANSWER_S = 2.0
 _POLL_S = 0.05
+_APART_S = 0.005  # between the two messages of a pair
+_PAIRS = 5
+_QUIET_S = 60  # no pings meanwhile: while the answer to one is not acknowledged, both messages of a pair wait
+_SETTLED = 1.5  # round trips between two pairs: the one before is acknowledged then
+_MATTERS_S = 0.02  # a shorter round trip delays nothing that people notice
+_HELD = 0.75  # of a round trip: a thin link itself needs some of it for the second message
 
 
-def publishing(what: str, settings: MqttSettings, base: str) -> Finding:
-    """Publish a probe, which no program takes for anything else, below ``base``, and see whether it comes back."""
-    topic, came_back = BRIDGE_PROBE.topic(base), threading.Event()
-    payload = new_probe(time.time_ns() // 1_000_000)
-    client = MqttTransport("doctor", settings)
-
-    def note(message: Message) -> None:
-        if message.payload == payload:
-            came_back.set()
-
+def publishing(what: str, settings: MqttSettings, base: str) -> Iterator[Finding]:
+    """Publish probes, which no program takes for anything else, below ``base``, and see when they come back."""
+    client = MqttTransport("doctor", replace(settings, keepalive_s=_QUIET_S, silence_s=_QUIET_S))
     with closing(client):
         client.open(_OPEN_S)
         if client.state is not State.CONNECTED:
-            return warn(what, f"cannot be published to: {client.problem}")
-        client.subscribe(topic, note)
-        client.publish(topic, payload, qos=QoS.DELIVERED)
+            yield warn(what, f"cannot be published to: {client.problem}")
+            return
+        echo = _Echo(client, BRIDGE_PROBE.topic(base))
+        came_back = echo.arrival(echo.send(QoS.DELIVERED), giving_up=lambda: bool(echo.refusal)) is not None
+        if echo.refusal or not (came_back or settings.protocol == "5"):  # which says what it refuses
+            why = echo.refusal or "it does not come back (or may this account not read it?)"
+            fix = f"allow it to write and read {echo.topic.rpartition('/')[0]}/# on the broker"
+            yield fail(what, f"this account may not publish to {echo.topic}: {why}", fix)
+            return
+        yield ok(what, "accepts what this account publishes")
+        pairs = [pair for _ in range(_PAIRS if came_back else 0) if (pair := echo.pair()) is not None]
+        if pairs:
+            yield from held_back(what, min(pair[0] for pair in pairs), median(pair[1] for pair in pairs))
+
+
+def held_back(what: str, round_trip_s: float, apart_s: float) -> Iterator[Finding]:
+    """Judge the shortest round trip, and the time by which the second message of a pair usually came after the first.
+
+    By Nagle's algorithm a broker sends the second one when the first is acknowledged, so a round trip later.
+    """
+    if round_trip_s < _MATTERS_S:
+        return
+    if apart_s < _HELD * round_trip_s:
+        yield ok(what, "passes small messages on at once")
+        return
+    saved_ms = 1000 * (apart_s - _APART_S)
+    yield warn(
+        what,
+        f"holds small messages back: a command that follows another one comes up to {saved_ms:.0f} ms later, "
+        f"a round trip being {1000 * round_trip_s:.0f} ms",
+        "in mosquitto.conf: set_tcp_nodelay true",
+    )
+
+
+class _Echo:
+    """Probes on one topic, and when each came back."""
+
+    def __init__(self, client: MqttTransport, topic: str) -> None:
+        self._client, self.topic = client, topic
+        self._came, self._arrivals = threading.Condition(), dict[bytes, float]()
+        client.subscribe(topic, self._note)
+
+    @property
+    def refusal(self) -> str:
+        """Why the broker does not take them; empty: it has not refused them."""
+        if self.topic in self._client.not_taken:
+            return self._client.not_taken[self.topic][0]
+        hung_up = self._client.state is not State.CONNECTED or self._client.counters["connected"] > 1
+        return "the broker hangs up on it" if hung_up else ""
+
+    def send(self, qos: QoS) -> bytes:
+        payload = new_probe(time.time_ns() // 1_000_000)
+        self._client.publish(self.topic, payload, qos=qos, urgent=True)
+        return payload
+
+    def arrival(self, payload: bytes, giving_up: Callable[[], bool] = lambda: False) -> float | None:
+        """When it came back; None: it has not within some seconds."""
         deadline = time.monotonic() + _ANSWER_S
-        while not came_back.wait(_POLL_S) and time.monotonic() < deadline:
-            if topic in client.not_taken:
-                return _refused(what, topic, client.not_taken[topic][0])
-            if client.state is not State.CONNECTED or client.counters["connected"] > 1:
-                return _refused(what, topic, "the broker hangs up on it")
-    if came_back.is_set() or settings.protocol == "5":  # which says what it refuses
-        return ok(what, "accepts what this account publishes")
-    return _refused(what, topic, "it does not come back (or may this account not read it?)")
+        with self._came:
+            while payload not in self._arrivals and time.monotonic() < deadline and not giving_up():
+                self._came.wait(_POLL_S)
+            return self._arrivals.get(payload)
 
+    def pair(self) -> tuple[float, float] | None:
+        """The round trip of one message, and by how much a second one, sent a moment later, came after it."""
+        began = time.monotonic()
+        first = self.send(QoS.LATEST)
+        time.sleep(_APART_S)
+        second = self.send(QoS.LATEST)
+        came = self.arrival(first), self.arrival(second)
+        if came[0] is None or came[1] is None:
+            return None
+        round_trip_s = came[0] - began
+        time.sleep(_SETTLED * round_trip_s)
+        return round_trip_s, came[1] - came[0]
 
-def _refused(what: str, topic: str, why: str) -> Finding:
-    fix = f"allow it to write and read {topic.rpartition('/')[0]}/# on the broker"
-    return fail(what, f"this account may not publish to {topic}: {why}", fix)
+    def _note(self, message: Message) -> None:
+        with self._came:
+            self._arrivals.setdefault(message.payload, time.monotonic())
+            self._came.notify()

@@ -203,7 +203,7 @@ def test_an_account_that_may_not_publish_is_found(
     broker = Broker(tmp_path, f"acl_file {tmp_path / 'acl'}")
     try:
         settings = MqttSettings(host="127.0.0.1", port=broker.port, protocol=protocol)
-        finding = publishing("b", settings, "pebble/robots/goob")
+        finding = next(publishing("b", settings, "pebble/robots/goob"))
     finally:
         broker.stop()
     assert (finding.level, why in finding.text) == (level, True)
@@ -213,7 +213,7 @@ def test_an_account_that_may_not_publish_is_found(
 def test_a_broker_that_hangs_up_on_what_is_published_is_found(open_broker: Broker) -> None:
     with ForbiddingProxy(open_broker.port) as proxy:
         proxy.forbidden = {"pebble/robots/goob/outgoing/bridge-probe"}
-        finding = publishing("b", MqttSettings(host="127.0.0.1", port=proxy.port), "pebble/robots/goob")
+        finding = next(publishing("b", MqttSettings(host="127.0.0.1", port=proxy.port), "pebble/robots/goob"))
     assert (finding.level, "hangs up" in finding.text) == (Level.FAIL, True)
 
 
