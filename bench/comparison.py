@@ -183,7 +183,8 @@ class Comparison:
     references: Sequence[str] = ()  # more of them, which are always measured
     conditions: Callable[[Run], Sequence[Params]] = unconditional
     is_null: bool = False  # one variant in three roles: see pebble.bench.judging.null
-    modes: Mapping[str, Comparison] = field(default_factory=dict)  # what is run instead if this option is given
+    #: What is run instead if this option is given, or (``option=begin``) only values of it that begin so.
+    modes: Mapping[str, Comparison] = field(default_factory=dict)
 
     measuring: Measuring = Measuring()
     report: Report = Report()
@@ -204,6 +205,15 @@ class Comparison:
         """The command line in a report, without ``pebble``."""
         more = ["--quick"] if quick else self.report.reported_full
         return [*(self.words or ("bench", self.name)), *(self.report.reported or ()), *more]
+
+    def mode(self, given: Mapping[str, Any]) -> Comparison:
+        """What is to be run with these options."""
+        for condition, mode in self.modes.items():
+            name, _, begin = condition.partition("=")
+            values = given.get(name)
+            if values and (not begin or all(str(one).startswith(begin) for one in values)):
+                return mode
+        return self
 
     def expected_s(self, quick: bool) -> int:
         return (self.quick if quick else self.full).takes_s

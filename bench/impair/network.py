@@ -61,13 +61,14 @@ _TABLE = "table ip impair { counter lost { }; chain arriving { type filter hook 
 
 @dataclass(frozen=True)
 class Traffic:
-    """Counters of the uplink, with all headers. Only differences within one condition mean something.
+    """Counters, with all headers. Only differences within one condition mean something.
 
     Packets dropped by the rate limit were never on the wire; lost packets were.
     """
 
     bytes_up: int = 0
     dropped_up: int = 0
+    bytes_down: int = 0
 
 
 class NamespaceNetwork(Worker):
@@ -106,7 +107,7 @@ class NamespaceNetwork(Worker):
     def traffic(self) -> Traffic:
         """The kernel counts, and the process what it dropped itself."""
         dropped = self._request("")["dropped_up"] + self._robot.dropped() + self._remote.lost()
-        return Traffic(self._robot.sent_bytes(), dropped)
+        return Traffic(self._robot.sent_bytes(), dropped, self._remote.sent_bytes())
 
     def _request(self, line: str) -> dict[str, Any]:
         """Sends a line and returns the answer. A timeout ends the process: its late answer would be misread."""

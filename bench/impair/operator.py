@@ -51,11 +51,11 @@ class MediaSubscriber(MediaReceiver):
 
     def on_picture(self, picture: Decoded) -> None:
         if picture.captured_ms is not None:  # as in all of our robots' pictures
-            self.seen.append(Arrival(_monotonic_ns(picture.captured_ms), time.monotonic_ns()))
+            self.seen.append(Arrival(monotonic_ns(picture.captured_ms), time.monotonic_ns()))
 
     def on_sound(self, received: ReceivedSound) -> None:
         now, seconds = time.monotonic_ns(), len(received.samples) / received.rate
-        self.received.append(Sound(_monotonic_ns(received.captured_ms), now, seconds, received.sequence))
+        self.received.append(Sound(monotonic_ns(received.captured_ms), now, seconds, received.sequence))
 
 
 class TrialOperator:
@@ -172,7 +172,7 @@ class TrialOperator:
         self._controls.subscribe(channel.topic(self._base), on_message)
 
     def _on_heartbeat(self, heartbeat: Online) -> None:
-        sent_ns, now_ns = _monotonic_ns(heartbeat.t), time.monotonic_ns()
+        sent_ns, now_ns = monotonic_ns(heartbeat.t), time.monotonic_ns()
         self._heartbeats.append(Heartbeat(sent_ns, now_ns, heartbeat.online is not False))
 
     def _on_status(self, status: Any) -> None:
@@ -192,7 +192,7 @@ def _pause(seconds: float, meanwhile: Callable[[], None] = lambda: None) -> None
     _wait(lambda: False, seconds, meanwhile)
 
 
-def _monotonic_ns(epoch_ms: int) -> int:
+def monotonic_ns(epoch_ms: int) -> int:
     """Converts a wall-clock time of the robot, which runs on this machine, to the monotonic clock."""
     return epoch_ms * 1_000_000 - wall_clock_ahead_ns()
 

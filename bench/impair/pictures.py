@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from pebble.bench.impair import trials
+from pebble.bench.impair import trials, wheels
 from pebble.bench.judging.aims import single, with_lost
 from pebble.bench.plots import Picture, Style, around, finite, guide, legend, log_axis, panels, short, styles, unique
 from pebble.bench.results import OVER_TIME, Cell, Results, grouped
@@ -35,6 +35,7 @@ _CROSS: Final[dict[str, Any]] = {
 }  # fmt: skip
 _NARROW, _WORST = f"aim\nat {trials.NARROW}", f"aim at\n{trials.WORST}"
 _BANDS = ("#f3f0e7", "#ffffff")
+_WIDE, _THIN = "#D55E00", "#0072B2"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -182,4 +183,47 @@ def _series(cells: Sequence[Cell], results: Results, title: str) -> Figure:
         axes.set_xlim(-0.01 * last, 1.01 * last)
         log_axis(axes, "y", f"{short(cell.variant, 18)}\nlatency, ms", *ends)
     every[-1].set_xlabel("seconds since the first trial began")
+    return figure
+
+
+# -- what the wheels did
+
+
+def what_the_wheels_did(results: Results) -> list[Picture]:
+    """One picture for each trial: the speed that was commanded, and that of the wheels, a panel for each robot."""
+    found = []
+    curves = [one for one in results.cells if one.measure.endswith(OVER_TIME) and len(one.rounds) == 2]
+    for trial, shown in grouped(curves, lambda cell: str(cell.params.get("trial", ""))).items():
+        robots = grouped(shown, lambda cell: cell.variant)
+        known = {name: {one.measure: one for one in cells} for name, cells in robots.items()}
+        link = trial.removeprefix("thin-")
+        caption = f"What the wheels did over {link}: commanded (line) and driven (filled), let go (│) and stopped (■)"
+        found.append(Picture(f"{results.bench}-wheels-{link}", caption, partial(_wheels, known, caption)))
+    return found
+
+
+def _wheels(robots: Mapping[str, Mapping[str, Cell]], title: str) -> Figure:
+    figure, every = panels(len(robots), 1, (11.0, 1.9), title)
+    last = max(max(cells[wheels.COMMANDED].rounds[0]) for cells in robots.values())
+    for axes, (name, cells) in zip(every, robots.items(), strict=True):
+        commanded, moved = cells[wheels.COMMANDED], cells[wheels.WHEELS]
+        colour = _WIDE if name == "wide" else _THIN
+        axes.fill_between(*moved.rounds, step="post", color=colour, alpha=0.75, linewidth=0)
+        axes.step(*commanded.rounds, where="post", color="#1a1a1a", linewidth=1.0)
+        for measure, colour, text in ((wheels.RELEASED, "#555", "let go"), (wheels.STOPPED, "#A4133C", "STOP")):
+            for at in cells[measure].rounds[0] if measure in cells else ():
+                axes.axvline(at, color=colour, linewidth=1.6 if text == "STOP" else 1.0, linestyle=(0, (3, 2)))
+                axes.annotate(text, (at, 1.0), xycoords=("data", "axes fraction"), xytext=(3, -2), fontsize=8,
+                              textcoords="offset points", color=colour, va="top",
+                              weight="bold" if text == "STOP" else "normal")  # fmt: skip
+        axes.set(xlim=(0, last), ylim=(0, 1.15), ylabel=f"{short(name, 18)}\nspeed")
+        axes.set_yticks([0, 0.5, 1])
+        axes.grid(visible=False, axis="x")
+    every[-1].set_xlabel("seconds")
+    handles = [
+        Line2D([], [], color="#1a1a1a", linewidth=1.0, label="commanded"),
+        Line2D([], [], color=_WIDE, linewidth=6, alpha=0.75, label="what the wheels did, today's robot"),
+        Line2D([], [], color=_THIN, linewidth=6, alpha=0.75, label="what the wheels did, with the link's keys"),
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)
     return figure

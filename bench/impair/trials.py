@@ -19,6 +19,7 @@ from pebble.bench.impair.conditions import CONDITIONS, Condition
 from pebble.bench.impair.metrics import OperatorReport, Plan, Trial, cells_of, over_time
 from pebble.bench.impair.network import REMOTE_HOST, NamespaceNetwork, Traffic, require_namespaces
 from pebble.bench.impair.operator import CLIP
+from pebble.bench.impair.thin import IMPAIR_THIN as IMPAIR_THIN
 from pebble.bench.judging.aims import Aim, outcome, single, with_lost
 from pebble.bench.judging.ratios import paired
 from pebble.bench.pictures import Drawn
@@ -355,7 +356,7 @@ IMPAIR = Comparison(
     "(JSON video, PCM audio); “h264 opus” are the encodings with rate control.",
     options=(
         Option(name="trials", many=True, known=TRIALS, metavar="NAMES", recorded=False,
-               help="Some of them, separated by commas."),
+               help="Some of them, separated by commas; or thin: the trials of thin links, which are others."),
         Option(name="subjects", sets="variants", many=True, known=SUBJECTS, metavar="NAMES",
                help='Such as "mqtt original,zenoh h264 opus".'),
         Option(name="window", sets="window_s", kind=float, least=1.0, most=LONGEST_S,
@@ -386,4 +387,5 @@ IMPAIR = Comparison(
     ),
     words=("impair",),
     root=True,
+    modes={"trials=thin": IMPAIR_THIN},
 )  # fmt: skip

@@ -94,7 +94,7 @@ def command_of(about: Comparison) -> Callable[..., int]:
         from pebble.bench.engine import run as run_
 
         wanted = {options[name].key: _parsed(options[name], value) for name, value in given.items()}
-        mode = next((mode for name, mode in about.modes.items() if wanted.get(name)), about)
+        mode = about.mode(wanted)
         return run_(mode.run_of(quick=quick, output=output, **wanted))
 
     declared: dict[str, tuple[Any, Any]] = {name: (_annotation(about, one), None) for name, one in options.items()}
