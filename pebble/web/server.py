@@ -14,6 +14,7 @@ from pebble.client.broker import Broker
 from pebble.client.drive_reasons import SCRIPT_ORDER, SERVER_ORDER, Code, Situation, first_reason
 from pebble.client.estop import send
 from pebble.client.named_topics import why_not
+from pebble.client.pace_of_link import WIDE
 from pebble.client.page_settings import WebSettings
 from pebble.client.robot_topics import FLEET, SYNONYMS
 from pebble.client.robot_view import RobotView
@@ -63,6 +64,7 @@ class Server:
         self.robots, self.stops, self.driving = Robots(), Stops(), Driving(server)
         self.controls = Controls(self.driving, self._robot)
         self.driving.held_elsewhere = self.controls.elsewhere
+        self.driving.pace_of = lambda ref: WIDE if (robot := self._robot(ref)) is None else robot.pace
         self.saved = SavedRobots(people)
         known = self.robots.before = self.saved.robots
         self.own_hosts = OwnHosts(settings)
@@ -84,6 +86,7 @@ class Server:
         """Connect to the broker and subscribe. Raises TransportError for settings that can never work."""
         await self.broker.open()
         self.broker.on_state(self._show_broker)
+        self.broker.on_state(self.driving.renew_key)
         self._show_broker()
         for channel in (*FLEET, *SYNONYMS):
             deferred = channel is ONLINE or channel in SYNONYMS
@@ -153,9 +156,9 @@ class Server:
     def publish(self, commands: list[Command], by: str = "") -> bool:
         """Publish drive commands of a person, each to the robot's own topic; False if one was not accepted."""
         accepted = True
-        for ref, drive in commands:
+        for ref, drive, qos in commands:
             topic = self.robots.topic(ref, "drive", "topic", DRIVE)
-            accepted = self.broker.publish(topic, codec.encode(DRIVE, drive), by=by) and accepted
+            accepted = self.broker.publish(topic, codec.encode(DRIVE, drive), qos=qos, by=by) and accepted
         self._show_drivers()
         return accepted
 
