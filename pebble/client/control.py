@@ -8,9 +8,10 @@ control of another one only gives it back.
 import secrets
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Any, Literal
+from typing import Literal
 
 import msgspec
+from msgspec import UNSET, UnsetType
 
 from pebble.client.pace_of_link import WIDE, Pace, ms
 from pebble.contract import CONTROL, CONTROL_STATE, CONTROL_TAKE, codec
@@ -149,9 +150,8 @@ class ControlClient:
         if self.wanted and now >= self._due_at:
             pace = self._pace_of()
             self._due_at = now + pace.control_s
-            more = {"t": ms(now)} if pace.stamped else {}
-            channel = CONTROL_TAKE if self._take else CONTROL
-            self._out.append(self._message(channel, for_ms=pace.control_for_ms, **more))
+            channel, at = CONTROL_TAKE if self._take else CONTROL, ms(now) if pace.stamped else UNSET
+            self._out.append(self._message(channel, for_ms=pace.control_for_ms, t=at))
             self._take = False
         out, self._out = self._out, []
         return out
@@ -188,8 +188,14 @@ class ControlClient:
             return f"{self.robot.base.rpartition('/')[2]} does not answer"
         return f"{self.robot.who} drives on" if now - self._asked_at > ASKS_S else ""
 
-    def _message(self, channel: Channel, want: Literal["hold", "release"] = "hold", **more: Any) -> Message:
-        request = ControlRequest(id=self.id, want=want, by=self._by, device=self._device, **more)
+    def _message(
+        self,
+        channel: Channel,
+        want: Literal["hold", "release"] = "hold",
+        for_ms: float = WIDE.control_for_ms,
+        t: int | UnsetType = UNSET,
+    ) -> Message:
+        request = ControlRequest(id=self.id, want=want, for_ms=for_ms, by=self._by, device=self._device, t=t)
         return Message(channel.topic(self.robot.base), codec.encode(channel, request), QoS(channel.default_qos))
 
 
