@@ -21,6 +21,7 @@ _SOON_S = 0.15  # what is sent may wait for so long
 _FIRST_BYTES, _LEAST_BYTES, _MOST_BYTES = 1500, 300, 64 * 1024  # that may be on their way, while that is learned
 _MOST = 256  # messages that are remembered
 _SLACK_BYTES = 64  # of pings and headers
+_CARRIED = 0.75  # of what a link carries; the rest are headers of small packets
 _POLL_S = 0.1  # so late an acknowledgement is noticed
 
 
@@ -126,7 +127,7 @@ class Room:
     """
 
     def __init__(self, kbit: float | None = None) -> None:
-        self._rate = None if kbit is None else kbit * 125  # bytes/s
+        self._rate = None if kbit is None else _CARRIED * kbit * 125  # bytes/s
         self._bytes = float(_FIRST_BYTES)
         self._in_flight = InFlight(_SLACK_BYTES, _MOST)
         self._waiting = 0
