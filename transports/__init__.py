@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from pebble.errors import TransportError
+from pebble.transports.base import Answer as Answer
 from pebble.transports.base import Handler as Handler
 from pebble.transports.base import Message as Message
 from pebble.transports.base import Outgoing as Outgoing

@@ -53,6 +53,15 @@ class Outgoing:
     stalled_s: float = 0.0  # how long DELIVERED messages wait and none was acknowledged, beyond two usual round trips
 
 
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """How long the other end has taken to answer the newest question, or the oldest one that it has not answered."""
+
+    number: int  # counts the answers of one connection
+    seconds: float
+    queue_s: float | None  # by so much TCP's own round trips are longer than the shortest; None: the system cannot tell
+
+
 Handler = Callable[[Message], None]
 Watcher = Callable[[State], None]
 
@@ -220,6 +229,13 @@ class Transport(ABC):
     is_invented: Callable[[str], bool] = staticmethod(lambda _topic: False)
     #: Whether a topic is one of stops: where a backend refuses messages because too many wait, it still takes these.
     is_stop: Callable[[str], bool] = staticmethod(lambda _topic: False)
+    #: Over a slow way: keep little in the kernel, where nothing can go ahead of what waits; and wait longer for
+    #: answers, with fewer questions. Set by :meth:`suit_link`; a backend may ignore both.
+    keeps_little: bool = False
+    is_patient: bool = False
+    #: A retained topic of ours whose values differ: while `is_patient`, if the other end has its newest one after an
+    #: outage, it has kept the others. Empty: each is asked for.
+    proof: str = ""
     #: What is published in place of a message, in this order; the first one counts as it. None: the message itself.
     forms: Callable[[Message], Iterable[Message]] | None = None
 
@@ -254,6 +270,11 @@ class Transport(ABC):
         return Outgoing()
 
     @property
+    def answer(self) -> Answer | None:
+        """How long an answer takes now; None while there is none, and from a backend that asks nothing."""
+        return None
+
+    @property
     def untried(self) -> bool:
         """Whether the name of the broker has addresses that have not had their first turn yet."""
         return False
@@ -272,6 +293,10 @@ class Transport(ABC):
         self.skips_retained = skips_retained or self.skips_retained
         self.forms = forms or self.forms
         self.delivers_late = self.delivers_late if delivers_late is None else delivers_late
+
+    def suit_link(self, *, little: bool, patient: bool) -> None:
+        """Suit the way to the other end, from now on: see `keeps_little` and `is_patient`."""
+        self.keeps_little, self.is_patient = little, patient
 
     def on_state(self, watcher: Watcher) -> None:
         """Call ``watcher`` on every change of state, in order, on a thread of the transport: it must return at once."""

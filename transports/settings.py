@@ -41,6 +41,7 @@ class MqttSettings:
     sends_retained: bool = True
     #: Filters of topics that are sent even to a broker that hangs up on them.
     vital: tuple[str, ...] = ()
+    dscp: int = 0  # of our packets (RFC 2474), where the system permits it: 46 is served before 10
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,4 +1,4 @@
-"""The server's connection to the broker, for code on an event loop."""
+"""A server's connection to the broker, for code on an event loop."""
 
 from __future__ import annotations
 
@@ -27,6 +27,7 @@ class Broker:
     def __init__(self, settings: MqttSettings, name: str = "pebble-web") -> None:
         """``name``: what the broker's log calls it."""
         self.transport: Transport = create("mqtt", f"{name}-{secrets.token_hex(4)}", settings)
+        self.transport.on_state(lambda _state: self._call(self._notify))
         self._loop: asyncio.AbstractEventLoop | None = None
         self._watchers: list[Callable[[], None]] = []
         self._arrived = Arrived()
@@ -62,7 +63,6 @@ class Broker:
     async def open(self) -> None:
         """Start connecting, and wait a moment for success. Raises TransportError for settings that can never work."""
         self._loop = asyncio.get_running_loop()
-        self.transport.on_state(lambda _state: self._call(self._notify))
         await asyncio.to_thread(self.transport.open, 2.0)
 
     async def close(self) -> None:

@@ -1,16 +1,19 @@
 """Control of a robot: who has it, as its motor owners publish it, and a client that asks for it. Pure.
 
-The robot is the memory: a client repeats what it wants every second, and the state is the answer. Of several motor
-owners the first one by name decides, so that two clients never share a robot; who has control of another one only
-gives it back.
+The robot is the memory: a client repeats what it wants every second, over a thin link more rarely, and the state is
+the answer. Of several motor owners the first one by name decides, so that two clients never share a robot; who has
+control of another one only gives it back.
 """
 
 import secrets
+from collections.abc import Callable
 from contextlib import suppress
 from typing import Literal
 
 import msgspec
+from msgspec import UNSET, UnsetType
 
+from pebble.client.pace_of_link import WIDE, Pace, ms
 from pebble.contract import CONTROL, CONTROL_STATE, CONTROL_TAKE, codec
 from pebble.contract.channels import Channel
 from pebble.contract.payloads import ControlRequest, ControlState
@@ -19,10 +22,8 @@ from pebble.motion import lease
 from pebble.runtime.robot_estop import MAX_OWNERS, RobotEstop
 from pebble.transports import Message, QoS
 
-EVERY_S = 1.0  # between two requests; control ends 3 s after the last one
-ANSWER_S = 2.0  # a robot that has not answered by then will not
 ASKS_S = 30.0  # so long a driver is asked
-APART_S = 1.5  # longer than EVERY_S: until then the other client has the rest of the robot
+APART = 1.5  # times what lies between two requests: until then the other client has the rest of the robot
 IDLE_S = 60.0  # without a gesture control is given back
 
 _STATE_BYTES = 1024  # the contract allows 300
@@ -83,14 +84,16 @@ class ControlClient:
     ``held``: the robot has answered that it has control. ``failed``: why it no longer asks for it, for people.
     """
 
-    def __init__(self, robot: RobotControl, *, by: str, device: str) -> None:
+    def __init__(
+        self, robot: RobotControl, *, by: str, device: str, pace_of: Callable[[], Pace] = lambda: WIDE
+    ) -> None:
         self.robot = robot
         self.id = secrets.token_hex(4)
         self.wanted = self.held = False
         self.decided = ""  # the key of the owner that decides: a new one needs a new gesture
         self.failed = ""
         self.passed_over = ""  # the id of who was not let drive
-        self._by, self._device = by, device
+        self._by, self._device, self._pace_of = by, device, pace_of
         self._take = False
         self._asked_at = self._answered_at = self._due_at = 0.0
         self._out: list[Message] = []
@@ -137,7 +140,7 @@ class ControlClient:
             self._answered_at = now
         if not mine and state.id and self._has_any():
             self._out = [self._message(CONTROL, want="release")]
-            self._due_at = max(self._due_at, now + APART_S)
+            self._due_at = max(self._due_at, now + APART * self._pace_of().control_s)
 
     def tick(self, now: float) -> list[Message]:
         """What to publish now."""
@@ -145,8 +148,10 @@ class ControlClient:
         if self.wanted and not self.held and (why := self._hopeless(now)):
             self._give_up(why)
         if self.wanted and now >= self._due_at:
-            self._due_at = now + EVERY_S
-            self._out.append(self._message(CONTROL_TAKE if self._take else CONTROL))
+            pace = self._pace_of()
+            self._due_at = now + pace.control_s
+            channel, at = CONTROL_TAKE if self._take else CONTROL, ms(now) if pace.stamped else UNSET
+            self._out.append(self._message(channel, for_ms=pace.control_for_ms, t=at))
             self._take = False
         out, self._out = self._out, []
         return out
@@ -179,12 +184,18 @@ class ControlClient:
 
     def _hopeless(self, now: float) -> str:
         """Why it is given up; empty: it is not."""
-        if now - self._answered_at > ANSWER_S:
+        if now - self._answered_at > self._pace_of().control_answer_s:
             return f"{self.robot.base.rpartition('/')[2]} does not answer"
         return f"{self.robot.who} drives on" if now - self._asked_at > ASKS_S else ""
 
-    def _message(self, channel: Channel, want: Literal["hold", "release"] = "hold") -> Message:
-        request = ControlRequest(id=self.id, want=want, by=self._by, device=self._device)
+    def _message(
+        self,
+        channel: Channel,
+        want: Literal["hold", "release"] = "hold",
+        for_ms: float = WIDE.control_for_ms,
+        t: int | UnsetType = UNSET,
+    ) -> Message:
+        request = ControlRequest(id=self.id, want=want, for_ms=for_ms, by=self._by, device=self._device, t=t)
         return Message(channel.topic(self.robot.base), codec.encode(channel, request), QoS(channel.default_qos))
 
 

@@ -15,6 +15,7 @@ FLEET = (
     c.STATUS,
     c.ESTOP_STATE,
     c.CONTROL_STATE,
+    c.LINK,
     c.CHARGING_STATUS,
     c.CHARGING_LEVEL,
     c.AUTONOMY_STATUS,

@@ -7,10 +7,11 @@ from pebble import contract as c
 from pebble.client.control import RobotControl
 from pebble.client.drive_reasons import SILENT_S, Situation
 from pebble.client.driveable import Driveable, driveable_of
+from pebble.client.pace_of_link import WIDE, Pace, link_of, pace_of
 from pebble.client.robot_topics import section_of
 from pebble.contract import codec
 from pebble.contract.identity import is_of_another
-from pebble.contract.payloads import AutonomyStatus, EstopState, Heartbeat, Orientation
+from pebble.contract.payloads import AutonomyStatus, EstopState, Heartbeat, LinkState, Orientation
 from pebble.errors import PayloadError
 from pebble.runtime.robot_estop import RobotEstop
 from pebble.transports import Message
@@ -77,6 +78,7 @@ class RobotView:
         self.remembered: dict[str, Message] = {}  # by topic: what an emergency stop that begins later needs to know
         self.capabilities: dict[str, Any] = {}
         self.driveable: Driveable | None = None  # as its status says
+        self.link: LinkState | None = None  # what the way to its broker carries; None: everything
         self.autonomy: AutonomyStatus | None = None
         self.volts: float | None = None
         self.charging: bool | None = None
@@ -100,6 +102,8 @@ class RobotView:
             self.receive_stop(channel, message, now)
         elif channel is c.CONTROL_STATE:
             self.control.receive(message)
+        elif channel is c.LINK:
+            self.link = link_of(message.payload)
         elif channel is c.STATUS:
             self.driveable = driveable_of(message.payload)
         elif channel in _TELEMETRY:
@@ -186,6 +190,11 @@ class RobotView:
     def named(self) -> bool:
         """Whether it takes commands only with the name of their sender in the topic."""
         return self.estop.named
+
+    @property
+    def pace(self) -> Pace:
+        """At what rate, and how, commands go to it. What it has reported of its link ends with it."""
+        return WIDE if self.liveness.reported_offline else pace_of(self.link)
 
     @property
     def drive_topic(self) -> str | None:

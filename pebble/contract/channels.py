@@ -53,7 +53,7 @@ class Channel(Struct, frozen=True, kw_only=True, dict=True):
     ``metric`` may hold ``{names}``, one level each. With ``remote=False`` it never leaves the robot. With
     ``bridged=False`` its own process is connected to the remote broker. With ``newest``, only the newest of several
     waiting messages is handled. A one-shot message that has waited for longer than ``waits_s``, in a process or at a
-    broker, is stale, unless it ends something.
+    broker, is stale, unless it ends something. A ``prompt`` one never waits for room on a thin link.
     """
 
     metric: str
@@ -65,6 +65,7 @@ class Channel(Struct, frozen=True, kw_only=True, dict=True):
     bridged: bool = True
     newest: bool = False
     waits_s: float = WAITS_S
+    prompt: bool = False
     qos: int = -1  # -1: that of the kind
     retain: bool | None = None  # None: that of the kind
     override: Override | None = None
@@ -185,10 +186,10 @@ HEARTBEAT = _c("heartbeat", Kind.STATE, p.Heartbeat, "Older name of the heartbea
 CAPABILITIES = _c("capabilities", Kind.STATE, p.Capabilities, "What the robot can do, and under which topics.",
                   override=_full("services.launcher.capabilities"))  # fmt: skip
 STATUS = _c("status", Kind.STATE, p.Status, "General state; robots list the state of their services.")
-ESTOP_STATE = _c("estop/{owner}", Kind.STATE, p.EstopState, "Whether a motor owner is stopped, and by whom.")
-CONTROL_STATE = _c(
-    "control/{owner}", Kind.STATE, p.ControlState, "Who has control of a motor owner, and who asks for it."
-)
+ESTOP_STATE = _c("estop/{owner}", Kind.STATE, p.EstopState, "Whether a motor owner is stopped, and by whom.",
+                 prompt=True)  # fmt: skip
+CONTROL_STATE = _c("control/{owner}", Kind.STATE, p.ControlState,
+                   "Who has control of a motor owner, and who asks for it.", prompt=True)  # fmt: skip
 LINK = _c("link", Kind.STATE, p.LinkState, "What the link to the remote broker carries; only where it may be thin.")
 AUDIT = _c("audit", Kind.STATE, p.AuditState, "The newest line of each chain of the audit, for others to note.")
 AUDIT_LINES = _c("audit-lines", Kind.EVENT, p.AuditLines, "Lines of the audit that were requested, as stored.")

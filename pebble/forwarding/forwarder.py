@@ -11,9 +11,10 @@ waited, in a process that was stopped or stuck, or at the broker; what only ends
 
 import itertools
 import logging
+import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 import msgspec
 
@@ -26,6 +27,7 @@ from pebble.forwarding.publisher import Publisher
 from pebble.forwarding.retained_topics import RetainedTopics
 from pebble.forwarding.routing import Drop, Forward, Rules, Side, route
 from pebble.forwarding.side import Gate, Sides, SideState
+from pebble.forwarding.sieve import Sieve, Waiting
 from pebble.forwarding.signatures import unsigned
 from pebble.forwarding.subjects import Subject, Subjects
 from pebble.runtime.rate_limit import RateLimitedLog
@@ -90,6 +92,9 @@ class Forwarder:
         self.retained = RetainedTopics(self.sides, subjects, self.publisher, winner, both_ways, on_value)
         self._quiet_log = RateLimitedLog(log, period_s=60.0)
         self._mirroring = self._mirror_refused = False
+        self._sieve: Sieve | None = None
+        self._sifting = threading.RLock()  # so that a message which has waited is not sent after a newer one
+        self._forward = self._pass
         for transport in transports.values():
             transport.judge_topics(is_stop=self._is_stop)
 
@@ -110,7 +115,10 @@ class Forwarder:
         found = Counter(bounds_reached(*(one.transport.counters for one in self.sides.values())))
         for one, side in itertools.product(_BOUNDS, Side):
             found[one.name.lower()] += self.counters[f"{side.value}: {one.value}"]
-        return {**found, "events": self.counters["events_dropped"]}
+        found["events"] = self.counters["events_dropped"]
+        if shed := self.counters["shed"]:
+            found["shed"] = shed
+        return dict(found)
 
     # -- connections
 
@@ -139,6 +147,48 @@ class Forwarder:
             self.sides[Side.REMOTE].restarted = True
             self.sides.gate = Gate.WAITING
 
+    # -- a thin link
+
+    def sift(self, sieve: Sieve | None) -> None:
+        """From now on what leaves the robot passes ``sieve``, whose owner calls :meth:`send_waiting`; None: no more."""
+        with self._sifting:
+            before, self._sieve = self._sieve, sieve
+            self._forward = self._pass if sieve is None else self._sift
+            if before is not None and before is not sieve:
+                self._send(before.empty())
+                self.sides[Side.REMOTE].events.resume()
+
+    def send_waiting(self) -> None:
+        """Send what waits in the sieve, as far as there is room."""
+        with self._sifting:
+            if self._sieve is not None:
+                if self._sieve.takes_events:
+                    self.sides[Side.REMOTE].events.resume()
+                self._send(self._sieve.due())
+
+    def _send(self, waiting: Iterable[Waiting]) -> None:
+        here = self.sides[Side.LOCAL]
+        for one in waiting:
+            if isinstance(self._pass(here, one.subject, one.message, one.forward), Forward):
+                here.count_forwarded()
+
+    def _sift(self, here: SideState, subject: Subject, message: Message, forward: Forward) -> Forward | Drop:
+        """Like :meth:`_pass`, where the link is thin."""
+        if here.side is not Side.LOCAL or subject.prompt:
+            return self._pass(here, subject, message, forward)
+        with self._sifting:
+            sieve = self._sieve
+            if sieve is None or self.sides.gate is not Gate.OPEN:
+                return self._pass(here, subject, message, forward)
+            if subject.kind is Kind.EVENT and message.qos is QoS.DELIVERED and not sieve.takes_events:
+                there = self.sides[Side.REMOTE]
+                self.publisher.note_return(there, subject, message)
+                there.events.hold(message)
+                return Drop.NO_ROOM
+            if sieve.keeps(subject, message, forward):
+                return Drop.NO_ROOM
+            return self._pass(here, subject, message, forward)
+
     # -- the receiving threads
 
     def skips_retained(self, side: Side, topic: bytes) -> bool:
@@ -162,7 +212,7 @@ class Forwarder:
             subject = self._subjects[message.topic]
             outcome = self._admit(here, subject, message, message.topic)
             if subject is not None and isinstance(outcome, Forward):
-                outcome = self._pass(here, subject, message, outcome)
+                outcome = self._forward(here, subject, message, outcome)
             routed = Routed(subject, outcome)
         if isinstance(routed.outcome, Drop):
             self.counters.add(f"{side.value}: {routed.outcome.value}")

@@ -45,6 +45,7 @@ class Drop(Enum):
     CIRCULATES = "comes back by another way"
     KNOWN = "the other side has this value"
     OVERRULED = "the other side's value counts"
+    NO_ROOM = "waits for room on a thin link"
     HELD = "waits for the other side's values"
     CLOSED = "nothing is forwarded now"
     LATE = "waited too long, here or at the broker"

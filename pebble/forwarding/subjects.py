@@ -51,6 +51,11 @@ class Subject:
         return once if self.kind.one_shot else inf
 
     @cached_property
+    def prompt(self) -> bool:
+        """Whether it never waits for room on a thin link."""
+        return self.channel is not None and self.channel.prompt
+
+    @cached_property
     def is_stop(self) -> bool:
         return self.channel is not None and self.channel.payload is EstopCommand
 

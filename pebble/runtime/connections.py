@@ -23,6 +23,8 @@ _ALL_VITAL = (*_VITAL_STATES, f"{_ANY}/{c.INCOMING}/#")
 
 LOCAL_RECONNECT_S, REMOTE_RECONNECT_S = 0.5, 2.0
 _BRIDGE = "remote-bridge"
+#: RFC 4594: what must not wait, and what may be dropped last of what can. Where a link may be thin.
+_EXPEDITED, _ASSURED = 46, 10
 
 
 def local_transport(config: Config, name: str, *, will: Message | None = None, as_published: bool = False) -> Transport:
@@ -82,6 +84,8 @@ def remote_transport(config: Config, name: str, *, will: Message | None = None) 
         remote, program = bridge.remote_mqtt, "" if name == _BRIDGE else name
         settings = mqtt_settings(remote, as_published=True, reconnect_max_s=REMOTE_RECONNECT_S, program=program)
         settings = replace_settings(settings, vital=(*_VITAL_STATES, *_renamed_vital(config)))
+        if bridge.link.profile != "wide":
+            settings = replace_settings(settings, dscp=_EXPEDITED if name == _BRIDGE else _ASSURED)
         return create("mqtt", _name(config, "mqtt", name), settings, will=will)
     kind = bridge.remote.kind
     return create(kind, _name(config, kind, name), _remote_settings(config, bridge.remote), will=will)

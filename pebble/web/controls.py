@@ -4,7 +4,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from pebble.client.control import ANSWER_S, ControlClient
+from pebble.client.control import ControlClient
+from pebble.client.pace_of_link import WIDE
 from pebble.client.robot_view import RobotView
 from pebble.contract.payloads import ControlState
 from pebble.transports import Message
@@ -56,7 +57,7 @@ class Controls:
         if wish is None:
             if sum(one.tab is tab for one in self._wishes) >= MOST_WISHES:
                 return f"This page has control of {MOST_WISHES} robots: release one"
-            client = ControlClient(robot.control, by=tab.user, device=tab.device)
+            client = ControlClient(robot.control, by=tab.user, device=tab.device, pace_of=lambda: robot.pace)
             wish = Wish(tab, robot.base, client, granted, failed)
             self._wishes.append(wish)
         wish.granted, wish.failed = granted, failed
@@ -151,5 +152,6 @@ class Controls:
             wish.ended_at = float("inf")
             return False
         wish.ended_at = min(wish.ended_at, now)
-        state = self.state(wish.ref)
-        return state is None or state.id != wish.client.id or now - wish.ended_at > ANSWER_S
+        state, robot = self.state(wish.ref), self._robot_of(wish.ref)
+        answer_s = (WIDE if robot is None else robot.pace).control_answer_s
+        return state is None or state.id != wish.client.id or now - wish.ended_at > answer_s

@@ -4,6 +4,7 @@ Motion belongs to a numbered gesture: from the moment the inputs leave neutral u
 a gesture ends it for good, so a key that is held down never moves anything again before it was released.
 """
 
+import secrets
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -11,17 +12,17 @@ from typing import NamedTuple
 import msgspec
 
 from pebble.client.control import IDLE_S, ControlClient
+from pebble.client.pace_of_link import WIDE, Pace
 from pebble.contract.payloads import Drive
+from pebble.transports import QoS
 from pebble.web.messages import DriveOp
 from pebble.web.page_clock import PageClock
 
-VALID_MS = 400  # of a command: twenty per second, so seven lost in a row do not stop the robot
 SILENCE_S = 0.25  # without a command of a gesture it is over
 REPEATS_S = (0.1, 0.2)  # after a zero of the server's own
 TAKEN_FROM_IDLE_S = 5.0  # a driver who has not moved for so long is not asked
 RESERVED_S = 5.0  # for a page that connects again
 ANNOUNCED_S = 3.0  # so long another server's announcement counts; they come every second
-MIN_STEP_S = 0.015  # between two commands of one gesture
 MAX_ANNOUNCED = 1000  # robots, by other servers
 
 LET_GO = "Let go first"
@@ -33,6 +34,7 @@ class Command(NamedTuple):
 
     ref: str
     drive: Drive
+    qos: QoS = WIDE.qos
 
 
 @dataclass(slots=True, eq=False)
@@ -99,10 +101,16 @@ class Driving:
         self.leases: dict[str, Lease] = {}
         self.changed: set[str] = set()
         self.held_elsewhere: Callable[[str], Elsewhere | None] = lambda _ref: None  # as robots tell it themselves
+        self.pace_of: Callable[[str], Pace] = lambda _ref: WIDE
+        self.renew_key()
         self._server = server
         self._announced: dict[str, Announced] = {}
         self._reserved: dict[str, tuple[str, Lease, float]] = {}  # by token: the robot, and until when
         self._repeats: dict[str, list[float]] = {}  # by robot: when to send a zero again
+
+    def renew_key(self) -> None:
+        """Robots without control compare ages per key: what was on its way takes another one from now on."""
+        self._key = secrets.token_hex(4)
 
     # -- leases
 
@@ -218,10 +226,12 @@ class Driving:
         if tab.live != op.g:
             self._begin(tab, lease, op)
         lease.received_at = now
-        if now - lease.sent_at < MIN_STEP_S:
+        pace = self.pace_of(op.ref)
+        if now - lease.sent_at < pace.step_s:
             return Outcome([])
         lease.sent_at, lease.moving = now, True
-        return Outcome([Command(op.ref, lease.signed(Drive(x=op.x, z=op.z, y=op.y, valid_ms=VALID_MS)))])
+        drive = lease.signed(Drive(x=op.x, z=op.z, y=op.y, valid_ms=pace.valid_ms))
+        return Outcome([Command(op.ref, pace.dated(drive, now, self._key), pace.qos)])
 
     def stop(self, ref: str, now: float) -> list[Command]:
         """A zero from anybody; the gesture that moves the robot is over."""

@@ -333,6 +333,8 @@ class Robots:
         component.robot.remembered.pop(message.topic, None)
         component.robot.receive_stop(None, message, now)
         component.robot.control.receive(message)
+        if metric == c.LINK.metric:
+            component.robot.link = None
 
     def _interpret(self, component: Component, metric: str, channel: c.Channel, message: Message, now: float) -> None:
         robot = component.robot
@@ -343,8 +345,8 @@ class Robots:
             if robot.receive_stop(channel, message, now):
                 component.update_rank(known=self._is_known(component.ref))
             robot.capabilities = robot.capabilities or before  # empty ones take nothing away
-        elif channel is c.CONTROL_STATE:
-            robot.control.receive(message)
+        elif channel in (c.CONTROL_STATE, c.LINK):
+            robot.receive(channel, message, now, 0.0)
         elif channel is c.MCU_DESCRIBE:
             component.aliases[metric] = _aliases(message.payload)
         elif channel is c.ONLINE or channel in SYNONYMS:

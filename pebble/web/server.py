@@ -14,6 +14,7 @@ from pebble.client.broker import Broker
 from pebble.client.drive_reasons import SCRIPT_ORDER, SERVER_ORDER, Code, Situation, first_reason
 from pebble.client.estop import send
 from pebble.client.named_topics import why_not
+from pebble.client.pace_of_link import WIDE
 from pebble.client.page_settings import WebSettings
 from pebble.client.robot_topics import FLEET, SYNONYMS
 from pebble.client.robot_view import RobotView
@@ -34,6 +35,7 @@ from pebble.web.controls import Controls
 from pebble.web.driven_here import DrivenHere
 from pebble.web.driving import Command, Driving, Tab
 from pebble.web.known_robots import SavedRobots
+from pebble.web.media.connection import MediaConnection
 from pebble.web.media.pictures import MediaHub
 from pebble.web.media.robot_streams import OwnHosts, origin
 from pebble.web.media.sound import SoundHub
@@ -60,17 +62,19 @@ class Server:
         self.settings, self.people, self.audit = settings, people, audit
         server = f"{settings.name}-{secrets.token_hex(2)}"
         self.broker = Broker(settings.broker)
+        self.media_connection = MediaConnection(Broker(settings.broker, "pebble-web-media"))
         self.robots, self.stops, self.driving = Robots(), Stops(), Driving(server)
         self.controls = Controls(self.driving, self._robot)
         self.driving.held_elsewhere = self.controls.elsewhere
+        self.driving.pace_of = lambda ref: WIDE if (robot := self._robot(ref)) is None else robot.pace
         self.saved = SavedRobots(people)
         known = self.robots.before = self.saved.robots
         self.own_hosts = OwnHosts(settings)
-        self.broker.is_named = self._is_named
+        self.broker.is_named = self.media_connection.broker.is_named = self._is_named
         self.broker.is_known = lambda topic: "/".join(topic.split("/", 3)[:3]) in known
         self.robots.streams.update(people.all(_STREAM_ADDRESS))
-        self.media = MediaHub(self.broker, self.robots)
-        self.sound = SoundHub(self.broker, self.robots, self._note_talk)
+        self.media = MediaHub(self.media_connection, self.robots)
+        self.sound = SoundHub(self.media_connection, self.robots, self._note_talk)
         self.open_components = OpenComponents(self.broker, self.robots, self.spawn)
         self.by_name = ByName(FLEET, lambda ref: ref in known or ref in self.open_components)
         self.robots.on_forget = self.by_name.forget
@@ -84,6 +88,7 @@ class Server:
         """Connect to the broker and subscribe. Raises TransportError for settings that can never work."""
         await self.broker.open()
         self.broker.on_state(self._show_broker)
+        self.broker.on_state(self.driving.renew_key)
         self._show_broker()
         for channel in (*FLEET, *SYNONYMS):
             deferred = channel is ONLINE or channel in SYNONYMS
@@ -105,7 +110,7 @@ class Server:
             await asyncio.gather(*self._tasks, return_exceptions=True)
         finally:
             await asyncio.gather(self.media.close(), self.sound.close())
-            await self.broker.close()
+            await asyncio.gather(self.media_connection.close(), self.broker.close())
 
     def spawn(self, work: Coroutine[Any, Any, None]) -> None:
         """Run it until it ends or the server does."""
@@ -153,9 +158,9 @@ class Server:
     def publish(self, commands: list[Command], by: str = "") -> bool:
         """Publish drive commands of a person, each to the robot's own topic; False if one was not accepted."""
         accepted = True
-        for ref, drive in commands:
+        for ref, drive, qos in commands:
             topic = self.robots.topic(ref, "drive", "topic", DRIVE)
-            accepted = self.broker.publish(topic, codec.encode(DRIVE, drive), by=by) and accepted
+            accepted = self.broker.publish(topic, codec.encode(DRIVE, drive), qos=qos, by=by) and accepted
         self._show_drivers()
         return accepted
 

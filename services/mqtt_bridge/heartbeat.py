@@ -24,13 +24,13 @@ class Heartbeat:
             self.topic, codec.encode(ONLINE, HeartbeatPayload(t=now_ms, online=False)), QoS.DELIVERED, retain=True
         )
 
-    def publish(self, transport: Transport, now_ms: int) -> None:
-        """Publish, if connected; a heartbeat is never sent later."""
+    def publish(self, transport: Transport, now_ms: int, qos: int | None = None) -> None:
+        """Publish, if connected; a heartbeat is never sent later. ``qos`` None: as configured."""
         if transport.state is not State.CONNECTED:
             return
         payload = codec.encode(ONLINE, HeartbeatPayload(t=now_ms))
         self._sent.append(payload)
-        transport.publish(self.topic, payload, qos=self._qos, retain=self._retain)
+        transport.publish(self.topic, payload, qos=self._qos if qos is None else QoS(qos), retain=self._retain)
 
     def is_ours(self, message: Message) -> bool:
         """Whether we have sent exactly this; that of another program may be equal by chance."""

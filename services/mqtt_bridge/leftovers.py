@@ -6,7 +6,7 @@ retained topics that nobody but the robot publishes.
 
 from collections.abc import Callable
 
-from pebble.contract import AUDIT, CHANNELS, MCU_DESCRIBE, MCU_VALUE, ONLINE, OUTGOING, Kind
+from pebble.contract import AUDIT, CHANNELS, MCU_DESCRIBE, MCU_VALUE, ONLINE, OUTGOING, Channel, Kind
 from pebble.forwarding.subjects import Subjects
 from pebble.transports import Message, Subscription, Transport
 
@@ -17,13 +17,14 @@ _NOT_HERE = (ONLINE, AUDIT, MCU_DESCRIBE)  # the bridge's own, and what MCU_VALU
 class Leftovers:
     """What robot and broker retain. Transports call :meth:`note_local` on their threads."""
 
-    def __init__(self, base: str, subjects: Subjects, remote: Transport) -> None:
+    def __init__(self, base: str, subjects: Subjects, remote: Transport, *own: Channel) -> None:
+        """``own`` are further ones that the bridge itself publishes on the remote side."""
         self._remote = remote
         self._here: set[str] | None = set()  # topics that the robot retains; None: it is over
         self._there: set[str] = set()
         self._subscriptions: list[Subscription] = []
         states = [one for one in CHANNELS if one.kind is Kind.STATE and one.direction == OUTGOING]
-        ours = [one for one in states if one not in _NOT_HERE and one.synonym_of is None]
+        ours = [one for one in states if one not in (*_NOT_HERE, *own) and one.synonym_of is None]
         named = subjects.topics(*(one for one in ours if not one.is_pattern))
         self._filters = [MCU_VALUE.filter(base), *(one.filter(base) for one in ours if one.is_pattern), *named]
         self._next = 0  # of the filters

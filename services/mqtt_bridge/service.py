@@ -4,7 +4,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from pebble.contract import AUDIT_READ, BRIDGE_PROBE, DRIVE, ONLINE, REMOTE_MIRROR, Channel, codec
+from pebble.contract import AUDIT_READ, BRIDGE_PROBE, DRIVE, LINK, ONLINE, REMOTE_MIRROR, Channel, codec
 from pebble.contract.payloads import AuditRead, MediaRequest
 from pebble.errors import PayloadError
 from pebble.forwarding.forwarder import Routed, barrier
@@ -27,6 +27,7 @@ from pebble.services.mqtt_bridge.media import MEDIA, Media, MediaRequests
 from pebble.services.mqtt_bridge.motor_owners import CHECK_S, MotorOwners
 from pebble.services.mqtt_bridge.private_topics import PrivateTopics
 from pebble.services.mqtt_bridge.same_broker import SameBrokerProbe, now_ms
+from pebble.services.mqtt_bridge.uplink import POLL_S, Uplink
 from pebble.transports import Message, State, Transport
 
 #: After the barrier, for brokers that pass messages between connections with a delay.
@@ -65,7 +66,11 @@ class MqttBridge(ForwardingService):
         self._owners = MotorOwners(self.config.base, owners, notifier)
         self._audit = Audit(self.config, self.remote, self.clock)
         self._private = PrivateTopics(self.config.base)
-        self._leftovers = Leftovers(self.config.base, self.subjects, self.remote)
+        self._uplink: Uplink | None = None
+        if section.link.profile != "wide":
+            self._uplink = Uplink(section, self.addresses[LINK], self.remote, self.forwarder, self.clock)
+        own = () if self._uplink is None else (LINK,)
+        self._leftovers = Leftovers(self.config.base, self.subjects, self.remote, *own)
         self._leftover_timer: Timer | None = None
         self.transport.judge_topics(is_invented=lambda topic: self.subjects.invented(topic.encode()) is not None)
         self.remote.judge_topics(skips_retained=partial(self.forwarder.skips_retained, Side.REMOTE), delivers_late=True)
@@ -101,13 +106,21 @@ class MqttBridge(ForwardingService):
         if self._heartbeat is not None:
             interval = self.config.services.mqtt_bridge.heartbeat.interval_seconds
             self.timers.add(self.clock(), self._publish_heartbeat, period=interval)
+        if self._uplink is not None:
+            self.timers.add(self.clock(), self._follow_link, period=POLL_S)
         self._look_later()
 
     # -- the service's thread
 
-    def _publish_heartbeat(self) -> None:
-        if self._heartbeat is not None:
-            self._heartbeat.publish(self.remote, now_ms())
+    def _publish_heartbeat(self, *, at_once: bool = False) -> None:
+        if self._heartbeat is None or not (at_once or self._uplink is None or self._uplink.heartbeat_due()):
+            return
+        self._heartbeat.publish(self.remote, now_ms(), None if self._uplink is None else self._uplink.heartbeat_qos)
+
+    def _follow_link(self) -> None:
+        """Learn what the link carries, and send what has waited for room."""
+        if self._uplink is not None and self._uplink.poll():
+            self._publish_heartbeat()
 
     def _look_later(self) -> None:
         """Wait (again) until all that the robot retains is known, and look for what only the remote side retains."""
@@ -123,7 +136,8 @@ class MqttBridge(ForwardingService):
             self._look_later()
             return
         asked = self._leftovers.ask_next()
-        wait, then = (ASK_S, self._look_for_leftovers) if asked else (INITIAL_SYNC_S, self._remove_leftovers)
+        pause = ASK_S if self._uplink is None else self._uplink.pause(ASK_S)
+        wait, then = (pause, self._look_for_leftovers) if asked else (INITIAL_SYNC_S, self._remove_leftovers)
         self._leftover_timer = self.call_at(self.clock() + wait, then)
 
     def _remove_leftovers(self) -> None:
@@ -137,7 +151,7 @@ class MqttBridge(ForwardingService):
 
     def connected(self, side: Side, epoch: int) -> None:
         if side is Side.REMOTE:
-            self._publish_heartbeat()
+            self._publish_heartbeat(at_once=True)
         else:
             barrier(self.transport, self._same_broker.topic)
             self.forwarder.subscribed(Side.LOCAL)

@@ -6,11 +6,13 @@ import random
 from collections.abc import Callable
 
 import pytest
+from msgspec import UNSET
 
-from pebble.client.control import ANSWER_S, ASKS_S, ControlClient, RobotControl
+from pebble.client.control import ASKS_S, ControlClient, RobotControl
+from pebble.client.pace_of_link import WIDE, pace_of
 from pebble.client.robot_view import RobotView
 from pebble.contract import CAPABILITIES, CONTROL, CONTROL_STATE, codec
-from pebble.contract.payloads import ControlRequest, ControlState
+from pebble.contract.payloads import ControlRequest, ControlState, LinkState
 from pebble.transports import Message
 from tests.client.control_robot import KeepingRobot
 from tests.client.estop_robot import capabilities
@@ -28,13 +30,14 @@ class World:
         self.now = 100.0
         self.sent: list[Message] = []
         self.clients: list[ControlClient] = []
+        self.pace = WIDE
         self.lost: Callable[[ControlClient], bool] = lambda _client: False  # whether its messages get lost
 
     def client(self, by: str = "ann") -> ControlClient:
         view = RobotView(GOOB)
         owners = [one.name for one in self.robot.owners]
         view.receive_stop(CAPABILITIES, capabilities(GOOB, {"estop": {"available": True, "owners": owners}}), self.now)
-        client = ControlClient(view.control, by=by, device="desk")
+        client = ControlClient(view.control, by=by, device="desk", pace_of=lambda: self.pace)
         self.clients.append(client)
         self.receive(self.robot.states())
         return client
@@ -86,6 +89,26 @@ def test_free_control_is_given_at_once_and_repeated_every_second() -> None:
     assert len({one.payload for one in world.sent}) == 1
     request: ControlRequest = codec.decode(CONTROL, world.sent[0].payload)
     assert (request.id, request.by, request.device, request.for_ms) == (ann.id, "ann", "desk", 3000)
+
+
+def test_over_a_thin_link_it_is_asked_for_more_rarely_and_longer() -> None:
+    world = World()
+    world.pace = pace_of(LinkState(level="thin", drive_hz=4, rtt_ms=600, queue_ms=0, t=1))
+    ann = world.holder()
+    world.wait(9.5)
+    ann.release()
+    world.wait(STEP_S)
+    asked: list[ControlRequest] = [codec.decode(CONTROL, one.payload) for one in world.sent]
+    assert [(one.want, one.for_ms, one.t) for one in asked] == [
+        *(("hold", 10_000, 1000 * seconds) for seconds in (100, 103, 106, 109)),
+        ("release", 3000, UNSET),
+    ]
+    world.lost = lambda _client: True
+    ann.ask(world.now)
+    world.wait(9.9)
+    assert ann.wanted
+    world.wait(0.2)
+    assert (ann.wanted, ann.failed) == (False, "goob does not answer")
 
 
 def test_what_is_given_back_is_free() -> None:
@@ -199,7 +222,7 @@ def test_a_robot_that_does_not_answer_is_not_asked_for_ever() -> None:
     ann = world.client()
     world.robot.owners[0].receives = False
     ann.ask(world.now)
-    world.wait(ANSWER_S + 1.1)
+    world.wait(WIDE.control_answer_s + 1.1)
     assert (ann.wanted, ann.failed) == (False, "goob does not answer")
 
 

@@ -5,13 +5,17 @@ from __future__ import annotations
 from itertools import count
 
 import pytest
+from msgspec import UNSET
 
-from pebble.contract.payloads import Drive
-from pebble.web.driving import LET_GO, VALID_MS, Command, Driving, Tab
+from pebble.client.pace_of_link import WIDE, pace_of
+from pebble.contract.levels import LEVELS
+from pebble.contract.payloads import Drive, LinkLevel, LinkState
+from pebble.transports import QoS
+from pebble.web.driving import LET_GO, Command, Driving, Tab
 from pebble.web.messages import DriveOp
 
 REF, OTHER = "pebble/robots/goob", "pebble/robots/fred"
-MOVE = Command(REF, Drive(z=0.5, valid_ms=VALID_MS))
+MOVE = Command(REF, Drive(z=0.5, valid_ms=WIDE.valid_ms))
 ZERO = Command(REF, Drive())
 FINAL = Command(REF, Drive(valid_ms=0))
 STEP_S = 0.05
@@ -125,6 +129,30 @@ def test_a_gesture_that_goes_on_is_not_silent_though_it_is_thinned_out(world: Wo
         world.receive(tab)
         assert world.drive(tab, 1) in ([], [MOVE])
     assert world.driving.tick(world.now) == []
+
+
+@pytest.mark.parametrize(("level", "qos"), [("wide", 1), ("narrow", 0), ("thin", 0)])
+def test_a_link_thins_out_what_moves_and_nothing_that_stops(world: World, level: LinkLevel, qos: int) -> None:
+    tab, wanted = world.holder(), LEVELS[level]
+    link = LinkState(level=level, drive_hz=wanted.drive_hz, rtt_ms=9, queue_ms=0, t=1)
+    world.driving.pace_of = lambda _ref: pace_of(link)
+    sent: list[Command] = []
+    times: list[object] = []
+    for _ in range(40):
+        commands = world.drive(tab, 1)
+        assert isinstance(commands, list)
+        sent += commands
+        times += [round(1000 * world.now) if wanted.stamped else UNSET for _ in commands]
+        world.now += STEP_S
+        world.receive(tab)
+    assert len(sent) == 2 * wanted.drive_hz
+    assert {(one.qos, one.drive.valid_ms) for one in sent} == {(qos, wanted.valid_ms)}
+    assert [one.drive.t for one in sent] == times
+    keys = {one.drive.key for one in sent}
+    assert (len(keys), UNSET in keys) == (1, not wanted.stamped)
+    assert world.zero(tab, 1) == [ZERO]
+    assert world.driving.stop(REF, world.now) == [FINAL]
+    assert ZERO.qos is FINAL.qos is QoS.DELIVERED
 
 
 @pytest.mark.parametrize("age", [0.61, 2.0])

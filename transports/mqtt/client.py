@@ -21,6 +21,7 @@ from pebble.transports.settings import MqttSettings
 SEND_BUFFER = 64 * 1024  # bytes in the kernel for a slow connection: with its default a stream would lag by minutes
 _PIECE = 64 * 1024  # bytes that are read at once
 _MOST_IDS = 65_535
+_NOTSENT_LOWAT = getattr(socket, "TCP_NOTSENT_LOWAT", None)  # not on Windows
 _NOT_NOW = (BlockingIOError, ssl.SSLWantReadError, ssl.SSLWantWriteError)
 
 
@@ -65,6 +66,22 @@ class SendQuota:
             self._left = min(self._left + 1, self._most)
 
 
+def keep_unsent(sock: socket.socket, size: int) -> None:
+    """Have the kernel accept about ``size`` bytes at most beyond those on their way, where it can; 0: its own bound."""
+    if _NOTSENT_LOWAT is not None:
+        with suppress(OSError):  # it may be closed already
+            sock.setsockopt(socket.IPPROTO_TCP, _NOTSENT_LOWAT, size)
+
+
+def _mark(sock: socket.socket, dscp: int) -> None:
+    """Mark our packets for routers that serve some of them first; where the system permits it."""
+    v6 = sock.family == socket.AF_INET6
+    with suppress(OSError):
+        sock.setsockopt(
+            socket.IPPROTO_IPV6 if v6 else socket.IPPROTO_IP, socket.IPV6_TCLASS if v6 else socket.IP_TOS, dscp << 2
+        )
+
+
 class Client:
     """`open` waits for TCP and TLS, everything else returns at once. ``listener`` is called by `read`."""
 
@@ -97,6 +114,8 @@ class Client:
         try:
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
+            if opening.settings.dscp:
+                _mark(sock, opening.settings.dscp)
             if opening.context is not None:
                 sock = opening.context.wrap_socket(sock, server_hostname=opening.settings.host)
             sock.setblocking(False)

@@ -14,15 +14,22 @@ from contextlib import suppress
 from typing import Protocol
 
 from pebble.transports import clock, hosts
-from pebble.transports.base import Message, Outgoing, QoS
+from pebble.transports.base import Answer, Message, Outgoing, QoS
 from pebble.transports.counters import Counters
 from pebble.transports.mqtt.bridge_mode import Result
 from pebble.transports.mqtt.broker_limits import EVERYTHING, Limits
-from pebble.transports.mqtt.client import Opening
+from pebble.transports.mqtt.client import Opening, keep_unsent
 from pebble.transports.mqtt.client_kinds import AnyClient, client_class
 from pebble.transports.mqtt.ending import Absent, Lost, Refused, Silent
 from pebble.transports.mqtt.incoming import OVERSLEPT_S, Incoming, Sink
-from pebble.transports.mqtt.outgoing import Backlog, InFlightTable, PendingAck, shortest_round_trip_s, unconfirmed_bytes
+from pebble.transports.mqtt.outgoing import (
+    Backlog,
+    InFlightTable,
+    PendingAck,
+    present_round_trip_s,
+    shortest_round_trip_s,
+    unconfirmed_bytes,
+)
 from pebble.transports.mqtt.packets import Filter
 from pebble.transports.mqtt.poll import SocketPoll
 from pebble.transports.mqtt.suspects import Written
@@ -32,6 +39,8 @@ UNACKED_RESERVE = 100  # except so many stops: the messages before them may be t
 _OVERHEAD = 1 + 4 + 2 + 2 + 1 + 5  # bytes of a PUBLISH besides topic and payload, at most: with an expiry
 _FRESH_S = 0.05  # what is in a socket that was empty so recently counts as having come just now
 _UNWRITTEN = 1 << 20  # bytes of DELIVERED messages that wait where the broker has no QoS 1; beyond it they are refused
+_UNSENT = 4 * 1024  # bytes in the kernel beyond those on their way, over a slow way
+_BY_SYSTEM = 0  # as the system has it
 _QUICKACK = getattr(socket, "TCP_QUICKACK", None)  # Linux only
 _ABORT = struct.pack("ii", 1, 0)  # SO_LINGER that makes close() drop what was not sent
 
@@ -77,6 +86,7 @@ class Connection:
             opening.settings, owner, counters, self._in_flight, where=where, as_published=as_published
         )
         self.pings = self.incoming.pings
+        self._keeps_little = False
         self._poll = SocketPoll()
         bridge = as_published and opening.settings.protocol != "5"
         self._client: AnyClient = client_class(opening.settings.client)(opening, self.incoming, bridge=bridge)
@@ -134,6 +144,14 @@ class Connection:
     def wake(self) -> None:
         """Make `pump` return; for other threads."""
         self._poll.wake()
+
+    def suit(self, *, little: bool, patient: bool) -> None:
+        """Suit the way to the broker: see `Transport.suit_link`."""
+        with self._lock:
+            sock = self._client.socket
+            if sock is not None and little is not self._keeps_little:
+                keep_unsent(sock, _UNSENT if little else _BY_SYSTEM)
+            self._keeps_little, self.pings.is_patient = little, patient
 
     # -- the network thread
 
@@ -347,9 +365,24 @@ class Connection:
             return Outgoing(waiting, round_trip_s, stalled_s)
 
     @property
+    def answer(self) -> Answer | None:
+        with self._lock:
+            sock = self._client.socket
+            if sock is None:
+                return None
+            number, seconds = self._in_flight.newest_answer(clock.since_boot())
+            shortest, present = shortest_round_trip_s(sock), present_round_trip_s(sock)
+            return Answer(number, seconds, max(0.0, present - shortest) if shortest else None) if number else None
+
+    @property
     def confirmed(self) -> Limits:
         """What this connection has shown the broker to have."""
         return Limits(self._in_flight.has_retained, int(self._in_flight.has_acknowledged))
+
+    def is_unconfirmed(self, topic: str) -> bool:
+        """Whether the broker may lack the newest retained message of ``topic``."""
+        with self._lock:
+            return self._in_flight.is_unconfirmed(topic)
 
     def unconfirmed_retained(self) -> list[Message]:
         """Retained messages that the broker may not have received, oldest first."""

@@ -101,6 +101,8 @@ class Incoming:
             if self._packets == before:
                 break
             unread, now = left, clock.since_boot()
+        if size and self.pings.is_patient:  # any sign of life: answers wait behind what others have published
+            self.answered_at = clock.since_boot()
         if age.has_retained or (size and self._packets == first):  # the latter is a piece of a long message
             age.note_arriving()
         if not self.more:

@@ -139,6 +139,7 @@ class InFlightTable:
         self._written: dict[str, tuple[float, int]] = {}
         self._accepted: dict[str, tuple[float, int]] = {}  # that an answered ping followed.
         self._ping_number = self._pong_number = 0
+        self._newest_s = 0.0  # how long the newest answer to a ping took
 
     # -- messages
 
@@ -237,7 +238,8 @@ class InFlightTable:
             return
         sent_at, ack, written = self._pings.popleft()
         self._pong_number += 1
-        self.measured(now - sent_at)
+        self._newest_s = now - sent_at
+        self.measured(self._newest_s)
         for topic, (at, size) in written.items():
             _note(self._accepted, topic, at, max(size, SMALL))
         for topic in [t for t, entry in self._unconfirmed.items() if entry.ping and entry.ping <= self._pong_number]:
@@ -253,6 +255,15 @@ class InFlightTable:
     def round_trip_s(self) -> float:
         """The shortest recent one: an answer that a stalled connection delayed gives the next stall no extra time."""
         return min(self._round_trips, default=0.0)
+
+    def newest_answer(self, now: float) -> tuple[int, float]:
+        """How many pings were answered, and how long the newest answer took; or the next one, if that is longer."""
+        waits = now - self._pings[0][0] if self._pings else 0.0
+        return self._pong_number, max(self._newest_s, waits)
+
+    def is_unconfirmed(self, topic: str) -> bool:
+        """Whether the broker may lack the newest retained message of ``topic``."""
+        return topic in self._unconfirmed
 
     def end(self) -> None:
         """Complete everything: no answer can come any more."""

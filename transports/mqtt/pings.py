@@ -11,6 +11,7 @@ from pebble.transports.settings import MqttSettings
 
 _CLEAR = 8 * 1024  # bytes ahead of a ping that do not delay it much
 _LEAST_S = 0.05  # between two pings, however short the allowed silence
+_PATIENT_S, _PATIENT_TRIPS, _PATIENT_INTERVAL_S = 5.0, 8, 1.0  # over a slow way: the limit, and between two pings
 _LEAST_SHARE = 0.75  # of the interval between pings: answers to regular ones could not be told apart
 
 
@@ -21,6 +22,8 @@ class Pings:
         self._in_flight, self._age = in_flight, age
         self._silence_s = max(settings.silence_s, 4 * _LEAST_S)
         self._interval_s = max(_LEAST_S, min(settings.silence_s, settings.keepalive_s or inf) / 4)  # keepalive 0: none
+        self._patient_interval_s = min(_PATIENT_INTERVAL_S, (settings.keepalive_s or inf) / 2)
+        self.is_patient = False
         self.due_at = inf  # once accepted they are sent regularly: other answers come only to what we publish
         self._stalled_since = (
             age.waiting.checked_at
@@ -36,7 +39,8 @@ class Pings:
         sock = client.socket
         ahead = client.unwritten + (0 if sock is None else unconfirmed_bytes(sock))
         now = clock.since_boot()
-        self.due_at = now + self._interval_s * random.uniform(_LEAST_SHARE, 1.0)  # noqa: S311  (no secret)
+        interval_s = self._patient_interval_s if self.is_patient else self._interval_s
+        self.due_at = now + interval_s * random.uniform(_LEAST_SHARE, 1.0)  # noqa: S311  (no secret)
         self._in_flight.ping(now, ack)
         self._age.delay.asked(now, clear=ahead <= _CLEAR)
         client.ping()
@@ -53,4 +57,6 @@ class Pings:
     @property
     def silence_limit_s(self) -> float:
         """After so long without an answer the broker is silent."""
+        if self.is_patient:
+            return max(self._silence_s, _PATIENT_S, _PATIENT_TRIPS * self._in_flight.round_trip_s)
         return max(self._silence_s, 4 * self._in_flight.round_trip_s)

@@ -1,5 +1,6 @@
 """Asks a broker once which of our own retained messages it has: nothing else shows what it silently drops."""
 
+from collections import deque
 from collections.abc import Callable, Collection
 from math import inf
 
@@ -10,6 +11,7 @@ from pebble.transports.mqtt.outgoing import PendingAck
 AFTER_S = 2.0  # from the first connection to the question
 LATE_S = 1.0  # without another message, after which none comes any more
 TOPICS = 200  # at most are asked for
+_VALUES = 16  # of a topic, of which each may be the broker's newest
 
 
 class RetentionCheck:
@@ -47,6 +49,36 @@ class RetentionCheck:
             self._newest_at = min(self._newest_at, now)
         left = [topic for topic in self.topics if topic not in self._found]
         return None if left and now - self._newest_at < LATE_S else left
+
+
+class KeptProof:
+    """Shows by one retained topic which others a broker has kept: its values differ, and only we publish there.
+
+    A broker that has one of the values that may be its newest has all that was sent before it.
+    """
+
+    def __init__(self, topic: str) -> None:
+        self.topic = topic
+        self._values: deque[tuple[bytes, set[str]]] = deque(maxlen=_VALUES)  # and the topics that were sent after each
+
+    def sent(self, message: Message, *, confirmed: bool) -> None:
+        """A retained message is sent. ``confirmed``: the broker has the newest value of the topic before."""
+        if message.topic != self.topic:
+            for _, later in self._values:
+                later.add(message.topic)
+            return
+        while len(self._values) > 1 and confirmed:
+            self._values.popleft()
+        self._values.append((message.payload, set()))
+
+    @property
+    def unproved(self) -> set[str]:
+        """Topics that have to be asked for beside this one."""
+        return set().union(*(later for _, later in self._values))
+
+    def proves(self, found: bytes) -> bool:
+        """Whether a broker that has ``found`` has all that was sent, but for what is `unproved`."""
+        return any(value == found for value, _ in self._values)
 
 
 class RetentionChecks:

@@ -11,7 +11,7 @@ from math import ceil
 
 from pebble.errors import TransportError
 from pebble.transports import clock
-from pebble.transports.base import Message, Outgoing, QoS, State, Subscription, Transport
+from pebble.transports.base import Answer, Message, Outgoing, QoS, State, Subscription, Transport
 from pebble.transports.mqtt.client_kinds import client_class
 from pebble.transports.mqtt.connection import Connection, ignore
 from pebble.transports.mqtt.dialler import Dialler
@@ -19,7 +19,7 @@ from pebble.transports.mqtt.ending import Lost, Silent
 from pebble.transports.mqtt.filters import BrokerFilters, OwnMessageFilter, overlap
 from pebble.transports.mqtt.outgoing import PendingAck
 from pebble.transports.mqtt.refused_topics import RefusedTopics
-from pebble.transports.mqtt.retention import RetentionChecks
+from pebble.transports.mqtt.retention import KeptProof, RetentionChecks
 from pebble.transports.mqtt.suspects import is_large, named
 from pebble.transports.settings import MqttSettings
 
@@ -62,6 +62,7 @@ class MqttTransport(Transport):
         self._thread: threading.Thread | None = None
         self._refused = RefusedTopics(client_id, settings.vital)
         self._retention = RetentionChecks()
+        self._kept: KeptProof | None = None
         self._logged = ("", 0.0)  # the newest problem in the log, and when it went there
 
     @property
@@ -78,10 +79,22 @@ class MqttTransport(Transport):
         connection = self._connection
         return Outgoing() if connection is None else connection.outgoing
 
+    @property
+    def answer(self) -> Answer | None:
+        connection = self._connection
+        return None if connection is None else connection.answer
+
+    def suit_link(self, *, little: bool, patient: bool) -> None:
+        super().suit_link(little=little, patient=patient)
+        attempt = self._dialler.attempt
+        if attempt is not None:
+            attempt.suit(little=little, patient=patient)
+
     # -- the interface to base
 
     def _open(self, timeout: float) -> None:  # noqa: ARG002  (base waits)
         self._dialler.open()
+        self._kept = KeptProof(self.proof) if self.proof else None
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join(_ANSWER_S)  # closed while it was dialling
         self._stopping = stopping = _Stop()
@@ -119,6 +132,8 @@ class MqttTransport(Transport):
         expires_s = ceil(self.settings.silence_s) if urgent and not message.retain else None
         if message.retain:
             self._own_message_filter.note_own(message)
+            if self._kept is not None:
+                self._kept.sent(message, confirmed=not connection.is_unconfirmed(self._kept.topic))
         accepted = connection.publish(message, expires_s=expires_s)
         if tried and not accepted:
             self._refused.suspects.give_up()
@@ -206,6 +221,7 @@ class MqttTransport(Transport):
         """Run one connection from its start to its end; raises Lost unless it ends by `close`."""
         self._dialler.begin()
         connection = self._dialler.connect(self, self.counters, stopping)
+        connection.suit(little=self.keeps_little, patient=self.is_patient)
         try:
             if self.settings.as_published:
                 as_published = connection.incoming.as_published
@@ -312,7 +328,8 @@ class MqttTransport(Transport):
             self._refused.suspects.connected(now)
             connection.pings.doubtful |= self._refused.suspects.doubtful
         self._initial_sync(known)
-        self._retention.begin(self._dialler.address, now)
+        if not self.is_patient:  # it costs as much as a beginning
+            self._retention.begin(self._dialler.address, now)
 
     def _let_catch_up(self, connection: Connection, stopping: _Stop) -> None:
         """Wait before subscribing: a broker that was suspended first forwards old messages of others."""
@@ -332,22 +349,43 @@ class MqttTransport(Transport):
             unsure = self._own.shared | {
                 topic for topic, message in own.items() if not self._accepts(connection, message)
             }
-        topics = list(own)
-        if not topics:
-            return set()
-        connection.subscribe([(topic, False) for topic in topics], QoS.LATEST)
-        found: dict[str, bytes] = {}
-
-        def note(messages: list[Message]) -> None:
-            found.update((one.topic, one.payload) for one in messages if one.retain and one.topic in own)
-
-        self._await(connection, connection.ping(), stopping, note)
-        connection.unsubscribe(topics)
+        found, proved = self._find_few(connection, own, stopping) if self.is_patient else ({}, None)
+        if proved is None:
+            found = self._find(connection, list(own), stopping)
         if self.will is not None and found.get(self.will.topic) == self.will.payload:
             del found[self.will.topic]  # our own will, published although we were running
         older = {topic for topic, payload in found.items() if topic not in unsure and payload != own[topic].payload}
         self.went_back = bool(older)
-        return found.keys() - older
+        return (found.keys() - older) | (proved or set())
+
+    def _find_few(
+        self, connection: Connection, own: Mapping[str, Message], stopping: _Stop
+    ) -> tuple[dict[str, bytes], set[str] | None]:
+        """What the broker has of few topics, and of which others that proves that it has them; None: of none."""
+        kept = self._kept
+        if kept is None:
+            return {}, None
+        asked = {topic for topic in kept.unproved if topic in own} | {kept.topic}
+        found = self._find(connection, sorted(asked), stopping)
+        value = found.pop(kept.topic, b"")
+        if not kept.proves(value):
+            return {}, None
+        proved = own.keys() - asked - ({self.will.topic} if self.will is not None else set())
+        return found, proved | {topic for topic in own if topic == kept.topic and own[topic].payload == value}
+
+    def _find(self, connection: Connection, topics: list[str], stopping: _Stop) -> dict[str, bytes]:
+        """What the broker has retained on these topics."""
+        found: dict[str, bytes] = {}
+        if not topics:
+            return found
+        connection.subscribe([(topic, False) for topic in topics], QoS.LATEST)
+
+        def note(messages: list[Message]) -> None:
+            found.update((one.topic, one.payload) for one in messages if one.retain and one.topic in topics)
+
+        self._await(connection, connection.ping(), stopping, note)
+        connection.unsubscribe(topics)
+        return found
 
     def _accepts(self, connection: Connection, message: Message) -> bool:
         """Whether the broker has, as far as is known, accepted this retained message."""
@@ -360,7 +398,10 @@ class MqttTransport(Transport):
         while not ack.done:
             if stopping.is_set():
                 raise Lost("closed")
-            left = max(asked_at, connection.incoming.age.arriving_at) + _ANSWER_S - clock.since_boot()
+            since, answer_s = max(asked_at, connection.incoming.age.arriving_at), _ANSWER_S
+            if connection.pings.is_patient:
+                since, answer_s = max(since, connection.incoming.answered_at), connection.pings.silence_limit_s
+            left = since + answer_s - clock.since_boot()
             if left < 0:
                 raise Silent(f"{connection.where} does not answer")
             connection.pump(left, receive)

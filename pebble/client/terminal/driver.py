@@ -3,6 +3,7 @@
 The rules are those of the operator page: a reason against driving ends the gesture, and the keys must be released.
 """
 
+import secrets
 from collections.abc import Sequence
 
 import msgspec
@@ -12,6 +13,7 @@ from pebble.client.drive_reasons import SLOW_S, SLOW_SPEED, Code, Situation, fir
 from pebble.client.driver_lease import FILTER, LISTEN_S, DriverLease
 from pebble.client.estop import Progress, StopSender, new_name
 from pebble.client.names import id_of
+from pebble.client.pace_of_link import WIDE, Pace
 from pebble.client.robot_view import RobotView
 from pebble.client.terminal.key_decoder import ESCAPE, SPACE
 from pebble.client.terminal.key_gesture import AXES, KeyGesture
@@ -22,19 +24,20 @@ from pebble.contract import (
     CONTROL_STATE,
     DRIVE,
     ESTOP_STATE,
+    LINK,
     ONLINE,
     channel_of,
     codec,
 )
 from pebble.contract.payloads import Drive
-from pebble.transports import Message, QoS
+from pebble.transports import Message
 
 TWICE_S = 0.6  # between two presses of Escape
 _WANTS_S = 1.0  # after a key that drives
 
 TAKE, TAKE_OVER, LET, KEEP = "t", "o", "l", "k"  # keys
 
-_RECEIVED = (ESTOP_STATE, CONTROL_STATE, CAPABILITIES, ONLINE, CHARGING_LEVEL, AUTONOMY_STATUS)
+_RECEIVED = (ESTOP_STATE, CONTROL_STATE, CAPABILITIES, ONLINE, LINK, CHARGING_LEVEL, AUTONOMY_STATUS)
 _WORDS = {
     Code.UNSEEN: "waiting for {name}",
     Code.STOPPING: "emergency stop",
@@ -65,7 +68,9 @@ class TerminalDriver:
     ) -> None:
         self.robot = RobotView(base)
         self.gesture, self.lease = gesture, lease
-        self.control = ControlClient(self.robot.control, by=by.partition("@")[0], device=lease.device)
+        self.control = ControlClient(
+            self.robot.control, by=by.partition("@")[0], device=lease.device, pace_of=lambda: self._pace
+        )
         self.stopping: StopSender | None = None  # the newest emergency stop from here
         self._by, self._take_over, self._heartbeat = by, take_over, heartbeat
         self._began = self._used_at = now
@@ -74,6 +79,7 @@ class TerminalDriver:
         self._escape_at = float("-inf")
         self._reason = "connecting"
         self._connected = False
+        self._key = ""  # where the robot has given none; another one with each connection
         self._out: list[Message] = []
 
     @property
@@ -92,11 +98,11 @@ class TerminalDriver:
         self.lease.receive(message, now)
         if held and not self.lease.held:  # of a robot that does not keep control itself
             self._take_over = False  # a newer driver is asked for, not fought
-            self._drive(self.gesture.interrupt(now, repeat=False))
+            self._drive(self.gesture.interrupt(now, repeat=False), now)
         if message.topic.startswith(f"{self.robot.base}/"):
             channel = channel_of(message.topic[len(self.robot.base) + 1 :])
             self.robot.receive(channel, message, now, wall)
-            if channel is not CONTROL_STATE:
+            if channel not in (CONTROL_STATE, LINK):
                 self.robot.remember(message)
             self._check_control(now)
         if self.stopping is not None:
@@ -110,7 +116,7 @@ class TerminalDriver:
             if key == "!" or twice:
                 self._estop(now)
             elif key == SPACE:
-                self._drive(self.gesture.stop(now))
+                self._drive(self.gesture.stop(now), now)
             elif self.robot.controlled:
                 self._press_control(key, now)
         if not AXES.keys().isdisjoint(keys):
@@ -126,12 +132,13 @@ class TerminalDriver:
         """
         if not problem and not self._connected:
             self.lease.reconnected()
+            self._key = secrets.token_hex(4)
         self._connected = not problem
         situation = self._situation(now, problem, late_s)
         against = first_reason(situation)
         self._reason = self._words(against, situation, now)
         limit = SLOW_SPEED if (self.lease.round_trip_s or 0.0) >= SLOW_S else 1.0
-        self._drive(self.gesture.update(against is None, now, limit=limit))
+        self._drive(self.gesture.update(against is None, now, limit=limit, step_s=self._pace.step_s), now)
         if self.robot.controlled:
             self._tick_control(now, int(1000 * wall), problem)
         elif self.gesture.active:
@@ -151,7 +158,7 @@ class TerminalDriver:
 
     def leave(self, now: float, wall: float) -> list[Message]:
         """The terminal is gone, or the driver leaves: stop, and give the lease back. Then :meth:`tick` twice more."""
-        self._drive(self.gesture.interrupt(now))
+        self._drive(self.gesture.interrupt(now), now)
         self._wants_until, self._decided = now, ""  # the zero is repeated all the same
         self.control.release()
         self._out += self.control.tick(now)
@@ -162,7 +169,7 @@ class TerminalDriver:
 
     def suspend(self, now: float) -> list[Message]:
         """This process is about to stand still. Then :meth:`tick` twice more."""
-        self._drive(self.gesture.interrupt(now))
+        self._drive(self.gesture.interrupt(now), now)
         out, self._out = self._out, []
         return out
 
@@ -212,6 +219,10 @@ class TerminalDriver:
         return "" if latency is None else f"heartbeat {1000 * latency:.0f} ms old"
 
     # -- inside
+
+    @property
+    def _pace(self) -> Pace:
+        return self.robot.pace if self._heartbeat else WIDE  # within the robot there is no link
 
     def _situation(self, now: float, problem: str, late_s: float) -> Situation:
         """What speaks for and against driving now."""
@@ -278,7 +289,7 @@ class TerminalDriver:
         elif key == KEEP:
             self.control.keep()
         elif key == LET and self.control.asked_by:
-            self._drive(self.gesture.interrupt(now, repeat=False))
+            self._drive(self.gesture.interrupt(now, repeat=False), now)
             self.control.release()
 
     def _tick_control(self, now: float, epoch_ms: int, problem: str) -> None:
@@ -308,7 +319,7 @@ class TerminalDriver:
         self.control.update(now)
         if self.control.decided != self._decided:
             self._decided, self._wants_until = self.control.decided, now
-            self._drive(self.gesture.interrupt(now, repeat=False))
+            self._drive(self.gesture.interrupt(now, repeat=False), now)
 
     def _estop(self, now: float) -> None:
         if self.stopping is None or self.stopping.finished:
@@ -316,13 +327,16 @@ class TerminalDriver:
             for message in self.robot.remembered.values():
                 self.stopping.receive(message, now)
             self._out += self.stopping.tick(now)
-        self._drive(self.gesture.stop(now))
+        self._drive(self.gesture.stop(now), now)
 
-    def _drive(self, commands: Sequence[Drive]) -> None:
-        self._out += map(self._message, commands)
+    def _drive(self, commands: Sequence[Drive], now: float) -> None:
+        self._out += [self._message(command, now) for command in commands]
 
-    def _message(self, command: Drive) -> Message:
-        key = self.control.key
+    def _message(self, command: Drive, now: float) -> Message:
+        key, qos = self.control.key, WIDE.qos
         if key and command.valid_ms != 0:  # a final zero is no letting go
             command = msgspec.structs.replace(command, key=key)
-        return Message(self.robot.estop.drive_topic, codec.encode(DRIVE, command), QoS(DRIVE.default_qos))
+        if command.moves:
+            qos = self._pace.qos
+            command = self._pace.dated(msgspec.structs.replace(command, valid_ms=self._pace.valid_ms), now, self._key)
+        return Message(self.robot.estop.drive_topic, codec.encode(DRIVE, command), qos)

@@ -7,11 +7,11 @@ arrived for 0.4 s.
 
 from collections.abc import Sequence
 
+from pebble.client.pace_of_link import WIDE
 from pebble.client.terminal.key_decoder import DOWN, LEFT, RIGHT, UP
 from pebble.contract.payloads import Drive
 
 PERIOD_S = 0.05  # between two commands
-VALID_MS = 400  # of a command: seven lost in a row do not stop the robot
 HELD_S = 0.4  # after its last repetition
 STALL_S = 0.25  # a process that stood still for longer does not go on as if nothing had happened
 BURST = 8  # as many keys at once were held back on the way, and are old
@@ -55,8 +55,11 @@ class KeyGesture:
             self._key_at = now
         self._burst = self._burst or len(moving) >= BURST
 
-    def update(self, allowed: bool, now: float, *, limit: float = 1.0) -> list[Drive]:
-        """What to publish now. ``allowed``: whether anything may be moved; ``limit`` reduces the speed."""
+    def update(self, allowed: bool, now: float, *, limit: float = 1.0, step_s: float = 0.0) -> list[Drive]:
+        """What to publish now. ``allowed``: whether anything may be moved; ``limit`` reduces the speed.
+
+        ``step_s``: at least, between two commands that move something.
+        """
         stalled, self._updated_at = now - self._updated_at > STALL_S, now
         if stalled or self._burst:
             self._burst = False
@@ -72,7 +75,7 @@ class KeyGesture:
             return self._end(ZERO, now)
         if wanted.moves and not self.must_release:
             if allowed:
-                return self._step(wanted, now)
+                return self._step(wanted, now, step_s)
             self.must_release = True
         return self._repeat(now)
 
@@ -104,9 +107,9 @@ class KeyGesture:
         speed = min(self._speed, limit)
         return mixed(x * min(self._turn, limit), z * speed, y * speed)
 
-    def _step(self, wanted: Drive, now: float) -> list[Drive]:
+    def _step(self, wanted: Drive, now: float, step_s: float) -> list[Drive]:
         changed = (wanted.x, wanted.z, wanted.y) != (self.last.x, self.last.z, self.last.y)
-        if self.active and now - self._sent_at < (_STEP_S if changed else PERIOD_S * 0.8):
+        if self.active and now - self._sent_at < max(step_s, _STEP_S if changed else PERIOD_S * 0.8):
             return []
         self.active, self._repeats = True, []
         self.last, self._sent_at = wanted, now
@@ -131,4 +134,4 @@ def mixed(x: float, z: float, y: float) -> Drive:
     most = max(1.0, abs(left), abs(right))
     axes = ((left - right) / 2 / most, (left + right) / 2 / most, y)
     x, z, y = (round(axis, 3) + 0.0 for axis in axes)
-    return Drive(x=x, z=z, y=y, valid_ms=VALID_MS)
+    return Drive(x=x, z=z, y=y, valid_ms=WIDE.valid_ms)

@@ -6,12 +6,12 @@ import time
 from collections.abc import Callable
 from typing import Final
 
-from pebble.client.broker import Broker
 from pebble.client.media_request.encoding_choice import BEST_FIRST, EncodingChoice
 from pebble.client.media_request.offer import offered
 from pebble.client.media_request.queue import NO_FRAME, Frame, ViewerQueue, assess
 from pebble.media.picture_header import PictureHeader, PictureSequence
 from pebble.web.media import rescue
+from pebble.web.media.connection import MediaConnection
 from pebble.web.media.rescue import FULL, SMALL, Form, RescuedPicture, RescueStream
 from pebble.web.media.stream import MediaStream
 from pebble.web.messages import PictureView
@@ -37,8 +37,8 @@ class PageViewer:
 class PictureStream(MediaStream[PageViewer, PictureView]):
     """Gives the pictures of one robot to each viewer's queue."""
 
-    def __init__(self, broker: Broker, robots: Robots, ref: str, pinned: str, show: Show) -> None:
-        super().__init__(broker, robots, ref, "video", show, rest(pinned))
+    def __init__(self, connection: MediaConnection, robots: Robots, ref: str, pinned: str, show: Show) -> None:
+        super().__init__(connection, robots, ref, "video", show, rest(pinned))
         self.choice = EncodingChoice()
         self.choice.pinned = pinned
         self._rescue = RescueStream(self._on_rescued)

@@ -8,9 +8,9 @@ from weakref import WeakKeyDictionary
 
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from pebble.client.broker import Broker
 from pebble.client.media_request.encoding_choice import BEST_FIRST
 from pebble.contract import CAMERA
+from pebble.web.media.connection import MediaConnection
 from pebble.web.media.picture_stream import PageViewer, PictureStream, rest
 from pebble.web.media.rescue import RescuedPicture, newest_jpeg
 from pebble.web.media.stream import Streams
@@ -25,9 +25,9 @@ _SNAPSHOT_S: Final = 0.5  # a snapshot this recent is used again
 class MediaHub:
     """All streams of pictures. Only the event loop calls it."""
 
-    def __init__(self, broker: Broker, robots: Robots) -> None:
-        self._broker, self._robots = broker, robots
-        self._streams = Streams(CAMERA, self._make)
+    def __init__(self, connection: MediaConnection, robots: Robots) -> None:
+        self._connection, self._robots = connection, robots
+        self._streams = Streams(CAMERA, connection, self._make)
         self._snapshots: WeakKeyDictionary[PictureStream, _Snapshot] = WeakKeyDictionary()
         self._pinned: dict[str, str] = {}
 
@@ -66,7 +66,7 @@ class MediaHub:
         await self._streams.close()
 
     def _make(self, ref: str) -> PictureStream:
-        return PictureStream(self._broker, self._robots, ref, self._pinned.get(ref, ""), self._show)
+        return PictureStream(self._connection, self._robots, ref, self._pinned.get(ref, ""), self._show)
 
     def _show(self, ref: str, view: PictureView) -> None:
         if self._robots.capabilities(ref):

@@ -10,13 +10,13 @@ from typing import Final
 import msgspec
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from pebble.client.broker import Broker
 from pebble.client.media_request.offer import offered, refusal
 from pebble.contract import AUDIO, AUDIO_STREAM
 from pebble.contract.packets import Codec, Sound
 from pebble.errors import PayloadError
 from pebble.fleet.roles import Session, page_rights
 from pebble.transports import QoS
+from pebble.web.media.connection import MediaConnection
 from pebble.web.media.stream import MediaStream, Streams
 from pebble.web.media.talk import PIECE_BYTES, SILENT_S, Talk, Voice
 from pebble.web.messages import SoundView, TalkAnswer
@@ -87,9 +87,14 @@ class SoundStream(MediaStream[SoundPage, SoundView]):
     """Gives the sound of one robot to each listener's queue, and one talker's voice to the robot."""
 
     def __init__(
-        self, broker: Broker, robots: Robots, ref: str, show: Callable[[str, SoundView], None], note: NoteTalk
+        self,
+        connection: MediaConnection,
+        robots: Robots,
+        ref: str,
+        show: Callable[[str, SoundView], None],
+        note: NoteTalk,
     ) -> None:
-        super().__init__(broker, robots, ref, "audio", show, rest())
+        super().__init__(connection, robots, ref, "audio", show, rest())
         self._voice = Voice()
         self._note_talk = note
         self._talk: Talk | None = None
@@ -210,9 +215,9 @@ class SoundStream(MediaStream[SoundPage, SoundView]):
 class SoundHub:
     """All streams of sound. Only the event loop calls it."""
 
-    def __init__(self, broker: Broker, robots: Robots, note: NoteTalk) -> None:
+    def __init__(self, connection: MediaConnection, robots: Robots, note: NoteTalk) -> None:
         self._robots = robots
-        self._streams = Streams(AUDIO, lambda ref: SoundStream(broker, robots, ref, self._show, note))
+        self._streams = Streams(AUDIO, connection, lambda ref: SoundStream(connection, robots, ref, self._show, note))
 
     async def serve(
         self, websocket: WebSocket, ref: str, can: frozenset[str], session: Session, device: str = "", address: str = ""

@@ -10,13 +10,13 @@ from typing import Any, Final, Generic, TypeVar
 
 from starlette.websockets import WebSocket
 
-from pebble.client.broker import Broker
 from pebble.client.media_request.request import TICK_S, MediaRequest
 from pebble.client.robot_topics import own_topic
 from pebble.client.viewer import Medium
 from pebble.contract import Channel
 from pebble.contract.identity import Direction
 from pebble.media.rate_meter import RateMeter
+from pebble.web.media.connection import MediaConnection
 from pebble.web.robots import Robots
 
 log = logging.getLogger(__name__)
@@ -63,7 +63,13 @@ class MediaStream(ABC, Generic[ViewerT, ViewT]):
     """
 
     def __init__(
-        self, broker: Broker, robots: Robots, ref: str, medium: Medium, show: Callable[[str, ViewT], None], view: ViewT
+        self,
+        connection: MediaConnection,
+        robots: Robots,
+        ref: str,
+        medium: Medium,
+        show: Callable[[str, ViewT], None],
+        view: ViewT,
     ) -> None:
         """``show`` tells pages of the robot's view; ``view`` is that of one at rest, which is shown already."""
         self.ref = ref
@@ -71,8 +77,8 @@ class MediaStream(ABC, Generic[ViewerT, ViewT]):
         self.refused = 0  # payloads that are nothing of this medium, or too large
         self.view = view  # as shown last
         self._shown_at = float("-inf")
-        self._broker, self._robots, self._show = broker, robots, show
-        self._request = MediaRequest(broker, ref, medium, self.receive)
+        self._connection, self._broker, self._robots, self._show = connection, connection.broker, robots, show
+        self._request = MediaRequest(self._broker, ref, medium, self.receive)
         self._arrivals = Arrivals()
         self.task = asyncio.create_task(self._run())
 
@@ -111,7 +117,8 @@ class MediaStream(ABC, Generic[ViewerT, ViewT]):
 
     async def _run(self) -> None:
         try:
-            await self._request.run(self._step)
+            async with self._connection.used():
+                await self._request.run(self._step)
         finally:
             self._end()
 
@@ -146,7 +153,8 @@ class MediaStream(ABC, Generic[ViewerT, ViewT]):
         if self._arrivals.flowing(now):
             return "flowing", self._problem()
         if not self._broker.connected:
-            return "silent", f"the server cannot reach the broker: {self._broker.problem}"
+            what = _WHAT[self._request.medium]
+            return "silent", f"no connection to the broker for the {what}: {self._broker.problem}"
         quiet_s = self._arrivals.quiet_s(now)
         if quiet_s is None:
             return "starting", ""
@@ -163,8 +171,8 @@ StreamT = TypeVar("StreamT", bound=MediaStream[Any, Any])
 class Streams(Generic[StreamT]):
     """The streams of one medium, by robot; one that has ended is forgotten."""
 
-    def __init__(self, channel: Channel, make: Callable[[str], StreamT]) -> None:
-        self._channel, self._make = channel, make
+    def __init__(self, channel: Channel, connection: MediaConnection, make: Callable[[str], StreamT]) -> None:
+        self._channel, self._connection, self._make = channel, connection, make
         self._closed = False
         self._streams: dict[str, StreamT] = {}
 
@@ -179,16 +187,17 @@ class Streams(Generic[StreamT]):
         if self._closed or not own_topic(ref, self._channel.topic(ref), Direction.OUTGOING):
             await websocket.close(_BAD_REQUEST, "no such component")
             return
-        stream = self._open(ref)
-        stream.join(viewer)
-        tasks = {asyncio.create_task(one(stream)) for one in work}
-        try:
-            await asyncio.wait({*tasks, stream.task}, return_when=asyncio.FIRST_COMPLETED)
-        finally:
-            stream.leave(viewer)
-            await _end(tasks)
-            with contextlib.suppress(RuntimeError):  # it is closed already
-                await websocket.close(_GONE)
+        async with self._connection.used():
+            stream = self._open(ref)
+            stream.join(viewer)
+            tasks = {asyncio.create_task(one(stream)) for one in work}
+            try:
+                await asyncio.wait({*tasks, stream.task}, return_when=asyncio.FIRST_COMPLETED)
+            finally:
+                stream.leave(viewer)
+                await _end(tasks)
+                with contextlib.suppress(RuntimeError):  # it is closed already
+                    await websocket.close(_GONE)
 
     async def close(self) -> None:
         """Withdraw all requests; for good."""

@@ -80,7 +80,9 @@ MUTATIONS = {
         "            return []\n        return []",
     ),
     "commands are valid for long": Mutation(
-        _DRIVING, "Drive(x=op.x, z=op.z, y=op.y, valid_ms=VALID_MS)", "Drive(x=op.x, z=op.z, y=op.y, valid_ms=5000)"
+        _DRIVING,
+        "y=op.y, valid_ms=pace.valid_ms)",
+        "y=op.y, valid_ms=5000)",
     ),
     "another server's driver is ignored": Mutation(
         _DRIVING,

@@ -26,6 +26,7 @@ from pebble.media.speech import Speech
 from pebble.media.video import make_encoder
 from pebble.transports import Message, MqttSettings, QoS, Transport
 from pebble.transports.memory import MemoryHub, MemoryTransport
+from pebble.web.media.connection import MediaConnection
 from pebble.web.media.pictures import MediaHub
 from pebble.web.media.sound import SoundHub
 from pebble.web.robots import Robots
@@ -282,10 +283,10 @@ class SoundPage(Page):
         return sent
 
 
-def broker_on(hub: MemoryHub) -> Broker:
+def broker_on(hub: MemoryHub, name: str = "server") -> Broker:
     """The server's connection to the network inside the process; it is not open yet."""
     broker = Broker(MqttSettings(host="127.0.0.1"))
-    broker.transport = MemoryTransport("server", hub)
+    broker.transport = MemoryTransport(name, hub)
     return broker
 
 
@@ -293,7 +294,8 @@ class Server:
     """The hubs of pictures and sound, with what they show of the robot."""
 
     def __init__(self, hub: MemoryHub) -> None:
-        self.broker = broker_on(hub)
+        self.fleet, self.broker = broker_on(hub), broker_on(hub, "media")
+        self.connection = MediaConnection(self.broker)
         self.subscribed: list[str] = []
         subscribe = self.broker.transport.subscribe
 
@@ -304,8 +306,8 @@ class Server:
         self.broker.transport.subscribe = noted  # type: ignore[method-assign]
         self.robots = Robots()
         self.noted: list[tuple[str, str]] = []  # who talked
-        self.media = MediaHub(self.broker, self.robots)
-        self.sound = SoundHub(self.broker, self.robots, lambda ref, session, *_: self.noted.append((ref, session.user)))
+        self.media = MediaHub(self.connection, self.robots)
+        self.sound = SoundHub(self.connection, self.robots, lambda ref, who, *_: self.noted.append((ref, who.user)))
         self.views: list[tuple[float, Any]] = []
         self._tasks: set[asyncio.Task[None]] = set()
         publish = self.robots.set_server_metric
@@ -345,14 +347,15 @@ class Server:
         await self.media.close()
         await self.sound.close()
         await asyncio.gather(*self._tasks)
-        await self.broker.close()
+        await self.connection.close()
+        await self.fleet.close()
 
 
 @asynccontextmanager
 async def serving(robot: MediaRobot) -> AsyncIterator[Server]:
     server = Server(robot.hub)
-    await server.broker.open()
-    await server.broker.subscribe(CAPABILITIES, server.robots.receive)
+    await server.fleet.open()
+    await server.fleet.subscribe(CAPABILITIES, server.robots.receive)
     try:
         await until(lambda: server.robots.capabilities(REF))
         yield server

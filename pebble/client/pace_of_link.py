@@ -1,0 +1,68 @@
+"""How often, and how, a robot is sent commands over the link that it reports as ``outgoing/link``. Pure.
+
+What brings something to rest has no pace: it is sent at once, with QoS 1, at every level.
+"""
+
+from typing import NamedTuple
+
+from msgspec.structs import replace
+
+from pebble.contract import DRIVE, codec
+from pebble.contract.channels import LINK
+from pebble.contract.levels import LEVELS
+from pebble.contract.payloads import Drive, LinkState
+from pebble.errors import PayloadError
+from pebble.transports import QoS
+
+_LEAST_S = 0.015  # between two commands on a wide link: what comes together counts once
+_EARLY_S = 0.025  # half of what lies between two commands of a page: a slot is met, not missed by a moment
+_LEAST_VALID = 2  # commands within the time that one is valid: a robot may report any rate, and must not halt by it
+
+
+class Pace(NamedTuple):
+    """Towards one robot. ``stamped``: what moves anything carries ``t`` and ``key``, a request of control ``t``."""
+
+    step_s: float = _LEAST_S  # at least, between two commands of one gesture
+    qos: QoS = QoS(DRIVE.default_qos)  # of those that move anything
+    valid_ms: int = LEVELS["wide"].valid_ms
+    stamped: bool = False
+    control_s: float = 1.0  # between two requests of control
+    control_for_ms: float = 3000  # so long each holds it
+    control_answer_s: float = 2.0  # a robot that has not answered by then will not
+
+    def dated(self, drive: Drive, now: float, key: str) -> Drive:
+        """A command that moves something with the time at which it is sent; ``key``: where the robot has given none."""
+        return replace(drive, t=ms(now), key=drive.key or key) if self.stamped else drive
+
+
+WIDE = Pace()
+
+
+def pace_of(link: LinkState | None) -> Pace:
+    """The pace that a robot asks for; one that reports no link is sent everything."""
+    if link is None or link.level == "wide":
+        return WIDE
+    level = LEVELS[link.level]
+    hz = min(max(link.drive_hz, 1000 * _LEAST_VALID / level.valid_ms), LEVELS["wide"].drive_hz)
+    return Pace(
+        step_s=1 / hz - _EARLY_S,
+        qos=WIDE.qos if level.drive_qos is None else QoS(level.drive_qos),
+        valid_ms=level.valid_ms,
+        stamped=level.stamped,
+        control_s=3.0,  # commands renew it, too
+        control_for_ms=10_000,
+        control_answer_s=10.0,
+    )
+
+
+def link_of(payload: bytes) -> LinkState | None:
+    """What a message on ``outgoing/link`` reports; None where it is removed, or cannot be read."""
+    try:
+        return codec.decode(LINK, payload) if payload else None
+    except PayloadError:
+        return None
+
+
+def ms(now: float) -> int:
+    """``t`` of a command: milliseconds of the sender's clock. It goes on while the machine is suspended."""
+    return round(1000 * now)

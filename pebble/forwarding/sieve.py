@@ -1,0 +1,110 @@
+"""What leaves a robot over a thin link: of each stream the newest, so often, and nothing that can wait for room.
+
+Pure: the owner guards it, and passes on what comes out of it.
+
+Stops and whatever else is on its way *to* the robot never come here, nor do flags, and states that are ``prompt``.
+"""
+
+from collections.abc import Callable, Iterator
+from enum import IntEnum
+
+from msgspec import Struct
+
+from pebble.contract import Kind
+from pebble.forwarding.routing import Forward
+from pebble.forwarding.subjects import Subject
+from pebble.transports import Message, QoS
+from pebble.transports.counters import Counters
+
+TOPICS = 512  # of which the newest message waits, or is known to have been sent
+
+
+class Rank(IntEnum):
+    """In which order what leaves a robot has to wait: streams as soon as there is little room, heartbeats last."""
+
+    STREAM = 1
+    STATE = 2
+    HEARTBEAT = 4
+
+
+class Waiting(Struct, frozen=True):
+    """The newest message of a topic, which has not been sent."""
+
+    rank: Rank
+    subject: Subject
+    message: Message
+    forward: Forward
+
+
+class Sieve:
+    """``takes(rank, size)`` is whether so many bytes are sent now; times are those of ``clock``.
+
+    ``stream_s``: seconds between two messages of a stream, at least. Counted as ``thinned`` are those that more of
+    their stream followed, and as ``shed`` messages for which there was no room while there was a newer one.
+    """
+
+    def __init__(self, takes: Callable[[Rank, int], bool], counters: Counters, clock: Callable[[], float]) -> None:
+        self.stream_s = 0.0
+        self._takes, self._counters, self._clock = takes, counters, clock
+        self._waiting: dict[str, Waiting] = {}  # by topic, in the order of their last turns
+        self._sent_at: dict[str, float] = {}  # of streams, the oldest first
+
+    def __len__(self) -> int:
+        return len(self._waiting)
+
+    @property
+    def takes_events(self) -> bool:
+        return self._takes(Rank.STATE, 0)
+
+    def keeps(self, subject: Subject, message: Message, forward: Forward) -> bool:
+        """Whether ``message`` waits here, for itself or in vain; else it is sent now."""
+        rank, topic = _rank(subject, message), message.topic
+        if rank is None:
+            return False
+        waits = topic in self._waiting
+        if not waits and self._may_pass(rank, message):
+            return False
+        if not waits and len(self._waiting) >= TOPICS:
+            if rank is Rank.STATE:
+                return False  # no state is lost
+            self._counters.add("shed")
+            return True
+        if waits:
+            self._counters.add("thinned" if self._takes(rank, 0) else "shed")  # the older one
+        self._waiting[topic] = Waiting(rank, subject, message, forward)
+        return True
+
+    def due(self) -> Iterator[Waiting]:
+        """What is sent now, one after the other: states first."""
+        for topic, one in sorted(self._waiting.items(), key=lambda item: -item[1].rank):
+            if self._may_pass(one.rank, one.message):
+                del self._waiting[topic]
+                yield one
+
+    def empty(self) -> Iterator[Waiting]:
+        """All that waits: there is room enough from now on."""
+        while self._waiting:
+            yield self._waiting.pop(next(iter(self._waiting)))
+
+    def _may_pass(self, rank: Rank, message: Message) -> bool:
+        now, topic = self._clock(), message.topic
+        is_stream = rank is Rank.STREAM
+        if is_stream and now - self._sent_at.get(topic, float("-inf")) < self.stream_s:
+            return False
+        if not self._takes(rank, len(topic) + len(message.payload)):
+            return False
+        if is_stream:
+            self._sent_at.pop(topic, None)
+            if len(self._sent_at) >= TOPICS:
+                del self._sent_at[next(iter(self._sent_at))]
+            self._sent_at[topic] = now
+        return True
+
+
+def _rank(subject: Subject, message: Message) -> Rank | None:
+    """None: it never waits."""
+    if subject.prompt:
+        return None
+    if subject.kind is Kind.STREAM or (subject.kind is Kind.EVENT and message.qos is QoS.LATEST):
+        return Rank.STREAM
+    return Rank.STATE if subject.kind is Kind.STATE else None

@@ -1,0 +1,155 @@
+"""What the way to the remote broker carries: its level by measurement, and how much may be on its way. Pure.
+
+Losses alone lower nothing: what was lost and sent again delays an answer, and TCP's own round trips leave it out.
+"""
+
+from collections import deque
+
+from msgspec import Struct
+
+from pebble.contract.payloads import LinkLevel
+from pebble.forwarding.sieve import Rank
+from pebble.media.in_flight import InFlight
+
+_ORDER: tuple[LinkLevel, ...] = ("wide", "narrow", "thin")
+_LITTLE_KBIT = 32.0  # less does not carry the commands and heartbeats of a robot on a wide link
+_REST_S = 0.05  # a shorter queue is none
+_REMEMBERED_S, _PART_S = 600.0, 60.0  # how long a short round trip counts, and how exactly
+_LONGEST_WAIT_S = 600.0
+_PROVED_S = 60.0  # a level that lasts for so long was reached rightly
+_SOON_S = 0.15  # what is sent may wait for so long
+_FIRST_BYTES, _LEAST_BYTES, _MOST_BYTES = 1500, 300, 64 * 1024  # that may be on their way, while that is learned
+_MOST = 256  # messages that are remembered
+_SLACK_BYTES = 64  # of pings and headers
+_CARRIED = 0.75  # of what a link carries; the rest are headers of small packets
+_POLL_S = 0.1  # so late an acknowledgement is noticed
+
+
+class _Rule(Struct, frozen=True):
+    """When a level ends: ``worse_s`` of queue in two of three answers, or no queue for ``rise_s``."""
+
+    worse_s: float
+    rise_s: float
+
+
+_RULES: dict[LinkLevel, _Rule] = {
+    "wide": _Rule(0.15, float("inf")),
+    "narrow": _Rule(0.3, 20.0),
+    "thin": _Rule(float("inf"), 60.0),
+}
+
+
+class ShortestTrip:
+    """The shortest round trip of the last ten minutes: over a shorter time a queue that stays would become the norm."""
+
+    def __init__(self) -> None:
+        self._parts: deque[tuple[float, float]] = deque()  # when each began, and the shortest in it
+
+    def note(self, seconds: float, now: float) -> None:
+        parts = self._parts
+        if not parts or now - parts[-1][0] >= _PART_S:
+            parts.append((now, seconds))
+        else:
+            parts[-1] = parts[-1][0], min(parts[-1][1], seconds)
+        while now - parts[0][0] >= _REMEMBERED_S + _PART_S:
+            parts.popleft()
+
+    @property
+    def seconds(self) -> float:
+        return min((shortest for _, shortest in self._parts), default=0.0)
+
+
+class LinkMeter:
+    """Decides the level from answers: at `auto` by the queue, which is how much longer than the shortest one they take.
+
+    A level ends early for the next lower one, and late for the next higher one. Each rise that fails doubles the time
+    without a queue that the next one takes, up to ten minutes.
+    """
+
+    def __init__(self, profile: str, kbit: float | None = None) -> None:
+        thin = profile == "thin" or (profile == "auto" and kbit is not None and kbit < _LITTLE_KBIT)
+        self.level: LinkLevel = "thin" if thin else "wide"
+        self.queue_s = 0.0
+        self._fixed = thin or profile != "auto"
+        self._shortest = ShortestTrip()
+        self._newest: deque[float] = deque(maxlen=3)  # queues, at this level
+        self._rise_s = {level: rule.rise_s for level, rule in _RULES.items()}
+        self._rests_since: float | None = None
+        self._risen_at = float("-inf")
+
+    @property
+    def round_trip_s(self) -> float:
+        return self._shortest.seconds
+
+    def answered(self, seconds: float, now: float, tcp_queue_s: float | None = None) -> None:
+        """An answer took so long. ``tcp_queue_s``: by so much TCP's own round trips exceed the shortest one."""
+        self._shortest.note(seconds, now)
+        queue_s = seconds - self._shortest.seconds
+        self.queue_s = queue_s if tcp_queue_s is None else min(queue_s, tcp_queue_s)
+        if not self._fixed:
+            self._newest.append(self.queue_s)
+            self._decide(now)
+
+    def lost(self) -> None:
+        """The connection is lost: what is measured next does not follow what was measured."""
+        self._newest.clear()
+        self._rests_since = None
+
+    def _decide(self, now: float) -> None:
+        level = self.level
+        if sum(queue_s > _RULES[level].worse_s for queue_s in self._newest) >= 2:
+            self._fall(now)
+            return
+        if self.queue_s >= _REST_S:
+            self._rests_since = None
+        elif self._rests_since is None:
+            self._rests_since = now
+        elif now - self._rests_since >= self._rise_s[level]:
+            self._change(_ORDER[_ORDER.index(level) - 1])
+            self._risen_at = now
+
+    def _fall(self, now: float) -> None:
+        lower = _ORDER[_ORDER.index(self.level) + 1]
+        failed = now - self._risen_at < max(_PROVED_S, self._rise_s[lower])
+        self._rise_s[lower] = min(2 * self._rise_s[lower], _LONGEST_WAIT_S) if failed else _RULES[lower].rise_s
+        self._change(lower)
+
+    def _change(self, level: LinkLevel) -> None:
+        self.level = level
+        self.lost()
+
+
+class Room:
+    """How much may be on its way to the remote broker, so that nothing waits there for long.
+
+    Of a known link what drains within 150 ms beyond a round trip. Else it is learned: a little more with each message
+    that is confirmed without delay, a good deal less with one that is not.
+    """
+
+    def __init__(self, kbit: float | None = None) -> None:
+        self._rate = None if kbit is None else _CARRIED * kbit * 125  # bytes/s
+        self._bytes = float(_FIRST_BYTES)
+        self._in_flight = InFlight(_SLACK_BYTES, _MOST)
+        self._waiting = 0
+        self._used = False  # there was no room
+
+    def poll(self, waiting: int, round_trip_s: float, now: float) -> None:
+        """So many bytes are not confirmed; the shortest round trip is merely the way there and back."""
+        self._waiting = waiting
+        confirmed = self._in_flight.acknowledge(waiting)
+        if self._rate is not None:
+            self._bytes = max(_LEAST_BYTES, self._rate * (round_trip_s + _SOON_S))
+        elif any(now - one.at - round_trip_s > _SOON_S + _POLL_S for one in confirmed):
+            self._bytes = max(_LEAST_BYTES, 0.7 * self._bytes)
+        elif self._used:
+            self._bytes = min(_MOST_BYTES, self._bytes + sum(one.size for one in confirmed))
+        self._used = False
+
+    def takes(self, rank: Rank, size: int, now: float) -> bool:
+        """Whether so many bytes of this rank are sent now, of which it takes note; one message is always on its way."""
+        fits = not self._waiting or self._waiting + size <= self._bytes * rank
+        self._used = self._used or not fits
+        if fits and size:
+            self._in_flight.sent(size, now)
+            self._waiting += size
+        return fits

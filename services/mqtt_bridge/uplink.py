@@ -1,0 +1,147 @@
+"""Suits what the bridge sends to a link to the remote broker that may be thin, and publishes what it carries."""
+
+import logging
+import threading
+from collections.abc import Callable
+from math import inf
+
+from pebble.config import MqttBridge as BridgeSection
+from pebble.contract import LINK, codec
+from pebble.contract.levels import LEVELS, Level
+from pebble.contract.payloads import LinkState
+from pebble.forwarding.forwarder import Forwarder
+from pebble.forwarding.sieve import Rank, Sieve
+from pebble.runtime.addresses import Address
+from pebble.runtime.rate_limit import RateLimitedLog
+from pebble.services.mqtt_bridge.link import LinkMeter, Room
+from pebble.services.mqtt_bridge.same_broker import now_ms
+from pebble.transports import QoS, Transport
+
+log = logging.getLogger(__name__)
+
+POLL_S = 0.1
+_STATE_S, _STATES_S = 2.0, 10.0  # between two publications of the state at least, and at most
+_NEWS_S = 0.05  # a queue that has changed by less is the same, and by less than half a round trip
+_UNANSWERED_S = 0.5  # how often a question without an answer counts
+_PAUSE = 25  # so much longer on a thin link what can wait is spread
+_HEARTBEAT_BYTES = 80  # about
+
+
+class Uplink:
+    """The link to the remote broker, where a config says that it may be thin. Called on the service's thread."""
+
+    def __init__(
+        self,
+        section: BridgeSection,
+        address: Address,
+        remote: Transport,
+        forwarder: Forwarder,
+        clock: Callable[[], float],
+    ) -> None:
+        self._address, self._remote, self._forwarder, self._clock = address, remote, forwarder, clock
+        #: QoS 0 saves acknowledgements of MQTT; Zenoh has none, and may deliver the two in another order.
+        self._saves_acks = section.remote is None or section.remote.kind == "mqtt"
+        self._heartbeat_s = section.heartbeat.interval_seconds
+        self._meter, self._room = LinkMeter(section.link.profile, section.link.kbit), Room(section.link.kbit)
+        self._guard = threading.Lock()  # of the room: messages take it on the thread that received them
+        self._sieve = Sieve(self._takes, forwarder.counters, clock)
+        self._quiet_log = RateLimitedLog(log, period_s=60.0)
+        self._level = ""  # that the others know; none yet
+        self._heartbeat_at = self._state_at = self._answered_at = -inf
+        self._state_queue_s = 0.0
+        self._answers, self._shed = 0, 0
+        remote.proof = address.topic
+        self._suit_transport()
+
+    @property
+    def level(self) -> Level:
+        return LEVELS[self._meter.level]
+
+    @property
+    def heartbeat_qos(self) -> int | None:
+        return self.level.heartbeat_qos if self._saves_acks else None
+
+    def heartbeat_due(self) -> bool:
+        """Whether it is time for a heartbeat, and there is room for it."""
+        now, level = self._clock(), self.level
+        if level.heartbeat_s:
+            if now - self._heartbeat_at < max(level.heartbeat_s, self._heartbeat_s) - POLL_S / 2:
+                return False
+            if not self._takes(Rank.HEARTBEAT, _HEARTBEAT_BYTES):
+                return False
+        self._heartbeat_at = now
+        return True
+
+    def pause(self, seconds: float) -> float:
+        """How long to wait between two requests of what can wait."""
+        return seconds * _PAUSE if self._meter.level == "thin" else seconds
+
+    def poll(self) -> bool:
+        """Measure, send what has waited, and publish the state; every POLL_S. Whether heartbeats follow the level."""
+        now = self._clock()
+        outgoing = self._remote.outgoing
+        with self._guard:
+            self._room.poll(outgoing.waiting, outgoing.round_trip_s, now)
+        self._measure(now)
+        if self._meter.level != self._level:
+            self._suit()
+        self._forwarder.send_waiting()
+        self._report_shed()
+        change_s = abs(self._meter.queue_s - self._state_queue_s)
+        changed = now - self._state_at >= _STATE_S and change_s >= max(_NEWS_S, self._meter.round_trip_s / 2)
+        if (changed or now - self._state_at >= _STATES_S) and self._takes(Rank.STATE, _HEARTBEAT_BYTES):
+            self._publish(now)
+        return self.level.heartbeat_s > 0
+
+    def _measure(self, now: float) -> None:
+        answer = self._remote.answer
+        if answer is None:
+            self._answers = 0
+            self._meter.lost()
+        elif answer.number != self._answers or (
+            answer.seconds > _UNANSWERED_S and now - self._answered_at >= _UNANSWERED_S
+        ):
+            self._answers, self._answered_at = answer.number, now
+            self._meter.answered(answer.seconds, now, answer.queue_s)
+
+    def _suit(self) -> None:
+        """The level is another one."""
+        before, self._level = self._level, self._meter.level
+        self._suit_transport()
+        self._sieve.stream_s = 1 / self.level.stream_hz if self.level.stream_hz else 0.0
+        self._forwarder.sift(None if self._level == "wide" else self._sieve)
+        if before:
+            log.info(
+                "the link to the remote broker is %s now (it was %s): a round trip of %d ms, and %d ms of queue",
+                self._level, before, *self._milliseconds()
+            )  # fmt: skip
+        self._publish(self._clock())
+
+    def _suit_transport(self) -> None:
+        level = self._meter.level
+        self._remote.suit_link(little=level != "wide", patient=level == "thin")
+
+    def _publish(self, now: float) -> None:
+        """A retained message: without a connection it is sent at the next one."""
+        self._state_at, self._state_queue_s = now, self._meter.queue_s
+        trip_ms, queue_ms = self._milliseconds()
+        state = LinkState(
+            level=self._meter.level, drive_hz=self.level.drive_hz, rtt_ms=trip_ms, queue_ms=queue_ms, t=now_ms()
+        )
+        address = self._address
+        self._remote.publish(address.topic, codec.encode(LINK, state), qos=QoS(address.qos), retain=address.retain)
+
+    def _milliseconds(self) -> tuple[int, int]:
+        return round(1000 * self._meter.round_trip_s), round(1000 * self._meter.queue_s)
+
+    def _takes(self, rank: Rank, size: int) -> bool:
+        with self._guard:
+            return self._room.takes(rank, size, self._clock())
+
+    def _report_shed(self) -> None:
+        shed = self._forwarder.counters["shed"]
+        if shed > self._shed:
+            self._quiet_log.warning(
+                "shed", "the link to the remote broker has no room: older values were not sent", times=shed - self._shed
+            )
+            self._shed = shed
