@@ -197,7 +197,7 @@ def what_the_wheels_did(results: Results) -> list[Picture]:
         robots = grouped(shown, lambda cell: cell.variant)
         known = {name: {one.measure: one for one in cells} for name, cells in robots.items()}
         link = trial.removeprefix("thin-")
-        caption = f"What the wheels did over {link}: commanded (line) and driven (filled), let go (│) and stopped (■)"
+        caption = f"What the wheels did over {link}: commanded, and obeyed"
         found.append(Picture(f"{results.bench}-wheels-{link}", caption, partial(_wheels, known, caption)))
     return found
 
@@ -208,8 +208,8 @@ def _wheels(robots: Mapping[str, Mapping[str, Cell]], title: str) -> Figure:
     for axes, (name, cells) in zip(every, robots.items(), strict=True):
         commanded, moved = cells[wheels.COMMANDED], cells[wheels.WHEELS]
         colour = _WIDE if name == "wide" else _THIN
-        axes.fill_between(*moved.rounds, step="post", color=colour, alpha=0.75, linewidth=0)
-        axes.step(*commanded.rounds, where="post", color="#1a1a1a", linewidth=1.0)
+        axes.fill_between(moved.rounds[0], moved.rounds[1], step="post", color=colour, alpha=0.75, linewidth=0)
+        axes.step(commanded.rounds[0], commanded.rounds[1], where="post", color="#1a1a1a", linewidth=1.0)
         for measure, colour, text in ((wheels.RELEASED, "#555", "let go"), (wheels.STOPPED, "#A4133C", "STOP")):
             for at in cells[measure].rounds[0] if measure in cells else ():
                 axes.axvline(at, color=colour, linewidth=1.6 if text == "STOP" else 1.0, linestyle=(0, (3, 2)))

@@ -20,7 +20,7 @@ from pebble.bench.comparison import Budget, Comparison, Measuring, Option, Repor
 from pebble.bench.impair import rsa_chain, wheels
 from pebble.bench.impair.conditions import Condition, Shape
 from pebble.bench.impair.network import REMOTE_HOST, NamespaceNetwork, require_namespaces
-from pebble.bench.impair.wheels import Gesture, Login, Orders, WheelReport, WheelTrial, cells_of
+from pebble.bench.impair.wheels import Gesture, Login, Orders, WheelRecord, WheelReport, WheelTrial, cells_of
 from pebble.bench.judging.aims import Aim, single, with_lost
 from pebble.bench.pictures import Drawn
 from pebble.bench.results import LONGEST_S, Cell
@@ -32,14 +32,13 @@ from pebble.fleet.broker_files import new_password
 from pebble.fleet.certificates import CA_CERT
 from pebble.fleet.folder import CONF, Fleet, Server, load
 from pebble.fleet.roles import Account
-from pebble.rig.processes import BROKERS, Processes, Program, Worker, free_port, mosquitto_path
+from pebble.rig.processes import BROKERS, Processes, Program, Worker, Wrap, free_port, mosquitto_path
 from pebble.rig.robot import BASE, NAME, Config, Robot, synthetic_media
 
 NODELAY: Final = "set_tcp_nodelay true"
 _PICTURES: Final = (320, 240, 10)
 _PEOPLE: Final = ("ann", "otto")
-_SILENT: Final = f"{REMOTE_HOST}"  # in the log: a connection to the remote broker,
-_SILENCE: Final = "has not answered for"  # which was taken for dead
+_SILENCE: Final = "has not answered for"  # in the log, of a connection that was taken for dead
 _READY_S, _STARTED_S = 150.0, 30.0
 _TAKES_S = 25.0  # one take-over and its drive, at most
 _SCENE = (Gesture("release", 7, 4), Gesture("release", 5, 4), Gesture("stop", 5, 4))
@@ -105,29 +104,42 @@ TRIALS: Final[Mapping[str, LinkTrial]] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkRobot:
-    """One subject in one trial."""
+    """One subject in one trial. ``on_operator`` puts a command on its operator's side of the link."""
 
     subject: str
     network: NamespaceNetwork
     robot: Robot
     broker: Program
     orders: Orders
-    operator: Worker | None
+    on_operator: Wrap
 
-    def report(self, limit_s: float) -> WheelReport:
+    def operator(self, processes: Processes) -> Worker:
+        """Starts one, which reports when the robot is ready."""
+        operator = processes.worker(
+            f"operator of {self.subject}", "pebble.bench.impair.thin_operator", wrap=self.on_operator
+        )
+        operator.send(msgspec.json.encode(self.orders).decode())  # not as an argument: there may be passwords in it
+        return operator
+
+    def report(self, operator: Worker, limit_s: float) -> WheelReport:
         """The operator's next one. Raises PebbleError for a problem, or a process that has ended."""
-        assert self.operator is not None
-        report = msgspec.convert(self.operator.answer(limit_s), WheelReport)
+        report = msgspec.convert(operator.answer(limit_s), WheelReport)
         if ended := next((one for one in (self.broker, *self.robot.programs) if one.ended), None):
             raise PebbleError(f"{self.subject}: {ended.name} has ended\n{ended.tail()}".rstrip())
         if report.problem is not None:
             raise PebbleError(f"{self.subject}: {report.problem}\n{self.robot.log()}".rstrip())
         return report
 
+    def record(self, operator: Worker, limit_s: float) -> WheelRecord:
+        operator.send("go")
+        if (record := self.report(operator, limit_s).record) is None:
+            raise PebbleError(f"{self.subject}: the operator recorded nothing")
+        return record
+
     def silences(self) -> int:
         """Connections to the remote broker that were taken for dead: none of these links ever is."""
         lines = self.robot.launcher.log.read_text(errors="replace").splitlines()
-        return sum(_SILENCE in line and _SILENT in line for line in lines)
+        return sum(_SILENCE in line and REMOTE_HOST in line for line in lines)
 
 
 def start(subject: str, trial: LinkTrial, orders: Orders, processes: Processes, folder: Path) -> LinkRobot:
@@ -169,16 +181,9 @@ def start(subject: str, trial: LinkTrial, orders: Orders, processes: Processes, 
     orders = msgspec.structs.replace(
         orders, host=host, port=port, ca_cert=None if ca_cert is None else str(ca_cert), people=people
     )
-    operator = None if trial.metered else _operator(processes, f"operator of {subject}", orders, on_operator)
     return LinkRobot(
-        subject=subject, network=network, robot=robot, broker=broker, orders=orders, operator=operator
+        subject=subject, network=network, robot=robot, broker=broker, orders=orders, on_operator=on_operator
     )  # fmt: skip
-
-
-def _operator(processes: Processes, name: str, orders: Orders, wrap: Any) -> Worker:
-    operator = processes.worker(name, "pebble.bench.impair.thin_operator", wrap=wrap)
-    operator.send(msgspec.json.encode(orders).decode())  # not as an argument: there may be passwords in it
-    return operator
 
 
 def _fleet_broker(processes: Processes, folder: Path, network: NamespaceNetwork) -> tuple[Program, int, dict[str, str]]:
@@ -244,26 +249,23 @@ def driven(run: Run, name: str, trial: LinkTrial, subjects: Sequence[str], proce
     ]
     limit_s = sum(one.drive_s + one.rest_s + _GESTURE_S for one in orders.gestures) + orders.takes * _TAKES_S + 60
 
-    def one(robot: LinkRobot) -> WheelTrial:
-        ready = robot.report(_READY_S)
-        assert robot.operator is not None
-        before = robot.silences()
-        robot.operator.send("go")
-        record = robot.report(limit_s).record
-        assert record is not None
+    operators = [robot.operator(processes) for robot in robots]
+
+    def one(robot: LinkRobot, operator: Worker) -> WheelTrial:
+        ready_s, before = robot.report(operator, _READY_S).ready_s or 0.0, robot.silences()
+        record = robot.record(operator, limit_s)
         return WheelTrial(
             subject=robot.subject, trial=name, record=record, entries=robot.robot.lines(record.began_ns),
-            ready_s=ready.ready_s or 0.0, silences=robot.silences() - before, scene=len(_SCENE),
+            ready_s=ready_s, silences=robot.silences() - before, scene=len(_SCENE),
         )  # fmt: skip
 
     with ThreadPoolExecutor(len(robots), thread_name_prefix="subject") as pool:
         try:
-            for trial_ in pool.map(one, robots):
-                yield from cells_of(trial_)
+            for found in pool.map(one, robots, operators):
+                yield from cells_of(found)
         finally:
-            for robot in robots:
-                if robot.operator is not None:
-                    robot.operator.ask_to_end()
+            for operator in operators:
+                operator.ask_to_end()  # unblocks threads that wait for it
 
 
 def metered(run: Run, name: str, trial: LinkTrial, subjects: Sequence[str], processes: Processes) -> Iterator[Cell]:
@@ -300,17 +302,15 @@ def metered(run: Run, name: str, trial: LinkTrial, subjects: Sequence[str], proc
     for watcher in watchers:
         watcher.answer(_STARTED_S)
     yield from count(_WATCHED)
-    operators = [
-        _operator(processes, f"operator of {one.subject}", one.orders, one.network.on_remote) for one in robots
-    ]
-    for operator in operators:
-        operator.answer(_READY_S)
+    operators = [robot.operator(processes) for robot in robots]
+    for robot, operator in zip(robots, operators, strict=True):
+        robot.report(operator, _READY_S)
     for operator in operators:
         operator.send("go")
     time.sleep(1)
     yield from count(_DRIVEN)
-    for operator in operators:
-        operator.answer(_READY_S)
+    for robot, operator in zip(robots, operators, strict=True):
+        robot.report(operator, _READY_S)
 
 
 # -- tables and aims
@@ -449,9 +449,9 @@ def beside(cells: Sequence[Cell]) -> Iterator[str]:
 IMPAIR_THIN = Comparison(
     name="impair-thin",
     title="Over a thin link",
-    what="Whole robots with MQTT inside that connect over links as thin as a radio modem's, limited in both directions. "
-    "“wide” is a robot without any key of this, “thin” one whose `link.profile` is thin; both run at the same time. The "
-    "operator drives as the operator page does: it takes control, and follows `outgoing/link`. Then it lets go, and "
+    what="Whole robots with MQTT inside that connect over links as thin as a radio modem's, limited both ways. “wide” "
+    "is a robot without any key of this, “thin” one whose `link.profile` is thin; both run at the same time. The operator "
+    " drives as the operator page does: it takes control, and follows `outgoing/link`. Then it lets go, and "
     "stops, many times; what counts is when the wheels of the simulated MCU are at rest for good. `thin-foreign`: an "
     "operator who knows of none of this sends 20 commands a second. `thin-page`: the operator is behind the link.",
     options=(

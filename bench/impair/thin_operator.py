@@ -56,8 +56,9 @@ class Person:
 
     def __init__(self, orders: Orders, login: Login) -> None:
         tls = None if orders.ca_cert is None else TlsSettings(ca_cert=Path(orders.ca_cert))
-        account = {"username": login.name, "password": login.password} if login.name else {}
-        self.settings = MqttSettings(host=orders.host, port=orders.port, tls=tls, **account)
+        self.settings = MqttSettings(
+            host=orders.host, port=orders.port, tls=tls, username=login.name or None, password=login.password or None
+        )
         self.transport = create("mqtt", f"pebble-trial-{login.name or 'controls'}", self.settings)
         self.name, self.base, self.foreign = login.name or _BY, orders.base, orders.foreign_hz > 0
         self.view = RobotView(orders.base)
@@ -108,7 +109,8 @@ class Person:
             self.transport.publish(message.topic, message.payload, qos=message.qos, urgent=True)
 
     def drive(self, left: float, right: float) -> None:
-        command, pace = Drive(**axes_of(left, right)), WIDE if self.foreign else self.view.pace
+        axes, pace = axes_of(left, right), WIDE if self.foreign else self.view.pace
+        command = Drive(x=axes["x"], z=axes["z"])
         if not self.foreign:
             key = self.control.key or msgspec.UNSET
             command = msgspec.structs.replace(command, valid_ms=pace.valid_ms, key=key)
