@@ -450,8 +450,8 @@ IMPAIR_THIN = Comparison(
     name="impair-thin",
     title="Over a thin link",
     what="Whole robots with MQTT inside that connect over links as thin as a radio modem's, limited both ways. “wide” "
-    "is a robot without any key of this, “thin” one whose `link.profile` is thin; both run at the same time. The operator "
-    " drives as the operator page does: it takes control, and follows `outgoing/link`. Then it lets go, and "
+    "is a robot without any key of this, “thin” one whose `link.profile` is thin; both run at the same time. The "
+    "operator drives as the operator page does: it takes control, and follows `outgoing/link`. Then it lets go, and "
     "stops, many times; what counts is when the wheels of the simulated MCU are at rest for good. `thin-foreign`: an "
     "operator who knows of none of this sends 20 commands a second. `thin-page`: the operator is behind the link.",
     options=(
