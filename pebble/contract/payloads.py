@@ -363,7 +363,7 @@ class LogRecord(Payload, frozen=True, kw_only=True):
 class ServiceState(Payload, frozen=True, kw_only=True):
     """The state of one service process, inside ``Status``."""
 
-    state: Literal["init", "ready", "restarting", "failed", "stopped"]
+    state: Literal["init", "ready", "restarting", "failed", "stopped", "held"]  # held: it waits while people drive
     restarts: int = 0
     last_exit: str | None = None  # for example "exit code 1" or "signal 9"
     dropped: dict[str, int] | UnsetType = UNSET  # messages since its start, by which bound was reached; absent: none

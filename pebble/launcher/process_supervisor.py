@@ -57,6 +57,7 @@ class ProcessSupervisor:
         self.program, self.policy = program, policy
         self.state = State.IDLE
         self.shown = not program.on_demand  # in the robot's status: on-demand programs from their first request on
+        self.held = False  # an on-demand program is requested, and waits for its turn
         self._reactor, self._spawn = reactor, spawn
         self._on_line, self._on_note, self._on_change, self._on_end = on_line, on_note, on_change, on_end
         self._child: Child | None = None
@@ -80,6 +81,7 @@ class ProcessSupervisor:
 
     def request(self) -> None:
         """Run an on-demand program: now, or as soon as its child that is being stopped has ended."""
+        self.held = False
         if self.state not in (State.IDLE, State.RELEASED):
             return
         log.info("%s is requested", self.program.name)
@@ -91,6 +93,9 @@ class ProcessSupervisor:
 
     def release(self) -> None:
         """Ask an on-demand program to end, and kill it if it does not; returns at once."""
+        if self.held:
+            self.held = False
+            self._on_change()
         if self.state not in _ACTIVE:
             return
         log.info("%s is released", self.program.name)
@@ -100,6 +105,13 @@ class ProcessSupervisor:
         self._end_child(State.RELEASED, State.IDLE)
         if self._child is not None:
             self._timer = self._reactor.after(self.program.stop_timeout_s, self._kill_overdue)
+
+    def hold(self) -> None:
+        """As :meth:`release`, until :meth:`request`: others know that the program is requested."""
+        if not self.held:
+            self.release()
+            self.shown = self.held = True
+            self._on_change()
 
     def start(self) -> None:
         self._lines, self._notes = _splitter(), _splitter()
@@ -118,6 +130,7 @@ class ProcessSupervisor:
 
     def stop(self) -> None:
         """Ask the child to end, and start no other."""
+        self.held = False
         self._end_child(State.STOPPING, State.STOPPED)
 
     def kill(self) -> None:

@@ -124,7 +124,10 @@ class StatusPublisher:
     def _state(self, supervisor: ProcessSupervisor) -> ServiceState:
         policy, dropped = supervisor.policy, self._dropped[supervisor.program.name]
         return ServiceState(
-            state=policy.state, restarts=policy.restarts, last_exit=policy.last_exit, dropped=dropped or UNSET
+            state="held" if supervisor.held else policy.state,
+            restarts=policy.restarts,
+            last_exit=policy.last_exit,
+            dropped=dropped or UNSET,
         )
 
     def _publish_capabilities(self) -> None:

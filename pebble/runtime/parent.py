@@ -146,6 +146,10 @@ class Notifier:
             log.info("there is no launcher to start %s", program)
         return self._write(f"WANT {program} {int(request.on)} {request.encoding}".rstrip().encode() + b"\n")
 
+    def hold(self, program: str, on: bool) -> bool:
+        """Let an on-demand program wait, at most until this process ends, or no longer; as :meth:`request`."""
+        return self._write(f"HOLD {program} {int(on)}\n".encode())
+
     def lacks(self, feature: str, lacking: bool) -> bool:
         """Report that this process cannot provide ``feature``, or can, until it ends; the capabilities follow.
 

@@ -6,6 +6,7 @@ from typing import Final
 
 from pebble.media.in_flight import InFlight
 from pebble.media.opus import BUNDLE_LIMIT
+from pebble.media.rests import Rests
 from pebble.transports.base import Outgoing
 
 LEAST_BITRATE: Final = 16_000  # of Opus: below it speech gets hard to follow
@@ -49,12 +50,18 @@ def steps(bundle: int, bitrate: int) -> tuple[Step, ...]:
 
 
 class RateController:
-    """Decides how Opus is encoded, ``step``, and which packets are sent. ``outgoing()`` says what is unacknowledged."""
+    """Decides how Opus is encoded, ``step``, and which packets are sent. ``outgoing()`` says what is unacknowledged.
 
-    def __init__(self, bundle: int, bitrate: int, now: float, outgoing: Callable[[], Outgoing]) -> None:
+    ``thin``: after one that was slow, none is sent for a while.
+    """
+
+    def __init__(
+        self, bundle: int, bitrate: int, now: float, outgoing: Callable[[], Outgoing], *, thin: bool = False
+    ) -> None:
         self._steps, self._outgoing = steps(bundle, bitrate), outgoing
         self._levels = LevelControl(len(self._steps) - 1, now)
         self._in_flight = InFlight(_OVERHEAD, _LIMIT)
+        self._rests, self._is_resting = Rests(thin), False
         self._age_s = 0.0  # of the oldest packet in flight, beyond a round trip
 
     @property
@@ -69,13 +76,15 @@ class RateController:
     def poll(self, now: float, encoding: str) -> Step | None:
         """Measure how long packets wait; returns the new step if it changes, which it does for Opus only."""
         outgoing = self._outgoing()
-        self._in_flight.acknowledge(outgoing.waiting)
+        for packet in self._in_flight.acknowledge(outgoing.waiting):
+            self._rests.note(now - packet.at - outgoing.round_trip_s, now)
+        self._is_resting = self._rests.lasts(now)
         self._age_s = max(0.0, self._in_flight.age_s(now) - outgoing.round_trip_s)
         return self.step if encoding == "opus" and self._levels.poll(self._age_s, now) else None
 
     def may_send(self, encoding: str) -> bool:
         """Would another packet arrive in time, by the last poll?"""
-        return self._age_s <= (OPUS_WAITING_LIMIT_S if encoding == "opus" else WAITING_LIMIT_S)
+        return not self._is_resting and self._age_s <= (OPUS_WAITING_LIMIT_S if encoding == "opus" else WAITING_LIMIT_S)
 
     def sent(self, size: int, now: float) -> None:
         """The connection has accepted a packet of ``size`` bytes."""

@@ -21,7 +21,15 @@ class Sender:
     """
 
     def __init__(
-        self, options: Options, transport: Transport, topic: str, qos: QoS, counters: Counters, now: float
+        self,
+        options: Options,
+        transport: Transport,
+        topic: str,
+        qos: QoS,
+        counters: Counters,
+        now: float,
+        *,
+        thin: bool = False,
     ) -> None:
         self.counters = counters
         self.meter = RateMeter()  # of what is sent
@@ -32,7 +40,7 @@ class Sender:
         self.format = ""  # of what is sent, for display
         self._options, self._transport, self._topic, self._qos = options, transport, topic, qos
         self._numbers = sequence_numbers()
-        self._rate = RateController(options.bundle, options.bitrate, now, lambda: transport.outgoing)
+        self._rate = RateController(options.bundle, options.bitrate, now, lambda: transport.outgoing, thin=thin)
         self._encoder: SoundEncoder | None = None
         self._made_for: tuple[object, ...] = ()  # encoding, rate, channels and step
 

@@ -33,7 +33,13 @@ class AudioPublisher(Service):
         self._remote = remote_transport(self.config, "audio-publisher")
         address = self.addresses[AUDIO]
         self._sender = Sender(
-            self._options, self._remote, address.topic, QoS(address.qos), self.counters, self._received_at
+            self._options,
+            self._remote,
+            address.topic,
+            QoS(address.qos),
+            self.counters,
+            self._received_at,
+            thin=self.config.services.mqtt_bridge.link.profile != "wide",
         )
         self._sender.requested = known_encoding(requested_encoding(), self._options.encoding)
         self._reader = FrameReader(self.config.run_dir(), "microphone", sharing=False, depth=_DEPTH)

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from fractions import Fraction
 
+from pebble.media.rests import Rests
 from pebble.services.camera_publisher.frame_selector import FrameSelector
 from pebble.services.camera_publisher.send_window import Acknowledged, SendWindow
 from pebble.transports.base import Outgoing
@@ -40,12 +41,16 @@ class RateController:
     """Decides which frames are encoded, and how: ``step``. No picture is sent that would wait behind another.
 
     ``outgoing()`` says what is unacknowledged on the connection. A frame that was due and not encoded because of that
-    is counted as ``held_back``.
+    is counted as ``held_back``. ``thin``: the connection may carry very little, so pictures begin small, and a slow one
+    is followed by a rest.
     """
 
-    def __init__(self, fps: float, now: float, outgoing: Callable[[], Outgoing], counters: Counters) -> None:
+    def __init__(
+        self, fps: float, now: float, outgoing: Callable[[], Outgoing], counters: Counters, *, thin: bool = False
+    ) -> None:
         self._fps, self._outgoing, self._counters = fps, outgoing, counters
-        self._selector, self._window, self._levels = FrameSelector(fps), SendWindow(), LevelControl(fps, now)
+        self._selector, self._window, self._rests = FrameSelector(fps), SendWindow(), Rests(thin)
+        self._levels = LevelControl(fps, now, SMALL if thin else 0)
         self._blocked = False  # was a frame held back since the last one that was encoded, because of a late one?
         self._changed = False  # has ``step`` changed since the last poll?
 
@@ -64,6 +69,9 @@ class RateController:
         if not self._selector.due(captured_s):
             return False
         round_trip_s = self._update(now)
+        if self._rests.lasts(now):
+            self._counters.add("held_back")
+            return False
         if self._window.full(round_trip_s, now):
             self._blocked = self._blocked or self._window.age_s(round_trip_s, now) > 0
             self._counters.add("held_back")
@@ -90,6 +98,8 @@ class RateController:
     def _update(self, now: float) -> float:
         outgoing = self._outgoing()
         acknowledged = self._window.poll(outgoing.waiting, outgoing.round_trip_s, now)
+        for frame in acknowledged:
+            self._rests.note(frame.took_s, now)
         if self._levels.poll(acknowledged, self._window.age_s(outgoing.round_trip_s, now), now):
             self._selector.fps = self._fps * float(self.step.rate)
             self._changed = True
@@ -136,6 +146,7 @@ STEPS = (
     _step("1/2", "1/4", "1/4"),
     _step("1/2", "1/4", "1/8"),
 )
+SMALL = 6  # of them: small pictures, as many as are configured
 
 
 class LevelControl:
@@ -143,14 +154,14 @@ class LevelControl:
     went wrong.
     """
 
-    def __init__(self, fps: float, now: float) -> None:
-        self.level = 0
+    def __init__(self, fps: float, now: float, level: int = 0) -> None:
+        self.level = level
         self._period = 1.0 / fps
         self._seen: deque[tuple[float, float]] = deque()  # when a frame was acknowledged, and how long it took
         self._lost: deque[tuple[float, float]] = deque()  # when turns were lost, and how many
         self._changed_at = self._good_since = now
         self._rose_at: float | None = None  # None: nothing was restored since the last step down
-        self._patience = _PATIENCE_S
+        self._patience = _MEASURE_S if level else _PATIENCE_S  # nothing has gone wrong yet
 
     @property
     def step(self) -> Step:
@@ -202,7 +213,7 @@ class LevelControl:
         lower = range(self.level + 1, len(STEPS))
         affordable = self.step.cost * _AIM / load
         if self._rose_at is not None and now - self._rose_at < _PROBATION_S:
-            self._patience = min(_LONGEST_PATIENCE_S, 2 * self._patience)
+            self._patience = min(_LONGEST_PATIENCE_S, max(_PATIENCE_S, 2 * self._patience))
             affordable = self.step.cost if load <= 2 * _FULL else affordable
         self._rose_at = None
         level = next((level for level in lower if STEPS[level].cost <= affordable), len(STEPS) - 1)

@@ -46,7 +46,8 @@ class CameraPublisher(Service):
         self._meter, self._keyframes = RateMeter(), KeyframeRequests()
         self._picture_topic = self.addresses[CAMERA].topic
         self._remote = remote_transport(self.config, "camera-publisher")
-        self._rate = RateController(self._fps, now, lambda: self._remote.outgoing, self.counters)
+        thin = self.config.services.mqtt_bridge.link.profile != "wide"
+        self._rate = RateController(self._fps, now, lambda: self._remote.outgoing, self.counters, thin=thin)
         self._encoding = self._known(requested_encoding())
         self._encoder = self._make_encoder(self._encoding)
         self._reader = CameraReader(

@@ -1,11 +1,12 @@
 """The bridge as a process: forwarding, heartbeat, same-broker probe, system actions and media requests."""
 
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from typing import Any
 
 from pebble.contract import AUDIT_READ, BRIDGE_PROBE, DRIVE, LINK, ONLINE, REMOTE_MIRROR, Channel, codec
-from pebble.contract.payloads import AuditRead, MediaRequest
+from pebble.contract.payloads import SCRIPT, AuditRead, Drive, MediaRequest
 from pebble.errors import PayloadError
 from pebble.forwarding.forwarder import Routed, barrier
 from pebble.forwarding.names import Names
@@ -23,7 +24,7 @@ from pebble.services.mqtt_bridge.audit import Audit
 from pebble.services.mqtt_bridge.audit_rows import ROBOT
 from pebble.services.mqtt_bridge.heartbeat import Heartbeat
 from pebble.services.mqtt_bridge.leftovers import Leftovers
-from pebble.services.mqtt_bridge.media import MEDIA, Media, MediaRequests
+from pebble.services.mqtt_bridge.media import MEDIA, Hold, Media, MediaRequests
 from pebble.services.mqtt_bridge.motor_owners import CHECK_S, MotorOwners
 from pebble.services.mqtt_bridge.private_topics import PrivateTopics
 from pebble.services.mqtt_bridge.same_broker import SameBrokerProbe, now_ms
@@ -62,6 +63,7 @@ class MqttBridge(ForwardingService):
         self._actions = SystemActions(section, folder=self.config.state_dir(), clock=self.clock)
         notifier = Notifier()
         self._media = MediaRequests(Media(self.config.on_demand_programs(), earlier_requests()), notifier.request)
+        self._hold = Hold(self.config.on_demand_programs(), notifier.hold)
         owners = map(self.config.motor_owner, self.config.motor_lines())
         self._owners = MotorOwners(self.config.base, owners, notifier)
         self._audit = Audit(self.config, self.remote, self.clock)
@@ -80,6 +82,8 @@ class MqttBridge(ForwardingService):
             **{row.channel.suffix: partial(self._on_action, row.channel) for row in ACTIONS},
             AUDIT_READ.suffix: self._on_audit_read,
         }
+        if section.link.profile != "wide":
+            self._message_reactions[DRIVE.suffix] = self._on_drive
         self._flag_reactions: dict[str, Callable[[bytes], None]] = {
             **{row.flag.suffix: partial(self._on_media_flag, row.flag) for row in MEDIA},
             REMOTE_MIRROR.suffix: self._on_remote_mirror,
@@ -89,6 +93,10 @@ class MqttBridge(ForwardingService):
     def winner(self) -> Side:
         """Where names are checked, nothing on the remote side but the robot itself can have left a flag there."""
         return Side.LOCAL if self.config.security.named else Side.REMOTE
+
+    @property
+    def _is_thin(self) -> bool:
+        return self.config.services.mqtt_bridge.link.profile == "thin"
 
     def make_names(self) -> Names | None:
         security = self.config.security
@@ -221,6 +229,7 @@ class MqttBridge(ForwardingService):
     @every(_RETRY_S)
     def _send_media_requests(self) -> None:
         self._media.send()
+        self._hold.send(self.clock())
 
     @every(CHECK_S)
     def _check_owners(self) -> None:
@@ -304,6 +313,15 @@ class MqttBridge(ForwardingService):
             self.refusals.malformed(channel, error)
         else:
             self.post_message(channel, partial(self._media.request, channel, request), newest_of=channel.metric)
+
+    def _on_drive(self, payload: bytes) -> None:
+        """On a thin link pictures and sound wait while a person drives; who the robot obeys is decided elsewhere."""
+        if not self._is_thin:
+            return
+        with suppress(PayloadError):
+            command: Drive = codec.decode(DRIVE, payload)
+            if command.moves and command.source != SCRIPT:
+                self.post_message(DRIVE, lambda: self._hold.drive(self.clock()), newest_of="hold")
 
     def _on_audit_read(self, payload: bytes) -> None:
         try:

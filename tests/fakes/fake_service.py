@@ -49,7 +49,7 @@ def ask(notify: Notifier) -> None:
     """Send the requests that a test appends to the file ``JOURNAL.orders.NAME``: ``media 1 h264``.
 
     ``half media 1`` sends it in two pieces, ``noise media 1`` after 100 kB of anything. ``lacks estop`` and
-    ``has estop`` are reports, as is ``dropped too_large=3``.
+    ``has estop`` are reports, as is ``dropped too_large=3``; ``hold media 1`` lets it wait.
     """
     orders = Path(f"{sys.argv[3]}.orders.{sys.argv[1]}")
     orders.write_text("")  # those of the previous process are old
@@ -64,6 +64,8 @@ def ask(notify: Notifier) -> None:
                     blurt(first, f"WANT {' '.join(rest)}\n".encode())
                 elif first in ("lacks", "has"):
                     notify.lacks(rest[0], first == "lacks")
+                elif first == "hold":
+                    notify.hold(rest[0], rest[1] == "1")
                 elif first == "dropped":
                     notify.dropped({reason: int(number) for reason, number in (word.split("=") for word in rest)})
                 else:

@@ -7,6 +7,7 @@ import os
 import signal
 import socket
 import time
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -50,6 +51,57 @@ def test_runs_while_requested_and_shows_from_then_on(launch: Launch) -> None:
     assert robot.ready("media")
     assert robot.services()["media"]["restarts"] == 0, "nothing went wrong"
     assert len(robot.events("media", "start")) == 2
+
+
+def test_a_held_program_waits_and_is_remembered_by_the_next_bridge(launch: Launch) -> None:
+    robot = launch(ASKER, media("good"))
+    assert robot.ready("bridge")
+    robot.order("bridge", "media 1")
+    assert robot.ready("media")
+    robot.order("bridge", "hold media 1")
+    assert until(lambda: robot.events("media", "stop"))
+    assert until(lambda: state_of(robot) == "held")
+    robot.order("bridge", "hold media 0")
+    assert started(robot, "media", 2)
+    assert robot.ready("media")
+    robot.order("bridge", "hold media 1")
+    assert until(lambda: state_of(robot) == "held")
+    os.kill(robot.events("bridge", "start")[0], signal.SIGKILL)
+    assert started(robot, "media", 3), "who held it has ended"
+    assert until(lambda: robot.events("bridge", "before:media="))
+
+
+@pytest.mark.parametrize(
+    ("lines", "states"),
+    [
+        ("H1 W1 H0 W0", "idle held runs idle"),
+        ("W1 H1 W0 H0", "runs held idle idle"),
+        ("W1 H1 W0 W1 H0", "runs held idle held runs"),
+        ("W1 H1 W1 dies", "runs held held runs"),
+        ("H1 dies W1", "idle idle runs"),
+        ("W1 H1 expires H0", "runs held idle idle"),
+        ("W1 dies H1 W1", "runs runs held held"),
+    ],
+)
+def test_a_program_runs_if_it_is_requested_and_not_held(
+    monkeypatch: pytest.MonkeyPatch, lines: str, states: str
+) -> None:
+    monkeypatch.setattr(on_demand, "OUTLIVE_S", 0.0)
+    reactor, supervisor = Reactor(), StandIn()
+    programs = OnDemand(reactor, [cast(ProcessSupervisor, supervisor)])
+    bridge = Program("bridge", "bridge", (), Stage.CONNECTION, may_request=True)
+    acts: dict[str, Callable[[str], object]] = {
+        "W": lambda rest: programs.receive(bridge, f"WANT media {rest}"),
+        "H": lambda rest: programs.receive(bridge, f"HOLD media {rest}"),
+        "d": lambda _: programs.ended(bridge),
+        "e": lambda _: programs.ended(bridge) or reactor.run_until(lambda: not programs.requested, 10),
+    }
+    found = []
+    for line in lines.split():
+        acts[line[0]](line[1:])
+        found.append(supervisor.shown)
+    reactor.close()
+    assert " ".join(found) == states
 
 
 def test_programs_that_are_not_requested_are_left_out_of_the_summary(launch: Launch, tmp_path: Path) -> None:
@@ -267,6 +319,8 @@ def test_one_that_still_starts_begins_again_with_what_is_requested_now(state: st
         "READY?",
         "WANT media 1 H264",
         "WANT media 1 a b",
+        "HOLD media",
+        "HOLD media 1 h264",
         "\ufffd" * 9,
     ],
 )
@@ -285,12 +339,20 @@ class StandIn:
     def __init__(self, state: str = "ready") -> None:
         self.program = Program("media", "media", (), Stage.CONNECTION, on_demand=True)
         self.policy = SimpleNamespace(state=state)
-        self.requested = False
+        self.requested = self.held = False
         self.releases = 0
 
+    @property
+    def shown(self) -> str:
+        return {(True, False): "runs", (False, True): "held", (False, False): "idle"}[self.requested, self.held]
+
     def request(self) -> None:
-        self.requested = True
+        self.requested, self.held = True, False
 
     def release(self) -> None:
         self.releases += self.requested
-        self.requested = False
+        self.requested = self.held = False
+
+    def hold(self) -> None:
+        self.release()
+        self.held = True

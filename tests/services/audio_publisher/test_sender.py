@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import pytest
 
 from pebble.config.media import AudioPublisher as Options
@@ -85,3 +87,17 @@ def test_sound_gets_larger_and_smaller_and_none_is_lost() -> None:
     ends_ms = [sound.captured_ms + sound.samples // 16 for sound in received]
     assert [sound.captured_ms for sound in received] == [0, *ends_ms[:-1]]
     assert counters["dropped"] == 0
+
+
+@pytest.mark.parametrize(("thin", "rest_s"), [(True, 2.6), (False, 0.0)])
+def test_on_a_thin_link_a_slow_packet_is_followed_by_a_rest(thin: bool, rest_s: float) -> None:
+    counters, transport = Counters(), Behind()
+    transport.open()
+    sender = Sender(Options(encoding="opus", bundle=1), transport, "sound", QoS.LATEST, counters, 0.0, thin=thin)  # type: ignore[arg-type]
+    sent_at = []
+    for number in range(250):
+        before, now = len(transport.packets), number * CHUNK_S
+        transport.behind = 99 if now < 0.3 else 0
+        sender.take(SOUND, CHUNK, now)
+        sent_at += [now] * (len(transport.packets) - before)
+    assert max(b - a for a, b in pairwise(sent_at)) == pytest.approx(rest_s, abs=0.1)

@@ -28,18 +28,23 @@ class Run:
     fps: float = 10.0
     delay_s: float = 0.01
     beacon_s: float = 0.0
+    thin: bool = False
     ages: list[tuple[float, float]] = field(default_factory=list)  # when a frame had arrived whole, and its age then
     levels: list[tuple[float, int]] = field(default_factory=list)
+    busy_s: float = 0.0  # so long something was on its way out
 
     def run(self, seconds: float, *, step_s: float = 0.005) -> Run:
         waiting, now, camera = 0.0, 0.0, 0.0
-        rate = RateController(self.fps, 0.0, lambda: Outgoing(round(waiting), 2 * self.delay_s), Counters())
+        rate = RateController(
+            self.fps, 0.0, lambda: Outgoing(round(waiting), 2 * self.delay_s), Counters(), thin=self.thin
+        )
         unsent, frames, number = 0.0, list[list[float]](), 0
         confirmed: list[tuple[float, float]] = []  # when the confirmation of so many bytes arrives
         while now < seconds:
             now += step_s
             went = min(unsent, self.kbits(now) * KILOBIT * step_s)
             unsent -= went
+            self.busy_s += step_s * (unsent > 0)
             if went:
                 back = now + 2 * self.delay_s
                 confirmed.append((self.beacon_s * ceil(back / self.beacon_s) if self.beacon_s else back, went))
@@ -84,6 +89,21 @@ def test_pictures_stay_young_on_any_link(kbits: int, delay_s: float) -> None:
     assert run.worst_age(0) < 3.5  # the very first, at full size
     assert run.worst_age(4) < 0.9 + delay_s
     assert run.rate(10, 60) > 2
+
+
+@pytest.mark.parametrize(("kbits", "delay_s"), [(9.6, 0.3), (19.2, 0.15), (64, 0.05)])
+def test_on_a_thin_link_a_slow_picture_is_followed_by_a_rest(kbits: float, delay_s: float) -> None:
+    """What is sent during the rest of the time finds the modem empty."""
+    run = Run(lambda _now: kbits, full=40_000, delay_s=delay_s, thin=True).run(120)
+    assert len(run.ages) >= 3
+    assert run.busy_s < 0.25 * 120
+    assert run.worst_age(0) < 20_000 / (kbits * KILOBIT)  # the first one is small, too
+
+
+def test_a_good_link_that_may_be_thin_gets_everything_soon() -> None:
+    run = Run(lambda _now: 8000, thin=True).run(30)
+    assert run.level_at(15) == 0
+    assert run.rate(15, 30) == pytest.approx(10, rel=0.02)
 
 
 @pytest.mark.parametrize("kbits", [256, 512])

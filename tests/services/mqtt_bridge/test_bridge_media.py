@@ -115,12 +115,12 @@ class AskingBridge(World):
         self.start(av_daemon=DEVICES, **section)
         self.run()
 
-    def wanted(self, program: str) -> str:
+    def wanted(self, program: str, note: str = "WANT", *, after: float = 3.0) -> str:
         """What the launcher was told about a program last."""
-        self.run()
+        self.run(after)
         with suppress(BlockingIOError):
             self.asked += os.read(self._read, 1_000_000).decode().splitlines()
-        start = f"WANT {program} "
+        start = f"{note} {program} "
         reported = [line.removeprefix(start) for line in self.asked if line.startswith(start)]
         return reported[-1] if reported else ""
 
@@ -236,6 +236,32 @@ class TestBridge:
         either.begin()
         assert either.wanted(CAMERA) == "1 h264"
         assert f"WANT {CAMERA} 0" not in either.asked
+
+    @pytest.mark.parametrize(
+        ("profile", "drive", "held"),
+        [
+            ("thin", b'{"z": 0.5}', "1"),
+            ("thin", b'{"z": 0.5, "t": 1, "key": "aabbccdd"}', "1"),
+            ("thin", b'{"z": 0}', ""),
+            ("thin", b"{", ""),
+            ("wide", b'{"z": 0.5}', ""),
+        ],
+    )
+    def test_on_a_thin_link_what_is_sent_waits_for_driving(
+        self, bridge: AskingBridge, profile: str, drive: bytes, held: str
+    ) -> None:
+        bridge.begin(link={"profile": profile})
+        bridge.remote.publish(DRIVE, drive)
+        assert [bridge.wanted(program, "HOLD", after=0.0) for program in ALL] == [held, held, ""]
+        bridge.run(1.8)
+        bridge.remote.publish(DRIVE, b'{"z": 0}')
+        assert bridge.wanted(CAMERA, "HOLD", after=0.1) == held
+        assert bridge.wanted(CAMERA, "HOLD", after=1.2) == held.replace("1", "0")
+
+    def test_what_a_script_drives_holds_nothing_up(self, bridge: AskingBridge) -> None:
+        bridge.begin(link={"profile": "thin"})
+        bridge.local.publish(DRIVE, b'{"z": 0.5, "source": "autonomy", "run": 1}')
+        assert bridge.wanted(CAMERA, "HOLD") == ""
 
     def test_a_request_is_sent_again_to_a_busy_launcher(self, bridge: AskingBridge) -> None:
         bridge.begin()
