@@ -229,11 +229,10 @@ class Transport(ABC):
     is_invented: Callable[[str], bool] = staticmethod(lambda _topic: False)
     #: Whether a topic is one of stops: where a backend refuses messages because too many wait, it still takes these.
     is_stop: Callable[[str], bool] = staticmethod(lambda _topic: False)
-    #: Over a slow way: keep little in the kernel, where nothing can go ahead of what waits; and wait longer for
-    #: answers, with fewer questions. Set by :meth:`suit_link`; a backend may ignore both.
-    keeps_little: bool = False
-    is_patient: bool = False
-    #: A retained topic of ours whose values differ: while `is_patient`, if the other end has its newest one after an
+    #: Whether the way to the other end is slow: keep little in the kernel, where nothing can go ahead of what waits,
+    #: and wait longer for answers, with fewer questions. Set by :meth:`suit_link`; a backend may ignore it.
+    is_slow: bool = False
+    #: A retained topic of ours whose values differ: while `is_slow`, if the other end has the newest one after an
     #: outage, it has kept the others. Empty: each is asked for.
     proof: str = ""
     #: What is published in place of a message, in this order; the first one counts as it. None: the message itself.
@@ -294,9 +293,9 @@ class Transport(ABC):
         self.forms = forms or self.forms
         self.delivers_late = self.delivers_late if delivers_late is None else delivers_late
 
-    def suit_link(self, *, little: bool, patient: bool) -> None:
-        """Suit the way to the other end, from now on: see `keeps_little` and `is_patient`."""
-        self.keeps_little, self.is_patient = little, patient
+    def suit_link(self, *, slow: bool) -> None:
+        """Suit the way to the other end, from now on: see `is_slow`."""
+        self.is_slow = slow
 
     def on_state(self, watcher: Watcher) -> None:
         """Call ``watcher`` on every change of state, in order, on a thread of the transport: it must return at once."""

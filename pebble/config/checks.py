@@ -108,7 +108,14 @@ def _video_stream(reader: Reader, stream: VideoStream, path: Path) -> VideoStrea
 
 
 def _bridge(reader: Reader, bridge: MqttBridge, path: Path) -> MqttBridge:
-    notes, remote = reader.notes, bridge.remote
+    notes, remote, link = reader.notes, bridge.remote, bridge.link
+    if link.kbit is not None and link.profile == "wide":
+        notes.problem(
+            (*path, "link", "kbit"), 'has no effect at profile "wide": write "thin" or "auto", or leave it out'
+        )
+    if link.profile == "auto" and remote is not None and remote.kind != "mqtt":
+        text = f'cannot be "auto": only MQTT connections are measured, and remote.kind is "{remote.kind}"; write "thin"'
+        notes.problem((*path, "link", "profile"), text)
     if remote is not None and remote.kind != "mqtt":
         if bridge.remote_mqtt.host:
             notes.warning((*path, "remote_mqtt"), f'not used: remote.kind is "{remote.kind}"')

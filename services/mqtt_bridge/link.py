@@ -128,7 +128,7 @@ class Room:
 
     def __init__(self, kbit: float | None = None) -> None:
         self._rate = None if kbit is None else _CARRIED * kbit * 125  # bytes/s
-        self._bytes = float(_FIRST_BYTES)
+        self._bytes = float(_FIRST_BYTES if self._rate is None else _LEAST_BYTES)
         self._in_flight = InFlight(_SLACK_BYTES, _MOST)
         self._waiting = 0
         self._used = False  # there was no room

@@ -118,8 +118,7 @@ class Uplink:
         self._publish(self._clock())
 
     def _suit_transport(self) -> None:
-        level = self._meter.level
-        self._remote.suit_link(little=level != "wide", patient=level == "thin")
+        self._remote.suit_link(slow=self._meter.level != "wide")
 
     def _publish(self, now: float) -> None:
         """A retained message: without a connection it is sent at the next one."""

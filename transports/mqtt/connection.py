@@ -86,7 +86,6 @@ class Connection:
             opening.settings, owner, counters, self._in_flight, where=where, as_published=as_published
         )
         self.pings = self.incoming.pings
-        self._keeps_little = False
         self._poll = SocketPoll()
         bridge = as_published and opening.settings.protocol != "5"
         self._client: AnyClient = client_class(opening.settings.client)(opening, self.incoming, bridge=bridge)
@@ -145,13 +144,13 @@ class Connection:
         """Make `pump` return; for other threads."""
         self._poll.wake()
 
-    def suit(self, *, little: bool, patient: bool) -> None:
-        """Suit the way to the broker: see `Transport.suit_link`."""
+    def suit(self, *, slow: bool) -> None:
+        """Suit the way to the broker: see `Transport.is_slow`."""
         with self._lock:
             sock = self._client.socket
-            if sock is not None and little is not self._keeps_little:
-                keep_unsent(sock, _UNSENT if little else _BY_SYSTEM)
-            self._keeps_little, self.pings.is_patient = little, patient
+            if sock is not None and slow is not self.pings.is_patient:
+                keep_unsent(sock, _UNSENT if slow else _BY_SYSTEM)
+            self.pings.is_patient = slow
 
     # -- the network thread
 

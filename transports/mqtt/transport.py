@@ -84,11 +84,11 @@ class MqttTransport(Transport):
         connection = self._connection
         return None if connection is None else connection.answer
 
-    def suit_link(self, *, little: bool, patient: bool) -> None:
-        super().suit_link(little=little, patient=patient)
+    def suit_link(self, *, slow: bool) -> None:
+        super().suit_link(slow=slow)
         attempt = self._dialler.attempt
         if attempt is not None:
-            attempt.suit(little=little, patient=patient)
+            attempt.suit(slow=slow)
 
     # -- the interface to base
 
@@ -221,7 +221,7 @@ class MqttTransport(Transport):
         """Run one connection from its start to its end; raises Lost unless it ends by `close`."""
         self._dialler.begin()
         connection = self._dialler.connect(self, self.counters, stopping)
-        connection.suit(little=self.keeps_little, patient=self.is_patient)
+        connection.suit(slow=self.is_slow)
         try:
             if self.settings.as_published:
                 as_published = connection.incoming.as_published
@@ -328,7 +328,7 @@ class MqttTransport(Transport):
             self._refused.suspects.connected(now)
             connection.pings.doubtful |= self._refused.suspects.doubtful
         self._initial_sync(known)
-        if not self.is_patient:  # it costs as much as a beginning
+        if not self.is_slow:  # it costs as much as a beginning
             self._retention.begin(self._dialler.address, now)
 
     def _let_catch_up(self, connection: Connection, stopping: _Stop) -> None:
@@ -349,7 +349,7 @@ class MqttTransport(Transport):
             unsure = self._own.shared | {
                 topic for topic, message in own.items() if not self._accepts(connection, message)
             }
-        found, proved = self._find_few(connection, own, stopping) if self.is_patient else ({}, None)
+        found, proved = self._find_few(connection, own, stopping) if self.is_slow else ({}, None)
         if proved is None:
             found = self._find(connection, list(own), stopping)
         if self.will is not None and found.get(self.will.topic) == self.will.payload:

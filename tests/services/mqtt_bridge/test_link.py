@@ -1,0 +1,187 @@
+"""The level of a link: tables of what is measured, and random walks that keep its rules. Nothing waits."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterable, Iterator
+from itertools import pairwise
+
+import pytest
+
+from pebble.contract.payloads import LinkLevel
+from pebble.forwarding.sieve import Rank
+from pebble.services.mqtt_bridge.link import LinkMeter, Room
+
+PING_S = 0.5
+LEVELS: list[LinkLevel] = ["wide", "narrow", "thin"]
+WORSE_S = {"wide": 0.15, "narrow": 0.3, "thin": float("inf")}
+RISE_S = {"wide": float("inf"), "narrow": 20.0, "thin": 60.0}
+
+
+class Walk:
+    """A meter that is told round trips, in seconds, at every ping; notes when its level changed."""
+
+    def __init__(self, profile: str = "auto", kbit: float | None = None) -> None:
+        self.meter = LinkMeter(profile, kbit)
+        self.now = 1000.0
+        self.changes: list[tuple[float, LinkLevel]] = [(self.now, self.meter.level)]
+
+    def take(self, trips: Iterable[float], tcp_queue_s: float | None = None) -> Walk:
+        for trip in trips:
+            self.now += PING_S
+            self.meter.answered(trip, self.now, tcp_queue_s)
+            if self.meter.level != self.changes[-1][1]:
+                self.changes.append((self.now, self.meter.level))
+        return self
+
+    def read(self, history: str) -> Walk:
+        """Words like ``600x30``: a round trip of so many ms, for so many seconds; ``lost``: the connection is."""
+        for word in history.split():
+            if word == "lost":
+                self.meter.lost()
+            else:
+                trip_ms, seconds = map(float, word.split("x"))
+                self.take([trip_ms / 1000] * round(seconds / PING_S))
+        return self
+
+    @property
+    def levels(self) -> str:
+        return " ".join(level for _, level in self.changes)
+
+
+@pytest.mark.parametrize(
+    ("history", "levels"),
+    [
+        ("20x30", "wide"),
+        ("600x30", "wide"),  # far away is not narrow
+        ("600x5 740x60", "wide"),
+        ("20x5 400x0.5 20x60", "wide"),  # one late answer of three
+        ("20x5 200x1", "wide narrow"),
+        ("20x5 200x0.5 20x0.5 200x0.5", "wide narrow"),  # two of three
+        ("20x5 200x0.5 20x1 200x0.5 20x9", "wide"),
+        ("20x5 200x30", "wide narrow"),  # not worse than 300 ms
+        ("20x5 400x1", "wide narrow"),  # each level has its turn
+        ("20x5 400x2", "wide narrow thin"),
+        ("20x5 400x660", "wide narrow thin"),  # a queue that stays
+        ("20x5 400x725", "wide narrow thin narrow"),  # becomes the norm after ten minutes, to the minute
+        ("20x5 200x1 20x20", "wide narrow"),
+        ("20x5 200x1 20x20.5", "wide narrow wide"),
+        ("20x5 200x1 20x15 80x0.5 20x15", "wide narrow"),  # without a queue from then on only
+        ("20x5 200x1 20x15 lost 20x15", "wide narrow"),
+        ("20x5 400x2 20x60.5", "wide narrow thin narrow"),
+        ("20x5 400x2 20x81", "wide narrow thin narrow wide"),
+        ("20x5 400x0.5 lost 400x0.5", "wide"),  # of two connections
+        ("20x5 200x1 20x20.5 200x1 20x39", "wide narrow wide narrow"),  # a rise has failed: twice the time
+        ("20x5 200x1 20x20.5 200x1 20x41", "wide narrow wide narrow wide"),
+        ("20x5 200x1 20x100 200x1 20x20.5", "wide narrow wide narrow wide"),  # that one had not
+    ],
+)
+def test_histories(history: str, levels: str) -> None:
+    assert Walk().read(history).levels == levels
+
+
+@pytest.mark.parametrize(
+    ("profile", "kbit", "levels"),
+    [
+        ("wide", None, "wide"),
+        ("thin", None, "thin"),
+        ("thin", 500.0, "thin"),
+        ("auto", 31.0, "thin"),  # carries no commands of a wide link, whatever is measured
+        ("auto", 32.0, "wide narrow thin narrow wide"),
+    ],
+)
+def test_profiles(profile: str, kbit: float | None, levels: str) -> None:
+    assert Walk(profile, kbit).read("20x5 400x2 20x90").levels == levels
+
+
+def test_the_state_shows_what_is_measured() -> None:
+    walk = Walk("thin").read("620x60 600x0.5 950x0.5")
+    assert (round(walk.meter.round_trip_s, 3), round(walk.meter.queue_s, 3)) == (0.6, 0.35)
+    walk.read("950x661")  # the shortest one is forgotten after ten minutes, to the minute
+    assert (round(walk.meter.round_trip_s, 3), walk.meter.queue_s) == (0.95, 0.0)
+
+
+def test_losses_alone_lower_nothing() -> None:
+    """What was lost and sent again delays answers; TCP's own round trips leave that out."""
+    chance = random.Random(1)
+    late = (chance.random() < 0.3 for _ in range(100_000))
+    assert Walk().take((0.05 + chance.random() * 3 * one for one in late), tcp_queue_s=0.04).levels == "wide"
+
+
+def test_a_wide_link_stays_wide() -> None:
+    """Half a day with jitter below the limit, and single late answers."""
+    chance = random.Random(1)
+    trips = (0.01 + 0.14 * chance.random() + (2.0 if number % 7 == 0 else 0.0) for number in range(100_000))
+    assert Walk().take(trips).levels == "wide"
+
+
+def spells(chance: random.Random) -> Iterator[float]:
+    """Round trips of a link that is good and bad for random times."""
+    for _ in range(40):
+        yield 0.02
+        queue_s = chance.choice((0.0, 0.0, 0.03, 0.1, 0.2, 0.5, 2.0))
+        for _ in range(round(chance.choice((1, 3, 10, 25, 70, 200)) / PING_S)):
+            yield 0.02 + max(0.0, queue_s + chance.uniform(-0.02, 0.02))
+
+
+def check_rules(seed: int) -> int:
+    """How often the level has changed; each time as its rules have it."""
+    trips = [0.02, *spells(random.Random(seed))]
+    walk = Walk().take(trips)
+    queues = [trip - 0.02 for trip in trips]
+    waits, risen_at = dict(RISE_S), float("-inf")
+    for (since, level), (at, then) in pairwise(walk.changes):
+        first, last = (round((time - 1000.0) / PING_S) for time in (since, at))
+        assert abs(LEVELS.index(then) - LEVELS.index(level)) == 1
+        if LEVELS.index(then) > LEVELS.index(level):
+            assert sum(queue > WORSE_S[level] for queue in queues[first:last][-3:]) >= 2, seed
+            failed = at - risen_at < max(60.0, waits[then])
+            waits[then] = min(2 * waits[then], 600.0) if failed else RISE_S[then]
+        else:
+            assert at - since > waits[level], f"{seed}: never sooner than this level's time without a queue"
+            assert max(queues[last - round(waits[level] / PING_S) : last]) < 0.05, seed
+            risen_at = at
+    return len(walk.changes)
+
+
+def test_random_walks_keep_the_rules() -> None:
+    assert sum(map(check_rules, range(200))) > 1000
+
+
+def test_a_link_that_fails_each_time_changes_ever_more_rarely() -> None:
+    walk = Walk().read("20x5")
+    while walk.now < 1000.0 + 4 * 3600:
+        walk.read("200x1" if walk.meter.level == "wide" else "20x1")
+    rises = [at for at, level in walk.changes[1:] if level == "wide"]
+    gaps = [round(later - earlier) for earlier, later in pairwise(rises)]
+    assert gaps[:6] == [42, 82, 162, 322, 602, 602]
+    assert set(gaps[5:]) == {602}
+
+
+class TestRoom:
+    def test_of_a_known_link_is_what_drains_soon(self) -> None:
+        room = Room(kbit=9.6)
+        room.poll(0, 0.6, 0.0)
+        assert [room.takes(Rank.STREAM, 200, 0.0) for _ in range(4)] == [True, True, True, False]
+        assert [room.takes(Rank.STATE, 200, 0.0) for _ in range(4)] == [True, True, True, False]
+        assert room.takes(Rank.HEARTBEAT, 200, 0.0)
+
+    def test_is_learned(self) -> None:
+        """It grows while what is sent is confirmed without delay, and shrinks when it is not."""
+        room, now = Room(), 0.0
+        sizes = []
+        for round_trip_s in (0.1, 0.1, 0.1, 0.1, 0.5, 0.5, 0.5, 0.5, 0.5):
+            sent = 0
+            while room.takes(Rank.STREAM, 100, now):
+                sent += 1
+            sizes.append(sent)
+            now += round_trip_s
+            room.poll(0, 0.1, now)
+        assert sizes == [15, 30, 60, 120, 240, 168, 117, 82, 57]
+
+    def test_one_message_is_always_on_its_way(self) -> None:
+        room = Room(kbit=1.0)
+        assert room.takes(Rank.STREAM, 5000, 0.0)
+        assert not room.takes(Rank.HEARTBEAT, 1, 0.0)
+        room.poll(0, 0.1, 40.0)
+        assert room.takes(Rank.STREAM, 5000, 40.0)
