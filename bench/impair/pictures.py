@@ -36,6 +36,7 @@ _CROSS: Final[dict[str, Any]] = {
 _NARROW, _WORST = f"aim\nat {trials.NARROW}", f"aim at\n{trials.WORST}"
 _BANDS = ("#f3f0e7", "#ffffff")
 _WIDE, _THIN = "#D55E00", "#0072B2"
+_ROBOTS = {"wide": "robot of today", "thin": "profile thin", "auto": "profile auto"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -207,8 +208,14 @@ def _wheels(robots: Mapping[str, Mapping[str, Cell]], title: str) -> Figure:
     last = max(max(cells[wheels.COMMANDED].rounds[0]) for cells in robots.values())
     for axes, (name, cells) in zip(every, robots.items(), strict=True):
         commanded, moved = cells[wheels.COMMANDED], cells[wheels.WHEELS]
-        colour = _WIDE if name == "wide" else _THIN
-        axes.fill_between(moved.rounds[0], moved.rounds[1], step="post", color=colour, alpha=0.75, linewidth=0)
+        axes.fill_between(
+            moved.rounds[0],
+            moved.rounds[1],
+            step="post",
+            color=_WIDE if name == "wide" else _THIN,
+            alpha=0.75,
+            linewidth=0,
+        )
         axes.step(commanded.rounds[0], commanded.rounds[1], where="post", color="#1a1a1a", linewidth=1.0)
         for measure, colour, text in ((wheels.RELEASED, "#555", "let go"), (wheels.STOPPED, "#A4133C", "STOP")):
             for at in cells[measure].rounds[0] if measure in cells else ():
@@ -216,14 +223,17 @@ def _wheels(robots: Mapping[str, Mapping[str, Cell]], title: str) -> Figure:
                 axes.annotate(text, (at, 1.0), xycoords=("data", "axes fraction"), xytext=(3, -2), fontsize=8,
                               textcoords="offset points", color=colour, va="top",
                               weight="bold" if text == "STOP" else "normal")  # fmt: skip
-        axes.set(xlim=(0, last), ylim=(0, 1.15), ylabel=f"{short(name, 18)}\nspeed")
+        if not any(moved.rounds[1]):
+            axes.annotate("the wheels never turned", (0.5, 0.5), xycoords="axes fraction", fontsize=11, color=_WIDE,
+                          ha="center", weight="bold", backgroundcolor="white")  # fmt: skip
+        axes.set(xlim=(0, last), ylim=(0, 1.15), ylabel=f"{_ROBOTS.get(name, name)}\nspeed")
         axes.set_yticks([0, 0.5, 1])
         axes.grid(visible=False, axis="x")
     every[-1].set_xlabel("seconds")
     handles = [
         Line2D([], [], color="#1a1a1a", linewidth=1.0, label="commanded"),
-        Line2D([], [], color=_WIDE, linewidth=6, alpha=0.75, label="what the wheels did, today's robot"),
-        Line2D([], [], color=_THIN, linewidth=6, alpha=0.75, label="what the wheels did, with the link's keys"),
+        Line2D([], [], color=_WIDE, linewidth=6, alpha=0.75, label="what the wheels did, robot of today"),
+        Line2D([], [], color=_THIN, linewidth=6, alpha=0.75, label="what the wheels did, with a link profile"),
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)
     return figure

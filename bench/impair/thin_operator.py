@@ -199,18 +199,20 @@ class ThinOperator:
                 person.zero()
         else:
             stop = person.stop()
-            if self._wait(lambda: stop.confirmed, _CONFIRM_S):
+            if person.foreign:  # it drives on
+                self._drive(person, _CONFIRM_S, lambda: stop.confirmed)
+            if self._wait(lambda: stop.confirmed, 0 if person.foreign else _CONFIRM_S):
                 confirmed_ns = time.monotonic_ns()
         self._pause(ended + gesture.rest_s - clock())
         self._gestures.append(Driven(gesture.kind, began_ns, ended_ns, time.monotonic_ns(), confirmed_ns))
         if gesture.kind == "stop":
             self._reset(person)
 
-    def _drive(self, person: Person, seconds: float) -> None:
+    def _drive(self, person: Person, seconds: float, enough: Callable[[], bool] = lambda: False) -> None:
         began, sent_at = clock(), float("-inf")
         period = 1 / self._orders.foreign_hz if person.foreign else _TICK_S
         due = began
-        while (now := clock()) < began + seconds:
+        while (now := clock()) < began + seconds and not enough():
             if now >= due:
                 due += period
                 if person.foreign or now - sent_at >= person.view.pace.step_s:

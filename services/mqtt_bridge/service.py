@@ -6,6 +6,7 @@ from functools import partial
 from typing import Any
 
 from pebble.contract import AUDIT_READ, BRIDGE_PROBE, DRIVE, LINK, ONLINE, REMOTE_MIRROR, Channel, codec
+from pebble.contract.levels import LEVELS
 from pebble.contract.payloads import SCRIPT, AuditRead, Drive, MediaRequest
 from pebble.errors import PayloadError
 from pebble.forwarding.forwarder import Routed, barrier
@@ -96,7 +97,7 @@ class MqttBridge(ForwardingService):
 
     @property
     def _is_thin(self) -> bool:
-        return self.config.services.mqtt_bridge.link.profile == "thin"
+        return self._uplink is not None and self._uplink.level is LEVELS["thin"]
 
     def make_names(self) -> Names | None:
         security = self.config.security
