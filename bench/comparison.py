@@ -178,6 +178,7 @@ class Comparison:
     constants: Mapping[str, Value | list[Value]] = field(default_factory=dict)  # recorded with the options
     folder: Path = FOLDER  # of the results, by default
     root: bool = False  # needs root
+    by_name: bool = False  # it takes so long that a report has it only where it is named
 
     variants: Sequence[str] = ()  # measured in turn; the option of this name chooses some
     references: Sequence[str] = ()  # more of them, which are always measured
@@ -334,9 +335,12 @@ def reported() -> list[Comparison]:
 
 
 def chosen(names: Sequence[str]) -> list[Comparison]:
-    """Those of these names, in the report's order; without names all that this user may run. Raises PebbleError."""
+    """Those of these names, in the report's order; without names the usual ones that this user may run.
+
+    Raises PebbleError for an unknown name.
+    """
     known = {one.name: one for one in reported()}
     if unknown := [name for name in names if name not in known]:
         raise PebbleError(f"there is no {', '.join(unknown)} in the report: there are {', '.join(known)}")
-    may_run = [name for name, one in known.items() if not one.root or os.geteuid() == 0]
+    may_run = [name for name, one in known.items() if not one.by_name and (not one.root or os.geteuid() == 0)]
     return [one for name, one in known.items() if name in (names or may_run)]

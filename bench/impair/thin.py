@@ -474,4 +474,5 @@ IMPAIR_THIN = Comparison(
     ),
     words=("impair",),
     root=True,
+    by_name=True,
 )  # fmt: skip

@@ -134,10 +134,13 @@ def rest_ms(moved: Sequence[tuple[int, tuple[float, float]]], driven: Driven) ->
 
 def longest_above_s(links: Sequence[LinkSeen], ended_ns: int) -> float:
     """The longest time for which the robot reported a queue above :data:`LONG_QUEUE_MS`."""
-    longest = since = 0
+    longest, since = 0, None
     for seen, after in pairwise([*links, LinkSeen(ended_ns, "", 0)]):
-        since = (since or seen.ns) if seen.queue_ms > LONG_QUEUE_MS else 0
-        longest = max(longest, after.ns - since if since else 0)
+        if seen.queue_ms <= LONG_QUEUE_MS:
+            since = None
+            continue
+        since = seen.ns if since is None else since
+        longest = max(longest, after.ns - since)
     return longest / 1e9
 
 

@@ -211,6 +211,23 @@ def impair(trials: tuple[str, ...] = TRIALS) -> Results:
     return _results("impair", cells, aims, options={"window_s": 8.0, "marks": marks})
 
 
+def impair_thin() -> Results:
+    """Two robots, one of which never moves; it is let go once and stopped once."""
+    cells = []
+    for subject, speed in (("wide", 0.0), ("thin", 0.6)):
+        curves = {
+            "commanded": [[0.0, 0.5, 5.0, 9.0, 12.0], [0.0, 0.6, 0.0, 0.4, 0.0]],
+            "wheels": [[0.0, 0.8, 5.3, 9.3, 12.3], [0.0, speed, 0.0, speed, 0.0]],
+            "released": [[5.0], [0.0]],
+            "stopped": [[12.0], [0.0]],
+        }
+        cells += [
+            Cell(variant=subject, params={"trial": "thin-9.6k"}, measure=f"{what} over time", unit="s", rounds=rounds)
+            for what, rounds in curves.items()
+        ]
+    return _results("impair-thin", cells, [])
+
+
 def broken() -> Results:
     """NaN, empty rounds, a single round, a missing variant, very long names."""
     long = "a-variant-with-a-name-that-is-much-longer-than-anybody-would-think"
@@ -255,7 +272,7 @@ def _robot_traffic(name: str) -> RobotTraffic:
 def one_of_each(small: bool = False) -> dict[str, Results]:
     """By the name of the comparison; ``small``: fewer cells of the largest ones."""
     trials = ("base-start", "512k", "256k", "64k+5%", "wifi-power-save") if small else TRIALS
-    made: list[Callable[[], Results]] = [bridge, startup, video, sound, fleet, traffic]
+    made: list[Callable[[], Results]] = [bridge, startup, video, sound, fleet, traffic, impair_thin]
     every = [control(small), frames(small), cost(small), *(make() for make in made), impair(trials)]
     every += [null_test("control", "zenoh-p2p"), null_test("bridge", "zenoh"), null_test("frames", "zenoh-shm")]
     return {results.bench: results for results in every}
