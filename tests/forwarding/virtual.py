@@ -17,7 +17,7 @@ from pebble.services import mqtt_mirror as mirror_module
 from pebble.services.mqtt_bridge import service as bridge_module
 from pebble.services.mqtt_bridge.service import MqttBridge
 from pebble.services.mqtt_mirror import MqttMirror
-from pebble.transports import Message
+from pebble.transports import Answer, Message, Outgoing
 from pebble.transports.memory import MemoryHub, MemoryTransport
 from tests.services.mqtt_bridge.bridge_rig import Client, make_config
 
@@ -35,7 +35,21 @@ class Connection(MemoryTransport):
     def __init__(self, name: str, hub: Hub, world: World, *, will: Message | None = None) -> None:
         super().__init__(name, hub, will=will)
         self._away = False
+        self.way = Outgoing()  # what a service measures of it
+        self.reply: Answer | None = None
         world.connections.append(self)
+
+    @property
+    def outgoing(self) -> Outgoing:
+        return self.way
+
+    @property
+    def answer(self) -> Answer | None:
+        return self.reply
+
+    def answers(self, seconds: float) -> None:
+        """The next question is answered, after so long."""
+        self.reply = Answer(1 if self.reply is None else self.reply.number + 1, seconds, None)
 
     def cut(self) -> None:
         self._away = True

@@ -145,7 +145,7 @@ def check_rules(seed: int) -> int:
 
 
 def test_random_walks_keep_the_rules() -> None:
-    assert sum(map(check_rules, range(200))) > 1000
+    assert sum(map(check_rules, range(50))) > 250
 
 
 def test_a_link_that_fails_each_time_changes_ever_more_rarely() -> None:

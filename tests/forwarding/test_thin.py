@@ -1,0 +1,313 @@
+"""What a bridge sends over a thin link, in virtual time: heartbeats, streams, states, events, and nothing in a stop's way."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable
+from itertools import pairwise
+from typing import Any
+
+import pytest
+
+from pebble.contract import LINK, codec
+from pebble.contract.payloads import LinkState
+from pebble.forwarding.event_buffer import LIMIT
+from pebble.forwarding.sieve import TOPICS
+from pebble.transports import Message, Outgoing, QoS
+from tests.forwarding.virtual import World
+from tests.services.mqtt_bridge.bridge_rig import BASE
+
+LINK_STATE, ONLINE = "outgoing/link", "outgoing/online"
+IMU, TOUCH, LOGS = "outgoing/sensors/imu", "outgoing/touch-sensors", "outgoing/logs"
+STATUS, STOPPED, CONTROL = "outgoing/status", "outgoing/estop/serial", "outgoing/control/serial"
+EVENT, DRIVE, STOP, FLAG = (
+    "outgoing/somebody/happened",
+    "incoming/drive-values",
+    "incoming/estop",
+    "incoming/flags/lamp",
+)
+FULL, FREE = Outgoing(waiting=100_000, round_trip_s=0.1), Outgoing(round_trip_s=0.1)
+Start = Callable[..., World]
+
+
+@pytest.fixture
+def start(monkeypatch: pytest.MonkeyPatch) -> Start:
+    def started(profile: str = "thin", **section: Any) -> World:
+        world = World("bridge", monkeypatch)
+        world.start(link={"profile": profile}, **section)
+        world.run()
+        return world
+
+    return started
+
+
+def link_states(world: World) -> list[LinkState]:
+    return [codec.decode(LINK, payload) for payload in world.remote.payloads(LINK_STATE)]
+
+
+def times(world: World, suffix: str) -> list[float]:
+    """When messages of a heartbeat's kind were made, in seconds."""
+    return [json.loads(payload)["t"] for payload in world.remote.payloads(suffix)]
+
+
+def stream(world: World, suffix: str, seconds: float, *, every_s: float = 0.02, qos: int = 1) -> int:
+    """Publish numbers; returns the last one."""
+    number = 0
+    for number in range(round(seconds / every_s)):
+        world.local.publish(suffix, b"%d" % number, qos=qos)
+        world.run(every_s)
+    return number
+
+
+class TestLevels:
+    @pytest.mark.parametrize(
+        ("profile", "kbit", "level"), [("thin", {}, "thin"), ("auto", {}, "wide"), ("auto", {"kbit": 9.6}, "thin")]
+    )
+    def test_the_state_is_retained_from_the_start(
+        self, start: Start, profile: str, kbit: dict[str, float], level: str
+    ) -> None:
+        world = World.__new__(World)
+        world = start(profile)
+        world.stop()
+        world.start(link={"profile": profile, **kbit})
+        world.run()
+        retained = world.retained(LINK_STATE)
+        assert retained[0] is None, "it concerns the remote side alone"
+        state = codec.decode(LINK, retained[1] or b"")
+        assert (state.level, state.drive_hz) == (level, {"thin": 4, "wide": 20}[level])
+
+    def test_it_follows_what_is_measured(self, start: Start) -> None:
+        world = start("auto")
+        for trip_s, pings in ((0.02, 5), (0.5, 4), (0.02, 170)):
+            for _ in range(pings):
+                world.uplink.answers(trip_s)
+                world.run(0.5)
+        levels = [state.level for state in link_states(world)]
+        changes = levels[:1] + [later for earlier, later in pairwise(levels) if later != earlier]
+        assert changes == ["wide", "narrow", "thin", "narrow", "wide"]
+        assert [state.drive_hz for state in link_states(world) if state.level == "narrow"][0] == 10
+
+    def test_it_is_published_on_change_and_else_rarely(self, start: Start) -> None:
+        world = start()
+        before = len(link_states(world))
+        world.run(60)
+        assert len(link_states(world)) - before == 6
+        for number in range(100):
+            world.uplink.answers(0.1 + 0.5 * (number % 2))
+            world.run(0.5)
+        states = link_states(world)[before + 6 :]
+        assert 20 <= len(states) <= 26
+        assert {(state.rtt_ms, state.queue_ms) for state in states[1:]} <= {(100, 0), (100, 500)}
+
+    def test_one_that_is_wide_again_takes_the_state_back(self, start: Start) -> None:
+        world = start()
+        world.stop()
+        assert world.retained(LINK_STATE)[1]
+        world.start()
+        world.run(60)
+        assert world.retained(LINK_STATE) == (None, None)
+
+    def test_one_that_is_not_keeps_it(self, start: Start) -> None:
+        world = start()
+        world.run(120)
+        assert world.retained(LINK_STATE)[1]
+
+
+class TestHeartbeats:
+    @pytest.mark.parametrize(
+        ("profile", "section", "gap", "qos"),
+        [
+            ("wide", {}, 0.25, 1),
+            ("auto", {}, 0.25, 1),
+            ("thin", {}, 1.0, 0),
+            ("thin", {"heartbeat": {"interval_seconds": 3}}, 3.0, 0),
+            ("thin", {"remote": {"kind": "zenoh", "connect": ["tcp/host:7447"]}}, 1.0, 1),  # QoS 0 saves nothing there
+        ],
+    )
+    def test_by_level(self, start: Start, profile: str, section: dict[str, Any], gap: float, qos: int) -> None:
+        world = start(profile, **section)
+        began = len(world.remote.on(ONLINE))
+        world.run(30)
+        beats = world.remote.on(ONLINE)[began:]
+        assert abs(len(beats) - 30 / gap) <= 1
+        assert {int(beat.qos) for beat in beats} == {qos}
+
+    def test_wait_last_and_come_as_soon_as_there_is_room(self, start: Start) -> None:
+        world = start()
+        world.uplink.way = FULL
+        world.run(1)
+        before = len(world.remote.on(ONLINE))
+        world.run(5)
+        assert len(world.remote.on(ONLINE)) == before
+        world.uplink.way = FREE
+        world.run(0.11)
+        assert len(world.remote.on(ONLINE)) == before + 1
+
+
+class TestStreams:
+    @pytest.mark.parametrize("suffix", [IMU, LOGS, "outgoing/programs/reading"])
+    def test_the_newest_of_each_second_passes(self, start: Start, suffix: str) -> None:
+        world = start()
+        qos = 0 if suffix.endswith("reading") else 1  # of what the contract does not know
+        last = stream(world, suffix, 10, qos=qos)
+        world.run(2)
+        numbers = [int(payload) for payload in world.remote.payloads(suffix)]
+        assert len(numbers) in (10, 11)
+        assert numbers[-1] == last, "and the very last one"
+        assert numbers == sorted(numbers)
+
+    def test_each_has_its_own_turn(self, start: Start) -> None:
+        world = start()
+        for number in range(500):
+            for suffix in (IMU, TOUCH):
+                world.local.publish(suffix, b"%d" % number)
+            world.run(0.02)
+        assert {len(world.remote.on(suffix)) for suffix in (IMU, TOUCH)} <= {10, 11}
+
+    def test_more_topics_than_are_remembered_lose_streams_and_no_state(self, start: Start) -> None:
+        world = start()
+        world.uplink.way = FULL
+        world.run(0.2)
+        for number in range(TOPICS + 100):
+            world.local.publish(f"outgoing/programs/reading{number}", b"1", qos=0)
+        world.local.publish(STATUS, b"last", retain=True)
+        world.run(1)
+        assert world.retained(STATUS)[1] == b"last"
+        world.uplink.way = FREE
+        world.run(5)
+        arrived = {message.topic for message in world.remote.seen if "reading" in message.topic}
+        assert len(arrived) == TOPICS
+        assert world.service.dropped()["shed"] >= 100
+
+    def test_at_a_level_that_is_wide_again_all_pass_at_once(self, start: Start) -> None:
+        world = start("auto")
+        for trip_s, pings in ((0.02, 5), (0.5, 4)):
+            for _ in range(pings):
+                world.uplink.answers(trip_s)
+                world.run(0.5)
+        world.uplink.way = FULL
+        world.run(0.2)
+        world.local.publish(STATUS, b"waits", retain=True)
+        world.local.publish(EVENT, b"waits")
+        world.run(0.2)
+        assert not world.remote.on(EVENT)
+        for _ in range(170):
+            world.uplink.answers(0.02)
+            world.run(0.5)
+        assert link_states(world)[-1].level != "thin"
+        assert stream(world, IMU, 1) == 49
+        assert len(world.remote.on(IMU)) == 50
+
+
+class TestNoRoom:
+    def test_what_waits_and_what_never_does(self, start: Start) -> None:
+        world = start()
+        world.local.publish(STATUS, b"0", retain=True)
+        world.run()
+        world.uplink.way = FULL
+        world.run(0.2)
+        for number in range(1, 4):
+            for suffix in (STATUS, STOPPED, CONTROL, FLAG, IMU, EVENT):
+                retain = suffix in (STATUS, STOPPED, CONTROL, FLAG)
+                world.local.publish(suffix, b"%d" % number, retain=retain)
+            world.run(0.5)
+        passed = {suffix: world.remote.payloads(suffix) for suffix in (STATUS, STOPPED, CONTROL, FLAG, IMU, EVENT)}
+        numbers = [b"1", b"2", b"3"]
+        assert passed == {STATUS: [b"0"], STOPPED: numbers, CONTROL: numbers, FLAG: numbers, IMU: [], EVENT: []}
+        world.uplink.way = FREE
+        world.run(0.2)
+        passed = {suffix: world.remote.payloads(suffix) for suffix in (STATUS, IMU, EVENT)}
+        assert passed == {STATUS: [b"0", b"3"], IMU: [b"3"], EVENT: numbers}, "the newest value, and each event"
+
+    def test_states_go_first(self, start: Start) -> None:
+        world = start()
+        world.uplink.way = FULL
+        world.run(0.2)
+        for suffix in (IMU, STATUS):
+            world.local.publish(suffix, b"1", retain=suffix == STATUS)
+        world.run(0.5)
+        world.uplink.way = FREE
+        world.run(0.5)
+        assert [message.topic for message in world.remote.seen if message.topic.endswith(("imu", "status"))] == [
+            f"{BASE}/{STATUS}",
+            f"{BASE}/{IMU}",
+        ]
+
+    def test_it_is_counted_and_said_once_a_minute(self, start: Start, caplog: pytest.LogCaptureFixture) -> None:
+        caplog.set_level(logging.WARNING)
+        world = start()
+        world.uplink.way = FULL
+        stream(world, IMU, 10)
+        assert world.service.dropped()["shed"] > 400
+        assert world.service.status.counts["shed"] == world.service.dropped()["shed"]
+        assert len([line for line in caplog.messages if "has no room" in line]) == 1
+
+    def test_events_have_a_bound(self, start: Start) -> None:
+        world = start()
+        world.uplink.way = FULL
+        world.run(0.2)
+        for number in range(LIMIT + 50):
+            world.local.publish(EVENT, b"%d" % number)
+            world.run(0.01)
+        world.uplink.way = FREE
+        world.run(0.5)
+        assert [int(payload) for payload in world.remote.payloads(EVENT)] == list(range(50, LIMIT + 50))
+
+    def test_what_is_lost_with_a_connection_comes_with_the_next(self, start: Start) -> None:
+        world = start()
+        world.uplink.way = FULL
+        world.run(0.2)
+        world.local.publish(STATUS, b"newest", retain=True)
+        world.run(0.2)
+        world.uplink.cut()
+        world.uplink.way = FREE
+        world.run(3)
+        world.uplink.mend()
+        world.run(3)
+        assert world.retained(STATUS)[1] == b"newest"
+
+
+class TestCommands:
+    """Nothing on its way to the robot waits, whatever waits the other way."""
+
+    @pytest.mark.parametrize("qos", [0, 1])
+    def test_pass_at_once_and_as_ever(self, start: Start, qos: int) -> None:
+        world = start()
+        world.uplink.way = FULL
+        world.run(0.2)
+        for suffix, payload in ((DRIVE, b'{"z": 0.5}'), (DRIVE, b'{"z": 0}'), (STOP, b'{"stop": "a1"}')):
+            world.local.seen.clear()
+            world.remote.publish(suffix, payload, qos=qos)
+            world.run(0)
+            assert [(one.topic, one.payload, one.qos) for one in world.local.seen] == [
+                (f"{BASE}/{suffix}", payload, QoS.DELIVERED)
+            ]
+
+
+def sent(world: World) -> list[tuple[str, bytes, int, bool]]:
+    """What the bridge has published on the remote side, without what differs at each run."""
+    own = (ONLINE, "outgoing/bridge-probe", "outgoing/audit")
+    return [
+        (one.topic, one.payload, int(one.qos), bool(one.retain_requested))
+        for one in world.remote.seen
+        if not one.topic.endswith(own)
+    ]
+
+
+def test_on_a_wide_link_the_bridge_sends_what_it_receives(start: Start) -> None:
+    """All of it, in order, at once, with the same bytes; and no state of the link."""
+    world = start("wide")
+    world.uplink.way = FULL
+    expected: list[Message] = []
+    for number in range(200):
+        for suffix, qos, retain in ((IMU, 1, False), (LOGS, 0, False), (STATUS, 1, True), (EVENT, 1, False)):
+            message = Message(f"{BASE}/{suffix}", b"%d" % number, QoS(qos), retain)
+            expected.append(message)
+            world.local.publish(suffix, message.payload, qos=qos, retain=retain)
+        world.run(0.01)
+    assert sent(world) == [(one.topic, one.payload, int(one.qos), one.retain) for one in expected]
+    assert not world.remote.on(LINK_STATE)
+    beats = len(world.remote.on(ONLINE))
+    world.run(10)
+    assert len(world.remote.on(ONLINE)) - beats == 40

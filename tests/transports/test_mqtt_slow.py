@@ -1,0 +1,237 @@
+"""A connection over a slow way: patience, short queues, and a beginning that asks only for what it has to know."""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections.abc import Callable, Iterator
+from contextlib import closing, suppress
+from pathlib import Path
+
+import pytest
+
+from pebble.transports import Message, MqttSettings, QoS, State, create
+from pebble.transports.mqtt import packets
+from pebble.transports.mqtt.ending import Silent
+from pebble.transports.mqtt.retention import KeptProof
+from pebble.transports.mqtt.transport import MqttTransport
+from tests.support import Broker, until
+from tests.tcp_proxy import TcpProxy
+from tests.transports.received import Received
+from tests.transports.test_mqtt_connection import Link, sent
+
+PROOF, WILL = "slow/proof", "slow/online"
+STATES = [f"slow/state/{number}" for number in range(40)]
+ALL = list(range(40))
+
+
+class TestPatience:
+    @pytest.mark.parametrize(
+        ("silence_s", "round_trip_s", "limit_s"), [(2.0, 0.0, 5.0), (20.0, 0.0, 20.0), (2.0, 0.9, 7.2)]
+    )
+    def test_the_limit(
+        self, monkeypatch: pytest.MonkeyPatch, silence_s: float, round_trip_s: float, limit_s: float
+    ) -> None:
+        with closing(Link(monkeypatch, silence_s, round_trip_s)) as link:
+            link.connection.suit(slow=True)
+            link.idle(limit_s - 0.2)
+            with pytest.raises(Silent, match=f"has not answered for {limit_s} s"):
+                link.idle(0.4)
+
+    def test_one_ping_a_second(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        with closing(Link(monkeypatch)) as link:
+            link.connection.suit(slow=True)
+            asked = 0
+            for _ in range(200):
+                link.idle(0.05)
+                asked += link.answer_pings()
+        assert 9 <= asked <= 14, "a little more, so that two are never a period"
+
+    def test_anything_is_a_sign_of_life(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        with closing(Link(monkeypatch)) as link:
+            link.connection.suit(slow=True)
+            for _ in range(20):
+                link.idle(2.0)
+                link.sends(sent(b"live"))
+                link.pump()
+            assert link.counters["silences"] == 0
+            assert link.messages[-1].waited_s > 1.0, "which proves nothing about its age"
+
+    def test_an_answer_tells_how_long_it_took(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        with closing(Link(monkeypatch)) as link:
+            assert link.connection.answer is None
+            link.idle(0.6)
+            link.now += 0.3
+            assert link.answer_pings() == 1
+            first = link.connection.answer
+            assert first is not None
+            assert (first.number, first.queue_s is not None) == (1, True)
+            assert 0.3 < first.seconds < 0.6
+            link.idle(1.5)  # the next one is not answered
+            second = link.connection.answer
+            assert second is not None
+            assert second.number == 1
+            assert second.seconds > 0.9
+
+
+class TestSocket:
+    def test_keeps_little_while_the_way_is_slow(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        with closing(Link(monkeypatch)) as link:
+            assert link.connection.socket is not None
+            sizes = []
+            for slow in (False, True, False):
+                link.connection.suit(slow=slow)
+                sizes.append(link.connection.socket.getsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT))
+        assert sizes == [0, 4096, 0]
+
+    @pytest.mark.parametrize(("dscp", "tos"), [(0, 0), (46, 0xB8), (10, 0x28)])
+    def test_marks_packets(self, broker: Broker, dscp: int, tos: int) -> None:
+        settings = MqttSettings(host="127.0.0.1", port=broker.port, dscp=dscp)
+        with closing(create("mqtt", "client", settings).open(10)) as transport:
+            assert isinstance(transport, MqttTransport)
+            assert transport.state is State.CONNECTED
+            assert _marks(broker.port) == [tos]
+
+
+def _marks(port: int) -> list[int]:
+    """How this process's connections to ``port`` mark their packets."""
+    found = []
+    for link in list(Path("/proc/self/fd").iterdir()):
+        with suppress(OSError, IndexError), socket.socket(fileno=os.dup(int(link.name))) as copy:
+            if copy.getpeername()[1] == port:
+                found.append(copy.getsockopt(socket.IPPROTO_IP, socket.IP_TOS) & 0xFC)
+    return found
+
+
+def message(topic: str, payload: bytes = b"x") -> Message:
+    return Message(topic, payload, QoS.DELIVERED, retain=True)
+
+
+class TestProof:
+    """What is sent: names of topics, and values of the proof, with ``!`` where the one before is confirmed."""
+
+    @pytest.mark.parametrize(
+        ("history", "proving", "unproved"),
+        [
+            ("", "", ""),
+            ("a b", "", ""),
+            ("=1", "1", ""),
+            ("a =1 b c", "1", "b c"),
+            ("=1 a =2 b", "1 2", "a b"),  # either may be the newest one of the broker
+            ("=1 a !=2 b", "1 2", "a b"),  # 1 was confirmed; whether 2 arrives is not known
+            ("=1 a !=2 b !=3 c", "2 3", "b c"),
+            ("=1 a =2 b =3 !=4 c", "3 4", "c"),
+        ],
+    )
+    def test_histories(self, history: str, proving: str, unproved: str) -> None:
+        proof = KeptProof(PROOF)
+        for word in history.split():
+            value = word.partition("=")[2]
+            proof.sent(message(PROOF, value.encode()) if value else message(word), confirmed=word[0] == "!")
+        assert [one for one in "01234" if proof.proves(one.encode())] == proving.split()
+        assert proof.unproved == set(unproved.split())
+
+
+class Recorder(TcpProxy):
+    """Keeps what clients send."""
+
+    def __init__(self, target: int) -> None:
+        self.sent = bytearray()
+        super().__init__(target)
+
+    def passes(self, data: bytes) -> bool:
+        self.sent += data
+        return True
+
+
+@pytest.fixture
+def broker(tmp_path: Path) -> Iterator[Broker]:
+    broker = Broker(tmp_path, persistence=True, autosave=False)
+    yield broker
+    broker.stop()
+
+
+class Robot:
+    """Forty states and a proof at a broker behind a proxy."""
+
+    def __init__(self, broker: Broker, proxy: Recorder, *, slow: bool = True) -> None:
+        self.proxy = proxy
+        settings = MqttSettings(host="127.0.0.1", port=proxy.port, reconnect_max_s=0.1)
+        self.transport = create("mqtt", "robot", settings, will=message(WILL, b"offline"))
+        self.transport.proof = PROOF
+        self.transport.suit_link(slow=slow)
+        self.transport.open(10)
+        for topic in STATES:
+            self.publish(topic, b"old")
+        self.publish(PROOF, b"1")
+        self.publish(PROOF, b"2")
+        assert self.confirmed()
+
+    def publish(self, topic: str, payload: bytes) -> None:
+        assert self.transport.publish(topic, payload, qos=QoS.DELIVERED, retain=True)
+
+    def confirmed(self) -> bool:
+        return until(lambda: self.transport.outgoing.waiting == 0)
+
+    def reconnects(self, meanwhile: Callable[[], object] = lambda: None) -> list[int]:
+        """Lose the connection; returns for which states the next one asks, or which it sends."""
+        count = self.transport.counters["connected"]
+        self.proxy.cut()
+        assert until(lambda: self.transport.state is State.CONNECTING)
+        meanwhile()
+        self.proxy.sent.clear()
+        self.proxy.mend()
+        assert until(lambda: self.transport.counters["connected"] > count)
+        return [number for number in range(40) if b"slow/state/%d\0" % number in self.proxy.sent]
+
+
+@pytest.fixture
+def recorder(broker: Broker) -> Iterator[Recorder]:
+    with Recorder(broker.port) as recorder:
+        yield recorder
+
+
+def values(broker: Broker) -> dict[str, bytes]:
+    """What the broker has retained."""
+    received = Received()
+    with create("mqtt", "reader", MqttSettings(host="127.0.0.1", port=broker.port)) as reader:
+        reader.subscribe("slow/#", received, direct=True)
+        return {one.topic: one.payload for one in received.messages}
+
+
+class TestBeginning:
+    @pytest.fixture
+    def robot(self, broker: Broker, recorder: Recorder) -> Iterator[Robot]:
+        robot = Robot(broker, recorder)
+        yield robot
+        robot.transport.close()
+
+    def test_asks_for_little_where_the_broker_has_kept_what_it_had(self, robot: Robot, broker: Broker) -> None:
+        robot.publish(STATES[3], b"after the proof")
+        assert robot.confirmed()
+        assert robot.reconnects(lambda: robot.publish(STATES[5], b"meanwhile")) == [3, 5]
+        assert len(robot.proxy.sent) < 600
+        found = values(broker)
+        assert [found[STATES[number]] for number in (3, 4, 5)] == [b"after the proof", b"old", b"meanwhile"]
+
+    def test_asks_for_all_where_it_has_not(self, robot: Robot, broker: Broker) -> None:
+        broker.kill()
+        assert robot.reconnects(broker.start) == ALL
+        assert until(lambda: set(values(broker)) == {*STATES, PROOF})
+
+    def test_notices_an_older_save(self, robot: Robot, broker: Broker) -> None:
+        """Which has a value of the proof, too, and one that is not much older."""
+        broker.save()
+        robot.publish(STATES[7], b"newer")
+        for number in range(3, 6):
+            robot.publish(PROOF, b"%d" % number)
+            assert robot.confirmed()
+        broker.kill()
+        assert robot.reconnects(broker.start) == ALL
+        assert until(lambda: values(broker)[STATES[7]] == b"newer")
+
+    def test_asks_for_all_on_a_wide_link(self, broker: Broker, recorder: Recorder) -> None:
+        robot = Robot(broker, recorder, slow=False)
+        assert robot.reconnects() == ALL
+        robot.transport.close()
+        assert packets.PINGREQ in robot.proxy.sent
