@@ -36,21 +36,21 @@ class Patience(Struct, frozen=True):
 class _Clock:
     """One sender's clock. A difference is what our clock shows when a message arrives, less its stamp."""
 
-    __slots__ = ("began", "heard_at", "least", "newest", "other", "patience_s", "proved")
+    __slots__ = ("began", "least", "newest", "other", "patience_s", "proved", "received_at")
 
     def __init__(self, sent: float, waited_s: float, now: float, patience_s: float = inf) -> None:
-        self.began = self.heard_at = now
+        self.began = self.received_at = now
         self.newest = sent  # stamp
         self.least = now - sent  # difference: that of the fastest message
         self.proved = self.least - waited_s  # the largest that a message without any delay can have had
         self.patience_s = patience_s
         self.other: _Clock | None = None  # what it has become, if all that came since was not late
 
-    def hear(self, sent: float, waited_s: float, now: float) -> None:
-        drift = _DRIFT * (now - self.heard_at)
+    def receive(self, sent: float, waited_s: float, now: float) -> None:
+        drift = _DRIFT * (now - self.received_at)
         self.least = min(now - sent, self.least + drift)
         self.proved = max(now - sent - waited_s, self.proved + drift)
-        self.heard_at, self.newest = now, max(self.newest, sent)
+        self.received_at, self.newest = now, max(self.newest, sent)
 
     def age_s(self, sent: float, now: float) -> float:
         return now - sent - min(self.least, self.proved)
@@ -59,7 +59,7 @@ class _Clock:
 class SenderClocks(Generic[K]):
     """The clocks of at most so many senders, each known by a key.
 
-    Where there is no room, one that is silent gives way, or else that which was heard for the shortest time: no flood
+    Where there is no room, one that is silent gives way, or else that which was received for the shortest time: no flood
     of invented keys takes the place of a sender that goes on. One that finds no place is judged as without a stamp.
     """
 
@@ -72,17 +72,17 @@ class SenderClocks(Generic[K]):
         return len(self._clocks)
 
     def age_s(self, key: K, sent: float, waited_s: float, now: float, late_s: float) -> float:
-        """Seconds for which a message has waited that is stamped ``sent``; ``now`` is of our clock. It is late above ``late_s``.
+        """Seconds for which a message has waited that is stamped ``sent``: at ``now`` of our clock; late above ``late_s``.
 
-        ``waited_s`` is what is known without the stamp: at most so long. A sender is only believed beyond it once one
-        of its messages has waited for less.
+        ``waited_s`` is what is known without the stamp: at most so long. It counts as well until the clock is two
+        seconds old, and until one of its messages was fast by both.
         """
         with self._lock:
             clock = self._clocks.get(key)
-            if clock is None or now - clock.heard_at > self._patience.silent_s or now - sent < clock.least - _JUMP_S:
+            if clock is None or now - clock.received_at > self._patience.silent_s or now - sent < clock.least - _JUMP_S:
                 clock = self._clocks[key] = self._begin(key, _Clock(sent, waited_s, now))
             else:
-                clock.hear(sent, waited_s, now)
+                clock.receive(sent, waited_s, now)
                 clock = self._believed(key, clock, sent, waited_s, now, late_s)
             age = clock.age_s(sent, now)
             return max(age, waited_s) if now - clock.began < _YOUNG_S else age
@@ -90,9 +90,11 @@ class SenderClocks(Generic[K]):
     def _begin(self, key: K, clock: _Clock) -> _Clock:
         clocks = self._clocks
         if key not in clocks and len(clocks) >= self._most:
-            silent = min(clocks, key=lambda one: clocks[one].heard_at)
-            if clock.began - clocks[silent].heard_at <= _IDLE_S:
-                silent = min(clocks, key=lambda one: (clocks[one].heard_at - clocks[one].began, clocks[one].heard_at))
+            silent = min(clocks, key=lambda one: clocks[one].received_at)
+            if clock.began - clocks[silent].received_at <= _IDLE_S:
+                silent = min(
+                    clocks, key=lambda one: (clocks[one].received_at - clocks[one].began, clocks[one].received_at)
+                )
             del clocks[silent]
         return clock
 
@@ -103,10 +105,10 @@ class SenderClocks(Generic[K]):
             return clock
         other, patience = clock.other, self._patience
         patience_s = patience.set_back_s if sent < clock.newest - _JUMP_S else patience.believed_s
-        if other is None or now - other.heard_at > patience.gap_s or patience_s < other.patience_s:
+        if other is None or now - other.received_at > patience.gap_s or patience_s < other.patience_s:
             clock.other = _Clock(sent, waited_s, now, patience_s)
             return clock
-        other.hear(sent, waited_s, now)
+        other.receive(sent, waited_s, now)
         if now - other.began <= other.patience_s:
             return clock
         self._clocks[key] = other

@@ -54,7 +54,7 @@ class Channel(Struct, frozen=True, kw_only=True, dict=True):
     ``metric`` may hold ``{names}``, one level each. With ``remote=False`` it never leaves the robot. With
     ``bridged=False`` its own process is connected to the remote broker. With ``newest``, only the newest of several
     waiting messages is handled. A one-shot message that has waited for longer than ``waits_s``, in a process or at a
-    broker, is stale, unless it ends something; on its way over a link that may be thin it may wait for ``thin_waits_s``.
+    broker, is stale, unless it ends something; on the way over a link that may be thin, than ``thin_waits_s``.
     """
 
     metric: str
