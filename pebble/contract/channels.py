@@ -18,6 +18,7 @@ INCOMING, OUTGOING = "incoming", "outgoing"
 WAITS_S = 0.5  # how long what happens once may wait; in the connection another 2 s at most
 _PATIENT_S = 2.0  # the same, where it moves nothing
 _HOLD_S = 3.0  # the same, of what is repeated every second and lasts for 3 s
+_HOLD_THIN_S = 10.0  # the same, where the link may be thin: control lasts for as long at most
 
 
 class Kind(Enum):
@@ -53,7 +54,8 @@ class Channel(Struct, frozen=True, kw_only=True, dict=True):
     ``metric`` may hold ``{names}``, one level each. With ``remote=False`` it never leaves the robot. With
     ``bridged=False`` its own process is connected to the remote broker. With ``newest``, only the newest of several
     waiting messages is handled. A one-shot message that has waited for longer than ``waits_s``, in a process or at a
-    broker, is stale, unless it ends something. A ``prompt`` one never waits for room on a thin link.
+    broker, is stale, unless it ends something; on the way over a link that may be thin, than ``thin_waits_s``.
+    A ``prompt`` one never waits for room on a thin link.
     """
 
     metric: str
@@ -65,6 +67,7 @@ class Channel(Struct, frozen=True, kw_only=True, dict=True):
     bridged: bool = True
     newest: bool = False
     waits_s: float = WAITS_S
+    thin_waits_s: float | None = None  # None: the same
     prompt: bool = False
     qos: int = -1  # -1: that of the kind
     retain: bool | None = None  # None: that of the kind
@@ -142,9 +145,9 @@ DRIVE = _c("drive-values", Kind.COMMAND, p.Drive, "Wanted steering x and throttl
 ESTOP = _c("estop", Kind.COMMAND, p.EstopCommand, "Emergency stop: nothing moves until a reset.", waits_s=math.inf)
 ESTOP_RESET = _c("estop-reset", Kind.COMMAND, p.EstopReset, "Ends the emergency stop of one motor owner.")
 CONTROL = _c("control", Kind.COMMAND, p.ControlRequest, "Requests, renews or releases control: who drives.",
-             waits_s=_HOLD_S)  # fmt: skip
+             waits_s=_HOLD_S, thin_waits_s=_HOLD_THIN_S)  # fmt: skip
 CONTROL_TAKE = _c("control/take", Kind.COMMAND, p.ControlRequest, "Takes control over from somebody else.",
-                  waits_s=_HOLD_S)  # fmt: skip
+                  waits_s=_HOLD_S, thin_waits_s=_HOLD_THIN_S)  # fmt: skip
 LIGHTS_SOLID = _c("lights-solid", Kind.COMMAND, p.LightsSolid, "A steady colour.",
                   newest=True, waits_s=_PATIENT_S, override=_serial("lights_solid"))  # fmt: skip
 LIGHTS_FLASH = _c("lights-flash", Kind.COMMAND, p.LightsFlash, "A colour fading in and out.",

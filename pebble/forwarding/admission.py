@@ -1,11 +1,10 @@
-"""What a robot takes: how much from outside, where everybody may send it anything, and how late."""
+"""What a robot takes: how much from outside, where everybody may send it anything."""
 
 import time
 from collections.abc import Callable
 
-from pebble.contract import INCOMING, Channel, Kind, codec
+from pebble.contract import INCOMING, Channel, Kind
 from pebble.contract.codec import MAX_COMMAND_BYTES
-from pebble.errors import PayloadError
 from pebble.forwarding.routing import Drop, Side
 from pebble.forwarding.subjects import Subject
 from pebble.transports import Message
@@ -16,7 +15,7 @@ MAX_UNKNOWN_FLAGS = 64  # each is retained on the robot: in its broker or hub, a
 
 
 class Admission:
-    """Bounds what a robot takes: by size, by how long it waited, and by number what is no command of the contract.
+    """Bounds what a robot takes: by size, and by number what is no command of the contract.
 
     Flags that the contract does not know: what the robot itself has set counts as well, so a restarted bridge begins no
     new number, but is always admitted.
@@ -35,11 +34,7 @@ class Admission:
         """Why this message may not pass to ``topic``; None if it may. Hot."""
         if side is Side.REMOTE and len(message.payload) > MAX_COMMAND_BYTES and _is_bounded(subject):
             return Drop.TOO_LARGE
-        if subject.counted and (drop := self._count(side, subject, message, topic)):
-            return drop
-        if subject.kind.one_shot and message.waited_s > subject.waits_s and not _ends_something(subject, message):
-            return Drop.LATE
-        return None
+        return self._count(side, subject, message, topic) if subject.counted else None
 
     def _count(self, side: Side, subject: Subject, message: Message, topic: str) -> Drop | None:
         if side is Side.REMOTE and self._is_too_often(subject, message):
@@ -80,13 +75,3 @@ class Admission:
 
 def _is_bounded(subject: Subject) -> bool:
     return subject.kind.direction == INCOMING and not subject.is_stop  # any payload is a stop
-
-
-def _ends_something(subject: Subject, message: Message) -> bool:
-    """Whether a late message passes, because it can only bring something to rest."""
-    if subject.channel is None:
-        return False
-    try:
-        return subject.channel.ends(codec.decode(subject.channel, message.payload))
-    except PayloadError:
-        return False

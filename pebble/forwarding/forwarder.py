@@ -21,6 +21,7 @@ import msgspec
 from pebble.contract import ESTOP, Kind
 from pebble.contract.names import NO_ACCOUNT
 from pebble.forwarding.admission import Admission
+from pebble.forwarding.command_ages import CommandAges
 from pebble.forwarding.cycles import Cycles, Finding
 from pebble.forwarding.names import Names, Signed
 from pebble.forwarding.publisher import Publisher
@@ -86,6 +87,7 @@ class Forwarder:
         #: What :func:`route` has returned. There are not many subjects, so it needs no bound.
         self._routes: dict[tuple[Side, Subject, QoS, bool, bool | None, bool], Forward | Drop] = {}
         self._admission = Admission(clock)
+        self.ages = CommandAges()
         self.cycles = Cycles(clock, yields=not rules.leaves_robot)  # a mirror, to the bridge
         both_ways = frozenset(kind for kind in Kind if rules.both_ways(kind))
         self.publisher = Publisher(self.sides, self.cycles, subjects, self.counters, both_ways)
@@ -232,7 +234,7 @@ class Forwarder:
                 case Signed(message, by) if by != NO_ACCOUNT and subject.kind is Kind.FLAG:
                     outcome = self.retained.change(subject, message)
                 case Signed(message, by):
-                    outcome = self._pass(here, subject, message, outcome)
+                    outcome = self._pass(here, subject, message, outcome, sender.account)
                 case Drop.UNNAMED if outcome.retain:  # the broker may retain what the robot itself has published
                     outcome = self.retained.receive(here, subject, message, outcome, old=True)
                 case drop:
@@ -275,8 +277,15 @@ class Forwarder:
                 return drop
         return forward
 
-    def _pass(self, here: SideState, subject: Subject, message: Message, forward: Forward) -> Forward | Drop:
-        """Publish it on the other side, or say why not. Hot."""
+    def _pass(
+        self, here: SideState, subject: Subject, message: Message, forward: Forward, account: str = ""
+    ) -> Forward | Drop:
+        """Publish it on the other side, or say why not. Hot.
+
+        ``account`` is that of its sender, where names are checked.
+        """
+        if subject.kind.one_shot and self.ages.is_late(subject, message, account, stamped=forward.stamped):
+            return Drop.LATE
         if forward.unsigned:
             passing = unsigned(message.payload)
             if passing is not message.payload:

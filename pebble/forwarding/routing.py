@@ -63,6 +63,7 @@ class Forward(Struct, frozen=True):
     retain: bool
     urgent: bool
     unsigned: bool = False  # a script's signature does not pass (see .signatures)
+    stamped: bool = False  # it may tell its own age (see .command_ages)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,8 +107,14 @@ def route(rules: Rules, side: Side, subject: Subject | None, message: Message, *
             return Drop.ONE_WAY
         if not mirroring:
             return Drop.NOT_MIRRORED
-    unsigned = subject.drives and side is Side.REMOTE and rules.leaves_robot
-    return Forward(_qos(subject, message), _retain(subject, message), subject.kind in URGENT, unsigned)
+    outside = side is Side.REMOTE and rules.leaves_robot
+    return Forward(
+        _qos(subject, message),
+        _retain(subject, message),
+        subject.kind in URGENT,
+        outside and subject.drives,
+        outside and subject.stamped,
+    )
 
 
 def _qos(subject: Subject, message: Message) -> QoS:

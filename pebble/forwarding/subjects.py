@@ -6,7 +6,7 @@ from math import inf
 
 from pebble.config import Config
 from pebble.contract import CHANNELS, INCOMING, OUTGOING, WAITS_S, Channel, Kind
-from pebble.contract.payloads import Drive, EstopCommand
+from pebble.contract.payloads import ControlRequest, Drive, EstopCommand
 from pebble.errors import TransportError
 from pebble.runtime.addresses import Addresses
 from pebble.runtime.process import view_of
@@ -33,6 +33,7 @@ class Subject:
     channel: Channel | None = None
     qos: int = 0
     retain: bool = False  # assumed if the broker hides it
+    thin: bool = False  # the way to it may be a thin link
 
     @cached_property
     def stays(self) -> bool:
@@ -47,8 +48,12 @@ class Subject:
     @cached_property
     def waits_s(self) -> float:
         """Seconds for which a message may wait before it is stale."""
-        once = WAITS_S if self.channel is None else self.channel.waits_s
-        return once if self.kind.one_shot else inf
+        if not self.kind.one_shot:
+            return inf
+        if self.channel is None:
+            return WAITS_S
+        thin_s = self.channel.thin_waits_s
+        return thin_s if self.thin and thin_s is not None else self.channel.waits_s
 
     @cached_property
     def prompt(self) -> bool:
@@ -62,6 +67,11 @@ class Subject:
     @cached_property
     def drives(self) -> bool:
         return self.channel is not None and self.channel.payload is Drive
+
+    @cached_property
+    def stamped(self) -> bool:
+        """Whether its messages may carry their sender's clock and a key, by which their age is known."""
+        return self.channel is not None and self.channel.payload in (Drive, ControlRequest)
 
     @cached_property
     def runs(self) -> bool:
@@ -91,6 +101,7 @@ class Subjects(dict[str, Subject | None]):
         names = dict.fromkeys(["", *config.serial_instances()])
         self._addresses = [Addresses(view_of(config, name)) for name in names]
         self._subject = cache(Subject)
+        self._thin = config.services.mqtt_bridge.link.profile != "wide"
         self._incoming = f"{self._base}/{INCOMING}/".encode()
         named = (addresses[one].topic.encode() for addresses in self._addresses for one in CHANNELS)
         self._named = frozenset(topic.removeprefix(self._incoming) for topic in named)
@@ -146,7 +157,7 @@ class Subjects(dict[str, Subject | None]):
             channel = addresses.channel(topic)
             if channel is not None:
                 address = addresses[channel]
-                return self._subject(channel.kind, channel, address.qos, address.retain)
+                return self._subject(channel.kind, channel, address.qos, address.retain, self._thin)
         suffix = topic.removeprefix(f"{self._base}/")
         if suffix == topic:
             return None

@@ -107,6 +107,11 @@ class Acts:
         elif channel.kind in (Kind.FLAG, Kind.ACTION):
             self._on_switch(channel, by, payload)
 
+    @property
+    def keys(self) -> frozenset[bytes] | None:
+        """The key of who has control, of the owner that decides; None: no owner gives any."""
+        return self._keys
+
     def state(self, topic: str, payload: bytes) -> None:
         """A state of a motor owner; the same again is nothing new."""
         if self._newest.get(topic) != payload:

@@ -256,6 +256,7 @@ class MqttBridge(ForwardingService):
             self._owners.receive(message.topic)
         if message.topic in self._audit.topics:
             self._audit.state(message.topic, message.payload)
+            self.forwarder.ages.keys = self._audit.keys
         self._leftovers.note_local(message)
         for admitted in self._private.admit(message):
             self._react(Side.LOCAL, admitted, self.forwarder.receive(Side.LOCAL, admitted))

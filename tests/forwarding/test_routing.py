@@ -39,7 +39,7 @@ def forward(qos: int = 1, *, retain: bool = False, urgent: bool = False) -> Forw
 
 
 COMMAND = forward(urgent=True)
-DRIVE = Forward(QoS.DELIVERED, retain=False, urgent=True, unsigned=True)  # from outside
+DRIVE = Forward(QoS.DELIVERED, retain=False, urgent=True, unsigned=True, stamped=True)  # from outside
 FLAG = forward(retain=True, urgent=True)
 ACTION = forward(urgent=True)
 

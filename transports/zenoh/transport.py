@@ -18,12 +18,12 @@ import zenoh
 
 from pebble.errors import TransportError
 from pebble.transports import clock
+from pebble.transports.ages import MessageAges
 from pebble.transports.base import Message, QoS, State, Subscription, Transport
 from pebble.transports.peers import PresenceLock, new_name, prepare_run_dir
 from pebble.transports.settings import ZenohSettings
 from pebble.transports.topics import is_pattern
 from pebble.transports.zenoh import wire
-from pebble.transports.zenoh.ages import MessageAges
 from pebble.transports.zenoh.callbacks import direct
 from pebble.transports.zenoh.hub_connection import GOODBYE_S, HUB_ANSWER_S, HubConnection
 from pebble.transports.zenoh.keymap import filter_to_key, key_to_topic

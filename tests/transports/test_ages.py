@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from pebble.transports.zenoh.ages import MessageAges
+from pebble.transports.ages import MessageAges
 
 HERE, THERE = 1, 2
 LATE_S = 2.0

@@ -1,0 +1,137 @@
+"""How old messages are when they arrive, by the clocks of their senders (T19).
+
+Of another clock only this is known: the fastest recent message of its sender took almost no time, so one that took
+longer has waited somewhere.
+"""
+
+import threading
+from collections.abc import Hashable
+from math import inf
+from typing import Final, Generic, TypeVar
+
+from msgspec import Struct
+
+_DRIFT: Final = 1e-3  # two clocks drift apart by less, seconds per second
+_YOUNG_S: Final = 2.0  # so long a clock is not trusted alone: all its messages may have waited in one queue
+_JUMP_S: Final = 1.0  # a message that is so much faster than all before shows that a clock was set, or a queue ended
+_IDLE_S: Final = 60.0  # a clock that was not heard for so long gives way to another
+_MACHINES: Final = 64  # whose clocks are remembered
+
+K = TypeVar("K", bound=Hashable)
+
+
+class Patience(Struct, frozen=True):
+    """When a sender whose messages all seem late is believed, because it is its clock that has changed. In seconds.
+
+    ``gap_s``: only if no two of them were further apart. ``set_back_s``: if its stamps went back, which no delay does.
+    ``silent_s``: what was not heard for longer is forgotten.
+    """
+
+    believed_s: float
+    set_back_s: float
+    gap_s: float = inf
+    silent_s: float = inf
+
+
+class _Clock:
+    """One sender's clock. A difference is what our clock shows when a message arrives, less its stamp."""
+
+    __slots__ = ("began", "least", "newest", "other", "patience_s", "proved", "received_at")
+
+    def __init__(self, sent: float, waited_s: float, now: float, patience_s: float = inf) -> None:
+        self.began = self.received_at = now
+        self.newest = sent  # stamp
+        self.least = now - sent  # difference: that of the fastest message
+        self.proved = self.least - waited_s  # the largest that a message without any delay can have had
+        self.patience_s = patience_s
+        self.other: _Clock | None = None  # what it has become, if all that came since was not late
+
+    def receive(self, sent: float, waited_s: float, now: float) -> None:
+        drift = _DRIFT * (now - self.received_at)
+        self.least = min(now - sent, self.least + drift)
+        self.proved = max(now - sent - waited_s, self.proved + drift)
+        self.received_at, self.newest = now, max(self.newest, sent)
+
+    def age_s(self, sent: float, now: float) -> float:
+        return now - sent - min(self.least, self.proved)
+
+
+class SenderClocks(Generic[K]):
+    """The clocks of at most so many senders, each known by a key.
+
+    Where there is no room, one that is silent gives way, or else that which was received for the shortest time: no flood
+    of invented keys takes the place of a sender that goes on. One that finds no place is judged as without a stamp.
+    """
+
+    def __init__(self, most: int, patience: Patience) -> None:
+        self._most, self._patience = most, patience
+        self._lock = threading.Lock()
+        self._clocks: dict[K, _Clock] = {}
+
+    def __len__(self) -> int:
+        return len(self._clocks)
+
+    def age_s(self, key: K, sent: float, waited_s: float, now: float, late_s: float) -> float:
+        """Seconds for which a message has waited that is stamped ``sent``: at ``now`` of our clock; late above ``late_s``.
+
+        ``waited_s`` is what is known without the stamp: at most so long. It counts as well until the clock is two
+        seconds old, and until one of its messages was fast by both.
+        """
+        with self._lock:
+            clock = self._clocks.get(key)
+            if clock is None or now - clock.received_at > self._patience.silent_s or now - sent < clock.least - _JUMP_S:
+                clock = self._clocks[key] = self._begin(key, _Clock(sent, waited_s, now))
+            else:
+                clock.receive(sent, waited_s, now)
+                clock = self._believed(key, clock, sent, waited_s, now, late_s)
+            age = clock.age_s(sent, now)
+            return max(age, waited_s) if now - clock.began < _YOUNG_S else age
+
+    def _begin(self, key: K, clock: _Clock) -> _Clock:
+        clocks = self._clocks
+        if key not in clocks and len(clocks) >= self._most:
+            silent = min(clocks, key=lambda one: clocks[one].received_at)
+            if clock.began - clocks[silent].received_at <= _IDLE_S:
+                silent = min(
+                    clocks, key=lambda one: (clocks[one].received_at - clocks[one].began, clocks[one].received_at)
+                )
+            del clocks[silent]
+        return clock
+
+    def _believed(self, key: K, clock: _Clock, sent: float, waited_s: float, now: float, late_s: float) -> _Clock:
+        """The clock that counts for this message: while all seem late, perhaps another than before."""
+        if now - sent - clock.least <= late_s:
+            clock.other = None
+            return clock
+        other, patience = clock.other, self._patience
+        patience_s = patience.set_back_s if sent < clock.newest - _JUMP_S else patience.believed_s
+        if other is None or now - other.received_at > patience.gap_s or patience_s < other.patience_s:
+            clock.other = _Clock(sent, waited_s, now, patience_s)
+            return clock
+        other.receive(sent, waited_s, now)
+        if now - other.began <= other.patience_s:
+            return clock
+        self._clocks[key] = other
+        return other
+
+
+class MessageAges:
+    """Computes the ages of messages of other processes; one older than ``late_s`` is late. Thread-safe.
+
+    Processes that share a boot share a clock that counts since that boot. A machine whose messages all seem late was
+    stopped, as a virtual one is when it is paused.
+    """
+
+    def __init__(self, boot: int, late_s: float) -> None:
+        self._boot, self.late_s = boot, late_s
+        self._clocks = SenderClocks[int](_MACHINES, Patience(believed_s=5.0, set_back_s=5.0, gap_s=1.0))
+
+    def __len__(self) -> int:
+        """How many machines are remembered."""
+        return len(self._clocks)
+
+    def age_s(self, boot: int, sent: float, now: float) -> float:
+        """Both times in seconds, each since its own machine's boot. The first message of a machine counts as fresh."""
+        if boot == self._boot:
+            return now - sent
+        return self._clocks.age_s(boot, sent, 0.0, now, self.late_s)
