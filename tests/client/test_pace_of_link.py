@@ -35,7 +35,7 @@ def link(level: LinkLevel, hz: float) -> LinkState:
         (link("thin", 1e9), 0.025, QoS.LATEST, 750),
     ],
 )
-def test_a_robot_says_how_often_and_how(state: LinkState | None, step_s: float, qos: QoS, valid_ms: int) -> None:
+def test_a_robot_asks_for_a_pace(state: LinkState | None, step_s: float, qos: QoS, valid_ms: int) -> None:
     pace = pace_of(state)
     assert pace._replace(step_s=round(pace.step_s, 6))[:3] == (step_s, qos, valid_ms)
     assert pace.stamped is (qos is QoS.LATEST)
@@ -56,7 +56,7 @@ def test_a_link_that_cannot_be_read_carries_everything(payload: bytes) -> None:
         (Pace(stamped=True), msgspec.structs.replace(MOVE, key="aa bb"), {"t": 12_346, "key": "aa bb"}),
     ],
 )
-def test_a_command_tells_when_it_was_sent(pace: Pace, drive: Drive, expected: dict[str, object]) -> None:
+def test_a_stamped_command_has_a_time_and_a_key(pace: Pace, drive: Drive, expected: dict[str, object]) -> None:
     dated = pace.dated(drive, 12.3456, "0badf00d")
     assert {"t": dated.t, "key": dated.key} == {"t": UNSET, "key": UNSET, **expected}
 

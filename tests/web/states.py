@@ -339,6 +339,12 @@ def keeping(**more: Any) -> Callable[[int], Value]:
     return at(GOOB, "web/driver", driver() | {"keeps": True} | more)
 
 
+#: Goob waits with its pictures while it is driven.
+THIN = (
+    at(GOOB, "link", {"level": "thin", "drive_hz": 4, "rtt_ms": 610, "queue_ms": 40, "t": 1}),
+    at(GOOB, "status", {"t": 0, "value": {"services": {"camera_publisher": {"state": "held", "restarts": 0}}}}),
+    at(GOOB, "web/picture", flow("silent", "no picture for 9 s")),
+)
 EVE_STOPPED = (stopped(GOOB, "eve on phone"), stopped(FRED, "eve on phone"))
 
 
@@ -388,6 +394,7 @@ STATES: dict[str, State] = {
     "silent": of(GOOB_PATH, MINE, SILENT, repeated={}, pictures=False),
     "old-picture": replace(DRIVING, freezes=True),
     "no-picture": of(GOOB_PATH, MINE, at(GOOB, "web/picture", flow("starting")), logs=logs, pictures=False),
+    "thin-link": of(GOOB_PATH, MINE, *THIN, logs=logs, pictures=False),
     "listening": of(GOOB_PATH, MINE, at(GOOB, "web/sound", sound("flowing", talker="bob")), logs=logs),
     "no-sound": of(
         GOOB_PATH, MINE, at(GOOB, "web/sound", sound("refused", "its sound cannot be switched on from here")), logs=logs

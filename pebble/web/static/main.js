@@ -52,7 +52,7 @@ function join() {
   estop.onChange = () => connection.changed();
   driver.nameOf = (ref) => nameIn(store, ref);
   driver.loading = () => !isHere(PARTS.robot);
-  driver.pictureAge = () => (video.ref ? video.age().ms : null);
+  driver.pictureAge = () => (!video.ref ? null : video.waits ? -1 : video.age().ms);
   video.pictures = new Pictures(
     (bitmap, info) => {
       video.draw(bitmap, info);

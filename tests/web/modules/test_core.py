@@ -255,6 +255,8 @@ _GOOD = "mends.forEach((mend) => Object.assign(situation, mend));"
         ("{ pictureAgeMs: 1900, inSight: false }", None),
         ("{ pictureAgeMs: null, inSight: false }", None),
         ("{ pictureAgeMs: Infinity, inSight: false }", "picture"),
+        ("{ pictureAgeMs: -1, inSight: false }", "picture"),
+        ("{ pictureAgeMs: -1, inSight: true }", None),
         ("{ focus: false, fromKeys: false }", None),
     ],
 )

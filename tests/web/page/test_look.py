@@ -193,6 +193,7 @@ WHEN = {
     "silent": "goob is silent since",
     "old-picture": "The picture is ",
     "no-picture": "There is no picture yet",
+    "thin-link": "Pictures wait for driving",
     "old-page": "older than the server",
     "plain-http": "not encrypted",
     "tower": "live",
@@ -299,7 +300,7 @@ def test_screen(show: Show, axe: str, screen: Screen, size: Size) -> None:
 def _wait(opened: Tab, text: str) -> None:
     shown = f"() => !!window.pebble?.connection.you && document.body.innerText.includes({text!r})"
     assert opened.until(shown), f"{text!r} is not shown"
-    if text not in ("There is no picture yet", "goob is silent since"):
+    if text not in ("There is no picture yet", "Pictures wait for driving", "goob is silent since"):
         opened.until("() => !pebble.video.ref || !!pebble.video.info", 5)
 
 

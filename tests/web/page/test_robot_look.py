@@ -404,3 +404,16 @@ def test_a_full_picture_shows_speed_battery_and_where_it_is(show: Show) -> None:
         assert opened.until(lambda: opened.test("hud-speed").inner_text() == "0.1 m/s", 5)
         assert opened.page.locator(".hud-map canvas").count() == 1
         assert opened.page.locator(".float-tools [data-test=snapshot]").is_visible()
+
+
+def test_over_a_slow_connection_pictures_wait_and_whoever_drives_has_to_see_the_robot(show: Show) -> None:
+    with show(STATES["thin-link"]) as opened:
+        assert opened.until(lambda: "Pictures wait for driving" in opened.test("cover").inner_text())
+        assert opened.test("slow-link").inner_text() == "Slow connection: commands take 0.3 s"
+        assert opened.until("pebble.driver.reason()?.text === 'Pictures wait while you drive'")
+        opened.page.get_by_text("I can see the robot").click()
+        assert opened.until("pebble.driver.reason() === null")
+        for link in (7, {"level": "wide", "rtt_ms": 1, "queue_ms": 0}, {"level": "thin", "rtt_ms": "1"}, None):
+            opened.page.evaluate(SET, [GOOB, "link", link])
+            assert opened.until(lambda: opened.test("slow-link").count() == 0), link
+        assert opened.complaints() == []

@@ -33,7 +33,7 @@ const RESET_MS = 600; // after a reset robots refuse whoever has not paused for 
  * @property {import("../messages.js").DriverView|undefined} driver
  * @property {number} driverIdleMs since the driver's last gesture; -1: it lasts, or is not known
  * @property {{running?: boolean, file?: string}|undefined} script
- * @property {number|null} pictureAgeMs null: no picture is wanted here; NaN: its age is not known
+ * @property {number|null} pictureAgeMs null: no picture is wanted here; NaN: its age is not known; -1: none comes while it is driven
  * @property {boolean} inSight the driver sees the robot itself
  * @property {number} roundTripMs
  * @property {string} failed a part of this page that does not work; ""
@@ -105,7 +105,7 @@ function momentReason(s) {
   if (s.loading) return reason("loading", "This screen is still loading");
   if (s.dialog) return reason("dialog", "Close the panel first");
   if (s.script?.running && s.capabilities.drive?.arbitrates !== true) return scriptReason(scriptName(s));
-  if (s.pictureAgeMs !== null && !(s.pictureAgeMs <= PICTURE_OLD_MS) && !s.inSight) return reason("picture", oldPicture(s), SEE);
+  if (s.pictureAgeMs !== null && !(s.pictureAgeMs >= 0 && s.pictureAgeMs <= PICTURE_OLD_MS) && !s.inSight) return reason("picture", oldPicture(s), SEE);
   if (s.roundTripMs >= LATE_MS) return reason("late", `Commands are late (${Math.round(s.roundTripMs)} ms)`);
   if (s.padFrozen) return reason("pad", "The gamepad stands still: move its stick to neutral and back");
   if (s.fromKeys && !s.focus) return reason("focus", "Click this page first: keys go to another window");
@@ -126,6 +126,7 @@ function scriptReason(name) {
 const SEE = { label: "I can see the robot", kind: "see" };
 
 function oldPicture(s) {
+  if (s.pictureAgeMs < 0) return "Pictures wait while you drive";
   if (Number.isNaN(s.pictureAgeMs)) return "How old this stream is, is not known";
   if (!Number.isFinite(s.pictureAgeMs)) return "There is no picture yet";
   return `The picture is ${(s.pictureAgeMs / 1000).toFixed(1)} s old`;

@@ -1,7 +1,7 @@
 // What must not be overlooked, over the picture or a title: stops, lost connections, and what was not done.
 
 import {
-  html, useEffect, useLater, useLayoutEffect, useMetric, useModel, usePage, useRefs, useState, useTick, useValue,
+  html, useEffect, useLater, useLayoutEffect, useMetric, useModel, useOnline, usePage, useRefs, useState, useTick, useValue,
 } from "./parts/hooks.js";
 import { Model } from "./parts/models.js";
 import { nameIn } from "./parts/looks.js";
@@ -47,7 +47,7 @@ function All({ at }) {
     ${at ? html`<div class="stop-banners"><${StopBanner} at=${at} /></div>` : html`<${Unconfirmed} />`}
     <${PressBanner} />
     <div role="alert"><${ServerBanner} />${at && html`<${SilentBanner} at=${at} />`}</div>
-    ${at && html`<${AlsoStopped} at=${at} />`}
+    ${at && html`<${AlsoStopped} at=${at} /><${SlowLink} at=${at} />`}
     <${Notice} />
     ${at && html`<${ControlHint} />`}
   </section>`;
@@ -264,6 +264,15 @@ function AlsoStopped({ at }) {
     )}
     ${stopped.length > MOST_ALSO && html`<${RouteLink} to="">${stopped.length - MOST_ALSO} more<//>`}
   </p>`;
+}
+
+/** How long commands take over a thin link, as the robot reports it. */
+function SlowLink({ at }) {
+  const { level, rtt_ms: trip, queue_ms: queue } = useValue(at, "link") ?? {};
+  const ms = trip / 2 + queue;
+  const online = useOnline(at);
+  return online && level && level !== "wide" && ms >= 0 &&
+    html`<p class="also slow" data-test="slow-link">Slow connection: commands take ${(ms / 1000).toFixed(1)} s</p>`;
 }
 
 /** Draw again when the stop of one of them changes. @param {string[]} refs @returns {string[]} */

@@ -79,6 +79,11 @@ export class Video extends Model {
     return this.sinceDrawn > Math.max(STALE_MS, 2.5 * this.interval);
   }
 
+  /** Whether no picture comes while it is driven: its link carries too little for both. */
+  get waits() {
+    return this.store.get(this.ref, "link")?.value?.level === "thin";
+  }
+
   get isStale() {
     return this.hasStopped || this.age().ms > PICTURE_OLD_MS;
   }
