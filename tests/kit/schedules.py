@@ -30,6 +30,7 @@ ENGINES = {
     "lockstep": "tests.robot.lockstep.schedules",
     "driving_lockstep": "tests.web.driving_lockstep.schedules",
     "control": "tests.robot.control_schedules",
+    "thin": "tests.robot.thin_schedules",
 }
 
 Step = tuple[str, int, int]  # the world's method do_<action> is called with two small numbers
