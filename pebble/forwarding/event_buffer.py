@@ -37,6 +37,8 @@ class EventBuffer:
         self._waiting: deque[_Event] = deque()
         self._recent: deque[_Event] = deque(maxlen=limit)
         self._lost_at: float | None = None  # when the connection was lost, until flush()
+        #: Whether a message may be sent now, where a link is thin; what may not waits.
+        self.has_room: Callable[[Message], bool] | None = None
 
     def watch(self, state: State) -> None:
         """Follow the transport's state."""
@@ -85,6 +87,8 @@ class EventBuffer:
         while self._waiting:
             event = self._waiting[0]
             message = event.message
+            if self.has_room is not None and not self.has_room(message):
+                return
             if not self._transport.publish(message.topic, message.payload, qos=message.qos):
                 return
             event.sent_at = self._clock()

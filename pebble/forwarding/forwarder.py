@@ -28,7 +28,7 @@ from pebble.forwarding.publisher import Publisher
 from pebble.forwarding.retained_topics import RetainedTopics
 from pebble.forwarding.routing import Drop, Forward, Rules, Side, route
 from pebble.forwarding.side import Gate, Sides, SideState
-from pebble.forwarding.sieve import Sieve, Waiting
+from pebble.forwarding.sieve import Rank, Sieve, Waiting
 from pebble.forwarding.signatures import unsigned
 from pebble.forwarding.subjects import Subject, Subjects
 from pebble.runtime.rate_limit import RateLimitedLog
@@ -156,7 +156,8 @@ class Forwarder:
         with self._sifting:
             before, self._sieve = self._sieve, sieve
             self._forward = self._pass if sieve is None else self._sift
-            if before is not None and before is not sieve:
+            self.sides[Side.REMOTE].events.has_room = None if sieve is None else sieve.takes_event
+            if before is not None and sieve is None:
                 self._send(before.empty())
                 self.sides[Side.REMOTE].events.resume()
 
@@ -164,9 +165,9 @@ class Forwarder:
         """Send what waits in the sieve, as far as there is room."""
         with self._sifting:
             if self._sieve is not None:
-                if self._sieve.takes_events:
-                    self.sides[Side.REMOTE].events.resume()
-                self._send(self._sieve.due())
+                self._send(self._sieve.due(Rank.STATE))
+                self.sides[Side.REMOTE].events.resume()
+                self._send(self._sieve.due(Rank.STREAM))
 
     def _send(self, waiting: Iterable[Waiting]) -> None:
         here = self.sides[Side.LOCAL]
@@ -182,11 +183,6 @@ class Forwarder:
             sieve = self._sieve
             if sieve is None or self.sides.gate is not Gate.OPEN:
                 return self._pass(here, subject, message, forward)
-            if subject.kind is Kind.EVENT and message.qos is QoS.DELIVERED and not sieve.takes_events:
-                there = self.sides[Side.REMOTE]
-                self.publisher.note_return(there, subject, message)
-                there.events.hold(message)
-                return Drop.NO_ROOM
             if sieve.keeps(subject, message, forward):
                 return Drop.NO_ROOM
             return self._pass(here, subject, message, forward)

@@ -52,9 +52,9 @@ class Sieve:
     def __len__(self) -> int:
         return len(self._waiting)
 
-    @property
-    def takes_events(self) -> bool:
-        return self._takes(Rank.STATE, 0)
+    def takes_event(self, message: Message) -> bool:
+        """Whether an event is sent now. Each counts, so they wait elsewhere, in order."""
+        return self._takes(Rank.STATE, _size(message))
 
     def keeps(self, subject: Subject, message: Message, forward: Forward) -> bool:
         """Whether ``message`` waits here, for itself or in vain; else it is sent now."""
@@ -74,10 +74,10 @@ class Sieve:
         self._waiting[topic] = Waiting(rank, subject, message, forward)
         return True
 
-    def due(self) -> Iterator[Waiting]:
-        """What is sent now, one after the other: states first."""
-        for topic, one in sorted(self._waiting.items(), key=lambda item: -item[1].rank):
-            if self._may_pass(one.rank, one.message):
+    def due(self, rank: Rank) -> Iterator[Waiting]:
+        """What of this rank is sent now, one after the other."""
+        for topic, one in list(self._waiting.items()):
+            if one.rank is rank and self._may_pass(rank, one.message):
                 del self._waiting[topic]
                 yield one
 
@@ -91,7 +91,7 @@ class Sieve:
         is_stream = rank is Rank.STREAM
         if is_stream and now - self._sent_at.get(topic, float("-inf")) < self.stream_s:
             return False
-        if not self._takes(rank, len(topic) + len(message.payload)):
+        if not self._takes(rank, _size(message)):
             return False
         if is_stream:
             self._sent_at.pop(topic, None)
@@ -99,6 +99,10 @@ class Sieve:
                 del self._sent_at[next(iter(self._sent_at))]
             self._sent_at[topic] = now
         return True
+
+
+def _size(message: Message) -> int:
+    return len(message.topic) + len(message.payload)
 
 
 def _rank(subject: Subject, message: Message) -> Rank | None:

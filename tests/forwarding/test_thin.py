@@ -1,4 +1,4 @@
-"""What a bridge sends over a thin link, in virtual time: heartbeats, streams, states, events, and nothing in a stop's way."""
+"""What a bridge sends over a thin link, in virtual time, and that nothing is in a stop's way."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ Start = Callable[..., World]
 
 @pytest.fixture
 def start(monkeypatch: pytest.MonkeyPatch) -> Start:
-    def started(profile: str = "thin", **section: Any) -> World:
+    def started(profile: str = "thin", link: dict[str, float] | None = None, **section: Any) -> World:
         world = World("bridge", monkeypatch)
-        world.start(link={"profile": profile}, **section)
+        world.start(link={"profile": profile, **(link or {})}, **section)
         world.run()
         return world
 
@@ -67,11 +67,7 @@ class TestLevels:
     def test_the_state_is_retained_from_the_start(
         self, start: Start, profile: str, kbit: dict[str, float], level: str
     ) -> None:
-        world = World.__new__(World)
-        world = start(profile)
-        world.stop()
-        world.start(link={"profile": profile, **kbit})
-        world.run()
+        world = start(profile, kbit)
         retained = world.retained(LINK_STATE)
         assert retained[0] is None, "it concerns the remote side alone"
         state = codec.decode(LINK, retained[1] or b"")
@@ -86,7 +82,7 @@ class TestLevels:
         levels = [state.level for state in link_states(world)]
         changes = levels[:1] + [later for earlier, later in pairwise(levels) if later != earlier]
         assert changes == ["wide", "narrow", "thin", "narrow", "wide"]
-        assert [state.drive_hz for state in link_states(world) if state.level == "narrow"][0] == 10
+        assert {state.drive_hz for state in link_states(world) if state.level == "narrow"} == {10}
 
     def test_it_is_published_on_change_and_else_rarely(self, start: Start) -> None:
         world = start()

@@ -31,6 +31,7 @@ ENGINES = {
     "driving_lockstep": "tests.web.driving_lockstep.schedules",
     "control": "tests.robot.control_schedules",
     "ages": "tests.forwarding.age_schedules",
+    "thin": "tests.robot.thin_schedules",
 }
 
 Step = tuple[str, int, int]  # the world's method do_<action> is called with two small numbers
