@@ -224,6 +224,13 @@ def test_actions_and_requests_of_the_bridge_itself_need_a_name(world: World, mon
     assert ran == [REBOOT]
 
 
+@pytest.mark.parametrize(("metric", "most"), [(REBOOT, 10), ("arm/wave", 1000)])
+def test_what_has_no_name_takes_no_place_of_what_has_one(world: World, metric: str, most: int) -> None:
+    start(world)
+    assert received(world, metric, *[b"true"] * (most + 5)) == []
+    assert received(world, f"by/ann/{metric}", b"true") == [b"true"]
+
+
 def test_private_interfaces_stay_private_under_a_name(world: World) -> None:
     start(world)
     assert received(world, "by/ann/mcu/u1/describe", b"{}") == []

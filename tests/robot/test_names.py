@@ -175,13 +175,13 @@ def test_who_takes_control_over_drives_and_only_they_start_scripts(rig: Named) -
 
 def test_everybody_stops_it_and_only_a_safety_officer_resets_it(rig: Named) -> None:
     with rig.held("otto") as key, driving(_By(rig, "otto"), 0.7, key=key):
-        for suffix, by in (("incoming/by/vera/estop", "vera"), ("incoming/estop", "somebody")):
+        for suffix, by in (("incoming/by/vera/estop", "vera"), ("incoming/estop", "somebody?")):
             assert until(lambda: rig.mcu.moving(), 5)
-            pressed = time.monotonic()
             rig.person("vera").send(suffix, {"stop": f"{len(suffix):016x}", "by": by})
             assert until(lambda: not rig.mcu.moving(), 5)
-            stopped = rig.operator.wait_for(ESTOP, since=pressed).json
-            assert (stopped["latched"], stopped["by"].split("/")[0]) == (True, by)
+            assert until(lambda: state_of(rig)["latched"], 5)
+            stopped = state_of(rig)
+            assert stopped["by"].split("/")[0] == by  # with a mark where it was not checked
             reset = {one: stopped[one] for one in ("boot", "count")}
             rig.send("otto", "estop-reset", reset)
             rig.person("rover").send("incoming/estop-reset", reset)
