@@ -66,7 +66,10 @@ class EmergencyStop:
         name = why = ""
         if raw is not None:
             try:
+                account = by
                 name, by, why = stop_of(_signed(raw, by))
+                if by and self.named and not account:  # a claim, as Linux robots show it
+                    by = by[:31].rstrip("?") + "?"
             except (ValueError, OverflowError, MemoryError):
                 pass
         self.changed = True

@@ -54,11 +54,14 @@ class Latch:
         return found
 
     def stop(self, name: str, by: str, why: str, since: int) -> bool:
-        """Latch, unless this stop is known already: then nothing changes, and the result is False.
+        """Latch, unless this stop is known already: then the result is False, and at most its sender changes: one that
+        was not checked has a mark, and gives way.
 
         ``name`` is never empty: whoever receives a stop without a name makes one.
         """
         if name in self.recent:
+            if name == self.recent[0] and by and self.by[-1:] == "?" and by[-1] != "?":
+                self.by = by
             return False
         self.recent = ([name] + self.recent)[: self.names]
         self.latched = True

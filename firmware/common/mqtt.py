@@ -13,7 +13,7 @@ class Client:
         """Sizes in bytes: of the longest packet to read, and of the output buffer.
 
         ``topics``: to subscribe to, below ``root``. If only the first ``plain`` ones are, then all are a second time,
-        with the account of the sender: ``{root}by/{account}/{topic}``.
+        with the account of the sender: ``{root}by/{account}/{topic}``. The first one is that of stops.
         """
         self.data = memoryview(bytearray(incoming))
         self.out = memoryview(bytearray(outgoing))
@@ -120,10 +120,14 @@ class Client:
         if count < len(topics) and data[first : first + 3] == b"by/":  # type: ignore[comparison-overlap]
             count = len(topics)
             at = first = first + 3
-            # of a-z, 0-9, _ and -, which is none by itself or in front
+            # of a-z, 0-9, _ and -, which is none by itself or in front; behind others a stop has no name, and counts
             while first < stop and (96 < data[first] < 123 or 47 < data[first] < 58 or data[first] in (45, 95)):
                 first += 1
             if first >= stop or data[first] != 47 or not at < first <= at + 32 or data[at] == 45:
+                while first < stop and data[first] != 47:
+                    first += 1
+                if data[first + 1 : stop] == topics[0]:
+                    self.topic = 0
                 return
             self.by = bytes(data[at:first]).decode()
             first += 1

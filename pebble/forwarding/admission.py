@@ -25,19 +25,22 @@ class Admission:
         self._flags: set[str] = set()
         self._clock = clock
         self._second = 0
-        self._counts: dict[Kind | Channel, int] = {}  # of this second
+        self._counts: dict[tuple[Kind | Channel, bool], int] = {}  # of this second, with and without a name
 
     def __len__(self) -> int:
         return len(self._flags)
 
-    def refuse(self, side: Side, subject: Subject, message: Message, topic: str) -> Drop | None:
-        """Why this message may not pass to ``topic``; None if it may. Hot."""
+    def refuse(self, side: Side, subject: Subject, message: Message, topic: str, *, named: bool = True) -> Drop | None:
+        """Why this message may not pass to ``topic``; None if it may. Hot.
+
+        ``named`` False: it has no name where others have one. Such messages take no places of those.
+        """
         if side is Side.REMOTE and len(message.payload) > MAX_COMMAND_BYTES and _is_bounded(subject):
             return Drop.TOO_LARGE
-        return self._count(side, subject, message, topic) if subject.counted else None
+        return self._count(side, subject, message, topic, named) if subject.counted else None
 
-    def _count(self, side: Side, subject: Subject, message: Message, topic: str) -> Drop | None:
-        if side is Side.REMOTE and self._is_too_often(subject, message):
+    def _count(self, side: Side, subject: Subject, message: Message, topic: str, named: bool) -> Drop | None:
+        if side is Side.REMOTE and self._is_too_often(subject, message, named):
             return Drop.TOO_OFTEN
         if subject.kind is not Kind.FLAG or subject.channel is not None:
             return None
@@ -55,7 +58,7 @@ class Admission:
         """Whether this flag, which the contract does not know, would be one too many."""
         return len(self._flags) >= MAX_UNKNOWN_FLAGS and topic.decode(errors="replace") not in self._flags
 
-    def _is_too_often(self, subject: Subject, message: Message) -> bool:
+    def _is_too_often(self, subject: Subject, message: Message, named: bool) -> bool:
         if subject.kind is Kind.ACTION and subject.channel is not None:
             key: Kind | Channel = subject.channel
             most = MAX_ACTIONS
@@ -69,7 +72,7 @@ class Admission:
         if second != self._second:
             self._second = second
             self._counts.clear()
-        count = self._counts[key] = self._counts.get(key, 0) + 1
+        count = self._counts[key, named] = self._counts.get((key, named), 0) + 1
         return count > most
 
 

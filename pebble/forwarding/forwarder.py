@@ -208,7 +208,7 @@ class Forwarder:
             routed = self._receive_named(here, self._names, message)
         else:
             subject = self._subjects[message.topic]
-            outcome = self._admit(here, subject, message, message.topic)
+            outcome = self._admit(here, subject, message, message.topic, True)
             if subject is not None and isinstance(outcome, Forward):
                 outcome = self._forward(here, subject, message, outcome)
             routed = Routed(subject, outcome)
@@ -222,7 +222,7 @@ class Forwarder:
         """What arrives where names are checked: it passes on the topic without the name, with its sender in it."""
         sender = names[message.topic]
         subject, by = sender.subject, sender.account
-        outcome = self._admit(here, subject, message, sender.topic)
+        outcome = self._admit(here, subject, message, sender.topic, by != NO_ACCOUNT)
         if subject is None:
             outcome = sender.foreign
         elif isinstance(outcome, Forward):
@@ -239,7 +239,9 @@ class Forwarder:
             self._warn(outcome, message.topic[:_LOGGED])
         return Routed(subject, outcome, by)
 
-    def _admit(self, here: SideState, subject: Subject | None, message: Message, topic: str) -> Forward | Drop:
+    def _admit(
+        self, here: SideState, subject: Subject | None, message: Message, topic: str, named: bool
+    ) -> Forward | Drop:
         """How to forward it, or why not. Hot: what nearly no message needs is asked for here, and done elsewhere.
 
         ``topic`` is the one on which it passes, and would be retained.
@@ -258,7 +260,7 @@ class Forwarder:
             forward = self._routes[key] = route(self._rules, side, subject, message, mirroring=mirroring)
         if isinstance(forward, Drop):
             return forward
-        refused = self._admission.refuse(side, subject, message, topic)
+        refused = self._admission.refuse(side, subject, message, topic, named=named)
         if refused is not None:
             if refused in _WARNED:
                 self._warn(refused, message.topic[:_LOGGED])

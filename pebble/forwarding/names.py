@@ -13,7 +13,7 @@ from msgspec import Struct
 
 from pebble.config.security import Strangers
 from pebble.contract import DRIVE, INCOMING, Channel, codec
-from pebble.contract.names import BY, NO_ACCOUNT, without_name
+from pebble.contract.names import BY, NO_ACCOUNT, stop_topic, unchecked, without_name
 from pebble.contract.payloads import AutonomyCommand, Drive, EstopCommand, MediaRequest, SoundboardCommand
 from pebble.contract.rights import WRITES, Right
 from pebble.errors import PayloadError
@@ -73,6 +73,9 @@ class Names(dict[str, Sender]):
             return Sender(NO_ACCOUNT, topic, self._subjects[topic])
         found = without_name(topic)
         if found is None:
+            plain = stop_topic(topic)
+            if plain is not None:
+                return Sender(NO_ACCOUNT, plain, self._subjects[plain])
             return Sender(NO_ACCOUNT, topic, None, Drop.MISNAMED)
         return Sender(found.account, found.topic, self._subjects[found.topic])
 
@@ -80,14 +83,14 @@ class Names(dict[str, Sender]):
         """``message`` with its sender in the payload, and without in the topic. Hot.
 
         What stood there as ``by`` is a claim: an account's becomes the person, a stranger's is gone. A stop needs no
-        name.
+        name; there the claim stays, with a mark.
         """
         subject, account, payload = sender.subject, sender.account, message.payload
         channel = None if subject is None else subject.channel
         form = None if channel is None else channel.payload
         if account == NO_ACCOUNT:
             if form is EstopCommand:
-                return Signed(message, NO_ACCOUNT)
+                return Signed(_moved(message, sender.topic, _doubted(payload)), NO_ACCOUNT)
             if channel is None or not (channel.suffix in self._strangers or _is_zero(channel, payload)):
                 return Drop.UNNAMED
         elif (message.retain or message.retain_requested) and form is not EstopCommand:
@@ -97,7 +100,7 @@ class Names(dict[str, Sender]):
             if channel is not None and form not in _BARE:
                 return Drop.UNREADABLE
         else:
-            body = inner if isinstance(inner := found.get("value"), dict) else found
+            body = _body(found)
             claim = body.get("by")
             if account != NO_ACCOUNT and isinstance(claim, str) and claim:
                 by = _with_person(account, claim[:_LONGEST])
@@ -105,12 +108,27 @@ class Names(dict[str, Sender]):
                 found.pop("by", None)
                 body["by"] = by
                 payload = _encoder.encode(found)
-        return Signed(
-            Message(
-                sender.topic, payload, message.qos, message.retain, message.retain_requested, message.waiting_since
-            ),
-            by,
-        )
+        return Signed(_moved(message, sender.topic, payload), by)
+
+
+def _moved(message: Message, topic: str, payload: bytes) -> Message:
+    return Message(topic, payload, message.qos, message.retain, message.retain_requested, message.waiting_since)
+
+
+def _doubted(payload: bytes) -> bytes:
+    """A stop without a name: who it claims to be from is marked. What cannot be read names no sender to its readers."""
+    found = _object(payload)
+    body = {} if found is None else _body(found)
+    claim = body.get("by")
+    if not isinstance(claim, str) or not claim:
+        return payload
+    body["by"] = unchecked(claim)
+    return _encoder.encode(found)
+
+
+def _body(command: dict[str, Any]) -> dict[str, Any]:
+    """The object that holds the fields."""
+    return inner if isinstance(inner := command.get("value"), dict) else command
 
 
 def _is_zero(channel: Channel, payload: bytes) -> bool:

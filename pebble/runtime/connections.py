@@ -22,7 +22,7 @@ _VITAL_STATES = (
 _ALL_VITAL = (*_VITAL_STATES, f"{_ANY}/{c.INCOMING}/#")
 
 LOCAL_RECONNECT_S, REMOTE_RECONNECT_S = 0.5, 2.0
-_BRIDGE = "remote-bridge"
+_BRIDGE, _STOPS = "remote-bridge", "remote-stops"
 #: RFC 4594: what must not wait, and what may be dropped last of what can. Where a link may be thin.
 _EXPEDITED, _ASSURED = 46, 10
 
@@ -89,6 +89,19 @@ def remote_transport(config: Config, name: str, *, will: Message | None = None) 
         return create("mqtt", _name(config, "mqtt", name), settings, will=will)
     kind = bridge.remote.kind
     return create(kind, _name(config, kind, name), _remote_settings(config, bridge.remote), will=will)
+
+
+def stops_transport(config: Config) -> Transport | None:
+    """The bridge's second connection to operators, on which only stops are received; None: it has none.
+
+    Where the broker knows no accounts one connection is as good as another, and over a thin link a second one's pings
+    cost more than it saves. It receives the retain flag of old messages only: this is no as-published connection.
+    """
+    bridge = config.services.mqtt_bridge
+    if config.security.level == "open" or bridge.remote is not None or bridge.link.profile != "wide":
+        return None
+    settings = mqtt_settings(bridge.remote_mqtt, reconnect_max_s=REMOTE_RECONNECT_S, program=_STOPS)
+    return create("mqtt", _name(config, "mqtt", _STOPS), settings)
 
 
 def mirror_transport(config: Config, mirror: Mqtt, name: str) -> Transport:

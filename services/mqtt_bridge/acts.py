@@ -304,7 +304,7 @@ class Acts:
 
     def _sender(self, by: str | None, claim: object) -> tuple[str, str]:
         """Who to show, and whose quota it is."""
-        name = shown(claim, _NAME) if isinstance(claim, str) else ""
+        name = shown(claim.rstrip(_UNKNOWN), _NAME) if isinstance(claim, str) else ""  # a motor owner shows it marked
         if by == ROBOT:
             return f"{ROBOT}/{name}" if name else ROBOT, ROBOT
         if by is None or by == NO_ACCOUNT:

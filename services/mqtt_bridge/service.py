@@ -3,10 +3,11 @@
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from pebble.contract import AUDIT_READ, BRIDGE_PROBE, DRIVE, LINK, ONLINE, REMOTE_MIRROR, Channel, codec
+from pebble.contract import AUDIT_READ, BRIDGE_PROBE, DRIVE, ESTOP, LINK, ONLINE, REMOTE_MIRROR, Channel, codec
 from pebble.contract.levels import LEVELS
+from pebble.contract.names import with_name
 from pebble.contract.payloads import SCRIPT, AuditRead, Drive, MediaRequest
 from pebble.errors import PayloadError
 from pebble.forwarding.forwarder import Routed, barrier
@@ -16,7 +17,7 @@ from pebble.forwarding.routing import TABLE_A1, Drop, Forward, Side
 from pebble.forwarding.service import ForwardingService
 from pebble.forwarding.side import Gate
 from pebble.forwarding.subjects import Subject
-from pebble.runtime.connections import remote_transport
+from pebble.runtime.connections import remote_transport, stops_transport
 from pebble.runtime.parent import Notifier, earlier_requests
 from pebble.runtime.service import every
 from pebble.runtime.timers import Timer
@@ -32,12 +33,16 @@ from pebble.services.mqtt_bridge.same_broker import SameBrokerProbe, now_ms
 from pebble.services.mqtt_bridge.uplink import POLL_S, Uplink
 from pebble.transports import Message, State, Transport
 
+if TYPE_CHECKING:
+    from pebble.services.mqtt_bridge.stop_connection import StopConnection
+
 #: After the barrier, for brokers that pass messages between connections with a delay.
 _PROBE_WAIT_S = 0.1
 _RETRY_S = 1.0
 _IGNORED = (Drop.ECHO, Drop.LATE, Drop.PROBE)  # nothing that a person or a program requests of the bridge now
 LEFTOVERS_AFTER_S = 30.0  # by then all services have published what they retain; so long after the start, or later
 _LOGGED = 200  # characters of a topic
+_CHECK_STOPS_S, _NOTICED_S = 1.0, 1.0
 ASK_S = 0.2  # between two questions about what is left at the remote broker
 
 
@@ -75,6 +80,8 @@ class MqttBridge(ForwardingService):
         own = () if self._uplink is None else (LINK,)
         self._leftovers = Leftovers(self.config.base, self.subjects, self.remote, *own)
         self._leftover_timer: Timer | None = None
+        self._stop_topic = ESTOP.topic(self.config.base)
+        self._stops = self._make_stops()
         self.transport.judge_topics(is_invented=lambda topic: self.subjects.invented(topic.encode()) is not None)
         self.remote.judge_topics(skips_retained=partial(self.forwarder.skips_retained, Side.REMOTE), delivers_late=True)
         #: What the bridge itself does about a message, and about a flag's value, by channel.
@@ -108,8 +115,21 @@ class MqttBridge(ForwardingService):
         will = Heartbeat(self.addresses[ONLINE]).will(now_ms()) if enabled else None
         return remote_transport(self.config, "remote-bridge", will=will)
 
+    def _make_stops(self) -> "StopConnection | None":
+        transport = stops_transport(self.config)
+        if transport is None:
+            return None
+        from pebble.services.mqtt_bridge.stop_connection import StopConnection  # only who needs it pays for it
+
+        filters = [self._stop_topic, *([with_name(self._stop_topic, "+")] if self.config.security.named else [])]
+        notices_s = self.config.services.mqtt_bridge.remote_mqtt.silence_seconds + _NOTICED_S
+        return StopConnection(transport, filters, self._pass_stop, self._forwards, self.clock, notices_s=notices_s)
+
     def start(self) -> None:
         super().start()
+        if self._stops is not None:
+            self.on_stop(self._stops.close)
+            self.timers.add(self.clock(), self._stops.check, period=_CHECK_STOPS_S)
         self._audit.start()
         self.on_stop(self._audit.close)
         if self._heartbeat is not None:
@@ -173,7 +193,12 @@ class MqttBridge(ForwardingService):
         else:
             self._same_broker.send()
 
+    def _forwards(self) -> bool:
+        return self.forwarder.gate is Gate.OPEN and self.remote.state is State.CONNECTED
+
     def disconnected(self, side: Side) -> None:
+        if side is Side.REMOTE and self._stops is not None:
+            self._stops.main_lost(ended=self.remote.was_ended)
         self._look_later()
         super().disconnected(side)
 
@@ -271,7 +296,18 @@ class MqttBridge(ForwardingService):
         topic = message.topic if self.names is None else self.names[message.topic].topic
         if epoch != self.epoch or self._private.is_known(topic):
             return
+        if topic == self._stop_topic and self._has_passed(message):
+            return
         self._react(Side.REMOTE, message, self.forwarder.receive(Side.REMOTE, message))
+
+    def _has_passed(self, message: Message) -> bool:
+        """Whether this stop has come over the connection that stops have of their own."""
+        return self._stops is not None and not self.forwarder.mirroring and self._stops.is_copy(message)
+
+    def _pass_stop(self, message: Message) -> None:
+        """Of that connection. While the robot's own stops are mirrored, they come back there."""
+        if not self.forwarder.mirroring:
+            self._react(Side.REMOTE, message, self.forwarder.receive(Side.REMOTE, message))
 
     def _react(self, side: Side, message: Message, routed: Routed) -> None:
         """Do what the message requests of the bridge itself, whether or not a remote side is connected.

@@ -78,7 +78,11 @@ def test_who_has_control_drives_and_everybody_stops(tmp_path: Path, rules: Liter
             assert until(lambda: boards.moving(KIND))
             command(vera, "estop", by="vera")
             assert until(lambda: not boards.moving(KIND))
-            state = became(vera, "estop/mcu", latched=True)
+            became(vera, "estop/mcu", latched=True, by="vera?")  # who says so was not checked
+            command(otto, "estop", stop="00000000000000a1", by="ann")
+            became(vera, "estop/mcu", by="ann?", count=2)
+            command(otto, "estop", "otto", stop="00000000000000a1")  # the same one, with a name
+            state = became(vera, "estop/mcu", by="otto", count=2, latched=True)
             order = {"boot": state["boot"], "count": state["count"]}
             command(otto, "estop-reset", "otto", **order)
             command(otto, "estop-reset", **order)

@@ -123,22 +123,31 @@ class TestWithoutName:
             ("drive-values", "nothing", "refuse", None),
             ("control", '{"id":"3f2a91c0","by":"ann"}', "free", '{"id":"3f2a91c0","by":"-"}'),
             ("control", '{"id":"3f2a91c0","want":"release"}', "refuse", None),
-            ("estop", '{"by":"otto"}', "refuse", '{"by":"otto"}'),
-            ("estop", "?", "refuse", "?"),
+            ("estop", '{"by":"otto"}', "refuse", '{"by":"otto?"}'),
+            ("estop", '{"by":"otto?","value":{"by":"otto??"}}', "free", '{"by":"otto?","value":{"by":"otto?"}}'),
+            ("estop", '{"by":"%s"}' % ("ö" * 99), "drive", '{"by":"%s?"}' % ("ö" * 31)),
+            *(("estop", same, "refuse", same) for same in ("?", '{"by": ""}', '{"by": 7}', '{"why": "x"}', "[")),
+            *((f"{names}estop", '{"by":"ann"}', "refuse", '{"by":"ann?"}')
+              for names in ("by/Ann/", "by//", "by/-/", "by/ann/by/otto/", f"by/{'a' * 33}/")),
+            ("by/Ann/drive-values", '{"z":0}', "drive", None),
+            ("by/Ann/mcu/u1/estop", "{}", "drive", None),
             ("estop-reset", '{"boot":"a","count":1}', "drive", None),
             ("arm/wave", '{"z":0}', "drive", None),
         ],
-    )
+    )  # fmt: skip
     def test_what_passes_is_nobodys(self, suffix: str, payload: str, strangers: str, signed: str | None) -> None:
         found = sign(suffix, payload.encode(), strangers)
-        expected = Drop.UNNAMED if signed is None else (signed.encode(), "-")
-        assert expected == (found if isinstance(found, Drop) else (found.message.payload, found.by))
+        topic = f"{BASE}/incoming/{suffix.rpartition('/')[2] if suffix.startswith('by/') else suffix}"
+        expected = Drop.UNNAMED if signed is None else (topic, signed.encode(), "-")
+        assert expected == (
+            found if isinstance(found, Drop) else (found.message.topic, found.message.payload, found.by)
+        )
 
 
 class TestTopics:
     @pytest.mark.parametrize(
         "suffix",
-        ["by/ann/by/otto/drive-values", "by/Ann/drive-values", "by/-/drive-values", "by//estop", "by/ann", "by/ann/"],
+        ["by/ann/by/otto/drive-values", "by/Ann/drive-values", "by/-/drive-values", "by/estop", "by/ann", "by/ann/"],
     )
     def test_a_name_that_no_account_can_have_is_none(self, suffix: str) -> None:
         sender = NAMES["drive"][f"{BASE}/incoming/{suffix}"]
@@ -215,6 +224,13 @@ def test_actions_and_requests_of_the_bridge_itself_need_a_name(world: World, mon
     assert ran == [REBOOT]
 
 
+@pytest.mark.parametrize(("metric", "most"), [(REBOOT, 10), ("arm/wave", 1000)])
+def test_what_has_no_name_takes_no_place_of_what_has_one(world: World, metric: str, most: int) -> None:
+    start(world)
+    assert received(world, metric, *[b"true"] * (most + 5)) == []
+    assert received(world, f"by/ann/{metric}", b"true") == [b"true"]
+
+
 def test_private_interfaces_stay_private_under_a_name(world: World) -> None:
     start(world)
     assert received(world, "by/ann/mcu/u1/describe", b"{}") == []
@@ -225,14 +241,20 @@ class TestStops:
     def test_each_passes_with_and_without_a_name(self, world: World) -> None:
         start(world)
         press = b'{"stop":"00000000000000a1","by":"otto"}'
-        assert received(world, STOP, press, b"?") == [press, b"?"]
+        claimed = press.replace(b"otto", b"otto?")
+        assert received(world, STOP, press, b"?") == [claimed, b"?"]
+        for names in ("Ann", "a/by/b"):
+            world.remote.publish(f"incoming/by/{names}/estop", press)
+        world.run(1)
+        assert world.local.payloads("incoming/estop")[2:] == [claimed, claimed]
+        assert world.service.dropped()["misnamed"] == 0
         named = b'{"stop":"00000000000000a1","by":"ann/otto"}'
         assert received(world, "by/ann/estop", press, b"?") == [named, b"?"]
         assert received(world, "by/ann/estop", press, retain=True) == [named]  # live, although it asks to be retained
 
     def test_no_transport_skips_one_below_a_name(self, world: World) -> None:
         start(world)
-        for metric, skipped in (("by/ann/estop", False), ("by/ann/x", True), ("by/a/by/b/estop", True)):
+        for metric, skipped in (("by/ann/estop", False), ("by/ann/x", True), ("by/a/by/b/estop", False)):
             topic = f"{BASE}/incoming/{metric}".encode()
             assert world.service.forwarder.skips_retained(Side.REMOTE, topic) == skipped, metric
             assert world.uplink.is_stop(topic.decode()) == (not skipped)

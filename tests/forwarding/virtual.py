@@ -34,7 +34,8 @@ class Connection(MemoryTransport):
 
     def __init__(self, name: str, hub: Hub, world: World, *, will: Message | None = None) -> None:
         super().__init__(name, hub, will=will)
-        self._away = False
+        self._away = self._held = False
+        self._stopping = True  # until it is opened
         self.way = Outgoing()  # what a service measures of it
         self.reply: Answer | None = None
         world.connections.append(self)
@@ -57,6 +58,17 @@ class Connection(MemoryTransport):
     def mend(self) -> None:
         self._away = False
 
+    def hold(self) -> None:
+        """What is sent to it waits at the broker."""
+        self._held = True
+
+    def let_go(self) -> None:
+        self._held = False
+
+    def lose(self) -> None:
+        """The broker drops what waits, without a word."""
+        self._inbox.clear()
+
     def lead_to(self, hub: Hub) -> None:
         """The connection is lost, and the address leads to another broker from now on."""
         self._on_hub_stopped()
@@ -66,7 +78,7 @@ class Connection(MemoryTransport):
 
     def work(self) -> bool:
         """Do one thing, if there is one to do."""
-        if self._stopping or not (self._inbox or self._attached != self._reachable):
+        if self._stopping or not ((self._inbox and not self._held) or self._attached != self._reachable):
             return False
         if self._away and self._attached is not None:
             self._on_hub_stopped()
@@ -90,11 +102,12 @@ class Connection(MemoryTransport):
 
 
 class Running(NamedTuple):
-    """A service and its two connections."""
+    """A service and its connections."""
 
     service: ForwardingService
     here: Connection  # on the robot's side
     uplink: Connection
+    stops: Connection | None  # of a bridge that has one for stops alone
 
     @property
     def gate(self) -> Gate:
@@ -115,6 +128,7 @@ class World:
         self.running: list[Running] = []
         for module, name in ((bridge_module, "remote_transport"), (mirror_module, "mirror_transport")):
             monkeypatch.setattr(module, name, self._uplink)
+        monkeypatch.setattr(bridge_module, "stops_transport", self._stops)
 
     @property
     def service(self) -> ForwardingService:
@@ -133,15 +147,22 @@ class World:
         self._broker = broker or self.remote_hub
         here = Connection("here", self.local_hub, self)
         made = SERVICES[service or self.name](self._config(section), here, clock=lambda: self.now)
-        self.running.append(Running(made, here, self.connections[-1]))
+        first = self.connections.index(here) + 1
+        self.running.append(Running(made, here, *[*self.connections[first:], None][:2]))
         made.set_up()
         return self.running[-1]
 
     def stop(self) -> None:
         _, *connections = self.running.pop()
-        for connection in connections:
+        for connection in filter(None, connections):
             connection.close()
             self.connections.remove(connection)
+
+    @property
+    def stops(self) -> Connection:
+        found = self.running[0].stops
+        assert found is not None
+        return found
 
     def run(self, seconds: float = 3.0) -> None:
         """Let everything happen that is due by then."""
@@ -192,6 +213,9 @@ class World:
         transport = {"kind": "zenoh", "mqtt_mirror": {"host": "127.0.0.1"}}
         raw = {"robot": {"id": "rover"}, "transport": transport, "services": services}
         return parse(raw, folder=Path.cwd(), env={})
+
+    def _stops(self, config: Config) -> Connection | None:
+        return None if config.security.level == "open" else Connection("stops", self._broker, self)
 
     def _uplink(self, *_arguments: Any, will: Message | None = None) -> Connection:
         return Connection("uplink", self._broker, self, will=will)

@@ -91,9 +91,12 @@ class MotorGuard:
     def stop(self, command: EstopCommand, now: float) -> None:
         """Latch. The caller has stopped the motors before."""
         name = command.stop if isinstance(command.stop, str) else secrets.token_hex(8)
-        by, why = _given(command.by), _given(command.why)
+        by, why, before = _given(command.by), _given(command.why), self._latch.by
         if self._arbiter.stop(name, by, why, time.time_ns() // 1_000_000):
             self._log.log("stop", logging.WARNING, "emergency stop by %s", _described(by, why))
+            self._save()
+            self._state.changed(now)
+        elif self._latch.by != before:
             self._save()
             self._state.changed(now)
         elif now >= self._state.last + _REPEAT_S:

@@ -36,6 +36,23 @@ def test_a_stop_latches_and_its_repetition_changes_nothing() -> None:
     assert (latch.count, latch.by, latch.since) == (1, "ann", 5)
 
 
+def test_a_sender_that_was_not_checked_gives_way_to_one_that_was() -> None:
+    latch = stopped(B)
+    for by, shown in (
+        ("otto?", "otto?"),
+        ("", "otto?"),
+        ("ann?", "otto?"),
+        ("ann", "ann"),
+        ("vera", "ann"),
+        ("x?", "ann"),
+    ):
+        assert latch.stop(A, by, "", 9) == (by == "otto?")
+        assert (latch.by, latch.count) == (shown, 2)
+    latch.stop(C, "otto?", "", 9)
+    latch.stop(A, "vera", "", 9)  # of an older stop
+    assert latch.by == "otto?"
+
+
 def test_every_new_stop_counts_and_only_the_newest_names_are_remembered() -> None:
     latch = stopped(A, B, C)
     assert latch.count == 3

@@ -133,6 +133,14 @@ def test_a_stop_is_published_at_once_and_again_when_it_is_saved(rig: Rig, path: 
     assert len(set(rig.state.recent)) == rig.state.count == 3, "a stop without a name gets one"
 
 
+def test_its_sender_is_published_and_saved_once_that_was_checked(rig: Rig, path: Path) -> None:
+    rig.stop(A, by="otto?")
+    rig.stop(A, by="ann")
+    assert rig.written()
+    assert (rig.states[-1].by, rig.state.count, rig.states[-1].persisted) == ("ann", 1, True)
+    assert json.loads(path.read_text())["by"] == "ann"
+
+
 def test_at_most_four_states_a_second_and_the_last_one_is_published(rig: Rig) -> None:
     before = len(rig.states)
     for number in range(90):

@@ -1,0 +1,192 @@
+"""A second connection of the bridge to the operators' broker, for stops alone.
+
+A broker sends what it has for a client in order, and drops what comes while that waits. So one account that floods a
+robot with messages which it may write would hold up, or lose, the stop of another. On a connection that is subscribed
+to nothing else no stop waits. The main connection still receives every stop, too: each counts once, whichever way is
+faster, and without this connection all is as it was.
+"""
+
+import logging
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable
+from enum import Enum
+
+from pebble.contract.codec import MAX_COMMAND_BYTES
+from pebble.transports import Message, State, Subscription, Transport
+
+log = logging.getLogger(__name__)
+
+_COPIES, _KEPT = 1024, 64  # stops whose copy is expected, and that were recognised as copies just now
+_BEHIND_S = 60.0  # so long after its stop the main connection's copy is one; behind a flood 38 s were seen
+_PROMPT_S = 2.0  # and that of the stop connection, where nothing is in front of it
+_GRACE_S = 5.0  # for a connection to be made, while the main one is there
+_AGAIN_S = 600.0  # after which it is tried again
+_KICKED_S = 2.0  # who loses the main connection so soon after the other was made may have been allowed only one
+_KICKS = 3  # in a row
+
+
+class Way(Enum):
+    """The connection over which a stop has come."""
+
+    MAIN = "main"
+    STOPS = "stops"
+
+
+class Copies:
+    """Recognises the second copy of a stop that comes both ways. Any thread may use it.
+
+    No stop is lost for it: one that only the main connection has had, while the other was dead and this was not known
+    yet, is returned by :meth:`lost`.
+    """
+
+    def __init__(self, clock: Callable[[], float], notices_s: float) -> None:
+        """``notices_s``: after so long it is known that a connection is lost."""
+        self._clock, self._notices_s = clock, notices_s
+        self._lock = threading.Lock()
+        #: By the way on which the copy is to come: hashes, and until when.
+        self._expected = {way: deque[tuple[int, float]](maxlen=_COPIES) for way in Way}
+        self._dropped = deque[tuple[float, Message]](maxlen=_KEPT)
+
+    def is_copy(self, way: Way, message: Message, *, other: bool) -> bool:
+        """Whether this stop has come the other way before; ``other``: it can come that way now."""
+        key, now, expected = hash((message.topic, message.payload)), self._clock(), self._expected[way]
+        with self._lock:
+            while expected and expected[0][1] < now:
+                expected.popleft()
+            found = next((one for one in expected if one[0] == key), None)
+            if found is not None:
+                expected.remove(found)
+                if way is Way.MAIN:
+                    self._dropped.append((now, _shortened(message)))
+                return True
+            if other and not message.retain:  # one with the retain flag may be an old one, of which there is no copy
+                there, wait_s = (Way.STOPS, _PROMPT_S) if way is Way.MAIN else (Way.MAIN, _BEHIND_S)
+                self._expected[there].append((key, now + wait_s))
+            return False
+
+    def lost(self, way: Way) -> list[Message]:
+        """That connection was lost: no copy comes. Returns the stops that only the other way may have had."""
+        with self._lock:
+            self._expected[way].clear()
+            if way is Way.MAIN:
+                return []
+            self._expected[Way.MAIN].clear()
+            since, found = self._clock() - self._notices_s, list(self._dropped)
+            self._dropped.clear()
+        return [message for at, message in found if at >= since]
+
+
+def _shortened(message: Message) -> Message:
+    """What cannot be read is a stop as well."""
+    if len(message.payload) <= MAX_COMMAND_BYTES:
+        return message
+    return Message(message.topic, message.payload[:MAX_COMMAND_BYTES], message.qos)
+
+
+class StopConnection:
+    """Keeps the second connection, as long as the broker lets it.
+
+    ``pass_on`` gets each of its stops that did not come over the main connection before, on its thread; ``main`` tells
+    whether that one is there, and messages are forwarded. Call :meth:`check` once a second and :meth:`main_lost`, on
+    the service's thread.
+    """
+
+    def __init__(
+        self,
+        transport: Transport,
+        filters: Iterable[str],
+        pass_on: Callable[[Message], None],
+        main: Callable[[], bool],
+        clock: Callable[[], float],
+        *,
+        notices_s: float,
+    ) -> None:
+        """``notices_s``: after so long it is known that the connection is lost."""
+        self._transport, self._filters, self._clock = transport, tuple(filters), clock
+        self._pass_on, self._main = pass_on, main
+        self._copies = Copies(clock, notices_s)
+        self._subscriptions: list[Subscription] = []
+        self._failing_since = self._off_until = float("-inf")
+        self._connected_at = float("inf")
+        self._kicks = 0
+        self._told: bool | None = None  # the log says that it is there, or that it is not
+        transport.on_state(self._on_state)
+
+    @property
+    def listens(self) -> bool:
+        """Whether stops come this way."""
+        subscriptions = self._subscriptions
+        return bool(subscriptions) and self._transport.state is State.CONNECTED and not self._refused
+
+    def is_copy(self, message: Message) -> bool:
+        """Whether a stop that the main connection has received has passed already."""
+        return self._copies.is_copy(Way.MAIN, message, other=self.listens)
+
+    def check(self) -> None:
+        now = self._clock()
+        if not self._main():
+            self._failing_since = now
+        elif self._transport.state is State.CLOSED:
+            if now >= self._off_until:
+                self._failing_since = now
+                self._open()
+        elif self.listens:
+            self._failing_since = now
+            if now - self._connected_at > _KICKED_S:
+                self._kicks = 0
+                self._tell(True)
+        elif now - self._failing_since > _GRACE_S:
+            self._give_up("the broker refuses to subscribe it" if self._refused else self._transport.problem, _AGAIN_S)
+
+    def main_lost(self, *, ended: bool) -> None:
+        """``ended``: the broker has closed it."""
+        self._copies.lost(Way.MAIN)
+        if ended and self.listens and self._clock() - self._connected_at < _KICKED_S:
+            self._kicks += 1
+            if self._kicks >= _KICKS:
+                self._give_up("the broker ends the main one for it", float("inf"))
+
+    def close(self) -> None:
+        self._subscriptions = []
+        self._transport.close()
+
+    @property
+    def _refused(self) -> bool:
+        return any(one.refused for one in self._subscriptions)
+
+    def _open(self) -> None:
+        self._transport.open(timeout=0.0)
+        self._subscriptions = [
+            self._transport.subscribe(one, self._receive, echo=False, direct=True) for one in self._filters
+        ]
+
+    def _give_up(self, why: str, seconds: float) -> None:
+        self._off_until, self._kicks = self._clock() + seconds, 0
+        self.close()
+        self._tell(False, why)
+
+    def _tell(self, there: bool, why: str = "") -> None:
+        if there is self._told:
+            return
+        self._told = there
+        if there:
+            log.info("emergency stops have a connection of their own")
+        else:
+            log.warning("emergency stops have no connection of their own, and may wait behind a flood: %s", why)
+
+    # -- the transport's thread
+
+    def _receive(self, message: Message) -> None:
+        if message.retain:  # an old one: live ones have no such mark on this connection
+            return
+        if not self._copies.is_copy(Way.STOPS, message, other=self._main()):
+            self._pass_on(message)
+
+    def _on_state(self, state: State) -> None:
+        if state is State.CONNECTED:
+            self._connected_at = self._clock()
+            return
+        doubtful = self._copies.lost(Way.STOPS)
+        for message in doubtful if state is State.CONNECTING else ():
+            self._pass_on(message)
