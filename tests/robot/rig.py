@@ -319,6 +319,11 @@ class Rig:
         return {f"{name}_control": recorder(name) for name in ("reboot", "service_restart", "git_pull")}
 
 
+def lines(rig: Rig, z: float, since: float = 0.0) -> list[float]:
+    """When the wheels were told to turn so."""
+    return [at for at, wheels in rig.mcu.drives(since) if wheels == (z, z)]
+
+
 def _program(pid: int) -> str:
     """What a child of the launcher is; "" if it has just ended. The kernel knows the first 15 bytes of its name."""
     comm = process_name(pid)
