@@ -21,6 +21,7 @@ from pebble.transports import Message, QoS
 
 EVERY_S = 1.0  # between two requests; control ends 3 s after the last one
 ANSWER_S = 2.0  # a robot that has not answered by then will not
+UNANSWERED = "does not answer"
 ASKS_S = 30.0  # so long a driver is asked
 APART_S = 1.5  # longer than EVERY_S: until then the other client has the rest of the robot
 IDLE_S = 60.0  # without a gesture control is given back
@@ -180,7 +181,7 @@ class ControlClient:
     def _hopeless(self, now: float) -> str:
         """Why it is given up; empty: it is not."""
         if now - self._answered_at > ANSWER_S:
-            return f"{self.robot.base.rpartition('/')[2]} does not answer"
+            return f"{self.robot.base.rpartition('/')[2]} {UNANSWERED}"
         return f"{self.robot.who} drives on" if now - self._asked_at > ASKS_S else ""
 
     def _message(self, channel: Channel, want: Literal["hold", "release"] = "hold") -> Message:

@@ -67,6 +67,9 @@ class Person:
 
     def request(self, topic: str = "control", want: str = "hold") -> None:
         self.wants = want == "hold"
+        self._request(topic, want)
+
+    def _request(self, topic: str, want: str) -> None:
         self.send(topic, {"want": want, "id": self.id, "by": self.name, "device": "desk"})
 
     def drive(self, speed: float) -> None:
@@ -86,7 +89,7 @@ class Person:
             self.has_control()
             if self.wants and time.monotonic() > asked + 1.0:
                 asked = time.monotonic()
-                self.request()
+                self._request("control", "hold")
             if self.drives and self.key:
                 self.drive(SPEEDS[self.name])
             self._changed.wait(_PERIOD_S)
@@ -186,7 +189,7 @@ class World:
         person.send("autonomy-command", {"action": "stop"})
 
     def do_pose(self, person: Person, b: int) -> None:
-        """Drive, or take control, as the other one; or with the robot's account, which may speak for all by name only."""
+        """Drive, or take control, as the other one; or by the robot's account, which speaks for others by name only."""
         other = next(one for one in self.people if one is not person)
         drive = {"x": 0, "z": FORGED, "key": other.key, "by": other.name}
         taken = {"want": "hold", "id": f"{b:08x}", "by": other.name}
@@ -309,7 +312,7 @@ class World:
         self.do_start(self.people[0], 0)
         drives = until(lambda: any(by_script(wheels) for _, wheels in self.rig.mcu.drives(began)), 15.0)
         self.do_end(self.people[0], 0)
-        ends = until(lambda: not self.alive.groups, 5.0)
+        ends = until(lambda: not (self.alive.groups or self.rig.mcu.moving(began)), 5.0)
         return [] if drives and ends else ["a script does not drive" if ends else "a script does not end"]
 
     def _up(self) -> bool:

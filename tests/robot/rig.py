@@ -11,7 +11,7 @@ import tempfile
 import time
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from pebble.rig.processes import children
 from pebble.simulation.trace import Entry, read_trace
@@ -143,7 +143,7 @@ class Rig:
                 self.close()  # the caller cannot: it has no rig yet
                 raise
 
-    def __enter__(self) -> Rig:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
