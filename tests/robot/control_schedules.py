@@ -119,6 +119,7 @@ class World:
             self.people = [opened.enter_context(closing(person)) for person in people]
             assert self.rig.local is not None
             self.watcher = opened.enter_context(closing(Operator(self.rig.local.port, BASE, "outgoing/+/serial")))
+            assert until(lambda: self.watcher.last(STATE) is not None, 15), "nothing is mirrored"
             self.alive = opened.enter_context(closing(Alive(self.rig.folder)))
             self._opened = opened.pop_all()
 
