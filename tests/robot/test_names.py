@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import itertools
 import json
+import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,7 +18,8 @@ from pebble.config import load
 from pebble.forwarding.retained_window import INITIAL_SYNC_S
 from pebble.runtime.connections import local_transport
 from pebble.transports import Message
-from tests.robot.named import DRIVE, Hall, Named
+from tests.commands.test_drive import Console
+from tests.robot.named import CONTROL, DRIVE, Hall, Named
 from tests.robot.operator import Operator
 from tests.robot.rig import BASE, STOP, lines
 from tests.robot.test_control import driving
@@ -84,6 +86,31 @@ def test_who_takes_control_over_drives_and_only_they_start_scripts(rig: Named) -
                 rig.send(name, "autonomy-command", start)
                 found = lambda e=error: e in str(rig.operator.last("outgoing/autonomy-status").json["error"])  # type: ignore[union-attr]  # noqa: E731
                 assert until(found, 5), error
+
+
+def test_a_terminal_takes_control_by_its_account_is_asked_and_is_taken_over(rig: Named, tmp_path: Path) -> None:
+    password = tmp_path / "otto-password"
+    password.write_text(rig.hall.passwords["otto"])
+    password.chmod(0o600)
+    url = f"mqtt://otto@127.0.0.1:{rig.hall.plain_port}"
+    drive = [sys.executable, "-m", "pebble.cli", "drive", "rover", "--url", url, "--password-file", str(password)]
+    with closing(Console(*drive)) as console:
+        assert console.sees("ready"), console.shown
+        assert (rig.state()["by"].partition("/")[0], rig.state()["named"]) == ("otto", True)
+        began = time.monotonic()
+        console.hold(b"w")
+        assert until(lambda: rig.mcu.moving(began), 5)
+        rig.send("mia", CONTROL, {"id": "cccccccc", "for_ms": 10_000})
+        assert console.sees("mia asks for control: l lets mia drive"), console.shown
+        with rig.held("boss", "control/take") as key:
+            rig.judged("boss", key, 0.33)
+            taken = time.monotonic()
+            rig.judged("boss", key, 0.34)
+            assert {wheels for _, wheels in rig.mcu.drives(taken)} <= {STOP, (0.33, 0.33), (0.34, 0.34)}, (
+                "the key is held"
+            )
+            assert console.sees("boss (name checked) drives"), console.shown
+        rig.send("mia", CONTROL, {"id": "cccccccc", "want": "release"})
 
 
 def test_everybody_stops_it_and_only_a_safety_officer_resets_it(rig: Named) -> None:
