@@ -22,6 +22,7 @@ from pebble.motion import lease
 from pebble.runtime.robot_estop import MAX_OWNERS, RobotEstop
 from pebble.transports import Message, QoS
 
+UNANSWERED = "does not answer"
 ASKS_S = 30.0  # so long a driver is asked
 APART = 1.5  # times what lies between two requests: until then the other client has the rest of the robot
 IDLE_S = 60.0  # without a gesture control is given back
@@ -185,7 +186,7 @@ class ControlClient:
     def _hopeless(self, now: float) -> str:
         """Why it is given up; empty: it is not."""
         if now - self._answered_at > self._pace_of().control_answer_s:
-            return f"{self.robot.base.rpartition('/')[2]} does not answer"
+            return f"{self.robot.base.rpartition('/')[2]} {UNANSWERED}"
         return f"{self.robot.who} drives on" if now - self._asked_at > ASKS_S else ""
 
     def _message(

@@ -52,4 +52,6 @@ class Reset:
             return "it has restarted since"
         if now.count != before.count:
             return f"stopped again meanwhile by {now.by or 'unknown'}"
-        return "the reset reached it too late" if now.reset_refused == "old" else "no answer"
+        return (
+            "the reset reached it too late" if now.reset_refused == "old" else "no answer (may this account reset it?)"
+        )

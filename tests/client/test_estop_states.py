@@ -126,7 +126,7 @@ def test_a_reset_reports_owners_that_have_restarted_or_are_silent() -> None:
     reset = Reset(estop, "ann@desk")
     publish(estop, [outgoing(GOOB, "estop/left", STATE | {"boot": "12345678"})])
     assert reset.waiting == ["right"]
-    assert reset.refusals() == {"left": "it has restarted since", "right": "no answer"}
+    assert reset.refusals() == {"left": "it has restarted since", "right": "no answer (may this account reset it?)"}
     robot.owners[1].latch.reset("00000001", 1, age=1000, now=0)
     publish(estop, [robot.owners[1].state()])
     assert reset.refusals()["right"] == "the reset reached it too late"

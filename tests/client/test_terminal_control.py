@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from pebble.client.control import IDLE_S, ControlClient
+from pebble.client.control import ANSWER_S, IDLE_S, ControlClient
 from pebble.transports import Message
 from tests.client.control_robot import KeepingRobot
 from tests.client.test_terminal_driver import DRIVE, DRIVING, GOOB, Cab, announcement
@@ -99,6 +99,17 @@ def test_control_that_another_has_at_the_start_is_taken_once_it_is_free() -> Non
     assert not cab.mine
     cab.bob.release()
     cab.run(0.2)
+    assert cab.mine
+
+
+def test_a_robot_that_does_not_answer_may_be_out_of_this_accounts_reach() -> None:
+    cab = KeepingCab()
+    cab.keeping.owners[0].receives = False
+    cab.ready()
+    cab.run(ANSWER_S + 1.0)
+    assert "goob does not answer: may this account drive" in cab.status
+    cab.keeping.owners[0].receives = True
+    cab.type("t")
     assert cab.mine
 
 

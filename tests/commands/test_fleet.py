@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 
 from pebble.config import load
+from pebble.config.raw import deep_merge
 from pebble.fleet.broker_client import BrokerClient, Place
 from pebble.fleet.folder import CONF, ZENOH
 from pebble.fleet.people import People
@@ -54,24 +55,30 @@ def mosquitto(conf: Path, port: int) -> Iterator[None]:
         process.wait(10)
 
 
-def test_the_first_page_as_a_newcomer_types_it(tmp_path: Path) -> None:
+@pytest.mark.parametrize("level", ["login", "named"])
+def test_the_first_page_as_a_newcomer_types_it(level: str, tmp_path: Path) -> None:
     """The host is this machine instead of the broker's, and the port a free one: nothing else differs."""
     port, passwords = free_port(), dict[str, str]()
     init, start, *accounts, check = FIRST[:8]
     simulate, drive, stop, *later = (line.replace("broker.lab:8883", f"127.0.0.1:{port}") for line in FIRST[8:])
-    assert run(init.replace("broker.lab", f"127.0.0.1 --port {port}"), tmp_path).count(start.split("  ")[0]) == 1
+    assert (
+        run(init.replace("broker.lab", f"127.0.0.1 --port {port} --level {level}"), tmp_path).count(
+            start.split("  ")[0]
+        )
+        == 1
+    )
     with mosquitto(tmp_path / start.split()[2], port):
         for line in accounts:
             shown = run(line, tmp_path)
             passwords[line.split()[3]] = PASSWORD.findall(shown)[0]
             for piece in re.findall(r"^\{.*^\}", shown, re.DOTALL | re.MULTILINE):
-                _robot_accepts(json.loads(piece), tmp_path)
+                _robot_accepts(json.loads(piece), level, tmp_path)
         assert "attempts, 0 not as the table says" in run(check, tmp_path)
         for name, password in passwords.items():
             (tmp_path / f"{name}-password").write_text(f"{password}\n")
         place = Place("127.0.0.1", port, tmp_path / "hall" / "ca.pem")
         with BrokerClient(place, "minilamp", passwords["minilamp"]) as robot, typed(simulate, tmp_path):
-            robot.subscribe([f"{LAMP}/incoming/drive-values", f"{LAMP}/outgoing/estop/#"])
+            robot.subscribe([f"{LAMP}/incoming/#", f"{LAMP}/outgoing/estop/#"])
             with closing(Console(*python("pebble.cli", *shlex.split(drive)[1:]), cwd=tmp_path)) as console:
                 assert console.sees("ready"), console.shown
                 console.hold(b"w")
@@ -104,17 +111,15 @@ def typed(line: str, folder: Path) -> Iterator[None]:
         process.wait(10)
 
 
-def _robot_accepts(piece: dict[str, Any], folder: Path) -> None:
-    """The piece that was printed and a copy of the authority make a valid config."""
-    file = folder / "robot.json"
+def _robot_accepts(piece: dict[str, Any], level: str, folder: Path) -> None:
+    """The piece that was printed, merged into a config, and a copy of the authority make a valid one."""
+    kind = {True: "minilamp", False: "minimal"}["local_mqtt" in piece]
+    file = folder / f"{kind}.json"
     (folder / "ca.pem").write_bytes((folder / "hall" / "ca.pem").read_bytes())
-    text = json.dumps(
-        {"robot": {"id": "goob", "platform": {True: "esp32", False: "linux"}["local_mqtt" in piece]}, **piece}
-    )
-    file.write_text(text.replace("127.0.0.1", "broker.lab"))
+    file.write_text(json.dumps(deep_merge(json.loads((ROOT / "configs" / f"{kind}.json").read_text()), piece)))
     file.chmod(0o600)
     config = load(file)
-    assert (config.security.level, config.warnings) == ("login", ())
+    assert (config.security.level, config.warnings) == (level, ())
 
 
 @pytest.fixture

@@ -21,6 +21,7 @@ from pebble.doctor.broker_probe import ProbeResult, connect_packet, probe
 from pebble.doctor.publishing import publishing
 from pebble.doctor.who import who_drives
 from pebble.transports.settings import MqttSettings, TlsSettings
+from tests.fleet.brokers import FleetBroker, accounts
 from tests.support import Broker, free_port
 from tests.tcp_proxy import ForbiddingProxy
 
@@ -228,12 +229,34 @@ def test_an_open_or_unencrypted_broker_elsewhere_is_a_warning() -> None:
     assert levels(doctor.broker("b", plain, probe_returning(let_in, let_in))) == ["ok", "warn", "warn"]
     assert levels(doctor.broker("b", plain, probe_returning(let_in, shut_out))) == ["ok", "ok", "warn"]
     assert levels(doctor.broker("b", tls, probe_returning(let_in, shut_out))) == ["ok", "ok", "ok"]
-    ending = ProbeResult(code=0, expires=1000.0 + 3 * 86400)
     anyone = replace(tls, tls=TlsSettings(insecure=True))
     *_, last = doctor.broker("b", anyone, probe_returning(let_in, shut_out))
     assert (last.level, last.fix) == (Level.WARN, "set tls.insecure to false")
-    *_, last = doctor.broker("b", tls, probe_returning(ending, shut_out), 1000.0)
-    assert (last.level, last.text) == (Level.WARN, "its certificate expires in 3 days")
+
+
+@pytest.mark.parametrize(
+    ("days", "level", "text"),
+    [
+        (3, Level.WARN, "its certificate expires in 3 days"),
+        (15, Level.OK, "encrypted, its certificate for 15 more days"),
+        (397, Level.OK, "encrypted, its certificate for 397 more days"),
+    ],
+)
+def test_the_days_of_a_brokers_certificate(days: int, level: Level, text: str) -> None:
+    answer, shut_out = ProbeResult(code=0, expires=1000.0 + days * 86400), ProbeResult(code=5)
+    settings = MqttSettings(host="b", username="ann", password="geheim", tls=TlsSettings())
+    *_, last = doctor.broker("b", settings, probe_returning(answer, shut_out), 1000.0)
+    assert (last.level, last.text) == (level, text)
+
+
+def test_the_certificate_of_a_fleets_broker_is_read(tmp_path: Path) -> None:
+    with FleetBroker(tmp_path / "hall", accounts(["viewer"])) as hall:
+        tls = TlsSettings(ca_cert=hall.place.ca)
+        settings = MqttSettings(
+            host="127.0.0.1", port=hall.port, username="viewer", password=hall.passwords["viewer"], tls=tls
+        )
+        texts = [one.text for one in doctor.broker("b", settings)]
+    assert texts[1:] == ["refuses anonymous logins", "encrypted, its certificate for 397 more days"]
 
 
 def test_a_server_that_is_no_broker_is_a_problem() -> None:

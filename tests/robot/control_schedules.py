@@ -1,7 +1,8 @@
 """Random schedules of two people who take control of a whole robot from each other, of its script, and of faults.
 
 ``python -m tests.kit.schedules control``: real processes, so a violated schedule need not be violated again. Whose a
-line of the MCU is shows in its speed. The robot refuses strangers, so that each line of a person had a key.
+line of the MCU is shows in its speed. The robot refuses strangers, so that each line of a person had a key. At the
+level named each person also commands by the other's name and with the other's key, which must move nothing.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ from typing import Any
 
 from pebble.client.estop import new_name
 from tests.kit.schedules import Engine, Outcome, RandomSteps, Steps
-from tests.robot.operator import Operator
+from tests.robot.named import Hall, Named
+from tests.robot.operator import Operator, ReceivedMessage
 from tests.robot.rig import BASE, Rig
 from tests.robot.script_schedules.alive import Alive
 from tests.robot.script_schedules.rules import by_script, problems
@@ -28,10 +30,12 @@ from tests.support import ROOT, until
 
 STATE = "outgoing/control/serial"
 SPEEDS = {"ann": 0.3, "otto": 0.5}
+FORGED = 0.7  # the speed of what has another's name or key
 _PERIOD_S = 0.06
 _ANSWER_S = 0.5
 _WAITS_S = (0.02, 0.05, 0.1, 0.1, 0.2, 0.3, 0.5, 1.0)
 _FAULTS = ("serial_mcu_bridge", "mqtt_bridge")
+_ROLES = "driver,safety,maintainer"
 _WEIGHTS = {
     "hold": 4, "take": 4, "release": 2, "drive": 6, "let_go": 2, "lose": 1, "stop": 1, "reset": 2,
     "start": 2, "end": 1, "kill": 1, "freeze": 1, "go_silent": 1, "restart_broker": 1,
@@ -39,11 +43,13 @@ _WEIGHTS = {
 
 
 class Person:
-    """Repeats a request for control and a drive command, each while it is wanted; a key is used for ever."""
+    """Repeats a request for control and a drive command, each while it is wanted; a key is used for ever.
 
-    def __init__(self, name: str, port: int) -> None:
-        self.name, self.id = name, secrets.token_hex(4)
-        self.operator = Operator(port, BASE, STATE)
+    ``by``: what the topics of its commands have before the metric.
+    """
+
+    def __init__(self, name: str, operator: Operator, by: str = "") -> None:
+        self.name, self.id, self.operator, self._by = name, secrets.token_hex(4), operator, by
         self.key = ""
         self.wants = self.drives = False
         self._changed, self._ended = threading.Event(), False
@@ -56,12 +62,18 @@ class Person:
         self._thread.join()
         self.operator.close()
 
+    def send(self, metric: str, body: dict[str, Any]) -> None:
+        self.operator.send(f"incoming/{self._by}{metric}", body)
+
     def request(self, topic: str = "control", want: str = "hold") -> None:
         self.wants = want == "hold"
-        self.operator.send(f"incoming/{topic}", {"want": want, "id": self.id, "by": self.name, "device": "desk"})
+        self._request(topic, want)
+
+    def _request(self, topic: str, want: str) -> None:
+        self.send(topic, {"want": want, "id": self.id, "by": self.name, "device": "desk"})
 
     def drive(self, speed: float) -> None:
-        self.operator.send("incoming/drive-values", {"x": 0, "z": speed, "key": self.key})
+        self.send("drive-values", {"x": 0, "z": speed, "key": self.key})
 
     def has_control(self) -> bool:
         """Whether it has control, and the key of now."""
@@ -77,7 +89,7 @@ class Person:
             self.has_control()
             if self.wants and time.monotonic() > asked + 1.0:
                 asked = time.monotonic()
-                self.request()
+                self._request("control", "hold")
             if self.drives and self.key:
                 self.drive(SPEEDS[self.name])
             self._changed.wait(_PERIOD_S)
@@ -86,19 +98,28 @@ class Person:
 class World:
     """A robot, its brokers and two people; ``history`` is that of the present schedule."""
 
-    def __init__(self, transport: str) -> None:
+    def __init__(self, kind: str) -> None:
         self.history = History()
+        transport = kind.split()[0]
         with ExitStack() as opened:
             scripts = Path(opened.enter_context(tempfile.TemporaryDirectory(prefix="pbls")))
             shutil.copytree(ROOT / "tests" / "robot" / "scripts" / "cruise", scripts / "cruise")
             manager = {"enabled": True, "autonomy_root": str(scripts), "stop_timeout_seconds": 1.5}
-            config = {"security": {"strangers": "refuse"}}
-            self.rig = opened.enter_context(
-                Rig(transport, mirror=transport == "zenoh", top=config, autonomy_manager=manager)
-            )
+            with_broker = {"mirror": transport == "zenoh", "autonomy_manager": manager}
+            if kind == transport:
+                strangers = {"security": {"strangers": "refuse"}}
+                self.rig = opened.enter_context(Rig(transport, top=strangers, **with_broker))
+                people = [Person(name, Operator(self.rig.remote.port, BASE, STATE)) for name in SPEEDS]
+            else:
+                hall = opened.enter_context(Hall(scripts / "hall", people=dict.fromkeys(("boss", *SPEEDS), _ROLES)))
+                security = {"level": "named"}
+                self.rig = opened.enter_context(Named(transport, hall, security, direct=False, **with_broker))
+                people = [Person(name, hall.client(name, STATE), f"by/{name}/") for name in SPEEDS]
+                self.thief = opened.enter_context(closing(hall.client("rover", STATE)))
+            self.people = [opened.enter_context(closing(person)) for person in people]
             assert self.rig.local is not None
             self.watcher = opened.enter_context(closing(Operator(self.rig.local.port, BASE, "outgoing/+/serial")))
-            self.people = [opened.enter_context(closing(Person(name, self.rig.remote.port))) for name in SPEEDS]
+            assert until(lambda: self.watcher.last(STATE) is not None, 15), "nothing is mirrored"
             self.alive = opened.enter_context(closing(Alive(self.rig.folder)))
             self._opened = opened.pop_all()
 
@@ -116,7 +137,7 @@ class World:
         left = self._rest()
         lines = self.rig.mcu.drives(began)
         found = problems(self.history, lines, self.rig.mcu.motors(began), list(self.alive.overlaps))
-        found += self._out_of_turn(began)
+        found += [*self._out_of_turn(began), *self._by_another_name(began)]
         counts = {"lines": float(len(lines)), "passed on": float(len(self._holders(began, ended)))}
         return Outcome(found + left, counts, log=lambda: self._log(began))
 
@@ -141,7 +162,7 @@ class World:
     def do_let_go(self, person: Person, b: int) -> None:
         person.drives = False
         self.history.add("zero", final=b % 3 == 0, by=person.name)
-        person.operator.send("incoming/drive-values", {"x": 0, "z": 0, **({"valid_ms": 0} if b % 3 == 0 else {})})
+        person.send("drive-values", {"x": 0, "z": 0, **({"valid_ms": 0} if b % 3 == 0 else {})})
 
     def do_lose(self, person: Person, _: int) -> None:
         self._note("lose", person)
@@ -151,22 +172,41 @@ class World:
         for one in self.people:
             one.drives = False
         self._note("estop", person)
-        person.operator.send("incoming/estop", {"stop": new_name(), "by": person.name})
+        person.send("estop", {"stop": new_name(), "by": person.name})
 
     def do_reset(self, person: Person, _: int) -> None:
         state = self.watcher.last("outgoing/estop/serial")
         if state is not None and state.payload:
             shown = {"boot": state.json["boot"], "count": state.json["count"]}
-            person.operator.send("incoming/estop-reset", {**shown, "by": person.name})
+            person.send("estop-reset", {**shown, "by": person.name})
 
     def do_start(self, person: Person, _: int) -> None:
         self._note("start", person)
         options = {"x": 0.0, "z": -0.3}
-        person.operator.send("incoming/autonomy-command", {"action": "start", "file": "cruise", "config": options})
+        person.send("autonomy-command", {"action": "start", "file": "cruise", "config": options})
 
     def do_end(self, person: Person, _: int) -> None:
         self._note("end", person)
-        person.operator.send("incoming/autonomy-command", {"action": "stop"})
+        person.send("autonomy-command", {"action": "stop"})
+
+    def do_pose(self, person: Person, b: int) -> None:
+        """Drive, or take control, as the other one; or by the robot's account, which speaks for others by name only."""
+        other = next(one for one in self.people if one is not person)
+        drive = {"x": 0, "z": FORGED, "key": other.key, "by": other.name}
+        taken = {"want": "hold", "id": f"{b:08x}", "by": other.name}
+        ways: list[tuple[Operator, str, dict[str, Any]]] = [
+            (person.operator, f"by/{person.name}/drive-values", drive),
+            (person.operator, f"by/{other.name}/drive-values", drive),
+            (person.operator, "drive-values", drive),
+            (person.operator, f"by/{other.name}/control/take", taken),
+            (person.operator, "control/take", taken),
+            (self.thief, "drive-values", drive),
+            (self.thief, "control/take", taken),
+        ]
+        self.history.add(f"poses, way {b % len(ways)}", by=person.name)
+        operator, metric, body = ways[b % len(ways)]
+        for _ in range(5):
+            operator.send(f"incoming/{metric}", body)
 
     # -- faults
 
@@ -203,10 +243,10 @@ class World:
     # -- rules
 
     def _holders(self, since: float, until_: float = float("inf")) -> list[str]:
-        """Who had control, in turn, as the robot has published it on its own side."""
+        """Whose accounts had control, in turn, as the robot has published it on its own side."""
         seen = [one for one in self.watcher.on(STATE) if one.payload]
         before = [one for one in seen if one.at < since][-1:]
-        names = [one.json["by"] for one in (*before, *(one for one in seen if since <= one.at < until_))]
+        names = [_account(one) for one in (*before, *(one for one in seen if since <= one.at < until_))]
         return [name for name, _ in groupby(names)]
 
     def _out_of_turn(self, since: float) -> Iterator[str]:
@@ -217,6 +257,16 @@ class World:
         for name, _ in groupby(driven):
             if name not in turns:
                 yield f"the wheels obey {name} out of turn: {driven[-5:]}, control of {self._holders(since)}"
+                return
+
+    def _by_another_name(self, since: float) -> Iterator[str]:
+        """A line of what was forged, or control of what the account's own program has not asked for."""
+        if any(FORGED in wheels for _, wheels in self.rig.mcu.drives(since)):
+            yield "the wheels obey another's name or key"
+        ids = {person.id: person.name for person in self.people} | {"": ""}
+        for state in [one for one in self.watcher.on(STATE, since) if one.payload]:
+            if ids.get(state.json["id"]) != _account(state):
+                yield f"control by another's name: {state.json}"
                 return
 
     # -- the end: each of the two gets control and drives, the other does not
@@ -263,7 +313,7 @@ class World:
         self.do_start(self.people[0], 0)
         drives = until(lambda: any(by_script(wheels) for _, wheels in self.rig.mcu.drives(began)), 15.0)
         self.do_end(self.people[0], 0)
-        ends = until(lambda: not self.alive.groups, 5.0)
+        ends = until(lambda: not (self.alive.groups or self.rig.mcu.moving(began)), 5.0)
         return [] if drives and ends else ["a script does not drive" if ends else "a script does not end"]
 
     def _up(self) -> bool:
@@ -288,17 +338,27 @@ class World:
         )
 
 
+def _account(state: ReceivedMessage) -> str:
+    """Who has control; a name that is checked has the account before the person."""
+    name: str = state.json["by"]
+    return name.partition("/")[0]
+
+
 @contextmanager
 def _world(kind: str, _bug: Any) -> Iterator[World]:
     with closing(World(kind)) as world:
         yield world
 
 
+_BEGIN = (("take", 0, None), ("drive", 0, None))
+_AS_THEMSELVES = RandomSteps(_WEIGHTS, length=22, layouts=1, begin=_BEGIN)
+_AS_OTHERS = RandomSteps(_WEIGHTS | {"pose": 6}, length=26, layouts=1, begin=_BEGIN)
+
 ENGINE = Engine(
-    draw=RandomSteps(_WEIGHTS, length=22, layouts=1, begin=(("take", 0, None), ("drive", 0, None))),
+    draw=lambda kind, seed, number: (_AS_OTHERS if "named" in kind else _AS_THEMSELVES)(kind, seed, number),
     world=_world,
     perform=lambda world, schedule: world.perform(schedule),
-    kinds=("mqtt", "zenoh"),
+    kinds=("mqtt", "zenoh", "mqtt named", "zenoh named"),
     schedules=200,
     per_world=20,
     repeats=False,

@@ -11,7 +11,7 @@ import tempfile
 import time
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from pebble.rig.processes import children
 from pebble.simulation.trace import Entry, read_trace
@@ -143,7 +143,7 @@ class Rig:
                 self.close()  # the caller cannot: it has no rig yet
                 raise
 
-    def __enter__(self) -> Rig:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -317,6 +317,11 @@ class Rig:
             return {"command": ["sh", "-c", f"echo {name} >> {self.folder}/actions.txt"], "cooldown_seconds": 0}
 
         return {f"{name}_control": recorder(name) for name in ("reboot", "service_restart", "git_pull")}
+
+
+def lines(rig: Rig, z: float, since: float = 0.0) -> list[float]:
+    """When the wheels were told to turn so."""
+    return [at for at, wheels in rig.mcu.drives(since) if wheels == (z, z)]
 
 
 def _program(pid: int) -> str:

@@ -14,7 +14,7 @@ import pytest
 
 from tests.robot.control_schedules import ENGINE
 from tests.robot.operator import Operator
-from tests.robot.rig import BASE, STOP, Rig
+from tests.robot.rig import BASE, STOP, Rig, lines
 from tests.support import beside, cases, until
 
 pytestmark = pytest.mark.alone  # lines are counted
@@ -60,11 +60,6 @@ def driving(operator: Operator, z: float, **more: Any) -> Iterator[list[float]]:
 
     with beside(drive, ending):
         yield sent
-
-
-def lines(rig: Rig, z: float, since: float = 0.0) -> list[float]:
-    """When the wheels were told to turn so."""
-    return [at for at, wheels in rig.mcu.drives(since) if wheels == (z, z)]
 
 
 def test_take_over_stop_and_a_restart_of_the_motor_owner(rig: Rig) -> None:

@@ -5,10 +5,11 @@ from __future__ import annotations
 import itertools
 import json
 import statistics
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,111 +18,26 @@ from msgspec.structs import replace
 
 from pebble.config import load
 from pebble.fleet.broker_client import BrokerClient, Place
-from pebble.fleet.roles import Account
 from pebble.forwarding.retained_window import INITIAL_SYNC_S
 from pebble.runtime.connections import local_transport
 from pebble.transports import Message
-from tests.fleet.brokers import HOST, FleetBroker
+from tests.commands.test_drive import Console
+from tests.fleet.brokers import HOST
+from tests.robot.named import CONTROL, DRIVE, Hall, Named
 from tests.robot.operator import Operator
-from tests.robot.rig import BASE, STOP, Rig
-from tests.robot.test_control import driving, lines
-from tests.support import beside, cases, free_port, until
+from tests.robot.rig import BASE, STOP, lines
+from tests.robot.test_control import driving
+from tests.support import beside, cases, until
 
 pytestmark = pytest.mark.alone  # lines are counted
 
-DRIVE, CONTROL, STATE, ESTOP = "drive-values", "control", "outgoing/control/serial", "outgoing/estop/serial"
-FLAG = "flags/mqtt-video"
-_ids = itertools.count()
+ESTOP, FLAG = "outgoing/estop/serial", "flags/mqtt-video"
 FLOOD_S = float(cases(2, 60))
-PEOPLE = {"otto": "driver", "mia": "driver", "zoe": "driver", "vera": "viewer", "boss": "driver,safety,maintainer"}
-
-
-class Hall(FleetBroker):
-    """The broker of a fleet, as a robot's remote broker: without TLS, because it is on loopback."""
-
-    def __init__(self, folder: Path, level: Literal["login", "named"] = "named") -> None:
-        people = {name: Account(roles=tuple(roles.split(","))) for name, roles in PEOPLE.items()}
-        robot = {"rover": Account(roles=("robot",), bases=(BASE,))}
-        super().__init__(folder, people | robot, level=level, unencrypted=free_port())
-
-    def client(self, name: str, **options: Any) -> Operator:
-        assert self.unencrypted is not None
-        return Operator(self.unencrypted, BASE, "outgoing/#", login=(name, self.passwords[name]), **options)
-
-
-class Remote:
-    """What a rig needs of its remote broker, which is not its own."""
-
-    def __init__(self, port: int) -> None:
-        self.port = port
-
-    def stop(self) -> None:
-        """Others end it."""
-
-
-class Named(Rig):
-    """A robot with an account. ``person`` and ``send`` are for people with accounts of their own."""
-
-    def __init__(self, kind: str, hall: Hall, start: bool = True, **security: str) -> None:
-        self.hall, self._people = hall, dict[str, Operator]()
-        port = hall.unencrypted
-        assert port is not None
-        login = {"host": "127.0.0.1", "username": "rover", "password": hall.passwords["rover"]}
-        super().__init__(
-            kind, remote=Remote(port), operator=hall.client("boss"), start=False,  # type: ignore[arg-type]
-            mqtt_bridge={"remote_mqtt": login | {"port": port}}, autonomy_manager={"enabled": True},
-        )  # fmt: skip
-        self._people["boss"] = self.operator
-        self.configure(**security)
-        if start:
-            self.start()
-
-    def configure(self, **security: str) -> None:
-        """Write the config anew; a hub's journal outlives the robot's restart, as the local broker does."""
-        raw = json.loads(self.config.read_text()) | {"security": security}
-        raw["transport"] |= {"zenoh": {"journal": str(self.folder / "journal")}}.get(self.kind, {})
-        self.config.write_text(json.dumps(raw))
-        self.config.chmod(0o600)
-
-    def person(self, name: str) -> Operator:
-        if name not in self._people:
-            self._people[name] = self.hall.client(name)
-        return self._people[name]
-
-    def send(self, name: str, metric: str, body: Any, **options: Any) -> None:
-        """Publish under one's own name."""
-        self.person(name).send(f"incoming/by/{name}/{metric}", body, **options)
-
-    def state(self) -> dict[str, Any]:
-        last = self.operator.last(STATE)
-        return {} if last is None else last.json
-
-    @contextmanager
-    def held(self, name: str, metric: str = CONTROL, for_ms: int = 10_000) -> Iterator[str]:
-        """The key of this person's control, which is released at the end."""
-        client = {"id": f"{next(_ids):08x}", "for_ms": for_ms}
-        self.send(name, metric, client)
-        assert until(lambda: self.state().get("id") == client["id"], 5), self.state()
-        assert (self.state()["by"], self.state()["named"]) == (name, True)
-        try:
-            yield self.state()["key"]
-        finally:
-            self.send(name, CONTROL, client | {"want": "release"})
-
-    def judged(self, name: str, key: str, z: float) -> None:
-        """What was sent before has been judged: the holder's command, which moves so, has come after it."""
-        assert until(lambda: self.send(name, DRIVE, {"x": 0, "z": z, "key": key}) or lines(self, z), 5, step=0.05)
-
-    def close(self) -> None:
-        for name, client in self._people.items():
-            if name != "boss":
-                client.close()
-        super().close()
 
 
 @pytest.fixture(scope="module", params=["mqtt", "zenoh"])
 def rig(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Named]:
-    with Hall(tmp_path_factory.mktemp("hall") / "hall") as hall, Named(request.param, hall, level="named") as one:
+    with Hall(tmp_path_factory.mktemp("hall") / "hall") as hall, Named(request.param, hall, {"level": "named"}) as one:
         yield one
 
 
@@ -177,6 +93,31 @@ def test_who_takes_control_over_drives_and_only_they_start_scripts(rig: Named) -
                 assert until(found, 5), error
 
 
+def test_a_terminal_takes_control_by_its_account_is_asked_and_is_taken_over(rig: Named, tmp_path: Path) -> None:
+    password = tmp_path / "otto-password"
+    password.write_text(rig.hall.passwords["otto"])
+    password.chmod(0o600)
+    url = f"mqtt://otto@127.0.0.1:{rig.hall.plain_port}"
+    drive = [sys.executable, "-m", "pebble.cli", "drive", "rover", "--url", url, "--password-file", str(password)]
+    with closing(Console(*drive)) as console:
+        assert console.sees("ready"), console.shown
+        assert (rig.state()["by"].partition("/")[0], rig.state()["named"]) == ("otto", True)
+        began = time.monotonic()
+        console.hold(b"w")
+        assert until(lambda: rig.mcu.moving(began), 5)
+        rig.send("mia", CONTROL, {"id": "cccccccc", "for_ms": 10_000})
+        assert console.sees("mia asks for control: l lets mia drive"), console.shown
+        with rig.held("boss", "control/take") as key:
+            rig.judged("boss", key, 0.33)
+            taken = time.monotonic()
+            rig.judged("boss", key, 0.34)
+            assert {wheels for _, wheels in rig.mcu.drives(taken)} <= {STOP, (0.33, 0.33), (0.34, 0.34)}, (
+                "the key is held"
+            )
+            assert console.sees("boss (name checked) drives"), console.shown
+        rig.send("mia", CONTROL, {"id": "cccccccc", "want": "release"})
+
+
 def test_everybody_stops_it_and_only_a_safety_officer_resets_it(rig: Named) -> None:
     with rig.held("otto") as key, driving(_By(rig, "otto"), 0.7, key=key):
         for suffix, by in (("incoming/by/vera/estop", "vera"), ("incoming/estop", "somebody?")):
@@ -212,7 +153,7 @@ def test_what_another_account_sends_holds_up_no_stop(rig: Named) -> None:
         began = time.monotonic()
         while len(took) < 3 or time.monotonic() < began + FLOOD_S:
             assert until(lambda: next(sent) > 100, 10)
-            name, pressed = f"{next(_ids):016x}", time.monotonic()
+            name, pressed = f"f{len(took):015x}", time.monotonic()
             rig.person("mia").send("incoming/estop", {"stop": name})  # once
             assert until(lambda n=name: n in state_of(rig).get("recent", []), 10), took
             took.append(time.monotonic() - pressed)
@@ -315,9 +256,7 @@ class Old(Operator):
     """
 
     def __init__(self, hall: Hall) -> None:
-        port = hall.unencrypted
-        assert port is not None
-        super().__init__(port, BASE, "outgoing/#", login=("boss", hall.passwords["boss"]))
+        super().__init__(hall.plain_port, BASE, "outgoing/#", login=("boss", hall.passwords["boss"]))
 
     def send(self, suffix: str, body: Any, *, qos: int = 1, retain: bool = False) -> None:
         self._client.publish(f"{self.base}/{suffix}", json.dumps(body), qos=qos, retain=retain).wait_for_publish(5)
@@ -327,7 +266,7 @@ class Old(Operator):
 @pytest.mark.parametrize("kind", ["mqtt", "zenoh"])
 def test_an_original_client_lives_through_the_migration(kind: str, tmp_path: Path) -> None:
     """Lights, scripts, flags, pictures and wheels: until the robot insists on names, and again when it does not."""
-    with Hall(tmp_path / "hall", "login") as hall, Named(kind, hall, level="login") as rig:
+    with Hall(tmp_path / "hall", "login") as hall, Named(kind, hall, {"level": "login"}) as rig:
         old, numbers = Old(hall), itertools.count(110)
 
         def stage(plain: bool, level: Literal["login", "named"], **security: str) -> None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import threading
 import time
+import tracemalloc
 from collections.abc import Awaitable, Callable, Iterator
 from importlib.resources import files
 from pathlib import Path
@@ -20,16 +22,18 @@ from starlette.responses import JSONResponse
 from starlette.routing import Route
 
 from pebble.client.page_settings import WebSettings
-from pebble.fleet.audit import Audit
+from pebble.fleet.audit import MAX_REFUSED, Audit
+from pebble.fleet.audit_rows import GROUPS, WINDOW_S
 from pebble.fleet.people import SESSION_S, People
 from pebble.fleet.roles import Role
 from pebble.transports import MqttSettings
 from pebble.web.access import login
 from pebble.web.access.guard import Guard
 from tests.fleet.conftest import cheap_hashes as cheap_hashes
-from tests.support import until
+from tests.support import cases, until
 
 pytestmark = pytest.mark.usefixtures("cheap_hashes")
+LOGINS = cases(500, 100_000)
 PASSWORD = "correct horse"
 URL = {"http": "http://pebble.test:8080", "https": "https://pebble.test:8080"}
 STATIC = files("pebble.web") / "static"
@@ -169,6 +173,50 @@ def test_guessing_by_many_at_once_is_limited_too(site: Site) -> None:
     codes = site.run(work)
     assert sorted(set(codes)) == [401, 429]
     assert codes.count(401) == 5
+
+
+def test_a_flood_of_refused_logins_displaces_no_row_and_grows_nothing(site: Site) -> None:
+    """Each from an address and with a name of its own, so that all get as far as the password."""
+    body = {"content-type": "application/json", "host": "pebble.test:8080", "origin": site.url}
+    headers = [(name.encode(), value.encode()) for name, value in body.items()]
+
+    async def refused(number: int) -> None:
+        raw = json.dumps({"user": f"u{number}", "password": "x"}).encode()
+        client = f"10.{number >> 16}.{number >> 8 & 255}.{number & 255}", 50000
+        scope = {"type": "http", "method": "POST", "path": "/api/login", "raw_path": b"/api/login", "query_string": b""}
+        scope |= {"headers": headers, "client": client, "scheme": "https", "http_version": "1.1", "root_path": ""}
+        answers: list[Any] = []
+
+        async def receive() -> Any:
+            return {"type": "http.request", "body": raw, "more_body": False}
+
+        async def send(message: Any) -> None:
+            answers.append(message)
+
+        await site.app(scope, receive, send)
+        assert answers[0]["status"] == 401
+
+    async def flood(first: int, last: int) -> None:
+        for number in range(first, last):
+            await refused(number)
+
+    site.audit.write("drive", ref="pebble/robots/goob", user="ann")
+    site.run(site.log_in)
+    site.run(lambda client: site.log_in(client, "alice", "typo"), address="198.51.100.9")
+    warm, began = LOGINS // 5, time.monotonic()
+    tracemalloc.start()
+    asyncio.run(flood(0, warm))
+    before = tracemalloc.get_traced_memory()[0]
+    asyncio.run(flood(warm, LOGINS))
+    grown = tracemalloc.get_traced_memory()[0] - before
+    tracemalloc.stop()
+    assert until(lambda: sum(row.count for row in site.audit.read(MAX_REFUSED) if row.refused) == LOGINS + 1, 10)
+    rows = site.audit.read(MAX_REFUSED)
+    assert [row.what for row in rows if not row.refused] == ["drive", "login"]
+    assert [row.user for row in rows if row.address == "198.51.100.9"] == ["alice"]
+    assert len(rows) <= 3 + (GROUPS + 1) * (2 + (time.monotonic() - began) // WINDOW_S)
+    assert grown < 8e6, "remembered tries are bounded, too"
+    assert site.run(site.log_in).status_code == 200
 
 
 def test_password_hashes_hold_up_nothing_else(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import msgspec
 
-from pebble.client.control import IDLE_S, ControlClient
+from pebble.client.control import IDLE_S, UNANSWERED, ControlClient
 from pebble.client.drive_reasons import SLOW_S, SLOW_SPEED, Code, Situation, first_reason
 from pebble.client.driver_lease import FILTER, LISTEN_S, DriverLease
 from pebble.client.estop import Progress, StopSender, new_name
@@ -280,6 +280,8 @@ class TerminalDriver:
         if state is None:
             return f"{self.name} has not published who has control"
         if not control.who:
+            if self.control.failed.endswith(UNANSWERED):  # brokers do not tell what they refuse
+                return f"{self.control.failed}: may this account drive, and is the robot of its broker's level? t asks"
             return "taking control" if self.control.wanted else "nobody drives: t takes control"
         device = f"{state.device}, " if state.device else ""
         who = f"{control.who} ({device}name {'' if state.named else 'not '}checked) drives"

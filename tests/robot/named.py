@@ -1,0 +1,111 @@
+"""A robot at the level named, behind a broker that knows roles and has accounts for people."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Literal
+
+from pebble.fleet.roles import Account
+from tests.fleet.brokers import FleetBroker
+from tests.robot.operator import Operator
+from tests.robot.rig import BASE, Rig, lines
+from tests.support import free_port, until
+
+DRIVE, CONTROL, STATE = "drive-values", "control", "outgoing/control/serial"
+PEOPLE = {"otto": "driver", "mia": "driver", "zoe": "driver", "vera": "viewer", "boss": "driver,safety,maintainer"}
+_ids = itertools.count()
+
+
+class Hall(FleetBroker):
+    """The broker of a fleet, as a robot's remote broker: without TLS, because it is on loopback.
+
+    ``people``: the roles of accounts by name; one of them is *boss*.
+    """
+
+    def __init__(
+        self, folder: Path, level: Literal["login", "named"] = "named", people: Mapping[str, str] = PEOPLE
+    ) -> None:
+        known = {name: Account(roles=tuple(roles.split(","))) for name, roles in people.items()}
+        robot = {"rover": Account(roles=("robot",), bases=(BASE,))}
+        self.plain_port = free_port()
+        super().__init__(folder, known | robot, level=level, unencrypted=self.plain_port)
+
+    def client(self, name: str, listens: str = "outgoing/#", **options: Any) -> Operator:
+        return Operator(self.plain_port, BASE, listens, login=(name, self.passwords[name]), **options)
+
+
+class Remote:
+    """What a rig needs of its remote broker, which is not its own."""
+
+    def __init__(self, hall: Hall) -> None:
+        self.port, self.kill, self.start = hall.plain_port, hall.stop, hall.start
+
+    def stop(self) -> None:
+        """Others end it."""
+
+
+class Named(Rig):
+    """A robot with an account. ``person`` and ``send`` are for people with accounts of their own.
+
+    ``options`` are a rig's.
+    """
+
+    def __init__(
+        self, kind: str, hall: Hall, security: Mapping[str, str], *, start: bool = True, **options: Any
+    ) -> None:
+        self.hall, self._people = hall, dict[str, Operator]()
+        options = {"direct": True, "autonomy_manager": {"enabled": True}} | options
+        remote: Any = Remote(hall)
+        super().__init__(kind, remote=remote, operator=hall.client("boss"), start=False, **options)
+        self._people["boss"] = self.operator
+        self.configure(**security)
+        if start:
+            self.start()
+
+    def configure(self, **security: str) -> None:
+        """Write the config anew; a hub's journal outlives the robot's restart, as the local broker does."""
+        raw = json.loads(self.config.read_text()) | {"security": security}
+        login = {"username": "rover", "password": self.hall.passwords["rover"]}
+        raw["services"]["mqtt_bridge"]["remote_mqtt"] |= login
+        raw["transport"] |= {"zenoh": {"journal": str(self.folder / "journal")}}.get(self.kind, {})
+        self.config.write_text(json.dumps(raw))
+        self.config.chmod(0o600)
+
+    def person(self, name: str) -> Operator:
+        if name not in self._people:
+            self._people[name] = self.hall.client(name)
+        return self._people[name]
+
+    def send(self, name: str, metric: str, body: Any, **options: Any) -> None:
+        """Publish under one's own name."""
+        self.person(name).send(f"incoming/by/{name}/{metric}", body, **options)
+
+    def state(self) -> dict[str, Any]:
+        last = self.operator.last(STATE)
+        return {} if last is None else last.json
+
+    @contextmanager
+    def held(self, name: str, metric: str = CONTROL, for_ms: int = 10_000) -> Iterator[str]:
+        """The key of this person's control, which is released at the end."""
+        client = {"id": f"{next(_ids):08x}", "for_ms": for_ms}
+        self.send(name, metric, client)
+        assert until(lambda: self.state().get("id") == client["id"], 5), self.state()
+        assert (self.state()["by"], self.state()["named"]) == (name, True)
+        try:
+            yield self.state()["key"]
+        finally:
+            self.send(name, CONTROL, client | {"want": "release"})
+
+    def judged(self, name: str, key: str, z: float) -> None:
+        """What was sent before has been judged: the holder's command, which moves so, has come after it."""
+        assert until(lambda: self.send(name, DRIVE, {"x": 0, "z": z, "key": key}) or lines(self, z), 5, step=0.05)
+
+    def close(self) -> None:
+        for name, client in self._people.items():
+            if name != "boss":
+                client.close()
+        super().close()
