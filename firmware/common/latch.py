@@ -56,7 +56,7 @@ class Latch:
     def stop(self, name: str, by: str, why: str, since: int) -> bool:
         """Latch, unless this stop is known already: then nothing changes, and the result is False.
 
-        ``name`` is never empty: whoever receives a stop without a name makes one.
+        ``name`` is never empty: the receiver of a stop without a name makes one.
         """
         if name in self.recent:
             return False
