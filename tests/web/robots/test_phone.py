@@ -239,7 +239,7 @@ def test_the_fleet_is_stopped_and_a_robot_opened_by_finger(browser: Browser, sta
         assert robot.tab.until("window.pebble.driver.ref === ''", 2)
         robot.test("stop-all").tap()
         assert robot.tab.until(lambda: wire.latched("minilamp"), 2)
-        robot.test("card-minilamp").get_by_role("link").tap()
+        robot.test("card-minilamp").get_by_role("link").first.tap()
         assert robot.because("stopped")
         robot.take()
         assert robot.drive_by_stick()
