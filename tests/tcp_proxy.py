@@ -74,7 +74,7 @@ class TcpProxy:
         self._thread.start()
 
     def lead_to(self, target: int) -> None:
-        """Whoever connects from now on finds another port behind it."""
+        """Connections from now on lead to another port behind it."""
         self._target = target
         self.drop()
 

@@ -57,7 +57,7 @@ class Latch:
         """Latch, unless this stop is known already: then the result is False, and at most its sender changes: one that
         was not checked has a mark, and gives way.
 
-        ``name`` is never empty: whoever receives a stop without a name makes one.
+        ``name`` is never empty: the receiver of a stop without a name makes one.
         """
         if name in self.recent:
             if name == self.recent[0] and by and self.by[-1:] == "?" and by[-1] != "?":

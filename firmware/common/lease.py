@@ -12,14 +12,14 @@ class Lease:
     def __init__(self, now: int, diff, random, strangers: int) -> None:
         """``random(4)`` returns 8 hex digits.
 
-        ``strangers``: commands without a key move the motors always (0), while nobody has control (1), or never (2).
+        ``strangers``: commands without a key move the motors always (0), while control is free (1), or never (2).
         """
-        self.key = ""  # "": nobody has control
-        self.holder: tuple = ()  # nobody
+        self.key = ""  # "": control is free
+        self.holder: tuple = ()  # (): control is free
         self.asker: tuple = ()
         self.others = False  # in the last 2 s a command without a key moved something, unless it was refused elsewhere
         self.changed = True  # since the last state
-        self.halts = False  # another one has control, or nobody: the motors are to be stopped
+        self.halts = False  # another one has control, or none: the motors are to be stopped
         self.strangers = strangers
         self._diff = diff
         self._random = random
@@ -28,7 +28,7 @@ class Lease:
         self._held = False  # in the last 5 s the holder moved something: others have to ask
 
     def hold(self, client: tuple, ms: int, urgent: bool, now: int) -> None:
-        """Request control, or renew it. ``urgent``: without asking whoever has it."""
+        """Request control, or renew it. ``urgent``: without asking its holder."""
         self.tick(now)
         ms = min(max(ms, 1000), 10_000)
         if client[:2] == self.holder[:2]:
@@ -54,7 +54,7 @@ class Lease:
     def holds(self, key: str, by: str) -> bool:
         """Whether a command of this account is from who has control; its key has those of several motor owners."""
         own = self.key
-        # nobody can try many keys at once
+        # no client can try many keys at once
         return own != "" and (key == own or (len(key) < 80 and own in key.split(" "))) and self.holder[:1] == (by,)
 
     def refuses(self, moves: bool, script: bool, key: str, by: str, now: int) -> bool:
@@ -93,7 +93,7 @@ class Lease:
             self._end(now)
 
     def take(self, client: tuple, ms: int, now: int) -> None:
-        """Control passes on to this client, or to nobody."""
+        """Control passes on to this client, or becomes free."""
         self.holder = client
         self.asker = ()
         self.key = self._random(4) if ms else ""

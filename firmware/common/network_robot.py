@@ -80,7 +80,7 @@ class NetworkRobot:
     def _guard(self, now: int) -> None:
         stops = self.stops
         stops.tick(now)
-        if stops.lease.halts:  # whoever gets control begins with wheels at rest
+        if stops.lease.halts:  # each new driver begins with wheels at rest
             stops.lease.halts = False
             self._halt()
         if self.deadman.expired(now):

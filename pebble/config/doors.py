@@ -1,4 +1,4 @@
-"""What the security level of a config refuses: ways to the robot by which nobody is asked who they are."""
+"""What the security level of a config refuses: ways to the robot without a login."""
 
 import re
 from collections.abc import Iterator

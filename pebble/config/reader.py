@@ -101,7 +101,7 @@ class Reader:
             return _WRONG
         try:
             return self.folder / Path(text).expanduser()
-        except RuntimeError:  # ~somebody, or ~ without a home
+        except RuntimeError:  # ~name of an unknown user, or ~ without a home
             self.notes.problem(path, "names a home folder that is not known, write the whole path")
             return _WRONG
 

@@ -1,6 +1,6 @@
 """A scripted operator drives the robots of a broker: steps, an emergency stop, and a script that it overrules.
 
-It yields to people: a robot that somebody else drives, or has stopped, is left alone until the step after.
+It yields to people: a robot that another person drives, or has stopped, is left alone until the step after.
 Times are seconds of time.monotonic().
 """
 
@@ -145,7 +145,7 @@ class Operator:
 
     ``activity`` and ``events`` (seconds and a line) are for display; ``completed`` collects finished steps, and
     ``left_alone`` the names of robots of which people had the control meanwhile. The emergency stop and the script
-    belong to the first round; while ``again`` has their names, they are repeated at once. Whoever assesses what was
+    belong to the first round; while ``again`` has their names, they are repeated at once. Those who assess what was
     completed removes it only then.
     """
 

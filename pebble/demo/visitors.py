@@ -23,7 +23,7 @@ class Visitors:
         self.left_alone: set[str] = set()  # names of robots that were found to be taken
         self.own_ids: set[str] = set()  # under which the operator itself has control
         self._name = name
-        self._driven: dict[str, float] = {}  # by base topic: when somebody drove it, or was announced to
+        self._driven: dict[str, float] = {}  # by base topic: when another one drove it, or was announced to
         self._moved: dict[str, float] = {}  # by base topic: when a person's command came
         self._drivers: dict[str, tuple[str, float]] = {}  # those that were announced
         self._sent: defaultdict[str, deque[bytes]] = defaultdict(partial(deque, maxlen=_SENT))  # by topic

@@ -41,7 +41,7 @@ _PUT_MARK = (
     "INSERT INTO marks VALUES (?, ?, ?, ?, ?) ON CONFLICT DO UPDATE SET n = excluded.n, h = excluded.h "
     "WHERE excluded.n > marks.n"
 )
-#: The oldest of whoever has the most rows of a kind: many of one person displace none of another.
+#: The oldest of the person with the most rows of a kind: many of one person displace none of another.
 _TRIM = """
 DELETE FROM {table} WHERE number IN (
     SELECT number FROM (

@@ -71,7 +71,7 @@ def role_of(name: str) -> str:
 
 
 def acls(rules: Iterable[Rule]) -> list[dict[str, Any]]:
-    """Rules as the plugin has them. What begins with `$` nobody subscribes to without being allowed to."""
+    """Rules as the plugin has them. A subscription to what begins with `$` needs a rule."""
     return [
         {"acltype": type_, "topic": filter_, "priority": 0, "allow": True}
         for access, filter_ in rules
@@ -97,7 +97,7 @@ def default_access() -> list[dict[str, Any]]:
 
 
 def security_text(fleet: Fleet, passwords: Mapping[str, Hashed]) -> str:
-    """`dynamic-security.json`. Accounts without a password are left out: nobody can log in."""
+    """`dynamic-security.json`. Accounts without a password are left out: they cannot log in."""
     names = [name for name in fleet.accounts if name in passwords]
     clients = [
         {"username": name, "roles": [{"rolename": role_of(name)}]}

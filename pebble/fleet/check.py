@@ -241,7 +241,7 @@ class _Attempts:
                 self._note(name, "read", topic, topic in expected, topic in seen)
 
     def _strangers(self) -> None:
-        """Who has no account, or no right password, and whoever comes unencrypted."""
+        """Clients without an account or the right password, and those that come unencrypted."""
         logins = {"without a name": (None, None), "with a wrong password": (ADMIN, "wrong"), "unknown": ("x1", "x")}
         ports = {place: f"port {place.port}" for place in (self._place, *self._unencrypted())}
         for place, shown in ports.items():

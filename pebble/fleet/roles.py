@@ -101,7 +101,7 @@ LOCAL = Session("local", "local", Role.ADMIN)
 
 
 def rights(roles: Iterable[str], level: SecurityLevel) -> frozenset[Right]:
-    """What somebody with these roles may do, which add up. Below ``named`` whoever drives also resets."""
+    """What a person with these roles may do, which add up. Below ``named`` those who drive also reset."""
     found = frozenset[Right]().union(*(_RIGHTS[role] for role in roles))
     return found | {Right.RESET} if level != "named" and Right.DRIVE in found else found
 

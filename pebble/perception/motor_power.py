@@ -51,7 +51,7 @@ class MotorPower:
         """Follow who has control: a change of it halts the wheels."""
         if state.key != self._lease.key:
             self._lease.key = state.key
-            self._lease.holder = ("",)  # whoever it is: the key shows it
+            self._lease.holder = ("",)  # of any account: the key shows it
             self._power = (0.0, 0.0)
 
     def at(self, now: float) -> tuple[tuple[float, int], tuple[float, int]]:

@@ -104,7 +104,7 @@ class Controls:
     # -- what is known
 
     def elsewhere(self, ref: str) -> Elsewhere | None:
-        """Who has control of that robot, if it is nobody of this server; None also if the robot does not keep it."""
+        """Who has control of that robot from elsewhere than this server; None also if the robot does not keep it."""
         state = self.state(ref)
         if state is None or not state.id or any(one.client.id == state.id for one in self._wishes):
             return None

@@ -87,7 +87,7 @@ class OpenComponents:
         self._broker.loop.call_later(self._keep_s, self._closed, ref)
 
     def _closed(self, ref: str) -> None:
-        """Some time later: whoever loads the page anew finds everything."""
+        """Some time later: a page that is loaded anew finds everything."""
         self._pages[ref] -= 1
         if not self._pages[ref]:
             del self._pages[ref]

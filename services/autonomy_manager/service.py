@@ -286,7 +286,7 @@ class AutonomyManager(Service):
             self.changed()
 
     def _waiting_for(self) -> str:
-        """What the present run waits for; empty: it does something, or nobody knows."""
+        """What the present run waits for; empty: it does something, or that is unknown."""
         run = self._runner.active
         if run is None or self.clock() - self._began < SILENT_S:
             return ""

@@ -261,7 +261,7 @@ class TestOverridePoints:
          "outgoing/control/mcu"],
     )  # fmt: skip
     def test_no_channel_takes_a_topic_of_an_emergency_stop_or_control_and_those_keep_theirs(self, metric: str) -> None:
-        """Not even another robot's: whoever drives this one would stop that one."""
+        """Not even another robot's: the driver of this one would stop that one."""
         channel = channel_of(metric)
         assert channel is not None
         assert channel.override is None

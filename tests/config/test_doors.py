@@ -1,4 +1,4 @@
-"""What each security level refuses in a config, and what it lets pass; and the warning of a robot that asks nobody."""
+"""What each security level refuses in a config, and what it lets pass; and the warning of a robot without logins."""
 
 from __future__ import annotations
 

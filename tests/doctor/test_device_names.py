@@ -26,7 +26,7 @@ KEY = "a.b"
         ("ttyACM0", {"by-id/usb-gone": "ttyACM7"}, ""),
         ("ttyACM0", {}, ""),
         ("ttyAMA0", {"by-id/usb-board": "ttyAMA0"}, ""),  # a port of the computer itself: its number stays
-        ("goob", {"by-id/usb-board": "goob"}, ""),  # a name that somebody gave it
+        ("goob", {"by-id/usb-board": "goob"}, ""),  # a name that its owner gave it
     ],
 )
 def test_a_number_that_may_change(tmp_path: Path, device: str, links: dict[str, str], named: str) -> None:

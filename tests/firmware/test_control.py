@@ -44,7 +44,7 @@ def test_two_drivers_and_only_who_has_control_moves_by_a_key(kind: str) -> None:
     run(drill, 0.2)
     drill.request("bbbbbbbb", by="otto", take=True)
     run(drill, 0.1)
-    assert not any(drill.outputs())  # whoever gets control begins with wheels at rest
+    assert not any(drill.outputs())  # each new driver begins with wheels at rest
     drill.nonsense(json.dumps({"z": 1, "key": ann["key"]}).encode())
     run(drill, 0.5)
     otto = drill.control()

@@ -99,4 +99,4 @@ def test_who_has_control_drives_and_everybody_stops(tmp_path: Path, rules: Liter
             command(ann, "drive-values", "ann", z=-1, key=key)
             command(sam, "drive-values", "sam", z=1, key=newest(vera, "control/mcu")["key"])
             assert until(lambda: boards.moving(KIND))
-            assert not [at for at in boards.moves[KIND] if min(at[1]) < 0]  # nobody else's commands
+            assert not [at for at in boards.moves[KIND] if min(at[1]) < 0]  # no others' commands

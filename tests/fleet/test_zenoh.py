@@ -87,14 +87,14 @@ class Hall:
         return {topic for sender, topic in self.received if sender == name}
 
     def retained(self) -> set[str]:
-        """What somebody receives who comes now."""
+        """What a client receives that comes now."""
         received: set[str] = set()
         with create("zenoh", "late", self.local) as reader:
             reader.subscribe(f"{GOOB}/#", lambda message: received.add(message.topic), direct=True)
         return received
 
     def mark(self, text: str) -> None:
-        """Wait until all that came before has been received: a stop of somebody who does nothing else comes through."""
+        """Wait until all that came before has been received: a stop of a client that only stops comes through."""
         with self.account("dora", topics=[f"a/b/{text}/incoming/estop"]) as dora:
             play(dora)
             assert until(lambda: f"a/b/{text}/incoming/estop" in self.of("dora"))

@@ -158,7 +158,7 @@ def test_many_robots_at_once_do_not_lose_a_client(broker: Broker, robot: Transpo
         assert until(lambda: watcher.info)
 
         def shown() -> bool:
-            """A broker queues no more than 1,000 messages for whoever reads slowly: what is missing comes again."""
+            """A broker queues no more than 1,000 messages for a slow reader: what is missing comes again."""
             for topic in topics - set(watcher.channels):
                 robot.publish(topic, b'{"t": 1}', qos=QoS.DELIVERED)
             return topics <= set(watcher.channels)

@@ -112,7 +112,7 @@ class Attack:
         self.at += self.random.random() < 0.5  # instead of the honest one, or before it
 
     def feed(self, packet: bytes, right: bytes | None, kind: str = "honest") -> None:
-        """``right``: the honest packet whose picture this may show; None: nobody can know."""
+        """``right``: the honest packet whose picture this may show; None: that is unknown."""
         shown = self.decoder.feed(packet)
         self.fed += 1
         self.seen[f"{kind}: {'shown' if shown else 'hidden'}"] += 1

@@ -8,7 +8,7 @@ What is promised, exactly:
 * A script elsewhere moves nothing without the key of its account; where names are not checked, it needs none.
 * Control ends by a release, by another who takes it, by the first who asks for it once 5 s are over in which it has
   moved nothing, or when neither request nor command came for ``for_ms``; then the first who asks gets it.
-* After a restart nobody has control.
+* After a restart control is free.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ OTHERS_MS = 2000
 
 
 class Client(NamedTuple):
-    """Somebody who drives: below the level of names the account is empty, and only the id counts."""
+    """A person who drives: below the level of names the account is empty, and only the id counts."""
 
     account: str
     id: str

@@ -250,7 +250,7 @@ class World:
         return [name for name, _ in groupby(names)]
 
     def _out_of_turn(self, since: float) -> Iterator[str]:
-        """A line of somebody who had no control then, by order alone: the clocks of two processes prove nothing."""
+        """A line of a sender who had no control then, by order alone: the clocks of two processes prove nothing."""
         turns = iter(self._holders(since))
         speeds = {(speed, speed): name for name, speed in SPEEDS.items()}
         driven = [speeds[wheels] for _, wheels in self.rig.mcu.drives(since) if wheels in speeds]

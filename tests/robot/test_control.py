@@ -125,7 +125,7 @@ def test_a_flood_of_strangers_takes_nothing_from_who_has_control(rig: Rig) -> No
 
 
 def test_a_client_that_knows_nothing_of_control_drives_as_ever(rig: Rig) -> None:
-    """Each of its commands reaches the line, also while somebody has control, and its bytes are not changed."""
+    """Each of its commands reaches the line, also while a person has control, and its bytes are not changed."""
     held(rig, CONTROL, OTTO)
     began = time.monotonic()
     wanted = [round(0.1 + number / 1000, 3) for number in range(200)]

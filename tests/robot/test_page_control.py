@@ -16,7 +16,7 @@ HALF, FAST, OLD = (0.5, 0.5), (0.7, 0.7), (0.9, 0.9)
 
 
 class Person:
-    """Somebody at a page, who drives by gestures."""
+    """A person at a page, who drives by gestures."""
 
     def __init__(self, page: Page, ref: str) -> None:
         self.page, self.ref, self.gesture = page, ref, 0

@@ -1,4 +1,4 @@
-"""Whoever imports pebble pays for what is used, and not for scripts."""
+"""A program that imports pebble pays for what it uses, and not for scripts."""
 
 from __future__ import annotations
 

@@ -87,7 +87,7 @@ class Device(ABC):
 
     @abstractmethod
     def write(self, number: int) -> None:
-        """Write what is due at that number; they are counted from 1, and also while nobody reads."""
+        """Write what is due at that number; they are counted from 1, also while there is no reader."""
 
     def _run(self) -> None:
         began, number = time.monotonic(), 0

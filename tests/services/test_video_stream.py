@@ -1,4 +1,4 @@
-"""Somebody else's streaming program: it runs while the service runs, and never longer."""
+"""Another maker's streaming program: it runs while the service runs, and never longer."""
 
 from __future__ import annotations
 

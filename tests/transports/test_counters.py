@@ -1,4 +1,4 @@
-"""Counts are exact, whoever counts and looks meanwhile."""
+"""Counts are exact, whichever threads count and look meanwhile."""
 
 from __future__ import annotations
 

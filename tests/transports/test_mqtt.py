@@ -61,7 +61,7 @@ def rules(folder: Path) -> list[str]:
 
 
 broker = module_broker()
-small_broker = module_broker("max_packet_size 20000")  # hangs up on whoever sends a larger packet
+small_broker = module_broker("max_packet_size 20000")  # hangs up on clients that send a larger packet
 #: Takes what is published below ``allowed``, and says nothing about the rest; everything may be read.
 reading_broker = module_broker(files=rules)
 strict_broker = module_broker(files=passwords)  # wants a user name and password

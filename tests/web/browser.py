@@ -40,7 +40,7 @@ PIXELS = """const pixelsOf = (canvas) => {
   copy.drawImage(canvas, 0, 0);
   return copy.getImageData(0, 0, width, height).data;
 };"""
-#: As if somebody had opened the cards for engineers, and all plots: most tests look at one of them.
+#: As if a viewer had opened the cards for engineers, and all plots: most tests look at one of them.
 _ENGINEERS = """try {
   const key = `pebble cards ${decodeURIComponent(location.pathname.split("/r/")[1])}`;
   const opened = ["services", "mcus", "logs", "values", "system"];

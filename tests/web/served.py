@@ -269,7 +269,7 @@ class RecordingRobot:
             self._publish_all(self.keeping.take(messages, time.monotonic()) if self.keeping else [])
 
     def stranger(self, **drive: float) -> None:
-        """Somebody publishes a drive command without any control, as the original's page does."""
+        """A program publishes a drive command without any control, as the original's page does."""
         self._transport.publish(f"{self.base}/incoming/drive-values", msgspec.json.encode(drive), qos=QoS.DELIVERED)
 
     def publish_states(self) -> None:

@@ -22,6 +22,8 @@ pytestmark = pytest.mark.page
 #: Among them some that are paths of the page itself.
 PREFIXES = ["/robots/", "/a/b/c/", "/r/", "/replay/", "/static/", "/p%C3%A4th%20/", "/"]
 
+#: Shown once the process that reads recordings has been started, which takes long on a busy machine.
+EMPTY = "document.body.innerText.includes('Nothing is recorded yet')"
 #: Where the page begins once it is installed.
 STARTS = """async () => {
   const { href } = document.querySelector("link[rel=manifest]");
@@ -57,9 +59,9 @@ def test_a_login_leads_to_the_screen_that_was_asked_for_and_each_screen_leads_on
         assert one.until("window.pebble?.connection.isOpen")
         one.page.get_by_role("link", name="Recordings").first.click()
         assert one.until(lambda: one.page.url == f"{url}replay")
-        assert one.until("document.body.innerText.includes('Nothing is recorded yet')")
+        assert one.until(EMPTY, 60)
         one.page.reload()
-        assert one.until("document.body.innerText.includes('Nothing is recorded yet')")
+        assert one.until(EMPTY, 60)
         assert one.page.evaluate(STARTS) == url
         one.page.evaluate("() => { pebble.commands.logOut() }")
         assert one.until(lambda: one.page.url == f"{url}login")

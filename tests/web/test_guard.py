@@ -235,6 +235,17 @@ def test_a_body_that_takes_too_long_is_given_up(app: App, monkeypatch: pytest.Mo
     assert app.requests == []
 
 
+def test_a_request_that_waits_while_the_server_ends_is_told_so() -> None:
+    async def ended(scope: Any, receive: Any, send: Any) -> None:
+        async def waits(*_: Any) -> None:
+            raise asyncio.CancelledError
+
+        await Guard(waits, settings=settings_for())(scope, receive, send)
+
+    status, _, text = ask(ended)
+    assert (status, text) == (503, "the server ends\n")
+
+
 def test_each_response_has_the_security_headers(app: App) -> None:
     guard = Guard(app, settings=settings_for())
     for answer in (ask(guard), ask(guard, headers={"host": "evil.test"}), ask(guard, "POST")):

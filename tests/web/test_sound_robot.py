@@ -59,6 +59,7 @@ def test_a_page_plays_the_robots_sound_and_the_robot_the_voice(goob: Stage, brow
     voice = lambda: played(goob)[before:]
     with tab(browser, goob.robot_url("goob"), size, script=PLAIN_MICROPHONE) as opened:
         opened.uncover("listen").click()
+        opened.uncover("sound-state")
         assert opened.until(lambda: "ms buffered · opus" in state(opened), 20)
         assert is_played(opened, 0.9, envelopes=True)
         assert talks(opened)
@@ -102,6 +103,7 @@ def test_mouth_to_ear_is_short_and_the_flag_is_down_afterwards(goob: Stage, brow
     ears = Ears(goob)
     with tab(browser, goob.robot_url("goob")) as opened, listener(goob.url.rstrip("/"), "pcm"):
         opened.test("listen").click()
+        opened.uncover("sound-state")
         assert opened.until(lambda: "ms buffered · pcm" in state(opened), 20)
         opened.page.wait_for_timeout(2000)
         assert is_played(opened, 0.95, envelopes=False)

@@ -30,6 +30,7 @@ def test_sound_through_a_slow_and_lossy_network(far: Rig) -> None:
     far.until(page, lambda: page.locator("[data-test=listen]:enabled").count(), "no page", 30)
     page.locator("[data-test=video]").click()  # pictures would need all of it
     page.locator("[data-test=listen]").click()
+    page.locator("[data-test=gear]").click()
     shown = page.locator("[data-test=sound-state]")
     far.until(page, lambda: "ms buffered · opus" in shown.inner_text(), lambda: shown.inner_text(), 30)
     far.pause(page, 3)

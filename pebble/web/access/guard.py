@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import ipaddress
 import socket
 
@@ -77,7 +78,11 @@ class Guard:
                 await _refuse(scope, receive, send, 413, f"the body has more than {MAX_BODY} bytes")
                 return
             receive = _replay(body, receive)
-        await self._app(scope, receive, send)
+        try:
+            await self._app(scope, receive, send)
+        except asyncio.CancelledError:  # it still waited when the server ended
+            with contextlib.suppress(RuntimeError):  # its answer has begun
+                await _refuse(scope, receive, send, 503, "the server ends")
 
     def _refusal(self, scope: Scope, headers: Headers) -> tuple[int, str] | None:
         """Status and text, if this request must not go on."""

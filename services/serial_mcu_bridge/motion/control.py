@@ -13,14 +13,14 @@ from pebble.services.serial_mcu_bridge.motion.paced import Paced
 
 log = logging.getLogger(__name__)
 
-_TICK_S = 0.25  # while somebody has control, or others drive: what is over ends so late at most
+_TICK_S = 0.25  # while a client has control, or others drive: what is over ends so late at most
 _NO_CLIENT = ("", "", "", "")
 
 
 class Control:
     """The lease of one motor owner, with a clock in seconds; on the service's thread.
 
-    ``publish(state)`` is called with each new state. Nothing is saved: after a restart nobody has control.
+    ``publish(state)`` is called with each new state. Nothing is saved: after a restart no client has control.
     """
 
     def __init__(self, security: Security, publish: Callable[[ControlState], object], now: float) -> None:

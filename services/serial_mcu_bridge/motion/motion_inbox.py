@@ -51,8 +51,8 @@ class MotionInbox:
     """Bounded. Any thread puts, one takes; a ``put`` returns True if nothing was waiting before: wake the one up then.
 
     Of drive commands the newest of each sender waits, and before it the zero that it replaced: a zero is always judged.
-    Who has control is a sender of its own, whom others do not replace. So is whoever requests it, by account and id, as
-    the lease has it: one account may name any number of persons.
+    The driver with control is a sender of its own, whom others do not replace. So is each client that requests it, by
+    account and id, as the lease has it: one account may name any number of persons.
     """
 
     def __init__(self, control: Control) -> None:

@@ -1,4 +1,4 @@
-"""Who moves the motors: people before scripts, nobody while latched."""
+"""Who moves the motors: people before scripts, and neither while latched."""
 
 from common.arbiter import PERSON, REFUSED, UNKNOWN_RUN, Arbiter
 from common.latch import Latch

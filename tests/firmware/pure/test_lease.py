@@ -133,7 +133,7 @@ def test_only_the_key_of_now_moves_and_a_zero_needs_none() -> None:
     for strangers, free, held in ((DRIVE, True, True), (FREE, True, False), (REFUSE, False, False)):
         own = lease(strangers)
         assert own.refuses(True, False, "", "", WRAPS) is not free
-        assert own.refuses(True, False, "00000001", "", WRAPS)  # nobody has it yet
+        assert own.refuses(True, False, "00000001", "", WRAPS)  # it is free yet
         own.hold(ANN, 3000, False, WRAPS)
         old = own.key
         assert own.refuses(True, False, "", "", WRAPS) is not held

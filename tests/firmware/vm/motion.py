@@ -77,7 +77,7 @@ def repeat(trace):
         else:
             result = [getattr(arbiters[number], method)(*arguments), arbiters[number].barred]
         if number in leases:
-            leases[number].halts = False  # as whoever owns motors does, after halting them
+            leases[number].halts = False  # as an owner of motors does, after halting them
         if result != expected:
             print("differs:", method, arguments, expected, result)
             return False

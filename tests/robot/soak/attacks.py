@@ -12,7 +12,7 @@ from tests.robot.soak.flood import FLOODS, flooding
 from tests.robot.soak.world import World
 
 _LINE_S = 0.85  # 0.75 s, and the time of a line
-_MCU_S = 1.3  # where nobody is left to send a zero, the MCU stops by itself
+_MCU_S = 1.3  # where no process is left to send a zero, the MCU stops by itself
 
 
 @dataclass(frozen=True)

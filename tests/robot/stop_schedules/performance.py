@@ -144,7 +144,7 @@ class Performance:
         problems = [] if self.world.is_up(healed, _UP_S) else ["a robot is not up again"]
         until(lambda: not self._waiting(), _CONFIRMED_S)
         problems += [f"a sender does not come to rest: {waiting}" for waiting in self._waiting()]
-        time.sleep(0.5)  # whoever is latched is driven a little longer
+        time.sleep(0.5)  # what is latched is driven a little longer
         self._resting = self.history.add("> people end everything")
         for sender, _ in self._senders:
             sender.end()

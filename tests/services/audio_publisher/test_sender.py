@@ -20,7 +20,7 @@ SOUND = FrameInfo(format="s16le", rate=16_000, channels=1, captured_ms=1)
 
 
 class Stuck(Transport):
-    """Accepts everything, and nobody confirms any of it."""
+    """Accepts everything, and confirms none of it."""
 
     def __init__(self) -> None:
         super().__init__("stuck")

@@ -35,7 +35,7 @@ class FakeChild:
         self.signals.append(number)
 
     def wait(self, timeout_s: float) -> None:
-        """Returns at once: whoever waits for it gives up."""
+        """Returns at once: a caller that waits for it gives up."""
 
     def end(self, code: int) -> None:
         self.running = False
@@ -114,7 +114,7 @@ class Bench:
         assert until(lambda: child.signals == [signal.SIGTERM])
 
     def holder(self, by: str) -> None:
-        """Publish who has control; empty: nobody."""
+        """Publish who has control; empty: it is free."""
         raw = msgspec.json.encode(ControlState(by=by, id="aaaaaaaa", key="0badf00d" if by else ""))
         self.world.transport.publish(f"{BASE}/outgoing/control/serial", raw, qos=QoS.DELIVERED, retain=True)
 

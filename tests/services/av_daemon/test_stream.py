@@ -119,7 +119,7 @@ def rests(stream: Stream) -> bool:
     return until(lambda: report(stream).doing == "rests: nobody reads")
 
 
-# -- while somebody reads
+# -- while there is a reader
 
 
 def test_a_device_is_open_only_while_it_has_readers(streams: Streams) -> None:

@@ -136,7 +136,7 @@ def test_a_slow_connection_gets_recent_pictures_and_delays_nothing_else(
 
 
 class Control:
-    """Somebody else who shares the link: small messages, and how long each takes."""
+    """Another sender, which shares the link: small messages, and how long each takes."""
 
     def __init__(self, link_port: int, broker_port: int) -> None:
         self._far, self._near = client("control-far", broker_port), client("control-near", link_port)

@@ -41,7 +41,7 @@ def test_states_are_published_when_they_change_and_not_more_than_four_times_a_se
         now = control.due
         control.tick(now)
         control.note(now)
-    assert len(states) == 6  # the newest as soon as it may be, and that nobody has control any more
+    assert len(states) == 6  # the newest as soon as it may be, and that control is free again
     assert states[4].by == "mia999"
     assert (states[5].key, now) == ("", pytest.approx(103.0, abs=0.3))
 
@@ -88,7 +88,7 @@ def held(bench: Bench, by: str) -> str:
 
 
 def test_who_has_control_drives_and_keys_of_before_do_not(bench: Bench) -> None:
-    assert bench.moves(0.1)  # nobody has control
+    assert bench.moves(0.1)  # control is free
     bench.send("control", ANN)
     ann = held(bench, "ann")
     assert bench.moves(0.2, key=ann)
@@ -185,7 +185,7 @@ def test_of_two_motor_owners_that_answer_differently_the_first_by_name_decides(t
     try:
         clients["otto"].ask(time.monotonic())
         assert became("otto", "otto")
-        left.restart()  # free: whoever asks first has this one
+        left.restart()  # free: the first who asks has this one
         left.send("control", {"id": clients["ann"].id, "by": "ann", "device": "desk"})
         assert until(lambda: left.world.newest("control/left").get("by") == "ann", 5)
         assert right.world.newest("control/right")["by"] == "otto"

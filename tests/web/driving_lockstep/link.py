@@ -55,7 +55,7 @@ class Wire:
         self.changed = 0  # counts faults
 
     def stall(self, until: float, *, up: bool = True, down: bool = True) -> None:
-        """Whoever calls it releases it then."""
+        """The caller releases it then."""
         self.changed += 1
         for pipe in [self.up] * up + [self.down] * down:
             pipe.stall(until)

@@ -4,7 +4,7 @@
    once; a page or a connection that stands still is noticed after 250 ms, a server that does after 400 ms.
 2. No motion resumes by itself: a gesture begins with an action of the human, and only of inputs that were pressed
    after the last interruption.
-3. Nobody is blocked for good: see rest.py.
+3. No page is blocked for good: see rest.py.
 4. Only the holder of the lease moves wheels.
 5. After a stop nothing moves until a new gesture begins.
 6. A command is at most 0.6 s old when the server forwards it.

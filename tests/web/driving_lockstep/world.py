@@ -155,7 +155,7 @@ class World:
             self.pages.do(human.page, "held", name) if name in KEYS else None
 
     def slot(self, page: int) -> int | None:
-        """Before which human this page is; None: nobody."""
+        """Before which human this page is; None: before none."""
         slot = page % 8
         return slot if self.humans[slot].page == page else None
 

@@ -1,4 +1,4 @@
-"""A visitor's first ten minutes with the demo: fingers in Chromium, and a clock. Nobody waits for the visitor to think.
+"""A visitor's first ten minutes with the demo: fingers in Chromium, and a clock. The visitor never stops to think.
 
 ``pytest -s`` prints the clock at each step; the pictures of all steps are in pytest's folder of the test.
 """

@@ -11,7 +11,7 @@ from tests.web.looks import FAILED, LOOKS, MOST_BYTES, SHARE, STORED, check, dif
 
 pytestmark = [pytest.mark.page, pytest.mark.timeout(180)]
 
-#: What somebody may break unseen, as rules besides the page's own.
+#: What a change may break unseen, as rules besides the page's own.
 BREAKS = {
     "another font": "body, button { font-family: serif; }",
     "a thinner title": ".card-head h2 { font-weight: 400; }",

@@ -152,7 +152,7 @@ def test_a_part_of_the_page_that_is_opened_takes_the_stick_away(at_lamp: Phone) 
     assert at_lamp.rests()
     assert at_lamp.test("stop-one").is_visible()
     at_lamp.fingers.lift()
-    at_lamp.page.wait_for_timeout(300)  # nobody taps anew at once
+    at_lamp.page.wait_for_timeout(300)  # no finger taps anew at once
     assert at_lamp.tab.until(at_lamp.opens_drive, 10)
     assert at_lamp.drive_by_stick()
 
@@ -239,7 +239,7 @@ def test_the_fleet_is_stopped_and_a_robot_opened_by_finger(browser: Browser, sta
         assert robot.tab.until("window.pebble.driver.ref === ''", 2)
         robot.test("stop-all").tap()
         assert robot.tab.until(lambda: wire.latched("minilamp"), 2)
-        robot.test("card-minilamp").get_by_role("link").tap()
+        robot.test("card-minilamp").get_by_role("link").first.tap()
         assert robot.because("stopped")
         robot.take()
         assert robot.drive_by_stick()

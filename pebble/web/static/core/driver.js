@@ -52,7 +52,7 @@ export class Driver {
     /** @type {Set<string>} parts of the page that do not work */
     this.failed = new Set();
     this.refusal = ""; // why the server has ended the last gesture
-    this.hintedAt = -Infinity; // when somebody without control last tried to drive
+    this.hintedAt = -Infinity; // when a person without control last tried to drive
     this.tried = false;
     /** @type {import("./reasons.js").Reason|null} why nothing moves it, whatever is sent; found by what is fetched later */
     this.doubt = null;
@@ -291,7 +291,7 @@ export class Driver {
     return this.ref !== "" && !document.querySelector("dialog[open]") && this.reason()?.action?.kind === "take";
   }
 
-  /** Somebody tries to drive: without control it is said how to get it. */
+  /** A person tries to drive: without control the page tells how to get it. */
   hint() {
     if (!this.isFree()) return;
     this.hintedAt = performance.now();

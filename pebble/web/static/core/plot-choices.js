@@ -9,7 +9,7 @@ const MINUTES = 60_000;
 
 /**
  * ``fields``: names within the metric's numbers; null: all of them, up to six. ``least``: the smallest range of values
- * that is shown. ``first``: it is shown before somebody asks for all of them.
+ * that is shown. ``first``: it is shown before all of them are asked for.
  * @typedef {{id: string, title: string, metric: string, fields: string[] | null, digits?: number, unit?: string,
  *   least?: number, first?: boolean}} Plot
  */

@@ -7,7 +7,7 @@ export const SLOW_MS = 300; // from this round trip on, the speed is limited
 const LATE_MS = 600;
 export const SLOW_SPEED = 0.4;
 const LET_GO = "Let go first"; // the server says the same
-const RESET_MS = 600; // after a reset robots refuse whoever has not paused for 0.5 s
+const RESET_MS = 600; // after a reset robots refuse a driver who has not paused for 0.5 s
 
 /** @typedef {{code: string, text: string, action?: Action, also?: Action}} Reason */
 /** @typedef {{label: string, kind: "take"|"ask"|"give-up"|"take-over"|"see"|"login"|"reload"|"stop-script"}} Action */

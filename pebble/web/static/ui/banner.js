@@ -328,7 +328,7 @@ function Notice() {
   return html`<div role="status" class="pill-place">${shown && html`<p class="pill">${notice.text}</p>`}</div>`;
 }
 
-/** What somebody who tries to drive without control has to do first. */
+/** What a person who tries to drive without control has to do first. */
 function ControlHint() {
   const { driver } = usePage();
   useModel(driver);

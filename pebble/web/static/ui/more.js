@@ -17,7 +17,7 @@ const STEP = 0.1; // of the speed, for each press
 const SLOWEST = 0.05; // as the slider's
 const CHECK_MS = 1000;
 const IDLE_MS = 55_000; // the server ends what is not used for a minute
-const RELOAD_MS = 5000; // where nobody is there to press a button
+const RELOAD_MS = 5000; // where no person is there to press a button
 
 /** To be called once. @param {any} page */
 export function install(page) {
@@ -86,7 +86,7 @@ class Doer {
   }
 }
 
-/** A screen that nobody touches for days. */
+/** A screen that is not touched for days. */
 class Wall {
   constructor(page) {
     this.page = page;

@@ -108,7 +108,7 @@ function sorted(store, refs, by) {
   return [...refs].sort((a, b) => (key(a) < key(b) ? -1 : key(a) > key(b) ? 1 : a < b ? -1 : 1));
 }
 
-/** Those which somebody should look at: at once, and for a while after the reason is gone. @returns {Set<string>} */
+/** Those which a person should look at: at once, and for a while after the reason is gone. @returns {Set<string>} */
 function useNeeding(store, refs) {
   const since = useRef(new Map());
   const now = performance.now();

@@ -137,7 +137,7 @@ export async function fetchPart(part) {
 }
 
 /**
- * A part of the page, fetched when it is first shown. ``failed``: nobody should wait for it any more.
+ * A part of the page, fetched when it is first shown. ``failed``: it will not come any more.
  * @param {() => Promise<any>} part the same one each time @param {boolean} [now] without waiting for fetchRest()
  * @returns {{body: any, failed: boolean}}
  */

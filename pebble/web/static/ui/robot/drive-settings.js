@@ -11,17 +11,20 @@ export function DriveSettings({ open = false }) {
   const { turn, balance } = useModel(driver).sliders;
   const part = `${Math.round(100 * turn)} %`;
   const side = balance === 0 ? "centred" : `${Math.round(100 * Math.abs(balance))} % ${balance > 0 ? "right" : "left"}`;
-  return html`<div class="sliders">
-    <${Slider} name="Turn" value=${turn} min=${5} text=${part} onInput=${set(driver, "turn")} />
-    <details class="folded" open=${open}>
-      <summary data-test="fold-drive">Balance, extra axis</summary>
-      <${Slider} name="Balance" value=${balance} min=${-50} max=${50} text=${side} onInput=${set(driver, "balance")} />
-      <div class="aux">
+  const rest = html`<${Slider} name="Balance" value=${balance} min=${-50} max=${50} text=${side} onInput=${set(driver, "balance")} />
+    <div class="aux">
       <span>Extra axis <kbd>Q</kbd> <kbd>E</kbd></span>
       <${AuxButton} driver=${driver} value=${1} label="Extra axis up">+<//>
       <${AuxButton} driver=${driver} value=${-1} label="Extra axis down">−<//>
-      </div>
-    </details>
+    </div>`;
+  return html`<div class="sliders">
+    <${Slider} name="Turn" value=${turn} min=${5} text=${part} onInput=${set(driver, "turn")} />
+    ${open
+      ? rest
+      : html`<details class="folded">
+          <summary data-test="fold-drive">Balance, extra axis</summary>
+          ${rest}
+        </details>`}
     ${pad && html`<p class="pad-name"><${Icon} name="pad" />${pad}</p>`}
   </div>`;
 }

@@ -147,10 +147,12 @@ function Portrait({ at, offers, view, video, source, onPanel }) {
           <${Slot} at=${at} />
           <${DrivePad} />
           <${Speed} />
-          <details class="more-drive" open=${!video}>
-            <summary data-test="more-drive">Turn, balance, extra axis</summary>
-            <${Part} part=${DRIVE} open />
-          </details>
+          ${video
+            ? html`<details class="folded">
+                <summary data-test="more-drive">Turn, balance, extra axis</summary>
+                <${Part} part=${DRIVE} open />
+              </details>`
+            : html`<${Part} part=${DRIVE} open />`}
         </section>
       <//>`}
     </div>`}
