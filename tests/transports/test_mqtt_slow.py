@@ -199,6 +199,20 @@ def values(broker: Broker) -> dict[str, bytes]:
         return {one.topic: one.payload for one in received.messages}
 
 
+def test_a_connection_made_anew_publishes_no_will(broker: Broker, recorder: Recorder) -> None:
+    robot, seen, wills = Robot(broker, recorder), Received(), Received()
+    robot.transport.subscribe("slow/command", seen, direct=True)
+    with create("mqtt", "operator", MqttSettings(host="127.0.0.1", port=broker.port)) as operator:
+        operator.subscribe(WILL, wills, direct=True)
+        count = robot.transport.counters["connected"]
+        robot.transport.renew_connection("only late commands come")
+        assert until(lambda: robot.transport.counters["connected"] > count)
+        operator.publish("slow/command", b"now", qos=QoS.DELIVERED)
+        assert until(lambda: seen.messages)
+        assert wills.messages == []
+    robot.transport.close()
+
+
 class TestBeginning:
     @pytest.fixture
     def robot(self, broker: Broker, recorder: Recorder) -> Iterator[Robot]:

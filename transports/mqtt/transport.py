@@ -59,6 +59,7 @@ class MqttTransport(Transport):
         self._filters = BrokerFilters()
         self._own_message_filter = OwnMessageFilter()
         self._stopping = _Stop()
+        self._renewal = ""  # why the connection is to be made anew
         self._thread: threading.Thread | None = None
         self._refused = RefusedTopics(client_id, settings.vital)
         self._retention = RetentionChecks()
@@ -89,6 +90,11 @@ class MqttTransport(Transport):
         attempt = self._dialler.attempt
         if attempt is not None:
             attempt.suit(slow=slow)
+
+    def renew_connection(self, why: str) -> None:
+        connection, self._renewal = self._connection, why
+        if connection is not None:
+            connection.wake()
 
     # -- the interface to base
 
@@ -221,6 +227,7 @@ class MqttTransport(Transport):
         """Run one connection from its start to its end; raises Lost unless it ends by `close`."""
         self._dialler.begin()
         connection = self._dialler.connect(self, self.counters, stopping)
+        self._renewal = ""
         connection.suit(slow=self.is_slow)
         try:
             if self.settings.as_published:
@@ -245,6 +252,9 @@ class MqttTransport(Transport):
             while not stopping.is_set():
                 receive = self._deliver_all if self._retention.current is None else self._deliver_and_note
                 connection.pump(_IDLE_S, receive)
+                if self._renewal:
+                    connection.disconnect()
+                    raise Lost(self._renewal)
                 if connection.limits is not self._dialler.reported and time.monotonic() > tried_at:
                     self._report_limits(connection)
                 if self._own.pending and connection.has_room:
