@@ -85,7 +85,7 @@ class LinkTrial:
 _PLAIN, _LOSSY = Shape(kbit=9.6, delay_ms=300), Shape(kbit=9.6, delay_ms=300, loss=0.05)
 TRIALS: Final[Mapping[str, LinkTrial]] = {
     "thin-9.6k+5%": LinkTrial(link=_LOSSY, subjects=("wide", "thin", "thin TLS"), share=1, video=True),
-    "thin-9.6k": LinkTrial(link=_PLAIN, subjects=("wide", "thin", "thin stock"), share=0.3),
+    "thin-9.6k": LinkTrial(link=_PLAIN, subjects=("wide", "thin", "thin TLS", "thin stock"), share=0.3),
     "thin-19.2k+2%": LinkTrial(
         link=Shape(kbit=19.2, delay_ms=150, loss=0.02), subjects=("wide", "thin", "thin TLS"), share=0.3
     ),
