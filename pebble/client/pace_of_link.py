@@ -63,6 +63,11 @@ def link_of(payload: bytes) -> LinkState | None:
         return None
 
 
+def way_s(link: LinkState) -> float:
+    """How long a command takes to the robot, roughly: half a round trip, and whatever waits before it."""
+    return (link.rtt_ms / 2 + link.queue_ms) / 1000
+
+
 def ms(now: float) -> int:
     """``t`` of a command: milliseconds of the sender's clock. It goes on while the machine is suspended."""
     return round(1000 * now)

@@ -7,7 +7,7 @@ from pebble import contract as c
 from pebble.client.control import RobotControl
 from pebble.client.drive_reasons import SILENT_S, Situation
 from pebble.client.driveable import Driveable, driveable_of
-from pebble.client.pace_of_link import WIDE, Pace, link_of, pace_of
+from pebble.client.pace_of_link import WIDE, Pace, link_of, pace_of, way_s
 from pebble.client.robot_topics import section_of
 from pebble.contract import codec
 from pebble.contract.identity import is_of_another
@@ -190,6 +190,12 @@ class RobotView:
     def named(self) -> bool:
         """Whether it takes commands only with the name of their sender in the topic."""
         return self.estop.named
+
+    @property
+    def slow_s(self) -> float | None:
+        """How long commands take over its thin link; None: it has reported none, or is gone."""
+        link = self.link
+        return None if link is None or link.level == "wide" or self.liveness.reported_offline else way_s(link)
 
     @property
     def pace(self) -> Pace:

@@ -211,13 +211,19 @@ def print_listing(listing: Listing, now: float, wall: float) -> None:
         console.print(f"omitted: {listing.omitted} messages of further topics")
 
 
-def stopped_robots(listing: Listing, wall: float) -> list[str]:
+def remarks(listing: Listing, wall: float) -> list[str]:
+    """Which robots are stopped, and which have a thin link."""
     discovery = Discovery()
     for record in listing.records.values():
         if record.last is not None:
             discovery.receive(record.last, record.arrived, wall)
     robots = sorted(discovery.all_robots(), key=lambda robot: robot.base)
-    return [stopped_line(robot.estop, wall) for robot in robots if robot.latched]
+    slow = [
+        f"{shown(robot.name)} has a slow connection: commands take {robot.slow_s:.1f} s"
+        for robot in robots
+        if robot.slow_s is not None
+    ]
+    return [stopped_line(robot.estop, wall) for robot in robots if robot.latched] + slow
 
 
 def stopped_line(robot: RobotEstop, wall: float) -> str:

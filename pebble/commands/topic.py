@@ -85,7 +85,7 @@ def list_(
                 listing.add(message, time.monotonic())
                 note(message)
         show.print_listing(listing, time.monotonic(), time.time())
-        for line in show.stopped_robots(listing, time.time()):
+        for line in show.remarks(listing, time.time()):
             typer.echo(line)
     return 0 if listing.records else 1
 

@@ -313,8 +313,9 @@ def test_a_command_that_the_transport_refuses_ends_the_gesture() -> None:
 @pytest.mark.parametrize(("level", "hz", "qos", "valid_ms"), [("narrow", 10, 0, 400), ("thin", 4, 0, 750)])
 def test_over_a_thin_link_it_sends_less_and_stops_as_ever(level: str, hz: int, qos: int, valid_ms: int) -> None:
     cab = Cab().ready()
-    cab.receive(outgoing(GOOB, "link", {"level": level, "drive_hz": hz, "rtt_ms": 300, "queue_ms": 0, "t": 1}))
+    cab.receive(outgoing(GOOB, "link", {"level": level, "drive_hz": hz, "rtt_ms": 280, "queue_ms": 0, "t": 1}))
     *moves, zero, _, _ = cab.run(2.0, "w") + cab.run(1.0)
+    assert cab.status.endswith("slow connection: commands take 0.1 s")
     assert [one["t"] for one in moves] == [2000 + 1000 * n // hz for n in range(len(moves))]
     assert len(moves) >= 2.3 * hz
     assert (len({one["key"] for one in moves}), {one["valid_ms"] for one in moves}) == (1, {valid_ms})
@@ -324,5 +325,5 @@ def test_over_a_thin_link_it_sends_less_and_stops_as_ever(level: str, hz: int, q
 
 def test_within_the_robot_there_is_no_link() -> None:
     cab = Cab(heartbeat=False).ready()
-    cab.receive(outgoing(GOOB, "link", {"level": "thin", "drive_hz": 4, "rtt_ms": 300, "queue_ms": 0, "t": 1}))
+    cab.receive(outgoing(GOOB, "link", {"level": "thin", "drive_hz": 4, "rtt_ms": 280, "queue_ms": 0, "t": 1}))
     assert cab.run(1.0, "w")[0] == {"x": 0, "z": 0.6, "y": 0, "valid_ms": 400}

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 
+import msgspec
 import pytest
 
+from pebble.client.names import ANY_ROBOT, Names
 from pebble.commands import show
 from pebble.media.rate_meter import RateMeter
 from pebble.transports import Message, QoS
@@ -41,6 +43,14 @@ def test_headlines() -> None:
     assert [show.duration(seconds) for seconds in (0.012, 99, 130, 7200, 200_000)] == [
         "12 ms", "99.0 s", "2 min", "2 h", "2 d",
     ]  # fmt: skip
+
+
+def test_a_thin_link_is_told() -> None:
+    listing = show.Listing(Names(ANY_ROBOT))
+    link = {"level": "thin", "drive_hz": 4, "rtt_ms": 600, "queue_ms": 45, "t": 1}
+    for name, value in (("goob", link), ("fred", link | {"level": "wide"}), ("eve", 7)):
+        listing.add(Message(f"pebble/robots/{name}/outgoing/link", msgspec.json.encode(value), retain=True), 0.0)
+    assert show.remarks(listing, 0.0) == ["goob has a slow connection: commands take 0.3 s"]
 
 
 def test_rates() -> None:

@@ -213,6 +213,8 @@ class TerminalDriver:
         return "" if self.robot.volts is None else f"{self.robot.volts:.1f} V"
 
     def _latency(self) -> str:
+        if self._heartbeat and self.robot.slow_s is not None:
+            return f"slow connection: commands take {self.robot.slow_s:.1f} s"
         if self.lease.round_trip_s is not None:
             return f"{1000 * self.lease.round_trip_s:.0f} ms"
         latency = self.robot.liveness.latency_s
