@@ -43,7 +43,8 @@ _READY_S, _STARTED_S = 150.0, 45.0  # half a minute after its start a bridge loo
 _TAKES_S = 25.0  # one take-over and its drive, at most
 _SCENE = (Gesture("release", 7, 4), Gesture("release", 5, 4), Gesture("stop", 5, 4))
 _RELEASE, _STOP = Gesture("release", 1.5, 2.5), Gesture("stop", 1.5, 2.5)
-_GESTURE_S = 12.0  # one of these, at most: a stop that is not confirmed, and a reset
+_GESTURE_S = 45.0  # one of these, at most: without control, a stop that is not confirmed, and a reset
+_PATIENCE = 1.5  # times as long as all gestures take where everything is answered
 _PARKED, _WATCHED, _DRIVEN = "parked", "watched", "driven"
 _HOUR_S = 3600
 
@@ -240,14 +241,16 @@ def measure(round_: Round) -> Iterator[Cell]:
 
 
 def driven(run: Run, name: str, trial: LinkTrial, subjects: Sequence[str], processes: Processes) -> Iterator[Cell]:
+    wanted = gestures(run, trial)
+    usual_s = sum(one.drive_s + one.rest_s for one in wanted)
     orders = Orders(
-        host="", port=0, base=BASE, people=[], gestures=gestures(run, trial), video=trial.video,
+        host="", port=0, base=BASE, people=[], gestures=wanted, limit_s=_PATIENCE * usual_s, video=trial.video,
         foreign_hz=trial.foreign_hz, takes=run["takes"] if trial.takes else 0,
     )  # fmt: skip
     robots = [
         start(one, trial, orders, processes, processes.folder / str(number)) for number, one in enumerate(subjects)
     ]
-    limit_s = sum(one.drive_s + one.rest_s + _GESTURE_S for one in orders.gestures) + orders.takes * _TAKES_S + 60
+    limit_s = orders.limit_s + orders.takes * _TAKES_S + 2 * _GESTURE_S + run["window_s"]
 
     operators = [robot.operator(processes) for robot in robots]
 
@@ -271,7 +274,7 @@ def driven(run: Run, name: str, trial: LinkTrial, subjects: Sequence[str], proce
 def metered(run: Run, name: str, trial: LinkTrial, subjects: Sequence[str], processes: Processes) -> Iterator[Cell]:
     """Bytes in both directions with all headers: of a robot alone, of one that a page shows, and of a driven one."""
     seconds = run["metered_s"]
-    orders = Orders(host="", port=0, base=BASE, people=[], gestures=[Gesture("release", seconds, 0)])
+    orders = Orders(host="", port=0, base=BASE, people=[], gestures=[Gesture("release", seconds, 0)], limit_s=seconds)
     robots = [
         start(one, trial, orders, processes, processes.folder / str(number)) for number, one in enumerate(subjects)
     ]

@@ -155,14 +155,15 @@ class ThinOperator:
 
     def run(self) -> WheelRecord:
         orders, first = self._orders, self._first
-        began_ns = time.monotonic_ns()
+        began_ns, until = time.monotonic_ns(), clock() + self._orders.limit_s
         first.heartbeats.clear()
         first.links[:] = first.links[-1:]
         if orders.video:
             self._watch()
         for gesture in orders.gestures:
-            self._own_control(first)
-            self._do(first, gesture)
+            if clock() < until:
+                self._own_control(first)
+                self._do(first, gesture)
         for number in range(orders.takes):
             self._take_over(self._people[number % 2], self._people[1 - number % 2])
         return WheelRecord(

@@ -48,6 +48,7 @@ class Orders(msgspec.Struct, kw_only=True):
     ca_cert: str | None = None
     people: list[Login]  # who drive; a second one only takes over
     gestures: list[Gesture] = []
+    limit_s: float = 0.0  # after so long no further gesture begins: where nothing is answered, each takes long
     video: bool = False
     foreign_hz: float = 0.0
     takes: int = 0  # so often control is taken over
