@@ -45,7 +45,7 @@ _SCENE = (Gesture("release", 7, 4), Gesture("release", 5, 4), Gesture("stop", 5,
 _RELEASE, _STOP = Gesture("release", 1.5, 2.5), Gesture("stop", 1.5, 2.5)
 _GESTURE_S = 45.0  # one of these, at most: without control, a stop that is not confirmed, and a reset
 _PATIENCE = 1.5  # times as long as all gestures take where everything is answered
-_PARKED, _WATCHED, _DRIVEN = "parked", "watched", "driven"
+_ALONE, _WATCHED, _DRIVEN = "parked", "watched", "driven"
 _HOUR_S = 3600
 
 
@@ -294,7 +294,7 @@ def metered(run: Run, name: str, trial: LinkTrial, subjects: Sequence[str], proc
                 figures={"up": round(_HOUR_S * up / took / 1000), "down": round(_HOUR_S * down / took / 1000)},
             )  # fmt: skip
 
-    yield from count(_PARKED)
+    yield from count(_ALONE)
     watchers = [
         processes.worker(
             f"watcher of {one.subject}", "pebble.bench.impair.watcher", one.orders.host, one.orders.port, BASE,
@@ -392,7 +392,7 @@ TABLES = (
     ),
     Grid(
         title="control at level named", rows=("trial", "measure"), heads=("trial", ""),
-        of=lambda cell: cell.measure in (wheels.TAKE, wheels.TOLD),
+        of=lambda cell: cell.measure in (wheels.TAKE, wheels.LOST),
         columns=[
             Column("of", lambda cell: str(cell.figures["sent"])), Column("done", lambda cell: str(len(cell.samples))),
             Column("p50\nms", _late(50)), Column("p95\nms", _late(95)),

@@ -238,13 +238,13 @@ class ThinOperator:
     def _take_over(self, taker: Person, other: Person) -> None:
         had, began_ns = other.control.held, time.monotonic_ns()
         taker.control.ask(clock(), over=True)
-        held_ns = told_ns = 0
+        held_ns = lost_ns = 0
         until = clock() + _CONTROL_S
-        while not (held_ns and (told_ns or not had)) and clock() < until:
+        while not (held_ns and (lost_ns or not had)) and clock() < until:
             self._step()
             held_ns = held_ns or (time.monotonic_ns() if taker.control.held else 0)
-            told_ns = told_ns or (time.monotonic_ns() if had and not other.control.held else 0)
-        self._takes.append(Take(began_ns, held_ns, told_ns))
+            lost_ns = lost_ns or (time.monotonic_ns() if had and not other.control.held else 0)
+        self._takes.append(Take(began_ns, held_ns, lost_ns))
         self._do(taker, Gesture("release", _TOOK_S, _LET_GO_S))
 
     # -- time
