@@ -107,8 +107,6 @@ def _size(message: Message) -> int:
 
 def _rank(subject: Subject, message: Message) -> Rank | None:
     """None: it never waits."""
-    if subject.prompt:
-        return None
     if subject.kind is Kind.STREAM or (subject.kind is Kind.EVENT and message.qos is QoS.LATEST):
         return Rank.STREAM
     return Rank.STATE if subject.kind is Kind.STATE else None
