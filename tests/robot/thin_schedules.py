@@ -51,7 +51,7 @@ _HEADERS = 66  # bytes of each packet
 _AHEAD = (12_000, 4_000, inf)
 _REST_S = 10.0  # until what has waited for room is sent
 _LONGEST = 11_000.0
-_FLOOD_S, _FLOODS = 0.02, 60
+_FLOOD_S, _FLOODS = 0.05, 20
 
 
 class Uplink(Connection):
@@ -341,7 +341,7 @@ class World:
 
     def _stream(self, b: int) -> None:
         self._samples += 1
-        for stream in (*STREAMS, *(f"programs/p{number}" for number in range(b % 12))):
+        for stream in (*STREAMS, *(f"programs/p{number}" for number in range(b % 5))):
             value = {"n": self._samples, "value": "x" * 150}
             self.robot.publish(f"{BASE}/outgoing/{stream}", value, qos=QoS(b % 2))
 
