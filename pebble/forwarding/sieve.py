@@ -20,7 +20,7 @@ TOPICS = 512  # of which the newest message waits, or is known to have been sent
 
 
 class Rank(IntEnum):
-    """In which order what leaves a robot has to wait: streams as soon as there is little room, heartbeats last."""
+    """What leaves a robot waits in this order: streams as soon as there is little room, heartbeats last."""
 
     STREAM = 1
     STATE = 2
