@@ -21,7 +21,7 @@ log = logging.getLogger(__name__)
 
 POLL_S = 0.1
 _STATE_S, _STATES_S = 2.0, 10.0  # between two publications of the state at least, and at most
-_NEWS_S = 0.05  # a queue that has changed by less is the same, and by less than half a round trip
+_CHANGE_S = 0.05  # a queue that has changed by less is the same, and by less than half a round trip
 _UNANSWERED_S = 0.5  # how often a question without an answer counts
 _PAUSE = 25  # so much longer on a thin link what can wait is spread
 _HEARTBEAT_BYTES = 80  # about
@@ -90,7 +90,7 @@ class Uplink:
         self._forwarder.send_waiting()
         self._report_shed()
         change_s = abs(self._meter.queue_s - self._state_queue_s)
-        changed = now - self._state_at >= _STATE_S and change_s >= max(_NEWS_S, self._meter.round_trip_s / 2)
+        changed = now - self._state_at >= _STATE_S and change_s >= max(_CHANGE_S, self._meter.round_trip_s / 2)
         if (changed or now - self._state_at >= _STATES_S) and self._takes(Rank.STATE, _HEARTBEAT_BYTES):
             self._publish(now)
         return self.level.heartbeat_s > 0
