@@ -18,7 +18,7 @@ _PATIENCE = Patience(believed_s=60.0, set_back_s=2.0, silent_s=60.0)
 
 
 class LateRun:
-    """Commands that were late, one after the other, since one that was not."""
+    """Commands of senders that do not follow the link: those that were late, one after the other."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -59,7 +59,8 @@ class CommandAges:
             return False
         if _ends_something(subject.channel, message.payload):
             return False
-        self.late.add()
+        if _STAMP not in message.payload:  # else its sender keeps to the pace of the link, and fills no queue
+            self.late.add()
         return True
 
     def _waited_s(self, subject: Subject, message: Message, account: str, waited_s: float) -> float:
