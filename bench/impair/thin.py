@@ -432,7 +432,7 @@ AIMS = (
     _aim("queue above 500 ms for", wheels.QUEUE, _WORST, single("longest_s"), "s", at_most=3),
     _aim("command p95", wheels.COMMAND, "thin-9.6k", _p95, "ms", at_most=400, subject="thin"),
     _aim("command p95", wheels.COMMAND, "thin-19.2k+2%", _p95, "ms", at_most=600),
-    _aim("stop confirmed, the longest", wheels.CONFIRMED, "thin-foreign", with_lost(100), "ms", at_most=6000,
+    _aim("stop to rest, the longest", wheels.STOP, "thin-foreign", with_lost(100), "ms", at_most=6000,
          subject="auto"),
     _aim("stop confirmed, p95", wheels.CONFIRMED, "thin-page", _p95, "ms", at_most=1500, subject="wide"),
     _aim("heartbeat age p95", wheels.HEARTBEAT_AGE, "thin-page", _p95, "ms", at_most=1000, subject="wide"),
