@@ -38,7 +38,7 @@ from pebble.rig.robot import BASE, NAME, Config, Robot, synthetic_media
 NODELAY: Final = "set_tcp_nodelay true"
 _PICTURES: Final = (320, 240, 10)
 _PEOPLE: Final = ("ann", "otto")
-_SILENCE: Final = "has not answered for"  # in the log, of a connection that was taken for dead
+_BRIDGE, _SILENCE = "remote_bridge: ", "has not answered for"  # in the log: its connection was taken for dead
 _READY_S, _STARTED_S = 150.0, 45.0  # half a minute after its start a bridge looks for what has remained
 _TAKES_S = 25.0  # one take-over and its drive, at most
 _SCENE = (Gesture("release", 7, 4), Gesture("release", 5, 4), Gesture("stop", 5, 4))
@@ -138,9 +138,9 @@ class LinkRobot:
         return record
 
     def silences(self) -> int:
-        """Connections to the remote broker that were taken for dead: none of these links ever is."""
+        """How often the bridge took its connection to the remote broker for dead: none of these links ever is."""
         lines = self.robot.launcher.log.read_text(errors="replace").splitlines()
-        return sum(_SILENCE in line and REMOTE_HOST in line for line in lines)
+        return sum(_BRIDGE in line and _SILENCE in line for line in lines)
 
 
 def start(subject: str, trial: LinkTrial, orders: Orders, processes: Processes, folder: Path) -> LinkRobot:
