@@ -264,11 +264,14 @@ class _Pair:
 
 
 class SlowTcpProxy:
-    """Listens on ``port`` and passes on to ``target``: at most ``kbits`` per second there, and unlimited back."""
+    """Listens on ``port`` and passes on to ``target``: at most ``kbits`` per second there, and unlimited back.
 
-    def __init__(self, target: int, kbits: float) -> None:
-        self.port, self.kbits = free_port(), kbits
-        self.passed = 0  # bytes to the target
+    ``back``: the other way round.
+    """
+
+    def __init__(self, target: int, kbits: float, *, back: bool = False) -> None:
+        self.port, self.kbits, self._back = free_port(), kbits, back
+        self.passed = 0  # bytes that were slow
         self._target = target
         self._turn = threading.Lock()
         self._free_at = 0.0
@@ -297,10 +300,13 @@ class SlowTcpProxy:
         with suppress(OSError):
             while True:
                 near, _ = self._listener.accept()
-                far = socket.create_connection(("127.0.0.1", self._target), 2)
-                far.settimeout(None)
+                far = socket.socket()
+                if self._back:
+                    far.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
+                    far.setsockopt(socket.IPPROTO_TCP, socket.TCP_MAXSEG, _SEGMENT)
+                far.connect(("127.0.0.1", self._target))
                 self._sockets += [near, far]
-                for source, sink, slow in ((near, far, True), (far, near, False)):
+                for source, sink, slow in ((near, far, not self._back), (far, near, self._back)):
                     sink.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
                     threading.Thread(target=self._carry, args=(source, sink, slow), daemon=True).start()
 

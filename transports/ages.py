@@ -38,29 +38,31 @@ class _Clock:
 
     __slots__ = ("began", "least", "newest", "other", "patience_s", "proved", "received_at")
 
-    def __init__(self, sent: float, waited_s: float, now: float, patience_s: float = inf) -> None:
+    def __init__(self, sent: float, now: float, patience_s: float = inf) -> None:
         self.began = self.received_at = now
         self.newest = sent  # stamp
         self.least = now - sent  # difference: that of the fastest message
-        self.proved = self.least - waited_s  # the largest that a message without any delay can have had
+        self.proved = -inf  # what a message without any delay has at least
         self.patience_s = patience_s
         self.other: _Clock | None = None  # what it has become, if all that came since was not late
 
-    def receive(self, sent: float, waited_s: float, now: float) -> None:
+    def receive(self, sent: float, now: float) -> None:
         drift = _DRIFT * (now - self.received_at)
         self.least = min(now - sent, self.least + drift)
-        self.proved = max(now - sent - waited_s, self.proved + drift)
+        self.proved += drift
         self.received_at, self.newest = now, max(self.newest, sent)
 
-    def age_s(self, sent: float, now: float) -> float:
-        return now - sent - min(self.least, self.proved)
+    @property
+    def standing(self) -> tuple[float, float]:
+        """It gives way to those that were received for longer, or else later."""
+        return self.received_at - self.began, self.received_at
 
 
 class SenderClocks(Generic[K]):
     """The clocks of at most so many senders, each known by a key.
 
-    Where there is no room, one that is silent gives way, or else that which was received for the shortest time: no flood
-    of invented keys takes the place of a sender that goes on. One that finds no place is judged as without a stamp.
+    Where there is no room, one that is silent gives way, or else the one that was received for the shortest time: no
+    flood of invented keys takes the place of a sender that goes on. Without a place it is judged as without a stamp.
     """
 
     def __init__(self, most: int, patience: Patience) -> None:
@@ -72,33 +74,33 @@ class SenderClocks(Generic[K]):
         return len(self._clocks)
 
     def age_s(self, key: K, sent: float, waited_s: float, now: float, late_s: float) -> float:
-        """Seconds for which a message has waited that is stamped ``sent``: at ``now`` of our clock; late above ``late_s``.
+        """Seconds for which a message that is stamped ``sent`` has waited at ``now``; more than ``late_s`` is late.
 
         ``waited_s`` is what is known without the stamp: at most so long. It counts as well until the clock is two
-        seconds old, and until one of its messages was fast by both.
+        seconds old, and until one of its messages was not late by that.
         """
         with self._lock:
             clock = self._clocks.get(key)
             if clock is None or now - clock.received_at > self._patience.silent_s or now - sent < clock.least - _JUMP_S:
-                clock = self._clocks[key] = self._begin(key, _Clock(sent, waited_s, now))
+                clock = self._clocks[key] = self._begin(key, _Clock(sent, now))
             else:
-                clock.receive(sent, waited_s, now)
-                clock = self._believed(key, clock, sent, waited_s, now, late_s)
-            age = clock.age_s(sent, now)
-            return max(age, waited_s) if now - clock.began < _YOUNG_S else age
+                clock.receive(sent, now)
+                clock = self._believed(key, clock, sent, now, late_s)
+            if waited_s <= late_s:
+                clock.proved = max(clock.proved, now - sent - waited_s)
+            age = now - sent - min(clock.least, clock.proved)
+            return age if now - clock.began >= _YOUNG_S else max(age, waited_s)
 
     def _begin(self, key: K, clock: _Clock) -> _Clock:
         clocks = self._clocks
         if key not in clocks and len(clocks) >= self._most:
-            silent = min(clocks, key=lambda one: clocks[one].received_at)
-            if clock.began - clocks[silent].received_at <= _IDLE_S:
-                silent = min(
-                    clocks, key=lambda one: (clocks[one].received_at - clocks[one].began, clocks[one].received_at)
-                )
-            del clocks[silent]
+            leaves = min(clocks, key=lambda one: clocks[one].received_at)
+            if clock.began - clocks[leaves].received_at <= _IDLE_S:
+                leaves = min(clocks, key=lambda one: clocks[one].standing)
+            del clocks[leaves]
         return clock
 
-    def _believed(self, key: K, clock: _Clock, sent: float, waited_s: float, now: float, late_s: float) -> _Clock:
+    def _believed(self, key: K, clock: _Clock, sent: float, now: float, late_s: float) -> _Clock:
         """The clock that counts for this message: while all seem late, perhaps another than before."""
         if now - sent - clock.least <= late_s:
             clock.other = None
@@ -106,9 +108,9 @@ class SenderClocks(Generic[K]):
         other, patience = clock.other, self._patience
         patience_s = patience.set_back_s if sent < clock.newest - _JUMP_S else patience.believed_s
         if other is None or now - other.received_at > patience.gap_s or patience_s < other.patience_s:
-            clock.other = _Clock(sent, waited_s, now, patience_s)
+            clock.other = _Clock(sent, now, patience_s)
             return clock
-        other.receive(sent, waited_s, now)
+        other.receive(sent, now)
         if now - other.began <= other.patience_s:
             return clock
         self._clocks[key] = other

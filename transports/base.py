@@ -297,6 +297,9 @@ class Transport(ABC):
         """Suit the way to the other end, from now on: see `is_slow`."""
         self.is_slow = slow
 
+    def renew_connection(self, why: str) -> None:  # noqa: B027 - where no other end keeps messages, nothing is to be done
+        """End the connection and make another: what waits for it at the other end is dropped there."""
+
     def on_state(self, watcher: Watcher) -> None:
         """Call ``watcher`` on every change of state, in order, on a thread of the transport: it must return at once."""
         self._watchers.append(watcher)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -199,7 +200,8 @@ def what_the_wheels_did(results: Results) -> list[Picture]:
         known = {name: {one.measure: one for one in cells} for name, cells in robots.items()}
         link = trial.removeprefix("thin-")
         caption = f"What the wheels did over {link}: commanded, and obeyed"
-        found.append(Picture(f"{results.bench}-wheels-{link}", caption, partial(_wheels, known, caption)))
+        name = re.sub("[^a-z0-9]+", "-", f"{results.bench}-wheels-{link}".removesuffix("%"))
+        found.append(Picture(name, caption, partial(_wheels, known, caption)))
     return found
 
 
@@ -224,7 +226,7 @@ def _wheels(robots: Mapping[str, Mapping[str, Cell]], title: str) -> Figure:
                               textcoords="offset points", color=colour, va="top",
                               weight="bold" if text == "STOP" else "normal")  # fmt: skip
         if not any(moved.rounds[1]):
-            axes.annotate("the wheels never turned", (0.5, 0.5), xycoords="axes fraction", fontsize=11, color=_WIDE,
+            axes.annotate("the wheels never turned", (0.5, 0.5), xycoords="axes fraction", fontsize=11, color="#A4133C",
                           ha="center", weight="bold", backgroundcolor="white")  # fmt: skip
         axes.set(xlim=(0, last), ylim=(0, 1.15), ylabel=f"{_ROBOTS.get(name, name)}\nspeed")
         axes.set_yticks([0, 0.5, 1])

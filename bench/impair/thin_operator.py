@@ -155,14 +155,15 @@ class ThinOperator:
 
     def run(self) -> WheelRecord:
         orders, first = self._orders, self._first
-        began_ns = time.monotonic_ns()
+        began_ns, until = time.monotonic_ns(), clock() + self._orders.limit_s
         first.heartbeats.clear()
         first.links[:] = first.links[-1:]
         if orders.video:
             self._watch()
         for gesture in orders.gestures:
-            self._own_control(first)
-            self._do(first, gesture)
+            if clock() < until:
+                self._own_control(first)
+                self._do(first, gesture)
         for number in range(orders.takes):
             self._take_over(self._people[number % 2], self._people[1 - number % 2])
         return WheelRecord(
@@ -237,13 +238,13 @@ class ThinOperator:
     def _take_over(self, taker: Person, other: Person) -> None:
         had, began_ns = other.control.held, time.monotonic_ns()
         taker.control.ask(clock(), over=True)
-        held_ns = told_ns = 0
+        held_ns = lost_ns = 0
         until = clock() + _CONTROL_S
-        while not (held_ns and (told_ns or not had)) and clock() < until:
+        while not (held_ns and (lost_ns or not had)) and clock() < until:
             self._step()
             held_ns = held_ns or (time.monotonic_ns() if taker.control.held else 0)
-            told_ns = told_ns or (time.monotonic_ns() if had and not other.control.held else 0)
-        self._takes.append(Take(began_ns, held_ns, told_ns))
+            lost_ns = lost_ns or (time.monotonic_ns() if had and not other.control.held else 0)
+        self._takes.append(Take(began_ns, held_ns, lost_ns))
         self._do(taker, Gesture("release", _TOOK_S, _LET_GO_S))
 
     # -- time

@@ -19,7 +19,7 @@ from pebble.bench.results import OVER_TIME, Cell, Value, rounded
 from pebble.simulation.trace import Entry
 
 COMMAND, RELEASE, STOP, CONFIRMED = "command", "release", "stop", "stop confirmed"
-TAKE, TOLD, HEARTBEAT, HEARTBEAT_AGE, QUEUE = "take", "taken over", "heartbeat gap", "heartbeat age", "queue"
+TAKE, LOST, HEARTBEAT, HEARTBEAT_AGE, QUEUE = "take", "taken over", "heartbeat gap", "heartbeat age", "queue"
 COMMANDED, WHEELS, RELEASED, STOPPED = (f"{what}{OVER_TIME}" for what in ("commanded", "wheels", "released", "stopped"))
 LONG_QUEUE_MS = 500
 _STEPS = 800
@@ -48,6 +48,7 @@ class Orders(msgspec.Struct, kw_only=True):
     ca_cert: str | None = None
     people: list[Login]  # who drive; a second one only takes over
     gestures: list[Gesture] = []
+    limit_s: float = 0.0  # after so long no further gesture begins: where nothing is answered, each takes long
     video: bool = False
     foreign_hz: float = 0.0
     takes: int = 0  # so often control is taken over
@@ -68,7 +69,7 @@ class Take(msgspec.Struct, array_like=True, frozen=True):
 
     began_ns: int
     held_ns: int
-    told_ns: int
+    lost_ns: int
 
 
 class LinkSeen(msgspec.Struct, array_like=True, frozen=True):
@@ -184,13 +185,13 @@ def cells_of(trial: WheelTrial) -> Iterator[Cell]:
                 )  # fmt: skip
         stops = [one for one in record.gestures if one.kind == STOP]
         if stops:
-            told = [(one.confirmed_ns - one.ended_ns) / 1e6 for one in stops if one.confirmed_ns]
-            yield trial.cell(CONFIRMED, "ms", told, sent=len(stops))
+            confirmed = [(one.confirmed_ns - one.ended_ns) / 1e6 for one in stops if one.confirmed_ns]
+            yield trial.cell(CONFIRMED, "ms", confirmed, sent=len(stops))
     if record.takes:
         held = [(one.held_ns - one.began_ns) / 1e6 for one in record.takes if one.held_ns]
-        told = [(one.told_ns - one.began_ns) / 1e6 for one in record.takes if one.told_ns]
+        lost = [(one.lost_ns - one.began_ns) / 1e6 for one in record.takes if one.lost_ns]
         yield trial.cell(TAKE, "ms", held, sent=len(record.takes))
-        yield trial.cell(TOLD, "ms", told, sent=len(record.takes) - 1)  # at first none has control
+        yield trial.cell(LOST, "ms", lost, sent=len(record.takes) - 1)  # at first none has control
     window = Window(record.began_ns, record.ended_ns)
     gaps = gaps_s([one.arrived_ns for one in record.heartbeats], window)
     yield trial.cell(

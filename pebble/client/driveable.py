@@ -1,6 +1,6 @@
-"""What a robot's status says of whether it can be driven, and stopped. Pure."""
+"""What a robot's status reports: whether it can be driven, and stopped, and what waits while it is driven. Pure."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from pebble.contract import STATUS, codec
 from pebble.errors import PayloadError
@@ -26,13 +26,24 @@ class Driveable(NamedTuple):
 
 def driveable_of(status: bytes) -> Driveable | None:
     """The value in an ``outgoing/status``; None: it is not there, as for an older robot, or one without motors."""
-    if len(status) > _STATUS_BYTES:
-        return None
-    try:
-        found = codec.decode(STATUS, status).value.get("driveable")
-    except PayloadError:
-        return None
+    found = _value(status).get("driveable")
     if not isinstance(found, dict) or found.get("state") not in ("yes", "no", "unknown"):
         return None
     why = found.get("why")
     return Driveable(found["state"], why[:_WHY] if isinstance(why, str) else "")
+
+
+def is_held(status: bytes, program: str) -> bool:
+    """Whether that program is requested, and waits while people drive over a thin link."""
+    found: Any = _value(status)
+    for level in ("services", program, "state"):
+        found = found.get(level) if isinstance(found, dict) else None
+    return bool(found == "held")
+
+
+def _value(status: bytes) -> dict[str, Any]:
+    try:
+        value: dict[str, Any] = codec.decode(STATUS, status).value if len(status) <= _STATUS_BYTES else {}
+    except PayloadError:
+        return {}
+    return value

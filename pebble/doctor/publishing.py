@@ -21,7 +21,7 @@ _POLL_S = 0.05
 _APART_S = 0.005  # between the two messages of a pair
 _PAIRS = 5
 _QUIET_S = 60  # no pings meanwhile: while the answer to one is not acknowledged, both messages of a pair wait
-_SETTLED = 1.5  # round trips between two pairs: the one before is acknowledged then
+_QUIET = 1.5  # round trips between two pairs: the one before is acknowledged then
 _MATTERS_S = 0.02  # a shorter round trip delays nothing that people notice
 _HELD = 0.75  # of a round trip: a thin link itself needs some of it for the second message
 
@@ -105,7 +105,7 @@ class _Echo:
         if came[0] is None or came[1] is None:
             return None
         round_trip_s = came[0] - began
-        time.sleep(_SETTLED * round_trip_s)
+        time.sleep(_QUIET * round_trip_s)
         return round_trip_s, came[1] - came[0]
 
     def _note(self, message: Message) -> None:

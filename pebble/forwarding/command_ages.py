@@ -17,6 +17,22 @@ _LONGEST = 80  # characters of the keys of several motor owners
 _PATIENCE = Patience(believed_s=60.0, set_back_s=2.0, silent_s=60.0)
 
 
+class LateRun:
+    """Commands of senders that do not follow the link: those that were late, one after the other."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._since = 0.0
+
+    def add(self) -> None:
+        self._since = self._since if self.count else clock.since_boot()
+        self.count += 1
+
+    @property
+    def seconds(self) -> float:
+        return clock.since_boot() - self._since if self.count else 0.0
+
+
 class CommandAges:
     """Judges one-shot messages of all senders; thread-safe.
 
@@ -26,6 +42,7 @@ class CommandAges:
 
     def __init__(self) -> None:
         self.keys: frozenset[bytes] | None = None
+        self.late = LateRun()
         self._drivers = SenderClocks[tuple[str, str]](MOST, _PATIENCE)
         self._asking = SenderClocks[tuple[str, str]](MOST, _PATIENCE)
 
@@ -37,7 +54,14 @@ class CommandAges:
         waited_s = message.waited_s
         if stamped and _STAMP in message.payload:
             waited_s = self._waited_s(subject, message, account, waited_s)
-        return waited_s > subject.waits_s and not _ends_something(subject.channel, message.payload)
+        if waited_s <= subject.waits_s:
+            self.late.count = 0
+            return False
+        if _ends_something(subject.channel, message.payload):
+            return False
+        if _STAMP not in message.payload:  # else its sender keeps to the pace of the link, and fills no queue
+            self.late.add()
+        return True
 
     def _waited_s(self, subject: Subject, message: Message, account: str, waited_s: float) -> float:
         """By its own stamp, if that counts; else ``waited_s``."""

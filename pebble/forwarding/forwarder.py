@@ -175,17 +175,19 @@ class Forwarder:
             if isinstance(self._pass(here, one.subject, one.message, one.forward), Forward):
                 here.count_forwarded()
 
-    def _sift(self, here: SideState, subject: Subject, message: Message, forward: Forward) -> Forward | Drop:
+    def _sift(
+        self, here: SideState, subject: Subject, message: Message, forward: Forward, account: str = ""
+    ) -> Forward | Drop:
         """Like :meth:`_pass`, where the link is thin."""
         if here.side is not Side.LOCAL or subject.prompt:
-            return self._pass(here, subject, message, forward)
+            return self._pass(here, subject, message, forward, account)
         with self._sifting:
             sieve = self._sieve
             if sieve is None or self.sides.gate is not Gate.OPEN:
-                return self._pass(here, subject, message, forward)
+                return self._pass(here, subject, message, forward, account)
             if sieve.keeps(subject, message, forward):
                 return Drop.NO_ROOM
-            return self._pass(here, subject, message, forward)
+            return self._pass(here, subject, message, forward, account)
 
     # -- the receiving threads
 

@@ -20,7 +20,7 @@ TOPICS = 512  # of which the newest message waits, or is known to have been sent
 
 
 class Rank(IntEnum):
-    """In which order what leaves a robot has to wait: streams as soon as there is little room, heartbeats last."""
+    """What leaves a robot waits in this order: streams as soon as there is little room, heartbeats last."""
 
     STREAM = 1
     STATE = 2
@@ -107,8 +107,6 @@ def _size(message: Message) -> int:
 
 def _rank(subject: Subject, message: Message) -> Rank | None:
     """None: it never waits."""
-    if subject.prompt:
-        return None
     if subject.kind is Kind.STREAM or (subject.kind is Kind.EVENT and message.qos is QoS.LATEST):
         return Rank.STREAM
     return Rank.STATE if subject.kind is Kind.STATE else None

@@ -370,7 +370,7 @@ class DriverView(Struct, frozen=True, kw_only=True):
 class PictureView(Struct, frozen=True, kw_only=True):
     """``web/picture``: the pictures of a component, as they come from it."""
 
-    state: str  # "rest", "starting", "flowing", "silent" or "refused"
+    state: str  # "rest", "starting", "flowing", "silent", "held" (it waits while people drive) or "refused"
     why: str
     encoding: str
     per_second: float
@@ -382,7 +382,7 @@ class PictureView(Struct, frozen=True, kw_only=True):
 class SoundView(Struct, frozen=True, kw_only=True):
     """``web/sound``: the sound of a component, as it comes from it, and who talks to it."""
 
-    state: str  # "rest", "starting", "flowing", "silent" or "refused"
+    state: str  # "rest", "starting", "flowing", "silent", "held" (it waits while people drive) or "refused"
     why: str
     encoding: str
     listeners: int

@@ -21,10 +21,11 @@ log = logging.getLogger(__name__)
 
 POLL_S = 0.1
 _STATE_S, _STATES_S = 2.0, 10.0  # between two publications of the state at least, and at most
-_NEWS_S = 0.05  # a queue that has changed by less is the same, and by less than half a round trip
+_CHANGE_S = 0.05  # a queue that has changed by less is the same, and by less than half a round trip
 _UNANSWERED_S = 0.5  # how often a question without an answer counts
 _PAUSE = 25  # so much longer on a thin link what can wait is spread
 _HEARTBEAT_BYTES = 80  # about
+_LATE, _LATE_S = 8, 1.5  # commands, and since when all of them were late: the broker holds more of the kind
 
 
 class Uplink:
@@ -85,10 +86,11 @@ class Uplink:
         self._measure(now)
         if self._meter.level != self._level:
             self._suit()
+        self._drop_late()
         self._forwarder.send_waiting()
         self._report_shed()
         change_s = abs(self._meter.queue_s - self._state_queue_s)
-        changed = now - self._state_at >= _STATE_S and change_s >= max(_NEWS_S, self._meter.round_trip_s / 2)
+        changed = now - self._state_at >= _STATE_S and change_s >= max(_CHANGE_S, self._meter.round_trip_s / 2)
         if (changed or now - self._state_at >= _STATES_S) and self._takes(Rank.STATE, _HEARTBEAT_BYTES):
             self._publish(now)
         return self.level.heartbeat_s > 0
@@ -103,6 +105,16 @@ class Uplink:
         ):
             self._answers, self._answered_at = answer.number, now
             self._meter.answered(answer.seconds, now, answer.queue_s)
+
+    def _drop_late(self) -> None:
+        """Who sends more commands than a thin link carries fills the broker's queue with them; a stop would wait there.
+
+        They are worth nothing when they come, and a new connection drops all that wait. The stop is repeated.
+        """
+        late = self._forwarder.ages.late
+        if self._level == "thin" and late.count >= _LATE and late.seconds >= _LATE_S:
+            late.count = 0
+            self._remote.renew_connection("only late commands come over a thin link: those that wait there are dropped")
 
     def _suit(self) -> None:
         """The level is another one."""

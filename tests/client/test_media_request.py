@@ -92,3 +92,24 @@ async def test_it_is_withdrawn_once_there_is_a_broker_again(monkeypatch: pytest.
         assert one.robot.encodings == ["json"]
         there[0] = True
         await until(lambda: one.robot.encodings == ["json", None])
+
+
+async def test_nothing_is_asked_of_a_robot_that_waits() -> None:
+    one = Requested()
+    one.request.waits = True
+    await one.broker.open()
+    one.request.want(True)
+    for _ in range(3):
+        await one.step()
+    await one.request.request_keyframe("json")
+    assert one.robot.published == []
+    one.request.waits = False
+    await one.step()
+    await until(lambda: one.robot.encodings == ["json"])
+    one.request.waits = True
+    await one.request.request_keyframe("json")
+    one.request.close()
+    await one.request.run(one.step)
+    await until(lambda: one.robot.encodings == ["json", None])
+    await one.broker.close()
+    one.robot.close()

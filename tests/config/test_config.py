@@ -490,6 +490,13 @@ class TestMistakes:
              'transport.kind: must be "mqtt" where robot.platform is "esp32"'),
             (at("services.mqtt_bridge", {"enabled": True, "remote": {"kind": "zenoh"}}),
              "services.mqtt_bridge.remote.connect: is missing"),
+            (at("services.mqtt_bridge.link", {"kbit": 9.6}),
+             'services.mqtt_bridge.link.kbit: has no effect at profile "wide": write "thin" or "auto"'),
+            (at("services.mqtt_bridge", {"link": {"profile": "auto"},
+                                         "remote": {"kind": "zenoh", "connect": ["tcp/a:1"]}}),
+             'services.mqtt_bridge.link.profile: cannot be "auto": only MQTT connections are measured'),
+            (at("services.mqtt_bridge.link", {"profile": "thin", "kbit": 0}),
+             "services.mqtt_bridge.link.kbit: must be a number above 0"),
         ],
     )  # fmt: skip
     def test_what_is_missing_or_does_not_fit_together(self, raw: dict[str, Any], expected: str) -> None:

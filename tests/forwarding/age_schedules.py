@@ -39,7 +39,7 @@ _QUEUES_S = (0.0, 0.0, 0.0, 0.2, 0.4, 0.8, 1.5, 6.0)
 _GROWTH = (0.0, 0.002, 0.006, 0.01, 0.03, 0.1, 0.3, 0.8)  # of a queue, seconds per second
 _SET_S = (0.3, -0.3, 0.8, -0.8, 1.5, -1.5, 9.0, -9.0)
 _RATES = (4, 5, 10)  # commands of a driver, a second
-_SETTLED_S = 63.0
+_USUAL_S = 63.0
 
 LAYOUTS = ("own keys", "control", "names")
 
@@ -78,7 +78,7 @@ class Driver:
     key_at: float = 0.0  # when its key was new
     new_at: float = 0.0  # when its memory began
     known_at: float | None = None  # a fast command of it arrived while the pings were fast
-    unsettled_at: float = 0.0  # when its clock, or a delay of it, was last not as usual
+    unusual_at: float = 0.0  # when its clock, or a delay of it, was last not as usual
     slow: bool = False  # its clock was set back, by too little to be seen: it seems slow
     set_back_at: float | None = None  # so was its clock, while it drove; since then nothing was late
 
@@ -88,7 +88,7 @@ class Driver:
     def begin_anew(self, now: float) -> None:
         self.seen.clear()
         self.changed_at, self.known_at = now, None
-        self.unsettled_at, self.set_back_at = now, None
+        self.unusual_at, self.set_back_at = now, None
 
 
 @dataclass(order=True)
@@ -116,7 +116,7 @@ class World:
             Driver("c" if self.layout == "names" else "", "0000000c", 5000.0, 0.0),
         ]
         for driver in self.drivers:
-            driver.changed_at = driver.key_at = driver.new_at = driver.unsettled_at = self.now
+            driver.changed_at = driver.key_at = driver.new_at = driver.unusual_at = self.now
         self._share_keys()
         self.down, self.ping_up = Queue(), Queue()
         self.down_high_since: float | None = None
@@ -229,7 +229,7 @@ class World:
             self.down_high_since = (self.down_high_since or self.now) if high else None
             for driver in self.drivers:
                 if driver.up.delay_s + self.down.delay_s > 0.1:
-                    driver.unsettled_at = self.now
+                    driver.unusual_at = self.now
                 if driver.driving and self.now >= driver.due:
                     driver.due = self.now + 1 / driver.per_s
                     self._send(driver, moves=True)
@@ -317,8 +317,8 @@ class World:
         check(not (standing and one.down_s > 0.75), "a queue that was there before is taken for the way")
 
     def _check_refused(self, driver: Driver, true_s: float, waited_s: float) -> None:
-        settled = self.now - driver.unsettled_at > _SETTLED_S
-        check(not (settled and true_s < 0.1 and not waited_s), "a driver is kept out for more than a minute")
+        usual = self.now - driver.unusual_at > _USUAL_S
+        check(not (usual and true_s < 0.1 and not waited_s), "a driver is kept out for more than a minute")
         set_back = driver.set_back_at is not None and self.now > driver.set_back_at + 3.0
         check(not set_back, "a driver whose clock was set back is kept out for more than three seconds")
         known = driver.known_at is not None and self.now > driver.known_at + 2.1
@@ -366,10 +366,10 @@ _CALM = {**_WEIGHTS, "up": 1, "down": 1, "down_grows": 0, "set_clock": 1, "freez
 _AGES, _JUDGE = "pebble.transports.ages", "pebble.forwarding.command_ages"
 MUTATIONS = {
     "a queue that was there from the beginning is taken for the way": Mutation(
-        _AGES, "return now - sent - min(self.least, self.proved)", "return now - sent - self.least"
+        _AGES, "min(clock.least, clock.proved)", "clock.least", schedule=40
     ),
-    "a young clock is trusted": Mutation(_AGES, "now - clock.began < _YOUNG_S", "False"),
-    "a clock that jumped is trusted": Mutation(_AGES, "now - sent < clock.least - _JUMP_S", "False"),
+    "a young clock is trusted": Mutation(_AGES, "if now - clock.began >= _YOUNG_S", "if True"),
+    "a clock that jumped is trusted": Mutation(_AGES, "now - sent < clock.least - _JUMP_S", "False", schedule=652),
     "the fastest message is forgotten": Mutation(_AGES, "min(now - sent, self.least + drift)", "now - sent"),
     "clocks drift by a tenth": Mutation(
         _AGES, "drift = _DRIFT * (now - self.received_at)", "drift = 0.1 * (now - self.received_at)"
@@ -379,11 +379,11 @@ MUTATIONS = {
     ),
     "who is late is never believed": Mutation(_AGES, "if now - other.began <= other.patience_s:", "if True:"),
     "a clock that is set back is one that is late": Mutation(
-        _AGES, "patience_s = patience.set_back_s if", "patience_s = patience.believed_s if"
+        _AGES, "patience_s = patience.set_back_s if", "patience_s = patience.believed_s if", schedule=173
     ),
-    "what was late long ago counts": Mutation(_AGES, "            clock.other = None\n", ""),
-    "the youngest way of a late sender is its way": Mutation(_AGES, "        other.receive(sent, waited_s, now)\n", ""),
-    "the oldest gives way": Mutation(_AGES, "if clock.began - clocks[silent].received_at <= _IDLE_S:", "if False:"),
+    "what was late long ago counts": Mutation(_AGES, "            clock.other = None\n", "", schedule=141),
+    "the youngest way of a late sender is its way": Mutation(_AGES, "        other.receive(sent, now)\n", ""),
+    "the oldest gives way": Mutation(_AGES, "if clock.began - clocks[leaves].received_at <= _IDLE_S:", "if False:"),
     "a key counts for every account": Mutation(_JUDGE, "clocks.age_s((account, key)", 'clocks.age_s(("", key)'),
     "any key counts while there is control": Mutation(_JUDGE, "if keys is None:", "if True:"),
     "a late zero is refused": Mutation(_JUDGE, " and not _ends_something(subject.channel, message.payload)", ""),

@@ -110,7 +110,7 @@ class TestLevels:
         assert world.retained(LINK_STATE)[1]
 
 
-class TestHeartbeats:
+class TestHeartarrived:
     @pytest.mark.parametrize(
         ("profile", "section", "gap", "qos"),
         [
@@ -125,9 +125,9 @@ class TestHeartbeats:
         world = start(profile, **section)
         began = len(world.remote.on(ONLINE))
         world.run(30)
-        beats = world.remote.on(ONLINE)[began:]
-        assert abs(len(beats) - 30 / gap) <= 1
-        assert {int(beat.qos) for beat in beats} == {qos}
+        arrived = world.remote.on(ONLINE)[began:]
+        assert abs(len(arrived) - 30 / gap) <= 1
+        assert {int(one.qos) for one in arrived} == {qos}
 
     def test_wait_last_and_come_as_soon_as_there_is_room(self, start: Start) -> None:
         world = start()
@@ -230,7 +230,7 @@ class TestNoRoom:
             f"{BASE}/{IMU}",
         ]
 
-    def test_it_is_counted_and_said_once_a_minute(self, start: Start, caplog: pytest.LogCaptureFixture) -> None:
+    def test_it_is_counted_and_logged_once_a_minute(self, start: Start, caplog: pytest.LogCaptureFixture) -> None:
         caplog.set_level(logging.WARNING)
         world = start()
         world.uplink.way = FULL
@@ -304,6 +304,6 @@ def test_on_a_wide_link_the_bridge_sends_what_it_receives(start: Start) -> None:
         world.run(0.01)
     assert sent(world) == [(one.topic, one.payload, int(one.qos), one.retain) for one in expected]
     assert not world.remote.on(LINK_STATE)
-    beats = len(world.remote.on(ONLINE))
+    arrived = len(world.remote.on(ONLINE))
     world.run(10)
-    assert len(world.remote.on(ONLINE)) - beats == 40
+    assert len(world.remote.on(ONLINE)) - arrived == 40

@@ -11,9 +11,8 @@ from pathlib import Path
 import pytest
 
 from pebble.transports import Message, MqttSettings, QoS, State, create
-from pebble.transports.mqtt import packets
 from pebble.transports.mqtt.ending import Silent
-from pebble.transports.mqtt.retention import KeptProof
+from pebble.transports.mqtt.retention import RetainedProof
 from pebble.transports.mqtt.transport import MqttTransport
 from tests.support import Broker, until
 from tests.tcp_proxy import TcpProxy
@@ -57,7 +56,7 @@ class TestPatience:
             assert link.counters["silences"] == 0
             assert link.messages[-1].waited_s > 1.0, "which proves nothing about its age"
 
-    def test_an_answer_tells_how_long_it_took(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_how_long_an_answer_took_is_known(self, monkeypatch: pytest.MonkeyPatch) -> None:
         with closing(Link(monkeypatch)) as link:
             assert link.connection.answer is None
             link.idle(0.6)
@@ -124,7 +123,7 @@ class TestProof:
         ],
     )
     def test_histories(self, history: str, proving: str, unproved: str) -> None:
-        proof = KeptProof(PROOF)
+        proof = RetainedProof(PROOF)
         for word in history.split():
             value = word.partition("=")[2]
             proof.sent(message(PROOF, value.encode()) if value else message(word), confirmed=word[0] == "!")
@@ -199,6 +198,20 @@ def values(broker: Broker) -> dict[str, bytes]:
         return {one.topic: one.payload for one in received.messages}
 
 
+def test_a_connection_made_anew_publishes_no_will(broker: Broker, recorder: Recorder) -> None:
+    robot, seen, wills = Robot(broker, recorder), Received(), Received()
+    robot.transport.subscribe("slow/command", seen, direct=True)
+    with create("mqtt", "operator", MqttSettings(host="127.0.0.1", port=broker.port)) as operator:
+        operator.subscribe(WILL, wills, direct=True)
+        count = robot.transport.counters["connected"]
+        robot.transport.renew_connection("only late commands come")
+        assert until(lambda: robot.transport.counters["connected"] > count)
+        operator.publish("slow/command", b"now", qos=QoS.DELIVERED)
+        assert until(lambda: seen.messages)
+        assert wills.messages == []
+    robot.transport.close()
+
+
 class TestBeginning:
     @pytest.fixture
     def robot(self, broker: Broker, recorder: Recorder) -> Iterator[Robot]:
@@ -206,7 +219,7 @@ class TestBeginning:
         yield robot
         robot.transport.close()
 
-    def test_asks_for_little_where_the_broker_has_kept_what_it_had(self, robot: Robot, broker: Broker) -> None:
+    def test_asks_for_little_where_the_broker_has_lost_nothing(self, robot: Robot, broker: Broker) -> None:
         robot.publish(STATES[3], b"after the proof")
         assert robot.confirmed()
         assert robot.reconnects(lambda: robot.publish(STATES[5], b"meanwhile")) == [3, 5]
@@ -234,4 +247,3 @@ class TestBeginning:
         robot = Robot(broker, recorder, slow=False)
         assert robot.reconnects() == ALL
         robot.transport.close()
-        assert packets.PINGREQ in robot.proxy.sent

@@ -342,8 +342,7 @@ def keeping(**more: Any) -> Callable[[int], Value]:
 #: Goob waits with its pictures while it is driven.
 THIN = (
     at(GOOB, "link", {"level": "thin", "drive_hz": 4, "rtt_ms": 610, "queue_ms": 40, "t": 1}),
-    at(GOOB, "status", {"t": 0, "value": {"services": {"camera_publisher": {"state": "held", "restarts": 0}}}}),
-    at(GOOB, "web/picture", flow("silent", "no picture for 9 s")),
+    at(GOOB, "web/picture", flow("held", "Pictures wait for driving")),
 )
 EVE_STOPPED = (stopped(GOOB, "eve on phone"), stopped(FRED, "eve on phone"))
 

@@ -51,7 +51,7 @@ class RetentionCheck:
         return None if left and now - self._newest_at < LATE_S else left
 
 
-class KeptProof:
+class RetainedProof:
     """Shows by one retained topic which others a broker has kept: its values differ, and only we publish there.
 
     A broker that has one of the values that may be its newest has all that was sent before it.

@@ -19,7 +19,7 @@ from pebble.transports.mqtt.ending import Lost, Silent
 from pebble.transports.mqtt.filters import BrokerFilters, OwnMessageFilter, overlap
 from pebble.transports.mqtt.outgoing import PendingAck
 from pebble.transports.mqtt.refused_topics import RefusedTopics
-from pebble.transports.mqtt.retention import KeptProof, RetentionChecks
+from pebble.transports.mqtt.retention import RetainedProof, RetentionChecks
 from pebble.transports.mqtt.suspects import is_large, named
 from pebble.transports.settings import MqttSettings
 
@@ -59,10 +59,11 @@ class MqttTransport(Transport):
         self._filters = BrokerFilters()
         self._own_message_filter = OwnMessageFilter()
         self._stopping = _Stop()
+        self._renewal = ""  # why the connection is to be made anew
         self._thread: threading.Thread | None = None
         self._refused = RefusedTopics(client_id, settings.vital)
         self._retention = RetentionChecks()
-        self._kept: KeptProof | None = None
+        self._retained_proof: RetainedProof | None = None
         self._logged = ("", 0.0)  # the newest problem in the log, and when it went there
 
     @property
@@ -90,11 +91,16 @@ class MqttTransport(Transport):
         if attempt is not None:
             attempt.suit(slow=slow)
 
+    def renew_connection(self, why: str) -> None:
+        connection, self._renewal = self._connection, why
+        if connection is not None:
+            connection.wake()
+
     # -- the interface to base
 
     def _open(self, timeout: float) -> None:  # noqa: ARG002  (base waits)
         self._dialler.open()
-        self._kept = KeptProof(self.proof) if self.proof else None
+        self._retained_proof = RetainedProof(self.proof) if self.proof else None
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join(_ANSWER_S)  # closed while it was dialling
         self._stopping = stopping = _Stop()
@@ -132,8 +138,8 @@ class MqttTransport(Transport):
         expires_s = ceil(self.settings.silence_s) if urgent and not message.retain else None
         if message.retain:
             self._own_message_filter.note_own(message)
-            if self._kept is not None:
-                self._kept.sent(message, confirmed=not connection.is_unconfirmed(self._kept.topic))
+            if self._retained_proof is not None:
+                self._retained_proof.sent(message, confirmed=not connection.is_unconfirmed(self._retained_proof.topic))
         accepted = connection.publish(message, expires_s=expires_s)
         if tried and not accepted:
             self._refused.suspects.give_up()
@@ -221,6 +227,7 @@ class MqttTransport(Transport):
         """Run one connection from its start to its end; raises Lost unless it ends by `close`."""
         self._dialler.begin()
         connection = self._dialler.connect(self, self.counters, stopping)
+        self._renewal = ""
         connection.suit(slow=self.is_slow)
         try:
             if self.settings.as_published:
@@ -245,6 +252,9 @@ class MqttTransport(Transport):
             while not stopping.is_set():
                 receive = self._deliver_all if self._retention.current is None else self._deliver_and_note
                 connection.pump(_IDLE_S, receive)
+                if self._renewal:
+                    connection.disconnect()
+                    raise Lost(self._renewal)
                 if connection.limits is not self._dialler.reported and time.monotonic() > tried_at:
                     self._report_limits(connection)
                 if self._own.pending and connection.has_room:
@@ -362,16 +372,18 @@ class MqttTransport(Transport):
         self, connection: Connection, own: Mapping[str, Message], stopping: _Stop
     ) -> tuple[dict[str, bytes], set[str] | None]:
         """What the broker has of few topics, and of which others that proves that it has them; None: of none."""
-        kept = self._kept
-        if kept is None:
+        proof = self._retained_proof
+        if proof is None:
             return {}, None
-        asked = {topic for topic in kept.unproved if topic in own} | {kept.topic}
+        asked = {topic for topic in proof.unproved if topic in own} | {proof.topic}
         found = self._find(connection, sorted(asked), stopping)
-        value = found.pop(kept.topic, b"")
-        if not kept.proves(value):
+        value = found.pop(proof.topic, b"")
+        if not proof.proves(value):
             return {}, None
-        proved = own.keys() - asked - ({self.will.topic} if self.will is not None else set())
-        return found, proved | {topic for topic in own if topic == kept.topic and own[topic].payload == value}
+        asked -= {topic for topic in asked if topic == proof.topic and topic in own and own[topic].payload == value}
+        if self.will is not None:
+            asked.add(self.will.topic)  # the broker has published it in place of ours
+        return found, {topic for topic, one in own.items() if topic not in asked and self._accepts(connection, one)}
 
     def _find(self, connection: Connection, topics: list[str], stopping: _Stop) -> dict[str, bytes]:
         """What the broker has retained on these topics."""

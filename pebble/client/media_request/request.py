@@ -28,6 +28,7 @@ class MediaRequest:
         self.ref, self.medium = ref, medium
         self.problem = ""  # why it is not requested
         self.encoding: str | None = None  # as requested; None: as configured, or nothing is requested
+        self.waits = False  # the robot knows of it, and sends nothing for now: nothing is repeated
         self.requested_at = float("-inf")
         self._broker = broker
         self._inbox = _Inbox(broker, lambda payload: None if self._viewer is None else receive(payload))
@@ -83,7 +84,7 @@ class MediaRequest:
             await self._withdraw()
             return
         chosen = encoding()
-        if not self._wanted:
+        if not self._wanted or self.waits:
             return
         try:
             await self._follow(capabilities, chosen)
@@ -92,7 +93,7 @@ class MediaRequest:
 
     async def request_keyframe(self, encoding: str) -> None:
         """Request a key frame in the encoding that arrives; the viewer lets one pass each second."""
-        if self._viewer is not None:
+        if self._viewer is not None and not self.waits:
             known = encoding if encoding in offered(self._viewer.capabilities, self.medium) else None
             await asyncio.to_thread(self._viewer.request_keyframe, known)
 

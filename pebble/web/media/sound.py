@@ -163,6 +163,8 @@ class SoundStream(MediaStream[SoundPage, SoundView]):
         component = self._robots.components.get(self.ref)
         if component is not None and component.robot.online(time.monotonic()) is False:
             return f"{component.robot.name} is silent"
+        if component is not None and component.robot.slow_s is not None:  # commands would wait behind a voice
+            return f"The connection of {component.robot.name} is too slow for a voice"
         return ""
 
     def _release(self, now: float) -> None:

@@ -10,10 +10,11 @@ from typing import Any, Final, Generic, TypeVar
 
 from starlette.websockets import WebSocket
 
+from pebble.client.driveable import is_held
 from pebble.client.media_request.request import TICK_S, MediaRequest
 from pebble.client.robot_topics import own_topic
 from pebble.client.viewer import Medium
-from pebble.contract import Channel
+from pebble.contract import STATUS, Channel
 from pebble.contract.identity import Direction
 from pebble.media.rate_meter import RateMeter
 from pebble.web.media.connection import MediaConnection
@@ -22,6 +23,8 @@ from pebble.web.robots import Robots
 log = logging.getLogger(__name__)
 
 _WHAT: Final[dict[Medium, str]] = {"video": "picture", "audio": "sound"}
+_PROGRAMS: Final[dict[Medium, str]] = {"video": "camera_publisher", "audio": "audio_publisher"}
+_WAITS: Final[dict[Medium, str]] = {"video": "Pictures wait for driving", "audio": "it waits for driving"}
 _SILENT_S: Final = 2.0
 _SILENT_PERIODS: Final = 3.0
 _GONE, _BAD_REQUEST = 1001, 4400  # codes of a closed socket
@@ -123,6 +126,8 @@ class MediaStream(ABC, Generic[ViewerT, ViewT]):
             self._end()
 
     async def _step(self) -> None:
+        status = self._robots.value(self.ref, STATUS.metric)
+        self._request.waits = status is not None and is_held(bytes(status), _PROGRAMS[self._request.medium])
         self._report()
         await self._follow()
         self._report()
@@ -152,6 +157,8 @@ class MediaStream(ABC, Generic[ViewerT, ViewT]):
             return "refused", self._request.problem
         if self._arrivals.flowing(now):
             return "flowing", self._problem()
+        if self._request.waits:
+            return "held", _WAITS[self._request.medium]
         if not self._broker.connected:
             what = _WHAT[self._request.medium]
             return "silent", f"no connection to the broker for the {what}: {self._broker.problem}"

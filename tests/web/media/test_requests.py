@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import operator
+import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import msgspec
 import pytest
 
+from pebble.transports import Message
 from tests.web.media.robots import (
     EVERYTHING,
     REF,
@@ -237,3 +240,14 @@ async def test_nothing_is_withdrawn_while_there_is_no_broker(kind: Kind, robot: 
     await asyncio.sleep(1.2)
     robot.hub.start()
     await until(lambda: robot.encodings[-1] is None and robot.flags[-1] is False)
+
+
+async def test_pages_are_told_that_what_they_want_waits_for_driving(kind: Kind, robot: Any, server: Server) -> None:
+    program = {"video": "camera_publisher", "audio": "audio_publisher"}[robot.medium]
+    robot.mute = True
+    server.open(kind.page())
+    await until(lambda: server.shows("starting"))
+    for state, shown in (("held", "held"), ("ready", "starting"), (7, "starting")):
+        status = {"t": 1, "value": {"services": {program: {"state": state}}}}
+        server.robots.receive(Message(f"{REF}/outgoing/status", msgspec.json.encode(status)), time.monotonic())
+        await until(lambda shown=shown: server.shows(shown))  # type: ignore[misc]

@@ -9,8 +9,11 @@ from itertools import pairwise
 
 import pytest
 
+from pebble.contract import LINK, codec
 from pebble.contract.packets import Codec, Sound
+from pebble.contract.payloads import LinkState
 from pebble.fleet.roles import Role
+from pebble.transports import Message
 from pebble.web.media.sound import MAX_PACKETS, WINDOW, SoundQueue, best
 from pebble.web.media.talk import LATE_S, PIECE_BYTES, PIECES_PER_S, SILENT_S, Talk, Voice
 from tests.web.media.robots import (
@@ -126,6 +129,16 @@ async def test_a_talk_to_a_robot_without_sound_is_refused() -> None:
         await page.speak(1, 3)
         await until(lambda: page.talks)
         assert page.talks == [{"talk": 1, "on": False, "why": "it has no sound"}]
+
+
+async def test_no_voice_takes_the_room_of_commands_on_a_thin_link(robot: SoundRobot, server: Server) -> None:
+    link = codec.encode(LINK, LinkState(level="thin", drive_hz=4, rtt_ms=600, queue_ms=0, t=1))
+    server.robots.receive(Message(LINK.topic(REF), link), time.monotonic())
+    page = server.open(SoundPage(), NOTHING)
+    await page.speak(1, 3)
+    await until(lambda: page.talks)
+    assert page.talks == [{"talk": 1, "on": False, "why": "The connection of goob is too slow for a voice"}]
+    assert robot.voice == []
 
 
 @pytest.mark.usefixtures("patient")

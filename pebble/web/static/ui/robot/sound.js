@@ -126,7 +126,7 @@ function words(sound, view, name) {
   const muted = sound.muted ? "muted · " : "";
   if (!sound.open) return "Connecting…";
   if (view?.state === "refused") return `${name} refuses: ${view.why}`;
-  if (view?.state === "silent") return `Waits for sound: ${view.why || "none comes"}`;
+  if (["silent", "held"].includes(view?.state)) return `Waits for sound: ${view.why || "none comes"}`;
   if (!stats?.received) return view?.why || "Waits for sound…";
   const lost = stats.lost + stats.refused;
   return `${muted}${stats.bufferedMs} ms buffered · ${stats.encoding} · ${lost ? `${lost} packets lost` : "nothing lost"}`;

@@ -5,7 +5,7 @@ import { Bands } from "../banner.js";
 import { EXTRAS, PICTURE, SOUND_FACTS, VOICE } from "../cards/cards.js";
 import { Boundary, html, useEffect, useLayoutEffect, useModel, usePage, useRef, useState, useTick, useValue } from "../parts/hooks.js";
 import { Extra, Face, Icon, Part, useName } from "../parts/parts.js";
-import { inner, span } from "../parts/words.js";
+import { span } from "../parts/words.js";
 
 /** Show pictures of ``source`` as long as this is on the page. @param {string} at @param {string} source "": none */
 export function useVideo(at, source) {
@@ -138,14 +138,13 @@ function useCover(control, source) {
   useModel(connection);
   const view = useValue(source, "web/picture");
   const online = useValue(source, "web/liveness")?.online;
-  const held = inner(useValue(source, "status"))?.services?.camera_publisher?.state === "held";
   const name = useName(source);
   if (!control.wanted) return "Paused";
   if (video.stream) return "";
   const old = video.info ? ` · this picture is ${span(video.age().ms)} old` : "";
   if (!connection.isOpen) return `No connection to the server${old}`;
   if (video.info && !video.isStale) return "";
-  if (held) return `Pictures wait for driving${old}`;
+  if (view?.state === "held") return view.why + old;
   if (video.info && !video.hasStopped) return `The pictures come late${old}`;
   if (online === false) return `${name} is silent${old}`;
   if (view?.state === "refused") return `No picture: ${view.why || "the robot refuses"}`;
