@@ -367,9 +367,6 @@ MUTATIONS = {
         f"{_BRIDGE}.link", "            self._waiting += size\n", "            pass\n"
     ),
     "streams have the room of states": Mutation(f"{_BRIDGE}.link", "self._bytes * rank", "self._bytes * 40"),
-    "what waits is sent after what is newer": Mutation(
-        f"{_FORWARDING}.sieve", "        waits = topic in self._waiting\n", "        waits = False\n"
-    ),
     "what waits for room is forgotten": Mutation(
         f"{_FORWARDING}.sieve",
         "        self._waiting[topic] = Waiting(rank, subject, message, forward)\n",
