@@ -51,6 +51,7 @@ _HEADERS = 66  # bytes of each packet
 _AHEAD = (12_000, 4_000, inf)
 _REST_S = 10.0  # until what has waited for room is sent
 _LONGEST = 11_000.0
+_LAST_S = 4.0  # for what the last stop that came has caused
 _FLOOD_S, _FLOODS = 0.05, 20
 
 
@@ -237,7 +238,7 @@ class World:
         self._numbers: dict[str, int] = {}  # the newest of each state at the robot,
         self._seen: dict[str, int] = {}  # and of what has left it
         self._stops = self._samples = 0
-        self._owed = set[bytes]()  # confirmations that have not left the robot
+        self._owed: dict[bytes, float] = {}  # confirmations that have not left the robot, and since when
         self.owner.start()
         self.bridge.start()
         scheduler.run(5.0)
@@ -260,16 +261,16 @@ class World:
 
     def _published(self, process: Process, message: Message) -> None:
         if message.topic in CONFIRMATIONS and self.scheduler.now > _BEGUN:
-            self._owed.add(message.payload)
-            self.scheduler.after(AT_ONCE_S, lambda: self._has_left(message.payload))
+            published = self._owed[message.payload] = self.scheduler.now
+            self.scheduler.after(AT_ONCE_S, lambda: self._has_left(message.payload, published))
 
-    def _has_left(self, payload: bytes) -> None:
-        self.scheduler.check(payload not in self._owed, "a confirmation waits in the robot")
+    def _has_left(self, payload: bytes, published: float) -> None:
+        self.scheduler.check(self._owed.get(payload) != published, "a confirmation waits in the robot")
 
     def _leaves(self, process: Process, message: Message) -> None:
         metric = message.topic.removeprefix(f"{BASE}/outgoing/")
         if message.topic in CONFIRMATIONS:
-            self._owed.discard(message.payload)
+            self._owed.pop(message.payload, None)
             self.counts["confirmations"] += 1
             self.scheduler.check(self.link.up.ahead < self._bound, "a confirmation waits behind what could wait")
         elif metric in STATES:
@@ -282,8 +283,9 @@ class World:
         for person in self.people:
             person.drives = person.wants = False
         self.scheduler.run(_REST_S)
-        while (self.link.up.ahead or self.link.down.ahead) and self.scheduler.now < _LONGEST:
+        while self.link.up.queue_s + self.link.down.queue_s > 1.0 and self.scheduler.now < _LONGEST:
             self.scheduler.run(_REST_S)
+        self.scheduler.run(_LAST_S)
         self.scheduler.check(self._seen == self._numbers, "the newest value of a state is lost")
         self.scheduler.check(self.wheels.speeds is None, "the wheels turn though nobody drives")
         mine, theirs = (one.newest.get("estop/serial") for one in (self.robot, self.people[0]))
@@ -365,9 +367,6 @@ MUTATIONS = {
         f"{_BRIDGE}.link", "            self._waiting += size\n", "            pass\n"
     ),
     "streams have the room of states": Mutation(f"{_BRIDGE}.link", "self._bytes * rank", "self._bytes * 40"),
-    "what waits is sent after what is newer": Mutation(
-        f"{_FORWARDING}.sieve", "        waits = topic in self._waiting\n", "        waits = False\n"
-    ),
     "what waits for room is forgotten": Mutation(
         f"{_FORWARDING}.sieve",
         "        self._waiting[topic] = Waiting(rank, subject, message, forward)\n",
