@@ -45,7 +45,7 @@ def test_headlines() -> None:
     ]  # fmt: skip
 
 
-def test_a_thin_link_is_told() -> None:
+def test_a_thin_link_is_listed() -> None:
     listing = show.Listing(Names(ANY_ROBOT))
     link = {"level": "thin", "drive_hz": 4, "rtt_ms": 600, "queue_ms": 45, "t": 1}
     for name, value in (("goob", link), ("fred", link | {"level": "wide"}), ("eve", 7)):

@@ -242,7 +242,7 @@ async def test_nothing_is_withdrawn_while_there_is_no_broker(kind: Kind, robot: 
     await until(lambda: robot.encodings[-1] is None and robot.flags[-1] is False)
 
 
-async def test_pages_are_told_that_what_they_want_waits_for_driving(kind: Kind, robot: Any, server: Server) -> None:
+async def test_pages_are_shown_that_pictures_and_sound_wait(kind: Kind, robot: Any, server: Server) -> None:
     program = {"video": "camera_publisher", "audio": "audio_publisher"}[robot.medium]
     robot.mute = True
     server.open(kind.page())

@@ -406,7 +406,7 @@ def test_a_full_picture_shows_speed_battery_and_where_it_is(show: Show) -> None:
         assert opened.page.locator(".float-tools [data-test=snapshot]").is_visible()
 
 
-def test_over_a_slow_connection_pictures_wait_and_whoever_drives_has_to_see_the_robot(show: Show) -> None:
+def test_over_a_slow_connection_pictures_wait_and_the_driver_has_to_see_the_robot(show: Show) -> None:
     with show(STATES["thin-link"]) as opened:
         assert opened.until(lambda: "Pictures wait for driving" in opened.test("cover").inner_text())
         assert opened.test("slow-link").inner_text() == "Slow connection: commands take 0.3 s"
