@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from pebble.forwarding.command_ages import MOST, CommandAges
+from pebble.forwarding.command_ages import MOST, CommandAges, ends_something
 from pebble.forwarding.routing import TABLE_A1, Forward, Side, route
 from pebble.forwarding.subjects import Subjects
 from pebble.transports import Message, QoS, clock
@@ -44,7 +44,8 @@ class Robot:
         assert subject is not None
         forward = route(TABLE_A1, Side.REMOTE, subject, message, mirroring=False)
         assert isinstance(forward, Forward)
-        return self.ages.is_late(subject, message, account, stamped=forward.stamped)
+        waited_s = self.ages.waited_s(subject, message, account) if forward.stamped else message.waited_s
+        return waited_s > subject.waits_s and not ends_something(subject, message)
 
     def knows(self, payload: dict[str, Any], metric: str = "drive-values", account: str = "") -> None:
         """For three seconds it receives fast ones."""
