@@ -10,7 +10,8 @@ from pebble.client.driveable import Driveable, driveable_of
 from pebble.client.robot_topics import section_of
 from pebble.contract import codec
 from pebble.contract.identity import is_of_another
-from pebble.contract.payloads import AutonomyStatus, EstopState, Heartbeat, Orientation
+from pebble.contract.levels import silent_after
+from pebble.contract.payloads import AutonomyStatus, EstopState, Heartbeat, LinkLevel, Orientation
 from pebble.errors import PayloadError
 from pebble.runtime.robot_estop import RobotEstop
 from pebble.transports import Message
@@ -25,6 +26,7 @@ class Liveness:
     def __init__(self) -> None:
         self.received_at: float | None = None  # monotonic
         self.reported_offline = False
+        self.link: LinkLevel = "wide"  # as its bridge measures it
         self._intervals: deque[float] = deque(maxlen=_HISTORY)
         self._latencies: deque[float] = deque(maxlen=_HISTORY)
         self.latency_s: float | None = None  # of the newest heartbeat; None if its clock is wrong
@@ -58,7 +60,7 @@ class Liveness:
         if self.received_at is None or len(self._intervals) < 2 or interval is None:
             return None
         age = now - self.received_at
-        return age <= max(2 * interval, 4 * (self.average_latency_s or 0.0)) or age < at_least_s
+        return age <= silent_after(interval, self.link, self.average_latency_s or 0.0) or age < at_least_s
 
 
 def _mean(values: deque[float]) -> float | None:
@@ -102,6 +104,8 @@ class RobotView:
             self.control.receive(message)
         elif channel is c.STATUS:
             self.driveable = driveable_of(message.payload)
+        elif channel is c.LINK:
+            self._receive_link(message)
         elif channel in _TELEMETRY:
             try:
                 self._receive_telemetry(channel, codec.decode(channel, message.payload))
@@ -181,6 +185,13 @@ class RobotView:
     def controlled(self) -> bool:
         """Whether it decides itself which person drives it."""
         return section_of(self.capabilities, "drive").get("control") is True
+
+    def _receive_link(self, message: Message) -> None:
+        """Absent or unreadable it is wide."""
+        try:
+            self.liveness.link = codec.decode(c.LINK, message.payload).level
+        except PayloadError:
+            self.liveness.link = "wide"
 
     @property
     def named(self) -> bool:
