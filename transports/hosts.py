@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 CONNECT_TIMEOUT_S = 2.0  # for each of TCP and TLS, and again for the broker's CONNACK (T12)
+HANDSHAKE_S = 10.0  # for TLS, while bytes go on arriving: at 9.6 kbit/s a chain of two certificates takes 3 s
 STEADY_S = 30.0  # an address that held a connection for so long is tried once more before the others
 _LONGEST = 8  # addresses whose failures are described one by one
 

@@ -11,7 +11,8 @@ from pebble.client.pace_of_link import WIDE, Pace, link_of, pace_of, way_s
 from pebble.client.robot_topics import section_of
 from pebble.contract import codec
 from pebble.contract.identity import is_of_another
-from pebble.contract.payloads import AutonomyStatus, EstopState, Heartbeat, LinkState, Orientation
+from pebble.contract.levels import silent_after
+from pebble.contract.payloads import AutonomyStatus, EstopState, Heartbeat, LinkLevel, LinkState, Orientation
 from pebble.errors import PayloadError
 from pebble.runtime.robot_estop import RobotEstop
 from pebble.transports import Message
@@ -26,6 +27,7 @@ class Liveness:
     def __init__(self) -> None:
         self.received_at: float | None = None  # monotonic
         self.reported_offline = False
+        self.link: LinkLevel = "wide"  # as its bridge measures it
         self._intervals: deque[float] = deque(maxlen=_HISTORY)
         self._latencies: deque[float] = deque(maxlen=_HISTORY)
         self.latency_s: float | None = None  # of the newest heartbeat; None if its clock is wrong
@@ -59,7 +61,7 @@ class Liveness:
         if self.received_at is None or len(self._intervals) < 2 or interval is None:
             return None
         age = now - self.received_at
-        return age <= max(2 * interval, 4 * (self.average_latency_s or 0.0)) or age < at_least_s
+        return age <= silent_after(interval, self.link, self.average_latency_s or 0.0) or age < at_least_s
 
 
 def _mean(values: deque[float]) -> float | None:
@@ -103,7 +105,7 @@ class RobotView:
         elif channel is c.CONTROL_STATE:
             self.control.receive(message)
         elif channel is c.LINK:
-            self.link = link_of(message.payload)
+            self._receive_link(message)
         elif channel is c.STATUS:
             self.driveable = driveable_of(message.payload)
         elif channel in _TELEMETRY:
@@ -185,6 +187,11 @@ class RobotView:
     def controlled(self) -> bool:
         """Whether it decides itself which person drives it."""
         return section_of(self.capabilities, "drive").get("control") is True
+
+    def _receive_link(self, message: Message) -> None:
+        """Absent or unreadable it is wide."""
+        self.link = link_of(message.payload)
+        self.liveness.link = "wide" if self.link is None else self.link.level
 
     @property
     def named(self) -> bool:

@@ -19,11 +19,24 @@ class Level(Struct, frozen=True, kw_only=True):
     heartbeat_s: float = 0.0  # at least, between two
     heartbeat_qos: int | None = None
     stream_hz: float | None = None  # of each stream at most, the newest; None: all of it
+    silent_s: float = 0.0  # a robot is not called silent before
     stamped: bool = False  # drive commands tell their own age, by ``t`` and ``key``
 
 
 LEVELS: Mapping[LinkLevel, Level] = {
     "wide": Level(drive_hz=20),
-    "narrow": Level(drive_hz=10, drive_qos=0, heartbeat_s=1.0, stream_hz=5, stamped=True),
-    "thin": Level(drive_hz=4, drive_qos=0, valid_ms=750, heartbeat_s=1.0, heartbeat_qos=0, stream_hz=1, stamped=True),
+    "narrow": Level(drive_hz=10, drive_qos=0, heartbeat_s=1.0, stream_hz=5, silent_s=3.0, stamped=True),
+    "thin": Level(
+        drive_hz=4, drive_qos=0, valid_ms=750, heartbeat_s=1.0, heartbeat_qos=0, stream_hz=1, silent_s=5.0, stamped=True
+    ),
+        drive_hz=4, drive_qos=0, valid_ms=750, heartbeat_s=1.0, heartbeat_qos=0, stream_hz=1, silent_s=5.0, stamped=True
+    ),
 }
+
+
+def silent_after(interval_s: float, link: LinkLevel = "wide", late_s: float = 0.0) -> float:
+    """Seconds without a heartbeat after which a robot counts as silent.
+
+    ``interval_s`` is between its heartbeats, which come ``late_s`` late; ``link`` is what it publishes.
+    """
+    return max(2 * interval_s, 4 * late_s, LEVELS[link].silent_s)

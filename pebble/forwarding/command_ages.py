@@ -1,10 +1,10 @@
-"""Which commands come too late: by what their transport knows, or by the clock of their sender.
+"""How long commands have waited, by the clocks of their senders.
 
 On a thin link what is known by pings includes the way *up*, which may wait behind pictures. A drive command with its
 sender's clock ``t`` and a ``key`` needs no pings once one of this key was fast; a request for control has its ``id``.
 """
 
-from pebble.contract import Channel, codec
+from pebble.contract import codec
 from pebble.contract.payloads import ControlRequest, Drive
 from pebble.errors import PayloadError
 from pebble.forwarding.subjects import Subject
@@ -12,7 +12,8 @@ from pebble.transports import Message, clock
 from pebble.transports.ages import Patience, SenderClocks
 
 MOST = 16  # senders of drive commands, and of requests for control, whose clocks are remembered
-_STAMP = b'"t"'
+STAMP = b'"t"'  # without it a command does not tell its age
+STAMP_LETTER = ord("t")  # most commands have none, which is known six times as fast
 _LONGEST = 80  # characters of the keys of several motor owners
 _PATIENCE = Patience(believed_s=60.0, set_back_s=2.0, silent_s=60.0)
 
@@ -34,7 +35,7 @@ class LateRun:
 
 
 class CommandAges:
-    """Judges one-shot messages of all senders; thread-safe.
+    """Computes the ages of drive commands and requests for control that tell them; thread-safe.
 
     :attr:`keys` are those of control now: others count for nothing, as at the motor owner; none while nobody has
     control. None: no motor owner gives any, and every sender has a key of its own.
@@ -46,25 +47,12 @@ class CommandAges:
         self._drivers = SenderClocks[tuple[str, str]](MOST, _PATIENCE)
         self._asking = SenderClocks[tuple[str, str]](MOST, _PATIENCE)
 
-    def is_late(self, subject: Subject, message: Message, account: str, *, stamped: bool) -> bool:
-        """Whether it has waited too long, and does more than to end something. Hot.
+    def waited_s(self, subject: Subject, message: Message, account: str) -> float:
+        """Seconds for which a message has waited that has a STAMP: by that, if it counts.
 
-        ``stamped``: it may tell its own age. A key, or an id, counts for the ``account`` that uses it.
+        A key, or an id, counts for the ``account`` that uses it.
         """
         waited_s = message.waited_s
-        if stamped and _STAMP in message.payload:
-            waited_s = self._waited_s(subject, message, account, waited_s)
-        if waited_s <= subject.waits_s:
-            self.late.count = 0
-            return False
-        if _ends_something(subject.channel, message.payload):
-            return False
-        if _STAMP not in message.payload:  # else its sender keeps to the pace of the link, and fills no queue
-            self.late.add()
-        return True
-
-    def _waited_s(self, subject: Subject, message: Message, account: str, waited_s: float) -> float:
-        """By its own stamp, if that counts; else ``waited_s``."""
         assert subject.channel is not None  # noqa: S101 - else it is not stamped
         try:
             command: Drive | ControlRequest = codec.decode(subject.channel, message.payload)
@@ -89,11 +77,11 @@ class CommandAges:
         return next((one for one in found.split(" ") if one.encode() in keys), "")
 
 
-def _ends_something(channel: Channel | None, payload: bytes) -> bool:
+def ends_something(subject: Subject, message: Message) -> bool:
     """Whether a late message passes, because it can only bring something to rest."""
-    if channel is None:
+    if subject.channel is None:
         return False
     try:
-        return channel.ends(codec.decode(channel, payload))
+        return subject.channel.ends(codec.decode(subject.channel, message.payload))
     except PayloadError:
         return False

@@ -21,7 +21,7 @@ import msgspec
 from pebble.contract import ESTOP, Kind
 from pebble.contract.names import NO_ACCOUNT
 from pebble.forwarding.admission import Admission
-from pebble.forwarding.command_ages import CommandAges
+from pebble.forwarding.command_ages import STAMP, STAMP_LETTER, CommandAges, ends_something
 from pebble.forwarding.cycles import Cycles, Finding
 from pebble.forwarding.names import Names, Signed
 from pebble.forwarding.publisher import Publisher
@@ -284,8 +284,16 @@ class Forwarder:
 
         ``account`` is that of its sender, where names are checked.
         """
-        if subject.kind.one_shot and self.ages.is_late(subject, message, account, stamped=forward.stamped):
-            return Drop.LATE
+        if subject.kind.one_shot:
+            waited_s = message.waited_s
+            if forward.stamped and STAMP_LETTER in message.payload and STAMP in message.payload:
+                waited_s = self.ages.waited_s(subject, message, account)
+            if waited_s > subject.waits_s and not ends_something(subject, message):
+                if forward.stamped and STAMP not in message.payload:  # else its sender keeps to the pace of the link
+                    self.ages.late.add()
+                return Drop.LATE
+            if forward.stamped:
+                self.ages.late.count = 0
         if forward.unsigned:
             passing = unsigned(message.payload)
             if passing is not message.payload:

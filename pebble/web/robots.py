@@ -334,7 +334,7 @@ class Robots:
         component.robot.receive_stop(None, message, now)
         component.robot.control.receive(message)
         if metric == c.LINK.metric:
-            component.robot.link = None
+            component.robot.receive(c.LINK, message, now, 0.0)
 
     def _interpret(self, component: Component, metric: str, channel: c.Channel, message: Message, now: float) -> None:
         robot = component.robot

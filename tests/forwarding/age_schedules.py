@@ -19,7 +19,7 @@ from unittest import mock
 import msgspec
 
 from pebble.config import parse
-from pebble.forwarding.command_ages import MOST, CommandAges
+from pebble.forwarding.command_ages import MOST, CommandAges, ends_something
 from pebble.forwarding.subjects import Subjects
 from pebble.transports import Message, clock
 from pebble.transports.mqtt.read_age import BrokerDelay
@@ -75,6 +75,7 @@ class Driver:
     #: Since its clock was set or its key changed: when commands arrived, and their true delay.
     seen: list[tuple[float, float]] = field(default_factory=list)
     changed_at: float = 0.0
+    fast_at: float = 0.0  # when a command of it was last not late
     key_at: float = 0.0  # when its key was new
     new_at: float = 0.0  # when its memory began
     known_at: float | None = None  # a fast command of it arrived while the pings were fast
@@ -278,6 +279,10 @@ class World:
             if not self._has_control(driver):
                 check(late == (waited_s > _LATE_S), "without a key that counts, it is not as the pings show")
             return
+        if true_s < _LATE_S:
+            driver.fast_at = self.now
+        elif self.now - driver.fast_at > 60.0:
+            driver.known_at = None
         if not driver.seen or self.now - driver.seen[-1][0] > 60.0:
             driver.known_at = None
         fast = true_s < 0.06 and not waited_s and driver.known_at is None
@@ -329,7 +334,7 @@ class World:
     def _judge(self, payload: bytes, account: str, since: float | None) -> bool:
         message = Message(f"{_BASE}/incoming/drive-values", payload, waiting_since=since)
         assert _DRIVE is not None
-        return self.ages.is_late(_DRIVE, message, account, stamped=True)
+        return self.ages.waited_s(_DRIVE, message, account) > _DRIVE.waits_s and not ends_something(_DRIVE, message)
 
     def _share_keys(self) -> None:
         """Where there is control, the first driver has it."""
@@ -386,7 +391,9 @@ MUTATIONS = {
     "the oldest gives way": Mutation(_AGES, "if clock.began - clocks[leaves].received_at <= _IDLE_S:", "if False:"),
     "a key counts for every account": Mutation(_JUDGE, "clocks.age_s((account, key)", 'clocks.age_s(("", key)'),
     "any key counts while there is control": Mutation(_JUDGE, "if keys is None:", "if True:"),
-    "a late zero is refused": Mutation(_JUDGE, " and not _ends_something(subject.channel, message.payload)", ""),
+    "a late zero is refused": Mutation(
+        _JUDGE, "return subject.channel.ends(codec.decode(subject.channel, message.payload))", "return False"
+    ),
 }
 
 ENGINE = Engine(

@@ -7,15 +7,17 @@ objects that nobody here looks at.
 
 import socket
 import ssl
+import time
 from collections import deque
 from collections.abc import Callable, Iterable
-from contextlib import suppress
+from contextlib import closing, suppress
 from typing import NamedTuple
 
 from pebble.transports.base import Message
-from pebble.transports.hosts import Address, dial
+from pebble.transports.hosts import CONNECT_TIMEOUT_S, HANDSHAKE_S, Address, dial
 from pebble.transports.mqtt import packets
 from pebble.transports.mqtt.packets import Filter, Listener, Reader
+from pebble.transports.mqtt.poll import SocketPoll
 from pebble.transports.settings import MqttSettings
 
 SEND_BUFFER = 64 * 1024  # bytes in the kernel for a slow connection: with its default a stream would lag by minutes
@@ -38,6 +40,25 @@ class Opening(NamedTuple):
 def is_hang_up(error: OSError | None) -> bool:
     """Whether the other side has closed the connection, by FIN (None) or RST, rather than the network between."""
     return error is None or isinstance(error, ConnectionError | ssl.SSLEOFError)
+
+
+def _shake_hands(sock: ssl.SSLSocket) -> None:
+    """Begin TLS on a socket that does not block. Raises OSError.
+
+    It ends after a silence of CONNECT_TIMEOUT_S, and after HANDSHAKE_S at any rate.
+    """
+    end = time.monotonic() + HANDSHAKE_S
+    with closing(SocketPoll()) as poll:
+        poll.register(sock)
+        while True:
+            try:
+                sock.do_handshake()
+            except _NOT_NOW as blocked:
+                wait_s = min(CONNECT_TIMEOUT_S, end - time.monotonic())
+                if wait_s <= 0 or not any(poll.wait(wait_s, write=isinstance(blocked, ssl.SSLWantWriteError))):
+                    raise TimeoutError("the TLS handshake does not go on") from None
+            else:
+                return
 
 
 class SendQuota:
@@ -117,8 +138,12 @@ class Client:
             if opening.settings.dscp:
                 _mark(sock, opening.settings.dscp)
             if opening.context is not None:
-                sock = opening.context.wrap_socket(sock, server_hostname=opening.settings.host)
+                sock = opening.context.wrap_socket(
+                    sock, server_hostname=opening.settings.host, do_handshake_on_connect=False
+                )
             sock.setblocking(False)
+            if isinstance(sock, ssl.SSLSocket):
+                _shake_hands(sock)
         except BaseException:
             sock.close()
             raise
