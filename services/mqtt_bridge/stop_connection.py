@@ -110,7 +110,7 @@ class StopConnection:
         self._failing_since = self._off_until = float("-inf")
         self._connected_at = float("inf")
         self._kicks = 0
-        self._told: bool | None = None  # the log says that it is there, or that it is not
+        self._reported: bool | None = None  # the log says that it is there, or that it is not
         transport.on_state(self._on_state)
 
     @property
@@ -135,7 +135,7 @@ class StopConnection:
             self._failing_since = now
             if now - self._connected_at > _KICKED_S:
                 self._kicks = 0
-                self._tell(True)
+                self._report(True)
         elif now - self._failing_since > _GRACE_S:
             self._give_up("the broker refuses to subscribe it" if self._refused else self._transport.problem, _AGAIN_S)
 
@@ -164,12 +164,12 @@ class StopConnection:
     def _give_up(self, why: str, seconds: float) -> None:
         self._off_until, self._kicks = self._clock() + seconds, 0
         self.close()
-        self._tell(False, why)
+        self._report(False, why)
 
-    def _tell(self, there: bool, why: str = "") -> None:
-        if there is self._told:
+    def _report(self, there: bool, why: str = "") -> None:
+        if there is self._reported:
             return
-        self._told = there
+        self._reported = there
         if there:
             log.info("emergency stops have a connection of their own")
         else:
