@@ -17,7 +17,7 @@ from pebble.transports import Message, State, Subscription, Transport
 
 log = logging.getLogger(__name__)
 
-_COPIES, _KEPT = 1024, 64  # stops whose copy is expected, and that were recognised as copies just now
+_COPIES, _DROPPED = 1024, 64  # stops whose copy is expected, and that were recognised as copies just now
 _BEHIND_S = 60.0  # so long after its stop the main connection's copy is one; behind a flood 38 s were seen
 _PROMPT_S = 2.0  # and that of the stop connection, where nothing is in front of it
 _GRACE_S = 5.0  # for a connection to be made, while the main one is there
@@ -46,7 +46,7 @@ class Copies:
         self._lock = threading.Lock()
         #: By the way on which the copy is to come: hashes, and until when.
         self._expected = {way: deque[tuple[int, float]](maxlen=_COPIES) for way in Way}
-        self._dropped = deque[tuple[float, Message]](maxlen=_KEPT)
+        self._dropped = deque[tuple[float, Message]](maxlen=_DROPPED)
 
     def is_copy(self, way: Way, message: Message, *, other: bool) -> bool:
         """Whether this stop has come the other way before; ``other``: it can come that way now."""
