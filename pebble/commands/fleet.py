@@ -228,7 +228,10 @@ def certificate(
         files = certificates.of_account(place, name, hosts or ())
         until = certificates.show(files[0]).until
     typer.echo(f"{' and '.join(map(_shown, files))} are for {name}, until {until:%Y-%m-%d}.")
-    typer.echo(f"Move them to its machine, with a copy of {_shown(place / certificates.CA_CERT)} beside them.")
+    copies = " and ".join(map(_shown, (files[0], place / certificates.CA_CERT)))
+    typer.echo(
+        f"Move the key to its machine, with copies of {copies} beside it. `pebble fleet check` watches the date."
+    )
     if ProgramRole.ROBOT in account.roles:
         tls = {"enabled": True, "ca_cert": certificates.CA_CERT, "client_cert": f"{name}.pem"}
         link = {"kind": "zenoh", "account": name, "connect": [f"tls/{fleet.brokers[0].host}:{_ZENOH_PORT}"]}

@@ -30,7 +30,7 @@ _OTHER = "check-other"  # whose name others take
 
 def compare(folder: Path, fleet: Fleet) -> list[str]:
     """What a broker has too much or too little, and what will not do for long; one line each. Raises FleetError."""
-    found = [*conf_differences(folder, fleet), *zenoh_differences(folder, fleet), *_certificate(folder)]
+    found = [*conf_differences(folder, fleet), *zenoh_differences(folder, fleet), *_certificates(folder, fleet)]
     if fleet.rules == "files":
         return [*found, *_of_files(folder, fleet)]
     for number, server in enumerate(fleet.brokers):
@@ -43,11 +43,16 @@ def compare(folder: Path, fleet: Fleet) -> list[str]:
     return found
 
 
-def _certificate(folder: Path) -> Iterator[str]:
-    shown = certificates.show(folder / certificates.SERVER_CERT)
-    left = shown.until - datetime.datetime.now(datetime.UTC)
-    if left < _SOON:
-        yield f"{shown.file} ends in {left.days} days: `pebble cert renew --folder {folder}`, then restart mosquitto"
+def _certificates(folder: Path, fleet: Fleet) -> Iterator[str]:
+    renewed = {folder / certificates.SERVER_CERT: f"`pebble cert renew --folder {folder}`, then restart mosquitto"}
+    for name in fleet.accounts:
+        file = folder / certificates.ACCOUNTS / f"{name}.pem"
+        if file.exists():
+            renewed[file] = f"`pebble fleet certificate {name}`, with its hosts, and move it to its machine"
+    for file, how in renewed.items():
+        left = certificates.show(file).until - datetime.datetime.now(datetime.UTC)
+        if left < _SOON:
+            yield f"{file} ends in {left.days} days: {how}"
 
 
 def _of_plugin(fleet: Fleet, connection: dynsec.Control) -> Iterator[str]:

@@ -24,6 +24,7 @@ class ChainFiles:
         self.path, self.older = path, path.with_suffix(".old.jsonl")
         self._most_bytes, self._synced = most_bytes, synced
         self._mark: Mark | None = None  # None: not read yet
+        self._torn = 0  # bytes that were removed, which no line tells yet
 
     @property
     def mark(self) -> Mark:
@@ -37,19 +38,20 @@ class ChainFiles:
             size = os.fstat(file).st_size - torn
             if torn:
                 os.ftruncate(file, size)
+                self._torn += torn
             if size >= self._most_bytes:
                 self.path.replace(self.older)
                 full, size = file, 0
                 file = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o600)
                 os.close(full)
             parts: list[bytes] = []
-            note = {"t": rows[0]["t"], "what": "torn", "who": ROBOT, "bytes": torn}
-            for row in [note, *rows] if torn else rows:
+            note = {"t": rows[0]["t"], "what": "torn", "who": ROBOT, "bytes": self._torn}
+            for row in [note, *rows] if self._torn else rows:
                 first = {"after": mark.h} if size == 0 and not parts else {}
                 raw, mark = chain.line(mark, {**row, **first})
                 parts.append(raw + b"\n")
             self._write(file, b"".join(parts), size)
-            self._mark = mark
+            self._mark, self._torn = mark, 0
         finally:
             os.close(file)
 

@@ -305,7 +305,7 @@ class MqttBridge(ForwardingService):
         return self._stops is not None and not self.forwarder.mirroring and self._stops.is_copy(message)
 
     def _pass_stop(self, message: Message) -> None:
-        """Of that connection. While the robot's own stops are mirrored, they come back there."""
+        """Forward a stop of that connection. While the robot's own stops are mirrored, they come back there."""
         if not self.forwarder.mirroring:
             self._react(Side.REMOTE, message, self.forwarder.receive(Side.REMOTE, message))
 

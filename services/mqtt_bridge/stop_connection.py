@@ -17,7 +17,7 @@ from pebble.transports import Message, State, Subscription, Transport
 
 log = logging.getLogger(__name__)
 
-_COPIES, _KEPT = 1024, 64  # stops whose copy is expected, and that were recognised as copies just now
+_COPIES, _DROPPED = 1024, 64  # stops whose copy is expected, and that were recognised as copies just now
 _BEHIND_S = 60.0  # so long after its stop the main connection's copy is one; behind a flood 38 s were seen
 _PROMPT_S = 2.0  # and that of the stop connection, where nothing is in front of it
 _GRACE_S = 5.0  # for a connection to be made, while the main one is there
@@ -46,7 +46,7 @@ class Copies:
         self._lock = threading.Lock()
         #: By the way on which the copy is to come: hashes, and until when.
         self._expected = {way: deque[tuple[int, float]](maxlen=_COPIES) for way in Way}
-        self._dropped = deque[tuple[float, Message]](maxlen=_KEPT)
+        self._dropped = deque[tuple[float, Message]](maxlen=_DROPPED)
 
     def is_copy(self, way: Way, message: Message, *, other: bool) -> bool:
         """Whether this stop has come the other way before; ``other``: it can come that way now."""
@@ -110,7 +110,7 @@ class StopConnection:
         self._failing_since = self._off_until = float("-inf")
         self._connected_at = float("inf")
         self._kicks = 0
-        self._told: bool | None = None  # the log says that it is there, or that it is not
+        self._reported: bool | None = None  # the log says that it is there, or that it is not
         transport.on_state(self._on_state)
 
     @property
@@ -135,7 +135,7 @@ class StopConnection:
             self._failing_since = now
             if now - self._connected_at > _KICKED_S:
                 self._kicks = 0
-                self._tell(True)
+                self._report(True)
         elif now - self._failing_since > _GRACE_S:
             self._give_up("the broker refuses to subscribe it" if self._refused else self._transport.problem, _AGAIN_S)
 
@@ -164,12 +164,12 @@ class StopConnection:
     def _give_up(self, why: str, seconds: float) -> None:
         self._off_until, self._kicks = self._clock() + seconds, 0
         self.close()
-        self._tell(False, why)
+        self._report(False, why)
 
-    def _tell(self, there: bool, why: str = "") -> None:
-        if there is self._told:
+    def _report(self, there: bool, why: str = "") -> None:
+        if there is self._reported:
             return
-        self._told = there
+        self._reported = there
         if there:
             log.info("emergency stops have a connection of their own")
         else:

@@ -17,6 +17,7 @@ import pytest
 
 from pebble.config import load
 from pebble.config.raw import deep_merge
+from pebble.fleet import certificates
 from pebble.fleet.broker_client import BrokerClient, Place
 from pebble.fleet.folder import CONF, ZENOH
 from pebble.fleet.people import People
@@ -206,7 +207,7 @@ def test_removing_a_person_acts_on_pages_here_and_names_those_elsewhere(hall: Pa
     assert pebble("pebble fleet remove page-2", hall).returncode == 0
 
 
-def test_zenoh_hubs_have_the_same_accounts(hall: Path) -> None:
+def test_zenoh_hubs_have_the_same_accounts(hall: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What is printed for a robot makes a valid config."""
     rules = hall / "hall" / ZENOH
     for line in ("add ann --role driver", "add goob --role robot", "zenoh", "certificate ann"):
@@ -222,5 +223,12 @@ def test_zenoh_hubs_have_the_same_accounts(hall: Path) -> None:
     run("pebble fleet zenoh --only-here", hall)
     run("pebble fleet remove goob", hall)
     assert set(read_access(rules).accounts) == {"admin"}
+    run("pebble fleet add boss --role admin", hall)
+    monkeypatch.setattr(certificates, "SERVER_DAYS", 20)
+    for name in ("boss", "gone"):
+        certificates.of_account(hall / "hall", name)
     rules.write_bytes(rules.read_bytes().replace(b"incoming/estop", b"incoming/#"))
-    assert "zenoh.json does not hold the rules of the table" in pebble("pebble fleet check", hall).stderr
+    problems = pebble("pebble fleet check", hall).stderr
+    assert "zenoh.json does not hold the rules of the table" in problems
+    assert "boss.pem ends in 19 days: `pebble fleet certificate boss`" in problems
+    assert "gone.pem" not in problems

@@ -136,33 +136,6 @@ def test_everybody_stops_it_and_only_a_safety_officer_resets_it(rig: Named) -> N
             rig.send("otto", DRIVE, {"x": 0, "z": 0, "key": key})  # lets go
 
 
-@pytest.mark.parametrize("rig", ["zenoh"], indirect=True)  # the robot's own side is not what is flooded
-def test_what_another_account_sends_holds_up_no_stop(rig: Named) -> None:
-    """A viewer floods what it may write, requests for pictures of 60 KB: faster than the robot reads."""
-    assert until(lambda: "have a connection of their own" in rig.log.read_text(), 10)
-    ending, sent, took = threading.Event(), itertools.count(), list[float]()
-
-    def flood() -> None:
-        place = Place(HOST, rig.remote.port, None)
-        with BrokerClient(place, "vera", rig.hall.passwords["vera"], timeout_s=30) as vera:
-            while not ending.is_set():
-                vera.publish(f"{BASE}/incoming/by/vera/front-camera", b"[" * 60_000)
-                next(sent)
-
-    with beside(flood, ending):
-        began = time.monotonic()
-        while len(took) < 3 or time.monotonic() < began + FLOOD_S:
-            assert until(lambda: next(sent) > 100, 10)
-            name, pressed = f"f{len(took):015x}", time.monotonic()
-            rig.person("mia").send("incoming/estop", {"stop": name})  # once
-            assert until(lambda n=name: n in state_of(rig).get("recent", []), 10), took
-            took.append(time.monotonic() - pressed)
-    assert statistics.median(took) < 1, took
-    order = {one: state_of(rig)[one] for one in ("boot", "count")}
-    free = lambda: rig.send("boss", "estop-reset", order) or until(lambda: not state_of(rig)["latched"], 0.5)  # noqa: E731
-    assert until(free, 30), state_of(rig)  # a reset waits behind what is left of it, and is too late then
-
-
 def state_of(rig: Named) -> dict[str, Any]:
     last = rig.operator.last(ESTOP)
     return {} if last is None else last.json
@@ -244,6 +217,40 @@ def test_a_flag_by_name_stays_on_both_sides(rig: Named, order: str) -> None:
         steps[step]()
         rig.wait_until_up(began, 30)
     assert until(lambda: retained(rig) == [b"true", b"true"], 15), retained(rig)
+
+
+@pytest.fixture
+def flooded(tmp_path: Path) -> Iterator[Named]:
+    """A robot of its own: what is left of a flood takes its time."""
+    with Hall(tmp_path / "hall") as hall, Named("zenoh", hall, {"level": "named"}) as one:
+        yield one
+
+
+def test_what_another_account_sends_holds_up_no_stop(flooded: Named) -> None:
+    """A viewer floods what it may write, requests for pictures of 60 KB: faster than the robot reads."""
+    rig = flooded
+    assert until(lambda: "have a connection of their own" in rig.log.read_text(), 10)
+    ending, sent, took = threading.Event(), itertools.count(), list[float]()
+
+    def flood() -> None:
+        place = Place(HOST, rig.remote.port, None)
+        with BrokerClient(place, "vera", rig.hall.passwords["vera"], timeout_s=30) as vera:
+            while not ending.is_set():
+                vera.publish(f"{BASE}/incoming/by/vera/front-camera", b"[" * 60_000)
+                next(sent)
+
+    with beside(flood, ending):
+        began = time.monotonic()
+        while len(took) < 3 or time.monotonic() < began + FLOOD_S:
+            assert until(lambda: next(sent) > 100, 10)
+            name, pressed = f"f{len(took):015x}", time.monotonic()
+            rig.person("mia").send("incoming/estop", {"stop": name})  # once
+            assert until(lambda n=name: n in state_of(rig).get("recent", []), 10), took
+            took.append(time.monotonic() - pressed)
+    assert statistics.median(took) < 1, took
+    order = {one: state_of(rig)[one] for one in ("boot", "count")}
+    free = lambda: rig.send("boss", "estop-reset", order) or until(lambda: not state_of(rig)["latched"], 0.5)  # noqa: E731
+    assert until(free, 30), state_of(rig)  # a reset waits behind what is left of it, and is too late then
 
 
 # -- from a broker with logins to names, as docs/fleet.md has it

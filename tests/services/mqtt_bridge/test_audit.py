@@ -213,15 +213,20 @@ def test_a_chain_goes_on_in_the_next_file_and_process(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("end", [b'{"n":4,"t":3.0,"wh', b"\0" * 5000, b'{"n":4}\n', b"\xff\n" * 70_000])
-def test_a_torn_end_is_dropped_with_a_note(tmp_path: Path, end: bytes) -> None:
+def test_a_torn_end_is_dropped_with_a_note(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, end: bytes) -> None:
     path = tmp_path / "acts.jsonl"
     ChainFiles(path, 10**6).append([row(1), row(2), row(3)])
     with path.open("ab") as file:
         file.write(end)
     files = ChainFiles(path, 10**6)
+    with monkeypatch.context() as patched:  # the first note is lost
+        patched.setattr("os.write", lambda _file, _content: 0)
+        with pytest.raises(OSError, match="space"):
+            files.append([row(4)])
     files.append([row(4)])
+    files.append([row(5)])
     written = [json.loads(raw) for raw in files.lines()]
-    assert [one["what"] for one in written] == ["stop"] * 3 + ["torn", "stop"]
+    assert [one["what"] for one in written] == ["stop"] * 3 + ["torn", "stop", "stop"]
     assert written[3]["bytes"] == len(end)
     assert chain.verify(files.lines(), [files.mark]) == ""
 
