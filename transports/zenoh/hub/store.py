@@ -139,5 +139,6 @@ class HubStore:
 def _size(message: Retained | Will | None) -> int:
     if message is None:
         return 0
-    where = message.key if isinstance(message, Retained) else message.topic
-    return _OVERHEAD + len(where) + len(message.payload)
+    retained = isinstance(message, Retained)
+    where, who = (message.key, message.stamp.origin) if retained else (message.topic, message.client)
+    return _OVERHEAD + len(where) + len(who) + len(message.payload)
