@@ -139,6 +139,8 @@ class HubStore:
 def _size(message: Retained | Will | None) -> int:
     if message is None:
         return 0
-    retained = isinstance(message, Retained)
-    where, who = (message.key, message.stamp.origin) if retained else (message.topic, message.client)
+    if isinstance(message, Retained):
+        where, who = message.key, message.stamp.origin
+    else:
+        where, who = message.topic, message.client
     return _OVERHEAD + len(where) + len(who) + len(message.payload)
