@@ -153,7 +153,7 @@ def run(tree: Path) -> Counter[str]:
 
 
 def robot(direct: int, remote: int, local: int) -> None:
-    """In a process of its own, with the modules of the tree that is measured."""
+    """This runs in a process of its own, with the modules of the tree that is measured."""
     from pebble import contract
     from pebble.bench.clients import AHEAD, ZERO, RobotSubscriber, StockClient
     from pebble.rig.processes import Processes

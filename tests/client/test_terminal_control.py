@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from pebble.client.control import ANSWER_S, IDLE_S, ControlClient
+from pebble.client.control import IDLE_S, ControlClient
+from pebble.client.pace_of_link import WIDE
 from pebble.transports import Message
 from tests.client.control_robot import KeepingRobot
 from tests.client.test_terminal_driver import DRIVE, DRIVING, GOOB, Cab, announcement
@@ -106,7 +107,7 @@ def test_a_robot_that_does_not_answer_may_be_out_of_this_accounts_reach() -> Non
     cab = KeepingCab()
     cab.keeping.owners[0].receives = False
     cab.ready()
-    cab.run(ANSWER_S + 1.0)
+    cab.run(WIDE.control_answer_s + 1.0)
     assert "goob does not answer: may this account drive" in cab.status
     cab.keeping.owners[0].receives = True
     cab.type("t")

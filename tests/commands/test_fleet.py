@@ -215,7 +215,7 @@ def test_zenoh_hubs_have_the_same_accounts(hall: Path, monkeypatch: pytest.Monke
     printed = run("pebble fleet certificate goob goob.local 10.0.0.7", hall)
     for name in ("goob.pem", "goob.key"):
         (hall / "hall" / "accounts" / name).rename(hall / name)
-    _robot_accepts(json.loads(printed[printed.index("{") :]), hall)
+    _robot_accepts(json.loads(printed[printed.index("{") :]), "login", hall)
     assert set(read_access(rules).accounts) == {"admin", "ann", "goob"}
     done = pebble("pebble fleet remove ann", hall)
     assert (done.returncode, set(read_access(rules).accounts)) == (1, {"admin", "goob"})

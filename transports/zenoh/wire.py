@@ -82,7 +82,11 @@ def read_live(attachment: zenoh.ZBytes | None) -> LiveStamp:
 
 
 class Stamp(msgspec.Struct, frozen=True):
-    """The origin of a retained message. ``retained_count`` 0: it was sent again, or made by the hub."""
+    """The origin of a retained message. ``retained_count`` 0: it was sent again, or made by the hub.
+
+    Both are believed, because a hub is not told which session a message came from. Who may retain on a topic can so
+    have a session pass over that message when it begins, or have a query answered half a second too early.
+    """
 
     qos: QoS
     retained_count: int

@@ -13,7 +13,7 @@ from pebble.transports.zenoh.wire import Hello, Stamp, Will, digest
 WILL = Will("status", b"gone", QoS.DELIVERED, True)
 
 
-def retained(key: str, payload: bytes, origin: str = "writer") -> Retained:
+def retained(key: str, payload: bytes, origin: str = "") -> Retained:
     return Retained(key, payload, Stamp(QoS.DELIVERED, 1, origin))
 
 
@@ -92,6 +92,12 @@ def test_what_has_no_room_is_refused_and_leaves_the_others_and_its_own_older_val
     made.apply(StoredWill("second", WILL))
     assert (made.wills(), made.refused) == ({"first"}, 4)
     assert "no room for the retained message of b" in caplog.text
+
+
+@pytest.mark.usefixtures("small")
+def test_long_names_take_room_too() -> None:
+    made = store(retained("a", b"1", "x" * 1000), StoredWill("client", Will("a", b"", QoS.DELIVERED, True, "x" * 1000)))
+    assert (made.retained(), made.wills(), made.refused) == ([], set(), 2)
 
 
 @pytest.mark.usefixtures("small")

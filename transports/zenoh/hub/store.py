@@ -139,5 +139,8 @@ class HubStore:
 def _size(message: Retained | Will | None) -> int:
     if message is None:
         return 0
-    where = message.key if isinstance(message, Retained) else message.topic
-    return _OVERHEAD + len(where) + len(message.payload)
+    if isinstance(message, Retained):
+        where, who = message.key, message.stamp.origin
+    else:
+        where, who = message.topic, message.client
+    return _OVERHEAD + len(where) + len(who) + len(message.payload)
