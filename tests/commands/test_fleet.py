@@ -73,7 +73,7 @@ def test_the_first_page_as_a_newcomer_types_it(level: str, tmp_path: Path) -> No
             shown = run(line, tmp_path)
             passwords[line.split()[3]] = PASSWORD.findall(shown)[0]
             for piece in re.findall(r"^\{.*^\}", shown, re.DOTALL | re.MULTILINE):
-                _robot_accepts(json.loads(piece), level, tmp_path)
+                _robot_accepts(_merged(json.loads(piece), tmp_path), level)
         assert "attempts, 0 not as the table says" in run(check, tmp_path)
         for name, password in passwords.items():
             (tmp_path / f"{name}-password").write_text(f"{password}\n")
@@ -112,13 +112,21 @@ def typed(line: str, folder: Path) -> Iterator[None]:
         process.wait(10)
 
 
-def _robot_accepts(piece: dict[str, Any], level: str, folder: Path) -> None:
-    """The piece that was printed, merged into a config, and a copy of the authority make a valid one."""
+def _merged(piece: dict[str, Any], folder: Path) -> Path:
+    """The piece that was printed in a copy of the config of its kind, with a copy of the authority beside it."""
     kind = {True: "minilamp", False: "minimal"}["local_mqtt" in piece]
-    file = folder / f"{kind}.json"
     (folder / "ca.pem").write_bytes((folder / "hall" / "ca.pem").read_bytes())
-    file.write_text(json.dumps(deep_merge(json.loads((ROOT / "configs" / f"{kind}.json").read_text()), piece)))
+    return _written(deep_merge(json.loads((ROOT / "configs" / f"{kind}.json").read_text()), piece), folder, kind)
+
+
+def _written(config: dict[str, Any], folder: Path, name: str) -> Path:
+    file = folder / f"{name}.json"
+    file.write_text(json.dumps(config))
     file.chmod(0o600)
+    return file
+
+
+def _robot_accepts(file: Path, level: str) -> None:
     config = load(file)
     assert (config.security.level, config.warnings) == (level, ())
 
@@ -215,7 +223,9 @@ def test_zenoh_hubs_have_the_same_accounts(hall: Path, monkeypatch: pytest.Monke
     printed = run("pebble fleet certificate goob goob.local 10.0.0.7", hall)
     for name in ("goob.pem", "goob.key"):
         (hall / "hall" / "accounts" / name).rename(hall / name)
-    _robot_accepts(json.loads(printed[printed.index("{") :]), "login", hall)
+    piece = json.loads(printed[printed.index("{") :])
+    (hall / "ca.pem").write_bytes((hall / "hall" / "ca.pem").read_bytes())
+    _robot_accepts(_written({"robot": {"id": "goob"}, **piece}, hall, "goob"), "login")
     assert set(read_access(rules).accounts) == {"admin", "ann", "goob"}
     done = pebble("pebble fleet remove ann", hall)
     assert (done.returncode, set(read_access(rules).accounts)) == (1, {"admin", "goob"})
