@@ -1,6 +1,6 @@
 """Which media programs are to run: a flag of the operators allows them, a request starts and stops them. Pure.
 
-On a thin link those that send pictures or sound wait while somebody drives: both share what the modem carries.
+On a thin link those that send pictures or sound wait while a person drives: both share what the modem carries.
 """
 
 from collections.abc import Callable, Collection, Mapping
