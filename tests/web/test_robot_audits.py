@@ -10,7 +10,6 @@ from typing import Any
 
 import httpx
 import pytest
-
 from playwright.sync_api import Browser
 
 from pebble.contract import chain
@@ -67,7 +66,8 @@ class AuditedRobot(RecordingRobot):
 
 @pytest.fixture
 def robot(broker: Broker) -> Iterator[AuditedRobot]:
-    with AuditedRobot(broker.port, f"pebble/robots/audited{next(NAMES)}") as one:
+    offered = {"system": {"available": True}, "estop": {"available": True, "owners": ["serial"]}}
+    with AuditedRobot(broker.port, f"pebble/robots/audited{next(NAMES)}", capabilities=offered) as one:
         one.lines = lines(20)
         yield one
 
@@ -141,9 +141,8 @@ def test_a_person_pages_through_an_audit_and_sees_that_a_line_was_changed(
         robot.lines[12] = robot.lines[12].replace(b"ann", b"bob")
         opened.test("audit-acts").click()
         assert shows("The audit was changed: line 13 was changed")
-        stop = opened.page.get_by_role("button", name="STOP: emergency stop")
-        stop.click()
+        opened.page.get_by_role("button", name="STOP: emergency stop").click()
         assert until(lambda: robot.latched, 10)
-        opened.page.keyboard.press("Escape")
+        opened.test("close-audit").click()
         assert opened.until(lambda: not opened.test("panel-audit").count())
         assert opened.complaints() == []

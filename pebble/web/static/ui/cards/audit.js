@@ -21,7 +21,7 @@ const FACTS = {
   seconds: (value) => `for ${text(value)} s`,
   commands: (value) => `${text(value)} drive commands`,
   since: (value) => `since ${timeOf(value)}`,
-  why: (value) => `(${text(value)})`,
+  why: (value) => `reason: ${text(value)}`,
 };
 const LONGEST = 200; // characters of one text: all of it is the robot's
 
