@@ -235,7 +235,7 @@ def test_a_body_that_takes_too_long_is_given_up(app: App, monkeypatch: pytest.Mo
     assert app.requests == []
 
 
-def test_a_request_that_waits_while_the_server_ends_is_told_so() -> None:
+def test_a_request_that_waits_while_the_server_ends_is_answered() -> None:
     async def ended(scope: Any, receive: Any, send: Any) -> None:
         async def waits(*_: Any) -> None:
             raise asyncio.CancelledError

@@ -59,8 +59,8 @@ class AuditedRobot(RecordingRobot):
                 self._answer(asked["chain"], asked["before"])
 
     def _answer(self, name: str, before: int) -> None:
-        kept = {"acts": self.lines}.get(name, [])
-        found = [raw.decode() for raw in kept if not before or json.loads(raw)["n"] < before]
+        known = self.lines if name == "acts" else []
+        found = [raw.decode() for raw in known if not before or json.loads(raw)["n"] < before]
         self.publish("audit-lines", {"chain": name, "before": before, "lines": found[-self.most :]})
 
 
