@@ -126,9 +126,10 @@ def test_a_person_pages_through_an_audit_and_sees_that_a_line_was_changed(
     robot.most = 15
     robot.publish("audit", state(robot.lines[-1]), retain=True)
     with tab(browser, f"{served.origin}/r/{robot.base}", size) as opened:
-        shows = lambda *texts: opened.until(
-            lambda: all(text in opened.test("panel-audit").inner_text() for text in texts), 20
-        )
+
+        def shows(*texts: str) -> bool:
+            return opened.until(lambda: all(text in opened.test("panel-audit").inner_text() for text in texts), 20)
+
         rows = lambda: opened.test("audit-line").count()
         opened.uncover("audit").click()
         assert shows("Nothing was changed or taken out of these lines; this server had noted", "number 19", "number 5")
