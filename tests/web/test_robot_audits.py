@@ -10,6 +10,7 @@ from typing import Any
 
 import httpx
 import pytest
+from playwright.sync_api import Browser
 
 from pebble.contract import chain
 from pebble.contract.chain import Mark
@@ -17,6 +18,7 @@ from pebble.fleet.audit import MAX_MARKS, Audit
 from pebble.transports import Message
 from tests.support import Broker, until
 from tests.web.attacker import Hall
+from tests.web.browser import Size, tab
 from tests.web.served import RecordingRobot, Served
 
 NAMES = itertools.count(1)
@@ -43,25 +45,29 @@ def hall(broker: Broker, tmp_path: Path) -> Iterator[Hall]:
 
 
 class AuditedRobot(RecordingRobot):
-    """Answers with the lines that it has, each time after an answer to another reader."""
+    """Answers with the newest lines of acts that it has, each time after an answer to another reader."""
 
     lines: list[bytes]
+    most = 50  # in one answer
 
     def answer(self, messages: list[Message]) -> None:
         super().answer(messages)
         for message in messages:
             if message.topic.endswith("/audit-read"):
-                self._answer(5)
-                self._answer(json.loads(message.payload)["before"])
+                asked = json.loads(message.payload)
+                self._answer("acts", 5)
+                self._answer(asked["chain"], asked["before"])
 
-    def _answer(self, before: int) -> None:
-        found = [raw.decode() for raw in self.lines if not before or json.loads(raw)["n"] < before]
-        self.publish("audit-lines", {"chain": "acts", "before": before, "lines": found})
+    def _answer(self, name: str, before: int) -> None:
+        known = self.lines if name == "acts" else []
+        found = [raw.decode() for raw in known if not before or json.loads(raw)["n"] < before]
+        self.publish("audit-lines", {"chain": name, "before": before, "lines": found[-self.most :]})
 
 
 @pytest.fixture
 def robot(broker: Broker) -> Iterator[AuditedRobot]:
-    with AuditedRobot(broker.port, f"pebble/robots/audited{next(NAMES)}") as one:
+    offered = {"system": {"available": True}, "estop": {"available": True, "owners": ["serial"]}}
+    with AuditedRobot(broker.port, f"pebble/robots/audited{next(NAMES)}", capabilities=offered) as one:
         one.lines = lines(20)
         yield one
 
@@ -110,3 +116,34 @@ def test_marks_survive_and_never_go_back(tmp_path: Path) -> None:
     assert len(log.marks("robot", "acts")) <= MAX_MARKS
     assert log.marks("robot", "refused") == []
     log.close()
+
+
+@pytest.mark.page
+@pytest.mark.parametrize("size", ["desktop", "phone"])
+def test_a_person_pages_through_an_audit_and_sees_that_a_line_was_changed(
+    served: Served, robot: AuditedRobot, browser: Browser, size: Size
+) -> None:
+    robot.most = 15
+    robot.publish("audit", state(robot.lines[-1]), retain=True)
+    with tab(browser, f"{served.origin}/r/{robot.base}", size) as opened:
+
+        def shows(*texts: str) -> bool:
+            return opened.until(lambda: all(text in opened.test("panel-audit").inner_text() for text in texts), 20)
+
+        rows = lambda: opened.test("audit-line").count()
+        opened.uncover("audit").click()
+        assert shows("Nothing was changed or taken out of these lines; this server had noted", "number 19", "number 5")
+        assert rows() == 15
+        opened.test("audit-older").click()
+        assert shows("number 4", "number 0")
+        assert (rows(), opened.test("audit-older").count()) == (5, 0)
+        opened.test("audit-refused").click()
+        assert shows("No lines")
+        robot.lines[12] = robot.lines[12].replace(b"ann", b"bob")
+        opened.test("audit-acts").click()
+        assert shows("The audit was changed: line 13 was changed")
+        opened.page.get_by_role("button", name="STOP: emergency stop").click()
+        assert until(lambda: robot.latched, 10)
+        opened.test("close-audit").click()
+        assert opened.until(lambda: not opened.test("panel-audit").count())
+        assert opened.complaints() == []

@@ -121,7 +121,7 @@ def test_boots_are_compared_by_owner() -> None:
     assert evaluate({"core/outcome.js": "bootsOf"}, steps) == ["a 2,b 1", "", ""]
 
 
-NOT_OFFERED, NO_COMMAND = "This robot does not offer it", "This robot has no command for it in its config"
+NOT_OFFERED, NO_COMMAND = "This robot does not offer it", "Not set up on this robot"
 
 
 @pytest.mark.parametrize(

@@ -98,6 +98,10 @@ def _recordings_link(page: Page) -> None:
     page.get_by_role("link", name="Recordings").wait_for()
 
 
+def _audit(page: Page) -> None:
+    page.locator("[data-test=audit-line]").first.wait_for()
+
+
 def _scroll_to(selector: str) -> Act:
     return lambda page: page.locator(selector).first.scroll_into_view_if_needed()
 
@@ -254,10 +258,13 @@ SCREENS = [
     Screen("logs", "operating", _MORE, ("phone",), _scroll_to(".log-foot")),
     Screen("system", "operating", sizes=("desktop",), hold=_scroll_to(".system .flag:last-child")),
     Screen("system", "operating", _MORE, ("phone",), _scroll_to(".system .flag:last-child")),
-    Screen("services", "operating", _SENSORS, ("phone",), _scroll_to(".services-list li:last-child")),
-    Screen("boards", "undriveable", _SENSORS, ("phone",), _scroll_to("[data-test=mcu-line-relays]")),
+    Screen("services", "operating", _MORE, ("phone",), _scroll_to(".services-list li:last-child")),
+    Screen("boards", "undriveable", _MORE, ("phone",), _scroll_to("[data-test=mcu-line-relays]")),
     Screen("system-ask", "operating", _press("[data-test=service-restart]"), ("desktop",)),
     Screen("system-ask", "operating", _press("[data-test=tab-more]", "[data-test=service-restart]"), ("phone",)),
+    Screen("audit", "operating", _press("[data-test=audit]"), ("desktop",), _audit),
+    Screen("audit", "operating", _all(_MORE, _press("[data-test=audit]")), ("phone",), _audit),
+    Screen("audit", "operating", _press(".round"), ("landscape",), _all(_press("[data-test=audit]"), _audit)),
     Screen("notices", "driving", _trouble_and_press("[data-test=bell]"), ("desktop",)),
     Screen("notices", "driving", _trouble_and_press("[data-test=tab-more]", ".wide"), ("phone",)),
     Screen("fleet-notices", "fleet", sizes=("desktop",), hold=_trouble_and_press("[data-test=bell]")),
@@ -357,6 +364,11 @@ _DRAWN_NEAR = """(selector) => {
   }
   return found;
 }"""
+#: What lies beside the bar that it belongs to, and over something else.
+_OUT_OF_BAR = """() => [...document.querySelectorAll(".picture-bar :is(button, label, select, output)")]
+  .filter((one) => one.checkVisibility())
+  .filter((one) => one.getBoundingClientRect().right > one.closest(".picture-bar").getBoundingClientRect().right)
+  .map((one) => `out of its bar: ${one.outerHTML.slice(0, 120)}`)"""
 _TOO_WIDE = "() => document.documentElement.scrollWidth > innerWidth"
 
 
@@ -371,6 +383,7 @@ def _measured(page: Page, size: Size) -> list[str]:
         problems += [
             f"{width} px: {text}" for text in page.evaluate(_SMALL, TAPPABLE) + page.evaluate(_DRAWN_NEAR, TAPPABLE)
         ]
+        problems += [f"{width} px: {text}" for text in page.evaluate(_OUT_OF_BAR)]
         for offset in (0, 40, 90, 150, 230):
             problems += [f"{width} px: {text}" for text in page.evaluate(_NEAR, [TAPPABLE, offset])]
     page.set_viewport_size(before)

@@ -109,5 +109,5 @@ export function lacks(action, capabilities) {
   if (entry === undefined) return "This robot does not offer it";
   if (entry === true) return "";
   if (!isObject(entry) || entry.available === false) return "This robot does not offer it";
-  return entry.controls === false ? "This robot has no command for it in its config" : "";
+  return entry.controls === false ? "Not set up on this robot" : "";
 }

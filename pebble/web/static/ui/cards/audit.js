@@ -4,6 +4,7 @@ import { ROOT } from "../../core/browser.js";
 import { isObject } from "../../core/json.js";
 import { html, useEffect, useState } from "../parts/hooks.js";
 import { useName } from "../parts/parts.js";
+import { clockTime } from "../parts/words.js";
 import { Panel } from "../panels/panel.js";
 
 const CHAINS = /** @type {const} */ ([
@@ -11,6 +12,17 @@ const CHAINS = /** @type {const} */ ([
   ["refused", "What was refused"],
 ]);
 const KNOWN = ["n", "t", "h", "what", "who", "after", "count"];
+/** What else a line may have, in words. */
+const FACTS = {
+  device: (value) => `on ${text(value)}`,
+  file: (value) => text(value),
+  name: (value) => text(value),
+  on: (value) => (value ? "on" : "off"),
+  seconds: (value) => `for ${text(value)} s`,
+  commands: (value) => `${text(value)} drive commands`,
+  since: (value) => `since ${timeOf(value)}`,
+  why: (value) => `reason: ${text(value)}`,
+};
 const LONGEST = 200; // characters of one text: all of it is the robot's
 
 /** @typedef {{lines: any[], problem: string, noted: number, failed: string, before: number}} Found */
@@ -41,11 +53,9 @@ export function Audit({ at, onClose }) {
         )}
       </div>
       <p role="status" data-test="audit-state" class=${found?.problem || found?.failed ? "bad" : "dim"}>${words(found)}</p>
-      <table>
-        <tbody>
-          ${[...(found?.lines ?? [])].reverse().map((line, index) => html`<${Line} key=${`${line.n} ${index}`} line=${line} />`)}
-        </tbody>
-      </table>
+      <ol>
+        ${linesOf(found).map((line) => html`<${Line} key=${line.key} line=${line} />`)}
+      </ol>
       ${first > 1 && html`<button type="button" data-test="audit-older" onClick=${() => go(first)}>Older</button>`}
       ${before > 0 && html`<button type="button" data-test="audit-newest" onClick=${() => go(0)}>Newest</button>`}
       <p class="dim">A name with ? was not checked. Lines with a number of times stand for that many alike.</p>
@@ -86,33 +96,44 @@ export function words(found) {
   if (found.problem) return `✖ The audit was changed: ${found.problem}`;
   if (!found.lines.length) return "No lines";
   const noted = found.noted ? `; this server had noted line ${found.noted}` : "; this server has noted none yet";
-  return `✔ These lines follow each other${found.before ? "" : noted}`;
+  return `✔ Nothing was changed or taken out of these lines${found.before ? "" : noted}`;
 }
 
-function Line({ line }) {
-  const { time, what, who, more } = partsOf(line);
-  return html`<tr data-test="audit-line">
-    <td class="dim">${time}</td>
-    <td><b>${what}</b></td>
-    <td>${who}</td>
-    <td class="dim">${more}</td>
-  </tr>`;
+function Line({ line: { day, time, what, who, more } }) {
+  return html`<li data-test="audit-line">
+    ${day && html`<h3>${day}</h3>`}
+    <p><b>${what}</b><time>${time}</time></p>
+    <p>${who} <span class="dim">${more}</span></p>
+  </li>`;
 }
 
-/** @param {any} line any JSON object of a robot @returns {{time: string, what: string, who: string, more: string}} */
+/** The newest first; each day is with its first line. @param {Found | null} found */
+function linesOf(found) {
+  let before = "";
+  return [...(found?.lines ?? [])].reverse().map((line, index) => {
+    const parts = partsOf(line);
+    const day = parts.day === before ? "" : parts.day;
+    before = parts.day;
+    return { ...parts, day, key: `${line.n} ${index}` };
+  });
+}
+
+/** @param {any} line any JSON object of a robot */
 export function partsOf(line) {
   const when = new Date(1000 * line.t);
-  const count = line.count > 1 ? ` × ${line.count}` : "";
+  const what = text(line.what).replaceAll("-", " ");
   const more = Object.entries(line).filter(([key]) => !KNOWN.includes(key));
+  const known = (key) => (Object.hasOwn(FACTS, key) ? FACTS[key] : (value) => `${key} ${text(value)}`);
   return {
-    time: Number.isNaN(when.getTime()) ? "" : when.toLocaleString(),
-    what: text(line.what).replaceAll("-", " ") + count,
+    day: Number.isNaN(when.getTime()) ? "" : when.toLocaleDateString(undefined, { dateStyle: "long" }),
+    time: timeOf(line.t),
+    what: what.charAt(0).toUpperCase() + what.slice(1) + (line.count > 1 ? ` × ${text(line.count)}` : ""),
     who: text(line.who),
-    more: text(more.map(([key, value]) => `${key} ${key === "since" ? clock(value) : text(value)}`).join(", ")),
+    more: text(more.map(([key, value]) => known(key)(value)).join(", ")),
   };
 }
 
-const clock = (t) => (Number.isNaN(new Date(1000 * t).getTime()) ? "" : new Date(1000 * t).toLocaleTimeString());
+const timeOf = (t) => (Number.isNaN(new Date(1000 * t).getTime()) ? "" : clockTime(1000 * t));
 
 const text = (value) => {
   const whole = isObject(value) || Array.isArray(value) ? JSON.stringify(value) : String(value ?? "");

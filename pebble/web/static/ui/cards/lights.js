@@ -89,7 +89,7 @@ function Period({ page, lights, why }) {
     else lights.setPeriod(seconds);
   };
   return html`<label class="field">
-    <span>period, s</span>
+    <span>Period, s</span>
     <input
       type="number"
       data-test="lights-period"
@@ -106,6 +106,7 @@ function Period({ page, lights, why }) {
 
 function asked({ mode, colour, period }) {
   if (!mode) return "Nothing was asked from here yet.";
-  const what = { solid: `${colour}, solid`, flash: `${colour}, flashing every ${period} s`, off: "off" };
+  const name = Object.entries(COLOURS).find(([, value]) => value === colour)?.[0] ?? colour;
+  const what = { solid: `${name}, solid`, flash: `${name}, flashing every ${period} s`, off: "off" };
   return `Asked from here last: ${what[mode]}.`;
 }

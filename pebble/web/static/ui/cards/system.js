@@ -225,7 +225,7 @@ function Flags({ at, offers }) {
   const shown = FLAGS.filter(([, field]) => has[field] || typeof flags?.[field] === "boolean");
   if (!shown.length) return null;
   return html`<section class="system" aria-labelledby="flags-title">
-    <h3 id="flags-title">Allowed, as the broker remembers it</h3>
+    <h3 id="flags-title">Allowed</h3>
     ${shown.map(
       ([name, field, title, meaning]) =>
         html`<${Flag} key=${`${at} ${name}`} at=${at} name=${name} title=${title} meaning=${meaning} value=${flags?.[field]} known=${Boolean(flags)} />`,
