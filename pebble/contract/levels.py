@@ -29,8 +29,6 @@ LEVELS: Mapping[LinkLevel, Level] = {
     "thin": Level(
         drive_hz=4, drive_qos=0, valid_ms=750, heartbeat_s=1.0, heartbeat_qos=0, stream_hz=1, silent_s=5.0, stamped=True
     ),
-        drive_hz=4, drive_qos=0, valid_ms=750, heartbeat_s=1.0, heartbeat_qos=0, stream_hz=1, silent_s=5.0, stamped=True
-    ),
 }
 
 

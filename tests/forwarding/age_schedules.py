@@ -138,6 +138,8 @@ class World:
 
     def do_drive(self, a: int, b: int) -> None:
         driver = self.drivers[a % 3]
+        if not driver.driving:
+            driver.unusual_at = self.now  # the minute for which it may be kept out begins with its first late command
         driver.driving, driver.per_s, driver.due = True, _RATES[b % 3], self.now
 
     def do_release(self, a: int, b: int) -> None:
