@@ -231,7 +231,7 @@ class World:
             high = self.down.delay_s > 0.75
             self.down_high_since = (self.down_high_since or self.now) if high else None
             for driver in self.drivers:
-                if driver.up.delay_s + self.down.delay_s > 0.1:
+                if driver.up.delay_s + self.down.delay_s > 0.1 or self.now < self.frozen_until:
                     driver.unusual_at = self.now
                 if driver.driving and self.now >= driver.due:
                     driver.due = self.now + 1 / driver.per_s
