@@ -138,6 +138,8 @@ class World:
 
     def do_drive(self, a: int, b: int) -> None:
         driver = self.drivers[a % 3]
+        if not driver.driving:
+            driver.unusual_at = self.now  # the minute for which it may be kept out begins with its first late command
         driver.driving, driver.per_s, driver.due = True, _RATES[b % 3], self.now
 
     def do_release(self, a: int, b: int) -> None:
@@ -229,7 +231,7 @@ class World:
             high = self.down.delay_s > 0.75
             self.down_high_since = (self.down_high_since or self.now) if high else None
             for driver in self.drivers:
-                if driver.up.delay_s + self.down.delay_s > 0.1:
+                if driver.up.delay_s + self.down.delay_s > 0.1 or self.now < self.frozen_until:
                     driver.unusual_at = self.now
                 if driver.driving and self.now >= driver.due:
                     driver.due = self.now + 1 / driver.per_s
@@ -374,7 +376,7 @@ MUTATIONS = {
         _AGES, "min(clock.least, clock.proved)", "clock.least", schedule=40
     ),
     "a young clock is trusted": Mutation(_AGES, "if now - clock.began >= _YOUNG_S", "if True"),
-    "a clock that jumped is trusted": Mutation(_AGES, "now - sent < clock.least - _JUMP_S", "False", schedule=652),
+    "a clock that jumped is trusted": Mutation(_AGES, "now - sent < clock.least - _JUMP_S", "False", schedule=1269),
     "the fastest message is forgotten": Mutation(_AGES, "min(now - sent, self.least + drift)", "now - sent"),
     "clocks drift by a tenth": Mutation(
         _AGES, "drift = _DRIFT * (now - self.received_at)", "drift = 0.1 * (now - self.received_at)"

@@ -100,6 +100,15 @@ def test_a_new_key_needs_the_pings(robot: Robot) -> None:
     assert late == [True, True, False, True, False]
 
 
+def test_a_clock_that_jumps_needs_the_pings_again(robot: Robot) -> None:
+    robot.knows(MOVES | OWN)
+    late = [robot.is_late("drive-values", MOVES | OWN, ago_s=ago_s, pings_s=6.0) for ago_s in (6.0, -3.0)]
+    robot.now += 3.0  # 9 s ahead, in a queue of six
+    late.append(robot.is_late("drive-values", MOVES | OWN, ago_s=-3.0, pings_s=6.0))
+    late.append(robot.is_late("drive-values", MOVES | OWN, ago_s=-8.9, pings_s=0.1))
+    assert late == [True, True, True, False]
+
+
 def test_only_the_key_of_control_counts_where_there_is_one(robot: Robot) -> None:
     robot.ages.keys = frozenset((b"0badf00d",))
     for key in ("0badf00d", "12345678", "0badf00d 12345678"):
