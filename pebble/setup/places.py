@@ -1,0 +1,51 @@
+"""Where an installed robot has its files, below ``/`` or below another root."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class Places:
+    """The paths of an installed robot. ``root`` is ``/``, or a folder that stands for it in tests and dry runs."""
+
+    root: Path = Path("/")
+
+    @cached_property
+    def etc(self) -> Path:
+        """Config, passwords, certificates and the manifest: ``root:pebble``, files 0640."""
+        return self.root / "etc/pebble"
+
+    @cached_property
+    def config(self) -> Path:
+        return self.etc / "robot.json"
+
+    @cached_property
+    def manifest(self) -> Path:
+        """What ``pebble setup`` was answered, and the SHA-256 of each file that it wrote."""
+        return self.etc / "setup.json"
+
+    @cached_property
+    def state(self) -> Path:
+        """What survives a power cut, the stop among it: ``pebble:pebble``, 0700. ``$STATE_DIRECTORY`` of the unit."""
+        return self.root / "var/lib/pebble"
+
+    @cached_property
+    def slots(self) -> Path:
+        """``a`` and ``b``, each a virtual environment, and the link ``active``."""
+        return self.root / "opt/pebble"
+
+    @cached_property
+    def slot_state(self) -> Path:
+        """``trial``, ``refused`` and ``sequence``: of ``pebble-slot`` and of updates."""
+        return self.root / "var/lib/pebble-update"
+
+    @cached_property
+    def current_slot(self) -> Path:
+        """The link that ``pebble-slot choose`` sets at each start; the unit runs what it points to."""
+        return self.root / "run/pebble-slot/current"
+
+    @cached_property
+    def broker(self) -> Path:
+        """The part of mosquitto's configuration that is ours."""
+        return self.root / "etc/mosquitto/conf.d/pebble.conf"
