@@ -23,8 +23,8 @@ class Discovery:
     def awaits_heartbeat(self, waited_s: float) -> bool:
         """Whether one of them, or the first of all, may be there although nothing was heard of it for so long."""
         robots = [one.liveness for one in self.all_robots()]
-        unheard = [one.link for one in robots if one.received_at is None] if robots else ["wide"]
-        return any(waited_s < silent_after(link=link) for link in unheard)
+        awaited = [silent_after(link=one.link) for one in robots if one.received_at is None]
+        return waited_s < max(awaited, default=0.0 if robots else silent_after())
 
     def receive(self, message: Message, now: float, wall: float) -> None:
         """Update from one message that arrived at ``now`` (monotonic) and ``wall`` (epoch seconds)."""

@@ -29,8 +29,13 @@ class Pace(NamedTuple):
     answer_s: float = LEVELS["wide"].answer_s  # a robot that has not answered by then will not
 
     def dated(self, drive: Drive, now: float, key: str) -> Drive:
-        """A command that moves something with the time at which it is sent; ``key``: where the robot has given none."""
-        return replace(drive, t=ms(now), key=drive.key or key) if self.stamped else drive
+        """A command that moves something, as it is sent now: valid for as long as commands on this link are, and dated.
+
+        ``key``: where the robot has given none.
+        """
+        if not self.stamped:
+            return drive
+        return replace(drive, t=ms(now), key=drive.key or key, valid_ms=self.valid_ms)
 
 
 WIDE = Pace()

@@ -83,7 +83,10 @@ def start(
     with _scripts(robot, target) as (transport, scripts, _):
         before, answers, began = scripts.status, scripts.answers, time.monotonic()
         _sent(transport, scripts.start(transport, file, context.args))
-        _wait(lambda: scripts.answers > answers and _answered(before, scripts.status, file, time.monotonic() - began), scripts.answer_s)
+        _wait(
+            lambda: scripts.answers > answers and _answered(before, scripts.status, file, time.monotonic() - began),
+            scripts.answer_s,
+        )
         status = scripts.status
         if scripts.answers == answers or status is None:
             raise PebbleError(f"no answer within {scripts.answer_s:g} s: is the robot up?")
@@ -103,7 +106,9 @@ def stop(robot: _Robot, *, target: Target) -> int:
         _sent(transport, scripts.stop(transport))
         _wait(lambda: scripts.status is not None and not scripts.status.running, scripts.answer_s)
         if scripts.status is None or scripts.status.running:
-            raise PebbleError(f"it is not known to have stopped within {scripts.answer_s:g} s: pebble estop stops the robot")
+            raise PebbleError(
+                f"it is not known to have stopped within {scripts.answer_s:g} s: pebble estop stops the robot"
+            )
         _print_status(scripts.status)
     return 0
 

@@ -34,8 +34,15 @@ LEVELS: Mapping[LinkLevel, Level] = {
     "wide": Level(drive_hz=20),
     "narrow": Level(drive_hz=10, drive_qos=0, heartbeat_s=1.0, stream_hz=5, silent_s=3.0, answer_s=10.0, stamped=True),
     "thin": Level(
-        drive_hz=4, drive_qos=0, valid_ms=750, heartbeat_s=1.0, heartbeat_qos=0, stream_hz=1, silent_s=5.0,
-        answer_s=10.0, stamped=True,
+        drive_hz=4,
+        drive_qos=0,
+        valid_ms=750,
+        heartbeat_s=1.0,
+        heartbeat_qos=0,
+        stream_hz=1,
+        silent_s=5.0,
+        answer_s=10.0,
+        stamped=True,
     ),
 }
 

@@ -241,8 +241,8 @@ pebble/recordings/replay/live.py
 
 silence, pebble estop status does not: client/test_silence.py
 pebble/client/discovery.py
-- waited_s < silent_after(link=link) for link in unheard
-+ waited_s < silent_after() for _ in unheard
+- [silent_after(link=one.link) for one in robots
++ [silent_after() for one in robots
 
 silence, a stop of all ends before a robot on a thin link is silent: client/test_silence.py
 pebble/client/estop.py

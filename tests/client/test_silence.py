@@ -1,4 +1,4 @@
-"""Who waits how long for a robot's silence, or for its answer: one table, at each level of its link, in virtual time."""
+"""Who waits how long for a robot's silence, or for its answer, at each level of its link; in virtual time."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def heartbeat(base: str = BASE) -> Message:
     return Message(ONLINE.topic(base), b'{"t": 1}')
 
 
-def told_by_a_page_or_terminal(level: LinkLevel, after_s: float) -> bool:
+def shown_by_a_page_or_terminal(level: LinkLevel, after_s: float) -> bool:
     robot = RobotView(BASE)
     robot.receive(LINK, link(level), 0.0, 0.0)
     for at in (-2.0, -1.0, 0.0):
@@ -73,7 +73,7 @@ def lets_a_replay_begin(level: LinkLevel, after_s: float) -> bool:
 
 
 MEMBERS: dict[str, tuple[Callable[[LinkLevel, float], bool], dict[LinkLevel, float]]] = {
-    "a page, or a terminal": (told_by_a_page_or_terminal, {"wide": 2, "narrow": 3, "thin": 5}),
+    "a page, or a terminal": (shown_by_a_page_or_terminal, {"wide": 2, "narrow": 3, "thin": 5}),
     "pebble estop status": (printed_by_estop_status, {"wide": 2, "narrow": 3, "thin": 5}),
     "who asks robots by name": (gives_its_place_to_another, {"wide": 2, "narrow": 3, "thin": 5}),
     "a replay in its name": (lets_a_replay_begin, {"wide": 2, "narrow": 3, "thin": 5}),
@@ -96,7 +96,7 @@ def test_an_answer_is_awaited_for(level: LinkLevel, scripts_s: float, others_s: 
     assert (scripts.answer_s, pace_of(link_of(link(level).payload)).answer_s) == (scripts_s, others_s)
 
 
-def test_a_stop_of_all_waits_for_robots_of_which_nothing_was_heard_as_on_the_thinnest_link() -> None:
+def test_a_stop_of_all_waits_for_silent_robots_as_on_the_thinnest_link() -> None:
     stop = StopSender(new_name(), by="ann", why="", now=0.0, robots=None)
     stop.receive(heartbeat(), COLLECT_S - NEAR_S)
     assert list(stop.robots) == [BASE]
