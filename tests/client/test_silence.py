@@ -17,12 +17,18 @@ from pebble.contract import LINK, ONLINE
 from pebble.contract.levels import LEVELS, link_of, silent_after
 from pebble.contract.payloads import LinkLevel
 from pebble.recordings.replay.live import LiveRobots
-from pebble.runtime.by_name import MAX_ROBOTS, ByName
+from pebble.runtime.by_name import ByName
 from pebble.transports import Message
 from pebble.transports.memory import MemoryHub, MemoryTransport
 
 BASE = "pebble/robots/goob"
 NEAR_S = 0.1
+ROBOTS = 8  # for which there is a place
+
+
+@pytest.fixture(autouse=True)
+def few_places(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pebble.runtime.by_name.MAX_ROBOTS", ROBOTS)
 
 
 def link(level: LinkLevel, base: str = BASE) -> Message:
@@ -50,7 +56,7 @@ def printed_by_estop_status(level: LinkLevel, after_s: float) -> bool:
 
 def gives_its_place_to_another(level: LinkLevel, after_s: float) -> bool:
     by_name = ByName()
-    for number in range(MAX_ROBOTS):
+    for number in range(ROBOTS):
         by_name.receive(heartbeat(f"{BASE}{number}"), 0.0)
         by_name.receive(link(level, f"{BASE}{number}"), 0.0)
     by_name.receive(heartbeat(), after_s)
@@ -113,7 +119,7 @@ def test_a_first_robot_is_awaited_as_one_of_which_nothing_is_known() -> None:
 
 def test_a_link_that_is_removed_is_wide() -> None:
     by_name = ByName()
-    for number in range(MAX_ROBOTS):
+    for number in range(ROBOTS):
         one = f"{BASE}{number}"
         for message in (heartbeat(one), link("thin", one), Message(LINK.topic(one), b"")):
             by_name.receive(message, 0.0)
