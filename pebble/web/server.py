@@ -20,7 +20,7 @@ from pebble.client.page_settings import WebSettings
 from pebble.client.robot_topics import FLEET, SYNONYMS
 from pebble.client.robot_view import RobotView
 from pebble.config.security import SecurityLevel
-from pebble.contract import AUDIT, CAPABILITIES, CONTROL_STATE, DRIVE, DRIVING, ONLINE, channel_of, codec
+from pebble.contract import AUDIT, CAPABILITIES, CONTROL_STATE, DRIVE, DRIVING, LINK, ONLINE, channel_of, codec
 from pebble.contract.identity import Identity, parse_topic
 from pebble.errors import ConfigError
 from pebble.fleet.audit import Audit
@@ -134,7 +134,7 @@ class Server:
         ref = address.identity.base
         self.robots.receive(message, now)
         self._send(self.stops.receive(message, clock()))
-        if address.metric == ONLINE.metric or ref in self.robots.components:
+        if address.metric in (ONLINE.metric, LINK.metric) or ref in self.robots.components:
             self.by_name.receive(message, now)  # what found no place is asked for
         if ref not in self.robots.components:
             return
