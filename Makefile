@@ -49,6 +49,7 @@ LESS := $(if $(PEBBLE_THOROUGH),, and not thorough)
 GENTLY := chrt --idle 0
 # Tests that check no times.
 COMPUTING := tests/config tests/contract tests/media tests/motion tests/perception tests/robot/test_lockstep.py \
+	tests/forwarding/test_command_ages.py \
 	$(addprefix tests/bench/,judging $(addprefix test_,plots.py report.py results.py)) \
 	$(addprefix tests/firmware/test_,compile.py deadman_virtual.py golden.py heap.py motor_boards.py outlets.py) \
 	$(addprefix tests/firmware/test_,types.py vm.py) \

@@ -10,6 +10,7 @@ from typing import Any
 
 from pebble.config import Mqtt
 from pebble.contract import BRIDGE_PROBE, ONLINE, codec
+from pebble.contract.levels import silent_after
 from pebble.errors import ConfigError, PayloadError
 from pebble.forwarding.forwarder import barrier
 from pebble.forwarding.probes import PROBE_REQUEST, Probes
@@ -20,7 +21,7 @@ from pebble.runtime.connections import mirror_transport
 from pebble.runtime.process import run
 from pebble.transports import Message, QoS, State, Transport
 
-_FRESH_HEARTBEATS = 3.0  # a heartbeat is current for so many of its intervals
+_FRESH = 1.5  # times what counts as silence: so old a heartbeat is current
 CHECK_S = 1.0  # before anything is forwarded: by then the bridge's probe has arrived
 _REQUEST_PERIOD_S = 1.0  # at most one request so often, when heartbeats on the broker are the reason
 
@@ -47,7 +48,7 @@ class MqttMirror(ForwardingService):
         self._watched = frozenset({self._probe_topic} if bridge.enabled else ())
         if bridge.enabled and bridge.heartbeat.enabled:
             self._watched |= {self.addresses[ONLINE].topic}
-        self._fresh_s = _FRESH_HEARTBEATS * bridge.heartbeat.interval_seconds
+        self._fresh_s = _FRESH * silent_after(bridge.heartbeat.interval_seconds, bridge.link.slowest)
         self._probes = Probes()
         self._announced = False  # the bridge has sent a probe since the newest check began
         self._requested_at = float("-inf")

@@ -185,7 +185,7 @@ class ControlClient:
 
     def _hopeless(self, now: float) -> str:
         """Why it is given up; empty: it is not."""
-        if now - self._answered_at > self._pace_of().control_answer_s:
+        if now - self._answered_at > self._pace_of().answer_s:
             return f"{self.robot.base.rpartition('/')[2]} {UNANSWERED}"
         return f"{self.robot.who} drives on" if now - self._asked_at > ASKS_S else ""
 

@@ -3,6 +3,7 @@
 from pebble.client.robot_view import RobotView
 from pebble.contract import OUTGOING, channel_of
 from pebble.contract.identity import parse_topic
+from pebble.contract.levels import silent_after
 from pebble.media.rate_meter import RateMeter
 from pebble.transports import Message
 
@@ -18,6 +19,12 @@ class Discovery:
 
     def all_robots(self) -> list[RobotView]:
         return list(self.robots.values())  # a copy: robots may be added meanwhile
+
+    def awaits_heartbeat(self, waited_s: float) -> bool:
+        """Whether one of them, or the first of all, may be there although nothing was heard of it for so long."""
+        robots = [one.liveness for one in self.all_robots()]
+        awaited = [silent_after(link=one.link) for one in robots if one.received_at is None]
+        return waited_s < max(awaited, default=0.0 if robots else silent_after())
 
     def receive(self, message: Message, now: float, wall: float) -> None:
         """Update from one message that arrived at ``now`` (monotonic) and ``wall`` (epoch seconds)."""

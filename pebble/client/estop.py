@@ -12,12 +12,13 @@ from pebble.client.estop_states import RobotEstop
 from pebble.client.rank import Rank, RankedTable
 from pebble.contract import AUTONOMY_COMMAND, DRIVE, ESTOP, STATUS, Channel, codec
 from pebble.contract.identity import Direction, parse_topic
+from pebble.contract.levels import silent_after
 from pebble.contract.payloads import AutonomyCommand, Drive, EstopCommand
 from pebble.motion.latch import is_name, stop_of
 from pebble.transports import Message, QoS
 
 REPEAT_S = 0.5
-COLLECT_S = 3.0  # so long a stop of all robots is sent to further ones
+COLLECT_S = silent_after(link="thin")  # so long a stop of all is sent to further robots, which may be at any level
 GIVE_UP_S = 60.0
 MAX_ROBOTS = 1000  # to which a stop of all is repeated; one beyond gets it whenever anything arrives from it
 MAX_PASSED = 4096  # robots beyond whose last stop is remembered; where there are more, they get it more often

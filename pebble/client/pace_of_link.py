@@ -7,11 +7,9 @@ from typing import NamedTuple
 
 from msgspec.structs import replace
 
-from pebble.contract import DRIVE, codec
-from pebble.contract.channels import LINK
+from pebble.contract import DRIVE
 from pebble.contract.levels import LEVELS
 from pebble.contract.payloads import Drive, LinkState
-from pebble.errors import PayloadError
 from pebble.transports import QoS
 
 _LEAST_S = 0.015  # between two commands on a wide link: what comes together counts once
@@ -28,11 +26,16 @@ class Pace(NamedTuple):
     stamped: bool = False
     control_s: float = 1.0  # between two requests of control
     control_for_ms: float = 3000  # so long each holds it
-    control_answer_s: float = 2.0  # a robot that has not answered by then will not
+    answer_s: float = LEVELS["wide"].answer_s  # a robot that has not answered by then will not
 
     def dated(self, drive: Drive, now: float, key: str) -> Drive:
-        """A command that moves something with the time at which it is sent; ``key``: where the robot has given none."""
-        return replace(drive, t=ms(now), key=drive.key or key) if self.stamped else drive
+        """A command that moves something, as it is sent now: valid for as long as commands on this link are, and dated.
+
+        ``key``: where the robot has given none.
+        """
+        if not self.stamped:
+            return drive
+        return replace(drive, t=ms(now), key=drive.key or key, valid_ms=self.valid_ms)
 
 
 WIDE = Pace()
@@ -51,16 +54,8 @@ def pace_of(link: LinkState | None) -> Pace:
         stamped=level.stamped,
         control_s=3.0,  # commands renew it, too
         control_for_ms=10_000,
-        control_answer_s=10.0,
+        answer_s=level.answer_s,
     )
-
-
-def link_of(payload: bytes) -> LinkState | None:
-    """What a message on ``outgoing/link`` reports; None where it is removed, or cannot be read."""
-    try:
-        return codec.decode(LINK, payload) if payload else None
-    except PayloadError:
-        return None
 
 
 def way_s(link: LinkState) -> float:

@@ -7,11 +7,11 @@ from pebble import contract as c
 from pebble.client.control import RobotControl
 from pebble.client.drive_reasons import SILENT_S, Situation
 from pebble.client.driveable import Driveable, driveable_of
-from pebble.client.pace_of_link import WIDE, Pace, link_of, pace_of, way_s
+from pebble.client.pace_of_link import WIDE, Pace, pace_of, way_s
 from pebble.client.robot_topics import section_of
 from pebble.contract import codec
 from pebble.contract.identity import is_of_another
-from pebble.contract.levels import silent_after
+from pebble.contract.levels import link_of, silent_after
 from pebble.contract.payloads import AutonomyStatus, EstopState, Heartbeat, LinkLevel, LinkState, Orientation
 from pebble.errors import PayloadError
 from pebble.runtime.robot_estop import RobotEstop

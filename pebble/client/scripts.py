@@ -5,13 +5,15 @@ from collections.abc import Sequence
 from typing import Any
 
 from pebble.client.names import Names
-from pebble.contract import AUTONOMY_COMMAND, AUTONOMY_FILES, AUTONOMY_STATUS, CAPABILITIES, codec
-from pebble.contract.payloads import AutonomyCommand, AutonomyStatus
+from pebble.contract import AUTONOMY_COMMAND, AUTONOMY_FILES, AUTONOMY_STATUS, CAPABILITIES, LINK, codec
+from pebble.contract.levels import LEVELS, level_of
+from pebble.contract.payloads import AutonomyCommand, AutonomyStatus, LinkLevel
 from pebble.errors import PayloadError, PebbleError
 from pebble.transports import Message, QoS, Transport
 
 _BYTES = 512 * 1024  # of a list of scripts
-_RECEIVED = (CAPABILITIES, AUTONOMY_FILES, AUTONOMY_STATUS)
+_RECEIVED = (CAPABILITIES, LINK, AUTONOMY_FILES, AUTONOMY_STATUS)
+_STARTS_S = 5.0  # that a script may take until its status shows it
 
 Entry = dict[str, Any]
 
@@ -24,8 +26,14 @@ class RobotScripts:
         self.status: AutonomyStatus | None = None
         self.answers = 0  # statuses that arrived live
         self.named = False  # it takes commands only with the name of their sender
+        self._link: LinkLevel = "wide"
         self._topics = {channel.metric: names.topic(channel.metric) for channel in _RECEIVED}
         self._command_topic = names.topic(AUTONOMY_COMMAND.metric)
+
+    @property
+    def answer_s(self) -> float:
+        """A robot whose status has not changed so long after a command does not follow it."""
+        return max(_STARTS_S, LEVELS[self._link].answer_s)
 
     def subscribe(self, transport: Transport) -> None:
         """Receive from ``transport``; when this returns, what is retained has arrived."""
@@ -40,6 +48,8 @@ class RobotScripts:
             if message.topic == self._topics[AUTONOMY_FILES.metric]:
                 listed = codec.decode(AUTONOMY_FILES, message.payload).files
                 self.files = {entry["file"]: entry for entry in listed if isinstance(entry.get("file"), str)}
+            elif message.topic == self._topics[LINK.metric]:
+                self._link = level_of(message.payload)
             elif message.topic == self._topics[CAPABILITIES.metric]:
                 self.named = codec.decode(CAPABILITIES, message.payload).value.get("named") is True
             elif message.topic == self._topics[AUTONOMY_STATUS.metric]:

@@ -21,10 +21,12 @@ from pebble.client.driveable import Driveable
 from pebble.client.estop import Progress, RobotStop, StopSender, new_name, send
 from pebble.client.estop_states import Reset, RobotEstop
 from pebble.client.names import id_of
+from pebble.client.robot_view import RobotView
 from pebble.commands import show
 from pebble.commands.options import with_target
 from pebble.config.visible import shown
-from pebble.contract import CAPABILITIES, ESTOP_STATE, ONLINE, STATUS
+from pebble.contract import CAPABILITIES, ESTOP_STATE, LINK, ONLINE, STATUS
+from pebble.contract.levels import LEVELS
 from pebble.errors import PebbleError, TransportError
 from pebble.runtime.by_name import ByName, ask_beside
 from pebble.runtime.signals import interrupted_by_signals
@@ -34,8 +36,7 @@ _VERBS = ("reset", "status")
 _TICK_S = 0.25
 _REPORT_PERIOD_S = 0.05
 _QUICK_S = 1.0  # an answer within this time needs no line before it
-_ANSWER_S = 2.0  # longest wait for the states of a robot, and for its answer to a reset
-_HEARTBEAT_S = 0.6  # more than two periods of a heartbeat
+_ANSWER_S = LEVELS["wide"].answer_s  # longest wait for what the broker has of a robot
 _BATCH = 1000  # messages that are handled before the next stop is due
 
 
@@ -240,9 +241,11 @@ def _line(robot: RobotStop, *, patient: bool) -> str:
 
 def _reset(target: Target) -> int:
     with connected(target) as (transport, names):
-        robot, name = RobotEstop(names.base), shown(id_of(names.base))
+        view, name = RobotView(names.base), shown(id_of(names.base))
+        robot = view.estop
         put_names(transport, names, lambda base: base == robot.base and robot.named)
         robot.subscribe(transport)
+        transport.subscribe(LINK.topic(robot.base), lambda one: view.receive(LINK, one, 0.0, 0.0), direct=True)
         _wait(lambda: robot.has_capabilities)
         transport.ask(robot.missing)  # the capabilities may have come after the subscription
         _wait(lambda: not robot.missing)
@@ -257,7 +260,7 @@ def _reset(target: Target) -> int:
         for message in reset.messages():
             if not transport.publish(message.topic, message.payload, qos=message.qos, urgent=True):
                 raise TransportError(f"the reset was not sent: {transport.problem or 'the connection was lost'}")
-        _wait(lambda: not reset.waiting)
+        _wait(lambda: not reset.waiting, view.pace.answer_s)
         for owner, why in reset.refusals().items():
             raise PebbleError(shown(f"{name} is still stopped: {owner}: {why}; look again, then repeat"))
     typer.echo(f"{name}: free; it moves again once drive commands have paused for half a second")
@@ -273,15 +276,15 @@ def _status(target: Target, *, every: bool) -> int:
             by_name.receive(message, time.monotonic())
 
         is_remote = target.remote or str(target.url).startswith("mqtt")  # within a robot there is no heartbeat
-        for channel in (ESTOP_STATE, STATUS, CAPABILITIES, *((ONLINE,) if is_remote else ())):
+        for channel in (ESTOP_STATE, STATUS, CAPABILITIES, *((ONLINE, LINK) if is_remote else ())):
             transport.subscribe(channel.filter(names.base), take, direct=True)
         ask_beside(transport, by_name)
         if not every:
             _wait(lambda: names.base in discovery.robots and discovery.robots[names.base].estop.has_capabilities)
             transport.ask([topic for robot in discovery.all_robots() for topic in robot.estop.missing])
         if is_remote:
-            found = discovery.all_robots
-            _wait(lambda: bool(found()) and all(one.liveness.received_at for one in found()), _HEARTBEAT_S)
+            found, began = discovery.all_robots, time.monotonic()
+            _wait(lambda: not discovery.awaits_heartbeat(time.monotonic() - began), float("inf"))
             _wait(lambda: not any(one.liveness.received_at and one.estop.lacks for one in found()))
         robots = sorted(discovery.all_robots(), key=lambda robot: robot.base)
     for robot in robots:

@@ -26,7 +26,6 @@ _HELP = """Programs that move a robot by themselves; docs/scripts.md explains th
     pebble script status goob.json
     pebble script stop goob.json
 """
-_ANSWER_S = 5.0
 _FIRST_SECOND_S = 1.0  # most mistakes in a script end it within that
 _SAME_ERROR_S = 1.0  # an error that was there before the command is the answer to it, too, if it stays
 
@@ -84,10 +83,13 @@ def start(
     with _scripts(robot, target) as (transport, scripts, _):
         before, answers, began = scripts.status, scripts.answers, time.monotonic()
         _sent(transport, scripts.start(transport, file, context.args))
-        _wait(lambda: scripts.answers > answers and _answered(before, scripts.status, file, time.monotonic() - began))
+        _wait(
+            lambda: scripts.answers > answers and _answered(before, scripts.status, file, time.monotonic() - began),
+            scripts.answer_s,
+        )
         status = scripts.status
         if scripts.answers == answers or status is None:
-            raise PebbleError(f"no answer within {_ANSWER_S:g} s: is the robot up?")
+            raise PebbleError(f"no answer within {scripts.answer_s:g} s: is the robot up?")
         if not _runs(before, status, file):
             raise PebbleError(shown(status.error or f"{file} does not run"))
         _print_status(status)
@@ -102,9 +104,11 @@ def stop(robot: _Robot, *, target: Target) -> int:
     """Stop the script that runs. In an emergency: pebble estop."""
     with _scripts(robot, target) as (transport, scripts, _):
         _sent(transport, scripts.stop(transport))
-        _wait(lambda: scripts.status is not None and not scripts.status.running)
+        _wait(lambda: scripts.status is not None and not scripts.status.running, scripts.answer_s)
         if scripts.status is None or scripts.status.running:
-            raise PebbleError(f"it is not known to have stopped within {_ANSWER_S:g} s: pebble estop stops the robot")
+            raise PebbleError(
+                f"it is not known to have stopped within {scripts.answer_s:g} s: pebble estop stops the robot"
+            )
         _print_status(scripts.status)
     return 0
 
@@ -191,7 +195,7 @@ def _print(line: str) -> None:
     typer.echo(shown(line))
 
 
-def _wait(condition: Callable[[], bool], seconds: float = _ANSWER_S) -> None:
+def _wait(condition: Callable[[], bool], seconds: float) -> None:
     end = time.monotonic() + seconds
     while not condition() and time.monotonic() < end:
         time.sleep(0.005)

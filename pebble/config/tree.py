@@ -31,7 +31,7 @@ from pebble.config.types import (
     doc,
 )
 from pebble.config.web import WebHandler, WebInterface
-from pebble.contract.payloads import Body, Colour
+from pebble.contract.payloads import Body, Colour, LinkLevel
 from pebble.contract.serial_protocols import SerialProtocolName
 
 
@@ -179,6 +179,11 @@ class Link(Section, frozen=True, kw_only=True):
         Literal["wide", "thin", "auto"], doc("`wide`: it carries everything; `thin`: little; `auto`: by measurement.")
     ] = "wide"
     kbit: Annotated[Annotated[float, Meta(gt=0)] | None, doc("What it carries, in kbit/s, if that is known.")] = None
+
+    @property
+    def slowest(self) -> LinkLevel:
+        """The level that it may come to, for those who wait for an answer over it and do not hear of its level."""
+        return "wide" if self.profile == "wide" else "thin"
 
 
 class MqttBridge(ServiceSection, frozen=True, kw_only=True):

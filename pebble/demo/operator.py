@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import queue
+import secrets
 import threading
 import time
 from collections import deque
@@ -24,6 +25,7 @@ from pebble.client.discovery import ALL_OUTGOING, Discovery
 from pebble.client.driver_lease import FILTER
 from pebble.client.estop import StopSender, new_name
 from pebble.client.estop_states import Reset
+from pebble.client.pace_of_link import WIDE, Pace
 from pebble.client.robot_view import RobotView
 from pebble.contract import (
     APRILTAG_DATA,
@@ -136,6 +138,10 @@ class CompletedFollow(NamedTuple):
     clip: str
 
 
+def _pace_of(robot: RobotView) -> Pace:
+    return robot.pace
+
+
 class EndedEarlyError(Exception):
     """The demo ends, or a person has taken the robot."""
 
@@ -157,6 +163,7 @@ class Operator:
         self.events: deque[tuple[float, str]] = deque(maxlen=_MOST_WAITING)
         self.completed: deque[CompletedStep | CompletedStop | CompletedFollow] = deque(maxlen=_MOST_WAITING)
         self._doing = "discovering robots"
+        self._key = secrets.token_hex(4)  # where a robot has given none
         self._visitors = Visitors(NAME)
         self._controls: dict[str, ControlClient] = {}  # by base topic, of robots that keep control themselves
         self._drawing: set[str] = set()  # base topics of robots that have listed the script for their trail
@@ -279,9 +286,19 @@ class Operator:
     def _drive(self, drive: Drive) -> float:
         """Send one command to all robots that are free; returns when."""
         for robot in filter(self._mine, self._robots):
-            self.commands[robot.base] = drive, time.monotonic()
-            self._publish(robot.drive_topic, codec.encode(DRIVE, self._signed(robot, drive)))
+            self._send(robot, drive, time.monotonic())
         return time.monotonic()
+
+    def _send(self, robot: RobotView, drive: Drive, now: float) -> None:
+        """A zero at once; what moves the robot at the pace that it asks for."""
+        pace, (last, sent_at) = robot.pace, self.commands.get(robot.base, (STOP, -math.inf))
+        if drive.moves and last.moves and now - sent_at < pace.step_s:
+            return
+        self.commands[robot.base] = drive, now
+        signed, qos = self._signed(robot, drive), QoS.DELIVERED
+        if drive.moves:
+            signed, qos = pace.dated(signed, now, self._key), pace.qos
+        self._publish(robot.drive_topic, codec.encode(DRIVE, signed), qos)
 
     def _signed(self, robot: RobotView, drive: Drive) -> Drive:
         """The command with the key of control, which it renews if it has it."""
@@ -298,11 +315,14 @@ class Operator:
         for robot in [one for one in self._robots if one.controlled and self._mine(one)]:
             control = self._controls.get(robot.base)
             if control is None or control.robot is not robot.control:
-                control = self._controls[robot.base] = ControlClient(robot.control, by=NAME, device="demo")
+                control = self._controls[robot.base] = ControlClient(
+                    robot.control, by=NAME, device="demo", pace_of=partial(_pace_of, robot)
+                )
                 self._visitors.own_ids.add(control.id)
             if not control.wanted:
                 control.ask(time.monotonic())
-        self._until(self._has_control, _CONTROL_S)
+        answers_s = [one.pace.answer_s for one in self._robots if one.pace is not WIDE]
+        self._until(self._has_control, max([_CONTROL_S, *answers_s]))
         for control in self._controls.values():
             if not control.held:  # a person was faster
                 control.release()
@@ -329,9 +349,9 @@ class Operator:
             self._wait(max(0.0, due - sent))
         return sent
 
-    def _publish(self, topic: str | None, payload: bytes) -> None:
+    def _publish(self, topic: str | None, payload: bytes, qos: QoS = QoS.DELIVERED) -> None:
         if topic is not None:
-            self._publish_all([Message(topic, payload, QoS.DELIVERED)])
+            self._publish_all([Message(topic, payload, qos)])
 
     def _publish_all(self, messages: Iterable[Message]) -> None:
         for one in messages:

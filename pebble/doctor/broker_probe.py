@@ -11,6 +11,7 @@ from pebble.transports.mqtt import client_ids, packets
 from pebble.transports.settings import MqttSettings
 from pebble.transports.tls import make_context
 
+TIMEOUT_S = 3.0  # of each of its steps
 _KEEPALIVE_S = 10
 _CONNACK = 0x20
 REFUSED_ID = 2
@@ -31,7 +32,7 @@ class ProbeResult:
     expires: float | None = None  # the broker's certificate, in epoch seconds
 
 
-def probe(settings: MqttSettings, *, login: bool, timeout_s: float = 3.0) -> ProbeResult:
+def probe(settings: MqttSettings, *, login: bool, timeout_s: float = TIMEOUT_S) -> ProbeResult:
     """Connect and disconnect, with the settings' user and password or (``login=False``) anonymously.
 
     Where the host has several addresses, the first one counts that accepts the login, else the last one that answers.

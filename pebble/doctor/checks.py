@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from importlib import metadata
 from pathlib import Path
 
@@ -19,8 +20,9 @@ from pebble.client.page_from_config import settings_of
 from pebble.client.page_packages import require_packages
 from pebble.config import Config, Mqtt
 from pebble.config.secret_text import shown_user
+from pebble.contract.levels import LEVELS
 from pebble.doctor import Finding, Level, device_names, fail, ok, warn
-from pebble.doctor.broker_probe import REFUSED_ID, REFUSED_LOGINS, ProbeResult, probe
+from pebble.doctor.broker_probe import REFUSED_ID, REFUSED_LOGINS, TIMEOUT_S, ProbeResult, probe
 from pebble.doctor.driving import driving
 from pebble.doctor.loudspeaker import loudspeaker
 from pebble.doctor.media import media
@@ -71,10 +73,12 @@ def _robot(config: Config) -> Iterator[Finding]:
     yield from recorder(config)
     for name, mqtt in _brokers(config):
         settings = mqtt_settings(mqtt, reconnect_max_s=REMOTE_RECONNECT_S, program="doctor")
-        found = list(broker(name, settings))
+        bridge = config.services.mqtt_bridge
+        answer_s = LEVELS[bridge.link.slowest if mqtt is bridge.remote_mqtt else "wide"].answer_s
+        found = list(broker(name, settings, partial(probe, timeout_s=max(TIMEOUT_S, answer_s))))
         yield from found
-        if mqtt is config.services.mqtt_bridge.remote_mqtt and found[0].level is Level.OK:
-            yield from publishing(found[0].what, settings, config.base)
+        if mqtt is bridge.remote_mqtt and found[0].level is Level.OK:
+            yield from publishing(found[0].what, settings, config.base, answer_s)
         if is_loopback(mqtt.host):
             yield from beyond_loopback(name, settings, own_addresses())
 

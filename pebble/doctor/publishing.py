@@ -10,13 +10,13 @@ from dataclasses import replace
 from statistics import median
 
 from pebble.contract import BRIDGE_PROBE
+from pebble.contract.levels import LEVELS
 from pebble.doctor import Finding, fail, ok, warn
 from pebble.forwarding.probes import new_probe
 from pebble.transports import Message, MqttSettings, QoS, State
 from pebble.transports.mqtt.transport import MqttTransport
 
 _OPEN_S = 5.0
-_ANSWER_S = 2.0
 _POLL_S = 0.05
 _APART_S = 0.005  # between the two messages of a pair
 _PAIRS = 5
@@ -26,15 +26,20 @@ _MATTERS_S = 0.02  # a shorter round trip delays nothing that people notice
 _HELD = 0.75  # of a round trip: a thin link itself needs some of it for the second message
 
 
-def publishing(what: str, settings: MqttSettings, base: str) -> Iterator[Finding]:
-    """Publish probes, which no program takes for anything else, below ``base``, and see when they come back."""
+def publishing(
+    what: str, settings: MqttSettings, base: str, answer_s: float = LEVELS["wide"].answer_s
+) -> Iterator[Finding]:
+    """Publish probes, which no program takes for anything else, below ``base``, and see when they come back.
+
+    After ``answer_s`` one counts as lost.
+    """
     client = MqttTransport("doctor", replace(settings, keepalive_s=_QUIET_S, silence_s=_QUIET_S))
     with closing(client):
         client.open(_OPEN_S)
         if client.state is not State.CONNECTED:
             yield warn(what, f"cannot be published to: {client.problem}")
             return
-        echo = _Echo(client, BRIDGE_PROBE.topic(base))
+        echo = _Echo(client, BRIDGE_PROBE.topic(base), answer_s)
         came_back = echo.arrival(echo.send(QoS.DELIVERED), giving_up=lambda: bool(echo.refusal)) is not None
         if echo.refusal or not (came_back or settings.protocol == "5"):  # which says what it refuses
             why = echo.refusal or "it does not come back (or may this account not read it?)"
@@ -69,8 +74,8 @@ def held_back(what: str, round_trip_s: float, apart_s: float) -> Iterator[Findin
 class _Echo:
     """Probes on one topic, and when each came back."""
 
-    def __init__(self, client: MqttTransport, topic: str) -> None:
-        self._client, self.topic = client, topic
+    def __init__(self, client: MqttTransport, topic: str, answer_s: float) -> None:
+        self._client, self.topic, self._answer_s = client, topic, answer_s
         self._came, self._arrivals = threading.Condition(), dict[bytes, float]()
         client.subscribe(topic, self._note)
 
@@ -88,8 +93,8 @@ class _Echo:
         return payload
 
     def arrival(self, payload: bytes, giving_up: Callable[[], bool] = lambda: False) -> float | None:
-        """When it came back; None: it has not within some seconds."""
-        deadline = time.monotonic() + _ANSWER_S
+        """When it came back; None: it has not in time."""
+        deadline = time.monotonic() + self._answer_s
         with self._came:
             while payload not in self._arrivals and time.monotonic() < deadline and not giving_up():
                 self._came.wait(_POLL_S)

@@ -179,6 +179,10 @@ class MediaFeed:
         self._request.want(self._is_wanted())
         return channels
 
+    def take_status(self, status: bytes) -> None:
+        """Take what the robot publishes of its programs: while it holds this medium back, nothing is requested."""
+        self._request.take_status(status)
+
     def wake(self, ending: str, *, subscribed: bool) -> None:
         """Take note that a client has subscribed, or unsubscribed."""
         self.wants_keyframe = self.wants_keyframe or (subscribed and ending == VIDEO[1])
@@ -243,7 +247,7 @@ class MediaFeed:
             return
         if not self._request.problem and (self.wants_keyframe or self._conversion.lacks_keyframe()):
             await self._request_keyframe()
-        self._report(self._request.problem or self._why_nothing_is_shown())
+        self._report(self._request.problem or self._request.waits or self._why_nothing_is_shown())
 
     async def _request_keyframe(self) -> None:
         """Not while another encoding still arrives: the one that was requested begins with a key frame."""

@@ -8,7 +8,7 @@ from typing import Any, Final
 from pebble.client.broker import Broker
 from pebble.client.robot_topics import FLEET, SYNONYMS, WATCHED
 from pebble.client.viewer import Medium
-from pebble.contract import CAPABILITIES, Channel, codec
+from pebble.contract import CAPABILITIES, STATUS, Channel, codec
 from pebble.contract.channels import channel_of
 from pebble.contract.identity import Identity, parse_topic
 from pebble.errors import PayloadError
@@ -69,6 +69,9 @@ class Robots:
         channel = channel_of(f"{address.direction}/{address.metric}")
         if channel is CAPABILITIES:
             self._update(address.identity.base, message.payload)
+        elif channel is STATUS:
+            for medium in _MEDIA:
+                self._feed(address.identity.base, medium).take_status(message.payload)
         self._publish(channel, message, time.time_ns() - round((time.monotonic() - at) * 1e9))
 
     def wake(self, topic: str, *, subscribed: bool) -> None:
@@ -127,10 +130,12 @@ class Robots:
             return
         (self._named.add if capabilities.get("named") is True else self._named.discard)(base)
         for medium in _MEDIA:
-            feed = self._feeds.get((base, medium)) or self._start(base, medium)
+            feed = self._feed(base, medium)
             self._by_channel.update(dict.fromkeys(feed.update(capabilities), feed))
 
-    def _start(self, base: str, medium: Medium) -> MediaFeed:
+    def _feed(self, base: str, medium: Medium) -> MediaFeed:
+        if (feed := self._feeds.get((base, medium))) is not None:
+            return feed
         feed = self._feeds[base, medium] = MediaFeed(self._broker, self._server, self._schemas, base, medium)
         task = asyncio.create_task(feed.run(), name=f"the {medium} of {base}")
         self._tasks.add(task)

@@ -9,8 +9,10 @@ from collections.abc import Callable, Collection, Iterable, Iterator
 from math import inf
 from typing import Final
 
-from pebble.contract import CAPABILITIES, CHANNELS, ONLINE, Channel
+from pebble.contract import CAPABILITIES, CHANNELS, LINK, ONLINE, Channel
 from pebble.contract.identity import Direction, parse_topic
+from pebble.contract.levels import level_of, silent_after
+from pebble.contract.payloads import LinkLevel
 from pebble.runtime.robot_estop import RobotEstop
 from pebble.transports import Message, State, Transport
 
@@ -20,7 +22,6 @@ EACH_S: Final = 0.05  # between two robots that are asked for
 MAX_ROBOTS: Final = 2000  # those known from before need no room
 _PAUSES_S = (1.0, 5.0, 30.0)  # before each time that one is asked for; it may have none
 _LASTS_S = 0.5
-_SILENT_S = 2.0  # without a heartbeat, after which its place may be another one's
 _SWEEP_S = 1.0  # between two searches for such places
 
 _HEARTBEATS = frozenset(one.metric for one in CHANNELS if ONLINE.metric in (one.metric, one.synonym_of))
@@ -34,6 +35,7 @@ class _Robot:
         self.estop: RobotEstop | None = None  # since it was asked for
         self.due = inf  # when it is asked for next
         self.asked = 0
+        self.link: LinkLevel = "wide"
         self._began: float | None = None  # its first heartbeat
         self._newest_at = -inf  # its newest one
         self._pauses: Iterator[float] = iter(_PAUSES_S)
@@ -44,7 +46,8 @@ class _Robot:
         return self._began is not None and self._newest_at - self._began >= _LASTS_S
 
     def may_go(self, now: float) -> bool:
-        return self.due == inf or now - self._newest_at > _SILENT_S
+        """Whether its place may be another one's."""
+        return self.due == inf or now - self._newest_at > silent_after(link=self.link)
 
     def heartbeat(self, now: float) -> None:
         self._newest_at = now
@@ -108,9 +111,13 @@ class ByName:
     def receive(self, message: Message, now: float) -> None:
         """Take any message of any robot."""
         address = parse_topic(message.topic)
-        if address is None or address.direction is not Direction.OUTGOING or not message.payload:
+        if address is None or address.direction is not Direction.OUTGOING:
             return
         metric = address.metric
+        if metric == LINK.metric and (known := self._robots.get(address.identity.base)) is not None:
+            known.link = level_of(message.payload)
+        if not message.payload:
+            return
         is_heartbeat = metric in _HEARTBEATS
         if is_heartbeat and message.retain:
             return  # no sign of life

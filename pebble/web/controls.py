@@ -153,5 +153,5 @@ class Controls:
             return False
         wish.ended_at = min(wish.ended_at, now)
         state, robot = self.state(wish.ref), self._robot_of(wish.ref)
-        answer_s = (WIDE if robot is None else robot.pace).control_answer_s
+        answer_s = (WIDE if robot is None else robot.pace).answer_s
         return state is None or state.id != wish.client.id or now - wish.ended_at > answer_s

@@ -230,7 +230,7 @@ class Driving:
         if now - lease.sent_at < pace.step_s:
             return Outcome([])
         lease.sent_at, lease.moving = now, True
-        drive = lease.signed(Drive(x=op.x, z=op.z, y=op.y, valid_ms=pace.valid_ms))
+        drive = lease.signed(Drive(x=op.x, z=op.z, y=op.y, valid_ms=WIDE.valid_ms))
         return Outcome([Command(op.ref, pace.dated(drive, now, self._key), pace.qos)])
 
     def stop(self, ref: str, now: float) -> list[Command]:

@@ -15,7 +15,7 @@ from pebble.errors import PayloadError, PebbleError
 from pebble.fleet.audit import Audit
 from pebble.transports import Message
 
-ANSWER_S = 5.0  # robots answer once a second
+ANSWER_S = 5.0  # robots answer once a second; on a thin link it takes longer
 NOTE_S = 60.0  # between two notes of one robot
 MOST_READS = 8  # at a time
 _MOST_BYTES = 64 * 1024  # of an answer
@@ -30,10 +30,18 @@ class RobotAudit(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class RobotAudits:
-    """``is_known``: robots of which there are not many. Only the event loop calls it."""
+    """``is_known``: robots of which there are not many; ``answer_s``: of a robot. Only the event loop calls it."""
 
-    def __init__(self, broker: Broker, audit: Audit, is_known: Callable[[str], bool], is_there: Callable[[str], bool]):
+    def __init__(
+        self,
+        broker: Broker,
+        audit: Audit,
+        is_known: Callable[[str], bool],
+        is_there: Callable[[str], bool],
+        answer_s: Callable[[str], float],
+    ) -> None:
         self._broker, self._audit, self._is_known, self._is_there = broker, audit, is_known, is_there
+        self._answer_s = answer_s
         self._newest: dict[str, AuditState] = {}  # not noted yet
         self._noted_at: dict[str, float] = {}
         self._reading = 0
@@ -84,7 +92,7 @@ class RobotAudits:
         try:
             if not self._broker.publish(AUDIT_READ.topic(ref), codec.encode(AUDIT_READ, request)):
                 raise PebbleError("the server cannot reach the broker")
-            return await asyncio.wait_for(answered, ANSWER_S)
+            return await asyncio.wait_for(answered, max(ANSWER_S, self._answer_s(ref)))
         except TimeoutError:
             raise PebbleError("the robot does not answer: it keeps no audit, or this server may not read it") from None
         finally:

@@ -15,11 +15,12 @@ from pebble.client.drive_reasons import SCRIPT_ORDER, SERVER_ORDER, Code, Situat
 from pebble.client.estop import send
 from pebble.client.named_topics import why_not
 from pebble.client.pace_of_link import WIDE
+from pebble.client.pace_of_link import Pace as LinkPace
 from pebble.client.page_settings import WebSettings
 from pebble.client.robot_topics import FLEET, SYNONYMS
 from pebble.client.robot_view import RobotView
 from pebble.config.security import SecurityLevel
-from pebble.contract import AUDIT, CAPABILITIES, CONTROL_STATE, DRIVE, DRIVING, ONLINE, channel_of, codec
+from pebble.contract import AUDIT, CAPABILITIES, CONTROL_STATE, DRIVE, DRIVING, LINK, ONLINE, channel_of, codec
 from pebble.contract.identity import Identity, parse_topic
 from pebble.errors import ConfigError
 from pebble.fleet.audit import Audit
@@ -66,7 +67,7 @@ class Server:
         self.robots, self.stops, self.driving = Robots(), Stops(), Driving(server)
         self.controls = Controls(self.driving, self._robot)
         self.driving.held_elsewhere = self.controls.elsewhere
-        self.driving.pace_of = lambda ref: WIDE if (robot := self._robot(ref)) is None else robot.pace
+        self.driving.pace_of = self._pace_of
         self.saved = SavedRobots(people)
         known = self.robots.before = self.saved.robots
         self.own_hosts = OwnHosts(settings)
@@ -79,7 +80,13 @@ class Server:
         self.by_name = ByName(FLEET, lambda ref: ref in known or ref in self.open_components)
         self.robots.on_forget = self.by_name.forget
         self.driven_here = DrivenHere(server)
-        self.robot_audits = RobotAudits(self.broker, audit, known.__contains__, self.robots.components.__contains__)
+        self.robot_audits = RobotAudits(
+            self.broker,
+            audit,
+            known.__contains__,
+            self.robots.components.__contains__,
+            lambda ref: self._pace_of(ref).answer_s,
+        )
         self.people_version = (0, 0, 0)
         self._stop_paces: dict[str, Pace] = {}  # by person
         self._tasks: set[asyncio.Task[None]] = set()
@@ -127,7 +134,7 @@ class Server:
         ref = address.identity.base
         self.robots.receive(message, now)
         self._send(self.stops.receive(message, clock()))
-        if address.metric == ONLINE.metric or ref in self.robots.components:
+        if address.metric in (ONLINE.metric, LINK.metric) or ref in self.robots.components:
             self.by_name.receive(message, now)  # what found no place is asked for
         if ref not in self.robots.components:
             return
@@ -243,6 +250,10 @@ class Server:
     def _robot(self, ref: str) -> RobotView | None:
         component = self.robots.components.get(ref)
         return None if component is None else component.robot
+
+    def _pace_of(self, ref: str) -> LinkPace:
+        robot = self._robot(ref)
+        return WIDE if robot is None else robot.pace
 
     # -- what is asked of robots
 

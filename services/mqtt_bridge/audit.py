@@ -26,7 +26,7 @@ _ACTS_BYTES, _REFUSED_BYTES = 2_000_000, 500_000  # of one of two files
 _ROUND_S = 1.0  # between two writes, and two answers
 _MARK_S = 10.0  # between two publications of the newest lines
 _ASKED = 8  # requests that wait to be answered
-LINES_BYTES = 16_000  # of one answer
+LINES_BYTES, THIN_LINES_BYTES = 16_000, 2_000  # of one answer: 2 s of 9.6 kbit/s, in which heartbeats wait behind it
 _END_S = 2.0  # longest wait for the last write
 
 
@@ -45,6 +45,7 @@ class Audit(Acts):
         super().__init__(config.base, map(config.motor_owner, config.motor_lines()), clock, time.time)
         self._remote, self._addresses = remote, Addresses(config)
         self._level = config.security.level
+        self._lines_bytes = LINES_BYTES if config.services.mqtt_bridge.link.slowest == "wide" else THIN_LINES_BYTES
         self._chains = {
             name: (files, self.acts if name == "acts" else self.refused) for name, files in chain_files(config).items()
         }
@@ -131,7 +132,7 @@ class Audit(Acts):
         size = 0
         for number, one in enumerate(reversed(lines)):  # the newest ones that fit
             size += len(msgspec.json.encode(one)) + 1
-            if size > LINES_BYTES:
+            if size > self._lines_bytes:
                 lines = lines[len(lines) - number :]
                 break
         address = self._addresses[AUDIT_LINES]

@@ -215,13 +215,48 @@ pebble/client/robot_view.py
 + len(self._intervals) < 1
 
 robot view, a slow link is a silence: client/test_discovery.py
-pebble/client/robot_view.py
-- age <= max(2 * interval, 4 * (self.average_latency_s or 0.0))
-+ age <= 2 * interval
+pebble/contract/levels.py
+- max(2 * interval_s, 4 * late_s, LEVELS[link].silent_s)
++ max(2 * interval_s, LEVELS[link].silent_s)
+
+silence, a thin link is one: client/test_silence.py client/test_discovery.py
+pebble/contract/levels.py
+- max(2 * interval_s, 4 * late_s, LEVELS[link].silent_s)
++ max(2 * interval_s, 4 * late_s)
+
+silence, places of robots on a thin link are taken: client/test_silence.py
+pebble/runtime/by_name.py
+- silent_after(link=self.link)
++ silent_after()
+
+silence, a removed link stays: client/test_silence.py
+pebble/runtime/by_name.py
+- known.link = level_of(message.payload)
++ known.link = level_of(message.payload) if message.payload else known.link
+
+silence, a replay does not look at links: client/test_silence.py
+pebble/recordings/replay/live.py
+- self._links[message.topic] = level_of(message.payload)
++ pass
+
+silence, pebble estop status does not: client/test_silence.py
+pebble/client/discovery.py
+- [silent_after(link=one.link) for one in robots
++ [silent_after() for one in robots
+
+silence, a stop of all ends before a robot on a thin link is silent: client/test_silence.py
+pebble/client/estop.py
+- COLLECT_S = silent_after(link="thin")
++ COLLECT_S = silent_after()
+
+silence, a script on a thin link is awaited as any: client/test_silence.py
+pebble/client/scripts.py
+- self._link = level_of(message.payload)
++ pass
 
 robot view, a silent robot is online: client/test_discovery.py
 pebble/client/robot_view.py
-- return age <= max(2 * interval, 4 * (self.average_latency_s or 0.0)) or age < at_least_s
+- return age <= silent_after(interval, self.link, self.average_latency_s or 0.0) or age < at_least_s
 + return True
 
 robot view, one late heartbeat is a silence for people: client/test_discovery.py client/test_terminal_driver.py

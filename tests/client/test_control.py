@@ -222,7 +222,7 @@ def test_a_robot_that_does_not_answer_is_not_asked_for_ever() -> None:
     ann = world.client()
     world.robot.owners[0].receives = False
     ann.ask(world.now)
-    world.wait(WIDE.control_answer_s + 1.1)
+    world.wait(WIDE.answer_s + 1.1)
     assert (ann.wanted, ann.failed) == (False, "goob does not answer")
 
 

@@ -9,7 +9,8 @@ from typing import Any
 import pytest
 
 from pebble.client.discovery import Discovery
-from pebble.client.robot_view import MAX_REMEMBERED, Liveness, RobotView
+from pebble.client.robot_view import MAX_REMEMBERED, RobotView
+from pebble.contract import LINK
 from pebble.transports import Message
 from tests.recordings.demo_robots import DRIVE, GOOB, MINILAMP, ROBOTS, messages, received, values
 from tests.support import ROOT
@@ -23,6 +24,12 @@ LIVENESS = json.loads((ROOT / "tests" / "vectors" / "liveness.json").read_text()
 def publish(discovery: Discovery, metric: str, body: object, *, now: float = 0.0, retain: bool = False) -> None:
     message = Message(f"{BASE}/outgoing/{metric}", json.dumps(body).encode(), retain=retain)
     discovery.receive(message, now, WALL + now)
+
+
+def link(level: str | None) -> bytes:
+    """What a robot publishes of its link; None: it removes that."""
+    body = {"level": level, "drive_hz": 4, "rtt_ms": 600, "queue_ms": 0, "t": 1}
+    return b"" if level is None else json.dumps(body).encode()
 
 
 def publish_heartbeats(discovery: Discovery, *times: float) -> RobotView:
@@ -71,10 +78,13 @@ def test_a_server_is_no_robot() -> None:
 
 @pytest.mark.parametrize("row", LIVENESS.values(), ids=LIVENESS)
 def test_what_heartbeats_show(row: dict[str, Any]) -> None:
-    liveness = Liveness()
+    robot = RobotView(BASE)
+    for level in row.get("link", ()):
+        robot.receive(LINK, Message(LINK.topic(BASE), link(level)), 0.0, 0.0)
+    liveness = robot.liveness
     for at, late_s in row["heartbeats"]:
         liveness.heartbeat(at, late_s)
-    found = [(at, liveness.online(at), liveness.latency_s, liveness.average_latency_s) for at, *_ in row["seen"]]
+    found = [(at, robot.online(at), liveness.latency_s, liveness.average_latency_s) for at, *_ in row["seen"]]
     assert [*chain(*found)] == pytest.approx([*chain(*row["seen"])], abs=1e-6)
 
 
@@ -82,8 +92,9 @@ def test_recorded_heartbeats_show_the_same() -> None:
     steps = (
         f"const rows = {json.dumps([*LIVENESS.values()])};"
         + """
-    result = rows.map(({ heartbeats, seen }) => {
+    result = rows.map(({ link = [], heartbeats, seen }) => {
       const beats = new Heartbeats(), start = 1e12, seconds = (ms) => (ms === null ? null : ms / 1000);
+      for (const level of link) beats.receiveLink(level === null ? undefined : { level });
       for (const [at, late] of heartbeats) beats.receive(start + 1000 * at, { t: start + 1000 * (at - late) });
       return seen.flatMap(([at]) => {
         const { online, latency_ms, average_latency_ms } = beats.view(start + 1000 * at);

@@ -13,7 +13,7 @@ import pytest
 from pebble.client.broker import Broker
 from pebble.client.media_request import request as module
 from pebble.client.media_request.request import MediaRequest
-from tests.web.media.robots import CAMERA, REF, VIDEO, PictureRobot, broker_on, until
+from tests.web.media.robots import CAMERA, REF, VIDEO, PictureRobot, broker_on, status_of, until
 
 pytestmark = pytest.mark.anyio
 
@@ -96,17 +96,18 @@ async def test_it_is_withdrawn_once_there_is_a_broker_again(monkeypatch: pytest.
 
 async def test_nothing_is_asked_of_a_robot_that_waits() -> None:
     one = Requested()
-    one.request.waits = True
+    one.request.take_status(status_of("held"))
+    assert one.request.waits == "Pictures wait for driving"
     await one.broker.open()
     one.request.want(True)
     for _ in range(3):
         await one.step()
     await one.request.request_keyframe("json")
     assert one.robot.published == []
-    one.request.waits = False
+    one.request.take_status(status_of("running"))
     await one.step()
     await until(lambda: one.robot.encodings == ["json"])
-    one.request.waits = True
+    one.request.take_status(status_of("held"))
     await one.request.request_keyframe("json")
     one.request.close()
     await one.request.run(one.step)

@@ -6,9 +6,10 @@ import msgspec
 import pytest
 from msgspec import UNSET
 
-from pebble.client.pace_of_link import WIDE, Pace, link_of, pace_of
+from pebble.client.pace_of_link import WIDE, Pace, pace_of
 from pebble.client.robot_view import RobotView
 from pebble.contract import LINK
+from pebble.contract.levels import link_of
 from pebble.contract.payloads import Drive, LinkLevel, LinkState
 from pebble.transports import QoS
 from tests.client.estop_robot import outgoing

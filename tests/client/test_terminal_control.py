@@ -107,7 +107,7 @@ def test_a_robot_that_does_not_answer_may_be_out_of_this_accounts_reach() -> Non
     cab = KeepingCab()
     cab.keeping.owners[0].receives = False
     cab.ready()
-    cab.run(WIDE.control_answer_s + 1.0)
+    cab.run(WIDE.answer_s + 1.0)
     assert "goob does not answer: may this account drive" in cab.status
     cab.keeping.owners[0].receives = True
     cab.type("t")

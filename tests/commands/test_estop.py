@@ -36,6 +36,8 @@ class LiveRobot:
         self.robot = Robot(self.base, *owners, persisted=persisted, **more)
         self.commands: list[Message] = []
         self.deaf = False
+        self.late_s = 0.0  # by so much what it answers
+        self._late: list[threading.Timer] = []
         self.on_stop: Callable[[], None] = lambda: None
         self._lock = threading.Lock()
         self._transport = create("mqtt", self.id, MqttSettings(host="127.0.0.1", port=port)).open()
@@ -60,6 +62,10 @@ class LiveRobot:
         heartbeat = json.dumps({"t": int(1000 * time.time()), "online": True}).encode()
         self._transport.publish(f"{self.base}/outgoing/online", heartbeat)
 
+    def publish_link(self, level: str) -> None:
+        link = {"level": level, "drive_hz": 4, "rtt_ms": 600, "queue_ms": 0, "t": 1}
+        self.publish(Message(f"{self.base}/outgoing/link", json.dumps(link).encode()))
+
     @property
     def latched(self) -> bool:
         return all(owner.latch.latched for owner in self.robot.owners)
@@ -69,9 +75,11 @@ class LiveRobot:
 
     def close(self) -> None:
         """Leave without a trace."""
+        for answer in self._late:
+            answer.join()
         for owner in self.robot.owners:
             self.publish(Message(owner.state().topic, b""))
-        self.publish(*(Message(f"{self.base}/outgoing/{metric}", b"") for metric in ("capabilities", "status")))
+        self.publish(*(Message(f"{self.base}/outgoing/{metric}", b"") for metric in ("capabilities", "status", "link")))
         self._transport.close()
 
     def _take(self, message: Message) -> None:
@@ -79,8 +87,12 @@ class LiveRobot:
             self.commands.append(message)
             if message.topic.endswith("/estop"):
                 self.on_stop()
-            if not self.deaf:
-                self.publish(*self.robot.take([message]))
+            answers = [] if self.deaf else self.robot.take([message])
+        if not self.late_s:
+            self.publish(*answers)
+            return
+        self._late.append(threading.Timer(self.late_s, self.publish, answers))
+        self._late[-1].start()
 
 
 class Heartbeat:
@@ -408,6 +420,24 @@ def test_a_reset_shows_who_stopped_the_robot_and_frees_it(run: Run, robot_on: Ma
     assert run("estop", "reset", robot.id, url) == 0
     assert run.out == f"{robot.id}: free\n"
     assert robot.count("estop-reset") == 2
+
+
+def test_over_a_thin_link_an_answer_may_take_longer(run: Run, robot_on: Make, url: str) -> None:
+    robot = robot_on("serial")
+    robot.publish_link("thin")
+    robot.late_s = 2.2
+    heartbeat = threading.Timer(robot.late_s, robot.publish_heartbeat)
+    heartbeat.start()
+    assert (run("estop", "status", robot.id, url), run.out) == (0, f"{robot.id}: free\n")
+    heartbeat.join()
+    assert run("estop", robot.id, url) == 0
+    *sent, confirmed = run.out.splitlines()
+    assert f"{robot.id}: stop sent, not confirmed yet: serial has not confirmed" in {
+        one.partition(": it")[0] for one in sent
+    }
+    assert confirmed.startswith(f"{robot.id}: stopped and confirmed after ")
+    assert run("estop", "reset", robot.id, url) == 0
+    assert not robot.latched
 
 
 def test_a_stop_that_was_not_shown_is_not_reset(robot_on: Make, url: str) -> None:

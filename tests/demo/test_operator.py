@@ -17,6 +17,7 @@ from pebble.contract import (
     DRIVE,
     DRIVING,
     ESTOP_STATE,
+    LINK,
     ONLINE,
     codec,
 )
@@ -29,8 +30,9 @@ from pebble.contract.payloads import (
     Driving,
     EstopState,
     Heartbeat,
+    LinkState,
 )
-from pebble.demo.operator import TRAIL, Operator
+from pebble.demo.operator import SCRIPT, TRAIL, Operator
 from pebble.transports import Message, MqttSettings, QoS, Transport, create
 from tests.support import Broker, until
 
@@ -73,6 +75,10 @@ class Robot:
         driven = {base: Driver(by="anna", device="phone", since=1) for base in robots}
         payload = codec.encode(DRIVING, Driving(t=1, robots=driven))
         self.transport.publish(DRIVING.topic("pebble/servers/hall"), payload, qos=QoS.DELIVERED)
+
+    def show_link(self) -> None:
+        link = codec.encode(LINK, LinkState(level="thin", drive_hz=4, rtt_ms=600, queue_ms=0, t=1))
+        self.transport.publish(LINK.topic(BASE), link, retain=True, qos=QoS.DELIVERED)
 
     def show_script(self) -> None:
         status = codec.encode(AUTONOMY_STATUS, AutonomyStatus(running=True, timestamp=1, file=self.scripts[-1] or ""))
@@ -180,3 +186,15 @@ def test_a_robot_with_scripts_draws_its_trail_from_the_first_drive_on(robot: Rob
     robot.show_script()
     assert until(lambda: len(robot.scripts) > 1, 30.0)
     assert robot.scripts[:2] == [TRAIL, None], "it is ended before the emergency stop, which would make it fail"
+
+
+def test_over_a_thin_link_it_drives_at_the_pace_that_the_robot_asks_for(robot: Robot, operator: Operator) -> None:
+    robot.show_link()
+    assert until(lambda: operator.discovery.robots[BASE].link is not None, START_S)
+    operator.begin()
+    assert until(lambda: any(not drive.moves for _, drive in robot.drives), START_S)
+    moving = [drive for _, drive in robot.drives if drive.moves]
+    assert 2 <= len(moving) <= SCRIPT[0].drive_s * 4 + 2
+    assert {(drive.valid_ms, isinstance(drive.t, int), isinstance(drive.key, str)) for drive in moving} == {
+        (750, True, True)
+    }

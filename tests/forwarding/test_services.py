@@ -491,6 +491,19 @@ class TestWrongBroker:
         mirror.run()
         assert self.is_mirrored(mirror)
 
+    @pytest.mark.parametrize(
+        ("profile", "age_s", "asks"), [("wide", 0.4, 1), ("wide", 1.2, 0), ("thin", 6.0, 1), ("thin", 9.0, 0)]
+    )
+    def test_a_heartbeat_from_there_counts_while_its_age_is_no_silence(
+        self, mirror: World, profile: str, age_s: float, asks: int
+    ) -> None:
+        mirror.start(enabled=True, link={"profile": profile})
+        mirror.run()
+        before = len(mirror.local.on("outgoing/bridge-probe"))
+        mirror.remote.publish(ONLINE, heartbeat(age_s))
+        mirror.run(0.5)
+        assert len(mirror.local.on("outgoing/bridge-probe")) - before == asks
+
     def test_without_a_bridge_the_heartbeat_is_anybodys(self, mirror: World) -> None:
         do(mirror, "start")
         mirror.remote.publish(ONLINE, heartbeat(), retain=True)

@@ -8,15 +8,24 @@ import sys
 import numpy as np
 import pytest
 
+from pebble.contract import CAPABILITIES, STATUS, codec
 from pebble.contract.packets import PBAT
+from pebble.contract.payloads import Capabilities
 from pebble.foxglove.media_feed import MAX_WAITING, MAX_WAITING_BYTES, MediaFeed
+from pebble.foxglove.robots import Robots
 from pebble.foxglove.server import MAX_BYTES, ChannelSpec, Server
 from pebble.media.picture_header import MAX_PAYLOAD
 from pebble.media.scene import Scene
 from pebble.media.video import make_encoder
 from pebble.recordings.exports.foxglove_messages import Schemas
+from pebble.transports import Message
 from pebble.transports.memory import MemoryHub
-from tests.web.media.robots import AUDIO, REF, VIDEO, broker_on
+from tests.web.media.robots import AUDIO, REF, VIDEO, PictureRobot, broker_on, status_of, until
+
+
+@pytest.fixture
+def anyio_backend() -> str:
+    return "asyncio"
 
 
 def pictures(count: int, keyframe_interval: int = 10) -> list[bytes]:
@@ -36,6 +45,42 @@ async def _feed(medium: str, payloads: list[bytes]) -> MediaFeed:
     for payload in payloads:
         feed.receive(payload)
     return feed
+
+
+class Watched(Server):
+    """Without a socket: clients have subscribed to all channels; what they are shown is remembered."""
+
+    def __init__(self) -> None:
+        super().__init__("test", lambda _topic, _on: None)
+        self.reported: list[str] = []
+
+    def declared(self, topic: str) -> bool:
+        return True
+
+    def subscribed(self, topic: str) -> bool:
+        return True
+
+    def report(self, text: str) -> None:
+        self.reported.append(text)
+
+
+@pytest.mark.anyio
+async def test_while_a_robot_holds_its_pictures_back_nothing_is_asked_of_it() -> None:
+    robot, server = PictureRobot(), Watched()
+    robot.mute = True
+    broker = broker_on(robot.hub)
+    await broker.open()
+    robots = Robots(broker, server, Schemas())
+    capabilities = Capabilities(t=1, value={"video": VIDEO})
+    robots.receive(Message(STATUS.topic(REF), status_of("held")), 0.0)
+    robots.receive(Message(CAPABILITIES.topic(REF), codec.encode(CAPABILITIES, capabilities)), 0.0)
+    await until(lambda: server.reported)
+    assert (server.reported[0].endswith(": Pictures wait for driving"), robot.published) == (True, [])
+    robots.receive(Message(STATUS.topic(REF), status_of("running")), 0.0)
+    await until(lambda: robot.requests)
+    await robots.close(5.0)
+    await broker.close()
+    robot.close()
 
 
 def feed(medium: str, payloads: list[bytes]) -> MediaFeed:

@@ -9,6 +9,7 @@ from collections.abc import Awaitable, Callable
 from typing import Any, Final
 
 from pebble.client.broker import Broker
+from pebble.client.driveable import is_held
 from pebble.client.media_request.offer import NAMED, WORDS, offered, refusal
 from pebble.client.viewer import Medium, Viewer
 from pebble.errors import PebbleError
@@ -17,6 +18,8 @@ log = logging.getLogger(__name__)
 
 LINGER_S: Final = 5.0  # unwanted, before the request is withdrawn: a page that reloads is back by then
 TICK_S: Final = 0.5
+_PROGRAMS: Final[dict[Medium, str]] = {"video": "camera_publisher", "audio": "audio_publisher"}
+_WAITS: Final[dict[Medium, str]] = {"video": "Pictures wait for driving", "audio": "it waits for driving"}
 _MAX_PENDING, _MAX_PENDING_BYTES = 2000, 16 << 20  # received, and not yet taken by the event loop
 
 
@@ -28,7 +31,7 @@ class MediaRequest:
         self.ref, self.medium = ref, medium
         self.problem = ""  # why it is not requested
         self.encoding: str | None = None  # as requested; None: as configured, or nothing is requested
-        self.waits = False  # the robot knows of it, and sends nothing for now: nothing is repeated
+        self.waits = ""  # why the robot, which knows of it, sends nothing for now: nothing is repeated
         self.requested_at = float("-inf")
         self._broker = broker
         self._inbox = _Inbox(broker, lambda payload: None if self._viewer is None else receive(payload))
@@ -44,6 +47,10 @@ class MediaRequest:
             self._wanted_at = time.monotonic()
         self._wanted = wanted
         self.wake()
+
+    def take_status(self, status: bytes) -> None:
+        """Take what the robot publishes of its programs: it may hold the one that sends this medium."""
+        self.waits = _WAITS[self.medium] if is_held(status, _PROGRAMS[self.medium]) else ""
 
     def wake(self) -> None:
         """Take the next step soon."""

@@ -342,5 +342,5 @@ class TerminalDriver:
             command = msgspec.structs.replace(command, key=key)
         if command.moves:
             qos = self._pace.qos
-            command = self._pace.dated(msgspec.structs.replace(command, valid_ms=self._pace.valid_ms), now, self._key)
+            command = self._pace.dated(command, now, self._key)
         return Message(self.robot.estop.drive_topic, codec.encode(DRIVE, command), qos)

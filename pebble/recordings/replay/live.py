@@ -4,19 +4,19 @@ from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from pebble.contract import CAPABILITIES, HEARTBEAT, ONLINE, OUTGOING, STATUS, codec
+from pebble.contract import CAPABILITIES, HEARTBEAT, LINK, ONLINE, OUTGOING, STATUS, codec
 from pebble.contract.identity import parse_topic
-from pebble.contract.payloads import Heartbeat
+from pebble.contract.levels import level_of, silent_after
+from pebble.contract.payloads import Heartbeat, LinkLevel
 from pebble.errors import PayloadError
 from pebble.recordings.replay.rules import ReplayError
 from pebble.transports import Message, QoS, Transport
 
-LISTEN_S: Final = 2.0  # eight heartbeats of a robot
 RETURN_S: Final = 5.0  # for the first own message
 _TICK_S: Final = 0.05
 _OWN: Final = 4096  # own messages that may still come back
 #: What a robot publishes that is running, wherever its connection leads.
-_SIGNS: Final = (ONLINE, HEARTBEAT, STATUS, CAPABILITIES)
+_SIGNS: Final = (ONLINE, HEARTBEAT, STATUS, CAPABILITIES, LINK)
 _SUFFIXES: Final = tuple(channel.suffix for channel in _SIGNS)
 _HEARTBEATS: Final = (ONLINE.suffix, HEARTBEAT.suffix)
 
@@ -31,7 +31,8 @@ class LiveRobots:
         self._own: OrderedDict[tuple[str, bytes], None] = OrderedDict()
         self._awaited: dict[str, float] = {}  # robots none of whose messages has come back, and since when
         self._returned: set[str] = set()
-        self._quiet_at: float | None = None  # when listening again after an outage is over
+        self._links: dict[str, LinkLevel] = {}  # by topic, as the broker has it of a robot that may be there
+        self._back_at: float | None = None  # since when it listens again after an outage; infinite: not yet
 
     def listen(self, listener: Transport, wait: Callable[[float], None]) -> None:
         """Subscribe, and wait for a sign of life. Raises ReplayError if there is one, or would not be noticed."""
@@ -42,8 +43,8 @@ class LiveRobots:
             raise ReplayError(
                 "the broker refuses to deliver the topics of these robots: a live one would not be noticed"
             )
-        end = self._now() + LISTEN_S
-        while self._now() < end and not self.found:
+        began = self._now()
+        while self._now() - began < self._listen_s and not self.found:
             wait(_TICK_S)
         for subscription in everything:
             subscription.close()
@@ -72,21 +73,26 @@ class LiveRobots:
 
     def lost(self) -> None:
         """A connection is lost: however short the outage is, a robot may have come meanwhile."""
-        self._quiet_at = float("inf")
+        self._back_at = float("inf")
         self._awaited.clear()
 
     def connected(self) -> None:
         """All connections are there for the first time."""
-        self._quiet_at = None
+        self._back_at = None
 
     @property
     def listening(self) -> bool:
         """Whether an outage is so short ago that a robot may have come without being noticed yet."""
-        if self._quiet_at is not None:
-            self._quiet_at = min(self._quiet_at, self._now() + LISTEN_S)
-            if self._now() >= self._quiet_at:
-                self._quiet_at = None
-        return self._quiet_at is not None
+        if self._back_at is not None:
+            self._back_at = min(self._back_at, self._now())
+            if self._now() - self._back_at >= self._listen_s:
+                self._back_at = None
+        return self._back_at is not None
+
+    @property
+    def _listen_s(self) -> float:
+        """A live robot would have been heard by then, as far as the broker has what the robot's link carries."""
+        return max((silent_after(link=one) for one in self._links.values()), default=silent_after())
 
     def _on_any(self, message: Message) -> None:
         if message.retain:
@@ -99,6 +105,8 @@ class LiveRobots:
         if (message.topic, message.payload) in self._own:
             self._returned.add(base_of_topic(message.topic))
             return
+        if message.retain and message.topic.endswith(LINK.suffix):
+            self._links[message.topic] = level_of(message.payload)
         if message.retain or not message.payload or _is_offline(message):
             return
         parsed = parse_topic(message.topic)

@@ -10,7 +10,6 @@ from typing import Any, Final, Generic, TypeVar
 
 from starlette.websockets import WebSocket
 
-from pebble.client.driveable import is_held
 from pebble.client.media_request.request import TICK_S, MediaRequest
 from pebble.client.robot_topics import own_topic
 from pebble.client.viewer import Medium
@@ -23,8 +22,6 @@ from pebble.web.robots import Robots
 log = logging.getLogger(__name__)
 
 _WHAT: Final[dict[Medium, str]] = {"video": "picture", "audio": "sound"}
-_PROGRAMS: Final[dict[Medium, str]] = {"video": "camera_publisher", "audio": "audio_publisher"}
-_WAITS: Final[dict[Medium, str]] = {"video": "Pictures wait for driving", "audio": "it waits for driving"}
 _SILENT_S: Final = 2.0
 _SILENT_PERIODS: Final = 3.0
 _GONE, _BAD_REQUEST = 1001, 4400  # codes of a closed socket
@@ -126,8 +123,7 @@ class MediaStream(ABC, Generic[ViewerT, ViewT]):
             self._end()
 
     async def _step(self) -> None:
-        status = self._robots.value(self.ref, STATUS.metric)
-        self._request.waits = status is not None and is_held(bytes(status), _PROGRAMS[self._request.medium])
+        self._request.take_status(bytes(self._robots.value(self.ref, STATUS.metric) or b""))
         self._report()
         await self._follow()
         self._report()
@@ -158,7 +154,7 @@ class MediaStream(ABC, Generic[ViewerT, ViewT]):
         if self._arrivals.flowing(now):
             return "flowing", self._problem()
         if self._request.waits:
-            return "held", _WAITS[self._request.medium]
+            return "held", self._request.waits
         if not self._broker.connected:
             what = _WHAT[self._request.medium]
             return "silent", f"no connection to the broker for the {what}: {self._broker.problem}"

@@ -104,7 +104,7 @@ def walk(folder: Path, seconds: int = 60) -> Path:
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """The player of this process listens more briefly."""
-    monkeypatch.setattr(live, "LISTEN_S", 0.3)
+    monkeypatch.setattr(live, "silent_after", lambda **_: 0.3)
     monkeypatch.setattr(replayed_robots, "OPEN_S", 1.0)
 
 

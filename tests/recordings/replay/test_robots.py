@@ -65,7 +65,7 @@ class Network:
 
 @pytest.fixture
 def network(monkeypatch: pytest.MonkeyPatch) -> Iterator[Network]:
-    monkeypatch.setattr(live, "LISTEN_S", 0.15)
+    monkeypatch.setattr(live, "silent_after", lambda **_: 0.15)
     monkeypatch.setattr(replayed_robots, "CLEAR_S", 0.5)
     network = Network()
     yield network

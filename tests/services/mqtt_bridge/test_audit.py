@@ -13,7 +13,7 @@ from pebble.contract import AUTONOMY_COMMAND, CONTROL_STATE, CONTROL_TAKE, DRIVE
 from pebble.contract import channels as c
 from pebble.forwarding.routing import Drop
 from pebble.services.mqtt_bridge.acts import Acts
-from pebble.services.mqtt_bridge.audit import LINES_BYTES, chain_files
+from pebble.services.mqtt_bridge.audit import LINES_BYTES, THIN_LINES_BYTES, chain_files
 from pebble.services.mqtt_bridge.audit_rows import ACCOUNTS, OTHERS, ROBOT, WAITING, AuditRows
 from pebble.services.mqtt_bridge.chain_files import ChainFiles
 from tests.services.mqtt_bridge.bridge_rig import BASE, MemoryRig, make_config
@@ -294,6 +294,20 @@ def test_a_bridge_writes_and_answers(monkeypatch: pytest.MonkeyPatch) -> None:
         assert json.loads(answer)["before"] == 3
         assert [one.encode() for one in json.loads(answer)["lines"]] == list(written.lines())[:2]
         assert bridge.status.counts
+    finally:
+        rig.close()
+
+
+@pytest.mark.parametrize(("profile", "most"), [("wide", LINES_BYTES), ("thin", THIN_LINES_BYTES)])
+def test_an_answer_is_as_long_as_its_link_permits(monkeypatch: pytest.MonkeyPatch, profile: str, most: int) -> None:
+    chain_files(make_config())["acts"].append([row(number) for number in range(200)])
+    rig = MemoryRig(monkeypatch)
+    try:
+        rig.bridge(link={"profile": profile})
+        rig.remote.publish("incoming/audit-read", b'{"chain": "acts", "before": 0, "count": 200}')
+        assert until(lambda: rig.remote.payloads("outgoing/audit-lines"))
+        [answer] = rig.remote.payloads("outgoing/audit-lines")
+        assert most / 2 < len(answer) <= most + 100
     finally:
         rig.close()
 

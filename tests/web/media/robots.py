@@ -193,6 +193,11 @@ class SoundRobot(MediaRobot):
         return list(encoder.encode(pcm, int(1000 * time.time())))
 
 
+def status_of(camera: str) -> bytes:
+    """What a robot publishes of the program that sends its pictures."""
+    return json.dumps({"t": 1, "value": {"services": {"camera_publisher": {"state": camera}}}}).encode()
+
+
 def capabilities(section: dict[str, Any], medium: Medium = "video") -> bytes:
     return json.dumps({"t": 1, "schema": "pebble-capabilities/v1", "value": {medium: section}}).encode()
 

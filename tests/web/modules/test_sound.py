@@ -131,6 +131,14 @@ SOUND: Rows = {
     "a key that cannot talk shows why": (
         "connection.may = () => false; await talk(true); result = [shown, sound.talking];",
         [["Not done: Log in as driver to talk"], None]),
+    "over a slow connection no microphone is asked for": (
+        "store.set(REF, 'link', { level: 'narrow' }); await talk(true); result = [shown, questions.length];",
+        [["Not done: The connection of goob is too slow for a voice"], 0]),
+    "a talk that a slow connection ends has its reason beside the button": ("""
+        await talk(true); await answer(); store.set(REF, "link", { level: "thin" });
+        sound.take({ answer: { talk: 1, on: false, why: sound.talkReason() } });
+        result = [sound.talking, sound.problem, sound.talkReason(), heard()];""",
+        [None, "", "The connection of goob is too slow for a voice", 0]),
 }
 # fmt: on
 

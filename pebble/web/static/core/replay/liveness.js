@@ -1,4 +1,4 @@
-/** Whether a component was online, by its recorded heartbeats: the rules of pebble.client.robot_view. Pure. */
+/** Whether people were told that a component is there, by its recorded heartbeats and link: RobotView.online. Pure. */
 
 import { isObject } from "../json.js";
 
@@ -6,6 +6,8 @@ const HISTORY = 10;
 const STAMPS = 5;
 const LEAST_MS = 50; // between two heartbeats
 const LONGEST_MS = 10_000;
+const SILENT_MS = 1500; // a silence of less is none
+const ON_LINK_MS = new Map([["narrow", 3000], ["thin", 5000]]); // nor is one of less there: pebble.contract.levels
 
 export class Heartbeats {
   constructor() {
@@ -19,6 +21,12 @@ export class Heartbeats {
     this.latency = null; // of the newest heartbeat; null if its clock is wrong
     /** @type {number[]} */
     this.stamps = [];
+    this.link = "wide";
+  }
+
+  /** @param {unknown} payload of the metric "link"; undefined: it was removed */
+  receiveLink(payload) {
+    this.link = isObject(payload) ? payload.level : "wide";
   }
 
   /** @param {number} at when it was received @param {unknown} payload of the metric "online" */
@@ -51,7 +59,8 @@ export class Heartbeats {
     if (this.offline) return false;
     const interval = mean(this.intervals);
     if (this.intervals.length < 2 || interval === null) return null;
-    return now - this.receivedAt <= Math.max(2 * interval, 4 * (mean(this.latencies) ?? 0));
+    const silent = Math.max(2 * interval, 4 * (mean(this.latencies) ?? 0), ON_LINK_MS.get(this.link) ?? SILENT_MS);
+    return now - this.receivedAt <= silent;
   }
 }
 

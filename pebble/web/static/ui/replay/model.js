@@ -302,8 +302,9 @@ export class Replay extends Model {
 
   /** @param {import("../../core/replay/frames.js").Frame} frame @param {unknown[]} lines of logs */
   takeValue({ at, metric, payload }, lines) {
+    const value = payload.length ? parsed(payload) : undefined;
+    if (metric === "link") this.heartbeats.receiveLink(value);
     if (!payload.length) return this.store.drop(this.ref, metric); // nothing is retained any more
-    const value = parsed(payload);
     if (value === undefined) return undefined;
     if (metric === "logs") lines.push(value);
     this.store.set(this.ref, metric, value, this.player.position - at);

@@ -164,7 +164,7 @@ export class Sound extends Model {
     if (!this.talking) return;
     this.talking = null;
     this.endedAt = performance.now();
-    if (why) this.problem = why;
+    if (why && why !== this.talkReason()) this.problem = why; // a reason that lasts is beside the button
     this.worker?.postMessage({ op: "end" });
     this.microphone?.release();
     this.adjust();
@@ -249,7 +249,10 @@ export class Sound extends Model {
     if (!this.connection.may("drive")) return "Log in as driver to talk";
     if (!more.microphone.possible) return "Needs https";
     const { ref } = this.route;
-    if (this.store.get(ref, "web/liveness")?.value.online === false) return `${nameIn(this.store, ref)} is silent`;
+    const name = nameIn(this.store, ref);
+    if (this.store.get(ref, "web/liveness")?.value.online === false) return `${name} is silent`;
+    const level = this.store.get(ref, "link")?.value?.level ?? "wide";
+    if (level !== "wide") return `The connection of ${name} is too slow for a voice`; // the server says the same
     const view = this.store.get(ref, "web/sound")?.value;
     if (view?.state === "refused") return view.why;
     return this.talker ? `${this.talker} is talking` : "";

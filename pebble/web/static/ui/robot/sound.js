@@ -14,6 +14,7 @@ export function SoundControls({ at, place = "card" }) {
   useModel(sound);
   const view = useValue(at, "web/sound");
   useValue(at, "web/liveness");
+  useValue(at, "link");
   useValue("", "web/broker");
   const { listening, muted } = sound;
   const noListening = listening ? "" : sound.listenReason();
