@@ -126,7 +126,8 @@ def page(robot: RobotUnderTest) -> Outcome:
     except PebbleError as error:
         return failed(str(error), "pebble doctor CONFIG")
     host = _ANY_HOST.get(settings.host, settings.host)
-    where = f"{'http' if settings.certificate is None else 'https'}://{f'[{host}]' if ':' in host else host}:{settings.port}/"
+    scheme, shown = "http" if settings.certificate is None else "https", f"[{host}]" if ":" in host else host
+    where = f"{scheme}://{shown}:{settings.port}/"
     try:
         status, days = _visit(settings, host)
     except ssl.SSLCertVerificationError as error:

@@ -79,8 +79,8 @@ class Side:
 
     def publish(self, messages: Iterable[Message]) -> bool:
         """Publish all at once; False if one was not accepted."""
-        publish = self.transport.publish
-        return all([publish(one.topic, one.payload, qos=one.qos, urgent=True) for one in messages])
+        accepted = [self.transport.publish(one.topic, one.payload, qos=one.qos, urgent=True) for one in messages]
+        return all(accepted)
 
     def pump(self, each: Each) -> None:
         """Take note of what has arrived, and pass it to ``each``."""

@@ -1,4 +1,4 @@
-"""Checks of the emergency stop, and that retained commands are refused. No wheel turns; the robot is free afterwards."""
+"""Checks of the emergency stop and of retained commands. No wheel turns, and the robot is free afterwards."""
 
 import time
 from contextlib import suppress
