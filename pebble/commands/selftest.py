@@ -60,12 +60,10 @@ def selftest(
 
 
 def _clear(name: str) -> bool:
-    """Whether a person says that the robot may move."""
-    sys.stderr.write(f"{shown(name)} will drive about 3 cm ahead and back, slowly.\n")
-    try:
-        return typer.confirm("Does it stand free, on the floor, with nobody in its way?", err=True)
-    except typer.Abort:
-        return False
+    """Whether a person answers that the robot may move. Standard output is for the result."""
+    typer.echo(f"{shown(name)} will drive about 3 cm ahead and back, slowly.", err=True)
+    typer.echo("Does it stand free, on the floor, with no person in its way? [y/N]: ", nl=False, err=True)
+    return sys.stdin.readline().strip().lower() in ("y", "yes")
 
 
 def _row(name: str, outcome: Outcome, config: str) -> dict[str, str]:

@@ -18,7 +18,7 @@ from pebble.selftest.motion import wheels
 from pebble.selftest.robot import RobotUnderTest, Side
 from pebble.selftest.stops import retained_commands, stop
 
-_BEATS = 10  # heartbeats in a row
+_IN_A_ROW = 10  # heartbeats in a row
 _LONGEST_GAP = 2.5  # times the interval that its config has
 _LEAST_CELL_V = 3.4  # of a lithium cell: below, a robot has minutes
 _SHOWN = 5  # names in one line
@@ -30,8 +30,11 @@ Need = Callable[[RobotUnderTest], str]
 # -- what a check needs: empty, or why it is lacking
 
 
-def own_side(robot: RobotUnderTest) -> str:
-    return "" if robot.own is not None else "its own side is not reached"
+def running(robot: RobotUnderTest) -> str:
+    if robot.own is None:
+        return "its own side is not reached"
+    states = set(_states(robot).values())
+    return "it does not run" if states and states <= {"stopped"} else ""
 
 
 def operators_side(robot: RobotUnderTest) -> str:
@@ -57,8 +60,8 @@ def free(robot: RobotUnderTest) -> str:
 
 def processes(robot: RobotUnderTest) -> Outcome:
     """Whether its own side answers, and each of its processes is ready."""
-    if robot.own is None:
-        return failed(robot.why_own, "sudo systemctl start pebble, or pebble up CONFIG; as the robot's user or root")
+    if why := robot.why_own or running(robot):
+        return failed(why, "sudo systemctl start pebble, or pebble up CONFIG; and test it as the robot's user or root")
     if not robot.wait(lambda: _unready(robot) == [], robot.patience_s):
         return failed(", ".join(_unready(robot)), _LOG)
     return ok(f"{len(_states(robot))} are ready")
@@ -82,34 +85,34 @@ def _unready(robot: RobotUnderTest) -> list[str]:
 
 def heartbeats(robot: RobotUnderTest) -> Outcome:
     """Whether operators see it, without gaps."""
-    side, beat = robot.operators, robot.config.services.mqtt_bridge.heartbeat
+    side, section = robot.operators, robot.config.services.mqtt_bridge.heartbeat
     if side is None:
         why = robot.why_operators
         return failed(why, "pebble doctor CONFIG") if robot.config.services.mqtt_bridge.enabled else skipped(why)
-    if not beat.enabled:
+    if not section.enabled:
         return skipped("services.mqtt_bridge.heartbeat is off")
 
     def longest() -> float:
         link = side.view.liveness.link
-        interval_s = max(beat.interval_seconds, LEVELS[link].heartbeat_s)
+        interval_s = max(section.interval_seconds, LEVELS[link].heartbeat_s)
         late_s = side.view.liveness.average_latency_s or 0.0
         return max(silent_after(interval_s, link, late_s), _LONGEST_GAP * interval_s)
 
-    if not robot.wait(lambda: _gap(side) <= longest(), 3 * _BEATS * longest()):
-        if not side.heartbeats:
-            return failed("none arrives", "pebble doctor CONFIG")
+    if not robot.wait(lambda: side.heartbeats, robot.patience_s):
+        return failed("none arrives", "pebble doctor CONFIG")
+    if not robot.wait(lambda: _gap(side) <= longest(), 3 * _IN_A_ROW * longest()):
         return failed(f"gaps of {_gap(side):.1f} s, where {longest():.1f} s is the longest", "pebble doctor CONFIG")
     late = side.view.liveness.average_latency_s
     shown = "" if late is None else f", {1000 * late:.0f} ms on the way"
-    return ok(f"{_BEATS} in a row, the longest gap {_gap(side):.2f} s{shown}")
+    return ok(f"{_IN_A_ROW} in a row, the longest gap {_gap(side):.2f} s{shown}")
 
 
 def _gap(side: Side) -> float:
     """The longest one between the newest heartbeats; infinite until there are enough."""
-    newest = list(side.heartbeats)[-_BEATS:]
+    newest = list(side.heartbeats)[-_IN_A_ROW:]
     return (
         max((after - before for before, after in pairwise(newest)), default=0.0)
-        if len(newest) == _BEATS
+        if len(newest) == _IN_A_ROW
         else float("inf")
     )
 
@@ -117,7 +120,7 @@ def _gap(side: Side) -> float:
 def capabilities(robot: RobotUnderTest) -> Outcome:
     """Whether it offers, on both sides, what its config has."""
     wanted = set(_available(expected_capabilities(robot.config, Addresses(robot.config))))
-    lacking = {}
+    lacking: dict[str, str] = {}
     for side in robot.sides:
         where = "" if side.own else " to operators"
         if not side.view.estop.has_capabilities:
@@ -210,7 +213,7 @@ class Check:
     needs: tuple[Need, ...] = ()
 
 
-_BOTH = (own_side, operators_side)
+_BOTH = (running, operators_side)
 CHECKS = (
     Check("unit", machine.unit),
     Check("slot", machine.slot),
@@ -218,18 +221,18 @@ CHECKS = (
     Check("disk", machine.disk),
     Check("processes", processes),
     Check("heartbeats", heartbeats),
-    Check("capabilities", capabilities, (own_side,)),
-    Check("boards", boards, (own_side,)),
-    Check("battery", battery, (own_side, motors)),
-    Check("leftovers", leftovers, (own_side,)),
+    Check("capabilities", capabilities, (running,)),
+    Check("boards", boards, (running,)),
+    Check("battery", battery, (running, motors)),
+    Check("leftovers", leftovers, (running,)),
     Check("page", machine.page),
     Check("picture", picture, _BOTH),
     Check("sound", sound, _BOTH),
     Check("retained commands", retained_commands, (*_BOTH, motors, free)),
-    Check("stop", stop, (own_side, motors, free)),
+    Check("stop", stop, (running, motors, free)),
 )
 #: What turns wheels: only where a person has agreed.
-MOVING = (Check("wheels", wheels, (own_side, motors, free)),)
+MOVING = (Check("wheels", wheels, (running, motors, free)),)
 
 
 def run(robot: RobotUnderTest, checks: Iterable[Check]) -> Iterator[tuple[Check, Outcome]]:

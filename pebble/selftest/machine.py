@@ -149,16 +149,22 @@ _RENEW = "pebble cert renew, then restart the robot"
 def _visit(settings: WebSettings, host: str) -> tuple[int, float | None]:
     """The status of ``/``, and the days that are left of the certificate. Raises OSError, HTTPException."""
     connection = http.client.HTTPConnection(host, settings.port, timeout=_PAGE_S)
-    if settings.certificate is not None:
-        context = ssl.create_default_context(cafile=str(settings.certificate))
-        context.check_hostname = False  # it is asked at an address of this machine
-        context.verify_flags |= ssl.VERIFY_X509_PARTIAL_CHAIN  # just this certificate is trusted, whoever signed it
-        plain = socket.create_connection((host, settings.port), _PAGE_S)
-        connection.sock = context.wrap_socket(plain)
+    until: object = None
     try:
-        until = connection.sock.getpeercert().get("notAfter") if settings.certificate is not None else None
+        if settings.certificate is not None:
+            plain = socket.create_connection((host, settings.port), _PAGE_S)
+            connection.sock = encrypted = _trusting(settings.certificate).wrap_socket(plain)
+            until = (encrypted.getpeercert() or {}).get("notAfter")
         connection.request("GET", "/")
         status = connection.getresponse().status
     finally:
         connection.close()
     return status, None if until is None else (ssl.cert_time_to_seconds(str(until)) - time.time()) / 86_400
+
+
+def _trusting(certificate: Path) -> ssl.SSLContext:
+    """Trusts just this certificate, whoever signed it, and at any name: it is asked at an address of this machine."""
+    context = ssl.create_default_context(cafile=str(certificate))
+    context.check_hostname = False
+    context.verify_flags |= ssl.VERIFY_X509_PARTIAL_CHAIN
+    return context

@@ -115,7 +115,7 @@ def _index(report: Report, known: Secrets) -> str:
 
 
 def _config(here: Here) -> str:
-    """As written and as it is meant, with stars where there are secrets."""
+    """The config as written and as it is meant, with stars where there are secrets."""
     written = masked(plain(decode(read_text(here.file), here.file.name), Notes()))
     whole: dict[str, Any] = {"file": str(here.file), "written": written}
     whole |= {"problems": here.problem.splitlines()} if here.config is None else {"resolved": resolved(here.config)}

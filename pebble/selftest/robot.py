@@ -23,6 +23,7 @@ from pebble.runtime.addresses import Addresses
 from pebble.setup.places import Places
 from pebble.transports import Message, QoS, Transport
 
+PATIENCE_S, RESTS_S = 3.0, 0.75
 _STEP_S = 0.005
 _WAITING = 20_000  # messages that have arrived and are not read yet: 50 samples of the wheels a second, and states
 _STAMPS = 400  # newest heartbeats, and samples of the wheels
@@ -129,8 +130,8 @@ class RobotUnderTest:
     config: Config
     places: Places
     by: str  # who tests it, for stops and control: ann@goob
-    patience_s: float = 3.0  # for a picture, a sound, and other answers
-    rests_s: float = 0.75  # so long after the last command wheels may turn
+    patience_s: float  # for a picture, a sound, and other answers
+    rests_s: float  # so long after the last command wheels may turn
     own: Side | None = None
     operators: Side | None = None
     why_own: str = ""
@@ -173,9 +174,11 @@ def _ignore(_side: Side, _message: Message, _at: float) -> None:
 
 
 @contextmanager
-def reached(config: Config, places: Places, by: str) -> Iterator[RobotUnderTest]:
+def reached(
+    config: Config, places: Places, by: str, *, patience_s: float = PATIENCE_S, rests_s: float = RESTS_S
+) -> Iterator[RobotUnderTest]:
     """Connect to both sides of a robot, as far as that is possible, until the block ends."""
-    robot = RobotUnderTest(config=config, places=places, by=by)
+    robot = RobotUnderTest(config=config, places=places, by=by, patience_s=patience_s, rests_s=rests_s)
     with ExitStack() as stack:
 
         def connect(target: Target, *, own: bool) -> tuple[Side | None, str]:

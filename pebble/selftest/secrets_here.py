@@ -61,7 +61,8 @@ class Secrets(NamedTuple):
 
 def secrets_of(places: Places, config: Config | None, more: Collection[Path] = ()) -> Secrets:
     """What is known on this machine. ``more``: further files and folders that may hold some."""
-    found, unread = list(_of_config(config)), []
+    found = list(_of_config(config))
+    unread: list[str] = []
     folders = [path for pattern in _PLACES for path in sorted(places.root.glob(pattern))]
     if config is not None:
         folders += [config.folder, config.state_dir(), *_files_of(config)]

@@ -83,7 +83,7 @@ def retained_commands(robot: RobotUnderTest) -> Outcome:
     if state.reset_refused is not None:
         return skipped("it refused a reset before, which looks the same", "run it again")
     topic, answers = ESTOP_RESET.topic(robot.config.base), ESTOP_STATE.topic(robot.config.base, owner=owner)
-    parked = codec.encode(ESTOP_RESET, EstopReset(boot=_NO_BOOT, count=0, by=_WHY))
+    old = codec.encode(ESTOP_RESET, EstopReset(boot=_NO_BOOT, count=0, by=_WHY))
     live = EstopReset(boot=state.boot, count=state.count + _NO_COUNT, by=_WHY)
     seen = set[str | None]()
 
@@ -94,7 +94,7 @@ def retained_commands(robot: RobotUnderTest) -> Outcome:
 
     with connected(operators.target) as (beside, _):  # it puts no name into the topic: nothing with one is retained
         try:
-            beside.publish(topic, parked, qos=QoS.DELIVERED, retain=True, remember=False)
+            beside.publish(topic, old, qos=QoS.DELIVERED, retain=True, remember=False)
             robot.wait(lambda: beside.outgoing.waiting == 0, robot.patience_s, note)
             operators.publish([message(ESTOP_RESET, topic, live)])
             robot.wait(lambda: "count" in seen, robot.patience_s, note)
@@ -104,5 +104,5 @@ def retained_commands(robot: RobotUnderTest) -> Outcome:
     if "boot" in seen:
         return failed("it read a retained command as if it were sent now", "pebble doctor CONFIG")
     if "count" not in seen:
-        return skipped("nor does it answer a live one of this account")
+        return skipped("a live one of this account is not answered either")
     return ok("it ignores them")
