@@ -92,8 +92,8 @@ def make(places: Places) -> Backup:
     for file in dict.fromkeys(_files(places, config)):
         _add(backup, places.root, file)
     for what, folder in _left_out(config):
-        if folder.exists():
-            backup.left_out[str(folder)] = what
+        if (place := _here(places, folder)).exists():
+            backup.left_out[str(place)] = what
     if backup.bytes > _MOST:
         raise BackupError(f"it would have {backup.bytes / 1e9:.1f} GB: is there something below {places.state}?")
     return backup
@@ -101,19 +101,24 @@ def make(places: Places) -> Backup:
 
 def _files(places: Places, config: Config) -> Iterator[Path]:
     """What the robot cannot be made from again. A file that another one names may be anywhere."""
-    recordings = {folder.absolute() for _, folder in _left_out(config)}
-    for folder in (places.etc, places.state, config.state_dir()):
-        yield from _below(folder, recordings)
-    yield people_of(config)
-    named = [places.broker, *_of_config(config)]
+    without = [_here(places, folder) for _, folder in _left_out(config)]
+    for folder in (places.etc, places.state, _here(places, config.state_dir())):
+        yield from _below(folder, without)
+    named = [places.broker, people_of(config), *_of_config(config)]
     if places.broker.is_file():
         named += map(Path, _BROKER_FILES.findall(places.broker.read_text(errors="replace")))
     for path in named:
-        file = path if path.is_relative_to(places.root) else places.root / path.relative_to("/")
+        file = _here(places, path)
         if (file.parent / FLEET).is_file():  # the accounts of a broker are one folder, with the authority's key
-            yield from _below(file.parent, recordings)
+            yield from _below(file.parent, without)
         if file.is_file():
             yield file
+
+
+def _here(places: Places, path: Path) -> Path:
+    """Where a path of the robot is below the root."""
+    path = path.absolute()
+    return path if path.is_relative_to(places.root) else places.root / path.relative_to("/")
 
 
 def _left_out(config: Config) -> Iterator[tuple[str, Path]]:
@@ -134,7 +139,7 @@ def _below(folder: Path, without: Iterable[Path]) -> Iterator[Path]:
 def _of_config(value: object) -> Iterator[Path]:
     """The files that a config names, such as certificates."""
     if isinstance(value, Path):
-        yield value.absolute()
+        yield value
     elif isinstance(value, Section):
         for one in fields(value):
             yield from _of_config(getattr(value, one.name))
@@ -212,7 +217,8 @@ def unpacked(raw: bytes, name: str) -> Backup:
             members = iter(tar)
             backup = Backup(_about(tar, next(members, None), name))
             for member in members:
-                backup.files[_path(member, backup, name)] = Saved(_content(tar, member), member.mode & 0o777)
+                path = _path(member, backup, name)
+                backup.files[path] = Saved(_content(tar, member), member.mode & 0o777)
             rest = raw[tar.offset :]
             if len(rest) < _END or rest.strip(b"\0"):  # tarfile takes a damaged header for the end
                 raise EOFError("its end is missing")

@@ -7,6 +7,7 @@ import json
 import os
 import re
 from collections.abc import Collection, Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import quote
@@ -90,11 +91,8 @@ def values_in(name: str, raw: bytes) -> Iterator[str]:
     for body in keys:
         yield from (line.strip() for line in body.splitlines() if len(line.strip()) >= _KEY_LINE)
     yield from (*_login(text), *_assigned(text))
-    if text.lstrip().startswith(("{", "[")):
-        try:
-            yield from _in_json(json.loads(text))
-        except (ValueError, RecursionError):
-            return
+    with suppress(ValueError, RecursionError):  # most are no JSON
+        yield from _in_json(json.loads(text))
         return
     is_named = _named(name) is not None and not keys and "-----BEGIN" not in text
     for line in filter(None, map(str.strip, text.splitlines())):

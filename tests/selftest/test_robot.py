@@ -48,7 +48,7 @@ def rig(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
         command = [sys.executable, "-m", "pebble.cli", "web", "user", "add", "ann", "--config", str(one.config)]
         with people.open() as password:
             subprocess.run(command, cwd=ROOT, stdin=password, check=True, capture_output=True)
-        one.start()
+        one.wait_until_up(one.start(ready=False), 60)  # the page takes its time on a busy machine
         yield one
 
 
