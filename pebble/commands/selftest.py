@@ -50,6 +50,8 @@ def selftest(
             found.append(_row(check.name, outcome, str(config)))
             if not as_json:
                 _print(found[-1])
+        if dropped := sum(side.dropped for side in robot.sides):
+            typer.echo(f"pebble: warning: {dropped} messages came too fast to be read", err=True)
     states = [row["state"] for row in found]
     failures = states.count(State.FAILED)
     if as_json:

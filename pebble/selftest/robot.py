@@ -55,6 +55,7 @@ class Side:
         self.status: dict[str, object] | None = None  # the newest status' value
         self.heartbeats: deque[float] = deque(maxlen=_STAMPS)  # when live ones arrived (monotonic)
         self.touches: deque[Touch] = deque(maxlen=_STAMPS)
+        self.dropped = 0  # messages that came faster than they were read
         self.others: dict[str, set[str]] = {}  # retained topics by the base of another robot
         self.live: set[str] = set()  # other robots that send heartbeats
         self._addresses = Addresses(config)
@@ -91,6 +92,7 @@ class Side:
             each(self, message, at)
 
     def _take(self, message: Message) -> None:
+        self.dropped += len(self._arrived) == _WAITING
         self._arrived.append((message, time.monotonic(), time.time()))
 
     def _note(self, message: Message, at: float, wall: float) -> None:

@@ -58,7 +58,7 @@ def _ended(robot: RobotUnderTest, name: str, before: dict[str, list[str]]) -> st
         return ""
     for owner, state in view.estop.latched.items():
         if state.recent[:1] != [name] or state.recent[1:] != before.get(owner, [])[: len(state.recent) - 1]:
-            return f"somebody else stopped it meanwhile: it stays stopped ({state.by or 'unknown'}: {state.why})"
+            return f"it was stopped by another one meanwhile, and stays so ({state.by or 'unknown'}: {state.why})"
     reset = Reset(view.estop, robot.by)
     if not robot.inside.publish(reset.messages()):
         return "the end of the stop was not sent: it stays stopped"

@@ -123,7 +123,7 @@ def test_the_command(places: Places, tmp_path: Path, run: Run) -> None:
 
 
 def test_others_cannot_read_it_from_its_first_byte_on(places: Places, tmp_path: Path) -> None:
-    """Of each call that creates the file, as the kernel sees it."""
+    """The call that makes the file makes it so."""
     file, log = tmp_path / "goob.tar", tmp_path / "calls"
     command = [sys.executable, "-m", "pebble.cli", "backup", str(file), "--root", str(places.root)]
     audit = (

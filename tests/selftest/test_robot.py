@@ -106,8 +106,7 @@ def test_a_person_who_agrees_sees_the_wheels_turn(rig: Rig) -> None:
     times = [at for at, wheels in rig.mcu.drives(began) if wheels != STOP]
     assert times[-1] - times[0] < 20
     assert rig.mcu.drives(began)[-1][1] == STOP
-    control = lambda: rig.operator.last("outgoing/control/serial")  # noqa: E731
-    assert until(lambda: control().json["key"] == "")  # type: ignore[union-attr]
+    assert until(lambda: rig.operator.last("outgoing/control/serial").json["key"] == "")  # type: ignore[union-attr]
 
 
 def test_without_an_answer_nothing_is_tested(rig: Rig) -> None:
@@ -139,7 +138,7 @@ def test_what_a_person_has_is_not_taken(rig: Rig) -> None:
     assert moved(rig, began) == set()
 
 
-def test_a_stop_of_somebody_else_meanwhile_stays(rig: Rig) -> None:
+def test_a_stop_of_another_person_meanwhile_stays(rig: Rig) -> None:
     """It comes as soon as the test's is seen: before that is ended, or after."""
     began = time.monotonic()
 
@@ -184,7 +183,7 @@ def test_a_pulled_board_is_named_and_the_exit_code_is_1(rig: Rig) -> None:
     assert until(lambda: found(rig, only("boards"))["boards"][0] == "ok", 30)
 
 
-def test_a_robot_that_is_off_says_how_it_is_started(rig: Rig) -> None:
+def test_how_a_robot_that_is_off_is_started(rig: Rig) -> None:
     rig.stop()  # the last test of this rig
     code, checks = command(rig)
     assert code == 1
