@@ -18,7 +18,7 @@ def backup(file: TarArgument, root: RootOption = Path("/")) -> int:
     run meanwhile. Recordings are not in it.
 
     \b
-        sudo pebble backup goob.tar
+        pebble backup goob.tar
     """
     from pebble.selftest import backup as backups  # of Linux only
     from pebble.selftest.new_file import write_new

@@ -21,7 +21,7 @@ def report(file: ZipArgument, config: OtherConfig = None, root: RootOption = Pat
     found, nothing is written. Run it as root: it searches only for what it may read.
 
     \b
-        sudo pebble report goob.zip
+        pebble report goob.zip
         pebble report goob.zip goob.json
     """
     from pebble.selftest.new_file import write_new  # of Linux only
