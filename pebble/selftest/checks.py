@@ -20,6 +20,7 @@ from pebble.selftest.stops import retained_commands, stop
 
 _IN_A_ROW = 10  # heartbeats in a row
 _LONGEST_GAP = 2.5  # times the interval that its config has
+_JUDGED_S = 6.0  # motor owners repeat every 5 s what the others must receive of them
 _LEAST_CELL_V = 3.4  # of a lithium cell: below, a robot has minutes
 _SHOWN = 5  # names in one line
 _LOG = "journalctl -u pebble -n 50"
@@ -148,11 +149,11 @@ def boards(robot: RobotUnderTest) -> Outcome:
     if not lines:
         return skipped("it has no serial line")
 
-    def known() -> bool:
-        drives = robot.view.driveable
-        return all(_mcu(robot, name).get("state") == "ready" for name in lines) and (not drives or not drives.doubt)
+    def ready() -> bool:
+        return all(_mcu(robot, name).get("state") == "ready" for name in lines)
 
-    robot.wait(known, robot.patience_s)
+    robot.wait(ready, robot.patience_s)
+    robot.wait(lambda: robot.view.driveable is None or robot.view.driveable.state != "unknown", _JUDGED_S * ready())
     for name, port in lines.items():
         mcu = _mcu(robot, name)
         if mcu.get("state") != "ready":
@@ -242,5 +243,5 @@ def run(robot: RobotUnderTest, checks: Iterable[Check]) -> Iterator[tuple[Check,
         why = next((why for need in check.needs if (why := need(robot))), "")
         try:
             yield check, skipped(why) if why else check.run(robot)
-        except PebbleError as error:  # a connection was lost
+        except (PebbleError, OSError) as error:  # a connection was lost
             yield check, failed(str(error), "run it again")

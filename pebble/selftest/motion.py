@@ -58,7 +58,7 @@ def _drive(robot: RobotUnderTest, side: Side, control: ControlClient, speed: flo
             return skipped(f"{robot.view.control.who or 'another one'} took control")
         sent_at = time.monotonic()
         side.publish([_command(side, control, Drive(z=speed, valid_ms=side.view.pace.valid_ms))])
-        _hold(robot, side, control, _STEP_S)
+        _hold(robot, side, control, max(_STEP_S, side.view.pace.step_s))
     _hold(robot, side, control, robot.rests_s + _LOOKS_S)
     samples = [one for one in robot.inside.touches if one.at >= began - _STEP_S]
     if not samples:

@@ -82,8 +82,9 @@ def make(places: Places, file: Path | None = None) -> Report:
     for name, part in PARTS.items():
         try:
             report.parts[name] = without_secrets(part(here))[:_LONGEST_PART]
-        except (PebbleError, OSError, subprocess.SubprocessError) as error:
-            report.missing[name] = without_secrets(" ".join(str(error).split()))
+        except Exception as error:  # noqa: BLE001 - what is broken is why there is a report: the rest is in it
+            kind = "" if isinstance(error, PebbleError) else f"{type(error).__name__}: "
+            report.missing[name] = without_secrets(kind + " ".join(str(error).split()))
     known = secrets_of(places, here.config, [here.file])
     report.unread = known.unread
     report.parts = {"index.txt": _index(report, known), **report.parts}

@@ -61,9 +61,9 @@ class Side:
         self._addresses = Addresses(config)
         self._arrived: deque[tuple[Message, float, float]] = deque(maxlen=_WAITING)
         put_names(transport, names, lambda base: base == config.base and self.view.named)
-        watched = (*_WATCHED, c.TOUCH_SENSORS) if own else _WATCHED
-        filters = {self._addresses[channel].topic for channel in watched}
-        if self.is_here(config):
+        filters = {self._addresses[channel].topic for channel in (*_WATCHED, *((c.TOUCH_SENSORS,) if own else ()))}
+        if self.is_here(config):  # each message comes once: of filters that overlap, only the wider ones
+            filters -= {channel.filter(config.base) for channel in _STATES}
             filters |= {channel.filter(_ANY) for channel in _STATES}
         for filter_ in sorted(filters):
             transport.subscribe(filter_, self._take, direct=True)

@@ -30,7 +30,9 @@ _PLACES = (
     *("etc/default/pebble*", "etc/systemd/system/pebble*", "etc/ssh/*_key"),
     *("etc/NetworkManager/system-connections", "etc/wpa_supplicant/*.conf", "etc/netplan"),
 )
-_NOT = ("_file", "_env", "key-mgmt", "key_mgmt")  # at the end of a key: it names no secret itself
+_NOT = ("_file", "-file", "_env", "key-mgmt", "key_mgmt")  # at the end of a key: it names no secret itself
+_SOURCES = (".py", ".sh", ".js", ".html", ".md")  # programs have "password=" in them, and no password
+_WORDS = ("true", "false", "none", "null")
 _named = re.compile(r"passw|secret|token|credential|psk|\.key$|_key$", re.IGNORECASE).search
 _setting = re.compile(r'^\s*"?([\w.-]{1,60})"?\s*[=: ]\s*"?([^"#\n]{1,512}?)"?\s*,?\s*$').match
 _assigned = re.compile(r"[\w-]*(?:pass|secret|token|pwd)[\w-]*=[\"']?([^\s\"'&]+)", re.IGNORECASE).findall
@@ -90,7 +92,10 @@ def values_in(name: str, raw: bytes) -> Iterator[str]:
     keys = _key(text)
     for body in keys:
         yield from (line.strip() for line in body.splitlines() if len(line.strip()) >= _KEY_LINE)
-    yield from (*_login(text), *_assigned(text))
+    yield from _login(text)
+    if name.endswith(_SOURCES):
+        return
+    yield from (value for value in _assigned(text) if value.lower() not in _WORDS)
     with suppress(ValueError, RecursionError):  # most are no JSON
         yield from _in_json(json.loads(text))
         return
@@ -100,7 +105,7 @@ def values_in(name: str, raw: bytes) -> Iterator[str]:
             continue
         if is_named:
             yield from _in_line(line)
-        elif (pair := _setting(line)) and _is_key(pair[1]):
+        elif (pair := _setting(line)) and _is_key(pair[1]) and pair[2].lower() not in _WORDS:
             yield pair[2].strip()
 
 

@@ -169,7 +169,8 @@ VALUES = [
         "-----BEGIN EC PRIVATE KEY-----\nMHcCAQEEIMHcCAQEEI\nAB==\n-----END EC PRIVATE KEY-----\n",
         ["MHcCAQEEIMHcCAQEEI"],
     ),
-    ("robot.txt", "an ordinary text: nothing\n", []),
+    ("robot.txt", "an ordinary text: nothing\npassword: none\n", []),
+    ("run.py", "connect(user, password=None, token=token)\n", []),
 ]
 
 

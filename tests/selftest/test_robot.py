@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
+import signal
 import subprocess
 import sys
 import threading
@@ -20,6 +21,7 @@ from pebble.fleet import certificates
 from pebble.selftest.checks import CHECKS, MOVING, Check, run
 from pebble.selftest.robot import reached
 from pebble.setup.places import Places
+from tests.commands.command_line import running
 from tests.robot.named import Hall, Named
 from tests.robot.operator import Operator, retained_messages
 from tests.robot.rig import BASE, DEVICES, STOP, Rig
@@ -109,6 +111,21 @@ def test_a_person_who_agrees_sees_the_wheels_turn(rig: Rig) -> None:
     assert until(lambda: rig.operator.last("outgoing/control/serial").json["key"] == "")  # type: ignore[union-attr]
 
 
+def test_one_that_is_ended_while_wheels_turn_sends_a_zero_and_gives_control_back(rig: Rig) -> None:
+    began = time.monotonic()
+    with running("selftest", rig.config, "--may-move", stdin=subprocess.PIPE) as process:
+        assert process.stdin is not None
+        process.stdin.write("y\n")
+        process.stdin.flush()
+        assert until(lambda: moved(rig, began), 90)
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(30) != 0
+    assert until(lambda: rig.operator.on("incoming/drive-values", began)[-1].json.get("valid_ms") == 0)
+    assert until(lambda: rig.operator.last("outgoing/control/serial").json["key"] == "")  # type: ignore[union-attr]
+    assert until(lambda: not rig.mcu.turning())
+    assert not state(rig)["latched"]
+
+
 def test_without_an_answer_nothing_is_tested(rig: Rig) -> None:
     began = time.monotonic()
     for typed in ("n\n", ""):
@@ -196,7 +213,8 @@ def test_how_a_robot_that_is_off_is_started(rig: Rig) -> None:
 @pytest.mark.parametrize(("kind", "level"), [("mqtt", "named"), further("zenoh", "named"), ("zenoh", "login")])
 def test_at_every_level(kind: str, level: Any, tmp_path: Path) -> None:
     hall = Hall(tmp_path / "hall", level)
-    with hall, Named(kind, hall, {"level": level}, av_daemon=DEVICES) as rig:
+    with hall, Named(kind, hall, {"level": level}, av_daemon=DEVICES, start=False) as rig:
+        rig.wait_until_up(rig.start(ready=False), 60)
         began = time.monotonic()
         checks = found(rig, (*CHECKS, *MOVING))
         states = {name: one[0] for name, one in checks.items()}
