@@ -1,6 +1,7 @@
 """``pebble selftest``: tests a robot that runs, end to end."""
 
 import json
+import shlex
 import sys
 import textwrap
 from pathlib import Path
@@ -70,7 +71,9 @@ def _clear(name: str) -> bool:
 
 def _row(name: str, outcome: Outcome, config: str) -> dict[str, str]:
     """One check for JSON: texts come from the robot, and fixes name this config."""
-    text, fix = (shown(without_secrets(one)) for one in (outcome.text, outcome.fix.replace("CONFIG", config)))
+    text, fix = (
+        shown(without_secrets(one)) for one in (outcome.text, outcome.fix.replace("CONFIG", shlex.quote(config)))
+    )
     return {"name": name, "state": outcome.state.value, "text": text, "fix": fix}
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import shlex
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
@@ -44,6 +46,11 @@ def operators_side(robot: RobotUnderTest) -> str:
 
 def motors(robot: RobotUnderTest) -> str:
     return "" if robot.config.motor_lines() else "it has no motors"
+
+
+def account(robot: RobotUnderTest) -> str:
+    nameless = robot.operators is not None and robot.view.named and not robot.operators.account
+    return "at level named it needs an account: services.mqtt_bridge.remote_mqtt.username" if nameless else ""
 
 
 def free(robot: RobotUnderTest) -> str:
@@ -111,11 +118,9 @@ def heartbeats(robot: RobotUnderTest) -> Outcome:
 def _gap(side: Side) -> float:
     """The longest one between the newest heartbeats; infinite until there are enough."""
     newest = list(side.heartbeats)[-_IN_A_ROW:]
-    return (
-        max((after - before for before, after in pairwise(newest)), default=0.0)
-        if len(newest) == _IN_A_ROW
-        else float("inf")
-    )
+    if len(newest) < _IN_A_ROW:
+        return math.inf
+    return max(after - before for before, after in pairwise(newest))
 
 
 def capabilities(robot: RobotUnderTest) -> Outcome:
@@ -179,9 +184,9 @@ def _mcu(robot: RobotUnderTest, name: str) -> dict[str, object]:
 
 def battery(robot: RobotUnderTest) -> Outcome:
     """Its voltage, and whether that is too low where its config has the number of cells."""
-    if not robot.wait(lambda: robot.view.volts is not None, 0.0) or robot.view.volts is None:
-        return skipped("it reports no voltage")
     volts, cells = robot.view.volts, robot.config.robot.battery_cells
+    if volts is None:
+        return skipped("it reports no voltage")
     charging = ", on the charger" if robot.view.charging else ""
     if cells and volts / cells < _LEAST_CELL_V and not robot.view.charging:
         return failed(f"{volts:.2f} V, {volts / cells:.2f} V a cell: it is nearly empty", "charge it")
@@ -198,7 +203,7 @@ def leftovers(robot: RobotUnderTest) -> Outcome:
         if gone:
             names = ", ".join(id_of(base) for base in gone[:_SHOWN])
             remote = "" if side.own else " --remote"
-            topic = min(side.others[gone[0]])
+            topic = shlex.quote(min(side.others[gone[0]]))  # anybody may have chosen it
             fix = f"if they are gone: pebble topic pub {topic} '' --retain --force -c CONFIG{remote}, and so on"
             return failed(f"{len(gone)} that send no heartbeat: {names}", fix)
     others = len({base for side in here for base in side.others})
@@ -227,13 +232,13 @@ CHECKS = (
     Check("battery", battery, (running, motors)),
     Check("leftovers", leftovers, (running,)),
     Check("page", machine.page),
-    Check("picture", picture, _BOTH),
-    Check("sound", sound, _BOTH),
-    Check("retained commands", retained_commands, (*_BOTH, motors, free)),
+    Check("picture", picture, (*_BOTH, account)),
+    Check("sound", sound, (*_BOTH, account)),
+    Check("retained commands", retained_commands, (*_BOTH, account, motors, free)),
     Check("stop", stop, (running, motors, free)),
 )
 #: What turns wheels: only where a person has agreed.
-MOVING = (Check("wheels", wheels, (running, motors, free)),)
+MOVING = (Check("wheels", wheels, (running, account, motors, free)),)
 
 
 def run(robot: RobotUnderTest, checks: Iterable[Check]) -> Iterator[tuple[Check, Outcome]]:

@@ -175,10 +175,13 @@ def test_a_stop_of_another_person_meanwhile_stays(rig: Rig) -> None:
 
 
 def test_what_an_old_id_has_left_is_named_with_what_removes_it(rig: Rig) -> None:
-    with closing(Operator(rig.remote.port, "pebble/robots/oldname")) as old:
+    hostile = "old; echo `id` 'name"
+    with closing(Operator(rig.remote.port, f"pebble/robots/{hostile}")) as old:
         old.send("outgoing/capabilities", {"t": 1, "value": {}}, retain=True)
         assert until(lambda: old.on("outgoing/capabilities"))
-    assert until(lambda: found(rig, only("leftovers"))["leftovers"] == ("failed", "1 that send no heartbeat: oldname"))
+    assert until(
+        lambda: found(rig, only("leftovers"))["leftovers"] == ("failed", f"1 that send no heartbeat: {hostile}")
+    )
     code, checks = command(rig)
     assert code == 1
     fix = checks["leftovers"]["fix"].partition("pebble ")[2].partition(", and so on")[0]
