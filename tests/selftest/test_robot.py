@@ -25,6 +25,7 @@ from tests.commands.command_line import running
 from tests.robot.named import Hall, Named
 from tests.robot.operator import Operator, retained_messages
 from tests.robot.rig import BASE, DEVICES, STOP, Rig
+from tests.robot.test_driveable import shows
 from tests.support import ROOT, beside, free_port, further, until
 
 pytestmark = pytest.mark.alone  # whole robots
@@ -50,8 +51,14 @@ def rig(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
         command = [sys.executable, "-m", "pebble.cli", "web", "user", "add", "ann", "--config", str(one.config)]
         with people.open() as password:
             subprocess.run(command, cwd=ROOT, stdin=password, check=True, capture_output=True)
-        one.wait_until_up(one.start(ready=False), 60)  # the page takes its time on a busy machine
+        started(one)
         yield one
+
+
+def started(rig: Rig) -> None:
+    """Start it, and wait until it knows that its motors obey; its page takes a while on a busy machine."""
+    rig.wait_until_up(rig.start(ready=False), 60)
+    assert shows(rig, "yes", seconds=60)
 
 
 def found(rig: Rig, checks: tuple[Check, ...] = CHECKS) -> dict[str, tuple[str, str]]:
@@ -217,7 +224,7 @@ def test_how_a_robot_that_is_off_is_started(rig: Rig) -> None:
 def test_at_every_level(kind: str, level: Any, tmp_path: Path) -> None:
     hall = Hall(tmp_path / "hall", level)
     with hall, Named(kind, hall, {"level": level}, av_daemon=DEVICES, start=False) as rig:
-        rig.wait_until_up(rig.start(ready=False), 60)
+        started(rig)
         began = time.monotonic()
         checks = found(rig, (*CHECKS, *MOVING))
         states = {name: one[0] for name, one in checks.items()}
