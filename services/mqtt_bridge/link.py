@@ -42,9 +42,9 @@ _RULES: dict[LinkLevel, _Rule] = {
 
 
 class FloodPauses:
-    """For how long stops alone are received, after commands have flooded the link; times are those of one clock.
+    """Decides for how long stops alone are received, after commands have flooded the link.
 
-    At first not at all: what waits at the broker is dropped with the connection. Each flood that follows soon doubles
+    At first they are not: what waits at the broker is dropped with the connection. Each flood that follows soon doubles
     the pause, and a minute without one ends that. So no flood has the bridge connect all the time, and in each pause
     nothing stands before a stop.
     """
@@ -171,8 +171,11 @@ class Room:
         self._used = False
 
     def takes(self, rank: Rank, size: int, now: float) -> bool:
-        """Whether so many bytes of this rank are sent now, of which it takes note; one message is always on its way."""
-        fits = not self._waiting or self._waiting + size <= self._bytes * rank
+        """Whether so many bytes of this rank are sent now, of which it takes note; one message is always on its way.
+
+        One that is larger than the room takes as much: what waits last leaves some for it.
+        """
+        fits = not self._waiting or self._waiting + min(size, self._bytes) <= self._bytes * rank
         self._used = self._used or not fits
         if fits and size:
             self._in_flight.sent(size, now)

@@ -76,7 +76,7 @@ class Uplink:
 
     @property
     def stops_alone_s(self) -> float:
-        """For how long yet nothing but stops is to be received."""
+        """So long nothing but stops is to be received."""
         return self._pauses.left_s(self._clock())
 
     def pause(self, seconds: float) -> float:

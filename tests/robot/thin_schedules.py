@@ -13,6 +13,7 @@ from __future__ import annotations
 import json
 import tempfile
 from collections import Counter
+from functools import partial
 from math import inf
 from pathlib import Path
 from typing import Any
@@ -53,6 +54,7 @@ _REST_S = 10.0  # until what has waited for room is sent
 _LONGEST = 11_000.0
 _LAST_S = 4.0  # for what the last stop that came has caused
 _FLOOD_S, _FLOODS = 0.05, 20
+_SIZES = (200, 20, 600)  # there may be room for a newer value that is shorter
 
 
 class Uplink(Connection):
@@ -327,7 +329,8 @@ class World:
     def do_report(self, a: int, b: int) -> None:
         """States change, many times."""
         for number in range(1 + b % 20):
-            self.scheduler.after(number * _FLOOD_S, lambda: self._report(STATES[a % len(STATES)]))
+            size = _SIZES[(b + number) % len(_SIZES)]
+            self.scheduler.after(number * _FLOOD_S, partial(self._report, STATES[a % len(STATES)], size))
 
     def do_flood(self, a: int, b: int) -> None:
         """Streams of sensors, and a program of somebody's."""
@@ -337,9 +340,9 @@ class World:
     def do_squeeze(self, a: int, b: int) -> None:
         self.link.up.kbit = self.link.down.kbit = _KBITS[b % len(_KBITS)]
 
-    def _report(self, state: str) -> None:
+    def _report(self, state: str, size: int = 200) -> None:
         number = self._numbers[state] = self._numbers.get(state, 0) + 1
-        self.robot.publish(f"{BASE}/outgoing/{state}", {"n": number, "value": "x" * 200}, retain=True)
+        self.robot.publish(f"{BASE}/outgoing/{state}", {"n": number, "value": "x" * size}, retain=True)
 
     def _stream(self, b: int) -> None:
         self._samples += 1
@@ -371,6 +374,11 @@ MUTATIONS = {
         f"{_FORWARDING}.sieve",
         "        self._waiting[topic] = Waiting(rank, subject, message, forward)\n",
         "        self._waiting.setdefault(topic, Waiting(rank, subject, message, forward))\n",
+    ),
+    "what waits is sent after what is newer": Mutation(
+        f"{_FORWARDING}.sieve",
+        "        if not waits and self._is_turn(",
+        "        if self._is_turn(",
     ),
     "nothing that waits is sent": Mutation(f"{_BRIDGE}.uplink", "        self._forwarder.send_waiting()\n", ""),
     "a stop leaves the wheels turning": Mutation(
