@@ -5,7 +5,8 @@ bytes in order, so that what is sent waits behind what is on its way. Rules, bes
 
 * A stop that has come through the link has the wheels at rest at once, whatever comes with it.
 * Its confirmation waits behind a bounded number of bytes, and so does who has control.
-* Of each state the operators have the newest value once the link is at rest, and never go back to an older one.
+* Of each state and stream the operators have the newest value once the link is at rest, and none goes back to an older
+  one.
 """
 
 from __future__ import annotations
@@ -237,7 +238,7 @@ class World:
         self.robot = Program("robot", self.inside, "outgoing/#")
         self.people = [Person(number, self.link, self.commands) for number in (1, 2)]
         self.counts = Counter[str]()
-        self._numbers: dict[str, int] = {}  # the newest of each state at the robot,
+        self._numbers: dict[str, int] = {}  # the newest of each state and stream at the robot,
         self._seen: dict[str, int] = {}  # and of what has left it
         self._stops = self._samples = 0
         self._owed: dict[bytes, float] = {}  # confirmations that have not left the robot, and since when
@@ -275,9 +276,9 @@ class World:
             self._owed.pop(message.payload, None)
             self.counts["confirmations"] += 1
             self.scheduler.check(self.link.up.ahead < self._bound, "a confirmation waits behind what could wait")
-        elif metric in STATES:
+        elif metric in (*STATES, *STREAMS):
             number = json.loads(message.payload)["n"]
-            self.scheduler.check(number >= self._seen.get(metric, 0), "an older state follows a newer one")
+            self.scheduler.check(number >= self._seen.get(metric, 0), "an older value follows a newer one")
             self._seen[metric] = number
 
     def rest(self) -> None:
@@ -288,7 +289,7 @@ class World:
         while self.link.up.queue_s + self.link.down.queue_s > 1.0 and self.scheduler.now < _LONGEST:
             self.scheduler.run(_REST_S)
         self.scheduler.run(_LAST_S)
-        self.scheduler.check(self._seen == self._numbers, "the newest value of a state is lost")
+        self.scheduler.check(self._seen == self._numbers, "the newest value is lost")
         self.scheduler.check(self.wheels.speeds is None, "the wheels turn though nobody drives")
         mine, theirs = (one.newest.get("estop/serial") for one in (self.robot, self.people[0]))
         self.scheduler.check(mine == theirs, "the people do not know whether the robot is stopped")
@@ -346,6 +347,7 @@ class World:
 
     def _stream(self, b: int) -> None:
         self._samples += 1
+        self._numbers.update(dict.fromkeys(STREAMS, self._samples))
         for stream in (*STREAMS, *(f"programs/p{number}" for number in range(b % 5))):
             value = {"n": self._samples, "value": "x" * 150}
             self.robot.publish(f"{BASE}/outgoing/{stream}", value, qos=QoS(b % 2))

@@ -35,6 +35,7 @@ class Opening(NamedTuple):
     context: ssl.SSLContext | None  # None: without TLS
     will: Message | None
     address: Address  # one of the host's; TLS checks the name of the host
+    patience_s: float = CONNECT_TIMEOUT_S  # for which TLS may be silent
 
 
 def is_hang_up(error: OSError | None) -> bool:
@@ -42,11 +43,18 @@ def is_hang_up(error: OSError | None) -> bool:
     return error is None or isinstance(error, ConnectionError | ssl.SSLEOFError)
 
 
-def _shake_hands(sock: ssl.SSLSocket) -> None:
-    """Begin TLS on a socket that does not block. Raises OSError.
+class TlsLateError(TimeoutError):
+    """TLS was not there in time."""
 
-    It ends after a silence of CONNECT_TIMEOUT_S, and after HANDSHAKE_S at any rate.
+
+def begin_tls(plain: socket.socket, opening: Opening) -> ssl.SSLSocket:
+    """Returns a socket that does not block. Raises OSError.
+
+    It ends after a silence of so many seconds as the opening has patience, and after HANDSHAKE_S at any rate.
     """
+    assert opening.context is not None  # noqa: S101 - else there is no TLS
+    sock = opening.context.wrap_socket(plain, server_hostname=opening.settings.host, do_handshake_on_connect=False)
+    sock.setblocking(False)
     end = time.monotonic() + HANDSHAKE_S
     with closing(SocketPoll()) as poll:
         poll.register(sock)
@@ -54,11 +62,11 @@ def _shake_hands(sock: ssl.SSLSocket) -> None:
             try:
                 sock.do_handshake()
             except _NOT_NOW as blocked:
-                wait_s = min(CONNECT_TIMEOUT_S, end - time.monotonic())
+                wait_s = min(opening.patience_s, end - time.monotonic())
                 if wait_s <= 0 or not any(poll.wait(wait_s, write=isinstance(blocked, ssl.SSLWantWriteError))):
-                    raise TimeoutError("the TLS handshake does not go on") from None
+                    raise TlsLateError("the TLS handshake does not go on") from None
             else:
-                return
+                return sock
 
 
 class SendQuota:
@@ -138,12 +146,8 @@ class Client:
             if opening.settings.dscp:
                 _mark(sock, opening.settings.dscp)
             if opening.context is not None:
-                sock = opening.context.wrap_socket(
-                    sock, server_hostname=opening.settings.host, do_handshake_on_connect=False
-                )
+                sock = begin_tls(sock, opening)
             sock.setblocking(False)
-            if isinstance(sock, ssl.SSLSocket):
-                _shake_hands(sock)
         except BaseException:
             sock.close()
             raise
