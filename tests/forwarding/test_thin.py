@@ -196,7 +196,8 @@ class TestStreams:
         for _ in range(170):
             world.uplink.answers(0.02)
             world.run(0.5)
-        assert link_states(world)[-1].level != "thin"
+        assert link_states(world)[-1].level == "wide"
+        assert (world.retained(STATUS)[1], world.remote.payloads(EVENT)) == (b"waits", [b"waits"])
         assert stream(world, IMU, 1) == 49
         assert len(world.remote.on(IMU)) == 50
 

@@ -54,7 +54,7 @@ _AHEAD = (12_000, 4_000, inf)
 _REST_S = 10.0  # until what has waited for room is sent
 _LONGEST = 11_000.0
 _LAST_S = 4.0  # for what the last stop that came has caused
-_FLOOD_S, _FLOODS = 0.05, 20
+_FLOOD_S, _FLOODS = 0.05, 30
 _SIZES = (200, 20, 600)  # there may be room for a newer value that is shorter
 
 
@@ -286,13 +286,17 @@ class World:
         for person in self.people:
             person.drives = person.wants = False
         self.scheduler.run(_REST_S)
-        while self.link.up.queue_s + self.link.down.queue_s > 1.0 and self.scheduler.now < _LONGEST:
+        while self._is_busy and self.scheduler.now < _LONGEST:
             self.scheduler.run(_REST_S)
         self.scheduler.run(_LAST_S)
         self.scheduler.check(self._seen == self._numbers, "the newest value is lost")
         self.scheduler.check(self.wheels.speeds is None, "the wheels turn though nobody drives")
         mine, theirs = (one.newest.get("estop/serial") for one in (self.robot, self.people[0]))
         self.scheduler.check(mine == theirs, "the people do not know whether the robot is stopped")
+
+    @property
+    def _is_busy(self) -> bool:
+        return self.link.up.queue_s + self.link.down.queue_s > 1.0 or self._seen != self._numbers
 
     # -- steps
 
