@@ -367,6 +367,7 @@ def _perform(folder: Folder, schedule: Steps) -> Outcome:
 
 _FORWARDING, _BRIDGE = "pebble.forwarding", "pebble.services.mqtt_bridge"
 _MOTORS = "pebble.services.serial_mcu_bridge"
+#: Of the sieve alone tests/forwarding/test_sieve.py has more.
 MUTATIONS = {
     "confirmations wait like other states": Mutation(
         f"{_FORWARDING}.forwarder", "Side.LOCAL or subject.prompt:", "Side.LOCAL or subject.drives:"
@@ -380,11 +381,6 @@ MUTATIONS = {
         f"{_FORWARDING}.sieve",
         "        self._waiting[topic] = Waiting(rank, subject, message, forward)\n",
         "        self._waiting.setdefault(topic, Waiting(rank, subject, message, forward))\n",
-    ),
-    "what waits is sent after what is newer": Mutation(
-        f"{_FORWARDING}.sieve",
-        "        if not waits and self._is_turn(",
-        "        if self._is_turn(",
     ),
     "nothing that waits is sent": Mutation(f"{_BRIDGE}.uplink", "        self._forwarder.send_waiting()\n", ""),
     "a stop leaves the wheels turning": Mutation(
