@@ -48,13 +48,20 @@ class TlsLateError(TimeoutError):
 
 
 def begin_tls(plain: socket.socket, opening: Opening) -> ssl.SSLSocket:
-    """Returns a socket that does not block. Raises OSError.
-
-    It ends after a silence of so many seconds as the opening has patience, and after HANDSHAKE_S at any rate.
-    """
+    """Returns a socket that does not block; takes ``plain`` and closes it if it fails. Raises OSError."""
     assert opening.context is not None  # noqa: S101 - else there is no TLS
     sock = opening.context.wrap_socket(plain, server_hostname=opening.settings.host, do_handshake_on_connect=False)
-    sock.setblocking(False)
+    try:
+        sock.setblocking(False)
+        _shake_hands(sock, opening.patience_s)
+    except BaseException:
+        sock.close()
+        raise
+    return sock
+
+
+def _shake_hands(sock: ssl.SSLSocket, patience_s: float) -> None:
+    """It ends after a silence of ``patience_s``, and after HANDSHAKE_S at any rate. Raises OSError."""
     end = time.monotonic() + HANDSHAKE_S
     with closing(SocketPoll()) as poll:
         poll.register(sock)
@@ -62,11 +69,11 @@ def begin_tls(plain: socket.socket, opening: Opening) -> ssl.SSLSocket:
             try:
                 sock.do_handshake()
             except _NOT_NOW as blocked:
-                wait_s = min(opening.patience_s, end - time.monotonic())
+                wait_s = min(patience_s, end - time.monotonic())
                 if wait_s <= 0 or not any(poll.wait(wait_s, write=isinstance(blocked, ssl.SSLWantWriteError))):
                     raise TlsLateError("the TLS handshake does not go on") from None
             else:
-                return sock
+                return
 
 
 class SendQuota:

@@ -186,6 +186,13 @@ class TestRoom:
             room.poll(0, 0.1, now)
         assert sizes == [15, 30, 60, 120, 240, 168, 117, 82, 57]
 
+    def test_does_not_grow_while_little_is_sent(self) -> None:
+        room = Room()
+        for number in range(100):
+            assert room.takes(Rank.STREAM, 100, number / 10)
+            room.poll(0, 0.1, number / 10 + 0.1)
+        assert sum(room.takes(Rank.STREAM, 100, 10.0) for _ in range(100)) == 15
+
     def test_one_message_is_always_on_its_way(self) -> None:
         room = Room(kbit=1.0)
         assert room.takes(Rank.STREAM, 5000, 0.0)
