@@ -81,7 +81,7 @@ class Turns:
 
     @property
     def patience_s(self) -> float:
-        """For how long TLS may be silent at the address whose turn it is."""
+        """TLS may be silent for so long at the address whose turn it is."""
         return HANDSHAKE_S if self._left and self._left[0] in self._slow else CONNECT_TIMEOUT_S
 
     def opened(self, seconds: float) -> None:
