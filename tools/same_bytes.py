@@ -42,15 +42,26 @@ FEW = 5
 
 
 class Recorder:
-    """A proxy on loopback. ``packets``: of all clients, masked, by the client's name."""
+    """A proxy on loopback. ``packets``: of all clients, masked, by the client's name; ``logins``: whole CONNECTs."""
 
     def __init__(self, target: int) -> None:
-        self._target, self.packets = target, Counter[str]()
+        self._target, self.packets, self.logins = target, Counter[str](), list[bytes]()
         self._listener = socket.create_server(("127.0.0.1", 0))
         self.port = self._listener.getsockname()[1]
         threading.Thread(target=self._accept, daemon=True).start()
 
+    def __enter__(self) -> Recorder:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._listener.shutdown(socket.SHUT_RDWR)
+        self._listener.close()
+
     def _accept(self) -> None:
+        with suppress(OSError):
+            self._pass_on()
+
+    def _pass_on(self) -> None:
         while True:
             near, _ = self._listener.accept()
             far = socket.create_connection(("127.0.0.1", self._target))
@@ -68,6 +79,7 @@ class Recorder:
                 found, data = packets(data)
                 for head, body in found:
                     if TYPES[head >> 4] == "CONNECT":
+                        self.logins.append(body)
                         name = masked(connect_id(body))
                     self.packets.update(f"{name}: {what}" for what in described(head, body))
             sink.shutdown(socket.SHUT_WR)

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 CONNECT_TIMEOUT_S = 2.0  # for each of TCP and TLS, and again for the broker's CONNACK (T12)
-HANDSHAKE_S = 10.0  # for TLS, while bytes go on arriving: at 9.6 kbit/s a chain of two certificates takes 3 s
+HANDSHAKE_S = 10.0  # for TLS while bytes arrive, and where it took long: at 9.6 kbit/s two certificates of RSA take 3 s
 STEADY_S = 30.0  # an address that held a connection for so long is tried once more before the others
 _LONGEST = 8  # addresses whose failures are described one by one
 
@@ -58,6 +58,7 @@ class Turns:
         self._steady: Address | None = None  # has lost a connection that held for long, and begins the next round
         self._is_first = True  # round
         self._failures: dict[str, str] = {}  # why each address failed last, without a success since
+        self._slow: set[Address] = set()  # where TLS took long, or was not there in time
         self.several = False  # the host had more than one address in this round
 
     def address(self) -> Address:
@@ -69,6 +70,7 @@ class Turns:
                 raise OSError("it has no address")
             self._left = sorted(found, key=lambda one: one != self._steady)
             self._steady, self.several = None, len(found) > 1
+            self._slow &= set(found)
             self._failures = {one.text: self._failures[one.text] for one in found if one.text in self._failures}
         return self._left[0]
 
@@ -76,6 +78,19 @@ class Turns:
     def untried(self) -> bool:
         """Whether one of several addresses has not had its first turn yet."""
         return self._is_first and self.several
+
+    @property
+    def patience_s(self) -> float:
+        """TLS may be silent for so long at the address whose turn it is."""
+        return HANDSHAKE_S if self._left and self._left[0] in self._slow else CONNECT_TIMEOUT_S
+
+    def opened(self, seconds: float) -> None:
+        """TCP and TLS took so long there; an address that has not answered in time was not slow, then, but dead."""
+        self._slow = {self._left[0]} if seconds > CONNECT_TIMEOUT_S else set()
+
+    def was_slow(self) -> None:
+        """TLS was silent for too long: the next time it gets longer."""
+        self._slow.add(self._left[0])
 
     def succeeded(self) -> str:
         """The address has a connection; returns which ones failed before it, and how."""

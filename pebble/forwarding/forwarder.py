@@ -79,7 +79,7 @@ class Forwarder:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.counters = Counters()
-        self._subjects, self._rules, self._names = subjects, rules, names
+        self._subjects, self._rules, self._names, self._clock = subjects, rules, names, clock
         self.sides = Sides(
             (side, SideState(side, transport, self.counters, clock, wins=side is winner))
             for side, transport in transports.items()
@@ -290,7 +290,7 @@ class Forwarder:
                 waited_s = self.ages.waited_s(subject, message, account)
             if waited_s > subject.waits_s and not ends_something(subject, message):
                 if forward.stamped and STAMP not in message.payload:  # else its sender keeps to the pace of the link
-                    self.ages.late.add()
+                    self.ages.late.add(self._clock())
                 return Drop.LATE
             if forward.stamped:
                 self.ages.late.count = 0

@@ -41,6 +41,8 @@ class Sieve:
 
     ``stream_s``: seconds between two messages of a stream, at least. Counted as ``thinned`` are those that more of
     their stream followed, and as ``shed`` messages for which there was no room while there was a newer one.
+    What waits for room goes in the order in which it began to wait, and states go before events: else a large message
+    never finds any, while smaller ones take it.
     """
 
     def __init__(self, takes: Callable[[Rank, int], bool], counters: Counters, clock: Callable[[], float]) -> None:
@@ -48,13 +50,14 @@ class Sieve:
         self._takes, self._counters, self._clock = takes, counters, clock
         self._waiting: dict[str, Waiting] = {}  # by topic, in the order of their last turns
         self._sent_at: dict[str, float] = {}  # of streams, the oldest first
+        self._short: set[Rank] = set()  # of which one waits for room
 
     def __len__(self) -> int:
         return len(self._waiting)
 
     def takes_event(self, message: Message) -> bool:
         """Whether an event is sent now. Each counts, so they wait elsewhere, in order."""
-        return self._takes(Rank.STATE, _size(message))
+        return Rank.STATE not in self._short and self._takes(Rank.STATE, _size(message))
 
     def keeps(self, subject: Subject, message: Message, forward: Forward) -> bool:
         """Whether ``message`` waits here, for itself or in vain; else it is sent now."""
@@ -62,7 +65,7 @@ class Sieve:
         if rank is None:
             return False
         waits = topic in self._waiting
-        if not waits and self._may_pass(rank, message):
+        if not waits and self._is_turn(rank, topic) and self._passes(rank, message):
             return False
         if not waits and len(self._waiting) >= TOPICS:
             if rank is Rank.STATE:
@@ -76,28 +79,35 @@ class Sieve:
 
     def due(self, rank: Rank) -> Iterator[Waiting]:
         """What of this rank is sent now, one after the other."""
+        self._short.discard(rank)
         for topic, one in list(self._waiting.items()):
-            if one.rank is rank and self._may_pass(rank, one.message):
+            if one.rank is rank and self._is_turn(rank, topic):
+                if not self._passes(rank, one.message):
+                    return
                 del self._waiting[topic]
                 yield one
 
     def empty(self) -> Iterator[Waiting]:
         """All that waits: there is room enough from now on."""
+        self._short.clear()
         while self._waiting:
             yield self._waiting.pop(next(iter(self._waiting)))
 
-    def _may_pass(self, rank: Rank, message: Message) -> bool:
-        now, topic = self._clock(), message.topic
-        is_stream = rank is Rank.STREAM
-        if is_stream and now - self._sent_at.get(topic, float("-inf")) < self.stream_s:
+    def _is_turn(self, rank: Rank, topic: str) -> bool:
+        """Whether the last message of a stream is long enough ago."""
+        return rank is Rank.STATE or self._clock() - self._sent_at.get(topic, float("-inf")) >= self.stream_s
+
+    def _passes(self, rank: Rank, message: Message) -> bool:
+        """Whether there is room, and none of this rank waits for it; of a stream it is noted then."""
+        if rank in self._short or not self._takes(rank, _size(message)):
+            self._short.add(rank)
             return False
-        if not self._takes(rank, _size(message)):
-            return False
-        if is_stream:
+        if rank is Rank.STREAM:
+            topic = message.topic
             self._sent_at.pop(topic, None)
             if len(self._sent_at) >= TOPICS:
                 del self._sent_at[next(iter(self._sent_at))]
-            self._sent_at[topic] = now
+            self._sent_at[topic] = self._clock()
         return True
 
 

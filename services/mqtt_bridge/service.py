@@ -106,6 +106,10 @@ class MqttBridge(ForwardingService):
     def _is_thin(self) -> bool:
         return self._uplink is not None and self._uplink.level is LEVELS["thin"]
 
+    @property
+    def _stop_filters(self) -> list[str]:
+        return [self._stop_topic, *([with_name(self._stop_topic, "+")] if self.config.security.named else [])]
+
     def make_names(self) -> Names | None:
         security = self.config.security
         return Names(self.config.base, self.subjects, security.unnamed) if security.named else None
@@ -121,9 +125,10 @@ class MqttBridge(ForwardingService):
             return None
         from pebble.services.mqtt_bridge.stop_connection import StopConnection  # only who needs it pays for it
 
-        filters = [self._stop_topic, *([with_name(self._stop_topic, "+")] if self.config.security.named else [])]
         notices_s = self.config.services.mqtt_bridge.remote_mqtt.silence_seconds + _NOTICED_S
-        return StopConnection(transport, filters, self._pass_stop, self._forwards, self.clock, notices_s=notices_s)
+        return StopConnection(
+            transport, self._stop_filters, self._pass_stop, self._forwards, self.clock, notices_s=notices_s
+        )
 
     def start(self) -> None:
         super().start()
@@ -192,6 +197,20 @@ class MqttBridge(ForwardingService):
             self.subscribe_remote()
         else:
             self._same_broker.send()
+
+    def subscribe_remote(self) -> None:
+        """After floods of commands first to stops alone, for a while: see `FloodPauses`."""
+        seconds = 0.0 if self._uplink is None else self._uplink.stops_alone_s
+        if not seconds:
+            super().subscribe_remote()
+            return
+        self.listen_remote(self._stop_filters)
+        self.forwarder.subscribed(Side.REMOTE)
+        self.call_at(self.clock() + seconds, partial(self._subscribe_to_all, self.epoch))
+
+    def _subscribe_to_all(self, epoch: int) -> None:
+        if epoch == self.epoch and self.forwarder.gate is Gate.OPEN:
+            super().subscribe_remote()
 
     def _forwards(self) -> bool:
         return self.forwarder.gate is Gate.OPEN and self.remote.state is State.CONNECTED

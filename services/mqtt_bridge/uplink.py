@@ -13,7 +13,7 @@ from pebble.forwarding.forwarder import Forwarder
 from pebble.forwarding.sieve import Rank, Sieve
 from pebble.runtime.addresses import Address
 from pebble.runtime.rate_limit import RateLimitedLog
-from pebble.services.mqtt_bridge.link import LinkMeter, Room
+from pebble.services.mqtt_bridge.link import FloodPauses, LinkMeter, Room
 from pebble.services.mqtt_bridge.same_broker import now_ms
 from pebble.transports import QoS, Transport
 
@@ -44,6 +44,7 @@ class Uplink:
         self._saves_acks = section.remote is None or section.remote.kind == "mqtt"
         self._heartbeat_s = section.heartbeat.interval_seconds
         self._meter, self._room = LinkMeter(section.link.profile, section.link.kbit), Room(section.link.kbit)
+        self._pauses = FloodPauses()
         self._guard = threading.Lock()  # of the room: messages take it on the thread that received them
         self._sieve = Sieve(self._takes, forwarder.counters, clock)
         self._quiet_log = RateLimitedLog(log, period_s=60.0)
@@ -72,6 +73,11 @@ class Uplink:
                 return False
         self._heartbeat_at = now
         return True
+
+    @property
+    def stops_alone_s(self) -> float:
+        """So long nothing but stops is to be received."""
+        return self._pauses.left_s(self._clock())
 
     def pause(self, seconds: float) -> float:
         """How long to wait between two requests of what can wait."""
@@ -111,10 +117,13 @@ class Uplink:
 
         They are worth nothing when they come, and a new connection drops all that wait. The stop is repeated.
         """
-        late = self._forwarder.ages.late
-        if self._level == "thin" and late.count >= _LATE and late.seconds >= _LATE_S:
+        late, now = self._forwarder.ages.late, self._clock()
+        if self._level == "thin" and late.count >= _LATE and late.seconds(now) >= _LATE_S:
             late.count = 0
-            self._remote.renew_connection("only late commands come over a thin link: those that wait there are dropped")
+            why, pause_s = "only late commands come over a thin link: those that wait there are dropped", ""
+            if seconds := self._pauses.begin(now):
+                pause_s = f", and for {seconds:.0f} s nothing but stops is received"
+            self._remote.renew_connection(why + pause_s)
 
     def _suit(self) -> None:
         """The level is another one."""

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from math import inf
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import msgspec
 import pytest
 
 from pebble.config import Config, parse
@@ -17,7 +19,7 @@ from pebble.services import mqtt_mirror as mirror_module
 from pebble.services.mqtt_bridge import service as bridge_module
 from pebble.services.mqtt_bridge.service import MqttBridge
 from pebble.services.mqtt_mirror import MqttMirror
-from pebble.transports import Answer, Message, Outgoing
+from pebble.transports import Answer, Message, Outgoing, clock
 from pebble.transports.memory import MemoryHub, MemoryTransport
 from tests.services.mqtt_bridge.bridge_rig import Client, make_config
 
@@ -38,6 +40,9 @@ class Connection(MemoryTransport):
         self._stopping = True  # until it is opened
         self.way = Outgoing()  # what a service measures of it
         self.reply: Answer | None = None
+        self.late_s = 0.0  # so long what arrives has waited at the broker
+        self.renewed: list[float] = []  # when the service has asked for another connection
+        self._world = world
         world.connections.append(self)
 
     @property
@@ -51,6 +56,16 @@ class Connection(MemoryTransport):
     def answers(self, seconds: float) -> None:
         """The next question is answered, after so long."""
         self.reply = Answer(1 if self.reply is None else self.reply.number + 1, seconds, None)
+
+    def receive(self, delivery: Any) -> None:
+        if self.late_s:
+            since = clock.since_boot() - self.late_s
+            delivery = replace(delivery, message=msgspec.structs.replace(delivery.message, waiting_since=since))
+        super().receive(delivery)
+
+    def renew_connection(self, why: str) -> None:
+        self.renewed.append(self._world.now)
+        self._on_hub_stopped()
 
     def cut(self) -> None:
         self._away = True

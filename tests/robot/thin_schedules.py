@@ -5,7 +5,8 @@ bytes in order, so that what is sent waits behind what is on its way. Rules, bes
 
 * A stop that has come through the link has the wheels at rest at once, whatever comes with it.
 * Its confirmation waits behind a bounded number of bytes, and so does who has control.
-* Of each state the operators have the newest value once the link is at rest, and never go back to an older one.
+* Of each state and stream the operators have the newest value once the link is at rest, and none goes back to an older
+  one.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from __future__ import annotations
 import json
 import tempfile
 from collections import Counter
+from functools import partial
 from math import inf
 from pathlib import Path
 from typing import Any
@@ -52,7 +54,8 @@ _AHEAD = (12_000, 4_000, inf)
 _REST_S = 10.0  # until what has waited for room is sent
 _LONGEST = 11_000.0
 _LAST_S = 4.0  # for what the last stop that came has caused
-_FLOOD_S, _FLOODS = 0.05, 20
+_FLOOD_S, _FLOODS = 0.05, 30
+_SIZES = (200, 20, 600)  # there may be room for a newer value that is shorter
 
 
 class Uplink(Connection):
@@ -235,7 +238,7 @@ class World:
         self.robot = Program("robot", self.inside, "outgoing/#")
         self.people = [Person(number, self.link, self.commands) for number in (1, 2)]
         self.counts = Counter[str]()
-        self._numbers: dict[str, int] = {}  # the newest of each state at the robot,
+        self._numbers: dict[str, int] = {}  # the newest of each state and stream at the robot,
         self._seen: dict[str, int] = {}  # and of what has left it
         self._stops = self._samples = 0
         self._owed: dict[bytes, float] = {}  # confirmations that have not left the robot, and since when
@@ -273,9 +276,9 @@ class World:
             self._owed.pop(message.payload, None)
             self.counts["confirmations"] += 1
             self.scheduler.check(self.link.up.ahead < self._bound, "a confirmation waits behind what could wait")
-        elif metric in STATES:
+        elif metric in (*STATES, *STREAMS):
             number = json.loads(message.payload)["n"]
-            self.scheduler.check(number >= self._seen.get(metric, 0), "an older state follows a newer one")
+            self.scheduler.check(number >= self._seen.get(metric, 0), "an older value follows a newer one")
             self._seen[metric] = number
 
     def rest(self) -> None:
@@ -283,13 +286,17 @@ class World:
         for person in self.people:
             person.drives = person.wants = False
         self.scheduler.run(_REST_S)
-        while self.link.up.queue_s + self.link.down.queue_s > 1.0 and self.scheduler.now < _LONGEST:
+        while self._is_busy and self.scheduler.now < _LONGEST:
             self.scheduler.run(_REST_S)
         self.scheduler.run(_LAST_S)
-        self.scheduler.check(self._seen == self._numbers, "the newest value of a state is lost")
+        self.scheduler.check(self._seen == self._numbers, "the newest value is lost")
         self.scheduler.check(self.wheels.speeds is None, "the wheels turn though nobody drives")
         mine, theirs = (one.newest.get("estop/serial") for one in (self.robot, self.people[0]))
         self.scheduler.check(mine == theirs, "the people do not know whether the robot is stopped")
+
+    @property
+    def _is_busy(self) -> bool:
+        return self.link.up.queue_s + self.link.down.queue_s > 1.0 or self._seen != self._numbers
 
     # -- steps
 
@@ -327,7 +334,8 @@ class World:
     def do_report(self, a: int, b: int) -> None:
         """States change, many times."""
         for number in range(1 + b % 20):
-            self.scheduler.after(number * _FLOOD_S, lambda: self._report(STATES[a % len(STATES)]))
+            size = _SIZES[(b + number) % len(_SIZES)]
+            self.scheduler.after(number * _FLOOD_S, partial(self._report, STATES[a % len(STATES)], size))
 
     def do_flood(self, a: int, b: int) -> None:
         """Streams of sensors, and a program of somebody's."""
@@ -337,12 +345,13 @@ class World:
     def do_squeeze(self, a: int, b: int) -> None:
         self.link.up.kbit = self.link.down.kbit = _KBITS[b % len(_KBITS)]
 
-    def _report(self, state: str) -> None:
+    def _report(self, state: str, size: int = 200) -> None:
         number = self._numbers[state] = self._numbers.get(state, 0) + 1
-        self.robot.publish(f"{BASE}/outgoing/{state}", {"n": number, "value": "x" * 200}, retain=True)
+        self.robot.publish(f"{BASE}/outgoing/{state}", {"n": number, "value": "x" * size}, retain=True)
 
     def _stream(self, b: int) -> None:
         self._samples += 1
+        self._numbers.update(dict.fromkeys(STREAMS, self._samples))
         for stream in (*STREAMS, *(f"programs/p{number}" for number in range(b % 5))):
             value = {"n": self._samples, "value": "x" * 150}
             self.robot.publish(f"{BASE}/outgoing/{stream}", value, qos=QoS(b % 2))
@@ -358,6 +367,7 @@ def _perform(folder: Folder, schedule: Steps) -> Outcome:
 
 _FORWARDING, _BRIDGE = "pebble.forwarding", "pebble.services.mqtt_bridge"
 _MOTORS = "pebble.services.serial_mcu_bridge"
+#: Of the sieve alone tests/forwarding/test_sieve.py has more.
 MUTATIONS = {
     "confirmations wait like other states": Mutation(
         f"{_FORWARDING}.forwarder", "Side.LOCAL or subject.prompt:", "Side.LOCAL or subject.drives:"

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from pebble.transports import MqttSettings, QoS, State, Transport, create
-from pebble.transports.hosts import STEADY_S, Address, Turns
+from pebble.transports.hosts import HANDSHAKE_S, STEADY_S, Address, Turns
 from pebble.transports.settings import TlsSettings
 from tests.fakes.bad_brokers import BEHAVIOURS, mute, serving, showing
 from tests.support import ROOT, Broker, free_port, some, until
@@ -213,6 +213,34 @@ def test_whose_turn_it_is(answers: list[list[Address]], held: list[float], tried
         assert turns.several is (len(answers[0]) > 1)
         turns.failed("x", seconds)
     assert seen == tried
+
+
+#: How an attempt went: TLS was silent for too long, nothing listens, or TCP and TLS took so long.
+WENT: dict[str, Callable[[Turns], object]] = {
+    "late": Turns.was_slow,
+    "lost": lambda _turns: None,
+    "3": lambda turns: turns.opened(3.0),
+    "0.1": lambda turns: turns.opened(0.1),
+}
+
+
+@pytest.mark.parametrize(
+    ("attempts", "patient"),  # at two addresses in turns, and which attempts may be silent for longer
+    [
+        ("late late 3 late late 3", "--+-++"),
+        ("late 0.1 late", "---"),  # one that answers at once shows that the other is not slow
+        ("3 0.1 3 lost 3 lost 0.1 lost lost", "----+-+--"),
+        ("3 lost 3 lost lost late 3", "--+-+-+"),  # that nothing listens says nothing of TLS
+    ],
+)
+def test_where_tls_took_long_it_may_be_silent_for_longer(attempts: str, patient: str) -> None:
+    turns, seen = Turns("b", 1883, lambda _host, _port: [A, B]), ""
+    for word in attempts.split():
+        turns.address()
+        seen += "-+"[turns.patience_s == HANDSHAKE_S]
+        WENT[word](turns)
+        turns.failed("x")
+    assert seen == patient
 
 
 def test_a_name_without_addresses_is_a_problem() -> None:

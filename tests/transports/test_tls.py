@@ -8,15 +8,19 @@ import threading
 import time
 from contextlib import closing, nullcontext, suppress
 from itertools import cycle, islice
+from pathlib import Path
 from unittest import mock
 
 import pytest
 
+from pebble.transports import create
 from pebble.transports.hosts import CONNECT_TIMEOUT_S, Address
-from pebble.transports.mqtt.client import Client, Opening
+from pebble.transports.mqtt.client import Opening
+from pebble.transports.mqtt.client_kinds import client_class
 from pebble.transports.settings import MqttSettings, TlsSettings
 from pebble.transports.tls import make_context
-from tests.support import ROOT
+from tests.support import ROOT, Broker, further, until
+from tests.tcp_proxy import TcpProxy
 
 CERTS = ROOT / "tests" / "data" / "tls"
 EVERY_CIPHER = "ALL:@SECLEVEL=0"
@@ -85,16 +89,52 @@ class SlowServer:
                     self.ended.wait(_PIECE_S)
 
 
+class SlowHello(TcpProxy):
+    """Holds the first bytes of a handshake, as a modem does whose queue is full of something else."""
+
+    def __init__(self, target: int) -> None:
+        self.held = 0
+        super().__init__(target)
+
+    def passes(self, data: bytes) -> bool:
+        is_hello = data[:1] == b"\x16" and data[5:6] == b"\1"
+        self.held += is_hello
+        time.sleep(_HELD_S * is_hello)
+        return True
+
+
+_HELD_S = 1.3
+
+
+@pytest.mark.parametrize("kind", ["pebble", further("paho")])
+def test_what_is_slow_is_remembered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
+    """The first attempt ends before an answer can be there; the next one waits, and so does each that follows."""
+    monkeypatch.setattr("pebble.transports.hosts.CONNECT_TIMEOUT_S", 1.0)
+    files = [f"cafile {CERTS}/ca.crt", f"certfile {CERTS}/server.crt", f"keyfile {CERTS}/server.key"]
+    broker = Broker(tmp_path, *files)
+    with SlowHello(broker.port) as proxy:
+        settings = MqttSettings(
+            host="localhost", port=proxy.port, tls=TlsSettings(ca_cert=CERTS / "ca.crt"), client=kind
+        )
+        with create("mqtt", "tool", settings) as transport:
+            assert until(lambda: transport.counters["connected"] == 1, 30)
+            first = proxy.held
+            proxy.drop()
+            assert until(lambda: transport.counters["connected"] == 2, 30)
+            assert (first, proxy.held) == (2, 3)
+    broker.stop()
+
+
 _PIECE, _PIECE_S = 150, 0.4  # bytes at 3 kbit/s
 
 
+@pytest.mark.parametrize("kind", ["pebble", "paho"])
 @pytest.mark.parametrize("silent_after", [1000, 2])
-def test_a_handshake_may_take_long_while_bytes_arrive(silent_after: int) -> None:
+def test_a_handshake_may_take_long_while_bytes_arrive(silent_after: int, kind: str) -> None:
     context = make_context(TlsSettings(ca_cert=CERTS / "ca.crt"))
     with closing(SlowServer(silent_after)) as server:
-        client = Client(
-            Opening("id", MqttSettings(host="localhost"), context, None, server.address), mock.Mock(), bridge=False
-        )
+        opening = Opening("id", MqttSettings(host="localhost"), context, None, server.address)
+        client = client_class(kind)(opening, mock.Mock(), bridge=False)
         began = time.monotonic()
         with nullcontext() if silent_after > 2 else pytest.raises(TimeoutError, match="TLS handshake"):
             client.open()

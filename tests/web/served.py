@@ -194,6 +194,7 @@ class RecordingRobot:
         capabilities: dict[str, Any] | None = None,
         keeps: bool = False,
         named: bool = False,
+        **login: str,
     ) -> None:
         self.base, self.named = base, named
         self.wire: set[str] = set()
@@ -206,7 +207,7 @@ class RecordingRobot:
             owner.named = named
         self._answering = threading.Lock()
         self._transport = create(
-            "mqtt", f"robot-{base.replace('/', '-')}", MqttSettings(host="127.0.0.1", port=broker_port)
+            "mqtt", f"robot-{base.replace('/', '-')}", MqttSettings(host="127.0.0.1", port=broker_port, **login)
         )
         self._transport.open()
         self._transport.subscribe(f"{base}/incoming/#", self._receive, direct=True)

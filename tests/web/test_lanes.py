@@ -6,7 +6,9 @@ import secrets
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,11 +16,14 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from pebble.contract import CAMERA
+from pebble.fleet.roles import Account
 from pebble.media.video import make_encoder
 from pebble.transports import MqttSettings, QoS, create
-from tests.support import Broker, until
+from tests.fleet.brokers import FleetBroker
+from tests.support import Broker, free_port, until
 from tests.tcp_proxy import SlowTcpProxy, TcpProxy
 from tests.web.served import FREE, Page, RecordingRobot, Served
+from tools.same_bytes import Recorder, connect_id
 
 GOOB = "pebble/robots/goob"
 KBITS, PICTURE_HZ = 64, 5
@@ -37,13 +42,13 @@ def robot(broker: Broker) -> Iterator[RecordingRobot]:
 
 
 @contextmanager
-def filming(port: int) -> Iterator[None]:
+def filming(port: int, **login: str) -> Iterator[None]:
     """Pictures of goob, all the time, many times as much as the server's connection carries."""
     noise = np.random.default_rng(1).integers(0, 255, (120, 160, 3), np.uint8)
     picture = make_encoder("json", fps=PICTURE_HZ, quality=90).encode(noise, int(1000 * time.time()), keyframe=True)
     assert len(picture) * 8 * PICTURE_HZ > 4000 * KBITS
     ending = threading.Event()
-    with create("mqtt", "camera", MqttSettings(host="127.0.0.1", port=port)) as camera:
+    with create("mqtt", "camera", MqttSettings(host="127.0.0.1", port=port, **login)) as camera:
 
         def film() -> None:
             while not ending.wait(1 / PICTURE_HZ):
@@ -122,3 +127,40 @@ def test_driving_goes_on_where_the_second_connection_is_refused(broker: Broker, 
             page.drive(GOOB, 1, z=0.5)
             assert until(lambda: any(one["z"] for one in robot.drives()))
             assert stop_s(page) < 4
+
+
+def test_at_named_it_has_the_servers_account_and_asks_only_for_pictures(tmp_path: Path) -> None:
+    """And when another client takes it away, the page drives and stops, and the pictures come again."""
+    people = {"page-1": Account(roles=("page",)), "goob": Account(roles=("robot",), bases=(GOOB,))}
+    with ExitStack() as ending:
+        broker = ending.enter_context(FleetBroker(tmp_path / "fleet", people, level="named", unencrypted=free_port()))
+        port = broker.unencrypted or 0
+        page_login, robot_login = ({"username": name, "password": broker.passwords[name]} for name in people)
+        seen = ending.enter_context(Recorder(port))
+        ending.enter_context(RecordingRobot(port, GOOB, capabilities=CAN, keeps=True, named=True, **robot_login))
+        account = MqttSettings(host="127.0.0.1", port=seen.port, **page_login)
+        served = ending.enter_context(Served(seen.port, broker=account))
+        page = ending.enter_context(served.page(name="ann"))
+        ending.enter_context(filming(port, **robot_login))
+        assert page.knows(GOOB)
+        ending.enter_context(watching(served))
+        assert until(lambda: page.value(GOOB, "web/picture", "state") == "flowing", 30)
+
+        def logins() -> list[bytes]:
+            return [one for one in seen.logins if connect_id(one).startswith(b"pebble-web-media")]
+
+        (login,) = logins()
+        assert all(value.encode() in login for value in page_login.values())
+        with create("mqtt", "thief", replace(account, port=port, client_id=connect_id(login).decode())):
+            assert until(lambda: len(logins()) > 1), "it was not ended"
+            assert page.take(GOOB)
+            assert stop_s(page) < 4
+        assert until(lambda: page.value(GOOB, "web/picture", "state") == "flowing", 30)
+        did = {one.partition(": ")[2] for one in seen.packets if one.startswith("pebble-web-media-HEX")}
+        assert {one.partition(" {")[0] for one in did if one.startswith(("SUB", "PUBLISH"))} == {
+            "SUBSCRIBE pebble/robots/goob/outgoing/front-camera qos=1",
+            "SUBSCRIBE pebble/robots/goob/incoming/flags/mqtt-video qos=1",
+            "PUBLISH retain=0 qos=1 pebble/robots/goob/incoming/by/page0/front-camera",
+            "PUBLISH retain=0 qos=1 pebble/robots/goob/incoming/by/page0/flags/mqtt-video",
+        }
+        assert {one.split()[2] for one in did if one.startswith("CONNECT")} == {"flags=11000010"}, "it leaves no will"

@@ -35,6 +35,7 @@ class Opening(NamedTuple):
     context: ssl.SSLContext | None  # None: without TLS
     will: Message | None
     address: Address  # one of the host's; TLS checks the name of the host
+    patience_s: float = CONNECT_TIMEOUT_S  # for which TLS may be silent
 
 
 def is_hang_up(error: OSError | None) -> bool:
@@ -42,11 +43,25 @@ def is_hang_up(error: OSError | None) -> bool:
     return error is None or isinstance(error, ConnectionError | ssl.SSLEOFError)
 
 
-def _shake_hands(sock: ssl.SSLSocket) -> None:
-    """Begin TLS on a socket that does not block. Raises OSError.
+class TlsLateError(TimeoutError):
+    """TLS was not there in time."""
 
-    It ends after a silence of CONNECT_TIMEOUT_S, and after HANDSHAKE_S at any rate.
-    """
+
+def begin_tls(plain: socket.socket, opening: Opening) -> ssl.SSLSocket:
+    """Returns a socket that does not block; takes ``plain`` and closes it if it fails. Raises OSError."""
+    assert opening.context is not None  # noqa: S101 - else there is no TLS
+    sock = opening.context.wrap_socket(plain, server_hostname=opening.settings.host, do_handshake_on_connect=False)
+    try:
+        sock.setblocking(False)
+        _shake_hands(sock, opening.patience_s)
+    except BaseException:
+        sock.close()
+        raise
+    return sock
+
+
+def _shake_hands(sock: ssl.SSLSocket, patience_s: float) -> None:
+    """It ends after a silence of ``patience_s``, and after HANDSHAKE_S at any rate. Raises OSError."""
     end = time.monotonic() + HANDSHAKE_S
     with closing(SocketPoll()) as poll:
         poll.register(sock)
@@ -54,9 +69,9 @@ def _shake_hands(sock: ssl.SSLSocket) -> None:
             try:
                 sock.do_handshake()
             except _NOT_NOW as blocked:
-                wait_s = min(CONNECT_TIMEOUT_S, end - time.monotonic())
+                wait_s = min(patience_s, end - time.monotonic())
                 if wait_s <= 0 or not any(poll.wait(wait_s, write=isinstance(blocked, ssl.SSLWantWriteError))):
-                    raise TimeoutError("the TLS handshake does not go on") from None
+                    raise TlsLateError("the TLS handshake does not go on") from None
             else:
                 return
 
@@ -138,12 +153,8 @@ class Client:
             if opening.settings.dscp:
                 _mark(sock, opening.settings.dscp)
             if opening.context is not None:
-                sock = opening.context.wrap_socket(
-                    sock, server_hostname=opening.settings.host, do_handshake_on_connect=False
-                )
+                sock = begin_tls(sock, opening)
             sock.setblocking(False)
-            if isinstance(sock, ssl.SSLSocket):
-                _shake_hands(sock)
         except BaseException:
             sock.close()
             raise

@@ -18,9 +18,9 @@ from pebble.transports.base import Answer, Message, Outgoing, QoS
 from pebble.transports.counters import Counters
 from pebble.transports.mqtt.bridge_mode import Result
 from pebble.transports.mqtt.broker_limits import EVERYTHING, Limits
-from pebble.transports.mqtt.client import Opening, keep_unsent
+from pebble.transports.mqtt.client import Opening, TlsLateError, keep_unsent
 from pebble.transports.mqtt.client_kinds import AnyClient, client_class
-from pebble.transports.mqtt.ending import Absent, Lost, Refused, Silent
+from pebble.transports.mqtt.ending import Absent, Lost, Refused, Silent, TlsLate
 from pebble.transports.mqtt.incoming import OVERSLEPT_S, Incoming, Sink
 from pebble.transports.mqtt.outgoing import (
     Backlog,
@@ -40,6 +40,7 @@ _OVERHEAD = 1 + 4 + 2 + 2 + 1 + 5  # bytes of a PUBLISH besides topic and payloa
 _FRESH_S = 0.05  # what is in a socket that was empty so recently counts as having come just now
 _UNWRITTEN = 1 << 20  # bytes of DELIVERED messages that wait where the broker has no QoS 1; beyond it they are refused
 _UNSENT = 4 * 1024  # bytes in the kernel beyond those on their way, over a slow way
+_UNREACHED: dict[type[Exception], type[Lost]] = {ConnectionRefusedError: Absent, TlsLateError: TlsLate}
 _BY_SYSTEM = 0  # as the system has it
 _QUICKACK = getattr(socket, "TCP_QUICKACK", None)  # Linux only
 _ABORT = struct.pack("ii", 1, 0)  # SO_LINGER that makes close() drop what was not sent
@@ -75,6 +76,7 @@ class Connection:
         as_published: bool,
         limits: Limits = EVERYTHING,
     ) -> None:
+        self.opened_s = 0.0  # so long TCP and TLS took
         self.dialling = True  # connect(2) or a TLS handshake may be blocking, and cannot be interrupted
         self.limits = limits  # what the broker has, with what it says on MQTT 5
         self.max_packet: int | None = None  # bytes, as the broker says on MQTT 5
@@ -97,11 +99,13 @@ class Connection:
 
         Returns how many seconds the broker took to answer.
         """
+        dialled = time.monotonic()
         try:
             self._client.open()
         except (OSError, ValueError) as error:
-            kind = Absent if isinstance(error, ConnectionRefusedError) else Lost
+            kind = next((one for known, one in _UNREACHED.items() if isinstance(error, known)), Lost)
             raise kind(f"{self.where} cannot be reached: {error}") from None
+        self.opened_s = time.monotonic() - dialled
         self.incoming.answered_at = began = clock.since_boot()
         self.dialling = False
         deadline = time.monotonic() + hosts.CONNECT_TIMEOUT_S

@@ -13,7 +13,7 @@ from pebble.transports.mqtt.bridge_mode import Attempt, BridgeMode, Result
 from pebble.transports.mqtt.broker_limits import EVERYTHING, BrokerLimits, Limits
 from pebble.transports.mqtt.client import Opening
 from pebble.transports.mqtt.connection import Connection, Owner
-from pebble.transports.mqtt.ending import Absent, Lost, Refused, Silent
+from pebble.transports.mqtt.ending import Absent, Lost, Refused, Silent, TlsLate
 from pebble.transports.settings import MqttSettings
 
 _ENDING_S = 1.0  # so long a broker that ends may still accept connections, and hang up on them
@@ -81,6 +81,7 @@ class Dialler:
             if connection.incoming.accepted is None:
                 connection.discard()
         self._note_result(Result.ACCEPTED)
+        self.turns.opened(connection.opened_s)
         return connection
 
     def _make(self, will: Message | None, owner: Owner, counters: Counters, *, as_published: bool) -> Connection:
@@ -88,7 +89,7 @@ class Dialler:
         assert self._credentials is not None  # noqa: S101 - and while it is open
         settings = replace(self._settings, password=self._credentials.password())
         self.attempt = Connection(
-            Opening(self._client_id, settings, self._credentials.context(), will, self._address),
+            Opening(self._client_id, settings, self._credentials.context(), will, self._address, self.turns.patience_s),
             counters,
             owner,
             where=self.where,
@@ -144,6 +145,8 @@ class Dialler:
         """Whether the other end is gone: nothing listens, or it hangs up as one that is just ending does."""
         now, silent = time.monotonic(), isinstance(lost, Silent)  # then it may be we who stood still
         self.stalled |= silent
+        if isinstance(lost, TlsLate):
+            self.turns.was_slow()
         if connected:
             self._gone_at = now
             return not silent

@@ -19,6 +19,10 @@ class Absent(Lost):
     """Nothing listens there."""
 
 
+class TlsLate(Lost):
+    """TCP is there, and TLS was not in time."""
+
+
 class Refused(Lost):
     """The broker refused our CONNECT, or closed the connection instead of answering."""
 

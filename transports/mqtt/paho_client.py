@@ -16,8 +16,8 @@ from paho.mqtt.reasoncodes import ReasonCode
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
 from pebble.transports import hosts
-from pebble.transports.hosts import Address, dial
-from pebble.transports.mqtt.client import SEND_BUFFER, Opening, is_hang_up
+from pebble.transports.hosts import dial
+from pebble.transports.mqtt.client import SEND_BUFFER, Opening, begin_tls, is_hang_up
 from pebble.transports.mqtt.packets import ANY_QOS, HEAD, MAX_PACKET, RETAIN, Accepted, Filter, Listener
 
 _PIECE = 64 * 1024  # bytes that are read at once
@@ -28,7 +28,7 @@ class _Paho(paho.Client):
     """paho, with pings of our own (its keepalive is too slow for T19), and a limit to what it collects."""
 
     listener: Listener
-    address: Address
+    opening: Opening
     ahead = b""  # was taken out of the socket; `begin` of it was read
     begin = 0
 
@@ -37,7 +37,10 @@ class _Paho(paho.Client):
         return sum(packet["to_process"] for packet in self._out_packet)
 
     def _create_socket_connection(self) -> socket.socket:
-        return dial(self.address)  # paho would try all of the host's in one attempt
+        return dial(self.opening.address)  # paho would try all of the host's in one attempt
+
+    def _ssl_wrap_socket(self, tcp_sock: socket.socket) -> ssl.SSLSocket:
+        return begin_tls(tcp_sock, self.opening)  # paho waits for 2 s, whatever arrives
 
     def _sock_recv(self, bufsize: int) -> bytes:
         if self.begin == len(self.ahead):
@@ -87,7 +90,7 @@ class PahoClient:
     """See `client.Client`."""
 
     def __init__(self, opening: Opening, listener: Listener, *, bridge: bool) -> None:
-        client_id, settings, context, will, address = opening
+        client_id, settings, context, will, *_ = opening
         self.drained, self.hung_up = True, True  # paho does not say how a connection ended on which it wrote
         self._settings, self._context, self._listener = settings, context, listener
         self._modern = settings.protocol == "5"
@@ -95,7 +98,7 @@ class PahoClient:
         self._paho = client = _Paho(
             CallbackAPIVersion.VERSION2, client_id=client_id, protocol=protocol, reconnect_on_failure=False
         )
-        client.listener, client.address = listener, address
+        client.listener, client.opening = listener, opening
         client.connect_timeout = hosts.CONNECT_TIMEOUT_S
         if not self._modern:
             client.max_inflight_messages_set(_IN_FLIGHT)  # on 5 the broker's Receive Maximum may be paho's 20

@@ -110,7 +110,7 @@ class MqttTransport(Transport):
         self._thread.start()
 
     def _close(self, will: Message | None) -> None:
-        """Do not wait for a thread that is connecting: it ends by itself, within CONNECT_TIMEOUT_S."""
+        """Do not wait for a thread that is connecting: it ends by itself, within HANDSHAKE_S."""
         self._stopping.will = will
         self._stopping.set()
         attempt = self._dialler.attempt

@@ -166,6 +166,13 @@ class TestRoom:
         assert [room.takes(Rank.STATE, 200, 0.0) for _ in range(4)] == [True, True, True, False]
         assert room.takes(Rank.HEARTBEAT, 200, 0.0)
 
+    def test_has_some_for_a_large_message_as_soon_as_little_is_on_its_way(self) -> None:
+        room = Room(kbit=9.6)
+        assert room.takes(Rank.HEARTBEAT, 80, 0.0)
+        assert not room.takes(Rank.STREAM, 5000, 0.0)
+        assert room.takes(Rank.STATE, 5000, 0.0)
+        assert not room.takes(Rank.HEARTBEAT, 80, 0.0)
+
     def test_is_learned(self) -> None:
         """It grows while what is sent is confirmed without delay, and shrinks when it is not."""
         room, now = Room(), 0.0
@@ -178,6 +185,13 @@ class TestRoom:
             now += round_trip_s
             room.poll(0, 0.1, now)
         assert sizes == [15, 30, 60, 120, 240, 168, 117, 82, 57]
+
+    def test_does_not_grow_while_little_is_sent(self) -> None:
+        room = Room()
+        for number in range(100):
+            assert room.takes(Rank.STREAM, 100, number / 10)
+            room.poll(0, 0.1, number / 10 + 0.1)
+        assert sum(room.takes(Rank.STREAM, 100, 10.0) for _ in range(100)) == 15
 
     def test_one_message_is_always_on_its_way(self) -> None:
         room = Room(kbit=1.0)

@@ -9,11 +9,15 @@ from pathlib import Path
 
 import pytest
 
+from pebble.bench.impair import rsa_chain
 from pebble.runtime.connections import local_transport
 from pebble.services.mqtt_bridge.service import MqttBridge
+from pebble.transports import State
+from pebble.transports.hosts import CONNECT_TIMEOUT_S
 from tests.robot.operator import Operator
 from tests.services.mqtt_bridge.bridge_rig import BASE, Running, make_config
 from tests.support import Broker, until
+from tests.tcp_proxy import SlowTcpProxy, TcpProxy
 
 IMU, STOP, ONLINE, LINK = "outgoing/sensors/imu", "incoming/estop", "outgoing/online", "outgoing/link"
 FLOOD = 10_000
@@ -25,6 +29,39 @@ def brokers(tmp_path: Path) -> Iterator[list[Broker]]:
     yield brokers
     for broker in brokers:
         broker.stop()
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("kind", ["pebble", "paho"])
+def test_it_connects_by_tls_to_a_broker_with_two_certificates_of_rsa(tmp_path: Path, kind: str) -> None:
+    """Over 9.6 kbit/s and 0.6 s to and fro they take 3 s."""
+    chain = rsa_chain.make(tmp_path, "127.0.0.1")
+    local = Broker(tmp_path)
+    remote = Broker(tmp_path, f"certfile {chain.sent}", f"keyfile {chain.key}", "set_tcp_nodelay true")
+    with (
+        SlowTcpProxy(remote.port, 9.6, back=True) as down,
+        SlowTcpProxy(down.port, 9.6) as up,
+        TcpProxy(up.port, delay_s=0.3) as link,
+    ):
+        config = make_config(
+            local_mqtt={"host": "127.0.0.1", "port": local.port},
+            remote_mqtt={
+                "host": "127.0.0.1",
+                "port": link.port,
+                "tls": {"enabled": True, "ca_cert": str(chain.root)},
+                "client": kind,
+            },
+            link={"profile": "thin", "kbit": 9.6},
+        )
+        began = time.monotonic()
+        bridge = MqttBridge(config, local_transport(config, "local-bridge", as_published=True))
+        running = Running(bridge)
+        assert until(lambda: bridge.remote.state is State.CONNECTED, 60)
+        assert time.monotonic() - began > 2 * CONNECT_TIMEOUT_S
+        assert bridge.remote.counters["connected"] == 1
+        running.stop()
+    local.stop()
+    remote.stop()
 
 
 def test_a_stop_passes_at_once_while_much_waits(brokers: list[Broker]) -> None:

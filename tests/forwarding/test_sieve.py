@@ -1,0 +1,143 @@
+"""What leaves a robot over a thin link: random walks that keep the rules of the sieve, and bugs that they find."""
+
+from __future__ import annotations
+
+import random
+from collections import Counter, deque
+
+import pytest
+
+from pebble.contract import Kind
+from pebble.forwarding import sieve as module
+from pebble.forwarding.routing import Forward
+from pebble.forwarding.sieve import Rank, Sieve
+from pebble.forwarding.subjects import Subject
+from pebble.transports import Message, QoS
+from pebble.transports.counters import Counters
+from tests.kit.mutations import Mutation, in_process
+from tests.support import cases
+
+STATE, STREAM, EVENT = (Subject(kind) for kind in (Kind.STATE, Kind.STREAM, Kind.EVENT))
+TOPICS = {f"{subject.kind.name}/{number}": subject for subject in (STATE, STREAM) for number in range(4)}
+SIZES = (20, 20, 150, 700)
+ROOM, DRAINS, TURN_S, STEP_S = 300, 60, 1.0, 0.1
+WAITS_S = 20.0  # for all that can wait before a message; seen were 7
+FORWARD = Forward(QoS.DELIVERED, False, False)
+
+
+class Walk:
+    """A sieve, its topics and a link that carries a little at each step. Each message has a number."""
+
+    def __init__(self, seed: int, *, fair: bool) -> None:
+        self.chance, self.fair = random.Random(seed), fair
+        self.counters, self.counts = Counters(), Counter[str]()
+        self.sieve = Sieve(self.takes, self.counters, lambda: self.now)
+        self.sieve.stream_s = TURN_S
+        self.now, self.ends = 100.0, False
+        self.on_way = 0
+        self.published = dict.fromkeys(TOPICS, 0)
+        self.passed = dict.fromkeys(TOPICS, 0)
+        self.passed_at = dict.fromkeys(TOPICS, 0.0)
+        self.waits_since: dict[str, float] = {}
+
+    def takes(self, rank: Rank, size: int) -> bool:
+        fits = not self.on_way or self.on_way + min(size, ROOM) <= ROOM * rank
+        self.on_way += size if fits else 0
+        return fits
+
+    def publish(self, topic: str) -> None:
+        number = self.published[topic] = self.published[topic] + 1
+        message = Message(topic, b"%d" % number + b" " * self.chance.choice(SIZES), QoS.DELIVERED)
+        self.counts["published"] += 1
+        if self.sieve.keeps(TOPICS[topic], message, FORWARD):
+            self.waits_since.setdefault(topic, self.now)
+        else:
+            self.passes(message)
+
+    def passes(self, message: Message) -> None:
+        topic, number = message.topic, int(message.payload)
+        since = self.waits_since.pop(topic, self.now)
+        assert number > self.passed[topic], "an older one follows a newer one"
+        assert number == self.published[topic], "one that is not the newest"
+        if self.fair:
+            turn_s = TURN_S if TOPICS[topic] is STREAM and not self.ends else 0.0
+            assert self.now - self.passed_at[topic] > turn_s - STEP_S / 2, "before its turn"
+            assert all(before >= since for before in self.states_wait), "before a state that waits for longer"
+            assert self.now - since < WAITS_S, "it waited for too long"
+        self.passed[topic], self.passed_at[topic] = number, self.now
+        self.counts["passed"] += 1
+
+    @property
+    def states_wait(self) -> list[float]:
+        return [since for topic, since in self.waits_since.items() if TOPICS[topic] is STATE]
+
+    def step(self) -> None:
+        for topic in self.chance.choices(list(TOPICS), weights=(1,) * 4 + (6,) * 4, k=self.chance.randrange(3)):
+            self.publish(topic)
+        self.send()
+
+    def send(self) -> None:
+        self.now += STEP_S
+        self.on_way = max(0, self.on_way - DRAINS)
+        for one in self.sieve.due(Rank.STATE):
+            self.passes(one.message)
+        event = Message("event", b"1", QoS.DELIVERED)
+        if self.chance.random() < 0.2 and self.sieve.takes_event(event) and self.fair:
+            assert not self.states_wait, "an event before a state that waits"
+        for one in self.sieve.due(Rank.STREAM):
+            self.passes(one.message)
+        assert len(self.sieve) <= module.TOPICS
+
+    def end(self, *, at_once: bool) -> None:
+        """All that waits is sent: the link carries it, or it is wide again."""
+        self.ends = at_once
+        for one in self.sieve.empty() if at_once else ():
+            self.waits_since = {one.message.topic: self.now}
+            self.passes(one.message)
+        for _ in range(0 if at_once else 300):
+            self.send()
+        lost = {topic for topic, number in self.published.items() if self.passed[topic] < number}
+        assert not {topic for topic in lost if TOPICS[topic] is STATE or self.fair}, "the newest is lost"
+        counted = self.counts["passed"] + self.counters["thinned"] + self.counters["shed"]
+        assert counted == self.counts["published"], "one is not counted"
+
+
+def perform(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A sieve with places for all topics, or for three of them; then what waits is sent, in one of two ways."""
+    fair = seed % 3 > 0
+    monkeypatch.setattr(module, "TOPICS", 512 if fair else 3)
+    walk = Walk(seed, fair=fair)
+    for _ in range(400):
+        walk.step()
+    walk.end(at_once=seed % 2 > 0)
+
+
+@pytest.mark.parametrize("seed", range(cases(12, 1000)))
+def test_no_walk_violates_a_rule(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    perform(seed, monkeypatch)
+
+
+BUGS = {
+    "what waits is sent after what is newer": ("if not waits and self._is_turn(", "if self._is_turn("),
+    "what waits is not replaced": (
+        "self._waiting[topic] = Waiting(rank, subject, message, forward)",
+        "self._waiting.setdefault(topic, Waiting(rank, subject, message, forward))",
+    ),
+    "what is sent waits on": ("                del self._waiting[topic]\n", ""),
+    "what was replaced is not counted": ('self._counters.add("thinned" if', '("thinned" if'),
+    "what has no place is not counted": ('            self._counters.add("shed")\n', ""),
+    "streams have no turns": ("rank is Rank.STATE or self._clock()", "True or self._clock()"),
+    "turns are not noted": ("            self._sent_at[topic] = self._clock()\n", ""),
+    "a small message goes before a large one": ("rank in self._short or", ""),
+    "events go before states": ("Rank.STATE not in self._short and ", ""),
+    "what was short of room once is so for ever": ("        self._short.discard(rank)\n", ""),
+    "a state without a place is lost": ("return False  # no state is lost", "return True"),
+    "any number waits": ("len(self._waiting) >= TOPICS", "len(self._waiting) >= 1000"),
+    "one message waits on a wide link": ("while self._waiting:", "if self._waiting:"),
+}
+
+
+@pytest.mark.parametrize("bug", BUGS)
+def test_each_deliberate_bug_shows(bug: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    with in_process(Mutation(module.__name__, *BUGS[bug])), pytest.raises(AssertionError):
+        deque((perform(seed, monkeypatch) for seed in range(30)), 0)
