@@ -96,7 +96,7 @@ def package(source: Path, version: str, release: list[Path], into: Path) -> Path
         target.chmod(mode)
     (tree / "usr/sbin").mkdir()
     (tree / "usr/sbin/pebble-slot").symlink_to("../lib/pebble/pebble-slot")
-    installed = sorted(path for path in tree.rglob("*") if path.is_file() and "DEBIAN" not in path.parts)
+    installed = sorted(path for path in tree.rglob("*") if path.is_file() and not path.is_symlink() and "DEBIAN" not in path.parts)
     sums = [f"{hashlib.md5(path.read_bytes()).hexdigest()}  {path.relative_to(tree)}\n" for path in installed]  # noqa: S324
     (tree / "DEBIAN" / "md5sums").write_text("".join(sums))
     deb = into / f"pebble-robot_{version}-1_all.deb"
