@@ -106,27 +106,23 @@ def package(source: Path, version: str, release: list[Path], into: Path) -> Path
     return deb
 
 
-def build(checkout: Path, into: Path, sbom: Path | None = None) -> str:
-    """Build the release of a checkout; returns its version. ``SOURCE_DATE_EPOCH`` is in the environment."""
-    os.umask(0o022)
+def build(source: Path, into: Path, sbom: Path | None = None) -> str:
+    """Build the release of a folder that :func:`copied` wrote; returns its version. Reads ``SOURCE_DATE_EPOCH``."""
     shutil.rmtree(into, ignore_errors=True)
     into.mkdir(parents=True)
-    with tempfile.TemporaryDirectory() as folder:
-        source = Path(folder) / "pebble"
-        copied(checkout, source)
-        (version,) = re.findall(r'^__version__ = "(.+)"$', (source / "pebble/version.py").read_text(), re.MULTILINE)
-        for kind in ("--sdist", "--wheel"):
-            command = [sys.executable, "-m", "build", kind, "--no-isolation", "--outdir", str(into), str(source)]
-            built = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
-            if built.returncode != 0:
-                sys.exit(built.stdout)
-            shutil.rmtree(source / "build", ignore_errors=True)
-        (sdist,), (wheel,) = into.glob("*.tar.gz"), into.glob("*.whl")
-        normal(sdist, int(os.environ["SOURCE_DATE_EPOCH"]))
-        lock = Path(shutil.copyfile(source / "requirements/robot.txt", into / "robot.txt"))
-        release = into / "RELEASE.json"
-        release.write_text(json.dumps(manifest(source, version, [wheel, lock]), indent=1) + "\n")
-        package(source, version, [release, lock, wheel], into)
+    (version,) = re.findall(r'^__version__ = "(.+)"$', (source / "pebble/version.py").read_text(), re.MULTILINE)
+    for kind in ("--sdist", "--wheel"):
+        command = [sys.executable, "-m", "build", kind, "--no-isolation", "--outdir", str(into), str(source)]
+        built = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
+        if built.returncode != 0:
+            sys.exit(built.stdout)
+        shutil.rmtree(source / "build", ignore_errors=True)
+    (sdist,), (wheel,) = into.glob("*.tar.gz"), into.glob("*.whl")
+    normal(sdist, int(os.environ["SOURCE_DATE_EPOCH"]))
+    lock = Path(shutil.copyfile(source / "requirements/robot.txt", into / "robot.txt"))
+    release = into / "RELEASE.json"
+    release.write_text(json.dumps(manifest(source, version, [wheel, lock]), indent=1) + "\n")
+    package(source, version, [release, lock, wheel], into)
     if sbom is not None:
         shutil.copyfile(sbom, into / sbom.name)
     sums = [f"{hashlib.sha256(path.read_bytes()).hexdigest()}  {path.name}\n" for path in sorted(into.iterdir())]
@@ -141,7 +137,10 @@ def main() -> None:
     asked = parser.parse_args()
     git = subprocess.run(["git", "log", "-1", "--format=%ct"], cwd=ROOT, capture_output=True, text=True, check=True)
     os.environ.setdefault("SOURCE_DATE_EPOCH", git.stdout.strip())
-    version = build(ROOT, asked.into.resolve(), asked.sbom)
+    os.umask(0o022)
+    with tempfile.TemporaryDirectory() as folder:
+        copied(ROOT, Path(folder))
+        version = build(Path(folder), asked.into.resolve(), asked.sbom)
     for path in sorted(asked.into.iterdir()):
         print(f"{path.stat().st_size:>9}  {path}")
     if subprocess.run(["git", "status", "--porcelain"], cwd=ROOT, capture_output=True, check=True).stdout:

@@ -1,8 +1,8 @@
 """A machine for tests: a real systemd as PID 1 in namespaces of its own, on a copy of this machine's files.
 
 Below is an overlay whose lower layer is this machine's own root, so Debian's packages are those that are installed here;
-what the machine writes is gone with it, or kept in ``disk`` from one boot to the next. Its network is a loopback of its
-own. Needs root, overlayfs, cgroup2 and systemd.
+what the machine writes is in ``disk``, which stays from one boot to the next, and may lie below other machines. Its
+network is a loopback of its own. Needs root, overlayfs, cgroup2 and systemd.
 """
 
 from __future__ import annotations
@@ -31,13 +31,14 @@ MASKED = (
 )
 DEVICES = {"null": (1, 3), "zero": (1, 5), "full": (1, 7), "random": (1, 8), "urandom": (1, 9), "tty": (5, 0)}
 
-#: In new namespaces: mounts what a kernel would, and becomes systemd. $1: the machine's folder; $2: shared ones.
+#: In new namespaces: mounts what a kernel would, and becomes systemd. $1: the machine's folder; $2: what lies below;
+#: $3: shared folders.
 BOOT = f"""
 set -eu
 mount --make-rprivate /
 root=$1/root
-mount -t overlay -o "lowerdir=/,upperdir=$1/disk/upper,workdir=$1/disk/work" machine "$root"
-for folder in $2; do
+mount -t overlay -o "lowerdir=$2,upperdir=$1/disk/upper,workdir=$1/disk/work" machine "$root"
+for folder in $3; do
     mkdir -p "$root/mnt/${{folder##*/}}"
     mount --bind "$folder" "$root/mnt/${{folder##*/}}"
     mount -o remount,bind,ro "$root/mnt/${{folder##*/}}"
@@ -82,18 +83,26 @@ def _cgroups() -> Path | None:
 
 
 class Machine:
-    """One that can be booted, cut off and booted again. ``shared``: folders that it sees, read-only, below /mnt."""
+    """One that can be booted, cut off and booted again.
 
-    def __init__(self, folder: Path, shared: Sequence[Path] = ()) -> None:
+    ``shared``: folders that it sees, read-only, below /mnt. ``like``: a machine that is off, with whose files it begins.
+    """
+
+    def __init__(self, folder: Path, shared: Sequence[Path] = (), like: Machine | None = None) -> None:
         self.folder, self._shared = folder, shared
         self.disk = folder / "disk"
         for name in ("root", "disk/upper", "disk/work"):
             (folder / name).mkdir(parents=True)
-        self._uppers()
+        self._layers: list[str] = ["/"]
+        if like is None:
+            self._hide()
+        else:
+            self._layers = [str(like.disk / "upper"), *like._layers]
+            (self.disk / "upper").chmod(0o755)
         self._boot: subprocess.Popen[Any] | None = None
         self._init = 0
 
-    def _uppers(self) -> None:
+    def _hide(self) -> None:
         upper = self.disk / "upper"
         upper.chmod(0o755)
         for hidden in HIDDEN:
@@ -128,7 +137,7 @@ class Machine:
         unshare = ["unshare", "--mount", "--pid", "--net", "--uts", "--ipc", "--cgroup", "--fork", "--kill-child"]
         shared = " ".join(map(str, self._shared))
         log = (self.folder / "boot.log").open("ab")
-        command = ["sh", "-c", enter, "boot", *unshare, "sh", "-c", BOOT, "boot", str(self.folder), shared]
+        command = ["sh", "-c", enter, "boot", *unshare, "sh", "-c", BOOT, "boot", str(self.folder), ":".join(self._layers), shared]
         self._boot = Child(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
         assert until(self._found, 30), f"no machine:\n{(self.folder / 'boot.log').read_text()}"
         assert until(lambda: self.run("systemctl", "is-system-running", check=False).strip() in _UP, 90, step=0.2), (
@@ -178,6 +187,9 @@ class Machine:
 
     def sh(self, script: str, **options: Any) -> str:
         return self.run("sh", "-euc", script, **options)
+
+    def succeeds(self, *words: str) -> bool:
+        return subprocess.run(self.command(*words), capture_output=True, check=False, timeout=60).returncode == 0
 
     def journal(self, unit: str) -> str:
         return self.run("journalctl", "--no-pager", "--output=cat", "--unit", unit)

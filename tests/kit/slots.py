@@ -61,11 +61,15 @@ class Slots:
         (self._bin / name).write_text(text)
         (self._bin / name).chmod(0o755)
 
-    def count_calls(self) -> None:
-        """From now on each program that the script starts is counted, and may be where it is killed."""
+    def run_counted(self, command: str, **environment: str) -> subprocess.CompletedProcess[str]:
+        """Run it with each program that it starts counted; ``BEFORE`` or ``AFTER`` one of them it is killed."""
         for name in _COMMANDS:
             real = "true" if name == "systemctl" else f"/usr/bin/{name}"
             self._program(name, _COUNTING.format(name=name, real=real))
+        done = self.run(command, **environment)
+        for name in _COMMANDS[:-1]:
+            (self._bin / name).unlink()
+        return done
 
     def run(self, command: str, *words: str, **environment: str) -> subprocess.CompletedProcess[str]:
         self.calls.unlink(missing_ok=True)
