@@ -40,7 +40,7 @@ class SmallDisk:
 
     @contextmanager
     def read_only(self) -> Iterator[None]:
-        """As after an error of its medium."""
+        """Refuse each write meanwhile, as after an error of the medium."""
         for how in ("ro", "rw"):
             subprocess.run(["mount", "-o", f"remount,{how}", str(self.root)], check=True)
             if how == "ro":

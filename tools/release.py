@@ -90,13 +90,16 @@ def package(source: Path, version: str, release: list[Path], into: Path) -> Path
     (tree / "DEBIAN").mkdir(parents=True)
     (tree / "DEBIAN" / "control").write_text(control)
     files = [(source / name, tree / where, mode) for name, where, mode in PACKAGE]
-    for path, target, mode in files + [(path, tree / SHARED / path.name, 0o644) for path in release]:
+    files += [(path, tree / SHARED / path.name, 0o644) for path in release]
+    for path, target, mode in files:
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(path, target)
         target.chmod(mode)
     (tree / "usr/sbin").mkdir()
     (tree / "usr/sbin/pebble-slot").symlink_to("../lib/pebble/pebble-slot")
-    installed = sorted(path for path in tree.rglob("*") if path.is_file() and not path.is_symlink() and "DEBIAN" not in path.parts)
+    installed = sorted(
+        path for path in tree.rglob("*") if path.is_file() and not path.is_symlink() and "DEBIAN" not in path.parts
+    )
     sums = [f"{hashlib.md5(path.read_bytes()).hexdigest()}  {path.relative_to(tree)}\n" for path in installed]  # noqa: S324
     (tree / "DEBIAN" / "md5sums").write_text("".join(sums))
     deb = into / f"pebble-robot_{version}-1_all.deb"

@@ -34,7 +34,7 @@ CHOICES = {
     },
 }
 #: the proof's result and exit status, and what then is to be seen; the trial began in b
-VERDICTS = {
+RESULTS = {
     "proven": ("success", "42", Seen("b", "b", "", ""), False),
     "undecided": ("success", "43", Seen("b", "a", "", ""), True),
     "disproven": ("exit-code", "1", Seen("b", "a", "", "0.3.0 it did not prove itself: exit-code 1"), True),
@@ -50,8 +50,8 @@ def test_choose(tmp_path: Path, whole: str, active: str, trial: str, expected: S
     assert (done.returncode, slots.seen()) == (0, expected), done.stderr
 
 
-@pytest.mark.parametrize(("result", "status", "expected", "restarts"), VERDICTS.values(), ids=VERDICTS)
-def test_settle(tmp_path: Path, result: str, status: str, expected: Seen, restarts: bool) -> None:
+@pytest.mark.parametrize(("result", "status", "expected", "restarts"), RESULTS.values(), ids=RESULTS)
+def test_a_proof_decides(tmp_path: Path, result: str, status: str, expected: Seen, restarts: bool) -> None:
     slots = Slots(tmp_path, trial=TRIAL)
     slots.run("choose")
     assert slots.judged(result, status).returncode == 0
@@ -64,7 +64,7 @@ def test_the_proof_of_another_start_decides_nothing(tmp_path: Path) -> None:
     slots.run("choose")
     slots.run("judge")
     slots.run("choose")
-    assert slots.settle("success", "42").returncode == 0
+    assert slots.decide("success", "42").returncode == 0
     assert slots.seen() == Seen("b", "a", f"b 0 0.3.0 {ID}", "")
 
 

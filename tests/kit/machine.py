@@ -31,13 +31,17 @@ MASKED = (
 )
 DEVICES = {"null": (1, 3), "zero": (1, 5), "full": (1, 7), "random": (1, 8), "urandom": (1, 9), "tty": (5, 0)}
 
-#: In new namespaces: mounts what a kernel would, and becomes systemd. $1: the machine's folder; $2: what lies below;
-#: $3: shared folders.
+#: In new namespaces: mounts what a kernel would, and becomes systemd. $1: the machine's folder; $2: the disk of
+#: another one to begin with, or nothing; $3: shared folders.
 BOOT = f"""
 set -eu
 mount --make-rprivate /
-root=$1/root
-mount -t overlay -o "lowerdir=$2,upperdir=$1/disk/upper,workdir=$1/disk/work" machine "$root"
+root=$1/root below=/
+if [ -n "$2" ]; then
+    below=$1/below
+    mount -t overlay -o "lowerdir=/,upperdir=$2/upper,workdir=$2/work" below "$below"
+fi
+mount -t overlay -o "lowerdir=$below,upperdir=$1/disk/upper,workdir=$1/disk/work" machine "$root"
 for folder in $3; do
     mkdir -p "$root/mnt/${{folder##*/}}"
     mount --bind "$folder" "$root/mnt/${{folder##*/}}"
@@ -91,20 +95,17 @@ class Machine:
     def __init__(self, folder: Path, shared: Sequence[Path] = (), like: Machine | None = None) -> None:
         self.folder, self._shared = folder, shared
         self.disk = folder / "disk"
-        for name in ("root", "disk/upper", "disk/work"):
+        for name in ("root", "below", "disk/upper", "disk/work"):
             (folder / name).mkdir(parents=True)
-        self._layers: list[str] = ["/"]
+        (self.disk / "upper").chmod(0o755)
+        self._like = str(like.disk) if like else ""
         if like is None:
             self._hide()
-        else:
-            self._layers = [str(like.disk / "upper"), *like._layers]
-            (self.disk / "upper").chmod(0o755)
         self._boot: subprocess.Popen[Any] | None = None
         self._init = 0
 
     def _hide(self) -> None:
         upper = self.disk / "upper"
-        upper.chmod(0o755)
         for hidden in HIDDEN:
             if Path(hidden).exists():
                 place = upper / hidden[1:]
@@ -137,7 +138,7 @@ class Machine:
         unshare = ["unshare", "--mount", "--pid", "--net", "--uts", "--ipc", "--cgroup", "--fork", "--kill-child"]
         shared = " ".join(map(str, self._shared))
         log = (self.folder / "boot.log").open("ab")
-        command = ["sh", "-c", enter, "boot", *unshare, "sh", "-c", BOOT, "boot", str(self.folder), ":".join(self._layers), shared]
+        command = ["sh", "-c", enter, "boot", *unshare, "sh", "-c", BOOT, "boot", str(self.folder), self._like, shared]
         self._boot = Child(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
         assert until(self._found, 30), f"no machine:\n{(self.folder / 'boot.log').read_text()}"
         assert until(lambda: self.run("systemctl", "is-system-running", check=False).strip() in _UP, 90, step=0.2), (

@@ -83,9 +83,9 @@ class Slots:
     def judged(self, result: str, status: str) -> subprocess.CompletedProcess[str]:
         """Settle as systemd does after the proof of the start that was chosen last."""
         self.run("judge")
-        return self.settle(result, status)
+        return self.decide(result, status)
 
-    def settle(self, result: str, status: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    def decide(self, result: str, status: str, **environment: str) -> subprocess.CompletedProcess[str]:
         code = "killed" if result == "timeout" else "exited"
         return self.run("settle", SERVICE_RESULT=result, EXIT_CODE=code, EXIT_STATUS=status, **environment)
 

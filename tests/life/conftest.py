@@ -88,9 +88,7 @@ def installed(
 
 
 @pytest.fixture
-def machine(
-    tmp_path: Path, installed: Machine, packages: Packages, wheels: Path
-) -> Iterator[Machine]:
+def machine(tmp_path: Path, installed: Machine, packages: Packages, wheels: Path) -> Iterator[Machine]:
     """One that has just been installed, and runs."""
     with Machine(tmp_path / "machine", [packages.folder, wheels], installed) as booted:
         yield booted

@@ -29,7 +29,7 @@ CONFIG: dict[str, Any] = {
 
 
 class Robot:
-    """What its machine's broker hears of it."""
+    """What its machine's broker receives of it."""
 
     def __init__(self, machine: Machine) -> None:
         self.machine = machine
@@ -45,22 +45,33 @@ class Robot:
         assert until(lambda: self.machine.succeeds("test", "-e", PORT), 30, step=0.1)
 
     def configure(self, config: dict[str, Any] = CONFIG) -> None:
-        """As ``pebble setup`` leaves it: readable by the robot's group."""
+        """Write its config as ``pebble setup`` leaves it: readable by the robot's group."""
         self.machine.write("/etc/pebble/robot.json", json.dumps(config))
         self.machine.sh("chown root:pebble /etc/pebble/robot.json; chmod 640 /etc/pebble/robot.json")
 
     def start(self) -> None:
         """Enable the unit; returns when its heartbeat arrives."""
         self.machine.run("systemctl", "enable", "--now", "pebble.service")
-        assert self.hears("outgoing/online", '"online":true'), self.machine.journal("pebble.service")
+        assert self.receives("outgoing/online", '"online":true'), self.machine.journal("pebble.service")
 
     def send(self, topic: str, body: Any, *options: str) -> None:
         message = json.dumps(body)
         self.machine.run("mosquitto_pub", "-h", "127.0.0.1", "-t", f"{BASE}/{topic}", "-m", message, *options)
 
-    def hears(self, topic: str, part: str = "", count: int = 3, timeout: int = 60) -> bool:
+    def receives(self, topic: str, part: str = "", count: int = 3, timeout: int = 60) -> bool:
         """Whether that many messages arrive that are not retained, and the last one has ``part``."""
-        words = ("mosquitto_sub", "-h", "127.0.0.1", "-R", "-C", str(count), "-W", str(timeout), "-t", f"{BASE}/{topic}")
+        words = (
+            "mosquitto_sub",
+            "-h",
+            "127.0.0.1",
+            "-R",
+            "-C",
+            str(count),
+            "-W",
+            str(timeout),
+            "-t",
+            f"{BASE}/{topic}",
+        )
         text = self.machine.run(*words, check=False, timeout=timeout + 30)
         last = text.splitlines()[-1:] if text.count("\n") >= count else [""]
         return bool(last[0]) and part in last[0].replace(" ", "")

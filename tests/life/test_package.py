@@ -51,19 +51,19 @@ def test_a_newer_package_is_built_beside_and_the_older_one_is_one_command_away(
     machine.run("pebble-slot", "take", "--wheels", "/mnt/wheels", timeout=600)
     assert machine.run("pebble", "--version") == f"pebble {NEW}\n"
     assert robot.runs_from() == "a", "what drives is not restarted"
-    assert robot.hears("outgoing/online")
+    assert robot.receives("outgoing/online")
     machine.run("systemctl", "restart", "pebble.service")
-    assert robot.hears("outgoing/online")
+    assert robot.receives("outgoing/online")
     assert robot.runs_from() == "b"
 
     machine.run("pebble-slot", "back")
     machine.run("systemctl", "restart", "pebble.service")
-    assert robot.hears("outgoing/online")
+    assert robot.receives("outgoing/online")
     assert robot.runs_from() == "a"
     machine.cut()
     machine.boot()
     robot.plug_in()
-    assert robot.hears("outgoing/online"), "it starts with the machine"
+    assert robot.receives("outgoing/online"), "it starts with the machine"
     assert robot.runs_from() == "a"
 
 
@@ -115,5 +115,5 @@ def test_a_removal_keeps_everything_and_a_purge_nothing(machine: Machine, how: s
     machine.run("apt-get", how, "--quiet", "--yes", "pebble-robot")
     assert not machine.succeeds("systemctl", "--quiet", "is-active", "pebble.service")
     assert not machine.succeeds("test", "-e", "/usr/bin/pebble")
-    kept = ("/etc/pebble/robot.json", "/var/lib/pebble", "/var/lib/pebble-update/sequence", "/opt/pebble/a/bin/pebble")
-    assert [path for path in kept if machine.succeeds("test", "-e", path) != left] == []
+    paths = ("/etc/pebble/robot.json", "/var/lib/pebble", "/var/lib/pebble-update/sequence", "/opt/pebble/a/bin/pebble")
+    assert [path for path in paths if machine.succeeds("test", "-e", path) != left] == []

@@ -26,8 +26,6 @@ COMMANDS = {
 }
 
 
-
-
 @pytest.mark.parametrize("when", ["BEFORE", "AFTER"])
 @pytest.mark.parametrize(("command", "result", "status", "active"), COMMANDS.values(), ids=COMMANDS)
 def test_a_kill_at_any_of_its_steps(
