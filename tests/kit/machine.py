@@ -1,7 +1,7 @@
 """A machine for tests: a real systemd as PID 1 in namespaces of its own, on a copy of this machine's files.
 
-Below is an overlay whose lower layer is this machine's own root, so Debian's packages are those that are installed here;
-what the machine writes is in ``disk``, which stays from one boot to the next, and may lie below other machines. Its
+Below is an overlay whose lower layer is this machine's own root, so Debian's packages are those that are installed
+here; what the machine writes is in ``disk``, which stays from one boot to the next, and may lie below other machines. Its
 network is a loopback of its own. Needs root, overlayfs, cgroup2 and systemd.
 """
 
@@ -89,7 +89,7 @@ def _cgroups() -> Path | None:
 class Machine:
     """One that can be booted, cut off and booted again.
 
-    ``shared``: folders that it sees, read-only, below /mnt. ``like``: a machine that is off, with whose files it begins.
+    ``shared``: folders that it sees, read-only, below /mnt. ``like``: one that is off, whose files it begins with.
     """
 
     def __init__(self, folder: Path, shared: Sequence[Path] = (), like: Machine | None = None) -> None:
@@ -190,7 +190,7 @@ class Machine:
         return self.run("sh", "-euc", script, **options)
 
     def succeeds(self, *words: str) -> bool:
-        return subprocess.run(self.command(*words), capture_output=True, check=False, timeout=60).returncode == 0
+        return subprocess.run(self.command(*words), capture_output=True, check=False, timeout=120).returncode == 0
 
     def journal(self, unit: str) -> str:
         return self.run("journalctl", "--no-pager", "--output=cat", "--unit", unit)

@@ -1,4 +1,4 @@
-"""Two slots below a root of their own, for tests of ``configs/slot/pebble-slot``: folders that only look like software."""
+"""Two slots below a root of their own, for tests of ``configs/slot/pebble-slot``: folders that only look so."""
 
 from __future__ import annotations
 

@@ -17,8 +17,8 @@ def test_a_robot_with_media_drives_stops_shows_and_sounds(machine: Machine) -> N
     for flag, ask in (("mqtt-video", "front-camera"), ("mqtt-audio", "audio")):
         robot.send(f"incoming/flags/{flag}", True, "-r")
         robot.send(f"incoming/{ask}", {"enabled": True})
-    assert robot.receives("outgoing/front-camera", count=5)
-    assert robot.receives("outgoing/audio", count=5)
+    assert robot.receives("outgoing/front-camera")
+    assert robot.receives("outgoing/audio")
     assert not robot.board.turning()
     robot.send("incoming/drive-values", {"x": 0, "z": 0.5})
     assert until(robot.board.motors, 10, step=0.1), "it drives"
