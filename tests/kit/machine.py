@@ -1,8 +1,8 @@
 """A machine for tests: a real systemd as PID 1 in namespaces of its own, on a copy of this machine's files.
 
 Below is an overlay whose lower layer is this machine's own root, so Debian's packages are those that are installed
-here; what the machine writes is in ``disk``, which stays from one boot to the next, and may lie below other machines. Its
-network is a loopback of its own. Needs root, overlayfs, cgroup2 and systemd.
+here. What the machine writes is in ``disk``, which stays from one boot to the next, and may lie below other machines.
+Its network is a loopback of its own. Needs root, overlayfs, cgroup2 and systemd.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import signal
 import subprocess
 from collections.abc import Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any, Self
 
@@ -168,7 +169,7 @@ class Machine:
             self._boot.wait(30)
             self._boot, self._init = None, 0
         for folder, _, _ in os.walk(self._cgroup, topdown=False):
-            assert until(lambda place=folder: _removed(Path(place)), 10), folder
+            assert until(partial(_removed, Path(folder)), 10), folder
 
     def command(self, *words: str) -> list[str]:
         """Return what runs a command in it, as root."""
@@ -182,7 +183,7 @@ class Machine:
             self.command(*words), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL,
             check=False, timeout=timeout, **options,
         )  # fmt: skip
-        text = done.stdout.decode(errors="replace")
+        text: str = done.stdout.decode(errors="replace")
         assert not check or done.returncode == 0, f"{words}: {done.returncode}\n{text}"
         return text
 
