@@ -119,7 +119,11 @@ class Machine:
         (upper / "etc/fstab").write_text("")
 
     def __enter__(self) -> Self:
-        self.boot()
+        try:
+            self.boot()
+        except BaseException:
+            self.__exit__()
+            raise
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -138,9 +142,9 @@ class Machine:
         enter = f'echo $$ >"{self._cgroup}/cgroup.procs" && exec "$@"'
         unshare = ["unshare", "--mount", "--pid", "--net", "--uts", "--ipc", "--cgroup", "--fork", "--kill-child"]
         shared = " ".join(map(str, self._shared))
-        log = (self.folder / "boot.log").open("ab")
         command = ["sh", "-c", enter, "boot", *unshare, "sh", "-c", BOOT, "boot", str(self.folder), self._like, shared]
-        self._boot = Child(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
+        with (self.folder / "boot.log").open("ab") as log:
+            self._boot = Child(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
         assert until(self._found, 30), f"no machine:\n{(self.folder / 'boot.log').read_text()}"
         assert until(lambda: self.run("systemctl", "is-system-running", check=False).strip() in _UP, 90, step=0.2), (
             self.run("systemctl", "list-jobs", check=False) + self.run("systemctl", "--failed", check=False)
