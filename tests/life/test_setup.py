@@ -1,4 +1,4 @@
-"""From a package and a file of answers to a robot that is heard, and a page on which its user logs in."""
+"""From a package and a file of answers to a robot with heartbeats, and a page on which its user logs in."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ print(ask("/"), ask("/api/login", {"user": "ann", "password": "%s"}))
 
 
 @pytest.mark.skipif(not SETUP, reason="needs pebble setup")
-def test_package_and_setup_make_a_robot_that_is_heard_and_lets_its_user_in(machine: Machine) -> None:
+def test_package_and_setup_make_a_robot_with_heartbeats_and_let_its_user_in(machine: Machine) -> None:
     robot = Robot(machine)
     robot.plug_in()
     machine.write("/srv/password", PASSWORD)
