@@ -5,7 +5,7 @@ VENV := .venv/bin/python
 
 .DEFAULT_GOAL := help
 unexport PYTHONDONTWRITEBYTECODE  # every test starts programs: compiling them each time would cost a third of the time
-.PHONY: help demo demo-options test quick thorough stops soak floods schedules script-schedules page-schedules page-tests looks gstreamer gstreamer-tests brokers check firmware report clean lock audit sbom check-types check-names check-collection quick-tests test-running test-robots test-computing test-checks test-demo
+.PHONY: help demo demo-options test quick thorough stops soak floods schedules script-schedules page-schedules page-tests looks gstreamer gstreamer-tests brokers check firmware report clean lock audit sbom release life life-long check-types check-names check-collection quick-tests test-running test-robots test-computing test-checks test-demo
 
 help:
 	@echo "make demo             four simulated robots, on Zenoh, on MQTT and on MCUs, driven through a broker; Ctrl-C ends it"
@@ -31,6 +31,9 @@ help:
 	@echo "make lock             write requirements/ anew from pyproject.toml; UPGRADE=1: with the newest versions"
 	@echo "make audit            ask OSV for known vulnerabilities of all packages; without an answer it fails: not checked"
 	@echo "make sbom             write build/sbom.cdx.json: what a robot's software consists of"
+	@echo "make release          write build/release: wheel, sdist, Debian package, SBOM, checksums; a minute"
+	@echo "make life             install, update, damage and remove packages on machines with a real systemd; root, 15 minutes"
+	@echo "make life-long        the same with all random cases"
 	@echo "make clean            remove what the other targets created"
 
 # Before the set-up, which takes a minute; the shortest is that of pebble.demo.main, rounded up.
@@ -83,7 +86,7 @@ test: .venv/.ready-dev
 
 test-running:
 	@echo "pebble: tests"
-	@$(TESTS) --workers 7 -m "not alone and not page$(LESS)" $(addprefix --ignore=,$(COMPUTING)) tests
+	@$(TESTS) --workers 7 -m "not alone and not page$(LESS)" $(addprefix --ignore=,$(COMPUTING) tests/life) tests
 
 test-checks:
 	@$(GENTLY) $(MAKE) --no-print-directory --jobs=2 check-types check-names >.venv/checks.log 2>&1 || \
@@ -166,6 +169,25 @@ script-schedules: .venv/.ready-dev
 page-schedules: .venv/.ready-dev
 	@sh tools/debian-packages.sh mosquitto=mosquitto chromium=chromium
 	@$(VENV) -m tests.web.chromium_schedules
+
+# Without root or namespaces its tests are skipped, and name what is missing.
+life: .venv/.ready-dev .venv/wheels/.ready
+	@sh tools/debian-packages.sh mosquitto=mosquitto mosquitto_pub=mosquitto-clients ip=iproute2 systemd-analyze=systemd minisign=minisign
+	@$(TESTS) --timeout 900 -ra tests/configs/test_slot.py tests/update tests/life
+
+life-long:
+	@PEBBLE_THOROUGH=1 $(MAKE) --no-print-directory life
+
+# What a slot is built from, for the system's own Python.
+.venv/wheels/.ready: requirements/robot.txt | .venv/.ready-dev
+	@echo "pebble: fetching the packages of a robot, 140 MB"
+	@rm -rf $(@D)
+	@$(VENV) -m pip download --quiet --disable-pip-version-check --require-hashes --only-binary :all: --dest $(@D) -r $<
+	@touch $@
+
+release: .venv/.ready-dev sbom
+	@sh tools/debian-packages.sh dpkg-deb=dpkg
+	@$(VENV) tools/release.py --sbom build/sbom.cdx.json
 
 firmware: .venv/.ready-dev
 	@sh tools/debian-packages.sh node=nodejs

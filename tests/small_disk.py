@@ -38,6 +38,14 @@ class SmallDisk:
         finally:
             filler.unlink()
 
+    @contextmanager
+    def read_only(self) -> Iterator[None]:
+        """Refuse each write meanwhile, as after an error of the medium."""
+        for how in ("ro", "rw"):
+            subprocess.run(["mount", "-o", f"remount,{how}", str(self.root)], check=True)
+            if how == "ro":
+                yield
+
     def close(self) -> None:
         while self._mounts:
             self.unmount()

@@ -85,6 +85,10 @@ def test_robots_install_the_versions_that_the_tests_run_with(name: str) -> None:
     assert {name: found for name, found in versions(name).items() if not found <= tested.get(name, set())} == {}
 
 
+def test_a_slot_without_a_lock_on_32_bits_has_what_the_lock_of_robots_has() -> None:
+    assert f"[{','.join(lock.LOCKS['robot'])}]" in (ROOT / "configs" / "slot" / "pebble-slot").read_text()
+
+
 FAKE_PIP = """#!/bin/sh
 echo "$*" >>"$CALLS"
 case "$*" in

@@ -1,0 +1,1 @@
+"""What makes a newer version safe to take: signed releases."""
