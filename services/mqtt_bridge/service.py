@@ -77,8 +77,8 @@ class MqttBridge(ForwardingService):
         self._uplink: Uplink | None = None
         if section.link.profile != "wide":
             self._uplink = Uplink(section, self.addresses[LINK], self.remote, self.forwarder, self.clock)
-        own = () if self._uplink is None else (LINK,)
-        self._leftovers = Leftovers(self.config.base, self.subjects, self.remote, *own)
+        own, sparing = ((), False) if self._uplink is None else ((LINK,), True)
+        self._leftovers = Leftovers(self.config.base, self.subjects, self.remote, *own, sparing=sparing)
         self._leftover_timer: Timer | None = None
         self._stop_topic = ESTOP.topic(self.config.base)
         self._stops = self._make_stops()
