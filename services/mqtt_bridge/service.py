@@ -43,6 +43,7 @@ _IGNORED = (Drop.ECHO, Drop.LATE, Drop.PROBE)  # nothing that a person or a prog
 LEFTOVERS_AFTER_S = 30.0  # by then all services have published what they retain; so long after the start, or later
 _LOGGED = 200  # characters of a topic
 _CHECK_STOPS_S, _NOTICED_S = 1.0, 1.0
+_THIN_GRACE_S = 30.0  # over a thin link, while a client floods it
 ASK_S = 0.2  # between two questions about what is left at the remote broker
 
 
@@ -123,7 +124,13 @@ class MqttBridge(ForwardingService):
 
         filters = [self._stop_topic, *([with_name(self._stop_topic, "+")] if self.config.security.named else [])]
         notices_s = self.config.services.mqtt_bridge.remote_mqtt.silence_seconds + _NOTICED_S
-        return StopConnection(transport, filters, self._pass_stop, self._forwards, self.clock, notices_s=notices_s)
+        make = partial(StopConnection, transport, filters, self._pass_stop, self._forwards, self.clock)
+        uplink = self._uplink
+        if uplink is None:
+            return make(notices_s=notices_s)
+        transport.suit_link(slow=True)
+        notices_s = max(notices_s, LEVELS["thin"].silent_s + _NOTICED_S)
+        return make(notices_s=notices_s, grace_s=_THIN_GRACE_S, wanted=lambda: uplink.is_flooded)
 
     def start(self) -> None:
         super().start()

@@ -26,6 +26,7 @@ _UNANSWERED_S = 0.5  # how often a question without an answer counts
 _PAUSE = 25  # so much longer on a thin link what can wait is spread
 _HEARTBEAT_BYTES = 80  # about
 _LATE, _LATE_S = 8, 1.5  # commands, and since when all of them were late: the broker holds more of the kind
+_FLOODED_S = 60.0  # after what was done about it
 
 
 class Uplink:
@@ -48,7 +49,7 @@ class Uplink:
         self._sieve = Sieve(self._takes, forwarder.counters, clock)
         self._quiet_log = RateLimitedLog(log, period_s=60.0)
         self._level = ""  # that the others know; none yet
-        self._heartbeat_at = self._state_at = self._answered_at = -inf
+        self._heartbeat_at = self._state_at = self._answered_at = self._flooded_at = -inf
         self._state_queue_s = 0.0
         self._answers, self._shed = 0, 0
         remote.proof = address.topic
@@ -57,6 +58,11 @@ class Uplink:
     @property
     def level(self) -> Level:
         return LEVELS[self._meter.level]
+
+    @property
+    def is_flooded(self) -> bool:
+        """Whether a client lately sent more commands than the link carries."""
+        return self._clock() - self._flooded_at < _FLOODED_S
 
     @property
     def heartbeat_qos(self) -> int | None:
@@ -109,11 +115,13 @@ class Uplink:
     def _drop_late(self) -> None:
         """Who sends more commands than a thin link carries fills the broker's queue with them; a stop would wait there.
 
-        They are worth nothing when they come, and a new connection drops all that wait. The stop is repeated.
+        They are worth nothing when they come, and a new connection drops all that wait. From then on stops have a
+        connection of their own.
         """
         late = self._forwarder.ages.late
         if self._level == "thin" and late.count >= _LATE and late.seconds >= _LATE_S:
             late.count = 0
+            self._flooded_at = self._clock()
             self._remote.renew_connection("only late commands come over a thin link: those that wait there are dropped")
 
     def _suit(self) -> None:
