@@ -505,7 +505,7 @@ class TestLeftovers:
     FOREIGN = ("incoming/flags/foreign", "outgoing/video", "outgoing/unknown", ONLINE)
 
     @pytest.mark.parametrize("forgets", [False, True], ids=["the robot has taken it back", "the robot is not there"])
-    @pytest.mark.parametrize(("section", "own", "seconds"), [({}, (), 60), ({"link": THIN}, ("outgoing/link", "outgoing/audit"), 600)])
+    @pytest.mark.parametrize(("section", "own", "seconds"), [({}, (), 60), ({"link": THIN}, ("outgoing/link",), 600)])
     def test_what_was_taken_back_while_no_bridge_ran_is_removed_there(
         self, bridge: World, section: dict[str, Any], own: tuple[str, ...], seconds: float, forgets: bool
     ) -> None:
@@ -526,7 +526,8 @@ class TestLeftovers:
         bridge.start(**section)
         bridge.run(seconds)
         left = {f"{BASE}/{topic}" for topic in (*self.FOREIGN, *own, *(f"outgoing/{name}" for name in self.STAYS))}
-        assert {*bridge.remote_hub.retained} == (there | left if forgets else left)
+        audit = {f"{BASE}/outgoing/audit"}  # saved by a thread, at the latest within the longer time
+        assert {*bridge.remote_hub.retained} - audit == (there | left if forgets else left)
 
 
 class TestPrivate:
