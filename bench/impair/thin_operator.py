@@ -25,6 +25,7 @@ from pebble.bench.impair.wheels import Driven, Gesture, LinkSeen, Login, Orders,
 from pebble.client.connection import put_names
 from pebble.client.control import ControlClient
 from pebble.client.drive_reasons import RESET_S
+from pebble.client.driveable import is_held
 from pebble.client.estop import StopSender, new_name
 from pebble.client.estop_states import Reset
 from pebble.client.names import Names
@@ -49,6 +50,8 @@ _RESET_AGAIN_S = 3.0
 _TOOK_S, _LET_GO_S = 2.5, 1.0  # so long is driven after control was taken
 _HEARTBEATS = 100_000
 _BY = "trial"
+_CAMERA = "camera_publisher"
+_DECIMALS = 4  # of an axis, as a page has them: they hold the three of a wheel
 
 
 class Person:
@@ -66,7 +69,7 @@ class Person:
         self.stopping: StopSender | None = None
         self.heartbeats: deque[Heartbeat] = deque(maxlen=_HEARTBEATS)
         self.links: list[LinkSeen] = []
-        self.ready = False
+        self.ready = self.held = False  # held: its pictures wait for driving
         self._key = secrets.token_hex(4)
         self._arrived: deque[tuple[Message, float, float, int]] = deque()
         names = Names(orders.base, account=login.name)
@@ -98,6 +101,7 @@ class Person:
                 self.links.append(LinkSeen(ns, self.view.link.level, self.view.link.queue_ms))
             elif channel is STATUS:
                 self.ready = all_ready(codec.decode(STATUS, message.payload).value)
+                self.held = is_held(message.payload, _CAMERA)
         now = clock()
         if not self.foreign:
             self.publish(self.control.tick(now))
@@ -110,7 +114,7 @@ class Person:
 
     def drive(self, left: float, right: float) -> None:
         axes, pace = axes_of(left, right), WIDE if self.foreign else self.view.pace
-        command = Drive(x=axes["x"], z=axes["z"])
+        command = Drive(x=round(axes["x"], _DECIMALS), z=round(axes["z"], _DECIMALS))
         if not self.foreign:
             key = self.control.key or msgspec.UNSET
             command = msgspec.structs.replace(command, valid_ms=pace.valid_ms, key=key)
@@ -252,7 +256,7 @@ class ThinOperator:
     def _step(self) -> None:
         for person in self._people:
             person.step()
-        if self._viewer is not None and clock() - self._polled_at > _TICK_S:
+        if self._viewer is not None and not self._first.held and clock() - self._polled_at > _TICK_S:
             self._polled_at = clock()
             self._viewer.poll()
         time.sleep(_STEP_S)

@@ -52,7 +52,7 @@ def pace_of(link: LinkState | None) -> Pace:
         qos=WIDE.qos if level.drive_qos is None else QoS(level.drive_qos),
         valid_ms=level.valid_ms,
         stamped=level.stamped,
-        control_s=3.0,  # commands renew it, too
+        control_s=5.0,  # commands renew it, too
         control_for_ms=10_000,
         answer_s=level.answer_s,
     )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
 from functools import partial
 from typing import Any, ClassVar
 
@@ -148,20 +147,17 @@ class ForwardingService(Service, ABC):
 
         So a retained message of the remote side is never older than what the robot has changed.
         """
-        directions = (INCOMING,) if self.rules.leaves_robot else (INCOMING, OUTGOING)
-        self.listen_remote(self.subjects.filters(*directions))
-        self.await_retained()
-        self.forwarder.subscribed(Side.REMOTE)
-        self.synchronize_later(Side.REMOTE)
-
-    def listen_remote(self, filters: Iterable[str]) -> None:
-        """Subscribe to these in place of what was subscribed to there."""
         self.unsubscribe(Side.REMOTE)
         self.forwarder.sides[Side.REMOTE].subscribing()
         receive = partial(self.receive_remote, self.epoch)
+        directions = (INCOMING,) if self.rules.leaves_robot else (INCOMING, OUTGOING)
         self.subscriptions[Side.REMOTE] = [
-            self.remote.subscribe(filter_, receive, echo=False, direct=True) for filter_ in filters
+            self.remote.subscribe(filter_, receive, echo=False, direct=True)
+            for filter_ in self.subjects.filters(*directions)
         ]
+        self.await_retained()
+        self.forwarder.subscribed(Side.REMOTE)
+        self.synchronize_later(Side.REMOTE)
 
     def unsubscribe(self, side: Side) -> None:
         subscriptions, self.subscriptions[side] = self.subscriptions[side], []

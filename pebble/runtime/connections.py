@@ -94,11 +94,12 @@ def remote_transport(config: Config, name: str, *, will: Message | None = None) 
 def stops_transport(config: Config) -> Transport | None:
     """The bridge's second connection to operators, on which only stops are received; None: it has none.
 
-    Where the broker knows no accounts one connection is as good as another, and over a thin link a second one's pings
-    cost more than it saves. It receives the retain flag of old messages only: this is no as-published connection.
+    Where the broker knows no accounts one connection is as good as another, unless the link may be thin: a client that
+    sends more than it carries fills it without meaning to. It receives the retain flag of old messages only: this is no
+    as-published connection.
     """
     bridge = config.services.mqtt_bridge
-    if config.security.level == "open" or bridge.remote is not None or bridge.link.profile != "wide":
+    if bridge.remote is not None or (config.security.level == "open" and bridge.link.profile == "wide"):
         return None
     settings = mqtt_settings(bridge.remote_mqtt, reconnect_max_s=REMOTE_RECONNECT_S, program=_STOPS)
     return create("mqtt", _name(config, "mqtt", _STOPS), settings)

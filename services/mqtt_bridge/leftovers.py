@@ -17,9 +17,12 @@ _NOT_HERE = (ONLINE, AUDIT, MCU_DESCRIBE)  # the bridge's own, and what MCU_VALU
 class Leftovers:
     """What robot and broker retain. Transports call :meth:`note_local` on their threads."""
 
-    def __init__(self, base: str, subjects: Subjects, remote: Transport, *own: Channel) -> None:
-        """``own`` are further ones that the bridge itself publishes on the remote side."""
-        self._remote = remote
+    def __init__(self, base: str, subjects: Subjects, remote: Transport, *own: Channel, sparing: bool = False) -> None:
+        """``own`` are further ones that the bridge itself publishes on the remote side.
+
+        ``sparing``: nothing is asked for that the robot has; the answer would only hold up what is on its way to it.
+        """
+        self._remote, self._sparing = remote, sparing
         self._here: set[str] | None = set()  # topics that the robot retains; None: it is over
         self._there: set[str] = set()
         self._subscriptions: list[Subscription] = []
@@ -46,6 +49,9 @@ class Leftovers:
 
     def ask_next(self) -> bool:
         """Ask the broker for some of the topics; False if all were asked for. Waits for its answer."""
+        here = self._here or set()
+        while self._sparing and self._next < len(self._filters) and self._filters[self._next] in here:
+            self._next += 1
         if self._next == len(self._filters):
             return False
         filter_ = self._filters[self._next]

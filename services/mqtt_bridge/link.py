@@ -23,8 +23,6 @@ _MOST = 256  # messages that are remembered
 _SLACK_BYTES = 64  # of pings and headers
 _CARRIED = 0.75  # of what a link carries; the rest are headers of small packets
 _POLL_S = 0.1  # so late an acknowledgement is noticed
-FIRST_PAUSE_S, LONGEST_PAUSE_S = 3.0, 12.0  # between floods of commands that follow each other
-_CALM_S = 60.0  # after which the next flood is the first one
 
 
 class _Rule(Struct, frozen=True):
@@ -39,29 +37,6 @@ _RULES: dict[LinkLevel, _Rule] = {
     "narrow": _Rule(0.3, 20.0),
     "thin": _Rule(float("inf"), 60.0),
 }
-
-
-class FloodPauses:
-    """Decides for how long stops alone are received, after commands have flooded the link.
-
-    At first they are not: what waits at the broker is dropped with the connection. Each flood that follows soon doubles
-    the pause, and a minute without one ends that. So no flood has the bridge connect all the time, and in each pause
-    nothing stands before a stop.
-    """
-
-    def __init__(self) -> None:
-        self._seconds = 0.0
-        self._until = float("-inf")
-
-    def begin(self, now: float) -> float:
-        """A flood has ended a connection: how long the pause is, which begins now."""
-        soon = now - self._until < _CALM_S
-        self._seconds = min(max(FIRST_PAUSE_S, 2 * self._seconds), LONGEST_PAUSE_S) if soon else 0.0
-        self._until = now + self._seconds
-        return self._seconds
-
-    def left_s(self, now: float) -> float:
-        return max(0.0, self._until - now)
 
 
 class ShortestTrip:

@@ -28,7 +28,7 @@ MEDIA: Final = (
     Row(MQTT_AUDIO, AUDIO_CONTROL, ALL_SOUND, ("audio_publisher", "audio_receiver")),
 )
 HELD: Final = ("camera_publisher", "video_stream", "audio_publisher")
-HOLD_S: Final = 2.0  # after the newest command that moves something
+HOLD_S: Final = 5.0  # after the newest command that moves something: each beginning costs 2 KB of states and logs
 _ROWS: Final = {channel.suffix: row for row in MEDIA for channel in (row.flag, row.request)}
 _NO: Final = ProgramRequest(on=False)
 

@@ -43,6 +43,7 @@ _IGNORED = (Drop.ECHO, Drop.LATE, Drop.PROBE)  # nothing that a person or a prog
 LEFTOVERS_AFTER_S = 30.0  # by then all services have published what they retain; so long after the start, or later
 _LOGGED = 200  # characters of a topic
 _CHECK_STOPS_S, _NOTICED_S = 1.0, 1.0
+_THIN_GRACE_S = 30.0  # over a thin link, while a client floods it
 ASK_S = 0.2  # between two questions about what is left at the remote broker
 
 
@@ -77,8 +78,8 @@ class MqttBridge(ForwardingService):
         self._uplink: Uplink | None = None
         if section.link.profile != "wide":
             self._uplink = Uplink(section, self.addresses[LINK], self.remote, self.forwarder, self.clock)
-        own = () if self._uplink is None else (LINK,)
-        self._leftovers = Leftovers(self.config.base, self.subjects, self.remote, *own)
+        own, sparing = ((), False) if self._uplink is None else ((LINK,), True)
+        self._leftovers = Leftovers(self.config.base, self.subjects, self.remote, *own, sparing=sparing)
         self._leftover_timer: Timer | None = None
         self._stop_topic = ESTOP.topic(self.config.base)
         self._stops = self._make_stops()
@@ -126,9 +127,13 @@ class MqttBridge(ForwardingService):
         from pebble.services.mqtt_bridge.stop_connection import StopConnection  # only who needs it pays for it
 
         notices_s = self.config.services.mqtt_bridge.remote_mqtt.silence_seconds + _NOTICED_S
-        return StopConnection(
-            transport, self._stop_filters, self._pass_stop, self._forwards, self.clock, notices_s=notices_s
-        )
+        make = partial(StopConnection, transport, self._stop_filters, self._pass_stop, self._forwards, self.clock)
+        uplink = self._uplink
+        if uplink is None:
+            return make(notices_s=notices_s)
+        transport.suit_link(slow=True)
+        notices_s = max(notices_s, LEVELS["thin"].silent_s + _NOTICED_S)
+        return make(notices_s=notices_s, grace_s=_THIN_GRACE_S, wanted=lambda: uplink.is_flooded)
 
     def start(self) -> None:
         super().start()
@@ -197,20 +202,6 @@ class MqttBridge(ForwardingService):
             self.subscribe_remote()
         else:
             self._same_broker.send()
-
-    def subscribe_remote(self) -> None:
-        """After floods of commands first to stops alone, for a while: see `FloodPauses`."""
-        seconds = 0.0 if self._uplink is None else self._uplink.stops_alone_s
-        if not seconds:
-            super().subscribe_remote()
-            return
-        self.listen_remote(self._stop_filters)
-        self.forwarder.subscribed(Side.REMOTE)
-        self.call_at(self.clock() + seconds, partial(self._subscribe_to_all, self.epoch))
-
-    def _subscribe_to_all(self, epoch: int) -> None:
-        if epoch == self.epoch and self.forwarder.gate is Gate.OPEN:
-            super().subscribe_remote()
 
     def _forwards(self) -> bool:
         return self.forwarder.gate is Gate.OPEN and self.remote.state is State.CONNECTED

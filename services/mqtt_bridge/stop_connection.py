@@ -101,8 +101,14 @@ class StopConnection:
         clock: Callable[[], float],
         *,
         notices_s: float,
+        grace_s: float = _GRACE_S,
+        wanted: Callable[[], bool] = lambda: True,
     ) -> None:
-        """``notices_s``: after so long it is known that the connection is lost."""
+        """``notices_s``: after so long it is known that the connection is lost; ``grace_s``: so long it may be tried.
+
+        ``wanted``: whether it is worth what it costs.
+        """
+        self._grace_s, self._wanted = grace_s, wanted
         self._transport, self._filters, self._clock = transport, tuple(filters), clock
         self._pass_on, self._main = pass_on, main
         self._copies = Copies(clock, notices_s)
@@ -125,7 +131,10 @@ class StopConnection:
 
     def check(self) -> None:
         now = self._clock()
-        if not self._main():
+        if not self._wanted():
+            if self._transport.state is not State.CLOSED:
+                self.close()
+        elif not self._main():
             self._failing_since = now
         elif self._transport.state is State.CLOSED:
             if now >= self._off_until:
@@ -136,7 +145,7 @@ class StopConnection:
             if now - self._connected_at > _KICKED_S:
                 self._kicks = 0
                 self._report(True)
-        elif now - self._failing_since > _GRACE_S:
+        elif now - self._failing_since > self._grace_s:
             self._give_up("the broker refuses to subscribe it" if self._refused else self._transport.problem, _AGAIN_S)
 
     def main_lost(self, *, ended: bool) -> None:

@@ -13,7 +13,7 @@ from pebble.forwarding.forwarder import Forwarder
 from pebble.forwarding.sieve import Rank, Sieve
 from pebble.runtime.addresses import Address
 from pebble.runtime.rate_limit import RateLimitedLog
-from pebble.services.mqtt_bridge.link import FloodPauses, LinkMeter, Room
+from pebble.services.mqtt_bridge.link import LinkMeter, Room
 from pebble.services.mqtt_bridge.same_broker import now_ms
 from pebble.transports import QoS, Transport
 
@@ -26,6 +26,7 @@ _UNANSWERED_S = 0.5  # how often a question without an answer counts
 _PAUSE = 25  # so much longer on a thin link what can wait is spread
 _HEARTBEAT_BYTES = 80  # about
 _LATE, _LATE_S = 8, 1.5  # commands, and since when all of them were late: the broker holds more of the kind
+_FLOODED_S = 60.0  # after what was done about it
 
 
 class Uplink:
@@ -44,12 +45,11 @@ class Uplink:
         self._saves_acks = section.remote is None or section.remote.kind == "mqtt"
         self._heartbeat_s = section.heartbeat.interval_seconds
         self._meter, self._room = LinkMeter(section.link.profile, section.link.kbit), Room(section.link.kbit)
-        self._pauses = FloodPauses()
         self._guard = threading.Lock()  # of the room: messages take it on the thread that received them
         self._sieve = Sieve(self._takes, forwarder.counters, clock)
         self._quiet_log = RateLimitedLog(log, period_s=60.0)
         self._level = ""  # that the others know; none yet
-        self._heartbeat_at = self._state_at = self._answered_at = -inf
+        self._heartbeat_at = self._state_at = self._answered_at = self._flooded_at = -inf
         self._state_queue_s = 0.0
         self._answers, self._shed = 0, 0
         remote.proof = address.topic
@@ -58,6 +58,11 @@ class Uplink:
     @property
     def level(self) -> Level:
         return LEVELS[self._meter.level]
+
+    @property
+    def is_flooded(self) -> bool:
+        """Whether a client lately sent more commands than the link carries."""
+        return self._clock() - self._flooded_at < _FLOODED_S
 
     @property
     def heartbeat_qos(self) -> int | None:
@@ -73,11 +78,6 @@ class Uplink:
                 return False
         self._heartbeat_at = now
         return True
-
-    @property
-    def stops_alone_s(self) -> float:
-        """So long nothing but stops is to be received."""
-        return self._pauses.left_s(self._clock())
 
     def pause(self, seconds: float) -> float:
         """How long to wait between two requests of what can wait."""
@@ -115,15 +115,14 @@ class Uplink:
     def _drop_late(self) -> None:
         """Who sends more commands than a thin link carries fills the broker's queue with them; a stop would wait there.
 
-        They are worth nothing when they come, and a new connection drops all that wait. The stop is repeated.
+        They are worth nothing when they come, and a new connection drops all that wait. From then on stops have a
+        connection of their own.
         """
         late, now = self._forwarder.ages.late, self._clock()
         if self._level == "thin" and late.count >= _LATE and late.seconds(now) >= _LATE_S:
             late.count = 0
-            why, pause_s = "only late commands come over a thin link: those that wait there are dropped", ""
-            if seconds := self._pauses.begin(now):
-                pause_s = f", and for {seconds:.0f} s nothing but stops is received"
-            self._remote.renew_connection(why + pause_s)
+            self._flooded_at = now
+            self._remote.renew_connection("only late commands come over a thin link: those that wait there are dropped")
 
     def _suit(self) -> None:
         """The level is another one."""

@@ -100,7 +100,7 @@ def test_over_a_thin_link_it_is_asked_for_more_rarely_and_longer() -> None:
     world.wait(STEP_S)
     asked: list[ControlRequest] = [codec.decode(CONTROL, one.payload) for one in world.sent]
     assert [(one.want, one.for_ms, one.t) for one in asked] == [
-        *(("hold", 10_000, 1000 * seconds) for seconds in (100, 103, 106, 109)),
+        *(("hold", 10_000, 1000 * seconds) for seconds in (100, 105)),
         ("release", 3000, UNSET),
     ]
     world.lost = lambda _client: True

@@ -11,13 +11,14 @@ from pathlib import Path
 import pytest
 
 from pebble.transports import Message, MqttSettings, QoS, State, create
+from pebble.transports.mqtt import packets
 from pebble.transports.mqtt.ending import Silent
 from pebble.transports.mqtt.retention import RetainedProof
 from pebble.transports.mqtt.transport import MqttTransport
 from tests.support import Broker, until
 from tests.tcp_proxy import TcpProxy
 from tests.transports.received import Received
-from tests.transports.test_mqtt_connection import Link, sent
+from tests.transports.test_mqtt_connection import PONG, Link, sent
 
 PROOF, WILL = "slow/proof", "slow/online"
 STATES = [f"slow/state/{number}" for number in range(40)]
@@ -37,14 +38,28 @@ class TestPatience:
             with pytest.raises(Silent, match=f"has not answered for {limit_s} s"):
                 link.idle(0.4)
 
-    def test_one_ping_a_second(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_a_ping_at_least_every_second_and_a_half(self, monkeypatch: pytest.MonkeyPatch) -> None:
         with closing(Link(monkeypatch)) as link:
             link.connection.suit(slow=True)
             asked = 0
             for _ in range(200):
                 link.idle(0.05)
                 asked += link.answer_pings()
-        assert 9 <= asked <= 14, "a little more, so that two are never a period"
+        assert 6 <= asked <= 10, "a little more, so that two are never a period"
+
+    def test_a_ping_that_is_soon_due_goes_along_with_a_message(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        with closing(Link(monkeypatch)) as link:
+            link.connection.suit(slow=True)
+            written = []
+            for _ in range(20):
+                link.connection.publish(message("slow/online"))
+                written.append(link.written())
+                link.sends(PONG * written[-1].count(packets.PINGREQ))
+                link.idle(0.25)
+            pings = sum(one.endswith(packets.PINGREQ) for one in written)
+            assert 5 <= pings <= 10
+            assert b"".join(written).count(packets.PINGREQ) == pings
+            assert packets.PINGREQ not in link.written(), "none of its own"
 
     def test_anything_is_a_sign_of_life(self, monkeypatch: pytest.MonkeyPatch) -> None:
         with closing(Link(monkeypatch)) as link:

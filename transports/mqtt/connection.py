@@ -18,7 +18,7 @@ from pebble.transports.base import Answer, Message, Outgoing, QoS
 from pebble.transports.counters import Counters
 from pebble.transports.mqtt.bridge_mode import Result
 from pebble.transports.mqtt.broker_limits import EVERYTHING, Limits
-from pebble.transports.mqtt.client import Opening, TlsLateError, keep_unsent
+from pebble.transports.mqtt.client import Opening, TlsLateError, keep_unsent, one_packet
 from pebble.transports.mqtt.client_kinds import AnyClient, client_class
 from pebble.transports.mqtt.ending import Absent, Lost, Refused, Silent, TlsLate
 from pebble.transports.mqtt.incoming import OVERSLEPT_S, Incoming, Sink
@@ -43,6 +43,7 @@ _UNSENT = 4 * 1024  # bytes in the kernel beyond those on their way, over a slow
 _UNREACHED: dict[type[Exception], type[Lost]] = {ConnectionRefusedError: Absent, TlsLateError: TlsLate}
 _BY_SYSTEM = 0  # as the system has it
 _QUICKACK = getattr(socket, "TCP_QUICKACK", None)  # Linux only
+_ONCE = 2  # of TCP_QUICKACK: what is due now; the next one again waits a moment for MQTT's own, to go along with it
 _ABORT = struct.pack("ii", 1, 0)  # SO_LINGER that makes close() drop what was not sent
 
 
@@ -243,7 +244,7 @@ class Connection:
         sock = self._client.socket
         if _QUICKACK is not None and sock is not None:
             try:  # noqa: SIM105  (hot)
-                sock.setsockopt(socket.IPPROTO_TCP, _QUICKACK, 1)
+                sock.setsockopt(socket.IPPROTO_TCP, _QUICKACK, _ONCE if self.pings.is_patient else 1)
             except OSError:  # the other side has just gone
                 pass
 
@@ -273,7 +274,12 @@ class Connection:
             else:
                 if self._backlog.waiting:
                     self._counters.add("dropped", self._backlog.supersede(message))
-                self._write_publish(message, expires_s)
+                if self.pings.joins(clock.since_boot()):
+                    with one_packet(client.socket):
+                        self._write_publish(message, expires_s)
+                        self.pings.send(client)
+                else:
+                    self._write_publish(message, expires_s)
             blocked = client.socket is None or client.waiting
         if blocked:
             self.wake()

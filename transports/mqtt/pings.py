@@ -11,7 +11,8 @@ from pebble.transports.settings import MqttSettings
 
 _CLEAR = 8 * 1024  # bytes ahead of a ping that do not delay it much
 _LEAST_S = 0.05  # between two pings, however short the allowed silence
-_PATIENT_S, _PATIENT_TRIPS, _PATIENT_INTERVAL_S = 5.0, 8, 1.0  # over a slow way: the limit, and between two pings
+_PATIENT_S, _PATIENT_TRIPS, _PATIENT_INTERVAL_S = 5.0, 8, 1.5  # over a slow way: the limit, and between two pings
+_EARLY_S = 0.6  # over a slow way a ping goes along with a message: half of its packets are saved
 _LEAST_SHARE = 0.75  # of the interval between pings: answers to regular ones could not be told apart
 
 
@@ -30,6 +31,10 @@ class Pings:
         )  # when the last time without reading began, for which a ping was sent
         #: Topics whose next message is followed by a ping at once: its answer shows that the broker accepts it.
         self.doubtful: set[str] = set()
+
+    def joins(self, now: float) -> bool:
+        """Whether a ping goes along with the message that is sent at ``now``."""
+        return self.is_patient and now >= self.due_at - _EARLY_S
 
     def begin(self, now: float) -> None:
         """The broker has accepted us."""

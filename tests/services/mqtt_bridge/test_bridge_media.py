@@ -255,7 +255,7 @@ class TestBridge:
         assert [bridge.wanted(program, "HOLD", after=0.0) for program in ALL] == [held, held, ""]
         bridge.run(1.8)
         bridge.remote.publish(DRIVE, b'{"z": 0}')
-        assert bridge.wanted(CAMERA, "HOLD", after=0.1) == held
+        assert bridge.wanted(CAMERA, "HOLD", after=3.1) == held
         assert bridge.wanted(CAMERA, "HOLD", after=1.2) == held.replace("1", "0")
 
     def test_what_a_script_drives_holds_nothing_up(self, bridge: AskingBridge) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,6 +21,7 @@ from tests.support import Broker, until
 from tests.tcp_proxy import SlowTcpProxy, TcpProxy
 
 IMU, STOP, ONLINE, LINK = "outgoing/sensors/imu", "incoming/estop", "outgoing/online", "outgoing/link"
+DRIVE, OWN = "incoming/drive-values", "emergency stops have a connection of their own"
 FLOOD = 10_000
 
 
@@ -97,3 +99,37 @@ def test_a_stop_passes_at_once_while_much_waits(brokers: list[Broker]) -> None:
     later.close()
     robot.close()
     running.stop()
+
+
+def test_commands_that_only_come_late_are_dropped_at_the_broker_and_stops_get_a_connection_of_their_own(
+    brokers: list[Broker], caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    local, remote = brokers
+    link = TcpProxy(remote.port)
+    config = make_config(
+        local_mqtt={"host": "127.0.0.1", "port": local.port},
+        remote_mqtt={"host": "127.0.0.1", "port": link.port},
+        link={"profile": "thin"},
+    )
+    running = Running(MqttBridge(config, local_transport(config, "local-bridge", as_published=True)))
+    robot, operator = Operator(local.port, BASE), Operator(remote.port, BASE)
+    assert until(lambda: operator.last(LINK))
+    link.delay_s = 0.9  # each way
+
+    def floods() -> bool:
+        operator.send(DRIVE, {"z": 0.5})
+        return any("only late commands come" in message for message in caplog.messages)
+
+    assert OWN not in caplog.messages
+    assert until(floods, 30, step=0.1)
+    link.delay_s = 0.0
+    assert until(lambda: OWN in caplog.messages, 30)
+    operator.send(STOP, {"stop": "00000000000000a1", "by": "test"})
+    operator.send(DRIVE, {"z": 0})
+    assert until(lambda: robot.last(STOP) and robot.last(DRIVE))
+    assert len([one for one in robot.seen if one.topic.endswith(STOP)]) == 1
+    for one in (robot, operator):
+        one.close()
+    running.stop()
+    link.stop()
