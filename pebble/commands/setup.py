@@ -1,10 +1,9 @@
 """``pebble setup``: from a blank machine to a robot that runs; the same command restores, renames, moves and undoes."""
 
-import importlib.util
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,7 +14,9 @@ from msgspec.structs import replace
 from pebble.client.page_packages import require_packages
 from pebble.config.text_files import read_password
 from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
+from pebble.demo.phone import qr_lines
 from pebble.fleet import certificates
+from pebble.fleet.database import DatabaseError
 from pebble.fleet.people import has_user, usable
 from pebble.setup import detect, manifest, plan, questions, restore
 from pebble.setup.manifest import Manifest, SetupError
@@ -122,7 +123,7 @@ class _Session:
     # -- forwards
 
     def set_up(self, file: Path | None, given: dict[str, Any], backup_file: Path | None, second: str | None) -> int:
-        there = manifest.load(self.places)
+        there = self._known()
         backup = None
         if backup_file is not None:
             backup = restore.read(backup_file)
@@ -131,6 +132,8 @@ class _Session:
             given |= {"id": second or given["id"]}
         known = there or Manifest()
         from_file = {} if file is None else questions.decode(questions.read_file(file), str(file))
+        if from_file.get("broker_ca"):
+            from_file["broker_ca"] = str(Path(from_file["broker_ca"]).absolute())
         answers = questions.combined(known.answers, from_file, given)
         secrets = _read_secrets(from_file | {key: one for key, one in given.items() if one is not None})
         machine = detect.machine(self.places)
@@ -139,12 +142,21 @@ class _Session:
             wanted = self._asked(wanted)
         self._require(wanted, known)
         self._leave(wanted, known, is_second=second is not None)
-        engine = Engine(self.places, known)
+        engine = Engine(self.places, known, is_live=self.places.is_live)
         known.answers = questions.plain(wanted.answers)
         if self.dry:
             return self._show(engine, wanted, backup)
         self._confirm(engine, wanted)
         return self._do(engine, wanted, backup, is_second=second is not None)
+
+    def _known(self) -> Manifest | None:
+        """What is known of this machine; a dry run goes without what this user may not read."""
+        try:
+            return manifest.load(self.places)
+        except SetupError:
+            if not self.dry:
+                raise
+            return None
 
     def _require(self, wanted: Plan, known: Manifest) -> None:
         """Raise AnswersError for what is missing still."""
@@ -156,8 +168,8 @@ class _Session:
             )
         try:
             known_user = answers.user is not None and has_user(self.places.people, answers.user)
-        except PermissionError:
-            known_user = True  # the step tells
+        except (PermissionError, DatabaseError):
+            known_user = True  # the step reports it
         missing = questions.missing(
             answers, wanted.secrets, has_login=_exists(wanted.broker_password), has_user=known_user or self.dry
         )
@@ -204,7 +216,7 @@ class _Session:
         for result in engine.apply(plan.steps(wanted)):
             results.append(result)
             _print(result, self.places)
-        engine.finish()
+        engine.finish({robot: plan.removal_of(robot) for robot in engine.manifest.leaving})
         checked = self._selftest(engine, wanted)
         self._summary(results, wanted, checked)
         return 1 if any(result.state is State.CANNOT for result in results) or checked else 0
@@ -233,7 +245,9 @@ class _Session:
         _block("Could not", could_not or ["nothing"])
         _block("Next", self._next(wanted))
         if wanted.answers.page and (self.places.tls / certificates.SERVER_CERT).is_file():
-            _print_qr(_url(self.places))
+            typer.echo()
+            for line in qr_lines(_url(self.places)):
+                typer.echo(line)
 
     def _next(self, wanted: Plan) -> Iterator[str]:
         answers, places = wanted.answers, self.places
@@ -254,7 +268,7 @@ class _Session:
         if found is None:
             raise SetupError(f"{self.places.manifest} is not there: this machine was not set up by this command")
         wanted = Plan(self.places, questions.combined(found.answers), detect.machine(self.places), found, Secrets())
-        engine = Engine(self.places, found)
+        engine = Engine(self.places, found, is_live=self.places.is_live)
         if engine.is_live and os.geteuid() != 0 and not self.dry:
             raise SetupError(f"only root can undo it: {_SUDO} --undo")
         if not (self.dry or self.yes):
@@ -334,16 +348,6 @@ def _url(places: Places) -> str:
     names = certificates.show(places.tls / certificates.SERVER_CERT).names
     host = f"[{names[0]}]" if ":" in names[0] else names[0]
     return f"https://{host}:{plan.PAGE_PORT}/"
-
-
-def _print_qr(url: str) -> None:
-    if importlib.util.find_spec("segno") is None:
-        typer.echo("\n(A QR code of it needs segno: pip install segno)")
-        return
-    import segno  # only here
-
-    typer.echo()
-    segno.make(url, micro=False).terminal(compact=True, border=2)
 
 
 # -- the six questions

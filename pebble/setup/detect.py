@@ -155,7 +155,7 @@ def machine(places: Places) -> Machine:
     installed = any((root / folder / "pebble.service").exists() for folder in units)
     polkit = ("usr/lib/polkit-1/polkitd", "usr/libexec/polkitd", "usr/lib/policykit-1/polkitd")
     return Machine(
-        systemd="" if (root / "run/systemd/system").is_dir() or root != Path("/") else NO_SYSTEMD,
+        systemd="" if (root / "run/systemd/system").is_dir() or not places.is_live else NO_SYSTEMD,
         unit="" if installed else "pebble.service is not installed: sudo apt install ./pebble-robot_….deb",
         mosquitto=_mosquitto(places),
         polkit="" if any((root / path).exists() for path in polkit) else NO_POLKIT,
@@ -210,7 +210,7 @@ def _mosquitto(places: Places) -> str:
         if found is not None:
             line = found[0].strip().split()[0]
             return f"{places.named(file)} has its own `{line}`: remove it, or give --broker the name of that broker"
-    if places.root != Path("/") or places.broker.exists() or _runs("mosquitto"):
+    if not places.is_live or places.broker.exists() or _runs("mosquitto"):
         return ""
     taken = next((port for port in (PLAIN_PORT, PORT) if _is_taken(port)), None)
     return (

@@ -21,7 +21,7 @@ class SetupError(PebbleError):
 
 
 class Manifest(Struct, kw_only=True, forbid_unknown_fields=True):
-    """``files``: by their paths below the root, the SHA-256 of each content that is ours; several while one is replaced.
+    """``files``: by path below the root, the SHA-256 of each content that is ours; several while one is replaced.
 
     ``folders`` are those that setup made. ``ran``: commands, each with the SHA-256 of what it ran for. ``leaving``:
     earlier ids, of which retained messages may still be at the broker. ``restoring``: the SHA-256 of a backup.

@@ -1,4 +1,4 @@
-"""The robot's own broker: the machine's mosquitto with a folder of `pebble fleet`, so that its commands change it later."""
+"""The robot's own broker: the machine's mosquitto, with a folder that the commands of `pebble fleet` change later."""
 
 from pathlib import Path
 

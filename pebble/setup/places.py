@@ -11,6 +11,11 @@ class Places:
 
     root: Path = Path("/")
 
+    @property
+    def is_live(self) -> bool:
+        """Whether it is the system that runs, of which services can be started."""
+        return self.root == Path("/")
+
     @cached_property
     def etc(self) -> Path:
         """Config, passwords, certificates and the manifest: ``root:pebble``, files 0640."""

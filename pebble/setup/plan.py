@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,7 @@ from pebble.setup.detect import Machine
 from pebble.setup.manifest import Manifest, SetupError
 from pebble.setup.places import Places
 from pebble.setup.questions import HERE, NONE, Answers, Secrets, account_of
-from pebble.setup.steps import Step
+from pebble.setup.steps import BESIDE, Step
 from pebble.transports import MqttSettings
 from pebble.transports.settings import TlsSettings
 
@@ -161,33 +162,58 @@ def _beside(folder: Path, path: Path) -> str:
 
 
 def _leaving(plan: Plan) -> Iterator[Step]:
-    """What an earlier name left: messages at the broker, and the stop and the audit under that name."""
-    places, manifest = plan.places, plan.manifest
-    for earlier in manifest.leaving:
-
-        def remove(earlier: str = earlier) -> None:
-            remove_retained(plan, earlier)
-            manifest.leaving.remove(earlier)
-
-        yield Step(what=f"stop {earlier}", command=("systemctl", "stop", _UNIT), live=True, cannot=_no_service(plan))
-        yield Step(
-            what=f"remove the retained messages of {earlier} at the broker",
-            act=remove,
-            done=lambda earlier=earlier: earlier not in manifest.leaving,  # type: ignore[misc]
-            live=plan.has_own_broker,
-        )
+    """What an earlier name left: the stop and the audit under that name, and messages at the broker."""
+    state, ran = plan.places.state, plan.manifest.ran
+    waits = _waiting_config(plan)
+    for earlier in plan.manifest.leaving:
         old, new = file_name(base_of(earlier)), file_name(plan.base)
         yield Step(
-            what=f"what {earlier} saved, its stop too, is {plan.answers.id}'s",
-            act=lambda old=old, new=new: _rename(places.state, old, new),  # type: ignore[misc]
-            done=lambda old=old: not _of_robot(places.state, old),  # type: ignore[misc]
+            what=f"{earlier} stands still",
+            command=("systemctl", "stop", _UNIT),
+            live=True,
+            cannot=waits or _no_service(plan),
         )
+        yield Step(
+            what=f"what {earlier} saved, its stop too, is {plan.answers.id}'s",
+            act=partial(_rename, state, old, new),
+            done=lambda old=old: not _of_robot(state, old),  # type: ignore[misc]
+            cannot=waits,
+        )
+        what = removal_of(earlier)
+        yield Step(
+            what=what,
+            act=partial(_remove_earlier, plan, earlier),
+            done=lambda what=what: what in ran,  # type: ignore[misc]
+            live=plan.has_own_broker,
+            cannot=waits,
+        )
+
+
+def removal_of(robot: str) -> str:
+    """The step after which an earlier name is forgotten."""
+    return f"the retained messages of {robot} leave the broker"
+
+
+def _waiting_config(plan: Plan) -> str:
+    """Why an earlier name is in use still: the config that has it is not ours."""
+    file = plan.places.config
+    if not file.exists() or plan.manifest.is_ours(plan.places.named(file), content := file.read_bytes()):
+        return ""
+    if json.loads(content)["robot"]["id"] == plan.answers.id:
+        return ""
+    return f"{plan.places.named(file)} was changed by hand: set robot.id there, as in {file.name}{BESIDE}, then again"
+
+
+def _remove_earlier(plan: Plan, earlier: str) -> None:
+    remove_retained(plan, earlier)
+    plan.manifest.ran[removal_of(earlier)] = ""
 
 
 def remove_retained(plan: Plan, robot: str) -> None:
     """Remove the retained messages of a robot of this name with the login of this one's config. Raises PebbleError."""
     file = plan.places.config
-    if not file.exists():
+    is_elsewhere = plan.has_own_broker and not plan.places.is_live
+    if not file.exists() or plan.answers.broker == NONE or is_elsewhere:
         return
     raw = json.loads(file.read_bytes())
     raw["robot"]["id"] = robot
@@ -251,7 +277,7 @@ def _own_broker(plan: Plan) -> Iterator[Step]:
         files = {plan.answers.account: plan.broker_password, own_broker.PAGE: plan.page_password}
         return {name: file.read_text().strip() for name, file in files.items() if file.exists()}
 
-    earlier = {account_of(robot) for robot in plan.manifest.leaving} | {account_of(str(plan.answers.id))}
+    earlier = set() if _waiting_config(plan) else {account_of(robot) for robot in plan.manifest.leaving}
     yield Step(
         what="accounts, rules and certificate of the robot's own broker",
         target=folder,
@@ -339,7 +365,15 @@ def _config(plan: Plan) -> Iterator[Step]:
         check_connections(parse(config, folder=plan.places.etc, env=os.environ))
 
     content = json.dumps(config, indent=1).encode() + b"\n"
-    yield Step(what="config", target=plan.places.config, content=content, check=check, mode=0o640, owner=_ROBOTS)
+    yield Step(
+        what="config",
+        target=plan.places.config,
+        content=content,
+        check=check,
+        mode=0o640,
+        owner=_ROBOTS,
+        undo_act=partial(remove_retained, plan, str(plan.answers.id)),
+    )
 
 
 def _first_user(plan: Plan) -> Iterator[Step]:

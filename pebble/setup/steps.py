@@ -9,7 +9,7 @@ import os
 import pwd
 import shutil
 import subprocess
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
@@ -97,20 +97,19 @@ class Engine:
     places: Places
     manifest: Manifest
     run: Callable[[Sequence[str]], None] = run_command
+    is_live: bool = False  # whether this is the machine that runs, of which services can be started
     _applied: set[Path] = field(default_factory=set)
-
-    @property
-    def is_live(self) -> bool:
-        """Whether this is the machine that runs, of which services can be started."""
-        return self.places.root == Path("/")
 
     def begin(self) -> None:
         """Write the manifest before anything else."""
         self._save()
 
-    def finish(self) -> None:
-        """Note that a backup is restored."""
+    def finish(self, left: Mapping[str, str]) -> None:
+        """Note that a backup is restored, and forget the earlier names whose last step, in ``left``, is done."""
         self.manifest.restoring = ""
+        for robot in [robot for robot in self.manifest.leaving if left[robot] in self.manifest.ran]:
+            self.manifest.leaving.remove(robot)
+            del self.manifest.ran[left[robot]]
         self._save()
 
     def forget(self) -> None:
@@ -329,7 +328,7 @@ class Engine:
             if step.undo and step.what in self.manifest.ran:
                 yield self._undone(" ".join(step.undo), lambda step=step: self.run(step.undo), step, dry)  # type: ignore[misc]
             if step.undo_act is not None:
-                yield self._undone(f"undo: {step.what}", step.undo_act, step, dry)
+                yield self._undone("remove the robot's retained messages", step.undo_act, step, dry)
         for name in sorted(self.manifest.files, reverse=True):
             path = self.places.root / name[1:]
             if not (path.exists() or path.is_symlink()):
