@@ -3,7 +3,7 @@
 import os
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -140,10 +140,9 @@ class _Session:
         wanted = Plan(self.places, answers, machine, known, secrets)
         if self.asks and file is None and (there is None or not _is_named(given)):
             wanted = self._asked(wanted)
-        self._require(wanted, known)
-        self._leave(wanted, known, is_second=second is not None)
+        self._require(wanted, known, {} if backup is None else backup.files, is_second=second is not None)
+        known.answer(questions.plain(wanted.answers), leaves=second is None)
         engine = Engine(self.places, known, is_live=self.places.is_live)
-        known.answers = questions.plain(wanted.answers)
         if self.dry:
             return self._show(engine, wanted, backup)
         self._confirm(engine, wanted)
@@ -158,8 +157,8 @@ class _Session:
                 raise
             return None
 
-    def _require(self, wanted: Plan, known: Manifest) -> None:
-        """Raise AnswersError for what is missing still."""
+    def _require(self, wanted: Plan, known: Manifest, restored: Collection[str], *, is_second: bool) -> None:
+        """Raise AnswersError for what is missing still. ``restored``: files of a backup."""
         answers = wanted.answers
         renamed = known.answers.get("id") not in (None, answers.id) and answers.is_far
         if renamed and answers.broker_user == known.answers.get("broker_user"):
@@ -170,21 +169,18 @@ class _Session:
             known_user = answers.user is not None and has_user(self.places.people, answers.user)
         except (PermissionError, DatabaseError):
             known_user = True  # the step reports it
-        missing = questions.missing(
-            answers, wanted.secrets, has_login=_exists(wanted.broker_password), has_user=known_user or self.dry
-        )
+        known_user |= self.dry or self._named(self.places.people) in restored
+        known_login = _exists(wanted.broker_password)
+        known_login |= not is_second and self._named(wanted.broker_password) in restored
+        missing = questions.missing(answers, wanted.secrets, has_login=known_login, has_user=known_user)
         if missing:
             raise questions.missing_error(missing)
         if wanted.secrets.password is not None:
             usable(wanted.secrets.password)
 
-    def _leave(self, wanted: Plan, known: Manifest, *, is_second: bool) -> None:
-        """Note an earlier name; a second robot leaves the first one alone."""
-        earlier = known.answers.get("id")
-        if earlier is not None and earlier != wanted.answers.id and not is_second and earlier not in known.leaving:
-            known.leaving.append(earlier)
-        if wanted.answers.id in known.leaving:
-            known.leaving.remove(str(wanted.answers.id))
+    def _named(self, file: Path) -> str:
+        """What the file is called in a backup."""
+        return str(file.relative_to(self.places.root))
 
     def _show(self, engine: Engine, wanted: Plan, backup: restore.Backup | None) -> int:
         for name in () if backup is None else backup.files:

@@ -35,6 +35,15 @@ class Manifest(Struct, kw_only=True, forbid_unknown_fields=True):
     leaving: list[str] = field(default_factory=list)
     restoring: str = ""
 
+    def answer(self, answers: dict[str, Any], *, leaves: bool = True) -> None:
+        """Take other answers. ``leaves``: an earlier name is no longer in use, as it is where a second robot begins."""
+        earlier, name = self.answers.get("id"), answers.get("id")
+        if leaves and earlier is not None and earlier not in self.leaving:
+            self.leaving.append(earlier)
+        if name in self.leaving:
+            self.leaving.remove(name)
+        self.answers = answers
+
     def is_ours(self, name: str, content: bytes) -> bool:
         known = self.files.get(name, [])
         return sha256(content) in known or _CHANGING in known

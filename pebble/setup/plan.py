@@ -197,7 +197,9 @@ def removal_of(robot: str) -> str:
 def _waiting_config(plan: Plan) -> str:
     """Why an earlier name is in use still: the config that has it is not ours."""
     file = plan.places.config
-    if not file.exists() or plan.manifest.is_ours(plan.places.named(file), content := file.read_bytes()):
+    if not plan.manifest.leaving or not file.exists():
+        return ""
+    if plan.manifest.is_ours(plan.places.named(file), content := file.read_bytes()):
         return ""
     if json.loads(content)["robot"]["id"] == plan.answers.id:
         return ""
@@ -336,7 +338,7 @@ def _refusal(plan: Plan) -> str:
     """Why the broker does not let the robot in; empty: it does."""
     host, port = plan.answers.remote or ("", 0)
     password = plan.secrets.broker_password
-    if password is None and plan.broker_password.is_file() and os.access(plan.broker_password, os.R_OK):
+    if password is None and os.access(plan.broker_password, os.R_OK):
         password = plan.broker_password.read_text().strip()
     given = None if plan.answers.broker_ca is None else Path(plan.answers.broker_ca)
     ca = given if given is None or given.is_file() else plan.ca

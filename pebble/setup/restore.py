@@ -20,9 +20,14 @@ from pebble.setup.plan import base_of
 from pebble.setup.steps import BESIDE, Engine
 
 _HEAD = "backup.json"
-_MOST, _LARGEST = 10_000, 1 << 30  # files, and bytes of all: a robot has some hundred
+MOST_FILES, _LARGEST = 10_000, 1 << 30  # files, and bytes of all: a robot has some hundred
 #: What a backup may hold, below the root, and who owns it there.
-_OWNERS = {"etc/pebble": "root:pebble", "var/lib/pebble": "pebble:pebble", "etc/mosquitto": "mosquitto:mosquitto"}
+_OWNERS = {
+    "etc/pebble": "root:pebble",
+    "var/lib/pebble": "pebble:pebble",
+    "etc/mosquitto/pebble": "mosquitto:mosquitto",
+    "etc/mosquitto": "root:root",
+}
 #: What a second robot gets anew.
 _SECRET = ("etc/mosquitto/", "etc/pebble/tls/", "etc/pebble/broker.password", "etc/pebble/page.password")
 
@@ -75,8 +80,8 @@ def _members(tar: tarfile.TarFile) -> Iterator[tuple[str, int, bytes]]:
     size = 0
     for number, member in enumerate(tar):
         size += member.size
-        if number >= _MOST or size > _LARGEST:
-            raise SetupError(f"the backup is larger than {_MOST} files or {_LARGEST >> 20} MB")
+        if number >= MOST_FILES or size > _LARGEST:
+            raise SetupError(f"the backup is larger than {MOST_FILES} files or {_LARGEST >> 20} MB")
         if member.isdir():
             continue
         name, path = member.name, PurePosixPath(member.name)
@@ -88,7 +93,7 @@ def _members(tar: tarfile.TarFile) -> Iterator[tuple[str, int, bytes]]:
         if not member.isfile():
             raise SetupError(f"the backup's {name} is no plain file")
         content = tar.extractfile(member)
-        yield name, member.mode & 0o770, b"" if content is None else content.read()
+        yield name, member.mode & 0o755, b"" if content is None else content.read()
 
 
 def _prefix(name: str) -> str:
@@ -138,7 +143,7 @@ def _parents(engine: Engine, target: Path) -> None:
             name = str(folder.relative_to(engine.places.root))
             owner = engine.owner(_OWNERS.get(_prefix(f"{name}/"), "root:root"))
             folder.mkdir(mode=0o755)
-            modes = {"": 0o755, "etc/pebble": 0o750}
+            modes = {"": 0o755, "etc/mosquitto": 0o755, "etc/pebble": 0o750}
             manifests.finish_folder(folder, modes.get(_prefix(f"{name}/"), 0o700), owner)
 
 

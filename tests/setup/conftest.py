@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
 
 from tests.commands.command_line import Run
-from tests.setup.rig import ANSWERS, PASSWORD, machine_root
+from tests.setup.rig import answers_in, machine_root
 
 
 @pytest.fixture
@@ -23,7 +22,4 @@ def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> 
 
 @pytest.fixture
 def answers(tmp_path: Path) -> Path:
-    password, file = tmp_path / "ann", tmp_path / "answers.json"
-    password.write_text(f"{PASSWORD}\n")
-    file.write_text(json.dumps(ANSWERS | {"password_file": str(password)}))
-    return file
+    return answers_in(tmp_path)

@@ -9,6 +9,7 @@ import signal
 import stat
 import sys
 import tarfile
+import traceback
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from pebble.setup.detect import Machine
 from pebble.setup.manifest import Manifest
 from pebble.setup.places import Places
 from pebble.setup.plan import Plan
-from pebble.setup.questions import Secrets, combined
+from pebble.setup.questions import Secrets, combined, plain
 from pebble.setup.steps import Engine, Result
 
 PASSWORD = "sentinel-of-ann-7c1d"
@@ -46,16 +47,24 @@ def machine_root(folder: Path) -> Path:
     return root
 
 
+def answers_in(folder: Path) -> Path:
+    """A file of answers, and one with Ann's password beside it."""
+    password, file = folder / "ann", folder / "answers.json"
+    password.write_text(f"{PASSWORD}\n")
+    file.write_text(json.dumps(ANSWERS | {"password_file": str(password)}))
+    return file
+
+
 def set_up(root: Path, machine: Machine | None = None, **changes: Any) -> list[Result]:
     """All steps once, as the command does them."""
     places = Places(root)
     known = manifest.load(places) or Manifest()
     answers = combined(ANSWERS, known.answers, changes)
-    known.answers = {name: value for name, value in (ANSWERS | known.answers | changes).items() if value is not None}
+    known.answer(plain(answers))
     wanted = Plan(places, answers, machine or Machine(), known, Secrets(password=PASSWORD))
     engine = Engine(places, known)
     found = list(engine.apply(plan.steps(wanted)))
-    engine.finish({})
+    engine.finish({robot: plan.removal_of(robot) for robot in known.leaving})
     return found
 
 
@@ -113,16 +122,17 @@ def in_child(act: Callable[[], object], *, kill_at: int | None = None, below: Pa
 
 
 def as_nobody(act: Callable[[], str]) -> str:
-    """Run it in a fork, as a user without rights if this one has any. Returns its text."""
+    """Run it in a fork, as a user without rights. Returns its text."""
     reader, writer = os.pipe()
     child = os.fork()
     if child == 0:
         try:
-            if os.geteuid() == 0:
-                os.setgroups([])
-                os.setgid(65534)
-                os.setuid(65534)
+            os.setgroups([])
+            os.setgid(65534)
+            os.setuid(65534)
             os.write(writer, act().encode())
+        except BaseException:
+            os.write(writer, traceback.format_exc().encode())
         finally:
             os._exit(0)
     os.close(writer)
