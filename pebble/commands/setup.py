@@ -23,7 +23,7 @@ from pebble.setup.manifest import Manifest, SetupError
 from pebble.setup.places import Places
 from pebble.setup.plan import Plan
 from pebble.setup.questions import HERE, NONE, Answers, AnswersError, Secrets
-from pebble.setup.steps import BESIDE, Engine, Result, State
+from pebble.setup.steps import Engine, Result, State
 
 _SUDO = "sudo pebble setup"
 _TRIES = 3  # for an answer that cannot be
@@ -230,8 +230,8 @@ class _Session:
         done = [result.step.what for result in results if result.state is State.NEW]
         could_not = [f"{result.step.what}: {result.why}" for result in results if result.state is State.CANNOT]
         skipped = [result.step.what for result in results if result.state is State.SKIPPED]
-        could_not += [f"{_where(one, self.places)} was changed by hand: ours is beside it" for one in results
-                      if one.state is State.BY_HAND]  # fmt: skip
+        by_hand = [result for result in results if result.state is State.BY_HAND]
+        could_not += [f"{_where(one, self.places)} was changed by hand and stays{_then(one.why)}" for one in by_hand]
         if skipped:
             could_not.append(f"{self.places.root} is not the system that runs, so not: {'; '.join(skipped)}")
         could_not += [*self.notes, *wanted.machine.lacks()]
@@ -277,7 +277,7 @@ class _Session:
         left = 0
         for what, state, why in engine.undo(plan.steps(wanted), purge=purge, dry=self.dry):
             word = "done" if state is State.NEW and not self.dry else str(state)
-            typer.echo(f"{word:<{_WIDTH}}  {what}{f': {why}' if why else ''}")
+            typer.echo(f"{word:<{_WIDTH}}  {what}{_then(why)}")
             left += state is State.CANNOT
         if self.dry:
             typer.echo("Nothing was removed: this was a dry run.")
@@ -322,11 +322,14 @@ def _read_secrets(given: dict[str, Any]) -> Secrets:
     return Secrets(password=read.get("password_file"), broker_password=read.get("broker_password_file"))
 
 
+def _then(why: str) -> str:
+    return f": {why}" if why else ""
+
+
 def _print(result: Result, places: Places) -> None:
     where = _where(result, places)
-    why = f": {result.why}" if result.why else ""
-    beside = f"; ours is {where}{BESIDE}" if result.state is State.BY_HAND else ""
-    typer.echo(f"{result.state:<{_WIDTH}}  {result.step.what}{f' ({where})' if where else ''}{why}{beside}")
+    shown = f"{result.step.what} ({where})" if where else result.step.what
+    typer.echo(f"{result.state:<{_WIDTH}}  {shown}{_then(result.why)}")
 
 
 def _where(result: Result, places: Places) -> str:

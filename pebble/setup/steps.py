@@ -135,7 +135,7 @@ class Engine:
                 if state is State.NEW:
                     self._do(step)
                     self._applied.update(filter(None, (step.target, *step.changes)))
-                elif state is State.BY_HAND:
+                elif state is State.BY_HAND and why:
                     self._put_beside(step)
                 else:
                     self._note_same(step, state)
@@ -162,11 +162,18 @@ class Engine:
         if step.cannot:
             return State.CANNOT, step.cannot
         try:
-            return self._found(step), ""
+            state = self._found(step)
+            return state, self._beside(step) if state is State.BY_HAND else ""
         except PermissionError as error:
             return State.CANNOT, f"{error.filename} may not be read by this user: use sudo"
         except (OSError, PebbleError) as error:
             return State.CANNOT, _reason(error)
+
+    def _beside(self, step: Step) -> str:
+        """Where our content goes; empty: it is that which was changed, so it is of no use."""
+        assert step.target is not None  # noqa: S101 - only files are changed by hand
+        known = isinstance(step.content, bytes) and self.manifest.is_ours(self._name(step.target), step.content)
+        return "" if known else f"ours is {self._name(step.target)}{BESIDE}"
 
     def _found(self, step: Step) -> State:
         if step.target is not None and (step.is_folder or step.make is not None):

@@ -125,7 +125,7 @@ def test_what_was_changed_by_hand_stays_and_is_named(root: Path, run: Run) -> No
     by_hand = config.read_text().replace("synthetic", "libcamera")
     config.write_text(by_hand)
     assert run("setup", "--root", root, "--yes", "--port", "none") == 0
-    assert "/etc/pebble/robot.json was changed by hand: ours is beside it" in run.out
+    assert "robot.json was changed by hand and stays: ours is /etc/pebble/robot.json.pebble-new" in run.out
     assert config.read_text() == by_hand
     ours = json.loads(config.with_name("robot.json.pebble-new").read_text())
     assert "serial_mcu_bridge" not in ours["services"]
