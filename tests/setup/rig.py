@@ -22,7 +22,7 @@ from pebble.setup.plan import Plan
 from pebble.setup.questions import Secrets, combined, plain
 from pebble.setup.steps import Engine, Result
 
-PASSWORD = "sentinel-of-ann-7c1d"
+PASSWORD, BROKER_PASSWORD = "sentinel-of-ann-7c1d", "sentinel-of-goob-11fe"
 ANSWERS: dict[str, Any] = {
     "id": "goob",
     "port": "/dev/serial/by-id/usb-board",
@@ -61,7 +61,7 @@ def set_up(root: Path, machine: Machine | None = None, **changes: Any) -> list[R
     known = manifest.load(places) or Manifest()
     answers = combined(ANSWERS, known.answers, changes)
     known.answer(plain(answers))
-    wanted = Plan(places, answers, machine or Machine(), known, Secrets(password=PASSWORD))
+    wanted = Plan(places, answers, machine or Machine(), known, Secrets(password=PASSWORD, broker_password=BROKER_PASSWORD))
     engine = Engine(places, known)
     found = list(engine.apply(plan.steps(wanted)))
     engine.finish({robot: plan.removal_of(robot) for robot in known.leaving})
@@ -121,7 +121,7 @@ def in_child(act: Callable[[], object], *, kill_at: int | None = None, below: Pa
     return status, counted
 
 
-def as_nobody(act: Callable[[], str]) -> str:
+def without_rights(act: Callable[[], str]) -> str:
     """Run it in a fork, as a user without rights. Returns its text."""
     reader, writer = os.pipe()
     child = os.fork()

@@ -15,6 +15,7 @@ from pebble.commands import web_people
 from pebble.config import load
 from pebble.contract.identity import Identity
 from pebble.doctor.broker_probe import probe
+from pebble.fleet import certificates
 from pebble.fleet.certificates import CA_CERT
 from pebble.fleet.people import People
 from pebble.fleet.roles import Account, Role
@@ -27,7 +28,7 @@ from pebble.transports.mqtt.transport import MqttTransport
 from pebble.transports.settings import TlsSettings
 from tests.commands.command_line import Run
 from tests.fleet.brokers import HOST, FleetBroker
-from tests.setup.rig import ANSWERS, PASSWORD, backup_of, machine_root, set_up, tar_of, tree
+from tests.setup.rig import ANSWERS, BROKER_PASSWORD, PASSWORD, backup_of, machine_root, set_up, tar_of, tree
 from tests.support import Broker, Child, free_port, listening, until
 
 HEAD = ("backup.json", b'{"format": 1, "version": "0", "id": "a"}')
@@ -149,27 +150,42 @@ def test_what_is_removed_is_a_list_of_the_robots_own_topics(root: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("user", "password", "why"),
-    [("goob", None, ""), ("goob", "wrong", "it does not: "), ("eve", None, "it does not: ")],
+    ("user", "password", "code", "shown"),
+    [
+        ("goob", None, 0, "lets the robot in"),
+        ("goob", "wrong-password", 1, "it does not: not authorised"),
+        ("eve", None, 1, "it does not: not authorised"),
+    ],
     ids=("right", "wrong password", "no account"),
 )
 def test_a_broker_elsewhere_is_asked_whether_it_lets_the_robot_in(
-    user: str, password: str | None, why: str, tmp_path: Path, run: Run
+    user: str, password: str | None, code: int, shown: str, root: Path, tmp_path: Path, run: Run
 ) -> None:
-    with FleetBroker(tmp_path / "hall", {"goob": Account(roles=("robot",), bases=(GOOB.base,))}) as broker:
-        root = machine_root(tmp_path)
-        file = tmp_path / "password"
+    robot = {"goob": Account(roles=("robot",), bases=(GOOB.base,))}
+    with FleetBroker(tmp_path / "hall", robot, unencrypted=free_port()) as broker:
+        file, answers = tmp_path / "password", tmp_path / "answers.json"
         file.write_text(password or broker.passwords["goob"])
-        answers = tmp_path / "answers.json"
-        given = ANSWERS | {
-            "broker": f"localhost:{broker.unencrypted or broker.port}",
-            "broker_user": user,
-            "page": False,
-        }
+        given = ANSWERS | {"broker": f"{HOST}:{broker.unencrypted}", "broker_user": user, "page": False}
         answers.write_text(json.dumps(given | {"broker_password_file": str(file)}))
-        run("setup", "--root", root, "--answers", answers, "--yes")
+        assert run("setup", "--root", root, "--answers", answers, "--yes") == code
+        assert shown in run.out
         assert file.read_text() not in run.out + run.err
-        assert json.loads(Places(root).manifest.read_text())["answers"]["broker_user"] == user
+        assert settings_of(root).password == file.read_text()
+
+
+def test_a_broker_on_another_machine_is_reached_encrypted_and_with_a_login(root: Path, tmp_path: Path) -> None:
+    certificates.init(tmp_path / "hall", ["broker.invalid"])
+    far = {"broker": "broker.invalid", "broker_user": "goob", "broker_ca": str(tmp_path / "hall" / CA_CERT)}
+    found = {result.step.what: result for result in set_up(root, **far)}
+    refused = found["broker broker.invalid:8883 lets the robot in"]
+    assert (str(refused.state), refused.why.startswith("it does not: ")) == ("cannot", True)
+    config = load(Places(root).config)
+    remote = config.services.mqtt_bridge.remote_mqtt
+    assert config.security.level == "login"
+    assert (remote.port, remote.username, remote.password, remote.tls.enabled) == (8883, "goob", BROKER_PASSWORD, True)
+    (tmp_path / "hall" / CA_CERT).unlink()
+    again = {result.step.what: str(result.state) for result in set_up(root)}
+    assert again["authority of the broker"] == "same", "the file that was named may be gone"
 
 
 # -- backups

@@ -20,12 +20,12 @@ from tests.commands.command_line import Run
 from tests.setup.rig import (
     PASSWORD,
     answers_in,
-    as_nobody,
     in_child,
     machine_root,
     manifest_is_true,
     set_up,
     tree,
+    without_rights,
 )
 from tests.support import cases, needs_root
 
@@ -65,7 +65,7 @@ def test_a_second_run_finds_all_the_same(root: Path, answers: Path, run: Run) ->
 
 
 @needs_root
-def test_a_dry_run_without_rights_names_each_step_and_writes_nothing(open_folder: Path, run: Run) -> None:
+def test_a_dry_run_of_an_ordinary_user_names_each_step_and_writes_nothing(open_folder: Path, run: Run) -> None:
     root = machine_root(open_folder)
     answers = answers_in(open_folder)
     for file in open_folder.glob("a*"):
@@ -83,7 +83,7 @@ def test_a_dry_run_without_rights_names_each_step_and_writes_nothing(open_folder
     def again() -> str:
         return f"{run(*line)} {run.err}\n{run.out}"
 
-    shown = as_nobody(again)
+    shown = without_rights(again)
     assert shown.startswith("0 \n"), shown
     assert len(states(shown)) == len(named)
     assert tree(root) == done
@@ -187,7 +187,7 @@ def test_commands_run_again_only_for_what_changed_and_are_undone(root: Path) -> 
     assert not file.exists()
 
 
-def test_no_password_is_shown_or_kept_but_where_it_belongs(root: Path, answers: Path, run: Run) -> None:
+def test_no_password_is_shown_or_stored_but_where_it_belongs(root: Path, answers: Path, run: Run) -> None:
     assert run("setup", "--root", root, "--answers", answers, "--yes") == 0
     places = Places(root)
     secrets = [PASSWORD, *((places.etc / f"{name}.password").read_text().strip() for name in ("broker", "page"))]
