@@ -30,7 +30,7 @@ from pebble.setup.steps import BESIDE, Step
 from pebble.transports import MqttSettings
 from pebble.transports.settings import TlsSettings
 
-_UNIT = "pebble.service"
+_UNIT, _MOSQUITTO = "pebble.service", "mosquitto starts with its part"
 _WANTS = f"etc/systemd/system/multi-user.target.wants/{_UNIT}"
 _SYSUSERS = b'u pebble - "Pebble robot" /var/lib/pebble\n'
 PAGE_PORT = 8080
@@ -301,18 +301,24 @@ def _own_broker(plan: Plan) -> Iterator[Step]:
         changes=(folder / ACL, folder / FLEET, folder / PASSWORDS),
         cannot=cannot,
     )
-    restart = ("systemctl", "restart", "mosquitto.service")
-    yield Step(
-        what="mosquitto starts with it",
+    yield _restart_of_mosquitto(plan, cannot)
+
+
+def _restart_of_mosquitto(plan: Plan, cannot: str = "") -> Step:
+    restart, folder = ("systemctl", "restart", "mosquitto.service"), plan.places.broker_folder
+    return Step(
+        what=_MOSQUITTO,
         command=restart,
         after=restart,
-        of=(places.broker, folder / certificates.SERVER_CERT, folder / ADMIN_PASSWORD),
+        of=(plan.places.broker, folder / certificates.SERVER_CERT, folder / ADMIN_PASSWORD),
         cannot=cannot or plan.machine.systemd,
         live=True,
     )
 
 
 def _other_broker(plan: Plan) -> Iterator[Step]:
+    if _MOSQUITTO in plan.manifest.ran:  # with a part that was ours, and is removed
+        yield _restart_of_mosquitto(plan)
     if plan.answers.remote is None:
         return
     if plan.answers.broker_ca is not None:

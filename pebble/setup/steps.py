@@ -129,7 +129,7 @@ class Engine:
     def apply(self, steps: Sequence[Step]) -> Iterator[Result]:
         """Do each step that is not done; one that fails does not keep the others from being done."""
         self._save()
-        for step in (*steps, *self.left_over(steps)):
+        for step in (*self.left_over(steps), *steps):
             state, why = self._state(step)
             try:
                 if state is State.NEW:

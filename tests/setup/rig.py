@@ -61,7 +61,9 @@ def set_up(root: Path, machine: Machine | None = None, **changes: Any) -> list[R
     known = manifest.load(places) or Manifest()
     answers = combined(ANSWERS, known.answers, changes)
     known.answer(plain(answers))
-    wanted = Plan(places, answers, machine or Machine(), known, Secrets(password=PASSWORD, broker_password=BROKER_PASSWORD))
+    wanted = Plan(
+        places, answers, machine or Machine(), known, Secrets(password=PASSWORD, broker_password=BROKER_PASSWORD)
+    )
     engine = Engine(places, known)
     found = list(engine.apply(plan.steps(wanted)))
     engine.finish({robot: plan.removal_of(robot) for robot in known.leaving})

@@ -32,7 +32,7 @@ from tests.support import cases, needs_root
 _MOMENTS = cases(6, 20)
 _LIVE = {
     "user pebble",
-    "mosquitto starts with it",
+    "mosquitto starts with its part",
     "the robot starts with the machine",
     "the robot runs with this config",
 }
