@@ -52,7 +52,7 @@ def setup(
     \b
         sudo pebble setup
         pebble setup --dry-run --answers goob.answers.json
-        sudo pebble setup --broker broker.lab --broker-user goob --broker-password-file goob-password
+        sudo pebble setup --camera none              one other answer
         sudo pebble setup --id fred                  another name
         sudo pebble setup --from goob.tar            after the SD card died
         sudo pebble setup --from goob.tar --as fred  a second robot
