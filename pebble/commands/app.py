@@ -15,6 +15,7 @@ from pebble.version import __version__
 
 #: Each command, and the module of this package that has the function of its name, or registers what is below it.
 COMMANDS = {
+    "setup": "setup",
     "up": "up",
     "check": "check",
     "doctor": "doctor",
@@ -54,6 +55,7 @@ _HELP = """Runs and inspects Pebble robots.
 
 \b
     pebble demo                run four simulated robots; needs nothing else
+    sudo pebble setup          make a robot of this machine
     pebble check goob.json     validate a config and summarise it
     pebble doctor goob.json    check that this machine is ready for the robot
     pebble up goob.json        run the robot

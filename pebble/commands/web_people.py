@@ -18,8 +18,10 @@ from pebble.fleet.audit import Audit
 from pebble.fleet.audit_rows import Entry
 from pebble.fleet.people import People
 from pebble.fleet.roles import Role
+from pebble.setup.places import Places
 
 PEOPLE = "people.sqlite"
+PLACES = Places()
 TLS = "tls"
 
 _USER_HELP = """Who may use the operator page, and as what.
@@ -137,10 +139,27 @@ def default_folder() -> Path:
 
 
 def _file(config: Path | None, people: Path | None) -> Path:
+    """The database that is named, else that of the page which the robot of this machine serves, else our own."""
+    if people is None and config is None:
+        config = _of_machine()
     if people is not None or config is None:
         return (people or default_folder() / PEOPLE).absolute()
     loaded = load(config)
     return loaded.web_interface.people or loaded.state_dir() / PEOPLE
+
+
+def _of_machine() -> Path | None:
+    """The config that `pebble setup` wrote, if its robot serves a page. Raises PebbleError if we may not read it."""
+    file = PLACES.config
+    try:
+        if not file.exists():
+            return None
+        file.read_bytes()
+    except PermissionError:
+        raise PebbleError(
+            f"{file}: this user may not read it: use sudo, or name another database, --people FILE"
+        ) from None
+    return file if load(file).services.web_handler.enabled else None
 
 
 @contextmanager

@@ -52,7 +52,7 @@ class Config(Root, frozen=True, kw_only=True):
 
     def state_file(self, name: str) -> Path:
         """A file in the state directory, which several robots may share."""
-        return self.state_folder / f"{name}-{_file_name(self.base)}.json"
+        return self.state_folder / f"{name}-{file_name(self.base)}.json"
 
     @staticmethod
     def motor_owner(instance: str) -> str:
@@ -182,13 +182,13 @@ def _user_id() -> int:
 
 def default_state_folder(base: str, env: Mapping[str, str]) -> Path:
     """The state directory of the robot with this base topic, if its config names none; one per robot."""
-    robot = _file_name(base)
+    robot = file_name(base)
     if by_systemd := env.get("STATE_DIRECTORY"):
         return Path(by_systemd.split(":")[0], robot)
     return Path(env.get("XDG_STATE_HOME") or in_home("~/.local/state"), "pebble", robot)
 
 
-def _file_name(base: str) -> str:
+def file_name(base: str) -> str:
     """A name for one robot's files: its base, or a digest of it where a file system would refuse the name."""
     name = base.replace("/", "+")  # which no level of a topic contains
     return name if len(name.encode()) <= _LONGEST_NAME else hashlib.sha256(base.encode()).hexdigest()

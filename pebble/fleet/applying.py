@@ -47,8 +47,11 @@ def found_plugin() -> Path | None:
     return None
 
 
-def make(folder: Path, fleet: Fleet, plugin: Path | None) -> str:
-    """Write all files of a new fleet, and its account for changes. Returns that one's password. Raises PebbleError."""
+def make(folder: Path, fleet: Fleet, plugin: Path | None, passwords: Mapping[str, str] | None = None) -> str:
+    """Write all files of a new fleet, and its account for changes. Returns that one's password. Raises PebbleError.
+
+    ``passwords``: of the accounts that it begins with. A broker that is ``included`` has its configuration elsewhere.
+    """
     if (folder / CONF).exists():
         raise FleetError(f"{folder / CONF} exists already: name another folder")
     server = fleet.brokers[0]
@@ -56,9 +59,11 @@ def make(folder: Path, fleet: Fleet, plugin: Path | None) -> str:
     fleet = fleet.with_account(ADMIN, Account(roles=(Role.ADMIN,)))
     certificates.init(folder, names_of(server))
     folder.chmod(0o700)
-    _write_rules(folder, fleet, {ADMIN: broker_files.hashed(password)})
+    given = {**(passwords or {}), ADMIN: password}
+    _write_rules(folder, fleet, {name: broker_files.hashed(one) for name, one in given.items()})
     write(folder / ADMIN_PASSWORD, f"{password}\n".encode(), 0o600, FleetError)
-    write_conf(folder, fleet, plugin)
+    if not server.included:
+        write_conf(folder, fleet, plugin)
     save(folder, fleet)
     return password
 

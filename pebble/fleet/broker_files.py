@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from pebble.config.web import is_loopback
 from pebble.fleet.certificates import CA_CERT, SERVER_CERT, SERVER_KEY
-from pebble.fleet.folder import ACL, CONF, PASSWORDS, PID, SECURITY, Fleet
+from pebble.fleet.folder import ACL, CONF, PASSWORDS, PID, PLAIN_PORT, SECURITY, Fleet
 from pebble.fleet.roles import Rule
 
 #: As mosquitto's own tools. More would hold up the broker's one thread at each login, and gain nothing: passwords are
@@ -29,6 +29,11 @@ class Hashed(NamedTuple):
     salt: str
     hash: str
     iterations: int = ITERATIONS
+
+    def is_of(self, password: str) -> bool:
+        salt = base64.b64decode(self.salt)
+        digest = hashlib.pbkdf2_hmac("sha512", password.encode(), salt, self.iterations)
+        return base64.b64encode(digest).decode() == self.hash
 
 
 def new_password() -> str:
@@ -48,17 +53,22 @@ def conf_text(fleet: Fleet, folder: Path, plugin: Path | None, user: str) -> str
     where = f" {server.host}" if is_loopback(server.host) else ""
     tls = [f"cafile {folder / CA_CERT}", f"certfile {folder / SERVER_CERT}", f"keyfile {folder / SERVER_KEY}"]
     limit = f"max_connections {MAX_CONNECTIONS}"
-    lines = [f"# Written by `pebble fleet init`; run `mosquitto -c {folder / CONF}`.", "per_listener_settings false"]
-    lines += ["allow_anonymous false", f"user {user}", f"pid_file {folder / PID}", "log_dest stderr"]
+    by = "setup`" if server.included else f"fleet init`; run `mosquitto -c {folder / CONF}`"
+    lines = [f"# Written by `pebble {by}.", "per_listener_settings false"]
+    lines.append("allow_anonymous false")
+    if not server.included:
+        lines += [f"user {user}", f"pid_file {folder / PID}", "log_dest stderr"]
+        lines += ["persistence true", f"persistence_location {folder}/", "persistent_client_expiration 1d"]
     if plugin is None:
         lines += [f"acl_file {folder / ACL}", f"password_file {folder / PASSWORDS}"]
     else:
         lines += [f"plugin {plugin}", f"plugin_opt_config_file {folder / SECURITY}"]
-    lines += ["persistence true", f"persistence_location {folder}/", "persistent_client_expiration 1d"]
     lines += [f"message_size_limit {_MAX_MESSAGE}", "set_tcp_nodelay true"]
     lines += [f"listener {server.port}{where}", *tls, "tls_version tlsv1.2", limit]
     if server.unencrypted is not None:
         lines += [f"listener {server.unencrypted}{where}", limit]
+    if server.included:
+        lines += [f"listener {PLAIN_PORT} 127.0.0.1", limit]
     return "\n".join(lines) + "\n"
 
 

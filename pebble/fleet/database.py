@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pebble.errors import PebbleError
+from pebble.fleet.whole_file import give_as
 from pebble.transports.own_file import OwnFile
 
 _BUSY_S = 5.0  # another process may be writing
@@ -19,6 +20,15 @@ class DatabaseError(PebbleError):
     def __init__(self, path: Path | None, error: Exception) -> None:
         self.why = (error.strerror or str(error)) if isinstance(error, OSError) else str(error)
         super().__init__(f"{path}: {self.why}")
+
+
+def _create(path: Path) -> None:
+    """Make an empty file. By root it is the folder's owner's: a robot could not read one of root's."""
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
+    try:
+        give_as(descriptor, path.parent)
+    finally:
+        os.close(descriptor)
 
 
 class Database:
@@ -42,7 +52,8 @@ class Database:
         try:
             if path is not None:
                 path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-                os.close(os.open(path, os.O_RDWR | os.O_CREAT, 0o600))
+                if not path.exists():
+                    _create(path)
             self._open()
         except (OSError, sqlite3.Error) as error:
             why = DatabaseError(path, error).why

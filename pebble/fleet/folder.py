@@ -20,7 +20,7 @@ from pebble.fleet.whole_file import write
 FLEET, ADMIN_PASSWORD, CONF, PID = "fleet.json", "admin.password", "mosquitto.conf", "mosquitto.pid"
 SECURITY, ACL, PASSWORDS, ZENOH = "dynamic-security.json", "acl", "passwords", "zenoh.json"
 ADMIN = "admin"  # the account by which `pebble fleet` changes a running broker
-PORT = 8883  # of MQTT over TLS
+PORT, PLAIN_PORT = 8883, 1883  # of MQTT over TLS, and without
 MAX_ACCOUNTS = 10_000
 _LOCK = ".lock"
 _METRIC = re.compile(r"[^/#$+\x00-\x20\x7f]+|\+")  # one level
@@ -31,11 +31,16 @@ class FleetError(PebbleError):
 
 
 class Server(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
-    """Where a broker of the fleet listens. ``unencrypted``: a port for boards that have no TLS."""
+    """Where a broker of the fleet listens. ``unencrypted``: a port for boards that have no TLS.
+
+    ``included``: it is the mosquitto of its machine, which reads `mosquitto.conf` as a part of its own, and which
+    programs of that machine reach at ``PLAIN_PORT`` of loopback: there TLS would keep out a robot whose clock is unset.
+    """
 
     host: str
     port: Annotated[int, Meta(ge=1, le=65535)] = PORT
     unencrypted: Annotated[int, Meta(ge=1, le=65535)] | None = None
+    included: bool = False
 
 
 class Fleet(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

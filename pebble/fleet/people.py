@@ -8,6 +8,7 @@ import sqlite3
 import threading
 import time
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -91,7 +92,7 @@ class People:
         """Raises PeopleError."""
         self.check_name(name)
         salt = secrets.token_bytes(16)
-        values = (name, role.value, salt, _hash(_usable(password), salt))
+        values = (name, role.value, salt, _hash(usable(password), salt))
         try:
             self._change("INSERT INTO people (name, role, salt, hash) VALUES (?, ?, ?, ?)", *values)
         except sqlite3.IntegrityError:
@@ -111,9 +112,13 @@ class People:
     def set_password(self, name: str, password: str) -> None:
         """Ends the person's sessions, too. Raises PeopleError."""
         salt = secrets.token_bytes(16)
-        hashed = _hash(_usable(password), salt)
+        hashed = _hash(usable(password), salt)
         self._change_one(name, "UPDATE people SET salt = ?, hash = ? WHERE name = ?", salt, hashed, name)
         self._change("DELETE FROM sessions WHERE name = ?", name)
+
+    def end_sessions(self) -> None:
+        """Everybody has to log in again."""
+        self._change("DELETE FROM sessions")
 
     def set_role(self, name: str, role: Role) -> None:
         """Counts for running sessions, too. Raises PeopleError."""
@@ -253,7 +258,21 @@ def _exists(name: str) -> PeopleError:
     return PeopleError(f"{name} exists already: change the password or the role, or remove {name}")
 
 
-def _usable(password: str) -> str:
+def has_user(path: Path, name: str) -> bool:
+    """Whether the database knows this person; writes nothing. Raises DatabaseError."""
+    if not path.exists():
+        return False
+    # what is in a write-ahead log is read, too, which needs a file of SQLite's that only then is there
+    unchanged = "" if path.with_name(f"{path.name}-wal").exists() else "&immutable=1"
+    try:
+        with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro{unchanged}", uri=True)) as connection:
+            return bool(connection.execute("SELECT 1 FROM people WHERE name = ?", (name,)).fetchall())
+    except sqlite3.Error as error:
+        raise DatabaseError(path, error) from None
+
+
+def usable(password: str) -> str:
+    """The password, if it can be one. Raises PeopleError."""
     if not MIN_PASSWORD <= len(password) <= MAX_PASSWORD:
         raise PeopleError(f"a password has {MIN_PASSWORD} to {MAX_PASSWORD} characters")
     return password

@@ -6,8 +6,25 @@ from pathlib import Path
 from pebble.errors import PebbleError
 
 
-def write(file: Path, content: bytes, mode: int, error: type[PebbleError]) -> None:
-    """Replace the file at once: never half of it, never readable by others for a moment. Raises ``error``."""
+def is_root() -> bool:
+    """Whether this process may give files away; on Windows none does."""
+    return hasattr(os, "geteuid") and os.geteuid() == 0
+
+
+def give_as(new: Path | int, model: Path) -> None:
+    """Give a file to the owner of ``model``, if that is there and we are root. Raises OSError."""
+    if is_root() and model.exists():
+        found = model.stat()
+        os.chown(new, found.st_uid, found.st_gid)
+
+
+def write(
+    file: Path, content: bytes, mode: int, error: type[PebbleError], owner: tuple[int, int] | None = None
+) -> None:
+    """Replace the file at once: never half of it, never readable by others for a moment. Raises ``error``.
+
+    ``owner`` None: for root it stays the file of its owner, who may be a broker that reads it.
+    """
     temporary = file.with_name(f".{file.name}.new")
     try:
         temporary.unlink(missing_ok=True)
@@ -15,6 +32,10 @@ def write(file: Path, content: bytes, mode: int, error: type[PebbleError]) -> No
             output.write(content)
             output.flush()
             os.fsync(output.fileno())
+        if owner is None:
+            give_as(temporary, file)
+        else:
+            os.chown(temporary, *owner)
         temporary.chmod(mode)
         temporary.replace(file)
     except OSError as why:

@@ -11,6 +11,11 @@ class Places:
 
     root: Path = Path("/")
 
+    @property
+    def is_live(self) -> bool:
+        """Whether it is the system that runs, of which services can be started."""
+        return self.root == Path("/")
+
     @cached_property
     def etc(self) -> Path:
         """Config, passwords, certificates and the manifest: ``root:pebble``, files 0640."""
@@ -49,3 +54,22 @@ class Places:
     def broker(self) -> Path:
         """The part of mosquitto's configuration that is ours."""
         return self.root / "etc/mosquitto/conf.d/pebble.conf"
+
+    @cached_property
+    def broker_folder(self) -> Path:
+        """Accounts, rules and certificate of the robot's own broker: a folder of `pebble fleet`."""
+        return self.root / "etc/mosquitto/pebble"
+
+    @cached_property
+    def tls(self) -> Path:
+        """The certificate of the robot's page, and its authority."""
+        return self.etc / "tls"
+
+    @cached_property
+    def people(self) -> Path:
+        """Who may use the robot's page. It keeps its name when the robot gets another."""
+        return self.state / "people.sqlite"
+
+    def named(self, path: Path) -> str:
+        """The path as it is on the machine whose root this is."""
+        return f"/{path.relative_to(self.root)}"
