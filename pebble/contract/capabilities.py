@@ -164,3 +164,4 @@ class CapabilitiesValue(Payload, frozen=True, kw_only=True):
     telemetry: TelemetryOffer | UnsetType = UNSET
     outlets: OutletsOffer | UnsetType = UNSET
     named: bool | UnsetType = UNSET  # it takes commands only with an account's name in the topic (docs/fleet.md)
+    announced: bool | UnsetType = UNSET  # only in what readers make of a heartbeat's `subscribes`; robots leave it out

@@ -205,7 +205,11 @@ class AuditRead(Payload, frozen=True, kw_only=True):
 
 
 class Heartbeat(Payload, frozen=True, kw_only=True):
-    """Sign of life; as the will it holds ``online: false`` (paper A.8.5)."""
+    """Sign of life; as the will it holds ``online: false`` (paper A.8.5).
+
+    A robot without capabilities may list what it obeys, here or in the ``value`` of its status:
+    ``"subscribes": ["incoming/drive-values"]``. Pages then offer that, and tell what to publish.
+    """
 
     t: int  # epoch milliseconds
     online: bool | UnsetType = UNSET
