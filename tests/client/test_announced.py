@@ -47,7 +47,7 @@ def test_all_else_announces_nothing(made: bytes) -> None:
 
 
 @pytest.mark.parametrize(("channel", "key"), [(c.ONLINE, "subscribes"), (c.STATUS, "value")])
-def test_it_is_driven_until_its_capabilities_tell_more(channel: c.Channel, key: str) -> None:
+def test_it_is_driven_until_it_publishes_capabilities(channel: c.Channel, key: str) -> None:
     robot = RobotView(BASE)
     made = payload(**{key: LIST if key == "subscribes" else {"subscribes": LIST}})
     robot.receive(channel, Message(channel.topic(BASE), made), now=1.0, wall=1710969600.0)
