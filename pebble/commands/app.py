@@ -18,6 +18,9 @@ COMMANDS = {
     "up": "up",
     "check": "check",
     "doctor": "doctor",
+    "selftest": "selftest",
+    "report": "report",
+    "backup": "backup",
     "topics": "topics",
     "topic": "topic",
     "estop": "estop",
@@ -54,6 +57,9 @@ _HELP = """Runs and inspects Pebble robots.
     pebble check goob.json     validate a config and summarise it
     pebble doctor goob.json    check that this machine is ready for the robot
     pebble up goob.json        run the robot
+    pebble selftest goob.json  test the running robot, end to end
+    pebble report goob.zip     pack what helps to find a fault, no secrets
+    pebble backup goob.tar     pack what a new machine needs to be this robot
     pebble drive goob.json     drive it with the keys of this terminal
     pebble estop goob.json     stop the robot until it is reset
     pebble script new follow   write a first program that moves a robot

@@ -28,6 +28,9 @@ CaCert = Annotated[Path | None, typer.Option(help="Certificate authority to trus
 RobotOption = Annotated[
     str | None, typer.Option("--robot", "-r", help="The robot that short names refer to.", metavar="[SYSTEM/TYPE/]ID")
 ]
+RootOption = Annotated[
+    Path, typer.Option("--root", help="Folder that stands for / where the robot is installed.", metavar="DIR")
+]
 Output = Annotated[Path, typer.Option("--output", help="Folder for results and plots.", metavar="FOLDER")]
 Quick = Annotated[bool, typer.Option("--quick", help="Few cases and short rounds; results are marked as quick.")]
 

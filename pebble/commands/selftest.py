@@ -1,0 +1,84 @@
+"""``pebble selftest``: tests a robot that runs, end to end."""
+
+import json
+import sys
+import textwrap
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from pebble.commands.estop import me
+from pebble.commands.options import ConfigArgument, RootOption
+from pebble.config import load
+from pebble.config.secret_text import without_secrets
+from pebble.config.visible import shown
+from pebble.runtime.signals import interrupted_by_signals
+from pebble.selftest import Outcome, State
+from pebble.setup.places import Places
+
+_COLOURS = {State.OK: typer.colors.GREEN, State.FAILED: typer.colors.RED, State.SKIPPED: typer.colors.YELLOW}
+_INDENT = " " * 9
+
+
+def selftest(
+    config: ConfigArgument,
+    may_move: Annotated[bool, typer.Option("--may-move", help="Ask, then also turn the wheels a little.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead.")] = False,
+    root: RootOption = Path("/"),
+) -> int:
+    """Test a robot that runs, end to end: on its own machine, as its user or root.
+
+    Without --may-move no wheel turns. The robot is stopped for a moment, by an emergency stop that is ended by its
+    name; not while a person or a script drives it, or another stop holds. Exits 1 if a check fails; each is printed
+    with what ends its failure.
+
+    \b
+        pebble selftest goob.json
+        pebble selftest goob.json --may-move
+    """
+    from pebble.selftest.checks import CHECKS, MOVING, run  # of Linux only
+    from pebble.selftest.robot import reached
+
+    loaded = load(config)
+    found: list[dict[str, str]] = []
+    if may_move and not _clear(loaded.robot.name or loaded.robot.id):
+        typer.echo("nothing was tested", err=True)
+        return 1
+    with interrupted_by_signals(), reached(loaded, Places(root.absolute()), me()) as robot:
+        for check, outcome in run(robot, (*CHECKS, *(MOVING if may_move else ()))):
+            found.append(_row(check.name, outcome, str(config)))
+            if not as_json:
+                _print(found[-1])
+    states = [row["state"] for row in found]
+    failures = states.count(State.FAILED)
+    if as_json:
+        typer.echo(json.dumps({"ok": not failures, "checks": found}, ensure_ascii=False))
+    else:
+        typer.echo(f"checks: {len(found)}, failures: {failures}, skipped: {states.count(State.SKIPPED)}")
+    return 1 if failures else 0
+
+
+def _clear(name: str) -> bool:
+    """Whether a person answers that the robot may move. Standard output is for the result."""
+    typer.echo(f"{shown(name)} will drive about 3 cm ahead and back, slowly.", err=True)
+    typer.echo("Does it stand free, on the floor, with no person in its way? [y/N]: ", nl=False, err=True)
+    return sys.stdin.readline().strip().lower() in ("y", "yes")
+
+
+def _row(name: str, outcome: Outcome, config: str) -> dict[str, str]:
+    """One check for JSON: texts come from the robot, and fixes name this config."""
+    text, fix = (shown(without_secrets(one)) for one in (outcome.text, outcome.fix.replace("CONFIG", config)))
+    return {"name": name, "state": outcome.state.value, "text": text, "fix": fix}
+
+
+def _print(row: dict[str, Any]) -> None:
+    state = State(row["state"])
+    because = "skipped because " if state is State.SKIPPED else ""
+    typer.secho(f"{state.value:<7}  ", fg=_COLOURS[state], nl=False)
+    text = textwrap.fill(
+        f"{row['name']}: {because}{row['text']}", 100, initial_indent=_INDENT, subsequent_indent=_INDENT
+    )
+    typer.echo(text.removeprefix(_INDENT))
+    if row["fix"]:  # always on one line: it is to be copied
+        typer.secho(f"{_INDENT}fix: {row['fix']}", bold=True)

@@ -1,0 +1,246 @@
+"""The checks of a robot that runs, as a table: what needs to be reached and free for each, and what makes it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+
+from pebble.client.names import id_of
+from pebble.client.robot_topics import section_of
+from pebble.contract.levels import LEVELS, silent_after
+from pebble.errors import PebbleError
+from pebble.launcher.capabilities import capabilities as expected_capabilities
+from pebble.runtime.addresses import Addresses
+from pebble.selftest import Outcome, failed, machine, ok, skipped
+from pebble.selftest.media import picture, sound
+from pebble.selftest.motion import wheels
+from pebble.selftest.robot import RobotUnderTest, Side
+from pebble.selftest.stops import retained_commands, stop
+
+_IN_A_ROW = 10  # heartbeats in a row
+_LONGEST_GAP = 2.5  # times the interval that its config has
+_LEAST_CELL_V = 3.4  # of a lithium cell: below, a robot has minutes
+_SHOWN = 5  # names in one line
+_LOG = "journalctl -u pebble -n 50"
+
+Need = Callable[[RobotUnderTest], str]
+
+
+# -- what a check needs: empty, or why it is lacking
+
+
+def running(robot: RobotUnderTest) -> str:
+    if robot.own is None:
+        return "its own side is not reached"
+    states = set(_states(robot).values())
+    return "it does not run" if states and states <= {"stopped"} else ""
+
+
+def operators_side(robot: RobotUnderTest) -> str:
+    return "" if robot.operators is not None else f"its operators' side is not reached: {robot.why_operators}"
+
+
+def motors(robot: RobotUnderTest) -> str:
+    return "" if robot.config.motor_lines() else "it has no motors"
+
+
+def free(robot: RobotUnderTest) -> str:
+    """No person and no script has it, and it is not stopped: a test takes nothing from them."""
+    view = robot.view
+    if view.stopped_by is not None:
+        return f"it is stopped by {view.stopped_by.by or 'unknown'}, which only a person ends"
+    if view.autonomy is not None and view.autonomy.running:
+        return f"the script {view.autonomy.file} is running"
+    return f"{view.control.who} drives it" if view.control.who else ""
+
+
+# -- the sides
+
+
+def processes(robot: RobotUnderTest) -> Outcome:
+    """Whether its own side answers, and each of its processes is ready."""
+    if why := robot.why_own or running(robot):
+        return failed(why, "sudo systemctl start pebble, or pebble up CONFIG; and test it as the robot's user or root")
+    if not robot.wait(lambda: _unready(robot) == [], robot.patience_s):
+        return failed(", ".join(_unready(robot)), _LOG)
+    return ok(f"{len(_states(robot))} are ready")
+
+
+def _states(robot: RobotUnderTest) -> dict[str, str]:
+    status = robot.inside.status or {}
+    return {name: str(section_of(status, f"services.{name}").get("state")) for name in section_of(status, "services")}
+
+
+def _unready(robot: RobotUnderTest) -> list[str]:
+    """``held`` ones wait while people drive over a thin link, and ``stopped`` ones until they are requested."""
+    if robot.inside.status is None:
+        return ["its status has not arrived: is it starting?"]
+    wanted = set(robot.config.on_demand_programs())
+    found = _states(robot).items()
+    return [
+        f"{name} is {state}" for name, state in found if state != "ready" and not (name in wanted or state == "held")
+    ]
+
+
+def heartbeats(robot: RobotUnderTest) -> Outcome:
+    """Whether operators see it, without gaps."""
+    side, section = robot.operators, robot.config.services.mqtt_bridge.heartbeat
+    if side is None:
+        why = robot.why_operators
+        return failed(why, "pebble doctor CONFIG") if robot.config.services.mqtt_bridge.enabled else skipped(why)
+    if not section.enabled:
+        return skipped("services.mqtt_bridge.heartbeat is off")
+
+    def longest() -> float:
+        link = side.view.liveness.link
+        interval_s = max(section.interval_seconds, LEVELS[link].heartbeat_s)
+        late_s = side.view.liveness.average_latency_s or 0.0
+        return max(silent_after(interval_s, link, late_s), _LONGEST_GAP * interval_s)
+
+    if not robot.wait(lambda: side.heartbeats, robot.patience_s):
+        return failed("none arrives", "pebble doctor CONFIG")
+    if not robot.wait(lambda: _gap(side) <= longest(), 3 * _IN_A_ROW * longest()):
+        return failed(f"gaps of {_gap(side):.1f} s, where {longest():.1f} s is the longest", "pebble doctor CONFIG")
+    late = side.view.liveness.average_latency_s
+    shown = "" if late is None else f", {1000 * late:.0f} ms on the way"
+    return ok(f"{_IN_A_ROW} in a row, the longest gap {_gap(side):.2f} s{shown}")
+
+
+def _gap(side: Side) -> float:
+    """The longest one between the newest heartbeats; infinite until there are enough."""
+    newest = list(side.heartbeats)[-_IN_A_ROW:]
+    return (
+        max((after - before for before, after in pairwise(newest)), default=0.0)
+        if len(newest) == _IN_A_ROW
+        else float("inf")
+    )
+
+
+def capabilities(robot: RobotUnderTest) -> Outcome:
+    """Whether it offers, on both sides, what its config has."""
+    wanted = set(_available(expected_capabilities(robot.config, Addresses(robot.config))))
+    lacking: dict[str, str] = {}
+    for side in robot.sides:
+        where = "" if side.own else " to operators"
+        if not side.view.estop.has_capabilities:
+            return failed(f"it has not published them{where}", _LOG)
+        for name in sorted(wanted - set(_available(side.view.capabilities))):
+            lacking.setdefault(name, f"{name}{where}")
+    if lacking:
+        return failed(f"it does not offer {', '.join(lacking.values())}", _LOG)
+    return ok(", ".join(sorted(wanted)) or "none")
+
+
+def _available(value: dict[str, object]) -> Iterator[str]:
+    """The sections of capabilities that are available; those that come with a device are left out."""
+    for name in value:
+        if section_of(value, name).get("available") is True and name != "outlets":
+            yield name
+
+
+# -- what hangs on it
+
+
+def boards(robot: RobotUnderTest) -> Outcome:
+    """Whether each serial line's board was heard, and commands reach the motors."""
+    lines = {name or "serial": line.serial.port for name, line in robot.config.serial_instances().items()}
+    if not lines:
+        return skipped("it has no serial line")
+
+    def known() -> bool:
+        drives = robot.view.driveable
+        return all(_mcu(robot, name).get("state") == "ready" for name in lines) and (not drives or not drives.doubt)
+
+    robot.wait(known, robot.patience_s)
+    for name, port in lines.items():
+        mcu = _mcu(robot, name)
+        if mcu.get("state") != "ready":
+            why = mcu.get("why") or _MCU_STATES.get(str(mcu.get("state")), "its state is not known")
+            return failed(f"{name} ({port}): {why}", f"plug it in, then: ls -l /dev/serial/by-id/; {_LOG}")
+    drives = robot.view.driveable
+    if drives is not None and drives.state == "no":
+        return failed(f"its motors are not reached: {drives.why}", _LOG)
+    unheard = [name for name in lines if not isinstance(age := _mcu(robot, name).get("heard_ms"), int) or age >= 10_000]
+    if unheard:
+        return skipped(f"{', '.join(unheard)} sends nothing at rest, as some boards do")
+    if drives is not None and drives.state == "unknown":
+        return skipped(f"it is not known whether its motors obey: {drives.why}")
+    return ok(f"{', '.join(lines)} was heard" + (", and commands reach the motors" if drives is not None else ""))
+
+
+_MCU_STATES = {"silent": "its board has stopped sending", "absent": "there is no such device", "booting": "it starts"}
+
+
+def _mcu(robot: RobotUnderTest, name: str) -> dict[str, object]:
+    return section_of(section_of(robot.inside.status or {}, "mcu"), name)
+
+
+def battery(robot: RobotUnderTest) -> Outcome:
+    """Its voltage, and whether that is too low where its config has the number of cells."""
+    if not robot.wait(lambda: robot.view.volts is not None, 0.0) or robot.view.volts is None:
+        return skipped("it reports no voltage")
+    volts, cells = robot.view.volts, robot.config.robot.battery_cells
+    charging = ", on the charger" if robot.view.charging else ""
+    if cells and volts / cells < _LEAST_CELL_V and not robot.view.charging:
+        return failed(f"{volts:.2f} V, {volts / cells:.2f} V a cell: it is nearly empty", "charge it")
+    return ok(f"{volts:.2f} V{charging}")
+
+
+def leftovers(robot: RobotUnderTest) -> Outcome:
+    """What robots of other ids have left retained on this machine: this one before it was renamed, for example."""
+    here = [side for side in robot.sides if side.is_here(robot.config)]
+    if not here:
+        return skipped("other ids at a broker elsewhere are other robots")
+    for side in here:
+        gone = sorted(side.others.keys() - side.live)
+        if gone:
+            names = ", ".join(id_of(base) for base in gone[:_SHOWN])
+            remote = "" if side.own else " --remote"
+            topic = min(side.others[gone[0]])
+            fix = f"if they are gone: pebble topic pub {topic} '' --retain --force -c CONFIG{remote}, and so on"
+            return failed(f"{len(gone)} that send no heartbeat: {names}", fix)
+    others = len({base for side in here for base in side.others})
+    return ok(f"none; {others} other robots are there" if others else "none")
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """``needs`` are asked in their order; the first that is lacking is why the check is skipped."""
+
+    name: str
+    run: Callable[[RobotUnderTest], Outcome]
+    needs: tuple[Need, ...] = ()
+
+
+_BOTH = (running, operators_side)
+CHECKS = (
+    Check("unit", machine.unit),
+    Check("slot", machine.slot),
+    Check("clock", machine.clock),
+    Check("disk", machine.disk),
+    Check("processes", processes),
+    Check("heartbeats", heartbeats),
+    Check("capabilities", capabilities, (running,)),
+    Check("boards", boards, (running,)),
+    Check("battery", battery, (running, motors)),
+    Check("leftovers", leftovers, (running,)),
+    Check("page", machine.page),
+    Check("picture", picture, _BOTH),
+    Check("sound", sound, _BOTH),
+    Check("retained commands", retained_commands, (*_BOTH, motors, free)),
+    Check("stop", stop, (running, motors, free)),
+)
+#: What turns wheels: only where a person has agreed.
+MOVING = (Check("wheels", wheels, (running, motors, free)),)
+
+
+def run(robot: RobotUnderTest, checks: Iterable[Check]) -> Iterator[tuple[Check, Outcome]]:
+    """Make one check after the other."""
+    for check in checks:
+        robot.wait(lambda: True, 0.0)  # what has arrived meanwhile decides whether it is free
+        why = next((why for need in check.needs if (why := need(robot))), "")
+        try:
+            yield check, skipped(why) if why else check.run(robot)
+        except PebbleError as error:  # a connection was lost
+            yield check, failed(str(error), "run it again")

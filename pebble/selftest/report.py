@@ -1,0 +1,224 @@
+"""What helps to find a fault from elsewhere, in one zip file without a password or key."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import time
+import zipfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from pebble import contract as c
+from pebble.client.connection import Target, connected
+from pebble.config import Config, load
+from pebble.config.config import resolved
+from pebble.config.masking import masked
+from pebble.config.problems import Notes
+from pebble.config.raw import decode, plain, read_text
+from pebble.config.secret_text import without_secrets
+from pebble.contract import codec
+from pebble.doctor.checks import run_checks
+from pebble.errors import PebbleError
+from pebble.selftest.secrets_here import Secrets, secrets_of
+from pebble.setup.places import Places
+from pebble.transports import Message
+from pebble.version import __version__
+
+_JOURNAL_LINES = 2000
+_PROGRAM_S = 20.0
+_STATES_S = 1.0  # for what its own side retains to arrive
+_LONGEST_PART = 8 << 20  # bytes
+_UNITS = ("etc/systemd/system", "usr/lib/systemd/system", "lib/systemd/system", "usr/local/lib/systemd/system")
+_STATES = (c.STATUS, c.CAPABILITIES, c.ESTOP_STATE, c.CONTROL_STATE, c.LINK, c.MEDIA_STATUS, c.AUTONOMY_STATUS)
+
+
+class MissingError(PebbleError):
+    """A part that cannot be had here. Example: ``journalctl is not installed``."""
+
+
+class LeakError(PebbleError):
+    """A secret of this machine is in a part: nothing is written."""
+
+
+@dataclass(frozen=True)
+class Here:
+    """What is reported: the installed robot below ``places``, or that of another config."""
+
+    places: Places
+    file: Path
+    config: Config | None = None  # None: it has mistakes, or is not there
+    problem: str = ""
+
+
+@dataclass
+class Report:
+    """``missing``: why a part is not in it; ``unread``: files whose secrets could not be searched for."""
+
+    parts: dict[str, str] = field(default_factory=dict)
+    missing: dict[str, str] = field(default_factory=dict)
+    unread: tuple[str, ...] = ()
+
+    def packed(self) -> bytes:
+        output = io.BytesIO()
+        with zipfile.ZipFile(output, "w", zipfile.ZIP_DEFLATED) as packed:
+            for name, text in self.parts.items():
+                packed.writestr(name, text)
+        return output.getvalue()
+
+
+def make(places: Places, file: Path | None = None) -> Report:
+    """Collect all parts; a part that fails is named in the index. Raises LeakError."""
+    here = _here(places, file or places.config)
+    report = Report()
+    for name, part in PARTS.items():
+        try:
+            report.parts[name] = without_secrets(part(here))[:_LONGEST_PART]
+        except (PebbleError, OSError, subprocess.SubprocessError) as error:
+            report.missing[name] = without_secrets(" ".join(str(error).split()))
+    known = secrets_of(places, here.config, [here.file])
+    report.unread = known.unread
+    report.parts = {"index.txt": _index(report, known), **report.parts}
+    for name, text in report.parts.items():
+        if where := known.found_in(name, text.encode()):
+            raise LeakError(f"nothing was written: a password or key of {where} is in {name}; is it a usual word?")
+    return report
+
+
+def _here(places: Places, file: Path) -> Here:
+    env = {"STATE_DIRECTORY": str(places.state)} if file == places.config and places.state.exists() else {}
+    try:
+        return Here(places, file, load(file, {**os.environ, **env}))
+    except PebbleError as error:
+        return Here(places, file, None, str(error))
+
+
+def _index(report: Report, known: Secrets) -> str:
+    lines = [f"Pebble {__version__}, {time.strftime('%Y-%m-%d %H:%M:%S %z')}", ""]
+    lines += [f"{name}: {len(text):,} characters" for name, text in report.parts.items()]
+    lines += [f"{name}: MISSING: {why}" for name, why in report.missing.items()]
+    lines += ["", f"searched for {len(known.known)} passwords and keys of this machine, and found none"]
+    lines += [f"too short to be searched for: one in {where}" for where in known.short]
+    lines += [f"could not be read, so what is in it was not searched for: {file}" for file in known.unread]
+    return "\n".join(lines) + "\n"
+
+
+# -- the parts
+
+
+def _config(here: Here) -> str:
+    """The config as written and as it is meant, with stars where there are secrets."""
+    written = masked(plain(decode(read_text(here.file), here.file.name), Notes()))
+    whole: dict[str, Any] = {"file": str(here.file), "written": written}
+    whole |= {"problems": here.problem.splitlines()} if here.config is None else {"resolved": resolved(here.config)}
+    return json.dumps(whole, indent=1, ensure_ascii=False)
+
+
+def _doctor(here: Here) -> str:
+    found = run_checks(here.config)
+    return "".join(f"{one.level.value:<4}  {one.what}: {one.text}  {one.fix}\n" for one in found) + here.problem
+
+
+def _status(here: Here) -> str:
+    """What the robot's own side retains of its state."""
+    if here.config is None:
+        raise MissingError("the config cannot be read")
+    found: dict[str, Any] = {}
+
+    def take(message: Message) -> None:
+        try:
+            found[message.topic] = json.loads(message.payload) if not codec.too_deep(message.payload) else "too deep"
+        except ValueError:
+            found[message.topic] = f"{len(message.payload)} bytes"
+
+    with connected(Target(config=here.config.path, program="report")) as (transport, names):
+        for channel in _STATES:
+            transport.subscribe(channel.filter(names.base), take)
+        time.sleep(_STATES_S)
+    return json.dumps(dict(sorted(found.items())), indent=1, ensure_ascii=False)
+
+
+def _journal(here: Here) -> str:
+    root = [] if here.places.root == Path("/") else [f"--root={here.places.root}"]
+    units = [word for name in ("pebble*", "mosquitto*") for word in ("--unit", name)]
+    return _printed("journalctl", *root, *units, f"--lines={_JOURNAL_LINES}", "--no-pager", "--output=short-iso")
+
+
+def _units(here: Here) -> str:
+    roots = [here.places.root / name for name in _UNITS]
+    files = [file for root in roots for file in sorted(root.glob("pebble*"))]
+    inside = [file for one in files for file in (sorted(one.glob("*")) if one.is_dir() else [one])]
+    inside += sorted((here.places.root / "etc/polkit-1/rules.d").glob("*pebble*"))
+    if not inside:
+        raise MissingError("no unit of Pebble is installed")
+    return "\n".join(f"# {file}\n{file.read_text(errors='replace')}" for file in inside)
+
+
+def _slots(here: Here) -> str:
+    places = here.places
+    if not places.slots.is_dir():
+        raise MissingError(f"there is no {places.slots}")
+    return "\n".join(_described(path) for path in _of_slots(places)) + "\n"
+
+
+def _of_slots(places: Places) -> Iterator[Path]:
+    yield from sorted(places.slots.iterdir())
+    yield from sorted(places.slots.glob("*/.complete"))
+    yield places.current_slot
+    yield from sorted(places.slot_state.glob("*"))
+
+
+def _described(path: Path) -> str:
+    if path.is_symlink():
+        return f"{path} -> {path.readlink()}"
+    if path.is_file():
+        return f"{path}: {path.read_text(errors='replace').strip()[:1000]}"
+    return f"{path}{'/' if path.is_dir() else ' is missing'}"
+
+
+def _versions(here: Here) -> str:
+    lines = [f"pebble {__version__}", f"python {sys.version}", f"{sys.executable}", " ".join(platform.uname())]
+    release = here.places.root / "etc/os-release"
+    lines += release.read_text(errors="replace").splitlines() if release.is_file() else []
+    installed = {one.name: one.version for one in metadata.distributions()}
+    return "\n".join([*lines, *(f"{name} {version}" for name, version in sorted(installed.items()))]) + "\n"
+
+
+def _devices(_here: Here) -> str:
+    names = [f"{path} -> {path.resolve()}" for path in sorted(Path("/dev").glob("*/by-id/*"))]
+    return "\n".join([_printed("lsusb"), *names]) + "\n"
+
+
+def _disk(_here: Here) -> str:
+    return _printed("df", "-h", "-x", "tmpfs") + _printed("free", "-h") + _printed("uptime")
+
+
+def _printed(program: str, *arguments: str) -> str:
+    if shutil.which(program) is None:
+        raise MissingError(f"{program} is not installed")
+    done = subprocess.run([program, *arguments], capture_output=True, timeout=_PROGRAM_S, check=False)
+    if done.returncode and not done.stdout:
+        raise MissingError(f"{program} ended with {done.returncode}: {done.stderr.decode(errors='replace')[:300]}")
+    return done.stdout.decode(errors="replace")
+
+
+#: In the order in which a reader wants them.
+PARTS: dict[str, Callable[[Here], str]] = {
+    "config.json": _config,
+    "doctor.txt": _doctor,
+    "status.json": _status,
+    "journal.txt": _journal,
+    "units.txt": _units,
+    "slots.txt": _slots,
+    "versions.txt": _versions,
+    "lsusb.txt": _devices,
+    "disk.txt": _disk,
+}
