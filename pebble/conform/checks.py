@@ -374,6 +374,7 @@ def _kept_by_first(witness: Witness, driver: Driver) -> Outcome:
 
 
 def _released(witness: Witness, driver: Driver) -> Outcome:
+    driver.asks(for_ms=5000)
     driver.asks("release")
     if not witness.wait(lambda: not driver.holds, ANSWER_S):
         return failed("it is kept after its release", 'end it by {"want": "release"}')

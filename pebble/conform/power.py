@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import secrets
-import sys
 
 from pebble import contract as c
 from pebble.conform.checks import ANSWER_S, Check, commanded, drives, free, stops
@@ -12,19 +11,13 @@ from pebble.conform.witness import Witness
 from pebble.contract.payloads import EstopCommand, EstopReset
 from pebble.selftest import Outcome, failed, ok, skipped
 
-_PERSON_S = 120.0  # until it is done
-_WILL_S = 100.0  # brokers notice after one and a half times a keep-alive of up to a minute
 _LOOKS_S = 3.0
 
 
-def _ask(text: str) -> None:
-    print(f"pebble: {text}", file=sys.stderr, flush=True)  # noqa: T201 - standard output is for the result
-
-
 def will(witness: Witness) -> Outcome:
-    _ask("cut the robot's power now")
     began = witness.look(0.0)
-    if not witness.wait(lambda: _offline(witness, began), _PERSON_S + _WILL_S):
+    witness.ask("cut the robot's power now")
+    if not witness.wait(lambda: _offline(witness, began), witness.person_s):
         fix = 'its will is outgoing/online {"t": <epoch ms>, "online": false}, retained'
         return failed("nothing tells that it is gone", fix)
     kept = [one for one in witness.kept() if one.channel is c.ONLINE]
@@ -58,12 +51,12 @@ def retained_commands(witness: Witness) -> Outcome:
 
 
 def _back(witness: Witness) -> str:
-    _ask("switch it on again")
     began = witness.look(0.0)
+    witness.ask("switch it on again")
     here = witness.wait(
-        lambda: [one for one in witness.of(c.ONLINE, began) if one.value.online is not False], _PERSON_S
+        lambda: [one for one in witness.of(c.ONLINE, began) if one.value.online is not False], witness.person_s
     )
-    return "" if here else f"it is not back within {_PERSON_S:g} s"
+    return "" if here else f"it is not back within {witness.person_s:g} s"
 
 
 def survives(witness: Witness) -> Outcome:
@@ -75,8 +68,10 @@ def survives(witness: Witness) -> Outcome:
     saved = bool(states) and all(one.persisted is True for one in states.values())
     boots = {one.boot for one in states.values()}
     if saved:
-        _ask("cut the robot's power for a moment")
-        witness.wait(lambda: {one.boot for one in witness.view.estop.states.values()}.isdisjoint(boots), _PERSON_S)
+        witness.ask("cut the robot's power for a moment")
+        witness.wait(
+            lambda: {one.boot for one in witness.view.estop.states.values()}.isdisjoint(boots), witness.person_s
+        )
         witness.look(ANSWER_S)
     outcome = (
         ok("it starts stopped") if witness.view.latched else failed("it is free after a power cut", "save the stop")

@@ -1,5 +1,6 @@
 """One component as any client at its broker sees it: everything it publishes, and what is sent to it."""
 
+import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -38,6 +39,8 @@ class Witness:
 
     def __init__(self, target: Target, transport: Transport, names: Names, base: str) -> None:
         self.base = base
+        self.ask = _ask  # tells the person at the robot what to do
+        self.person_s = 180.0  # until that is done, and a broker has noticed it: 1.5 times a keep-alive of a minute
         self.records: deque[Record] = deque(maxlen=_MOST)
         self.view = RobotView(base)
         self._target, self._transport, self.account = target, transport, names.account
@@ -96,6 +99,10 @@ class Witness:
             beside.subscribe(f"{self.base}/#", found.append, qos=QoS.DELIVERED, direct=True)
             self.wait(lambda: False, _KEPT_S)
         return [record_of(one, self.base, 0.0) for one in list(found) if one.retain and one.payload]
+
+
+def _ask(text: str) -> None:
+    print(f"pebble: {text}", file=sys.stderr, flush=True)  # noqa: T201 - standard output is for the result
 
 
 def record_of(message: Message, base: str, at: float) -> Record:
