@@ -42,6 +42,13 @@ PACKAGES = {
         ("lib/tsc.js", "lib/_tsc.js", "lib/lib.*", "package.json"),
         "TypeScript, which checks the types of the operator page",
     ),
+    "asyncapi": Package(
+        "@asyncapi/parser",
+        "3.6.6",
+        "DppE3OStajt6gHc+RsVf9VxRwW9WACagHnFvkOML5rZGwS9hXxtFYTxnsH3mHPRgHom0rClMs6DpbjNY65Y54A==",
+        ("browser/index.js",),
+        "AsyncAPI's own parser, which checks docs/asyncapi.yaml",
+    ),
     "node_modules/@foxglove/ws-protocol": Package(
         "@foxglove/ws-protocol",
         "0.8.0",

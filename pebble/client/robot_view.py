@@ -4,6 +4,7 @@ from collections import deque
 from typing import Any
 
 from pebble import contract as c
+from pebble.client.announced import announced
 from pebble.client.control import RobotControl
 from pebble.client.drive_reasons import SILENT_S, Situation
 from pebble.client.driveable import Driveable, driveable_of
@@ -108,6 +109,7 @@ class RobotView:
             self._receive_link(message)
         elif channel is c.STATUS:
             self.driveable = driveable_of(message.payload)
+            self.announce(message.payload)
         elif channel in _TELEMETRY:
             try:
                 self._receive_telemetry(channel, codec.decode(channel, message.payload))
@@ -123,7 +125,17 @@ class RobotView:
         except PayloadError:
             return None
         self.liveness.heartbeat(now, wall - payload.t / 1000, online=payload.online is not False)
+        self.announce(message.payload)
         return payload
+
+    def announce(self, payload: bytes) -> bool:
+        """Take what a heartbeat or status lists, unless it publishes capabilities; whether that is something else."""
+        if self.capabilities and "announced" not in self.capabilities:
+            return False
+        found = announced(self.base, payload)
+        changed = bool(found) and found != self.capabilities
+        self.capabilities = found or self.capabilities
+        return changed
 
     def receive_stop(self, channel: c.Channel | None, message: Message, now: float) -> bool:
         """Take capabilities, or the state of a motor owner; whether they say something of its emergency stop."""
@@ -236,7 +248,7 @@ class RobotView:
             online=self.online(now),
             latched=self.latched,
             free_s=now - self.reset_at,
-            published=self.estop.has_capabilities,
+            published=bool(self.capabilities) or self.estop.has_capabilities,
             drives=self.drives,
             arbitrates=self.arbitrates,
             script=script is not None and script.running,

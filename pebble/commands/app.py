@@ -40,6 +40,7 @@ COMMANDS = {
     "cert": "cert",
     "fleet": "fleet",
     "audit": "audit",
+    "conform": "conform",
     "flash": "flash",
     "bench": "bench",
     "impair": "impair",
@@ -72,6 +73,7 @@ _HELP = """Runs and inspects Pebble robots.
     pebble cert init NAME      make certificates, so that phones can, too
     pebble fleet init hall     give robots and people accounts at a broker
     pebble audit goob.json     show who did what to the robot
+    pebble conform rover       judge a robot of your own by the contract
     pebble flash lamp.json     install a robot's firmware on its board
     pebble bench control       compare MQTT and Zenoh on this machine
     pebble impair              measure robots behind an impaired network

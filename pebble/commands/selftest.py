@@ -48,12 +48,12 @@ def selftest(
         return 1
     with interrupted_by_signals(), reached(loaded, Places(root.absolute()), me()) as robot:
         for check, outcome in run(robot, (*CHECKS, *(MOVING if may_move else ()))):
-            found.append(_row(check.name, outcome, str(config)))
+            found.append(row(check.name, outcome, str(config)))
             if not as_json:
-                _print(found[-1])
+                printed(found[-1])
         if dropped := sum(side.dropped for side in robot.sides):
             typer.echo(f"pebble: warning: {dropped} messages came too fast to be read", err=True)
-    states = [row["state"] for row in found]
+    states = [one["state"] for one in found]
     failures = states.count(State.FAILED)
     if as_json:
         typer.echo(json.dumps({"ok": not failures, "checks": found}, ensure_ascii=False))
@@ -69,7 +69,7 @@ def _clear(name: str) -> bool:
     return sys.stdin.readline().strip().lower() in ("y", "yes")
 
 
-def _row(name: str, outcome: Outcome, config: str) -> dict[str, str]:
+def row(name: str, outcome: Outcome, config: str = "CONFIG") -> dict[str, str]:
     """One check for JSON: texts come from the robot, and fixes name this config."""
     text, fix = (
         shown(without_secrets(one)) for one in (outcome.text, outcome.fix.replace("CONFIG", shlex.quote(config)))
@@ -77,13 +77,13 @@ def _row(name: str, outcome: Outcome, config: str) -> dict[str, str]:
     return {"name": name, "state": outcome.state.value, "text": text, "fix": fix}
 
 
-def _print(row: dict[str, Any]) -> None:
-    state = State(row["state"])
+def printed(one: dict[str, Any]) -> None:
+    state = State(one["state"])
     because = "skipped because " if state is State.SKIPPED else ""
     typer.secho(f"{state.value:<7}  ", fg=_COLOURS[state], nl=False)
     text = textwrap.fill(
-        f"{row['name']}: {because}{row['text']}", 100, initial_indent=_INDENT, subsequent_indent=_INDENT
+        f"{one['name']}: {because}{one['text']}", 100, initial_indent=_INDENT, subsequent_indent=_INDENT
     )
     typer.echo(text.removeprefix(_INDENT))
-    if row["fix"]:  # always on one line: it is to be copied
-        typer.secho(f"{_INDENT}fix: {row['fix']}", bold=True)
+    if one["fix"]:  # always on one line: it is to be copied
+        typer.secho(f"{_INDENT}fix: {one['fix']}", bold=True)

@@ -31,7 +31,8 @@ from pebble.config.types import (
     doc,
 )
 from pebble.config.web import WebHandler, WebInterface
-from pebble.contract.payloads import Body, Colour, LinkLevel
+from pebble.contract.capabilities import Body, Colour
+from pebble.contract.payloads import LinkLevel
 from pebble.contract.serial_protocols import SerialProtocolName
 
 

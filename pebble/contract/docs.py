@@ -1,4 +1,4 @@
-"""Writes docs/topics.md and docs/payloads.schema.json: ``python -m pebble.contract.docs [FOLDER]``."""
+"""Writes docs/topics.md, payloads.schema.json and asyncapi.yaml: ``python -m pebble.contract.docs [FOLDER]``."""
 
 import inspect
 import json
@@ -12,11 +12,12 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 from msgspec import NODEFAULT, UNSET, UnsetType
 from msgspec.structs import FieldInfo, fields
 
-from pebble.contract import CHANNELS, INCOMING, OUTGOING, Channel, Kind
-from pebble.contract.payloads import SECTIONS, Capabilities, Payload
+from pebble.contract import CHANNELS, INCOMING, OUTGOING, Channel, Kind, asyncapi
+from pebble.contract.capabilities import CapabilitiesValue
+from pebble.contract.payloads import Capabilities, Payload
 from pebble.contract.schemas import schemas
 
-TOPICS, SCHEMAS = "topics.md", "payloads.schema.json"
+TOPICS, SCHEMAS, ASYNCAPI = "topics.md", "payloads.schema.json", "asyncapi.yaml"
 
 _DOCS = Path(__file__).resolve().parents[2] / "docs"
 _GENERATED = re.compile(r"(<!-- generated: (\w+) -->\n?).*?(<!-- end of generated: \2 -->)", re.DOTALL)
@@ -123,7 +124,7 @@ def _structs() -> list[type[Payload]]:
 def _collect(kind: Any, found: dict[type[Payload], None]) -> None:
     if isinstance(kind, type) and issubclass(kind, Payload) and kind not in found:
         found[kind] = None
-        for member in [*get_type_hints(kind).values(), *(SECTIONS.values() if kind is Capabilities else ())]:
+        for member in [*get_type_hints(kind).values(), *([CapabilitiesValue] if kind is Capabilities else ())]:
             _collect(member, found)
     for inner in get_args(kind):
         _collect(inner, found)
@@ -164,7 +165,7 @@ def _default(member: FieldInfo) -> str:
 
 
 def _remarks(struct: type[Payload]) -> dict[str, str]:
-    """The comments behind the fields of payloads.py: units and meanings."""
+    """The comments behind the fields of the structs: units and meanings."""
     sources = [inspect.getsource(base) for base in reversed(struct.__mro__) if issubclass(base, Payload)]
     lines = [line for source in sources for line in source.splitlines()]
     found = (re.match(r"    (\w+): [^#]*#\s*(.+)$", line) for line in lines)
@@ -182,11 +183,15 @@ def _yes(value: bool) -> str:
 
 def documents() -> dict[str, str]:
     """The generated files by name."""
-    return {TOPICS: topics_document(), SCHEMAS: json.dumps(schemas(), indent=2) + "\n"}
+    return {
+        TOPICS: topics_document(),
+        SCHEMAS: json.dumps(schemas(), indent=2) + "\n",
+        ASYNCAPI: asyncapi.document(),
+    }
 
 
 def main(arguments: list[str]) -> None:
-    """Write both files into the given folder, or into docs/ of this checkout."""
+    """Write the files into the given folder, or into docs/ of this checkout."""
     folder = Path(arguments[0]) if arguments else _DOCS
     for name, text in documents().items():
         (folder / name).write_text(text, encoding="utf-8")

@@ -205,7 +205,11 @@ class AuditRead(Payload, frozen=True, kw_only=True):
 
 
 class Heartbeat(Payload, frozen=True, kw_only=True):
-    """Sign of life; as the will it holds ``online: false`` (paper A.8.5)."""
+    """Sign of life; as the will it holds ``online: false`` (paper A.8.5).
+
+    A robot without capabilities may list what it obeys, here or in the ``value`` of its status:
+    ``"subscribes": ["incoming/drive-values"]``. Pages then offer that, and tell what to publish.
+    """
 
     t: int  # epoch milliseconds
     online: bool | UnsetType = UNSET
@@ -239,44 +243,15 @@ class TouchSensors(Payload, frozen=True, kw_only=True):
     unit: str = "adc"
 
 
-#: Colours of robots on the operator page, and its drawings of them (pebble/web/static/faces.svg).
-Colour = Literal["blue", "amber", "violet", "green", "coral", "rose", "teal", "slate"]
-Body = Literal[
-    "goob", "fred", "minilamp", "benjr", "pitcam", "outlets", "wheeled", "walker", "arm", "drone", "boat", "unknown"
-]  # fmt: skip
-
-
-class RobotIdentity(Payload, frozen=True, kw_only=True):
-    """``identity`` in the ``value`` of Capabilities: which robot it is, and how people shall see it.
-
-    What is absent is not set in its config: each program has its own default.
-    """
-
-    system: str
-    type: str
-    id: str
-    name: str | UnsetType = UNSET  # what people call it, 32 characters at most
-    description: str | UnsetType = UNSET  # what it is, 60 characters at most
-    colour: Colour | UnsetType = UNSET
-    picture: Body | UnsetType = UNSET  # the drawing that stands for it
-    battery_cells: int | UnsetType = UNSET  # lithium cells in series
-
-
 class Capabilities(Payload, frozen=True, kw_only=True):
     """What a robot can do, with the effective topics (paper A.8.6); again whenever it changes.
 
-    Of what comes and goes, ``telemetry.wheel_odometry`` is true while it is being published, and ``outlets`` lists
-    those of self-describing MCUs that are connected: ``available``, ``controls``, ``outlets[]{name, controls,
-    status_topic, command_topic}``. ``identity`` is a RobotIdentity.
+    Send ``value`` as CapabilitiesValue has it. One section that is wrong does not make the others unreadable.
     """
 
     t: int  # epoch milliseconds
-    value: dict[str, Any]
+    value: dict[str, Any]  # a [CapabilitiesValue](#capabilitiesvalue)
     schema: str = "pebble-capabilities/v1"
-
-
-#: The sections of its ``value`` that have a type.
-SECTIONS: dict[str, type[Payload]] = {"identity": RobotIdentity}
 
 
 class EstopState(Payload, frozen=True, kw_only=True):

@@ -9,7 +9,8 @@ from typing import Any
 import msgspec
 
 from pebble.contract import CHANNELS, INCOMING, Channel
-from pebble.contract.payloads import Drive, LightsFlash, LightsSolid
+from pebble.contract.capabilities import CapabilitiesValue
+from pebble.contract.payloads import Capabilities, Drive, LightsFlash, LightsSolid
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 _REF = "#/$defs/{name}"
@@ -24,7 +25,8 @@ def schemas() -> dict[str, Any]:
     """
     json_channels = [channel for channel in CHANNELS if channel.payload is not bytes]
     structs = list(dict.fromkeys(channel.payload for channel in json_channels if channel.payload is not bool))
-    roots, definitions = msgspec.json.schema_components(structs, ref_template=_REF)
+    (offers, *roots), definitions = msgspec.json.schema_components([CapabilitiesValue, *structs], ref_template=_REF)
+    definitions[Capabilities.__name__]["properties"]["value"] = offers
     for struct in (Drive, LightsSolid, LightsFlash):
         for field in definitions[struct.__name__]["properties"].values():
             if field["type"] == "number":

@@ -6,12 +6,13 @@ from collections.abc import Collection
 from typing import Any
 
 import msgspec
+from msgspec import UNSET
 
 from pebble import contract as c
 from pebble.config import Config, SystemControl
 from pebble.config.types import ServiceSection
+from pebble.contract import capabilities as offers
 from pebble.contract.encodings import ALL_SOUND, ALL_VIDEO
-from pebble.contract.payloads import RobotIdentity
 from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
 from pebble.media import pyav
 from pebble.runtime.addresses import Addresses
@@ -25,163 +26,170 @@ def capabilities(
 
     ``lacking`` and ``found`` are what its processes report at present (pebble.launcher.features).
     """
-    return {
-        "identity": msgspec.to_builtins(_identity(config)),
-        "transport": {"kind": config.transport.kind},
-        "video": _video(config, addresses),
-        "audio": _audio(config, addresses),
-        "soundboard": {
-            **_enabled(config.services.soundboard_handler),
-            **_topics(addresses, c.SOUNDBOARD_COMMAND, c.SOUNDBOARD_FILES, c.SOUNDBOARD_STATUS),
-        },
-        "autonomy": {
-            **_enabled(config.services.autonomy_manager),
-            **_topics(addresses, c.AUTONOMY_COMMAND, c.AUTONOMY_FILES, c.AUTONOMY_STATUS),
-        },
-        "system": _system(config, addresses),
-        **_motor(config, addresses, lacking, found),
-        "outlets": _outlets(config, found),
-        **({"named": True} if config.security.named else {}),
-    }
+    drive, estop, lights, telemetry = _motor(config, addresses, lacking, found)
+    soundboard, autonomy = config.services.soundboard_handler, config.services.autonomy_manager
+    value = offers.CapabilitiesValue(
+        identity=_identity(config),
+        transport=offers.TransportOffer(kind=config.transport.kind),
+        video=_video(config, addresses),
+        audio=_audio(config, addresses),
+        soundboard=_files(soundboard, addresses, c.SOUNDBOARD_COMMAND, c.SOUNDBOARD_FILES, c.SOUNDBOARD_STATUS),
+        autonomy=_files(autonomy, addresses, c.AUTONOMY_COMMAND, c.AUTONOMY_FILES, c.AUTONOMY_STATUS),
+        system=_system(config, addresses),
+        drive=drive,
+        estop=estop,
+        lights=lights,
+        telemetry=telemetry,
+        outlets=_outlets(config, found),
+        named=config.security.named or UNSET,
+    )
+    built: dict[str, Any] = msgspec.to_builtins(value)
+    return built
 
 
-def _identity(config: Config) -> RobotIdentity:
+def _identity(config: Config) -> offers.RobotIdentity:
     robot = config.robot
     looks = {key: getattr(robot, key) for key in ("name", "description", "colour", "picture", "battery_cells")}
     given: dict[str, Any] = {key: value for key, value in looks.items() if value is not None}
-    return RobotIdentity(system=robot.system, type=robot.type, id=robot.id, **given)
+    return offers.RobotIdentity(system=robot.system, type=robot.type, id=robot.id, **given)
 
 
-def _video(config: Config, addresses: Addresses) -> dict[str, Any]:
+def _video(config: Config, addresses: Addresses) -> offers.VideoOffer:
     sent, captured = config.services.mqtt_bridge.media.video_publisher, config.services.av_daemon.video
-    offered = _offered(config, captured.enabled)
+    available, controls = _offered(config, captured.enabled)
     if "video_stream" in config.on_demand_programs():
-        offered = {"available": True, "controls": True}
-    return {
-        **offered,
-        "topic": addresses[c.CAMERA].topic,
-        "command_topic": addresses[c.VIDEO_CONTROL].topic,
-        "flag_topic": addresses[c.MQTT_VIDEO].topic,
-        "overlays_topic": addresses[c.VIDEO_OVERLAYS].topic,
-        "width": _first(sent.publish_width, sent.width, captured.width),
-        "height": _first(sent.publish_height, sent.height, captured.height),
-        "fps": _first(sent.publish_fps, sent.target_fps, sent.fps, captured.fps),
-        "encoding": sent.encoding,
-        "encodings": list(pyav.available(ALL_VIDEO)),
-    }
+        available = controls = True
+    return offers.VideoOffer(
+        available=available,
+        controls=controls,
+        topic=addresses[c.CAMERA].topic,
+        command_topic=addresses[c.VIDEO_CONTROL].topic,
+        flag_topic=addresses[c.MQTT_VIDEO].topic,
+        overlays_topic=addresses[c.VIDEO_OVERLAYS].topic,
+        width=_first(sent.publish_width, sent.width, captured.width),
+        height=_first(sent.publish_height, sent.height, captured.height),
+        fps=_first(sent.publish_fps, sent.target_fps, sent.fps, captured.fps),
+        encoding=sent.encoding,
+        encodings=list(pyav.available(ALL_VIDEO)),
+    )
 
 
-def _audio(config: Config, addresses: Addresses) -> dict[str, Any]:
+def _audio(config: Config, addresses: Addresses) -> offers.AudioOffer:
     sent, captured = config.services.mqtt_bridge.media.audio_publisher, config.services.av_daemon.audio
-    return {
-        **_offered(config, captured.enabled),
-        "topic": addresses[c.AUDIO].topic,
-        "uplink_topic": addresses[c.AUDIO_STREAM].topic,
-        "command_topic": addresses[c.AUDIO_CONTROL].topic,
-        "flag_topic": addresses[c.MQTT_AUDIO].topic,
-        "rate": _first(sent.rate, captured.rate),
-        "channels": _first(sent.channels, captured.channels),
-        "encoding": sent.encoding,
-        "encodings": list(pyav.available(ALL_SOUND)),
-    }
+    available, controls = _offered(config, captured.enabled)
+    return offers.AudioOffer(
+        available=available,
+        controls=controls,
+        topic=addresses[c.AUDIO].topic,
+        uplink_topic=addresses[c.AUDIO_STREAM].topic,
+        command_topic=addresses[c.AUDIO_CONTROL].topic,
+        flag_topic=addresses[c.MQTT_AUDIO].topic,
+        rate=_first(sent.rate, captured.rate),
+        channels=_first(sent.channels, captured.channels),
+        encoding=sent.encoding,
+        encodings=list(pyav.available(ALL_SOUND)),
+    )
 
 
-def _offered(config: Config, captured: bool) -> dict[str, bool]:
-    """The bridge requests the programs that send it; without a bridge there are no requests."""
+def _offered(config: Config, captured: bool) -> tuple[bool, bool]:
+    """Whether it exists, and obeys: the bridge requests the programs that send it; without it there are no requests."""
     available = config.services.av_daemon.enabled and captured
-    return {"available": available, "controls": available and config.services.mqtt_bridge.enabled}
+    return available, available and config.services.mqtt_bridge.enabled
 
 
-def _enabled(section: ServiceSection) -> dict[str, bool]:
-    return {"available": section.enabled, "controls": section.enabled}
+def _files(
+    section: ServiceSection, addresses: Addresses, command: c.Channel, files: c.Channel, status: c.Channel
+) -> offers.FilesOffer:
+    return offers.FilesOffer(
+        available=section.enabled,
+        controls=section.enabled,
+        command_topic=addresses[command].topic,
+        files_topic=addresses[files].topic,
+        status_topic=addresses[status].topic,
+    )
 
 
-def _topics(addresses: Addresses, command: c.Channel, files: c.Channel, status: c.Channel) -> dict[str, Any]:
-    return {
-        "command_topic": addresses[command].topic,
-        "files_topic": addresses[files].topic,
-        "status_topic": addresses[status].topic,
-    }
-
-
-def _system(config: Config, addresses: Addresses) -> dict[str, Any]:
+def _system(config: Config, addresses: Addresses) -> offers.SystemOffer:
     bridge = config.services.mqtt_bridge
 
-    def entry(control: SystemControl, channel: c.Channel) -> dict[str, Any]:
+    def flag(control: SystemControl, channel: c.Channel) -> offers.FlagOffer:
         controls = bridge.enabled and bool(control.command)
-        return {"available": True, "controls": controls, "flag_topic": addresses[channel].topic}
+        return offers.FlagOffer(available=True, controls=controls, flag_topic=addresses[channel].topic)
 
-    return {
-        "reboot": entry(bridge.reboot_control, c.REBOOT),
-        "service_restart": entry(bridge.service_restart_control, c.SERVICE_RESTART),
-        "git_pull": entry(bridge.git_pull_control, c.GIT_PULL),
-    }
+    return offers.SystemOffer(
+        reboot=flag(bridge.reboot_control, c.REBOOT),
+        service_restart=flag(bridge.service_restart_control, c.SERVICE_RESTART),
+        git_pull=flag(bridge.git_pull_control, c.GIT_PULL),
+    )
 
 
-def _motor(config: Config, addresses: Addresses, lacking: Collection[str], found: Collection[str]) -> dict[str, Any]:
-    """Drive, lights and telemetry of the serial line to the motor MCU, with *its* effective topics."""
+def _motor(
+    config: Config, addresses: Addresses, lacking: Collection[str], found: Collection[str]
+) -> tuple[offers.DriveOffer, offers.EstopOffer, offers.LightsOffer, offers.TelemetryOffer]:
+    """Drive, stop, lights and telemetry of the serial line to the motor MCU, with *its* effective topics."""
     lines = config.motor_lines()
     present = bool(lines)
     name, line = next(iter(lines.items())) if lines else ("", config.services.serial_mcu_bridge)
     if name:
         addresses = Addresses(view_of(config, name))
-    return {
-        "drive": {
-            "available": present,
-            "controls": present,
-            "topic": addresses[c.DRIVE].topic,
-            **({"arbitrates": True} if present else {}),
-            **({"control": True} if present and "control" not in lacking else {}),
-        },
-        "estop": _estop(config, [] if "estop" in lacking else list(lines)),
-        "lights": {
-            "solid": present,
-            "flash": present,
-            "solid_topic": addresses[c.LIGHTS_SOLID].topic,
-            "flash_topic": addresses[c.LIGHTS_FLASH].topic,
-        },
-        "telemetry": {
-            "touch_sensors": present and line.telemetry.publish_touch_sensors,
-            "charging_status": present,
-            "touch_topic": addresses[c.TOUCH_SENSORS].topic,
-            "charging_topic": addresses[c.CHARGING_STATUS].topic,
-            "charging_level_topic": addresses[c.CHARGING_LEVEL].topic,
-            "wheel_odometry": c.WHEEL_ODOMETRY.metric in found,
-            "wheel_odometry_topic": addresses[c.WHEEL_ODOMETRY].topic,
-            **_imu(config),
-        },
-    }
+    drive = offers.DriveOffer(
+        available=present,
+        controls=present,
+        topic=addresses[c.DRIVE].topic,
+        arbitrates=present or UNSET,
+        control=(present and "control" not in lacking) or UNSET,
+    )
+    lights = offers.LightsOffer(
+        solid=present,
+        flash=present,
+        solid_topic=addresses[c.LIGHTS_SOLID].topic,
+        flash_topic=addresses[c.LIGHTS_FLASH].topic,
+    )
+    imu, imu_topic = _imu(config)
+    telemetry = offers.TelemetryOffer(
+        touch_sensors=present and line.telemetry.publish_touch_sensors,
+        charging_status=present,
+        touch_topic=addresses[c.TOUCH_SENSORS].topic,
+        charging_topic=addresses[c.CHARGING_STATUS].topic,
+        charging_level_topic=addresses[c.CHARGING_LEVEL].topic,
+        wheel_odometry=c.WHEEL_ODOMETRY.metric in found,
+        wheel_odometry_topic=addresses[c.WHEEL_ODOMETRY].topic,
+        imu=imu,
+        imu_topic=imu_topic,
+    )
+    return drive, _estop(config, [] if "estop" in lacking else list(lines)), lights, telemetry
 
 
-def _estop(config: Config, instances: list[str]) -> dict[str, Any]:
+def _estop(config: Config, instances: list[str]) -> offers.EstopOffer:
     """Where to stop the robot, and who then reports it as stopped. If one owner lacks the stop, the robot does."""
     owners = [config.motor_owner(instance) for instance in instances]
-    return {
-        "available": bool(owners),
-        "topic": c.ESTOP.topic(config.base),
-        "reset_topic": c.ESTOP_RESET.topic(config.base),
-        "owners": owners,
-        "status_topics": [c.ESTOP_STATE.topic(config.base, owner=owner) for owner in owners],
-    }
+    return offers.EstopOffer(
+        available=bool(owners),
+        topic=c.ESTOP.topic(config.base),
+        reset_topic=c.ESTOP_RESET.topic(config.base),
+        owners=owners,
+        status_topics=[c.ESTOP_STATE.topic(config.base, owner=owner) for owner in owners],
+    )
 
 
-def _imu(config: Config) -> dict[str, Any]:
+def _imu(config: Config) -> tuple[bool, str]:
     """An inertial sensor, known by its line's protocol or name; a self-describing MCU's manifest comes later."""
     lines = [name for name, line in config.serial_instances().items() if SERIAL_PROTOCOLS[line.protocol].has_imu(name)]
     addresses = Addresses(view_of(config, lines[0]) if lines else config)
-    return {"imu": bool(lines), "imu_topic": addresses[c.IMU].topic}
+    return bool(lines), addresses[c.IMU].topic
 
 
-def _outlets(config: Config, found: Collection[str]) -> dict[str, Any]:
+def _outlets(config: Config, found: Collection[str]) -> offers.OutletsOffer:
     """The outlets of self-describing MCUs that are connected now: what reports its state, and what can be switched."""
     topics: dict[str, dict[str, str]] = {}
     for key, channel in (("status_topic", c.OUTLET_STATUS), ("command_topic", c.OUTLET_COMMAND)):
         for feature in sorted(found):
             if name := channel.names(f"{config.base}/{channel.direction}/{feature}").get("outlet"):
                 topics.setdefault(name, {})[key] = channel.topic(config.base, outlet=name)
-    switched = [name for name, own in topics.items() if "command_topic" in own]
-    outlets = [{"name": name, "controls": name in switched, **own} for name, own in sorted(topics.items())]
-    return {"available": bool(outlets), "controls": bool(switched), "outlets": outlets}
+    outlets = [
+        offers.OutletOffer(name=name, controls="command_topic" in own, **own) for name, own in sorted(topics.items())
+    ]
+    return offers.OutletsOffer(available=bool(outlets), controls=any(one.controls for one in outlets), outlets=outlets)
 
 
 def _first(*values: float | None) -> float | None:

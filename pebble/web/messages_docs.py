@@ -12,8 +12,8 @@ from typing import Any, get_args
 import msgspec
 from msgspec import inspect as types
 
+from pebble.contract.capabilities import RobotIdentity
 from pebble.contract.docs import filled
-from pebble.contract.payloads import RobotIdentity
 from pebble.web import messages
 
 _ROOT = Path(__file__).parents[2]

@@ -350,13 +350,21 @@ class Robots:
         elif channel is c.MCU_DESCRIBE:
             component.aliases[metric] = _aliases(message.payload)
         elif channel is c.ONLINE or channel in SYNONYMS:
+            self._announce(component, message, now)
             arrived = time.time() - (time.monotonic() - now)
             if component.take_heartbeat(message, now, arrived) and component.sent_online is not False:
                 self._refresh(component, now)  # it may be back before the next round
-        elif channel is c.STATUS and component.restarts.receive(
-            message.payload, int(1000 * time.time()), dated=not message.retain
-        ):
-            self.set_server_metric(component.ref, "web/restarts", component.restarts.view())
+        elif channel is c.STATUS:
+            self._announce(component, message, now)
+            if component.restarts.receive(message.payload, int(1000 * time.time()), dated=not message.retain):
+                self.set_server_metric(component.ref, "web/restarts", component.restarts.view())
+
+    def _announce(self, component: Component, message: Message, now: float) -> None:
+        """Pages get what it announces as its capabilities, until it publishes them."""
+        if component.robot.announce(message.payload):
+            payload = msgspec.json.encode({"t": int(1000 * time.time()), "value": component.robot.capabilities})
+            made = Message(c.CAPABILITIES.topic(component.ref), payload)
+            self._store(component, c.CAPABILITIES.metric, c.CAPABILITIES, made, now)
 
     def _log(self, component: Component, message: Message) -> None:
         lines = self.logs.get(component.ref)

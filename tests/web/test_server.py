@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 
@@ -80,3 +81,18 @@ def test_strangers_keep_no_robot_out_and_push_none_out(
     flood()
     flood()
     assert GOOB in robots.components
+
+
+def test_pages_get_what_a_stranger_subscribes_to_until_it_publishes_what_it_can_do() -> None:
+    robots = Robots()
+    robots.receive(published(GOOB, "online", {"t": 1, "subscribes": ["incoming/drive-values"]}), 1.0)
+
+    def shown() -> dict[str, Any]:
+        found: dict[str, Any] = json.loads(bytes(robots.components[GOOB].values["capabilities"].raw))["value"]
+        return found
+
+    assert (shown()["drive"]["available"], shown()["announced"]) == (True, True)
+    assert robots.components[GOOB].robot.drives
+    robots.receive(published(GOOB, "capabilities", _CAPABILITIES), 2.0)
+    robots.receive(published(GOOB, "online", {"t": 2, "subscribes": ["incoming/drive-values"]}), 3.0)
+    assert "announced" not in shown()

@@ -4,7 +4,7 @@ import { html, useMetric, useOnline, useTick, useValue } from "../parts/hooks.js
 import { Live } from "../parts/parts.js";
 import { poseOf, poseWords } from "../../core/trail.js";
 import { charging, plain } from "../parts/more-words.js";
-import { battery, inner, isObject, mediaOf, number, roughly, span } from "../parts/words.js";
+import { battery, inner, isObject, mediaOf, number, roughly, span, typeOf } from "../parts/words.js";
 
 const STREAM_MS = 1000;
 const LEVEL_DEG = 3;
@@ -21,7 +21,19 @@ export function Telemetry({ at }) {
     <${Row} at=${at} metric="touch-sensors" name="Touch" online=${online} streams>${touch}<//>
     <${Row} at=${at} metric="wheel-odometry" name="Odometry" online=${online} streams>${odometry}<//>
     <${Troubles} at=${at} online=${online} />
-  </dl>`;
+  </dl>
+  <${Hint} at=${at} />`;
+}
+
+/** For the maker of a robot that does not say what it can do. */
+function Hint({ at }) {
+  const value = inner(useValue(at, "capabilities"));
+  const isKnown = isObject(value) && value.announced !== true;
+  if (isKnown || typeOf(at) !== "robots") return null;
+  const offered = isObject(value) ? "What is offered here, it lists as its subscriptions" : "So there is nothing to drive";
+  return html`<p class="dim" data-test="hint">
+    It publishes no capabilities. ${offered}. docs/your-robot.md tells its maker what to publish.
+  </p>`;
 }
 
 /**

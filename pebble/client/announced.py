@@ -1,0 +1,66 @@
+"""What a robot without capabilities offers, by the subscriptions that its heartbeat or status lists. Pure."""
+
+from typing import Any
+
+import msgspec
+
+from pebble import contract as c
+from pebble.contract.capabilities import (
+    AudioOffer,
+    CapabilitiesValue,
+    DriveOffer,
+    FilesOffer,
+    FlagOffer,
+    LightsOffer,
+    SystemOffer,
+    VideoOffer,
+)
+
+_LARGEST = 4096  # bytes of a heartbeat or status that are looked at
+_decode = msgspec.json.Decoder().decode
+
+
+def announced(base: str, payload: bytes) -> dict[str, Any]:
+    """The value of capabilities for ``"subscribes": ["incoming/drive-values", …]``; empty where there is no such list.
+
+    It has ``announced``, so that people can be told what to publish. Whole topics and others' are not looked at.
+    """
+    if len(payload) > _LARGEST or b'"subscribes"' not in payload:
+        return {}
+    try:
+        found = _decode(payload)
+    except (msgspec.MsgspecError, RecursionError, UnicodeDecodeError):
+        return {}
+    listed: Any = None
+    for level in (found, found.get("value") if isinstance(found, dict) else None):
+        listed = level.get("subscribes") if isinstance(level, dict) and listed is None else listed
+    if not isinstance(listed, list):
+        return {}
+    has = {channel for channel in _KNOWN if channel.suffix in listed}
+    value: dict[str, Any] = msgspec.to_builtins(_value(base, has)) if has else {}
+    return value
+
+
+_KNOWN = (
+    c.DRIVE, c.VIDEO_CONTROL, c.AUDIO_CONTROL, c.SOUNDBOARD_COMMAND, c.AUTONOMY_COMMAND,
+    c.LIGHTS_SOLID, c.LIGHTS_FLASH, c.REBOOT, c.SERVICE_RESTART, c.GIT_PULL,
+)  # fmt: skip
+
+
+def _value(base: str, has: set[c.Channel]) -> CapabilitiesValue:
+    def flag(channel: c.Channel) -> FlagOffer:
+        return FlagOffer(available=channel in has, controls=channel in has)
+
+    def offer(kind: Any, channel: c.Channel) -> Any:
+        return kind(available=channel in has, controls=channel in has)
+
+    return CapabilitiesValue(
+        video=offer(VideoOffer, c.VIDEO_CONTROL),
+        audio=offer(AudioOffer, c.AUDIO_CONTROL),
+        soundboard=offer(FilesOffer, c.SOUNDBOARD_COMMAND),
+        autonomy=offer(FilesOffer, c.AUTONOMY_COMMAND),
+        system=SystemOffer(reboot=flag(c.REBOOT), service_restart=flag(c.SERVICE_RESTART), git_pull=flag(c.GIT_PULL)),
+        drive=DriveOffer(available=c.DRIVE in has, controls=c.DRIVE in has, topic=c.DRIVE.topic(base)),
+        lights=LightsOffer(solid=c.LIGHTS_SOLID in has, flash=c.LIGHTS_FLASH in has),
+        announced=True,
+    )

@@ -1,0 +1,70 @@
+"""``pebble conform``: judges a robot, of any maker, by the contract."""
+
+from __future__ import annotations
+
+import json
+import sys
+from typing import Annotated
+
+import typer
+
+from pebble.client.connection import Target, target_of
+from pebble.commands.options import with_target
+from pebble.commands.selftest import printed, row
+from pebble.config.visible import shown
+from pebble.errors import PebbleError
+from pebble.runtime.signals import interrupted_by_signals
+from pebble.selftest import State
+
+_LOOKS_S = 4.0  # heartbeats of one a second need so long
+
+
+@with_target(program="conform")
+def conform(
+    robot: Annotated[str, typer.Argument(help="Its id, or SYSTEM/TYPE/ID.", metavar="ROBOT", show_default=False)],
+    may_move: Annotated[bool, typer.Option("--may-move", help="Ask, then also turn its wheels.")] = False,
+    cut: Annotated[bool, typer.Option("--cut", help="Ask to cut its power, and to switch it on again.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead.")] = False,
+    *,
+    target: Target,
+) -> int:
+    """Judge a robot, in any language, by the contract: only by what it publishes and how it answers.
+
+    Without --may-move no wheel turns; the robot is stopped and freed several times. Exits 1 if a check fails; each is
+    printed with why it matters and what to change.
+
+    \\b
+        pebble conform rover --url mqtt://broker.example
+        pebble conform rover --url mqtt://broker.example --may-move --cut
+    """
+    from pebble.conform.checks import CHECKS, run
+    from pebble.conform.motion import MOVING
+    from pebble.conform.power import CUT
+    from pebble.conform.witness import witnessed
+
+    options = target_of(robot, target)
+    found: list[dict[str, str]] = []
+    if may_move and not _clear(robot):
+        typer.echo("nothing was tested", err=True)
+        return 1
+    with interrupted_by_signals(), witnessed(options, _LOOKS_S) as witness:
+        if not witness.records:
+            raise PebbleError(f"nothing came from {witness.base} within {_LOOKS_S:g} s: is it on, at this broker?")
+        for check, outcome in run(witness, (*CHECKS, *(MOVING if may_move else ()), *(CUT if cut else ()))):
+            found.append({**row(check.name, outcome), "why": check.why})
+            if not as_json:
+                printed(found[-1])
+    states = [one["state"] for one in found]
+    failures = states.count(State.FAILED)
+    if as_json:
+        typer.echo(json.dumps({"ok": not failures, "robot": witness.base, "checks": found}, ensure_ascii=False))
+    else:
+        typer.echo(f"checks: {len(found)}, failures: {failures}, skipped: {states.count(State.SKIPPED)}")
+    return 1 if failures else 0
+
+
+def _clear(name: str) -> bool:
+    """Whether a person answers that the robot may move. Standard output is for the result."""
+    typer.echo(f"{shown(name)} will drive ahead for half a second, several times, and turn once.", err=True)
+    typer.echo("Does it stand free, with no person in its way? [y/N]: ", nl=False, err=True)
+    return sys.stdin.readline().strip().lower() in ("y", "yes")

@@ -1,0 +1,432 @@
+"""What a robot owes everybody who drives it, as a table: each check, and why it matters. Nothing here turns a wheel."""
+
+from __future__ import annotations
+
+import secrets
+import time
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Literal
+
+import msgspec
+
+from pebble import contract as c
+from pebble.client.robot_topics import section_of
+from pebble.conform.witness import Record, Witness
+from pebble.contract.capabilities import CapabilitiesValue
+from pebble.contract.identity import parse_topic
+from pebble.contract.levels import silent_after
+from pebble.contract.payloads import ControlRequest, EstopCommand, EstopReset, EstopState
+from pebble.errors import PebbleError
+from pebble.selftest import Outcome, failed, ok, skipped
+
+ANSWER_S = 1.0  # within which a robot answers
+_CLOCK_S = 60.0  # that its clock may differ
+_LARGEST = 64 * 1024  # bytes of JSON
+_LARGEST_STATE = 400  # bytes of a state of the emergency stop
+_REPEATED = (c.CHARGING_STATUS, c.CHARGING_LEVEL)  # boards of the original repeat them every 5 s instead
+_SHOWN = 3  # examples in one line
+_BY, _WHY = "conform", "conformance test"
+
+#: Of what a program with an error sends. A robot reads none of it, and goes on.
+JUNK = (b"", b"{", b"[]", b"null", b'"x"', b"\xff\xfe\x00", b"[" * 2000, b'{"x": ' + b"9" * 400 + b"}", b"x" * 70_000)
+
+
+@dataclass(frozen=True)
+class Check:
+    """``why`` tells what goes wrong where it fails."""
+
+    name: str
+    why: str
+    run: Callable[[Witness], Outcome]
+    needs: tuple[Callable[[Witness], str], ...] = ()
+
+
+# -- what a check needs: empty, or why it is lacking
+
+
+def drives(witness: Witness) -> str:
+    return "" if witness.view.drives else "its capabilities offer no driving"
+
+
+def stops(witness: Witness) -> str:
+    return "" if witness.view.estop.available else "its capabilities offer no emergency stop"
+
+
+def controls(witness: Witness) -> str:
+    return "" if witness.view.controlled else "its capabilities offer no control"
+
+
+def free(witness: Witness) -> str:
+    """A test takes nothing from people and scripts."""
+    view = witness.view
+    if view.stopped_by is not None:
+        return f"it is stopped by {view.stopped_by.by or 'unknown'}: reset it"
+    if view.autonomy is not None and view.autonomy.running:
+        return f"the script {view.autonomy.file} is running"
+    return f"{view.control.who} drives it" if view.control.who else ""
+
+
+def commanded(witness: Witness) -> str:
+    """At level named a robot hears only accounts."""
+    named = witness.view.named and not witness.account
+    return "it takes commands only with a name: use an account, as in --url mqtts://ANN@BROKER" if named else ""
+
+
+# -- signs of life
+
+
+def heartbeat(witness: Witness) -> Outcome:
+    found = witness.of(c.ONLINE)
+    if not found:
+        return failed("none arrived", 'publish {"t": <epoch ms>} on outgoing/online every 0.25 s to 1 s')
+    wrong = [one.wrong for one in found if one.wrong]
+    if wrong:
+        return failed(wrong[0], 'its payload is {"t": <epoch milliseconds, an integer>}')
+    gaps = [after.at - before.at for before, after in pairwise(found)]
+    interval = witness.view.liveness.interval_s
+    if len(gaps) < 2 or interval is None:
+        return failed(f"{len(found)} in the time of observation", "publish one at least every second")
+    longest = silent_after(interval, witness.view.liveness.link, 0.0)
+    if max(gaps) > longest:
+        return failed(f"a gap of {max(gaps):.1f} s, where {longest:.1f} s counts as silence", "publish them evenly")
+    return ok(f"every {interval:.2f} s")
+
+
+def clock(witness: Witness) -> Outcome:
+    newest = witness.of(c.ONLINE)[-1:]
+    if not newest or newest[0].wrong:
+        return skipped("there is no heartbeat")
+    off = newest[0].value.t / 1000 - time.time() + (time.monotonic() - newest[0].at)
+    if abs(off) > _CLOCK_S:
+        return failed(
+            f"its clock is {abs(off):.0f} s {'ahead' if off > 0 else 'behind'}", "set it, by SNTP for example"
+        )
+    return ok(f"{1000 * off:+.0f} ms")
+
+
+# -- what it publishes
+
+
+def payloads(witness: Witness) -> Outcome:
+    wrong = {one.metric: one.wrong for one in witness.records if one.wrong}
+    if wrong:
+        return failed(_some(wrong.values()), "docs/topics.md has each payload")
+    return ok(f"{len({one.metric for one in witness.records if one.channel})} kinds of messages")
+
+
+def numbers(witness: Witness) -> Outcome:
+    def strange(record: Record) -> bool:
+        try:
+            msgspec.json.decode(record.payload)
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+            return True
+        return False
+
+    is_json = [one for one in witness.records if one.channel and one.channel.payload is not bytes and one.payload]
+    if found := {one.metric for one in is_json if strange(one)}:
+        return failed(
+            f"not JSON: {_some(sorted(found))}", "NaN, Infinity and comments are no JSON: leave the field out"
+        )
+    return ok("all JSON is JSON")
+
+
+def sizes(witness: Witness) -> Outcome:
+    def limit(record: Record) -> int:
+        return _LARGEST_STATE if record.channel is c.ESTOP_STATE else _LARGEST
+
+    large = {
+        f"{one.metric} has {len(one.payload)} bytes, more than {limit(one)}"
+        for one in witness.records
+        if (one.channel is None or one.channel.payload is not bytes) and len(one.payload) > limit(one)
+    }
+    return failed(_some(sorted(large)), "send less: readers drop it") if large else ok("no message is too large")
+
+
+def retained(witness: Witness) -> Outcome:
+    kept = {one.metric for one in witness.kept()}
+    live = {one.metric: one.channel for one in witness.records if one.channel is not None and one.payload}
+    must = {metric for metric, channel in live.items() if channel.default_retain and channel not in _REPEATED}
+    lacks = sorted(must - kept)
+    if lacks:
+        return failed(f"not retained: {_some(lacks)}", "publish it with the retain flag: who connects later lacks it")
+    stale = sorted(metric for metric in kept & set(live) if not live[metric].default_retain)
+    if stale:
+        return failed(f"retained: {_some(stale)}", "publish it without the retain flag: it is news only once")
+    return ok(f"{len(kept)} states")
+
+
+def commands_kept(witness: Witness) -> Outcome:
+    found = sorted(one.metric for one in witness.kept() if one.channel is not None and one.channel.one_shot)
+    if found:
+        topic = f"{witness.base}/{found[0]}"
+        return failed(_some(found), f"remove it: mosquitto_pub -r -n -t '{topic}'; and find who publishes it so")
+    return ok("none")
+
+
+# -- what it offers
+
+
+def capabilities(witness: Witness) -> Outcome:
+    found = witness.of(c.CAPABILITIES, retained=True)
+    if not found:
+        return failed("it publishes none: pages offer nothing of it", "publish outgoing/capabilities, retained")
+    try:
+        msgspec.convert(found[-1].value.value, CapabilitiesValue)
+    except (msgspec.ValidationError, ValueError, AttributeError) as error:
+        return failed(str(found[-1].wrong or error), "docs/topics.md, CapabilitiesValue, has each field")
+    return ok(_some(_offers(witness), 20) or "nothing is offered")
+
+
+def _offers(witness: Witness) -> list[str]:
+    value = witness.view.capabilities
+    return sorted(name for name in value if section_of(value, name).get("available") is True)
+
+
+def own_topics(witness: Witness) -> Outcome:
+    foreign = sorted(
+        f"{path} is {topic}"
+        for path, topic in _topics(witness.view.capabilities, "")
+        if not topic.startswith(f"{witness.base}/") or parse_topic(topic) is None
+    )
+    if foreign:
+        return failed(_some(foreign), f"topics in capabilities begin with {witness.base}/: others are not used")
+    return ok("all are its own")
+
+
+def _topics(value: object, path: str) -> Iterator[tuple[str, str]]:
+    """What a key calls a topic, however deep it is."""
+    for key, inner in value.items() if isinstance(value, dict) else ():
+        where = f"{path}.{key}".lstrip(".")
+        if isinstance(inner, str) and key.endswith("topic"):
+            yield where, inner
+        for one in inner if isinstance(inner, list) and key.endswith("topics") else ():
+            yield where, str(one)
+        for one in inner if isinstance(inner, list) else (inner,):
+            yield from _topics(one, where)
+
+
+def identity(witness: Witness) -> Outcome:
+    section = section_of(witness.view.capabilities, "identity")
+    listed = "/".join(str(section.get(level)) for level in ("system", "type", "id"))
+    if not section:
+        return skipped("it lists no identity")
+    return (
+        ok(listed) if listed == witness.base else failed(f"it calls itself {listed}", "identity is that of its topics")
+    )
+
+
+# -- what it does with what it cannot read
+
+
+def junk(witness: Witness) -> Outcome:
+    began = time.monotonic()
+    for channel in (c.DRIVE, c.LIGHTS_SOLID, c.CONTROL, c.ESTOP_RESET, c.AUTONOMY_COMMAND):
+        for payload in JUNK:
+            witness.send(channel, payload)
+    interval = witness.view.liveness.interval_s or ANSWER_S
+    if not witness.wait(lambda: len(witness.of(c.ONLINE, began + 2 * interval)) >= 2, 6 * interval + ANSWER_S):
+        return failed("its heartbeats ended", "drop what is no JSON of the contract, and go on")
+    offline = [one for one in witness.of(c.ONLINE, began) if one.value and one.value.online is False]
+    return failed("it went offline meanwhile", "drop what cannot be read") if offline else ok("it goes on")
+
+
+# -- the emergency stop
+
+
+def _states(witness: Witness) -> dict[str, EstopState]:
+    return witness.view.estop.states
+
+
+def owners(witness: Witness) -> Outcome:
+    lacks = [topic.removeprefix(f"{witness.base}/") for topic in witness.view.estop.missing]
+    if lacks:
+        return failed(f"no state of {_some(lacks)}", "publish it, retained, for each owner that capabilities list")
+    return ok(", ".join(sorted(_states(witness))))
+
+
+def _stop(witness: Witness, name: str) -> bool:
+    witness.send(c.ESTOP, EstopCommand(stop=name, by=_BY, why=_WHY))
+    return witness.wait(lambda: _has(witness, name), ANSWER_S)
+
+
+def _has(witness: Witness, name: str) -> bool:
+    states = _states(witness)
+    return bool(states) and all(one.latched and name in one.recent for one in states.values())
+
+
+def _reset(witness: Witness, *, boot: str = "", more: int = 0) -> None:
+    for one in _states(witness).values():
+        witness.send(c.ESTOP_RESET, EstopReset(boot=boot or one.boot, count=one.count + more, by=_BY))
+
+
+def _freed(witness: Witness) -> bool:
+    _reset(witness)
+    return witness.wait(lambda: not witness.view.latched, ANSWER_S)
+
+
+def _while_stopped(test: Callable[[Witness, str], Outcome]) -> Callable[[Witness], Outcome]:
+    """Run a test on the robot while it is stopped by a new stop, and free it afterwards."""
+
+    def run(witness: Witness) -> Outcome:
+        name = secrets.token_hex(8)
+        try:
+            if not _stop(witness, name):
+                text = f"no state has its name within {ANSWER_S:g} s"
+                return failed(text, 'latch on incoming/estop, and publish outgoing/estop/{owner} with "recent"')
+            outcome = test(witness, name)
+        finally:
+            is_free = _freed(witness)
+        if not is_free:
+            return failed("a reset with its boot and count does not end it", "end it on incoming/estop-reset")
+        return outcome
+
+    return run
+
+
+def _confirmed(_witness: Witness, _name: str) -> Outcome:
+    return ok("each owner latches, confirms it by name, and is free after a reset")
+
+
+def _repeated(witness: Witness, name: str) -> Outcome:
+    before = {owner: one.count for owner, one in _states(witness).items()}
+    witness.send(c.ESTOP, EstopCommand(stop=name, by=_BY, why=_WHY))
+    witness.look(ANSWER_S / 2)
+    counted = [owner for owner, one in _states(witness).items() if one.count != before.get(owner)]
+    if counted:
+        return failed(f"its repetition counts again ({_some(counted)})", "a name in recent is the same stop")
+    return ok("the same stop counts once")
+
+
+def _unreadable(witness: Witness, _name: str) -> Outcome:
+    before = {owner: one.count for owner, one in _states(witness).items()}
+    witness.send(c.ESTOP, b"stop!")
+    if not witness.wait(lambda: all(one.count > before.get(of, 0) for of, one in _states(witness).items()), ANSWER_S):
+        return failed(
+            "a stop that is no JSON does nothing", "whatever arrives on incoming/estop is a stop, if not empty"
+        )
+    return ok("what cannot be read stops, too")
+
+
+def _wrong_reset(witness: Witness, _name: str) -> Outcome:
+    for more, boot, what in ((-1, "", "an older count"), (0, "ffffffff", "another boot")):
+        _reset(witness, boot=boot, more=more)
+        if witness.wait(lambda: not witness.view.latched, ANSWER_S / 2):
+            return failed(f"a reset with {what} ends it", "reset only with the boot and count of the state now")
+    return ok("it is refused")
+
+
+def _driven(witness: Witness, _name: str) -> Outcome:
+    witness.send(c.DRIVE, b'{"x": 0, "z": 0}')
+    if witness.wait(lambda: not witness.view.latched, ANSWER_S / 2):
+        return failed("a drive command ends the stop", "only a reset ends it")
+    return ok("a drive command does not end it")
+
+
+# -- control
+
+
+class Driver:
+    """Requests control as one program of a person."""
+
+    def __init__(self, witness: Witness) -> None:
+        self._witness, self.id = witness, secrets.token_hex(4)
+
+    def asks(self, want: Literal["hold", "release"] = "hold", for_ms: float = 1000) -> None:
+        self._witness.send(c.CONTROL, ControlRequest(id=self.id, want=want, for_ms=for_ms, by=_BY))
+
+    @property
+    def key(self) -> str:
+        """That of its control; empty while it has none."""
+        newest = self._witness.of(c.CONTROL_STATE, retained=True)[-1:]
+        return str(newest[0].value.key) if newest and newest[0].value and newest[0].value.id == self.id else ""
+
+    @property
+    def holds(self) -> bool:
+        return self.key != ""
+
+
+def _with_control(test: Callable[[Witness, Driver], Outcome]) -> Callable[[Witness], Outcome]:
+    def run(witness: Witness) -> Outcome:
+        driver = Driver(witness)
+        driver.asks()
+        try:
+            if not witness.wait(lambda: driver.holds, ANSWER_S):
+                return failed(f"no key within {ANSWER_S:g} s", "answer incoming/control on outgoing/control/{owner}")
+            return test(witness, driver)
+        finally:
+            driver.asks("release")
+            witness.wait(lambda: not driver.holds, ANSWER_S)
+
+    return run
+
+
+def _kept_by_first(witness: Witness, driver: Driver) -> Outcome:
+    second = Driver(witness)
+    second.asks()
+    took = witness.wait(lambda: second.holds, ANSWER_S / 2)
+    second.asks("release")
+    if took:
+        return failed("a second request takes it", "while one holds control, others wait: show them in asks")
+    driver.asks()
+    return ok("the first one keeps it")
+
+
+def _released(witness: Witness, driver: Driver) -> Outcome:
+    driver.asks(for_ms=5000)
+    driver.asks("release")
+    if not witness.wait(lambda: not driver.holds, ANSWER_S):
+        return failed("it is kept after its release", 'end it by {"want": "release"}')
+    return ok("it ends by its release")
+
+
+def _ends(witness: Witness, driver: Driver) -> Outcome:
+    if not witness.wait(lambda: not driver.holds, 1.0 + 2 * ANSWER_S):
+        return failed("it stays with who went away", "end it for_ms after the last request or command")
+    return ok("it ends by itself")
+
+
+def _some(names: Iterable[object], most: int = _SHOWN) -> str:
+    found = [str(one) for one in names]
+    more = f" and {len(found) - most} more" if len(found) > most else ""
+    return ", ".join(found[:most]) + more
+
+
+_LIVE = (drives, free, commanded)
+_STOP = (stops, free, commanded)
+_CONTROL = (controls, free, commanded)
+
+CHECKS = (
+    Check("heartbeat", "without it the robot is shown as offline, and not driven", heartbeat),
+    Check("clock", "people are shown how old messages are", clock),
+    Check("payloads", "what does not fit the contract is not read", payloads),
+    Check("numbers", "NaN is no JSON, and no speed", numbers),
+    Check("sizes", "boards and pages have little room", sizes),
+    Check("retained", "who connects later must know its state, and must not take old news for new", retained),
+    Check("kept commands", "a command that a broker keeps is carried out at every start", commands_kept),
+    Check("capabilities", "pages offer what they list, and no more", capabilities),
+    Check("own topics", "topics of others are not used", own_topics),
+    Check("identity", "it is known by its topics", identity),
+    Check("junk", "one program with an error must not end it", junk, (commanded,)),
+    Check("stop states", "a stop is confirmed only when each owner tells it", owners, (stops,)),
+    Check("stop", "people must see that it has stopped", _while_stopped(_confirmed), _STOP),
+    Check("stop once", "stops are repeated until they are confirmed", _while_stopped(_repeated), _STOP),
+    Check("stop unread", "a stop must not fail for a comma", _while_stopped(_unreadable), _STOP),
+    Check("stop holds", "only a person ends it", _while_stopped(_driven), _STOP),
+    Check("reset refused", "a reset must end only the stop that its sender saw", _while_stopped(_wrong_reset), _STOP),
+    Check("control", "one person drives at a time", _with_control(_kept_by_first), _CONTROL),
+    Check("control released", "the next one must not wait", _with_control(_released), _CONTROL),
+    Check("control ends", "who goes away must not keep it", _with_control(_ends), _CONTROL),
+)
+
+
+def run(witness: Witness, checks: Iterable[Check]) -> Iterator[tuple[Check, Outcome]]:
+    """Make one check after the other."""
+    for check in checks:
+        witness.wait(lambda: True, 0.0)
+        why = next((why for need in check.needs if (why := need(witness))), "")
+        try:
+            yield check, skipped(why) if why else check.run(witness)
+        except PebbleError as error:  # the connection was lost
+            yield check, failed(str(error), "run it again")

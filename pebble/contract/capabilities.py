@@ -1,0 +1,167 @@
+"""What a component offers: the sections of the ``value`` of its Capabilities (paper A.8.6).
+
+Nothing here is required: a reader takes a section that is absent, or is none of these, as one that offers nothing.
+Topics are whole ones and the component's own; readers use no others. What is absent has the topic of the contract.
+"""
+
+from typing import Literal
+
+from msgspec import UNSET, UnsetType
+
+from pebble.contract.payloads import Payload
+
+#: Colours of robots on the operator page, and its drawings of them (pebble/web/static/faces.svg).
+Colour = Literal["blue", "amber", "violet", "green", "coral", "rose", "teal", "slate"]
+Body = Literal[
+    "goob", "fred", "minilamp", "benjr", "pitcam", "outlets", "wheeled", "walker", "arm", "drone", "boat", "unknown"
+]  # fmt: skip
+
+
+class RobotIdentity(Payload, frozen=True, kw_only=True):
+    """Which robot it is, and how people shall see it. What is absent, each program has its own default for."""
+
+    system: str  # the first three levels of its topics
+    type: str
+    id: str
+    name: str | UnsetType = UNSET  # what people call it, 32 characters at most; without it, its id
+    description: str | UnsetType = UNSET  # what it is, 60 characters at most
+    colour: Colour | UnsetType = UNSET
+    picture: Body | UnsetType = UNSET  # the drawing that stands for it
+    battery_cells: int | UnsetType = UNSET  # lithium cells in series; without them volts are shown, and no per cent
+
+
+class TransportOffer(Payload, frozen=True, kw_only=True):
+    """How its processes talk to each other; for people only."""
+
+    kind: str  # mqtt or zenoh
+
+
+class Offer(Payload, frozen=True, kw_only=True):
+    """A section of capabilities. ``available``: it exists. ``controls``: it obeys commands."""
+
+    available: bool = False
+    controls: bool = False
+
+
+class VideoOffer(Offer, frozen=True, kw_only=True):
+    """A camera. Without it there is no picture to request; a robot without any capabilities may have one."""
+
+    topic: str | UnsetType = UNSET  # of the pictures
+    command_topic: str | UnsetType = UNSET  # of requests
+    flag_topic: str | UnsetType = UNSET  # of the flag that lets it send
+    overlays_topic: str | UnsetType = UNSET  # of drawings over the picture
+    width: float | UnsetType | None = UNSET  # pixels
+    height: float | UnsetType | None = UNSET
+    fps: float | UnsetType | None = UNSET
+    encoding: str | UnsetType = UNSET  # that it sends unless a request names another
+    encodings: list[str] | UnsetType = UNSET  # that a request may name; without them it names none
+
+
+class AudioOffer(Offer, frozen=True, kw_only=True):
+    """A microphone, and a loudspeaker where there is an ``uplink_topic``. Without it nothing is heard or spoken."""
+
+    topic: str | UnsetType = UNSET  # of its sound
+    uplink_topic: str | UnsetType = UNSET  # of voices to it
+    command_topic: str | UnsetType = UNSET
+    flag_topic: str | UnsetType = UNSET
+    rate: float | UnsetType | None = UNSET  # samples a second
+    channels: float | UnsetType | None = UNSET
+    encoding: str | UnsetType = UNSET
+    encodings: list[str] | UnsetType = UNSET
+
+
+class FilesOffer(Offer, frozen=True, kw_only=True):
+    """Sounds that it plays, or scripts that it runs. Without it their card is there once it publishes a list."""
+
+    command_topic: str | UnsetType = UNSET
+    files_topic: str | UnsetType = UNSET
+    status_topic: str | UnsetType = UNSET
+
+
+class FlagOffer(Offer, frozen=True, kw_only=True):
+    """Something that a flag starts."""
+
+    flag_topic: str | UnsetType = UNSET
+
+
+class SystemOffer(Payload, frozen=True, kw_only=True):
+    """The computer of the robot. What is absent has no button."""
+
+    reboot: FlagOffer | UnsetType = UNSET
+    service_restart: FlagOffer | UnsetType = UNSET
+    git_pull: FlagOffer | UnsetType = UNSET
+
+
+class DriveOffer(Offer, frozen=True, kw_only=True):
+    """Wheels, or whatever moves it. Without it there is no card to drive."""
+
+    topic: str | UnsetType = UNSET  # of drive commands
+    arbitrates: bool | UnsetType = UNSET  # people go before scripts; without it a script is stopped before one drives
+    control: bool | UnsetType = UNSET  # it says who drives (docs/control.md); without it servers agree on that
+
+
+class EstopOffer(Payload, frozen=True, kw_only=True):
+    """An emergency stop that stays. Without it a stop is a zero, and the page says that it does not stay."""
+
+    available: bool = False
+    topic: str | UnsetType = UNSET
+    reset_topic: str | UnsetType = UNSET
+    owners: list[str] | UnsetType = UNSET  # the names of all motor owners: a stop is confirmed when each reports it
+    status_topics: list[str] | UnsetType = UNSET  # of their states, in the order of `owners`
+
+
+class LightsOffer(Payload, frozen=True, kw_only=True):
+    """Lights. Without it there is no card for them."""
+
+    solid: bool = False  # a steady colour
+    flash: bool = False  # one that fades in and out
+    solid_topic: str | UnsetType = UNSET
+    flash_topic: str | UnsetType = UNSET
+
+
+class TelemetryOffer(Payload, frozen=True, kw_only=True):
+    """What it measures. What is not listed is shown from its first message on."""
+
+    touch_sensors: bool = False
+    charging_status: bool = False
+    touch_topic: str | UnsetType = UNSET
+    charging_topic: str | UnsetType = UNSET
+    charging_level_topic: str | UnsetType = UNSET
+    wheel_odometry: bool = False  # true while it is being published
+    wheel_odometry_topic: str | UnsetType = UNSET
+    imu: bool = False
+    imu_topic: str | UnsetType = UNSET
+
+
+class OutletOffer(Payload, frozen=True, kw_only=True):
+    """One outlet of a board that is connected."""
+
+    name: str
+    controls: bool = False
+    status_topic: str | UnsetType = UNSET
+    command_topic: str | UnsetType = UNSET
+
+
+class OutletsOffer(Offer, frozen=True, kw_only=True):
+    """Switched outlets. Without it an outlet is shown from its first status on."""
+
+    outlets: list[OutletOffer] | UnsetType = UNSET
+
+
+class CapabilitiesValue(Payload, frozen=True, kw_only=True):
+    """The ``value`` of Capabilities. A robot in another language lists what it has, and leaves out the rest."""
+
+    identity: RobotIdentity | UnsetType = UNSET
+    transport: TransportOffer | UnsetType = UNSET
+    video: VideoOffer | UnsetType = UNSET
+    audio: AudioOffer | UnsetType = UNSET
+    soundboard: FilesOffer | UnsetType = UNSET
+    autonomy: FilesOffer | UnsetType = UNSET
+    system: SystemOffer | UnsetType = UNSET
+    drive: DriveOffer | UnsetType = UNSET
+    estop: EstopOffer | UnsetType = UNSET
+    lights: LightsOffer | UnsetType = UNSET
+    telemetry: TelemetryOffer | UnsetType = UNSET
+    outlets: OutletsOffer | UnsetType = UNSET
+    named: bool | UnsetType = UNSET  # it takes commands only with an account's name in the topic (docs/fleet.md)
+    announced: bool | UnsetType = UNSET  # only in what readers make of a heartbeat's `subscribes`; robots leave it out
