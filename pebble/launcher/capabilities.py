@@ -130,7 +130,7 @@ def _motor(config: Config, addresses: Addresses, lacking: Collection[str], found
             "available": present,
             "controls": present,
             "topic": addresses[c.DRIVE].topic,
-            **({"arbitrates": True} if present else {}),
+            **({"arbitrates": True, "axes": ["x", "z"]} if present else {}),  # a line has speeds of two wheels
             **({"control": True} if present and "control" not in lacking else {}),
         },
         "estop": _estop(config, [] if "estop" in lacking else list(lines)),
