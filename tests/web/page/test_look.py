@@ -375,8 +375,8 @@ _SCROLLS_NEAR = """(selector) => {
       const b = other.getBoundingClientRect();
       const x = Math.max(b.left - a.right, a.left - b.right, 0);
       const y = Math.max(b.top - a.bottom, a.top - b.bottom, 0);
-      const text = `scrolls ${Math.hypot(x, y).toFixed(0)} px from ${stop.textContent}: ${other.outerHTML.slice(0, 120)}`;
-      if (!other.contains(stop) && Math.hypot(x, y) < 23.9) found.push(text);
+      if (other.contains(stop) || Math.hypot(x, y) >= 23.9) continue;
+      found.push(`scrolls near ${stop.textContent}: ${other.outerHTML.slice(0, 120)}`);
     }
   }
   return found;
