@@ -117,11 +117,10 @@ def subscriptions(log: Path) -> set[str]:
 
 
 def drives(page: Page, robot: RecordingRobot) -> bool:
-    """Whether the page can still take the lease, move the robot and stop it."""
-    assert page.knows(robot.base, 10)
-    assert page.ready()
-    assert page.take(robot.base)
-    gesture = int(time.monotonic() * 1000) % 1_000_000
+    """Whether the page can still take the lease, move the robot and stop it. It may be tried again."""
+    if not (page.knows(robot.base, 10) and page.ready() and page.take(robot.base)):
+        return False
+    gesture = next(NUMBERS)  # greater than all before: the server has ended those
     since = time.monotonic()
     end = since + 5
     while time.monotonic() < end and not any(one["z"] for one in robot.drives(since)):
@@ -302,6 +301,9 @@ STRANGERS = {
 }
 
 
+SHARE = 8  # of the time that the broker is left to others, for each second in which it takes the crowd's messages
+
+
 class Crowd:
     """600 components of a stranger, each of which publishes the same all the time."""
 
@@ -309,6 +311,7 @@ class Crowd:
         self._port, self._payload = port, payload
         self._topics = [f"pebble/robots/e{next(NUMBERS)}/outgoing/{metric}" for _ in range(600)]
         self._ending = threading.Event()
+        self._took_s = 0.0
         self._publish()
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
@@ -318,11 +321,14 @@ class Crowd:
         self._thread.join()
 
     def _run(self) -> None:
-        while not self._ending.wait(2):
+        while not self._ending.wait(max(2, SHARE * self._took_s)):
             self._publish()
 
     def _publish(self) -> None:
+        """The next round waits longer where the broker takes longer: else a busy machine would only meet a queue."""
+        began = time.monotonic()
         flood(self._port, ((topic, self._payload) for topic in self._topics))
+        self._took_s = time.monotonic() - began
 
 
 def new_robot(broker: Broker, **options: Any) -> RecordingRobot:
