@@ -29,6 +29,7 @@ VICTIM = "pebble/robots/victim"
 EVIL = "pebble/robots/evil"
 NUMBERS = itertools.count(1)
 MB = 1024 * 1024
+PATIENCE_S = 60  # with a machine that does much else
 
 
 class ServerProcess:
@@ -339,7 +340,7 @@ def is_stopped(page: Page, robot: RecordingRobot, ref: str) -> bool:
     """Whether the stop of a robot, or of all, reaches this one, which was not stopped before."""
     assert not robot.latched
     page.send("estop", ref=ref, stop=(name := f"{next(NUMBERS):016x}"), why="x")
-    stopped = until(lambda: robot.latched, 30)
+    stopped = until(lambda: robot.latched, PATIENCE_S)
     page.send("estop-end", stop=name)  # one of all would collect robots of later tests
     return stopped
 
@@ -351,10 +352,10 @@ def test_a_crowd_of_strangers_hides_no_robot_and_keeps_no_stop_from_it(
     with closing(Crowd(broker.port, metric, payload())), server.page() as page:
         with new_robot(broker) as robot:
             robot.publish("estop/serial", FREE, retain=True)  # as its motor owner does when it begins
-            assert page.knows(robot.base, 30)
+            assert page.knows(robot.base, PATIENCE_S)
             assert is_stopped(page, robot, ""), "by a stop of all"
         with new_robot(broker) as robot:
-            assert page.knows(robot.base, 30), "without a state of a stop, as what has no motors"
+            assert page.knows(robot.base, PATIENCE_S), "without a state of a stop, as what has no motors"
             assert until(lambda: page.value(robot.base, "capabilities"))
         with new_robot(broker, capabilities={}) as robot:
             assert is_stopped(page, robot, robot.base), "by its own stop, known or not"
@@ -369,7 +370,7 @@ def test_a_robot_is_shown_whole_by_a_server_that_finds_what_strangers_have_left(
     flood(broker.port, ((topic, LEFT[topic.split("outgoing/")[1]]()) for topic in topics), retain=True)
     try:
         with new_robot(broker) as robot, Served(broker.port) as served, served.page() as page:
-            assert page.knows(robot.base, 30)
+            assert page.knows(robot.base, PATIENCE_S)
             assert until(lambda: page.value(robot.base, "capabilities"), 10), (
                 "asked for again: there was no place for it"
             )
@@ -388,7 +389,7 @@ def test_a_robot_known_from_before_is_shown_and_stopped_at_once(broker: Broker, 
             Served(broker.port, people=tmp_path / "people.sqlite") as served,
             served.page() as page,
         ):
-            assert page.knows(robot.base, 30)
+            assert page.knows(robot.base, PATIENCE_S)
             assert is_stopped(page, robot, "")
 
 
@@ -402,7 +403,7 @@ def test_a_page_that_opens_thousands_of_components(server: ServerProcess, broker
                 mallory.send("watch", ref=f"pebble/robots/w{number}")
         time.sleep(1)
         assert drives(page, robot)
-        assert server.memory() - before < 40 * MB
+        assert until(lambda: server.memory() - before < 40 * MB, 10)
         assert len(subscriptions(log)) < 3000
 
 
@@ -414,7 +415,7 @@ def test_a_hundred_thousand_topics(server: ServerProcess, broker: Broker) -> Non
         assert flood(broker.port, many_topics()) == 100_000
         assert until(lambda: page.value("", "web/broker", "robots_omitted") > 1000, 30)
         assert until(lambda: drives(page, robot), 60)
-        assert server.memory() - before < 60 * MB
+        assert until(lambda: server.memory() - before < 60 * MB, 10)
         with server.page() as another:
             assert another.knows(VICTIM)
             assert len({ref for ref, _ in another.state}) <= 502
