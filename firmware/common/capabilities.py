@@ -7,7 +7,7 @@ from micropython import const
 # It also lists what the robot does not offer, because readers assume the presence of what is missing.
 _CAPABILITIES = const(
     b'{"schema":"pebble-capabilities/v1","t":%d,"value":{%s"identity":{"system":"%s","type":"%s","id":"%s"%s},'
-    b'"transport":{"kind":"mqtt"},"drive":{"available":true,"controls":true,"arbitrates":true,'
+    b'"transport":{"kind":"mqtt"},"drive":{"available":true,"controls":true,"arbitrates":true,"axes":["x","z"%s],'
     b'"control":%s,"topic":"%s/incoming/drive-values"},"estop":{"available":%s,"topic":"%s/incoming/estop",'
     b'"reset_topic":"%s/incoming/estop-reset","owners":["mcu"],"status_topics":["%s/outgoing/estop/mcu"]},'
     b'"telemetry":{"touch_sensors":false,"charging_status":%s,"charging_topic":"%s/outgoing/charging-status",'
@@ -16,14 +16,15 @@ _CAPABILITIES = const(
 )
 
 
-def describe(epoch_ms: int, root: bytes, name: str, stops, charging: bytes) -> bytes:
+def describe(epoch_ms: int, root: bytes, name: str, stops, charging: bytes, axes: bytes) -> bytes:
     """Make the payload; ``root`` is the base of the topics, ``name`` what people call it; empty: nothing else.
 
-    ``stops`` is the `EmergencyStop`. ``charging``: whether it reports that status, in JSON.
+    ``stops`` is the `EmergencyStop`. ``charging``: whether it reports that status, in JSON. ``axes``: those besides
+    x and z, likewise.
     """
     can, cannot = b"true", b"false"
     named = b',"name":' + json.dumps(name).encode() if name else b""
     values = [epoch_ms, b'"named":true,' if stops.named else b""] + root.split(b"/")
-    values += [named, can if stops.controllable else cannot, root, can if stops.stoppable else cannot]
+    values += [named, axes, can if stops.controllable else cannot, root, can if stops.stoppable else cannot]
     values += [root, root, root, charging, root, root]
     return _CAPABILITIES % tuple(values + [b'{"available":false,"controls":false}'] * 7)

@@ -37,6 +37,7 @@ class NetworkRobot:
 
     def __init__(self, settings: dict, body, charging: bytes, wrap) -> None:
         """``body`` has ``drive(x, z, y)``, True if anything moves; ``stop()``; ``report(publish)``; ``refresh()``.
+        ``AXES``, if it has the auxiliary one: see `describe`.
 
         ``charging``: whether it reports a charging status, in JSON. ``wrap`` wraps a socket in TLS; None: no TLS.
         """
@@ -186,7 +187,8 @@ class NetworkRobot:
             return False
         if not self._heartbeats:
             now_ms = self._clock.read(now)
-            session.publish(b"capabilities", describe(now_ms, session.root, self.name, stops, self.charging), 1)
+            axes = getattr(self.body, "AXES", b"")
+            session.publish(b"capabilities", describe(now_ms, session.root, self.name, stops, self.charging, axes), 1)
             stops.changed = stops.lease.changed = True
             self._due = now
         else:

@@ -96,6 +96,7 @@ class DriveOffer(Offer, frozen=True, kw_only=True):
     """Wheels, or whatever moves it. Without it there is no card to drive."""
 
     topic: str | UnsetType = UNSET  # of drive commands
+    axes: list[Literal["x", "y", "z"]] | UnsetType = UNSET  # that move anything; without it all of them
     arbitrates: bool | UnsetType = UNSET  # people go before scripts; without it a script is stopped before one drives
     control: bool | UnsetType = UNSET  # it says who drives (docs/control.md); without it servers agree on that
 

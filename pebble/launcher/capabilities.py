@@ -137,6 +137,7 @@ def _motor(
         controls=present,
         topic=addresses[c.DRIVE].topic,
         arbitrates=present or UNSET,
+        axes=["x", "z"] if present else UNSET,  # a line has speeds of two wheels
         control=(present and "control" not in lacking) or UNSET,
     )
     lights = offers.LightsOffer(

@@ -63,7 +63,8 @@ def test_its_capabilities_are_a_retained_message(kind: str) -> None:
         >= {
             "identity": {"system": "pebble", "type": "robots", "id": "rover"},
             "transport": {"kind": "mqtt"},
-            "drive": {"available": True, "controls": True, "arbitrates": True, "control": True, "topic": DRIVE},
+            "drive": {"available": True, "controls": True, "arbitrates": True, "control": True, "topic": DRIVE}
+            | {"axes": ["x", "z", *(["y"] if kind == "minilamp" else [])]},
             "estop": {
                 "available": True,
                 "topic": f"{BASE}/incoming/estop",

@@ -146,6 +146,7 @@ def test_a_motor_line_offers_driving_lights_and_telemetry() -> None:
     assert value["drive"]["available"]
     assert value["drive"]["controls"]
     assert value["drive"]["arbitrates"]
+    assert value["drive"]["axes"] == ["x", "z"]
     assert value["estop"]["available"]
     assert value["estop"]["owners"] == ["serial"]
     assert value["estop"]["status_topics"] == [f"{BASE}/outgoing/estop/serial"]

@@ -36,7 +36,7 @@ def capabilities(kind: str, *, video: bool = True, drive: bool = True) -> dict[s
             "transport": {"kind": kind},
             "video": {"available": video, "controls": video, "encodings": ["h264", "pbvz", "pbvd", "json"]},
             "audio": {"available": video, "controls": video, "encodings": ["pcm", "opus"]},
-            "drive": {"available": drive, "controls": drive, "arbitrates": True},
+            "drive": {"available": drive, "controls": drive, "arbitrates": True, "axes": ["x", "z"]},
             "system": {
                 "reboot": {"available": True, "controls": drive},
                 "service_restart": {"available": True, "controls": drive},

@@ -29,6 +29,7 @@ VICTIM = "pebble/robots/victim"
 EVIL = "pebble/robots/evil"
 NUMBERS = itertools.count(1)
 MB = 1024 * 1024
+PATIENCE_S = 60  # with a machine that does much else
 
 
 class ServerProcess:
@@ -117,11 +118,10 @@ def subscriptions(log: Path) -> set[str]:
 
 
 def drives(page: Page, robot: RecordingRobot) -> bool:
-    """Whether the page can still take the lease, move the robot and stop it."""
-    assert page.knows(robot.base, 10)
-    assert page.ready()
-    assert page.take(robot.base)
-    gesture = int(time.monotonic() * 1000) % 1_000_000
+    """Whether the page can still take the lease, move the robot and stop it. It may be tried again."""
+    if not (page.knows(robot.base, 10) and page.ready() and page.take(robot.base)):
+        return False
+    gesture = next(NUMBERS)  # greater than all before: the server has ended those
     since = time.monotonic()
     end = since + 5
     while time.monotonic() < end and not any(one["z"] for one in robot.drives(since)):
@@ -302,6 +302,9 @@ STRANGERS = {
 }
 
 
+SHARE = 8  # of the time that the broker is left to others, for each second in which it takes the crowd's messages
+
+
 class Crowd:
     """600 components of a stranger, each of which publishes the same all the time."""
 
@@ -309,6 +312,7 @@ class Crowd:
         self._port, self._payload = port, payload
         self._topics = [f"pebble/robots/e{next(NUMBERS)}/outgoing/{metric}" for _ in range(600)]
         self._ending = threading.Event()
+        self._took_s = 0.0
         self._publish()
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
@@ -318,11 +322,14 @@ class Crowd:
         self._thread.join()
 
     def _run(self) -> None:
-        while not self._ending.wait(2):
+        while not self._ending.wait(max(2, SHARE * self._took_s)):
             self._publish()
 
     def _publish(self) -> None:
+        """The next round waits longer where the broker takes longer: else a busy machine would only meet a queue."""
+        began = time.monotonic()
         flood(self._port, ((topic, self._payload) for topic in self._topics))
+        self._took_s = time.monotonic() - began
 
 
 def new_robot(broker: Broker, **options: Any) -> RecordingRobot:
@@ -333,7 +340,7 @@ def is_stopped(page: Page, robot: RecordingRobot, ref: str) -> bool:
     """Whether the stop of a robot, or of all, reaches this one, which was not stopped before."""
     assert not robot.latched
     page.send("estop", ref=ref, stop=(name := f"{next(NUMBERS):016x}"), why="x")
-    stopped = until(lambda: robot.latched, 30)
+    stopped = until(lambda: robot.latched, PATIENCE_S)
     page.send("estop-end", stop=name)  # one of all would collect robots of later tests
     return stopped
 
@@ -345,10 +352,10 @@ def test_a_crowd_of_strangers_hides_no_robot_and_keeps_no_stop_from_it(
     with closing(Crowd(broker.port, metric, payload())), server.page() as page:
         with new_robot(broker) as robot:
             robot.publish("estop/serial", FREE, retain=True)  # as its motor owner does when it begins
-            assert page.knows(robot.base, 30)
+            assert page.knows(robot.base, PATIENCE_S)
             assert is_stopped(page, robot, ""), "by a stop of all"
         with new_robot(broker) as robot:
-            assert page.knows(robot.base, 30), "without a state of a stop, as what has no motors"
+            assert page.knows(robot.base, PATIENCE_S), "without a state of a stop, as what has no motors"
             assert until(lambda: page.value(robot.base, "capabilities"))
         with new_robot(broker, capabilities={}) as robot:
             assert is_stopped(page, robot, robot.base), "by its own stop, known or not"
@@ -363,7 +370,7 @@ def test_a_robot_is_shown_whole_by_a_server_that_finds_what_strangers_have_left(
     flood(broker.port, ((topic, LEFT[topic.split("outgoing/")[1]]()) for topic in topics), retain=True)
     try:
         with new_robot(broker) as robot, Served(broker.port) as served, served.page() as page:
-            assert page.knows(robot.base, 30)
+            assert page.knows(robot.base, PATIENCE_S)
             assert until(lambda: page.value(robot.base, "capabilities"), 10), (
                 "asked for again: there was no place for it"
             )
@@ -382,7 +389,7 @@ def test_a_robot_known_from_before_is_shown_and_stopped_at_once(broker: Broker, 
             Served(broker.port, people=tmp_path / "people.sqlite") as served,
             served.page() as page,
         ):
-            assert page.knows(robot.base, 30)
+            assert page.knows(robot.base, PATIENCE_S)
             assert is_stopped(page, robot, "")
 
 
@@ -396,7 +403,7 @@ def test_a_page_that_opens_thousands_of_components(server: ServerProcess, broker
                 mallory.send("watch", ref=f"pebble/robots/w{number}")
         time.sleep(1)
         assert drives(page, robot)
-        assert server.memory() - before < 40 * MB
+        assert until(lambda: server.memory() - before < 40 * MB, 10)
         assert len(subscriptions(log)) < 3000
 
 
@@ -408,7 +415,7 @@ def test_a_hundred_thousand_topics(server: ServerProcess, broker: Broker) -> Non
         assert flood(broker.port, many_topics()) == 100_000
         assert until(lambda: page.value("", "web/broker", "robots_omitted") > 1000, 30)
         assert until(lambda: drives(page, robot), 60)
-        assert server.memory() - before < 60 * MB
+        assert until(lambda: server.memory() - before < 60 * MB, 10)
         with server.page() as another:
             assert another.knows(VICTIM)
             assert len({ref for ref, _ in another.state}) <= 502

@@ -364,6 +364,27 @@ _DRAWN_NEAR = """(selector) => {
   }
   return found;
 }"""
+#: What scrolls within itself can bring anything that it has to its edges.
+_SCROLLS_NEAR = """(selector) => {
+  const found = [];
+  for (const stop of document.querySelectorAll(".stop")) {
+    const a = stop.getBoundingClientRect();
+    for (const other of document.querySelectorAll("body *")) {
+      if (other.scrollHeight <= other.clientHeight || !other.checkVisibility()) continue;
+      if (!/auto|scroll/.test(getComputedStyle(other).overflowY) || !other.querySelector(selector)) continue;
+      const b = other.getBoundingClientRect();
+      const x = Math.max(b.left - a.right, a.left - b.right, 0);
+      const y = Math.max(b.top - a.bottom, a.top - b.bottom, 0);
+      if (other.contains(stop) || Math.hypot(x, y) >= 23.9) continue;
+      found.push(`scrolls near ${stop.textContent}: ${other.outerHTML.slice(0, 120)}`);
+    }
+  }
+  return found;
+}"""
+#: A name of usual length is read whole.
+_CUT = """() => [...document.querySelectorAll(".picker-name b")]
+  .filter((one) => one.checkVisibility() && one.scrollWidth > one.clientWidth)
+  .map((one) => `cut: ${one.textContent}`)"""
 #: What lies beside the bar that it belongs to, and over something else.
 _OUT_OF_BAR = """() => [...document.querySelectorAll(".picture-bar :is(button, label, select, output)")]
   .filter((one) => one.checkVisibility())
@@ -383,7 +404,8 @@ def _measured(page: Page, size: Size) -> list[str]:
         problems += [
             f"{width} px: {text}" for text in page.evaluate(_SMALL, TAPPABLE) + page.evaluate(_DRAWN_NEAR, TAPPABLE)
         ]
-        problems += [f"{width} px: {text}" for text in page.evaluate(_OUT_OF_BAR)]
+        problems += [f"{width} px: {text}" for text in page.evaluate(_SCROLLS_NEAR, TAPPABLE)]
+        problems += [f"{width} px: {text}" for script in (_OUT_OF_BAR, _CUT) for text in page.evaluate(script)]
         for offset in (0, 40, 90, 150, 230):
             problems += [f"{width} px: {text}" for text in page.evaluate(_NEAR, [TAPPABLE, offset])]
     page.set_viewport_size(before)

@@ -128,7 +128,7 @@ export function partsOf(line) {
     day: Number.isNaN(when.getTime()) ? "" : when.toLocaleDateString(undefined, { dateStyle: "long" }),
     time: timeOf(line.t),
     what: what.charAt(0).toUpperCase() + what.slice(1) + (line.count > 1 ? ` × ${text(line.count)}` : ""),
-    who: text(line.who),
+    who: line.who === "?" ? "Without a name" : text(line.who),
     more: text(more.map(([key, value]) => known(key)(value)).join(", ")),
   };
 }

@@ -13,7 +13,7 @@ export function RecordingsLink({ at = "", className = "button" }) {
   const { connection } = usePage();
   useModel(connection, (one) => one.you);
   if (!connection.you?.recordings || WATCHES) return null;
-  return html`<${RouteLink} path=${recordingsOf(at)} className=${className}
-    ><${Icon} name="recordings" />Recordings<//
+  return html`<${RouteLink} path=${recordingsOf(at)} className=${className} label="Recordings"
+    ><${Icon} name="recordings" /><span>Recordings</span><//
   >`;
 }

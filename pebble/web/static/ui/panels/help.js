@@ -1,6 +1,7 @@
 // Everything that keys, gamepad and fingers do here, and how stopping works.
 
 import { ACTIONS, buttonName, buttonOf } from "../../core/actions.js";
+import { useExtraAxis } from "../parts/axes.js";
 import { html, useModel, usePage } from "../parts/hooks.js";
 import { useKeyNames } from "../parts/keyboard.js";
 import { pads } from "../parts/pads.js";
@@ -34,11 +35,12 @@ function Bindings() {
   useModel(driver);
   useModel(pads);
   const name = useKeyNames();
+  const extra = useExtraAxis();
   const mapping = pads.mappingOf(driver.pads?.pad?.id ?? "");
   const standard = driver.pads?.pad?.mapping === "standard";
   return html`<section class="panel-text" aria-label="Keys, gamepad and touch">
     <ul class="bindings">
-      ${ACTIONS.map(
+      ${ACTIONS.filter(({ id }) => extra || id !== "auxiliary").map(
         (action) => html`<li key=${action.id}>
           <b>${action.words}</b>
           <span>${keyWords(action, name)}</span>

@@ -367,6 +367,12 @@ export class Offers {
     return this.section("drive").available === true;
   }
 
+  /** Whether it has an axis besides turning and going; one that does not list its axes may. */
+  get hasExtraAxis() {
+    const { axes } = this.section("drive");
+    return !Array.isArray(axes) || axes.includes("y");
+  }
+
   /** Whether a stop means anything to it. */
   get stops() {
     return this.assumed || this.drives || Object.keys(this.section("estop")).length > 0;

@@ -118,11 +118,12 @@ export function Live({ entry, online = true, children }) {
 }
 
 /**
- * ``isFirst``: it is closed until it is opened. ``place``: attributes that say where it is in the columns.
- * @param {{title: string, id: string, icon?: string, aside?: any, view?: any, isFirst?: boolean, ids?: string[],
+ * ``isFirst``: it is closed until it is opened. ``ids``: the cards among which ``menu`` moves it. ``place``: attributes
+ * that say where it is in the columns.
+ * @param {{title: string, id: string, icon?: string, aside?: any, view?: any, isFirst?: boolean, ids?: string[], menu?: any,
  *   className?: string, place?: Record<string, string>, style?: any, children: any}} props
  */
-export function Card({ title, id, icon, aside, view, isFirst = false, ids, className = "", place, style, children }) {
+export function Card({ title, id, icon, aside, view, isFirst = false, ids, menu, className = "", place, style, children }) {
   const closed = view?.isClosed(id, isFirst) ?? false;
   return html`<section
     class=${`card ${closed ? "closed" : ""} ${className}`}
@@ -146,52 +147,10 @@ export function Card({ title, id, icon, aside, view, isFirst = false, ids, class
       >
         <${Icon} name=${closed ? "down" : "up"} />
       </button>`}
-      ${view && ids && !closed && html`<${CardMenu} title=${title} id=${id} view=${view} isFirst=${isFirst} ids=${ids} />`}
+      ${menu && !closed && html`<${menu} ...${{ title, id, view, isFirst, ids }} />`}
     </header>
     ${!closed && html`<div class="card-body">${children}</div>`}
   </section>`;
-}
-
-/** What can be done with a card. ``ids``: the cards among which it can be moved, in their order. */
-function CardMenu({ title, id, view, isFirst, ids }) {
-  const [open, show] = useState(false);
-  const place = useRef(/** @type {HTMLElement | null} */ (null));
-  const end = (event) => event.type === "focusout" && place.current?.contains(event.relatedTarget) ? undefined : show(false);
-  const item = (words, does, off = false) => html`<button
-    type="button"
-    disabled=${off}
-    onClick=${() => {
-      show(false);
-      does();
-    }}
-  >
-    ${words}
-  </button>`;
-  const at = ids.indexOf(id);
-  return html`<div
-    class="card-menu"
-    ref=${place}
-    onFocusOut=${end}
-    onKeyDown=${(event) => event.key === "Escape" && show(false)}
-  >
-    <button
-      type="button"
-      class="quiet"
-      data-test=${`menu-${id}`}
-      aria-expanded=${open}
-      aria-label=${`${title}: close, hide, move`}
-      onClick=${() => show(!open)}
-    >
-      <${Icon} name="dots" />
-    </button>
-    ${open &&
-    html`<div class="card-menu-list" role="group" aria-label=${title}>
-      ${item(`Close ${title}`, () => view.toggle(id, isFirst))} ${item(`Hide ${title}`, () => view.hide(id))}
-      ${item("Move up", () => view.move(ids, id, -1), at <= 0)}
-      ${item("Move down", () => view.move(ids, id, 1), at === ids.length - 1)}
-      ${item("Arrange as new", () => view.reset())}
-    </div>`}
-  </div>`;
 }
 
 /** A list below a button, closed by Escape and when the focus leaves it. @param {any} props */

@@ -1,6 +1,7 @@
-// How the inputs are scaled, and the extra axis.
+// How the inputs are scaled, and the extra axis of a robot that has one.
 
 import * as browser from "../../core/browser.js";
+import { useExtraAxis } from "../parts/axes.js";
 import { html, useEffect, useModel, usePage } from "../parts/hooks.js";
 import { Icon, Slider, set } from "../parts/parts.js";
 
@@ -9,20 +10,22 @@ export function DriveSettings({ open = false }) {
   const { driver } = usePage();
   const pad = driver.pads?.pad?.id;
   const { turn, balance } = useModel(driver).sliders;
+  const extra = useExtraAxis();
   const part = `${Math.round(100 * turn)} %`;
   const side = balance === 0 ? "centred" : `${Math.round(100 * Math.abs(balance))} % ${balance > 0 ? "right" : "left"}`;
   const rest = html`<${Slider} name="Balance" value=${balance} min=${-50} max=${50} text=${side} onInput=${set(driver, "balance")} />
-    <div class="aux">
+    ${extra &&
+    html`<div class="aux">
       <span>Extra axis <kbd>Q</kbd> <kbd>E</kbd></span>
       <${AuxButton} driver=${driver} value=${1} label="Extra axis up">+<//>
       <${AuxButton} driver=${driver} value=${-1} label="Extra axis down">−<//>
-    </div>`;
+    </div>`}`;
   return html`<div class="sliders">
     <${Slider} name="Turn" value=${turn} min=${5} text=${part} onInput=${set(driver, "turn")} />
     ${open
       ? rest
       : html`<details class="folded">
-          <summary data-test="fold-drive">Balance, extra axis</summary>
+          <summary data-test="fold-drive">Balance${extra && ", extra axis"}</summary>
           ${rest}
         </details>`}
     ${pad && html`<p class="pad-name"><${Icon} name="pad" />${pad}</p>`}

@@ -1,5 +1,7 @@
 // Which keys drive; they light up while they are held.
 
+import { DOWN, UP } from "../../core/inputs.js";
+import { useExtraAxis } from "../parts/axes.js";
 import { html, useModel, usePage } from "../parts/hooks.js";
 import { useKeyNames } from "../parts/keyboard.js";
 import { Icon } from "../parts/parts.js";
@@ -10,10 +12,14 @@ export function KeyHints() {
   const { driver, panels } = usePage();
   useModel(driver);
   const name = useKeyNames();
+  const extra = useExtraAxis();
+  const has = (code) => extra || ![...UP, ...DOWN].includes(code);
   return html`<div class="keys">
     <div class="key-grid" aria-hidden="true">
-      ${GRID.map(
-        (code) => html`<kbd key=${code} class=${driver.inputs.keys.has(code) ? "on" : ""}>${name(code)}</kbd>`,
+      ${GRID.map((code) =>
+        has(code)
+          ? html`<kbd key=${code} class=${driver.inputs.keys.has(code) ? "on" : ""}>${name(code)}</kbd>`
+          : html`<i key=${code}></i>`,
       )}
     </div>
     <p aria-hidden="true">or arrows drive,<br /><b>Space</b> halts,<br /><b>Esc Esc</b> is STOP</p>

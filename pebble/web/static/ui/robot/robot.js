@@ -2,7 +2,7 @@
 
 import * as browser from "../../core/browser.js";
 import { Bands } from "../banner.js";
-import { CARDS, DRIVE, EXTRAS, HUD, NO_CAMERA, PICTURE, TABS, VOICE, hasMap } from "../cards/cards.js";
+import { CARDS, DRIVE, EXTRAS, HUD, MENU, NO_CAMERA, PICTURE, TABS, VOICE, hasMap } from "../cards/cards.js";
 import { expected, useColumns } from "./columns.js";
 import { DriveCard, DrivePad, Slot, Speed } from "./drive.js";
 import {
@@ -149,7 +149,7 @@ function Portrait({ at, offers, view, video, source, onPanel }) {
           <${Speed} />
           ${video
             ? html`<details class="folded">
-                <summary data-test="more-drive">Turn, balance, extra axis</summary>
+                <summary data-test="more-drive">Turn, balance${offers.hasExtraAxis && ", extra axis"}</summary>
                 <${Part} part=${DRIVE} open />
               </details>`
             : html`<${Part} part=${DRIVE} open />`}
@@ -260,6 +260,7 @@ const wanted = (offers, view) =>
 /** Until its part is here it keeps the height that it had last time. */
 function CardOf({ card, among, at, offers, view, columns = 0, side = false }) {
   const { body, failed } = usePart(card.part);
+  const menu = usePart(MENU).body;
   return html`<${Card}
     id=${card.id}
     title=${card.title}
@@ -267,6 +268,7 @@ function CardOf({ card, among, at, offers, view, columns = 0, side = false }) {
     view=${view}
     isFirst=${isEngineers(card)}
     ids=${among.map(({ id }) => id)}
+    menu=${menu}
     className=${isEngineers(card) ? "of-engineers" : ""}
     place=${side ? { "data-at": "side" } : undefined}
     style=${useHeight(view, columns, card, Boolean(body) || failed)}
