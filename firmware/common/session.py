@@ -27,8 +27,8 @@ _IN_FLIGHT = const(7)
 class Session:
     """Each turn ``step``, and if it is True ``read`` and ``write``; ``drop`` it after any OSError or ValueError."""
 
-    def __init__(self, settings: dict, root: bytes, topics: tuple, plain: int, wrap, take) -> None:
-        """``topics``, ``plain``: as of `mqtt.Client`. ``wrap`` wraps a socket in TLS; None: no TLS.
+    def __init__(self, settings: dict, root: bytes, topics: tuple, plain: int, names, wrap, take) -> None:
+        """``topics``, ``plain``, ``names``: as of `mqtt.Client`. ``wrap`` wraps a socket in TLS; None: no TLS.
 
         ``take(kind, now)`` is called for the SUBACK and for each publication, see `mqtt.Client.take`; it may raise
         ValueError.
@@ -40,7 +40,7 @@ class Session:
         # until the next boot. A broker must accept 23 bytes of it, and may refuse more (3.1.3.1).
         self._name = b"pebble-" + hexlify(os.urandom(8))
         size = _LONGEST_PAYLOAD + len(root) + _LONGEST_TOPIC + 7
-        self.client = mqtt.Client(size, _OUTGOING + 3 * len(root), root + b"/incoming/", topics, plain)
+        self.client = mqtt.Client(size, _OUTGOING + 3 * len(root), root + b"/incoming/", topics, plain, names)
         self.wrap = wrap
         self._take = take
         self.connection = Connection()
@@ -117,7 +117,7 @@ class Session:
             kind = client.take(count)
             while kind:
                 if kind == "welcome":
-                    client.send(*mqtt.subscription(client.root, client.topics, client.plain))
+                    client.send(*mqtt.subscription(client.root, client.topics, client.plain, client.names))
                     self.connection.move("subscribing", now)
                 elif kind == "pong":
                     self._in_flight = self._behind

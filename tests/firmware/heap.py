@@ -18,7 +18,7 @@ from tests.firmware.names import cost
 STOCK, FULL = "official image", "image with select"
 #: And on an ESP8266: the official image with a ROM file system, from which code runs in place, or the plain one.
 ROM, PLAIN = "image with ROMFS", "plain image"
-_UNUSED = {STOCK: ("usb",), FULL: ("console", "uart")}  # modules that are never loaded there
+_UNUSED = {STOCK: ("usb", "names"), FULL: ("console", "uart", "names"), ROM: ("names",), PLAIN: ("names",)}  # modules that are never loaded there
 _SCRIPTS = ("board", "net", "workload_serial", "workload_described", "workload_network", "heap")
 _DESCRIBED = ("goob_imu", "outlets")  # by pebble_serial_v1
 _HEAP = 64 * 1024  # to start with: the smaller, the quicker it is searched for garbage
