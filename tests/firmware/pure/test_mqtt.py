@@ -2,6 +2,7 @@
 
 import random
 
+from common import names
 from common.mqtt import Client, login, subscription
 
 ROOT = b"pebble/robots/r/incoming/"
@@ -11,7 +12,7 @@ CONTROL = (b"estop", b"drive-values", b"control", b"control/take")
 
 
 def client_of(incoming: int, outgoing: int) -> Client:
-    return Client(incoming, outgoing, ROOT, TOPICS, 2)
+    return Client(incoming, outgoing, ROOT, TOPICS, 2, None)
 
 
 def publication(payload: bytes, topic: bytes = TOPIC, first: int = 0x32) -> bytes:
@@ -86,10 +87,10 @@ def test_a_password_alone_comes_with_a_user_without_a_name() -> None:
 
 def test_subscribe_and_ping() -> None:
     client = client_of(100, 200)
-    client.send(*subscription(b"a/", (b"b", b"cd"), 2))
+    client.send(*subscription(b"a/", (b"b", b"cd"), 2, None))
     client.send(0xC0)
     assert sent(client) == b"\x82\x0f\0\1\0\3a/b\1\0\4a/cd\1" + b"\xc0\0"
-    client.send(*subscription(b"a/", (b"b", b"c"), 1))
+    client.send(*subscription(b"a/", (b"b", b"c"), 1, names))
     assert sent(client) == b"\x82\x1e\0\1\0\3a/b\1\0\x08a/by/+/b\1\0\x08a/by/+/c\1"
 
 
@@ -158,12 +159,12 @@ def test_the_account_in_a_topic_is_known() -> None:
         (b"by", -1, ""),
         (b"", -1, ""),
     ):
-        client = Client(200, 50, ROOT, CONTROL, 2)
+        client = Client(200, 50, ROOT, CONTROL, 2, names)
         assert receive(client, publication(b"/estop", ROOT + rest)) == [(b"/estop", 0)]
         assert (client.topic, client.by) == (topic, by), rest
         assert receive(client, publication(b"", b"pebble/robots/s/incoming/" + rest)) == [(b"", 0)]
         assert (client.topic, client.by) == (-1, "")
-    client = Client(200, 50, ROOT, CONTROL, 4)  # names are not checked
+    client = Client(200, 50, ROOT, CONTROL, 4, None)  # names are not checked
     assert receive(client, publication(b"x", ROOT + b"by/otto/estop")) == [(b"x", 0)]
     assert (client.topic, client.by) == (-1, "")
 
