@@ -28,7 +28,7 @@ class Client:
 
     def restart(self) -> None:
         """Discard all state for a new connection."""
-        self.waiting = self._at = self._end = self._skip = 0
+        self.waiting = self._at = self._end = self._skip = self._filters = 0
         self._more: list[bytes | memoryview] = []
 
     # -- in
@@ -48,7 +48,7 @@ class Client:
         ``count`` bytes were received since the last call. A publication is on ``topics[topic]``, ``retained`` or not,
         of the account ``by``; its payload is ``data[first:last]`` until the next call of ``space``. The kind of one
         whose payload is too long to be stored is "too long". "subscribed": that range has a byte for each topic of
-        ``subscription``, above 127 if it is refused.
+        ``subscribe``, above 127 if it is refused.
         """
         data = self.data
         self._end += count
@@ -81,7 +81,7 @@ class Client:
                 if code:  # 3.2.2.3: 1 protocol, 2 client id, 3 broker unavailable, 4 user or password, 5 rights
                     raise ValueError("refused by the broker: %d" % code)
                 return "welcome"
-            if first == 0x90 and length == 2 + self.plain + (len(self.topics) if self.names else 0):  # SUBACK
+            if first == 0x90 and length == 2 + self._filters:  # SUBACK
                 self.first = at + 3
                 self.last = stop
                 return "subscribed"
@@ -138,6 +138,14 @@ class Client:
         self.sent(0)
         return True
 
+    def subscribe(self, count: int) -> None:
+        """Subscribe to the first ``count`` topics with QoS 1, those without an account first (packet 1, 3.8)."""
+        names = self.names
+        both = self.topics[: min(count, self.plain)]
+        both += tuple([names.ANY + topic for topic in self.topics[:count]] if names else ())
+        self._filters = len(both)
+        self.send(0x82, b"\x00\x01", *[text(self.root + topic) + b"\x01" for topic in both])
+
     def publish(self, retain: int, topic: bytes, payload: bytes) -> bool:
         """Publish with QoS 0; ``retain`` 1: as a retained message. False: there is no room for it now."""
         return self.send(0x30 | retain, bytes((len(topic) >> 8, len(topic) & 255)), topic, payload)
@@ -172,9 +180,3 @@ def login(name: bytes, user: bytes, password: bytes, topic: bytes, will: bytes, 
     head = b"\x00\x04MQTT\x04" + bytes((flags, alive_s >> 8, alive_s & 255))
     secrets = (text(user) if user or password else b"") + (text(password) if password else b"")
     return 0x10, head, text(name), text(topic), text(will), secrets
-
-
-def subscription(root: bytes, topics: tuple, plain: int, names) -> tuple:
-    """SUBSCRIBE for ``send``: packet 1, each topic with QoS 1, those without an account first (3.8); see `Client`."""
-    both = topics[:plain] + tuple([names.ANY + topic for topic in topics] if names else ())
-    return (0x82, b"\x00\x01") + tuple([text(root + topic) + b"\x01" for topic in both])

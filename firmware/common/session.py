@@ -18,6 +18,7 @@ _LONGEST_PAYLOAD = const(512)
 _LONGEST_TOPIC = const(58)  # below the base: /incoming/by/{account}/drive-values
 _OUTGOING = const(420)  # plus three topics: room for a state and the 20 PUBACKs that a broker waits for
 _CHUNKS = const(4)  # reads per turn, at most
+_CALM_MS = const(3000)  # with the flood's last two seconds five: the next attempt is soon
 _PACE_MS = const(30)  # between two writes, so that acknowledgements share packets
 # Writes in flight, as far as pings tell. An ESP8266 queues eight; the ninth blocks for up to ten seconds, even if the
 # socket is non-blocking (micropython issue 19704), and a lost packet delays all later ones.
@@ -50,6 +51,11 @@ class Session:
         self._asked = False  # whether the answer to that ping is outstanding
         self.stuck = False  # whether data waits that could not be written
         self._wrote = 0  # the last write
+        self._got = 0  # the last bytes
+        # The last session was silent, for the answer to a ping waited behind what came: so long only stops are
+        # subscribed to, which get through then, and nothing moves.
+        self._flooded = False
+        self._calm = 0  # since when
 
     def step(self, now: int, server: str, clock) -> bool:
         """Return whether packets can be exchanged; ``server`` is the DNS server, "": there is no network.
@@ -59,6 +65,7 @@ class Session:
         connection = self.connection
         due = connection.step(now, server != "")
         if due == "drop":
+            self._flooded = connection.reason == "silence" and diff(now, self._got) < 500
             raise OSError(connection.reason)
         if due == "resolve":
             self._open = query_name(self._host, server, now, connection.failures)  # type: ignore[assignment]
@@ -112,21 +119,27 @@ class Session:
                 gc.collect()  # each command leaves some 200 bytes of garbage
             space = client.space()
             count = self._open.read(space) if len(space) else 0
-            if not count and len(space) == len(client.data):  # nothing is left from the last turn either
+            if count:
+                self._got = now
+            elif len(space) == len(client.data):  # nothing is left from the last turn either
                 break
             kind = client.take(count)
             while kind:
                 if kind == "welcome":
-                    client.send(*mqtt.subscription(client.root, client.topics, client.plain, client.names))
+                    client.subscribe(1 if self._flooded else len(client.topics))
                     self.connection.move("subscribing", now)
                 elif kind == "pong":
                     self._in_flight = self._behind
                     self._asked = False
                     self.connection.received(now)
-                else:
+                elif kind != "subscribed":
                     self._take(kind, now)
-                    if kind == "subscribed":
+                else:
+                    if not self._flooded:
+                        self._take(kind, now)
+                    if self.connection.state != "online":
                         self._in_flight = 0
+                        self._calm = now
                         self.connection.move("online", now)
                 kind = client.take()
             if count < len(space):
@@ -139,6 +152,9 @@ class Session:
     def write(self, now: int, urgent: bool) -> None:
         """Write what waits, if it is ``urgent`` or the last write is long enough ago."""
         client = self.client
+        if self._flooded and self.connection.state == "online" and diff(now, self._calm) >= _CALM_MS:
+            self._flooded = False
+            client.subscribe(len(client.topics))
         if not urgent and diff(now, self._wrote) < _PACE_MS and client.waiting < len(client.out) // 2:
             return
         if client.waiting and not self._asked and self.connection.state == "online":
