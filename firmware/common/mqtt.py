@@ -139,12 +139,17 @@ class Client:
         return True
 
     def subscribe(self, count: int) -> None:
-        """Subscribe to the first ``count`` topics with QoS 1, those without an account first (packet 1, 3.8)."""
+        """Subscribe to the first ``count`` topics, those without an account first (packet 1, 3.8).
+
+        With QoS 1 to stops and resets only: of those a broker keeps some for a client that is slow to read, whatever
+        else it is sent, and of what has QoS 0 it drops the newest.
+        """
         names = self.names
         both = self.topics[: min(count, self.plain)]
         both += tuple([names.ANY + topic for topic in self.topics[:count]] if names else ())
         self._filters = len(both)
-        self.send(0x82, b"\x00\x01", *[text(self.root + topic) + b"\x01" for topic in both])
+        filters = [text(self.root + topic) + (b"\1" if b"estop" in topic else b"\0") for topic in both]
+        self.send(0x82, b"\x00\x01", *filters)
 
     def publish(self, retain: int, topic: bytes, payload: bytes) -> bool:
         """Publish with QoS 0; ``retain`` 1: as a retained message. False: there is no room for it now."""

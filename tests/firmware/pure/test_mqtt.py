@@ -93,15 +93,15 @@ def test_a_password_alone_comes_with_a_user_without_a_name() -> None:
 
 
 def test_subscribe_and_ping() -> None:
-    client = Client(100, 200, b"a/", (b"b", b"cd"), 2, None)
+    client = Client(100, 200, b"a/", (b"estop", b"cd"), 2, None)
     client.subscribe(2)
     client.send(0xC0)
-    assert sent(client) == b"\x82\x0f\0\1\0\3a/b\1\0\4a/cd\1" + b"\xc0\0"
+    assert sent(client) == b"\x82\x13\0\1\0\7a/estop\1\0\4a/cd\0" + b"\xc0\0"
     client = Client(100, 200, b"a/", (b"b", b"c"), 1, names)
     client.subscribe(2)
-    assert sent(client) == b"\x82\x1e\0\1\0\3a/b\1\0\x08a/by/+/b\1\0\x08a/by/+/c\1"
+    assert sent(client) == b"\x82\x1e\0\1\0\3a/b\0\0\x08a/by/+/b\0\0\x08a/by/+/c\0"
     client.subscribe(1)
-    assert sent(client) == b"\x82\x13\0\1\0\3a/b\1\0\x08a/by/+/b\1"
+    assert sent(client) == b"\x82\x13\0\1\0\3a/b\0\0\x08a/by/+/b\0"
 
 
 def test_publish_short_and_long() -> None:
