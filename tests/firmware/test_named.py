@@ -108,7 +108,7 @@ def test_who_has_control_drives_and_everybody_stops(tmp_path: Path, rules: Liter
     [("ann", 0), *(pytest.param(*row, marks=pytest.mark.thorough) for row in (("otto", 0), ("otto", 60_000)))],
 )
 def test_a_flood_keeps_no_stop_away_that_is_repeated(tmp_path: Path, account: str, size: int) -> None:
-    """Of a driver, and of the one who has control, whose small commands all move the board."""
+    """A driver floods, or the one who has control, whose small commands all move the board."""
     with FleetBroker(tmp_path / "hall", ACCOUNTS, level="named", rules="plugin") as broker:
         login = {"username": KIND, "password": broker.passwords[KIND], "ca": tmp_path / "hall" / CA_CERT}
         with (
