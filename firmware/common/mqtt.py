@@ -28,7 +28,7 @@ class Client:
 
     def restart(self) -> None:
         """Discard all state for a new connection."""
-        self.waiting = self._at = self._end = self._skip = self._filters = 0
+        self.waiting = self._at = self._end = self._skip = self._asked = 0
         self._more: list[bytes | memoryview] = []
 
     # -- in
@@ -81,7 +81,7 @@ class Client:
                 if code:  # 3.2.2.3: 1 protocol, 2 client id, 3 broker unavailable, 4 user or password, 5 rights
                     raise ValueError("refused by the broker: %d" % code)
                 return "welcome"
-            if first == 0x90 and length == 2 + self._filters:  # SUBACK
+            if first == 0x90 and length == 2 + self._asked:  # SUBACK
                 self.first = at + 3
                 self.last = stop
                 return "subscribed"
@@ -147,7 +147,7 @@ class Client:
         names = self.names
         both = self.topics[: min(count, self.plain)]
         both += tuple([names.ANY + topic for topic in self.topics[:count]] if names else ())
-        self._filters = len(both)
+        self._asked = len(both)
         filters = [text(self.root + topic) + (b"\1" if b"estop" in topic else b"\0") for topic in both]
         self.send(0x82, b"\x00\x01", *filters)
 

@@ -51,11 +51,11 @@ class Session:
         self._asked = False  # whether the answer to that ping is outstanding
         self.stuck = False  # whether data waits that could not be written
         self._wrote = 0  # the last write
-        self._got = 0  # the last bytes
+        self._received = 0  # the last bytes
         # The last session was silent, for the answer to a ping waited behind what came: so long only stops are
         # subscribed to, which get through then, and nothing moves.
-        self._flooded = False
-        self._calm = 0  # since when
+        self._paused = False
+        self._since = 0  # since when
 
     def step(self, now: int, server: str, clock) -> bool:
         """Return whether packets can be exchanged; ``server`` is the DNS server, "": there is no network.
@@ -65,7 +65,7 @@ class Session:
         connection = self.connection
         due = connection.step(now, server != "")
         if due == "drop":
-            self._flooded = connection.reason == "silence" and diff(now, self._got) < 500
+            self._paused = connection.reason == "silence" and diff(now, self._received) < 500
             raise OSError(connection.reason)
         if due == "resolve":
             self._open = query_name(self._host, server, now, connection.failures)  # type: ignore[assignment]
@@ -120,13 +120,13 @@ class Session:
             space = client.space()
             count = self._open.read(space) if len(space) else 0
             if count:
-                self._got = now
+                self._received = now
             elif len(space) == len(client.data):  # nothing is left from the last turn either
                 break
             kind = client.take(count)
             while kind:
                 if kind == "welcome":
-                    client.subscribe(1 if self._flooded else len(client.topics))
+                    client.subscribe(1 if self._paused else len(client.topics))
                     self.connection.move("subscribing", now)
                 elif kind == "pong":
                     self._in_flight = self._behind
@@ -135,11 +135,11 @@ class Session:
                 elif kind != "subscribed":
                     self._take(kind, now)
                 else:
-                    if not self._flooded:
+                    if not self._paused:
                         self._take(kind, now)
                     if self.connection.state != "online":
                         self._in_flight = 0
-                        self._calm = now
+                        self._since = now
                         self.connection.move("online", now)
                 kind = client.take()
             if count < len(space):
@@ -152,8 +152,8 @@ class Session:
     def write(self, now: int, urgent: bool) -> None:
         """Write what waits, if it is ``urgent`` or the last write is long enough ago."""
         client = self.client
-        if self._flooded and self.connection.state == "online" and diff(now, self._calm) >= _CALM_MS:
-            self._flooded = False
+        if self._paused and self.connection.state == "online" and diff(now, self._since) >= _CALM_MS:
+            self._paused = False
             client.subscribe(len(client.topics))
         if not urgent and diff(now, self._wrote) < _PACE_MS and client.waiting < len(client.out) // 2:
             return
