@@ -24,7 +24,7 @@ def describe(epoch_ms: int, root: bytes, name: str, stops, charging: bytes, axes
     """
     can, cannot = b"true", b"false"
     named = b',"name":' + json.dumps(name).encode() if name else b""
-    values = [epoch_ms, b'"named":true,' if stops.named else b""] + root.split(b"/")
+    values = [epoch_ms, b'"named":true,' if stops.names else b""] + root.split(b"/")
     values += [named, axes, can if stops.controllable else cannot, root, can if stops.stoppable else cannot]
     values += [root, root, root, charging, root, root]
     return _CAPABILITIES % tuple(values + [b'{"available":false,"controls":false}'] * 7)

@@ -8,7 +8,7 @@ from micropython import const
 
 from common.arbiter import Arbiter
 from common.latch import Latch, fields, reset_of, stop_of
-from common.lease import Lease, request_of, shown
+from common.lease import Lease, request_of
 from common.payload import load
 from common.ticks import diff
 
@@ -29,14 +29,14 @@ _HOLDER = const(
 class EmergencyStop:
     """``stop`` and ``reset`` for their messages, then ``save`` while the motors are off; ``tick`` every turn."""
 
-    def __init__(self, now: int, watchdog_ms: int, strangers: int, named: bool) -> None:
-        """``strangers``: see `Lease`. ``named``: names are checked; else the accounts of senders are ""."""
+    def __init__(self, now: int, watchdog_ms: int, strangers: int, names) -> None:
+        """``strangers``: see `Lease`. ``names``: names.py; None: the accounts of senders are ""."""
         self.latch = Latch(_random(4), _NAMES, diff)
         self.lease = Lease(now, diff, _random, strangers)
         self.arbiter = Arbiter(self.latch, self.lease, now, diff, watchdog_ms)
         self.changed = True  # since the last state
         self.due = b""  # the state to publish: at most four a second, and that of a stop not in its turn
-        self.named = named
+        self.names = names
         self.stoppable = self.controllable = True  # the broker granted the topics of stops, and of control
         self._barred = 0  # of the last state
         self._paused = False
@@ -67,15 +67,22 @@ class EmergencyStop:
         if raw is not None:
             try:
                 account = by
-                name, by, why = stop_of(_signed(raw, by))
-                if by and self.named and not account:  # a claim, as Linux robots show it
-                    by = by[:31].rstrip("?") + "?"
+                name, by, why = stop_of(self._load(raw, by))
+                if self.names and not account:
+                    by = self.names.claimed(by)
             except (ValueError, OverflowError, MemoryError):
                 pass
         self.changed = True
         new = self.arbiter.stop(name or _random(8), by, why, since)
         self._unsaved = self._unsaved or self.latch.latched  # again if writing failed
         return new
+
+    def _load(self, raw: memoryview, by: str):
+        """Parse a command; it names its account, if there is one."""
+        body = load(raw)
+        if by:
+            self.names.sign(body, by)
+        return body
 
     def reset(self, raw: memoryview, now: int) -> None:
         """End the stop, if the sender saw its newest state."""
@@ -92,7 +99,7 @@ class EmergencyStop:
     def request(self, raw: memoryview, by: str, urgent: bool, now: int) -> None:
         """A request for control, or the end of it; ``urgent``: without asking."""
         try:
-            order = request_of(fields(_signed(raw, by)))
+            order = request_of(fields(self._load(raw, by)))
         except (ValueError, OverflowError, MemoryError):
             return
         if order:
@@ -108,7 +115,7 @@ class EmergencyStop:
             lease = self.lease
             _, name, by, device = lease.holder or ("", "", "", "")
             _, asks_id, asks, _ = lease.asker or ("", "", "", "")
-            others, named = json.dumps(lease.others), json.dumps(self.named)
+            others, named = json.dumps(lease.others), json.dumps(self.names is not None)
             return (_HOLDER % (by, name, lease.key, device, asks, asks_id, others, named, self.latch.boot)).encode()
         state = self.latch.state(self._saved == self.latch.latched if self._saves else None)
         if self.arbiter.barred:
@@ -166,16 +173,6 @@ class EmergencyStop:
             pass
         self.latch.restore(saved)
         self._saved = self.latch.latched
-
-
-def _signed(raw: memoryview, by: str):
-    """The command, with the account ``by`` instead of its own ``by``, or in front of it. A stranger's has no effect."""
-    body = load(raw)
-    if by:
-        found = fields(body)
-        person = found.get("by")
-        found["by"] = shown(by + "/" + person, 40) if isinstance(person, str) and person and by != "-" else by
-    return body
 
 
 def _random(count: int) -> str:

@@ -107,7 +107,7 @@ class Latch:
 
 def is_name(name: object) -> bool:
     """Whether this names a stop: 16 hex digits. A stop with any other name has none."""
-    return isinstance(name, str) and len(name) == 16 and all(char in "0123456789abcdefABCDEF" for char in name)
+    return isinstance(name, str) and len(name) == 16 and not name.strip("0123456789abcdefABCDEF")
 
 
 def stop_of(body: object) -> tuple[str, str, str]:

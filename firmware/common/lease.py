@@ -113,11 +113,10 @@ def request_of(fields: dict) -> tuple[str, str, str, int] | None:
     by = fields.get("by", "")
     device = fields.get("device", "")
     ms = fields.get("for_ms", 3000)
-    if not (isinstance(name, str) and isinstance(by, str) and isinstance(device, str)) or len(name) != 8:
+    if not (isinstance(name, str) and isinstance(by, str) and isinstance(device, str)):
         return None
-    for char in name:
-        if char not in "0123456789abcdefABCDEF":
-            return None
+    if len(name) != 8 or name.strip("0123456789abcdefABCDEF"):  # other letters would be left
+        return None
     if want not in ("hold", "release") or type(ms) not in (int, float):
         return None
     return name, shown(by, 40), shown(device, 20), int(min(max(ms, 1), 10_000)) if want == "hold" else 0

@@ -9,17 +9,18 @@ of the OASIS standard of 2014.
 class Client:
     """``space`` and ``take`` are for input; ``send``, ``out``, ``waiting`` and ``sent`` for output."""
 
-    def __init__(self, incoming: int, outgoing: int, root: bytes, topics: tuple, plain: int) -> None:
+    def __init__(self, incoming: int, outgoing: int, root: bytes, topics: tuple, plain: int, names) -> None:
         """Sizes in bytes: of the longest packet to read, and of the output buffer.
 
-        ``topics``: to subscribe to, below ``root``. If only the first ``plain`` ones are, then all are a second time,
-        with the account of the sender: ``{root}by/{account}/{topic}``. The first one is that of stops.
+        ``topics``: of which the first ``plain`` ones are subscribed to, below ``root``; the first is that of stops.
+        ``names``: names.py, by which all are subscribed to with the sender's account; None: names are not checked.
         """
         self.data = memoryview(bytearray(incoming))
         self.out = memoryview(bytearray(outgoing))
         self.root = root
         self.topics = topics
         self.plain = plain
+        self.names = names
         self.topic = -1  # of the publication: its place in ``topics``, -1: it is none of them
         self.by = ""  # the account in its topic; "": there is none
         self.first = self.last = self.retained = 0  # of the publication
@@ -27,7 +28,7 @@ class Client:
 
     def restart(self) -> None:
         """Discard all state for a new connection."""
-        self.waiting = self._at = self._end = self._skip = 0
+        self.waiting = self._at = self._end = self._skip = self._asked = 0
         self._more: list[bytes | memoryview] = []
 
     # -- in
@@ -47,7 +48,7 @@ class Client:
         ``count`` bytes were received since the last call. A publication is on ``topics[topic]``, ``retained`` or not,
         of the account ``by``; its payload is ``data[first:last]`` until the next call of ``space``. The kind of one
         whose payload is too long to be stored is "too long". "subscribed": that range has a byte for each topic of
-        ``subscription``, above 127 if it is refused.
+        ``subscribe``, above 127 if it is refused.
         """
         data = self.data
         self._end += count
@@ -80,8 +81,7 @@ class Client:
                 if code:  # 3.2.2.3: 1 protocol, 2 client id, 3 broker unavailable, 4 user or password, 5 rights
                     raise ValueError("refused by the broker: %d" % code)
                 return "welcome"
-            count = len(self.topics)
-            if first == 0x90 and length == 2 + self.plain + (count if self.plain < count else 0):  # SUBACK
+            if first == 0x90 and length == 2 + self._asked:  # SUBACK
                 self.first = at + 3
                 self.last = stop
                 return "subscribed"
@@ -117,20 +117,9 @@ class Client:
         first = at + len(self.root)
         if first > stop or data[at:first] != self.root:
             return
-        if count < len(topics) and data[first : first + 3] == b"by/":  # type: ignore[comparison-overlap]
-            count = len(topics)
-            at = first = first + 3
-            # of a-z, 0-9, _ and -, which is none by itself or in front; behind others a stop has no name, and counts
-            while first < stop and (96 < data[first] < 123 or 47 < data[first] < 58 or data[first] in (45, 95)):
-                first += 1
-            if first >= stop or data[first] != 47 or not at < first <= at + 32 or data[at] == 45:
-                while first < stop and data[first] != 47:
-                    first += 1
-                if data[first + 1 : stop] == topics[0]:
-                    self.topic = 0
-                return
-            self.by = bytes(data[at:first]).decode()
-            first += 1
+        if self.names and data[first : first + 3] == b"by/":  # type: ignore[comparison-overlap]
+            self.by, first = self.names.sender(data, first + 3, stop)
+            count = len(topics) if self.by else 1  # behind what is no account a stop has no name, and counts
         name = data[first:stop]
         while count and name != topics[count - 1]:
             count -= 1
@@ -148,6 +137,19 @@ class Client:
         self._more.extend(parts)
         self.sent(0)
         return True
+
+    def subscribe(self, count: int) -> None:
+        """Subscribe to the first ``count`` topics, those without an account first (packet 1, 3.8).
+
+        With QoS 1 to stops and resets only: of those a broker keeps some for a client that is slow to read, whatever
+        else it is sent, and of what has QoS 0 it drops the newest.
+        """
+        names = self.names
+        both = self.topics[: min(count, self.plain)]
+        both += tuple([names.ANY + topic for topic in self.topics[:count]] if names else ())
+        self._asked = len(both)
+        filters = [text(self.root + topic) + (b"\1" if b"estop" in topic else b"\0") for topic in both]
+        self.send(0x82, b"\x00\x01", *filters)
 
     def publish(self, retain: int, topic: bytes, payload: bytes) -> bool:
         """Publish with QoS 0; ``retain`` 1: as a retained message. False: there is no room for it now."""
@@ -183,11 +185,3 @@ def login(name: bytes, user: bytes, password: bytes, topic: bytes, will: bytes, 
     head = b"\x00\x04MQTT\x04" + bytes((flags, alive_s >> 8, alive_s & 255))
     secrets = (text(user) if user or password else b"") + (text(password) if password else b"")
     return 0x10, head, text(name), text(topic), text(will), secrets
-
-
-def subscription(root: bytes, topics: tuple, plain: int) -> tuple:
-    """SUBSCRIBE for ``send``: packet 1, each topic with QoS 1, those without an account first (3.8); see `Client`."""
-    both = [root + topic for topic in topics[:plain]]
-    if plain < len(topics):
-        both += [root + b"by/+/" + topic for topic in topics]
-    return (0x82, b"\x00\x01") + tuple([text(topic) + b"\x01" for topic in both])

@@ -48,13 +48,15 @@ class NetworkRobot:
         self.charging = charging
         self._wifi = Wifi(get(settings, "wifi", "ssid"), get(settings, "wifi", "password", ""))
         self._clock = Clock(settings.get("ntp", "pool.ntp.org"), now)
-        named = ("open", "login", "named").index(get(settings, "security", "level", "open")) == 2
+        names = None
+        if ("open", "login", "named").index(get(settings, "security", "level", "open")) == 2:
+            from common import names
         words = "drive", "free", "refuse"
-        strangers = words.index(get(settings, "security", "strangers", words[2 if named else 0]))
+        strangers = words.index(get(settings, "security", "strangers", words[2 if names else 0]))
         topics = b"estop", b"drive-values", b"control", b"control/take", b"estop-reset"
-        plain = _TOPICS if not named else _DRIVE + 1 if strangers == 2 else _CONTROL + 1
-        self.session = Session(settings, root, topics, plain, wrap, self._take)
-        self.stops = EmergencyStop(now, _DRIVE_LIMIT_MS, strangers, named)
+        plain = _TOPICS if not names else _DRIVE + 1 if strangers == 2 else _CONTROL + 1
+        self.session = Session(settings, root, topics, plain, names, wrap, self._take)
+        self.stops = EmergencyStop(now, _DRIVE_LIMIT_MS, strangers, names)
         self.deadman = DeadMan(_DRIVE_LIMIT_MS)
         self.body = body
         self.refused = 0  # commands that were retained, and drive commands that were invalid or not admitted
@@ -138,7 +140,7 @@ class NetworkRobot:
         topic = self.session.client.topic
         stops = self.stops
         by = self.session.client.by
-        sender = by or ("-" if stops.named else "")  # as Linux robots show a sender without a name
+        sender = by or ("-" if stops.names else "")  # as Linux robots show a sender without a name
         if topic == _DRIVE:
             self._judge(raw, sender, now)
         elif raw is not None and not len(raw):  # it removes a retained message

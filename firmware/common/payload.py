@@ -110,10 +110,7 @@ def _number(text: str) -> float:
     """0 for what is none, as Linux reads it: a board's float() would also accept 1_0, and "." and "e5" as 0."""
     if "nan" in text or "inf" in text:
         raise ValueError
-    for char in text:
-        if char not in "0123456789+-.e":
-            return 0.0
-    if not text.split("e")[0].strip("+-."):
+    if text.strip("0123456789+-.e") or not text.split("e")[0].strip("+-."):
         return 0.0
     try:
         return float(text)

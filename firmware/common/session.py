@@ -18,6 +18,7 @@ _LONGEST_PAYLOAD = const(512)
 _LONGEST_TOPIC = const(58)  # below the base: /incoming/by/{account}/drive-values
 _OUTGOING = const(420)  # plus three topics: room for a state and the 20 PUBACKs that a broker waits for
 _CHUNKS = const(4)  # reads per turn, at most
+_CALM_MS = const(3000)  # with the flood's last two seconds five: the next attempt is soon
 _PACE_MS = const(30)  # between two writes, so that acknowledgements share packets
 # Writes in flight, as far as pings tell. An ESP8266 queues eight; the ninth blocks for up to ten seconds, even if the
 # socket is non-blocking (micropython issue 19704), and a lost packet delays all later ones.
@@ -27,8 +28,8 @@ _IN_FLIGHT = const(7)
 class Session:
     """Each turn ``step``, and if it is True ``read`` and ``write``; ``drop`` it after any OSError or ValueError."""
 
-    def __init__(self, settings: dict, root: bytes, topics: tuple, plain: int, wrap, take) -> None:
-        """``topics``, ``plain``: as of `mqtt.Client`. ``wrap`` wraps a socket in TLS; None: no TLS.
+    def __init__(self, settings: dict, root: bytes, topics: tuple, plain: int, names, wrap, take) -> None:
+        """``topics``, ``plain``, ``names``: as of `mqtt.Client`. ``wrap`` wraps a socket in TLS; None: no TLS.
 
         ``take(kind, now)`` is called for the SUBACK and for each publication, see `mqtt.Client.take`; it may raise
         ValueError.
@@ -40,7 +41,7 @@ class Session:
         # until the next boot. A broker must accept 23 bytes of it, and may refuse more (3.1.3.1).
         self._name = b"pebble-" + hexlify(os.urandom(8))
         size = _LONGEST_PAYLOAD + len(root) + _LONGEST_TOPIC + 7
-        self.client = mqtt.Client(size, _OUTGOING + 3 * len(root), root + b"/incoming/", topics, plain)
+        self.client = mqtt.Client(size, _OUTGOING + 3 * len(root), root + b"/incoming/", topics, plain, names)
         self.wrap = wrap
         self._take = take
         self.connection = Connection()
@@ -50,6 +51,11 @@ class Session:
         self._asked = False  # whether the answer to that ping is outstanding
         self.stuck = False  # whether data waits that could not be written
         self._wrote = 0  # the last write
+        self._received = 0  # the last bytes
+        # The last session was silent, for the answer to a ping waited behind what came: so long only stops are
+        # subscribed to, which get through then, and nothing moves.
+        self._paused = False
+        self._since = 0  # since when
 
     def step(self, now: int, server: str, clock) -> bool:
         """Return whether packets can be exchanged; ``server`` is the DNS server, "": there is no network.
@@ -59,6 +65,7 @@ class Session:
         connection = self.connection
         due = connection.step(now, server != "")
         if due == "drop":
+            self._paused = connection.reason == "silence" and diff(now, self._received) < 500
             raise OSError(connection.reason)
         if due == "resolve":
             self._open = query_name(self._host, server, now, connection.failures)  # type: ignore[assignment]
@@ -112,21 +119,27 @@ class Session:
                 gc.collect()  # each command leaves some 200 bytes of garbage
             space = client.space()
             count = self._open.read(space) if len(space) else 0
-            if not count and len(space) == len(client.data):  # nothing is left from the last turn either
+            if count:
+                self._received = now
+            elif len(space) == len(client.data):  # nothing is left from the last turn either
                 break
             kind = client.take(count)
             while kind:
                 if kind == "welcome":
-                    client.send(*mqtt.subscription(client.root, client.topics, client.plain))
+                    client.subscribe(1 if self._paused else len(client.topics))
                     self.connection.move("subscribing", now)
                 elif kind == "pong":
                     self._in_flight = self._behind
                     self._asked = False
                     self.connection.received(now)
-                else:
+                elif kind != "subscribed":
                     self._take(kind, now)
-                    if kind == "subscribed":
+                else:
+                    if not self._paused:
+                        self._take(kind, now)
+                    if self.connection.state != "online":
                         self._in_flight = 0
+                        self._since = now
                         self.connection.move("online", now)
                 kind = client.take()
             if count < len(space):
@@ -139,6 +152,9 @@ class Session:
     def write(self, now: int, urgent: bool) -> None:
         """Write what waits, if it is ``urgent`` or the last write is long enough ago."""
         client = self.client
+        if self._paused and self.connection.state == "online" and diff(now, self._since) >= _CALM_MS:
+            self._paused = False
+            client.subscribe(len(client.topics))
         if not urgent and diff(now, self._wrote) < _PACE_MS and client.waiting < len(client.out) // 2:
             return
         if client.waiting and not self._asked and self.connection.state == "online":

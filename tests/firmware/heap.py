@@ -18,7 +18,10 @@ from tests.firmware.names import cost
 STOCK, FULL = "official image", "image with select"
 #: And on an ESP8266: the official image with a ROM file system, from which code runs in place, or the plain one.
 ROM, PLAIN = "image with ROMFS", "plain image"
-_UNUSED = {STOCK: ("usb",), FULL: ("console", "uart")}  # modules that are never loaded there
+#: The same, at the level at which senders have names.
+NAMED = "image with ROMFS, named"
+#: Modules that are never loaded there.
+_UNUSED = {STOCK: ("usb",), FULL: ("console", "uart"), ROM: ("names",), PLAIN: ("names",), "": ("names",)}
 _SCRIPTS = ("board", "net", "workload_serial", "workload_described", "workload_network", "heap")
 _DESCRIBED = ("goob_imu", "outlets")  # by pebble_serial_v1
 _HEAP = 64 * 1024  # to start with: the smaller, the quicker it is searched for garbage
@@ -39,6 +42,11 @@ class Case:
         return f"{self.robot}, {self.image}" if self.image else self.robot
 
     @property
+    def in_place(self) -> bool:
+        """Whether its code runs from flash."""
+        return self.image in (ROM, NAMED)
+
+    @property
     def firmware(self) -> Firmware:
         return FIRMWARE[self.robot]
 
@@ -48,6 +56,7 @@ SMALL, MIDDLE = 12 * 1024, 24 * 1024
 LIMITS: dict[Case, int | None] = {
     Case("minilamp"): None,  # its board has hundreds of kilobytes
     Case("benjr", ROM): MIDDLE,
+    Case("benjr", NAMED): MIDDLE,
     Case("benjr", PLAIN): None,
     **{Case(robot, image): SMALL for robot in ("goob", "fred", *_DESCRIBED) for image in (STOCK, FULL)},
 }
@@ -73,7 +82,7 @@ class Cost:
 def measure(case: Case, folder: Path, *, heap: int = _HEAP, capped: bool = False) -> Cost:
     """Run the robot for a minute. AssertionError if it fails."""
     folder = folder / re.sub(r"\W+", "-", str(case))
-    root, code = folder / "root", folder / ("rom" if case.image == ROM else "root")
+    root, code = folder / "root", folder / ("rom" if case.in_place else "root")
     files = modules(case.firmware)
     if not folder.exists():
         _fill(root, code, case, files)
@@ -81,9 +90,9 @@ def measure(case: Case, folder: Path, *, heap: int = _HEAP, capped: bool = False
     assert done.returncode == 0, done.stdout + done.stderr
     figures = json.loads(done.stdout.splitlines()[-1])
     loaded = [(code / file).with_suffix(".mpy") for file in _loaded(case, files)]
-    names = cost(loaded, case.firmware.board.port, in_place=case.image == ROM)
+    names = cost(loaded, case.firmware.board.port, in_place=case.in_place)
     for figure in ("imported", "built", "starting", "live", "peak"):
-        figures[figure] += names - _names_here(done.stdout, in_place=case.image == ROM)
+        figures[figure] += names - _names_here(done.stdout, in_place=case.in_place)
     size = sum((code / file).with_suffix(".mpy").stat().st_size for file in files)
     return Cost(files=size + main_file(case.firmware).stat().st_size, names=names, **figures)
 
@@ -131,6 +140,8 @@ def _fill(root: Path, code: Path, case: Case, files: list[Path]) -> None:
         else "workload_network"
     )
     settings = {} if case.firmware.is_report else {**_SETTINGS, "robot": {"id": case.robot}}
+    if case.image == NAMED:
+        settings["security"] = {"level": "named", "strangers": "free"}
     names = [".".join(file.with_suffix("").parts) for file in _loaded(case, files)]
     names.sort(key=lambda name: name == f"{case.robot}.robot")  # last: it needs all others
     case_json = {
@@ -139,5 +150,6 @@ def _fill(root: Path, code: Path, case: Case, files: list[Path]) -> None:
         "workload": workload,
         "stock": case.image == STOCK,
         "settings": settings,
+        "by": "by/page-1/" if case.image == NAMED else "",
     }
     (root / "case.json").write_text(json.dumps(case_json))

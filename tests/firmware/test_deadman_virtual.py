@@ -121,7 +121,7 @@ MUTATIONS = {
         "common/mqtt.py", 'self.by = "ann"', "self.by = bytes(data[at:first]).decode()", ("control",), named=True
     ),
     "without a name one is whoever has control": Mutation(
-        _ROBOT, 'by or (stops.lease.holder or [""])[0]', 'by or ("-" if stops.named else "")', ("control",), named=True
+        _ROBOT, 'by or (stops.lease.holder or [""])[0]', 'by or ("-" if stops.names else "")', ("control",), named=True
     ),
     "more writes than lwIP takes": Mutation(
         _SESSION, "_IN_FLIGHT = const(70)", "_IN_FLIGHT = const(7)", ("hole", "hole"), kind="benjr"

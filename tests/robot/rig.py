@@ -174,7 +174,7 @@ class Rig:
             text = log.read()
         return any(line in text for line in _LISTENS)
 
-    def wait_until_up(self, since: float, timeout: float = 15.0) -> None:
+    def wait_until_up(self, since: float, timeout: float = 60.0) -> None:
         """Every service is ready, and heartbeats arrive."""
         assert until(lambda: self._up(since), timeout), (
             f"the robot is not up: {self._newest()}\n{self.log.read_text()[-4000:]}"

@@ -2,7 +2,8 @@
 
 import random
 
-from common.mqtt import Client, login, subscription
+from common import names
+from common.mqtt import Client, login
 
 ROOT = b"pebble/robots/r/incoming/"
 TOPICS = (b"estop", b"drive-values")
@@ -11,7 +12,14 @@ CONTROL = (b"estop", b"drive-values", b"control", b"control/take")
 
 
 def client_of(incoming: int, outgoing: int) -> Client:
-    return Client(incoming, outgoing, ROOT, TOPICS, 2)
+    return Client(incoming, outgoing, ROOT, TOPICS, 2, None)
+
+
+def subscribed() -> Client:
+    client = client_of(160, 200)
+    client.subscribe(2)
+    client.sent(client.waiting)
+    return client
 
 
 def publication(payload: bytes, topic: bytes = TOPIC, first: int = 0x32) -> bytes:
@@ -85,12 +93,15 @@ def test_a_password_alone_comes_with_a_user_without_a_name() -> None:
 
 
 def test_subscribe_and_ping() -> None:
-    client = client_of(100, 200)
-    client.send(*subscription(b"a/", (b"b", b"cd"), 2))
+    client = Client(100, 200, b"a/", (b"estop", b"cd"), 2, None)
+    client.subscribe(2)
     client.send(0xC0)
-    assert sent(client) == b"\x82\x0f\0\1\0\3a/b\1\0\4a/cd\1" + b"\xc0\0"
-    client.send(*subscription(b"a/", (b"b", b"c"), 1))
-    assert sent(client) == b"\x82\x1e\0\1\0\3a/b\1\0\x08a/by/+/b\1\0\x08a/by/+/c\1"
+    assert sent(client) == b"\x82\x13\0\1\0\7a/estop\1\0\4a/cd\0" + b"\xc0\0"
+    client = Client(100, 200, b"a/", (b"b", b"c"), 1, names)
+    client.subscribe(2)
+    assert sent(client) == b"\x82\x1e\0\1\0\3a/b\0\0\x08a/by/+/b\0\0\x08a/by/+/c\0"
+    client.subscribe(1)
+    assert sent(client) == b"\x82\x13\0\1\0\3a/b\0\0\x08a/by/+/b\0"
 
 
 def test_publish_short_and_long() -> None:
@@ -102,7 +113,7 @@ def test_publish_short_and_long() -> None:
 
 
 def test_what_the_broker_answers() -> None:
-    assert receive(client_of(100, 50), b"\x20\2\0\0\x90\4\0\1\1\1\xd0\0") == ["welcome", "subscribed", "pong"]
+    assert receive(subscribed(), b"\x20\2\0\0\x90\4\0\1\1\1\xd0\0") == ["welcome", "subscribed", "pong"]
     assert receive(client_of(100, 50), b"\x20\2\1\0") == ["welcome"]  # it need not say that there is no session
 
 
@@ -113,7 +124,7 @@ def test_refusals() -> None:
 
 
 def test_each_topic_is_granted_or_refused_by_itself() -> None:
-    client = client_of(100, 50)
+    client = subscribed()
     assert receive(client, b"\x90\4\0\1\x80\1") == ["subscribed"]
     assert bytes(client.data[client.first : client.last]) == b"\x80\1"
 
@@ -158,12 +169,12 @@ def test_the_account_in_a_topic_is_known() -> None:
         (b"by", -1, ""),
         (b"", -1, ""),
     ):
-        client = Client(200, 50, ROOT, CONTROL, 2)
+        client = Client(200, 50, ROOT, CONTROL, 2, names)
         assert receive(client, publication(b"/estop", ROOT + rest)) == [(b"/estop", 0)]
         assert (client.topic, client.by) == (topic, by), rest
         assert receive(client, publication(b"", b"pebble/robots/s/incoming/" + rest)) == [(b"", 0)]
         assert (client.topic, client.by) == (-1, "")
-    client = Client(200, 50, ROOT, CONTROL, 4)  # names are not checked
+    client = Client(200, 50, ROOT, CONTROL, 4, None)  # names are not checked
     assert receive(client, publication(b"x", ROOT + b"by/otto/estop")) == [(b"x", 0)]
     assert (client.topic, client.by) == (-1, "")
 
@@ -180,7 +191,7 @@ def test_in_pieces_of_any_size() -> None:
         b"\x20\2\0\0" + publication(b"x" * 100) + b"\xd0\0" + publication(b"") + b"\x90\4\0\1\1\1" + publication(b"z")
     )
     for step in range(1, 40):
-        seen = receive(client_of(160, 50), data, step)
+        seen = receive(subscribed(), data, step)
         assert seen == ["welcome", (b"x" * 100, 0), "pong", (b"", 0), "subscribed", (b"z", 0)], step
 
 

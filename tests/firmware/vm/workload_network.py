@@ -7,7 +7,7 @@ import net
 
 _MINUTE_MS = 60_000
 _COMMAND_MS = 50
-_TOPIC = b"pebble/robots/%s/incoming/%s"
+_TOPIC = b"pebble/robots/%s/incoming/%s%s"
 _BAD = (
     b'{"x": NaN, "z": 1}',
     b"{" * 1000,
@@ -20,10 +20,10 @@ _BAD = (
 
 class Workload:
     def __init__(self, case):
-        robot = case["robot"].encode()
-        topic = _TOPIC % (robot, b"drive-values")
-        self._estop = _TOPIC % (robot, b"estop")
-        self._reset = _TOPIC % (robot, b"estop-reset")
+        robot, by = case["robot"].encode(), case["by"].encode()
+        topic = _TOPIC % (robot, by, b"drive-values")
+        self._estop = _TOPIC % (robot, by, b"estop")
+        self._reset = _TOPIC % (robot, by, b"estop-reset")
         self._stops = self._resets = 0
         self._signed = net.publish(
             topic, b'{"x":-0.250,"z":0.625,"y":0.000,"source":"autonomy","run":1000000,"valid_ms":400}', 2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import tempfile
 import threading
 import time
 from pathlib import Path
@@ -110,6 +111,7 @@ class MemoryRig:
         self.robot_side: MemoryTransport
         self._running: list[Running] = []
         monkeypatch.setattr(bridge_module, "remote_transport", self._remote_transport)
+        monkeypatch.setenv("XDG_STATE_HOME", tempfile.mkdtemp(dir=os.environ["XDG_STATE_HOME"]))  # an audit of its own
 
     def bridge(self, **section: Any) -> MqttBridge:
         """Start a bridge, and wait until it forwards."""
