@@ -139,7 +139,7 @@ def test_motors_obey_the_newest_fresh_command_and_stop_without_one(kind: str) ->
     )  # and often stopped by the dead-man's switch only
     assert sum(drill.robot.refused for drill in drills) > MIXED
     assert sum(drill.robot.stops.latch.count for drill in drills) > MIXED // 10
-    assert sum(drill.robot.stops.arbiter.barred > 0 for drill in drills) > MIXED // 20
+    assert sum(drill.robot.stops.arbiter.barred > 0 for drill in drills) >= MIXED // 20
 
 
 @pytest.mark.parametrize("fault", FAULTS)
