@@ -88,15 +88,15 @@ def halt(payload, account):
     """Whatever arrives here is a stop; what has a name counts once."""
     global count, refused
     try:
-        told = json.loads(payload)
-        told = told if isinstance(told, dict) else {}
+        claims = json.loads(payload)
+        claims = claims if isinstance(claims, dict) else {}
     except (ValueError, RecursionError):
-        told = {}
-    name = told.get("stop") if re.fullmatch("[0-9a-f]{16}", str(told.get("stop"))) else secrets.token_hex(8)
+        claims = {}
+    name = claims.get("stop") if re.fullmatch("[0-9a-f]{16}", str(claims.get("stop"))) else secrets.token_hex(8)
     turn(0.0, 0.0, 0.0)
     if name not in stop["recent"]:
         count, refused = count + 1, None
-        by, why = (ascii(str(told.get(key, "")))[1:-1] for key in ("by", "why"))
+        by, why = (ascii(str(claims.get(key, "")))[1:-1] for key in ("by", "why"))
         stop.update(
             latched=True, recent=[name, *stop["recent"]][:8], by=(account or by)[:32], why=why[:40], since=epoch_ms()
         )

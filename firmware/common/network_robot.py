@@ -50,7 +50,7 @@ class NetworkRobot:
         self._clock = Clock(settings.get("ntp", "pool.ntp.org"), now)
         names = None
         if ("open", "login", "named").index(get(settings, "security", "level", "open")) == 2:
-            from common import names
+            from common import names  # type: ignore[assignment]
         words = "drive", "free", "refuse"
         strangers = words.index(get(settings, "security", "strangers", words[2 if names else 0]))
         topics = b"estop", b"drive-values", b"control", b"control/take", b"estop-reset"

@@ -12,9 +12,9 @@ import pytest
 
 from pebble.client.connection import Target
 from pebble.conform.checks import CHECKS, Check, run
+from pebble.conform.component import Component, reached
 from pebble.conform.motion import MOVING
 from pebble.conform.power import CUT
-from pebble.conform.witness import Witness, witnessed
 from pebble.selftest import State
 from tests.support import ROOT, Broker
 
@@ -32,7 +32,7 @@ VIOLATIONS: dict[str, tuple[str, str]] = {
     "numbers": ('{"wheels": wheels}', '{"wheels": wheels, "amperes": math.nan}'),
     "sizes": ('"why": stop.get("why", "")', '"why": 400 * "x"'),
     "retained": ("qos=0, retain=True", "qos=0, retain=False"),
-    "kept commands": ("publish_control()\n\n\nclient", 'client.publish(IN + "control", "{}", 1, True)\n\n\nclient'),
+    "parked commands": ("publish_control()\n\n\nclient", 'client.publish(IN + "control", "{}", 1, True)\n\n\nclient'),
     "capabilities": ('"available": True', '"available": "yes"'),
     "own topics": ('"topic": IN + "drive-values"', '"topic": "pebble/robots/other/incoming/drive-values"'),
     "identity": ('BASE.split("/")', '("pebble", "robots", "other")'),
@@ -40,7 +40,7 @@ VIOLATIONS: dict[str, tuple[str, str]] = {
     "stop states": ('publish(f"estop/{OWNER}"', 'publish("estop/others"'),
     "stop": ("latched=True", "latched=False"),
     "stop once": ('if name not in stop["recent"]:', "if True:"),
-    "stop unread": ("        told = {}\n", "        return\n"),
+    "stop unread": ("        claims = {}\n", "        return\n"),
     "stop holds": (
         "        return turn(0.0, 0.0, 0.0)\n",
         '        stop["latched"] = False\n        return publish_stop()\n',
@@ -103,26 +103,26 @@ def broker(tmp_path: Path) -> Iterator[Broker]:
 
 
 @contextmanager
-def robot(broker: Broker, folder: Path, source: str) -> Iterator[Witness]:
+def robot(broker: Broker, folder: Path, source: str) -> Iterator[Component]:
     machine = Machine(broker, folder, source)
     machine.on()
     try:
-        with witnessed(Target(url=f"mqtt://127.0.0.1:{broker.port}", robot="mine"), LOOKS_S) as witness:
-            witness.wait(lambda: witness.view.capabilities, 10)
-            witness.look(LOOKS_S)
-            witness.ask, witness.person_s = machine.ask, 15.0
-            yield witness
+        with reached(Target(url=f"mqtt://127.0.0.1:{broker.port}", robot="mine"), LOOKS_S) as component:
+            component.wait(lambda: component.view.capabilities, 10)
+            component.look(LOOKS_S)
+            component.ask, component.person_s = machine.ask, 15.0
+            yield component
     finally:
         machine.off()
 
 
-def judged(witness: Witness, *checks: Check) -> dict[str, tuple[State, str]]:
-    return {check.name: (outcome.state, outcome.text) for check, outcome in run(witness, checks)}
+def judged(component: Component, *checks: Check) -> dict[str, tuple[State, str]]:
+    return {check.name: (outcome.state, outcome.text) for check, outcome in run(component, checks)}
 
 
 def test_the_smallest_honest_robot_passes(broker: Broker, tmp_path: Path) -> None:
-    with robot(broker, tmp_path, SOURCE) as witness:
-        found = judged(witness, *ALL.values())
+    with robot(broker, tmp_path, SOURCE) as component:
+        found = judged(component, *ALL.values())
     assert {name: one for name, one in found.items() if one[0] is not State.OK} == {}
     assert len(found) >= 20
 
@@ -132,5 +132,5 @@ def test_a_violation_is_found(broker: Broker, tmp_path: Path, name: str) -> None
     old, new = VIOLATIONS[name]
     assert old in SOURCE
     needs = [ALL["will"]] if name == "retained commands" else []
-    with robot(broker, tmp_path, SOURCE.replace(old, new)) as witness:
-        assert judged(witness, *needs, ALL[name])[name][0] is State.FAILED
+    with robot(broker, tmp_path, SOURCE.replace(old, new)) as component:
+        assert judged(component, *needs, ALL[name])[name][0] is State.FAILED

@@ -15,7 +15,7 @@ _NETWORK: Final = ("wifi", "broker", "hole", "dns", "ntp", "frozen", "mute")
 _COMMANDS: Final = ("quiet", "flood", "retained", "stale", "limits", "script", "stops", "control")
 FAULTS: Final = (*_NETWORK, *_COMMANDS, "i2c", "power", "disk")
 ACT_S: Final = 8.0  # so long an operator drives and things go wrong
-#: Then a connection is not about to be given up, and all is subscribed to: after a flood a board first hears stops only.
+#: Then a connection is not about to be given up, and a board hears all again: after a flood at first only stops.
 STABLE_S: Final = 4.5
 BACK_S: Final = 30.0  # the longest waits are a back-off of 10 s, and 15 s until the Wi-Fi is rejoined
 
