@@ -106,7 +106,7 @@ def _files(places: Places, config: Config) -> Iterator[Path]:
         yield from _below(folder, without)
     named = [places.broker, people_of(config), *_of_config(config)]
     if places.broker.is_file():
-        named += map(Path, _BROKER_FILES.findall(places.broker.read_text(errors="replace")))
+        named += map(Path, _BROKER_FILES.findall(places.broker.read_text(encoding="utf-8", errors="replace")))
     for path in named:
         file = _here(places, path)
         if (file.parent / FLEET).is_file():  # the accounts of a broker are one folder, with the authority's key
@@ -187,7 +187,7 @@ def packed(backup: Backup) -> bytes:
     """The tar file."""
     output = io.BytesIO()
     about = Saved(msgspec.json.format(msgspec.json.encode(backup.about)) + b"\n", 0o600)
-    with tarfile.open(fileobj=output, mode="w", format=tarfile.PAX_FORMAT) as tar:
+    with tarfile.open(None, "w", output, format=tarfile.PAX_FORMAT) as tar:
         for name, one in {ABOUT: about, **dict(sorted(backup.files.items()))}.items():
             member = tarfile.TarInfo(name)
             member.size, member.mode, member.mtime = len(one.content), one.mode, int(time.time())

@@ -160,7 +160,7 @@ def _units(here: Here) -> str:
     inside += sorted((here.places.root / "etc/polkit-1/rules.d").glob("*pebble*"))
     if not inside:
         raise MissingError("no unit of Pebble is installed")
-    return "\n".join(f"# {file}\n{file.read_text(errors='replace')}" for file in inside)
+    return "\n".join(f"# {file}\n{file.read_text(encoding='utf-8', errors='replace')}" for file in inside)
 
 
 def _slots(here: Here) -> str:
@@ -181,14 +181,14 @@ def _described(path: Path) -> str:
     if path.is_symlink():
         return f"{path} -> {path.readlink()}"
     if path.is_file():
-        return f"{path}: {path.read_text(errors='replace').strip()[:1000]}"
+        return f"{path}: {path.read_text(encoding='utf-8', errors='replace').strip()[:1000]}"
     return f"{path}{'/' if path.is_dir() else ' is missing'}"
 
 
 def _versions(here: Here) -> str:
     lines = [f"pebble {__version__}", f"python {sys.version}", f"{sys.executable}", " ".join(platform.uname())]
     release = here.places.root / "etc/os-release"
-    lines += release.read_text(errors="replace").splitlines() if release.is_file() else []
+    lines += release.read_text(encoding="utf-8", errors="replace").splitlines() if release.is_file() else []
     installed = {one.name: one.version for one in metadata.distributions()}
     return "\n".join([*lines, *(f"{name} {version}" for name, version in sorted(installed.items()))]) + "\n"
 

@@ -221,7 +221,7 @@ def _mosquitto(places: Places) -> str:
 def _runs(program: str) -> bool:
     for path in Path("/proc").glob("[0-9]*/comm"):
         try:
-            if path.read_text().strip() == program:
+            if path.read_text(encoding="utf-8").strip() == program:
                 return True
         except OSError:
             continue

@@ -277,7 +277,7 @@ def _own_broker(plan: Plan) -> Iterator[Step]:
 
     def passwords() -> dict[str, str]:
         files = {plan.answers.account: plan.broker_password, own_broker.PAGE: plan.page_password}
-        return {name: file.read_text().strip() for name, file in files.items() if file.exists()}
+        return {name: file.read_text(encoding="utf-8").strip() for name, file in files.items() if file.exists()}
 
     earlier = set() if _waiting_config(plan) else {account_of(robot) for robot in plan.manifest.leaving}
     yield Step(
@@ -345,7 +345,7 @@ def _refusal(plan: Plan) -> str:
     host, port = plan.answers.remote or ("", 0)
     password = plan.secrets.broker_password
     if password is None and os.access(plan.broker_password, os.R_OK):
-        password = plan.broker_password.read_text().strip()
+        password = plan.broker_password.read_text(encoding="utf-8").strip()
     given = None if plan.answers.broker_ca is None else Path(plan.answers.broker_ca)
     ca = given if given is None or given.is_file() else plan.ca
     user = plan.answers.account if plan.has_login else None
