@@ -39,13 +39,14 @@ def selftest(
         pebble selftest goob.json --may-move
     """
     from pebble.selftest.checks import CHECKS, MOVING, run  # of Linux only
-    from pebble.selftest.robot import reached
+    from pebble.selftest.robot import become_user_of, reached
 
     loaded = load(config)
     found: list[dict[str, str]] = []
     if may_move and not _clear(loaded.robot.name or loaded.robot.id):
         typer.echo("nothing was tested", err=True)
         return 1
+    become_user_of(loaded.run_dir())
     with interrupted_by_signals(), reached(loaded, Places(root.absolute()), me()) as robot:
         for check, outcome in run(robot, (*CHECKS, *(MOVING if may_move else ()))):
             found.append(row(check.name, outcome, str(config)))

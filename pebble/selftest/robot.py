@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import os
+import pwd
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple
 
 from pebble import contract as c
@@ -173,6 +176,21 @@ class RobotUnderTest:
 
 def _ignore(_side: Side, _message: Message, _at: float) -> None:
     """Nothing else follows from what arrives."""
+
+
+def user_of(folder: Path) -> pwd.struct_passwd | None:
+    """As whom root reaches a robot whose folder this is: its own files must not be there. None: as itself."""
+    owner = folder.stat().st_uid if folder.is_dir() else 0
+    return pwd.getpwuid(owner) if owner and os.geteuid() == 0 else None
+
+
+def become_user_of(folder: Path) -> None:
+    """Go on as :func:`user_of`."""
+    user = user_of(folder)
+    if user is not None:
+        os.initgroups(user.pw_name, user.pw_gid)
+        os.setgid(user.pw_gid)
+        os.setuid(user.pw_uid)
 
 
 @contextmanager
