@@ -35,14 +35,15 @@ def retained_commands(witness: Witness) -> Outcome:
     commands = {c.DRIVE: b'{"x": 0, "z": 0.2}', c.ESTOP: b'{"stop": "00000000000000ff", "by": "conform"}'}
     for channel, payload in commands.items():
         witness.retain(channel, payload)
+    since = witness.look(0.0)
     try:
         if why := _back(witness):
             return failed(why, "connect again by itself after a start")
-        began = witness.look(_LOOKS_S)
+        witness.look(_LOOKS_S)
         if witness.view.latched:
             return failed("it stops by a retained stop", "ignore messages with the retain flag on incoming/estop")
-        until = moves_until(witness, began - _LOOKS_S)
-        if until is not None and until > began - _LOOKS_S:
+        until = moves_until(witness, since)
+        if until is not None and until > since:
             return failed("it drives by a retained command", "ignore messages with the retain flag on incoming/")
     finally:
         for channel in commands:
