@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -20,9 +22,12 @@ from pebble.fleet.roles import Account
 from pebble.selftest import State
 from tests.fleet.brokers import HOST, FleetBroker
 from tests.fleet.conftest import cheap_hashes as cheap_hashes
-from tests.support import ROOT, Broker, Child
+from tests.support import ROOT, Broker, Child, further
 
 pytestmark = pytest.mark.alone  # deadlines of wheels are checked
+
+Command = list[str | Path]
+Language = Callable[[Path], Command]  # makes its robot in a folder, and returns how it is started
 
 ROBOTS = ROOT / "examples" / "your-robot"
 SOURCE = (ROBOTS / "robot.py").read_text()
@@ -119,13 +124,13 @@ def switched_on(command: Sequence[str | Path], target: Target) -> Iterator[Witne
         machine.off()
 
 
-def at_open(broker: Broker, folder: Path) -> tuple[list[str | Path], Target]:
+def at_open(broker: Broker, folder: Path) -> tuple[Command, Target]:
     """What a robot's program is started with, and how others reach it."""
     target = Target(url=f"mqtt://127.0.0.1:{broker.port}", robot="mine")
     return ["mine", "127.0.0.1", str(broker.port), folder / "stop.json"], target
 
 
-def at_named(broker: FleetBroker, folder: Path) -> tuple[list[str | Path], Target]:
+def at_named(broker: FleetBroker, folder: Path) -> tuple[Command, Target]:
     for name in ("mine", "ann"):
         (folder / name).write_text(broker.passwords[name])
         (folder / name).chmod(0o600)
@@ -142,23 +147,62 @@ def lacking(found: dict[str, tuple[State, str]]) -> dict[str, tuple[State, str]]
     return {name: one for name, one in found.items() if one[0] is not State.OK}
 
 
-def test_the_smallest_honest_robot_passes(broker: Broker, tmp_path: Path) -> None:
+def in_python(_folder: Path) -> Command:
+    return [sys.executable, ROBOTS / "robot.py"]
+
+
+def in_javascript(folder: Path) -> Command:
+    """npm's bundle is for browsers: it takes the place of the package, which has twenty others below it."""
+    bundle = ROOT / ".venv" / "mqtt" / "dist" / "mqtt.esm.js"
+    if shutil.which("node") is None or not bundle.exists():
+        missing("needs Node.js (apt install nodejs) and MQTT.js (python tools/fetch_npm.py .venv mqtt)")
+    package = folder / "node_modules" / "mqtt"
+    package.mkdir(parents=True)
+    (package / "package.json").write_text('{"exports": "./index.mjs"}')
+    (package / "index.mjs").write_text(
+        f'globalThis.navigator ??= {{}};\nexport default (await import("{bundle}")).default;\n'
+    )
+    return ["node", shutil.copy(ROBOTS / "robot.mjs", folder)]
+
+
+def in_c(folder: Path) -> Command:
+    headers = (Path("/usr/include/mosquitto.h"), Path("/usr/include/cjson/cJSON.h"))
+    if shutil.which("gcc") is None or not all(one.exists() for one in headers):
+        missing("needs a compiler and libraries (apt install gcc libc6-dev libmosquitto-dev libcjson-dev)")
+    warnings = ("-Wall", "-Wextra", "-Werror", "-O2")
+    libraries = ("-lmosquitto", "-lcjson", "-lm")
+    subprocess.run(["gcc", *warnings, "-o", folder / "robot", ROBOTS / "robot.c", *libraries], check=True)
+    return [folder / "robot"]
+
+
+def missing(what: str) -> None:
+    (pytest.fail if os.environ.get("CI") == "true" else pytest.skip)(what)
+
+
+LANGUAGES = (in_python, in_javascript, in_c)
+
+
+@pytest.mark.parametrize("language", LANGUAGES)
+def test_the_smallest_honest_robot_passes(broker: Broker, tmp_path: Path, language: Language) -> None:
+    program = language(tmp_path)
     arguments, target = at_open(broker, tmp_path)
-    with switched_on([sys.executable, ROBOTS / "robot.py", *arguments], target) as witness:
+    with switched_on([*program, *arguments], target) as witness:
         found = judged(witness, *ALL.values())
     assert lacking(found) == {}
     assert len(found) >= 20
 
 
 @pytest.mark.usefixtures("cheap_hashes")
-def test_it_passes_where_names_are_checked(tmp_path: Path) -> None:
+@pytest.mark.parametrize("language", [LANGUAGES[0], *map(further, LANGUAGES[1:])])
+def test_it_passes_where_names_are_checked(tmp_path: Path, language: Language) -> None:
+    program = language(tmp_path)
     people = {
         "mine": Account(roles=("robot",), bases=("pebble/robots/mine",)),
         "ann": Account(roles=("driver", "safety")),
     }
     with FleetBroker(tmp_path / "hall", people, level="named") as broker:
         arguments, target = at_named(broker, tmp_path)
-        with switched_on([sys.executable, ROBOTS / "robot.py", *arguments], target) as witness:
+        with switched_on([*program, *arguments], target) as witness:
             found = judged(witness, *ALL.values())
     assert lacking(found) == {}
 
