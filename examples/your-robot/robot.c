@@ -150,13 +150,13 @@ static void receive(struct mosquitto *, void *, const struct mosquitto_message *
     }
     cJSON_Delete(whole);
 }
-static void connected(struct mosquitto *mosq, void *data, int code) {
+static void connected(struct mosquitto *, void *, int code) {
     static const char *metrics[] = {"estop", "estop-reset", "drive-values", "control", "control/take"};
     char topic[128];
     online = code == 0;
     for (int i = 0; online && i < 5 * (named + 1); i++) {
         snprintf(topic, sizeof topic, "%s/incoming/%s%s", base, i < 5 ? "" : "by/+/", metrics[i % 5]);
-        mosquitto_subscribe(mosq, data, topic, 1);
+        mosquitto_subscribe(client, NULL, topic, 1);
     }
     publish("capabilities", 1, "{\"t\": %.0f, \"schema\": \"pebble-capabilities/v1\", \"value\": {\"named\": %s, "
             "\"identity\": {\"system\": \"pebble\", \"type\": \"robots\", \"id\": \"%s\"}, \"drive\": {\"available\": true, "
