@@ -38,26 +38,26 @@ def conform(
         pebble conform rover --url mqtt://broker.example --may-move --cut
     """
     from pebble.conform.checks import CHECKS, run
+    from pebble.conform.component import reached
     from pebble.conform.motion import MOVING
     from pebble.conform.power import CUT
-    from pebble.conform.witness import witnessed
 
     options = target_of(robot, target)
     found: list[dict[str, str]] = []
     if may_move and not _clear(robot):
         typer.echo("nothing was tested", err=True)
         return 1
-    with interrupted_by_signals(), witnessed(options, _LOOKS_S) as witness:
-        if not witness.records:
-            raise PebbleError(f"nothing came from {witness.base} within {_LOOKS_S:g} s: is it on, at this broker?")
-        for check, outcome in run(witness, (*CHECKS, *(MOVING if may_move else ()), *(CUT if cut else ()))):
+    with interrupted_by_signals(), reached(options, _LOOKS_S) as component:
+        if not component.records:
+            raise PebbleError(f"nothing came from {component.base} within {_LOOKS_S:g} s: is it on, at this broker?")
+        for check, outcome in run(component, (*CHECKS, *(MOVING if may_move else ()), *(CUT if cut else ()))):
             found.append({**row(check.name, outcome), "why": check.why})
             if not as_json:
                 printed(found[-1])
     states = [one["state"] for one in found]
     failures = states.count(State.FAILED)
     if as_json:
-        typer.echo(json.dumps({"ok": not failures, "robot": witness.base, "checks": found}, ensure_ascii=False))
+        typer.echo(json.dumps({"ok": not failures, "robot": component.base, "checks": found}, ensure_ascii=False))
     else:
         typer.echo(f"checks: {len(found)}, failures: {failures}, skipped: {states.count(State.SKIPPED)}")
     return 1 if failures else 0

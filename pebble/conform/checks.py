@@ -13,7 +13,7 @@ import msgspec
 
 from pebble import contract as c
 from pebble.client.robot_topics import section_of
-from pebble.conform.witness import Record, Witness
+from pebble.conform.component import Component, Record
 from pebble.contract.capabilities import CapabilitiesValue
 from pebble.contract.identity import parse_topic
 from pebble.contract.levels import silent_after
@@ -39,28 +39,28 @@ class Check:
 
     name: str
     why: str
-    run: Callable[[Witness], Outcome]
-    needs: tuple[Callable[[Witness], str], ...] = ()
+    run: Callable[[Component], Outcome]
+    needs: tuple[Callable[[Component], str], ...] = ()
 
 
 # -- what a check needs: empty, or why it is lacking
 
 
-def drives(witness: Witness) -> str:
-    return "" if witness.view.drives else "its capabilities offer no driving"
+def drives(component: Component) -> str:
+    return "" if component.view.drives else "its capabilities offer no driving"
 
 
-def stops(witness: Witness) -> str:
-    return "" if witness.view.estop.available else "its capabilities offer no emergency stop"
+def stops(component: Component) -> str:
+    return "" if component.view.estop.available else "its capabilities offer no emergency stop"
 
 
-def controls(witness: Witness) -> str:
-    return "" if witness.view.controlled else "its capabilities offer no control"
+def controls(component: Component) -> str:
+    return "" if component.view.controlled else "its capabilities offer no control"
 
 
-def free(witness: Witness) -> str:
+def free(component: Component) -> str:
     """A test takes nothing from people and scripts."""
-    view = witness.view
+    view = component.view
     if view.stopped_by is not None:
         return f"it is stopped by {view.stopped_by.by or 'unknown'}: reset it"
     if view.autonomy is not None and view.autonomy.running:
@@ -68,34 +68,34 @@ def free(witness: Witness) -> str:
     return f"{view.control.who} drives it" if view.control.who else ""
 
 
-def commanded(witness: Witness) -> str:
+def commanded(component: Component) -> str:
     """At level named a robot hears only accounts."""
-    named = witness.view.named and not witness.account
+    named = component.view.named and not component.account
     return "it takes commands only with a name: use an account, as in --url mqtts://ANN@BROKER" if named else ""
 
 
 # -- signs of life
 
 
-def heartbeat(witness: Witness) -> Outcome:
-    found = witness.of(c.ONLINE)
+def heartbeat(component: Component) -> Outcome:
+    found = component.of(c.ONLINE)
     if not found:
         return failed("none arrived", 'publish {"t": <epoch ms>} on outgoing/online every 0.25 s to 1 s')
     wrong = [one.wrong for one in found if one.wrong]
     if wrong:
         return failed(wrong[0], 'its payload is {"t": <epoch milliseconds, an integer>}')
     gaps = [after.at - before.at for before, after in pairwise(found)]
-    interval = witness.view.liveness.interval_s
+    interval = component.view.liveness.interval_s
     if len(gaps) < 2 or interval is None:
         return failed(f"{len(found)} in the time of observation", "publish one at least every second")
-    longest = silent_after(interval, witness.view.liveness.link, 0.0)
+    longest = silent_after(interval, component.view.liveness.link, 0.0)
     if max(gaps) > longest:
         return failed(f"a gap of {max(gaps):.1f} s, where {longest:.1f} s counts as silence", "publish them evenly")
     return ok(f"every {interval:.2f} s")
 
 
-def clock(witness: Witness) -> Outcome:
-    newest = witness.of(c.ONLINE)[-1:]
+def clock(component: Component) -> Outcome:
+    newest = component.of(c.ONLINE)[-1:]
     if not newest or newest[0].wrong:
         return skipped("there is no heartbeat")
     off = newest[0].value.t / 1000 - time.time() + (time.monotonic() - newest[0].at)
@@ -109,14 +109,14 @@ def clock(witness: Witness) -> Outcome:
 # -- what it publishes
 
 
-def payloads(witness: Witness) -> Outcome:
-    wrong = {one.metric: one.wrong for one in witness.records if one.wrong}
+def payloads(component: Component) -> Outcome:
+    wrong = {one.metric: one.wrong for one in component.records if one.wrong}
     if wrong:
         return failed(_some(wrong.values()), "docs/topics.md has each payload")
-    return ok(f"{len({one.metric for one in witness.records if one.channel})} kinds of messages")
+    return ok(f"{len({one.metric for one in component.records if one.channel})} kinds of messages")
 
 
-def numbers(witness: Witness) -> Outcome:
+def numbers(component: Component) -> Outcome:
     def strange(record: Record) -> bool:
         try:
             msgspec.json.decode(record.payload)
@@ -124,7 +124,7 @@ def numbers(witness: Witness) -> Outcome:
             return True
         return False
 
-    is_json = [one for one in witness.records if one.channel and one.channel.payload is not bytes and one.payload]
+    is_json = [one for one in component.records if one.channel and one.channel.payload is not bytes and one.payload]
     if found := {one.metric for one in is_json if strange(one)}:
         return failed(
             f"not JSON: {_some(sorted(found))}", "NaN, Infinity and comments are no JSON: leave the field out"
@@ -132,35 +132,35 @@ def numbers(witness: Witness) -> Outcome:
     return ok("all JSON is JSON")
 
 
-def sizes(witness: Witness) -> Outcome:
+def sizes(component: Component) -> Outcome:
     def limit(record: Record) -> int:
         return _LARGEST_STATE if record.channel is c.ESTOP_STATE else _LARGEST
 
     large = {
         f"{one.metric} has {len(one.payload)} bytes, more than {limit(one)}"
-        for one in witness.records
+        for one in component.records
         if (one.channel is None or one.channel.payload is not bytes) and len(one.payload) > limit(one)
     }
     return failed(_some(sorted(large)), "send less: readers drop it") if large else ok("no message is too large")
 
 
-def retained(witness: Witness) -> Outcome:
-    kept = {one.metric for one in witness.kept()}
-    live = {one.metric: one.channel for one in witness.records if one.channel is not None and one.payload}
+def retained(component: Component) -> Outcome:
+    there = {one.metric for one in component.retained()}
+    live = {one.metric: one.channel for one in component.records if one.channel is not None and one.payload}
     must = {metric for metric, channel in live.items() if channel.default_retain and channel not in _REPEATED}
-    lacks = sorted(must - kept)
+    lacks = sorted(must - there)
     if lacks:
         return failed(f"not retained: {_some(lacks)}", "publish it with the retain flag: who connects later lacks it")
-    stale = sorted(metric for metric in kept & set(live) if not live[metric].default_retain)
+    stale = sorted(metric for metric in there & set(live) if not live[metric].default_retain)
     if stale:
         return failed(f"retained: {_some(stale)}", "publish it without the retain flag: it is news only once")
-    return ok(f"{len(kept)} states")
+    return ok(f"{len(there)} states")
 
 
-def commands_kept(witness: Witness) -> Outcome:
-    found = sorted(one.metric for one in witness.kept() if one.channel is not None and one.channel.one_shot)
+def stale_commands(component: Component) -> Outcome:
+    found = sorted(one.metric for one in component.retained() if one.channel is not None and one.channel.one_shot)
     if found:
-        topic = f"{witness.base}/{found[0]}"
+        topic = f"{component.base}/{found[0]}"
         return failed(_some(found), f"remove it: mosquitto_pub -r -n -t '{topic}'; and find who publishes it so")
     return ok("none")
 
@@ -168,30 +168,30 @@ def commands_kept(witness: Witness) -> Outcome:
 # -- what it offers
 
 
-def capabilities(witness: Witness) -> Outcome:
-    found = witness.of(c.CAPABILITIES, retained=True)
+def capabilities(component: Component) -> Outcome:
+    found = component.of(c.CAPABILITIES, retained=True)
     if not found:
         return failed("it publishes none: pages offer nothing of it", "publish outgoing/capabilities, retained")
     try:
         msgspec.convert(found[-1].value.value, CapabilitiesValue)
     except (msgspec.ValidationError, ValueError, AttributeError) as error:
         return failed(str(found[-1].wrong or error), "docs/topics.md, CapabilitiesValue, has each field")
-    return ok(_some(_offers(witness), 20) or "nothing is offered")
+    return ok(_some(_offers(component), 20) or "nothing is offered")
 
 
-def _offers(witness: Witness) -> list[str]:
-    value = witness.view.capabilities
+def _offers(component: Component) -> list[str]:
+    value = component.view.capabilities
     return sorted(name for name in value if section_of(value, name).get("available") is True)
 
 
-def own_topics(witness: Witness) -> Outcome:
+def own_topics(component: Component) -> Outcome:
     foreign = sorted(
         f"{path} is {topic}"
-        for path, topic in _topics(witness.view.capabilities, "")
-        if not topic.startswith(f"{witness.base}/") or parse_topic(topic) is None
+        for path, topic in _topics(component.view.capabilities, "")
+        if not topic.startswith(f"{component.base}/") or parse_topic(topic) is None
     )
     if foreign:
-        return failed(_some(foreign), f"topics in capabilities begin with {witness.base}/: others are not used")
+        return failed(_some(foreign), f"topics in capabilities begin with {component.base}/: others are not used")
     return ok("all are its own")
 
 
@@ -207,77 +207,79 @@ def _topics(value: object, path: str) -> Iterator[tuple[str, str]]:
             yield from _topics(one, where)
 
 
-def identity(witness: Witness) -> Outcome:
-    section = section_of(witness.view.capabilities, "identity")
+def identity(component: Component) -> Outcome:
+    section = section_of(component.view.capabilities, "identity")
     listed = "/".join(str(section.get(level)) for level in ("system", "type", "id"))
     if not section:
         return skipped("it lists no identity")
     return (
-        ok(listed) if listed == witness.base else failed(f"it calls itself {listed}", "identity is that of its topics")
+        ok(listed)
+        if listed == component.base
+        else failed(f"it calls itself {listed}", "identity is that of its topics")
     )
 
 
 # -- what it does with what it cannot read
 
 
-def junk(witness: Witness) -> Outcome:
+def junk(component: Component) -> Outcome:
     began = time.monotonic()
     for channel in (c.DRIVE, c.LIGHTS_SOLID, c.CONTROL, c.ESTOP_RESET, c.AUTONOMY_COMMAND):
         for payload in JUNK:
-            witness.send(channel, payload)
-    interval = witness.view.liveness.interval_s or ANSWER_S
-    if not witness.wait(lambda: len(witness.of(c.ONLINE, began + 2 * interval)) >= 2, 6 * interval + ANSWER_S):
+            component.send(channel, payload)
+    interval = component.view.liveness.interval_s or ANSWER_S
+    if not component.wait(lambda: len(component.of(c.ONLINE, began + 2 * interval)) >= 2, 6 * interval + ANSWER_S):
         return failed("its heartbeats ended", "drop what is no JSON of the contract, and go on")
-    offline = [one for one in witness.of(c.ONLINE, began) if one.value and one.value.online is False]
+    offline = [one for one in component.of(c.ONLINE, began) if one.value and one.value.online is False]
     return failed("it went offline meanwhile", "drop what cannot be read") if offline else ok("it goes on")
 
 
 # -- the emergency stop
 
 
-def _states(witness: Witness) -> dict[str, EstopState]:
-    return witness.view.estop.states
+def _states(component: Component) -> dict[str, EstopState]:
+    return component.view.estop.states
 
 
-def owners(witness: Witness) -> Outcome:
-    lacks = [topic.removeprefix(f"{witness.base}/") for topic in witness.view.estop.missing]
+def owners(component: Component) -> Outcome:
+    lacks = [topic.removeprefix(f"{component.base}/") for topic in component.view.estop.missing]
     if lacks:
         return failed(f"no state of {_some(lacks)}", "publish it, retained, for each owner that capabilities list")
-    return ok(", ".join(sorted(_states(witness))))
+    return ok(", ".join(sorted(_states(component))))
 
 
-def _stop(witness: Witness, name: str) -> bool:
-    witness.send(c.ESTOP, EstopCommand(stop=name, by=_BY, why=_WHY))
-    return witness.wait(lambda: _has(witness, name), ANSWER_S)
+def _stop(component: Component, name: str) -> bool:
+    component.send(c.ESTOP, EstopCommand(stop=name, by=_BY, why=_WHY))
+    return component.wait(lambda: _has(component, name), ANSWER_S)
 
 
-def _has(witness: Witness, name: str) -> bool:
-    states = _states(witness)
+def _has(component: Component, name: str) -> bool:
+    states = _states(component)
     return bool(states) and all(one.latched and name in one.recent for one in states.values())
 
 
-def _reset(witness: Witness, *, boot: str = "", more: int = 0) -> None:
-    for one in _states(witness).values():
-        witness.send(c.ESTOP_RESET, EstopReset(boot=boot or one.boot, count=one.count + more, by=_BY))
+def _reset(component: Component, *, boot: str = "", more: int = 0) -> None:
+    for one in _states(component).values():
+        component.send(c.ESTOP_RESET, EstopReset(boot=boot or one.boot, count=one.count + more, by=_BY))
 
 
-def _freed(witness: Witness) -> bool:
-    _reset(witness)
-    return witness.wait(lambda: not witness.view.latched, ANSWER_S)
+def _freed(component: Component) -> bool:
+    _reset(component)
+    return component.wait(lambda: not component.view.latched, ANSWER_S)
 
 
-def _while_stopped(test: Callable[[Witness, str], Outcome]) -> Callable[[Witness], Outcome]:
+def _while_stopped(test: Callable[[Component, str], Outcome]) -> Callable[[Component], Outcome]:
     """Run a test on the robot while it is stopped by a new stop, and free it afterwards."""
 
-    def run(witness: Witness) -> Outcome:
+    def run(component: Component) -> Outcome:
         name = secrets.token_hex(8)
         try:
-            if not _stop(witness, name):
+            if not _stop(component, name):
                 text = f"no state has its name within {ANSWER_S:g} s"
                 return failed(text, 'latch on incoming/estop, and publish outgoing/estop/{owner} with "recent"')
-            outcome = test(witness, name)
+            outcome = test(component, name)
         finally:
-            is_free = _freed(witness)
+            is_free = _freed(component)
         if not is_free:
             return failed("a reset with its boot and count does not end it", "end it on incoming/estop-reset")
         return outcome
@@ -285,42 +287,44 @@ def _while_stopped(test: Callable[[Witness, str], Outcome]) -> Callable[[Witness
     return run
 
 
-def _confirmed(_witness: Witness, _name: str) -> Outcome:
+def _confirmed(_component: Component, _name: str) -> Outcome:
     return ok("each owner latches, confirms it by name, and is free after a reset")
 
 
-def _repeated(witness: Witness, name: str) -> Outcome:
-    before = {owner: one.count for owner, one in _states(witness).items()}
-    witness.send(c.ESTOP, EstopCommand(stop=name, by=_BY, why=_WHY))
-    witness.look(ANSWER_S / 2)
-    counted = [owner for owner, one in _states(witness).items() if one.count != before.get(owner)]
+def _repeated(component: Component, name: str) -> Outcome:
+    before = {owner: one.count for owner, one in _states(component).items()}
+    component.send(c.ESTOP, EstopCommand(stop=name, by=_BY, why=_WHY))
+    component.look(ANSWER_S / 2)
+    counted = [owner for owner, one in _states(component).items() if one.count != before.get(owner)]
     if counted:
         return failed(f"its repetition counts again ({_some(counted)})", "a name in recent is the same stop")
     return ok("the same stop counts once")
 
 
-def _unreadable(witness: Witness, _name: str) -> Outcome:
-    before = {owner: one.count for owner, one in _states(witness).items()}
-    witness.send(c.ESTOP, b"stop!")
-    if not witness.wait(lambda: all(one.count > before.get(of, 0) for of, one in _states(witness).items()), ANSWER_S):
+def _unreadable(component: Component, _name: str) -> Outcome:
+    before = {owner: one.count for owner, one in _states(component).items()}
+    component.send(c.ESTOP, b"stop!")
+    if not component.wait(
+        lambda: all(one.count > before.get(of, 0) for of, one in _states(component).items()), ANSWER_S
+    ):
         return failed(
             "a stop that is no JSON does nothing", "whatever arrives on incoming/estop is a stop, if not empty"
         )
-    witness.look(ANSWER_S / 2)  # at named it is sent with a name and without, and counts twice
+    component.look(ANSWER_S / 2)  # at named it is sent with a name and without, and counts twice
     return ok("what cannot be read stops, too")
 
 
-def _wrong_reset(witness: Witness, _name: str) -> Outcome:
+def _wrong_reset(component: Component, _name: str) -> Outcome:
     for more, boot, what in ((-1, "", "an older count"), (0, "ffffffff", "another boot")):
-        _reset(witness, boot=boot, more=more)
-        if witness.wait(lambda: not witness.view.latched, ANSWER_S / 2):
+        _reset(component, boot=boot, more=more)
+        if component.wait(lambda: not component.view.latched, ANSWER_S / 2):
             return failed(f"a reset with {what} ends it", "reset only with the boot and count of the state now")
     return ok("it is refused")
 
 
-def _driven(witness: Witness, _name: str) -> Outcome:
-    witness.send(c.DRIVE, b'{"x": 0, "z": 0}')
-    if witness.wait(lambda: not witness.view.latched, ANSWER_S / 2):
+def _driven(component: Component, _name: str) -> Outcome:
+    component.send(c.DRIVE, b'{"x": 0, "z": 0}')
+    if component.wait(lambda: not component.view.latched, ANSWER_S / 2):
         return failed("a drive command ends the stop", "only a reset ends it")
     return ok("a drive command does not end it")
 
@@ -331,16 +335,16 @@ def _driven(witness: Witness, _name: str) -> Outcome:
 class Driver:
     """Requests control as one program of a person."""
 
-    def __init__(self, witness: Witness) -> None:
-        self._witness, self.id = witness, secrets.token_hex(4)
+    def __init__(self, component: Component) -> None:
+        self._component, self.id = component, secrets.token_hex(4)
 
     def asks(self, want: Literal["hold", "release"] = "hold", for_ms: float = 1000) -> None:
-        self._witness.send(c.CONTROL, ControlRequest(id=self.id, want=want, for_ms=for_ms, by=_BY))
+        self._component.send(c.CONTROL, ControlRequest(id=self.id, want=want, for_ms=for_ms, by=_BY))
 
     @property
     def key(self) -> str:
         """That of its control; empty while it has none."""
-        newest = self._witness.of(c.CONTROL_STATE, retained=True)[-1:]
+        newest = self._component.of(c.CONTROL_STATE, retained=True)[-1:]
         return str(newest[0].value.key) if newest and newest[0].value and newest[0].value.id == self.id else ""
 
     @property
@@ -348,25 +352,25 @@ class Driver:
         return self.key != ""
 
 
-def _with_control(test: Callable[[Witness, Driver], Outcome]) -> Callable[[Witness], Outcome]:
-    def run(witness: Witness) -> Outcome:
-        driver = Driver(witness)
+def _with_control(test: Callable[[Component, Driver], Outcome]) -> Callable[[Component], Outcome]:
+    def run(component: Component) -> Outcome:
+        driver = Driver(component)
         driver.asks()
         try:
-            if not witness.wait(lambda: driver.holds, ANSWER_S):
+            if not component.wait(lambda: driver.holds, ANSWER_S):
                 return failed(f"no key within {ANSWER_S:g} s", "answer incoming/control on outgoing/control/{owner}")
-            return test(witness, driver)
+            return test(component, driver)
         finally:
             driver.asks("release")
-            witness.wait(lambda: not driver.holds, ANSWER_S)
+            component.wait(lambda: not driver.holds, ANSWER_S)
 
     return run
 
 
-def _kept_by_first(witness: Witness, driver: Driver) -> Outcome:
-    second = Driver(witness)
+def _first_keeps(component: Component, driver: Driver) -> Outcome:
+    second = Driver(component)
     second.asks()
-    took = witness.wait(lambda: second.holds, ANSWER_S / 2)
+    took = component.wait(lambda: second.holds, ANSWER_S / 2)
     second.asks("release")
     if took:
         return failed("a second request takes it", "while one holds control, others wait: show them in asks")
@@ -374,16 +378,16 @@ def _kept_by_first(witness: Witness, driver: Driver) -> Outcome:
     return ok("the first one keeps it")
 
 
-def _released(witness: Witness, driver: Driver) -> Outcome:
+def _released(component: Component, driver: Driver) -> Outcome:
     driver.asks(for_ms=5000)
     driver.asks("release")
-    if not witness.wait(lambda: not driver.holds, ANSWER_S):
+    if not component.wait(lambda: not driver.holds, ANSWER_S):
         return failed("it is kept after its release", 'end it by {"want": "release"}')
     return ok("it ends by its release")
 
 
-def _ends(witness: Witness, driver: Driver) -> Outcome:
-    if not witness.wait(lambda: not driver.holds, 1.0 + 2 * ANSWER_S):
+def _ends(component: Component, driver: Driver) -> Outcome:
+    if not component.wait(lambda: not driver.holds, 1.0 + 2 * ANSWER_S):
         return failed("it stays with who went away", "end it for_ms after the last request or command")
     return ok("it ends by itself")
 
@@ -405,7 +409,7 @@ CHECKS = (
     Check("numbers", "NaN is no JSON, and no speed", numbers),
     Check("sizes", "boards and pages have little room", sizes),
     Check("retained", "who connects later must know its state, and must not take old news for new", retained),
-    Check("kept commands", "a command that a broker keeps is carried out at every start", commands_kept),
+    Check("parked commands", "a command that a broker keeps is carried out at every start", stale_commands),
     Check("capabilities", "pages offer what they list, and no more", capabilities),
     Check("own topics", "topics of others are not used", own_topics),
     Check("identity", "it is known by its topics", identity),
@@ -416,18 +420,18 @@ CHECKS = (
     Check("stop unread", "a stop must not fail for a comma", _while_stopped(_unreadable), _STOP),
     Check("stop holds", "only a person ends it", _while_stopped(_driven), _STOP),
     Check("reset refused", "a reset must end only the stop that its sender saw", _while_stopped(_wrong_reset), _STOP),
-    Check("control", "one person drives at a time", _with_control(_kept_by_first), _CONTROL),
+    Check("control", "one person drives at a time", _with_control(_first_keeps), _CONTROL),
     Check("control released", "the next one must not wait", _with_control(_released), _CONTROL),
     Check("control ends", "who goes away must not keep it", _with_control(_ends), _CONTROL),
 )
 
 
-def run(witness: Witness, checks: Iterable[Check]) -> Iterator[tuple[Check, Outcome]]:
+def run(component: Component, checks: Iterable[Check]) -> Iterator[tuple[Check, Outcome]]:
     """Make one check after the other."""
     for check in checks:
-        witness.wait(lambda: True, 0.0)
-        why = next((why for need in check.needs if (why := need(witness))), "")
+        component.wait(lambda: True, 0.0)
+        why = next((why for need in check.needs if (why := need(component))), "")
         try:
-            yield check, skipped(why) if why else check.run(witness)
+            yield check, skipped(why) if why else check.run(component)
         except PebbleError as error:  # the connection was lost
             yield check, failed(str(error), "run it again")

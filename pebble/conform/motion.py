@@ -12,7 +12,7 @@ import msgspec
 
 from pebble import contract as c
 from pebble.conform.checks import ANSWER_S, Check, Driver, commanded, drives, free, stops
-from pebble.conform.witness import Witness
+from pebble.conform.component import Component
 from pebble.contract.payloads import EstopCommand, EstopReset
 from pebble.selftest import Outcome, failed, ok, skipped
 
@@ -26,14 +26,14 @@ _UNSEEN = "nothing that it publishes shows whether it moves"
 _SHOW_IT = 'publish {"value": {"wheels": [left, right]}} on outgoing/status whenever they change, or touch-sensors'
 
 
-def moves_until(witness: Witness, since: float) -> float | None:
+def moves_until(component: Component, since: float) -> float | None:
     """When the last motion after ``since`` ended, infinite while it lasts, 0 without any; None: nothing shows it.
 
     Shown by ``wheels`` in the status, which is published on change, or by readings of hall sensors.
     """
-    reports = [(one.at, _wheels(one.value)) for one in witness.of(c.STATUS) if one.value is not None]
+    reports = [(one.at, _wheels(one.value)) for one in component.of(c.STATUS) if one.value is not None]
     turning = [(at, any(wheels)) for at, wheels in reports if wheels is not None]
-    touches = [(one.at, msgspec.structs.astuple(one.value.value)) for one in witness.of(c.TOUCH_SENSORS) if one.value]
+    touches = [(one.at, msgspec.structs.astuple(one.value.value)) for one in component.of(c.TOUCH_SENSORS) if one.value]
     if not turning and not touches:
         return None
     last, level = 0.0, touches[0][1] if touches else ()
@@ -55,39 +55,39 @@ def _wheels(status: Any) -> list[float] | None:
 
 
 @contextmanager
-def _at_the_wheel(witness: Witness) -> Iterator[Callable[..., float]]:
+def _at_the_wheel(component: Component) -> Iterator[Callable[..., float]]:
     """A function that sends one drive command, with the key of control where the robot has one; zero at the end."""
-    driver = Driver(witness)
+    driver = Driver(component)
 
     def send(z: object = SPEED, **fields: object) -> float:
         key = {"key": driver.key} if driver.holds else {}
-        return witness.send(c.DRIVE, msgspec.json.encode({"x": 0, "z": z, **key, **fields}))
+        return component.send(c.DRIVE, msgspec.json.encode({"x": 0, "z": z, **key, **fields}))
 
-    if witness.view.controlled:
+    if component.view.controlled:
         driver.asks(for_ms=10_000)
-        witness.wait(lambda: driver.holds, ANSWER_S)
+        component.wait(lambda: driver.holds, ANSWER_S)
     send(0)  # after a reset a robot waits for one
-    witness.wait(lambda: moves_until(witness, time.monotonic()) != float("inf"), ANSWER_S)
+    component.wait(lambda: moves_until(component, time.monotonic()) != float("inf"), ANSWER_S)
     try:
         yield send
     finally:
         send(0)
         driver.asks("release")
-        witness.wait(lambda: not driver.holds, ANSWER_S)
+        component.wait(lambda: not driver.holds, ANSWER_S)
 
 
-def _drive(witness: Witness, send: Callable[..., float], **fields: object) -> tuple[float, float]:
+def _drive(component: Component, send: Callable[..., float], **fields: object) -> tuple[float, float]:
     """Drive for a moment; when the first and the last command left."""
     began = last = time.monotonic()
     while time.monotonic() < began + DRIVES_S:
         last = send(**fields)
-        witness.look(_STEP_S)
+        component.look(_STEP_S)
     return began, last
 
 
-def _rest(witness: Witness, began: float, last: float, limit_s: float) -> Outcome:
-    witness.look(limit_s + _LATE_S)
-    until = moves_until(witness, began)
+def _rest(component: Component, began: float, last: float, limit_s: float) -> Outcome:
+    component.look(limit_s + _LATE_S)
+    until = moves_until(component, began)
     if until is None:
         return skipped(_UNSEEN, _SHOW_IT)
     if until == 0.0:
@@ -98,42 +98,42 @@ def _rest(witness: Witness, began: float, last: float, limit_s: float) -> Outcom
     return ok(f"it rests {max(0.0, until - last):.2f} s after the last command")
 
 
-def dead_man(witness: Witness) -> Outcome:
-    with _at_the_wheel(witness) as send:
-        return _rest(witness, *_drive(witness, send), RESTS_S)
+def dead_man(component: Component) -> Outcome:
+    with _at_the_wheel(component) as send:
+        return _rest(component, *_drive(component, send), RESTS_S)
 
 
-def valid_ms(witness: Witness) -> Outcome:
-    with _at_the_wheel(witness) as send:
-        return _rest(witness, *_drive(witness, send, valid_ms=150), 0.15)
+def valid_ms(component: Component) -> Outcome:
+    with _at_the_wheel(component) as send:
+        return _rest(component, *_drive(component, send, valid_ms=150), 0.15)
 
 
-def zero(witness: Witness) -> Outcome:
-    with _at_the_wheel(witness) as send:
-        began, _ = _drive(witness, send)
-        return _rest(witness, began, send(0), 0.1)
+def zero(component: Component) -> Outcome:
+    with _at_the_wheel(component) as send:
+        began, _ = _drive(component, send)
+        return _rest(component, began, send(0), 0.1)
 
 
-def stop_moving(witness: Witness) -> Outcome:
+def stop_moving(component: Component) -> Outcome:
     """Commands go on, and move nothing."""
-    with _at_the_wheel(witness) as send:
-        began, _ = _drive(witness, send)
+    with _at_the_wheel(component) as send:
+        began, _ = _drive(component, send)
         name = secrets.token_hex(8)
-        at = witness.send(c.ESTOP, EstopCommand(stop=name, by="conform", why="conformance test"))
-        _drive(witness, send)
-        outcome = _rest(witness, began, at, 0.25)
-    for state in witness.view.estop.states.values():
-        witness.send(c.ESTOP_RESET, EstopReset(boot=state.boot, count=state.count, by="conform"))
-    is_free = witness.wait(lambda: not witness.view.latched, ANSWER_S)
+        at = component.send(c.ESTOP, EstopCommand(stop=name, by="conform", why="conformance test"))
+        _drive(component, send)
+        outcome = _rest(component, began, at, 0.25)
+    for state in component.view.estop.states.values():
+        component.send(c.ESTOP_RESET, EstopReset(boot=state.boot, count=state.count, by="conform"))
+    is_free = component.wait(lambda: not component.view.latched, ANSWER_S)
     return outcome if is_free else failed("a reset does not end the stop", "end it on incoming/estop-reset")
 
 
-def _moves_nothing(why: str, fix: str, **fields: object) -> Callable[[Witness], Outcome]:
-    def run(witness: Witness) -> Outcome:
-        with _at_the_wheel(witness) as send:
-            began, _ = _drive(witness, send, **fields)
-            witness.look(_LATE_S)
-            until = moves_until(witness, began)
+def _moves_nothing(why: str, fix: str, **fields: object) -> Callable[[Component], Outcome]:
+    def run(component: Component) -> Outcome:
+        with _at_the_wheel(component) as send:
+            began, _ = _drive(component, send, **fields)
+            component.look(_LATE_S)
+            until = moves_until(component, began)
         if until is None:
             return skipped(_UNSEEN, _SHOW_IT)
         return failed(why, fix) if until > began else ok("it moves nothing")
@@ -141,24 +141,24 @@ def _moves_nothing(why: str, fix: str, **fields: object) -> Callable[[Witness], 
     return run
 
 
-def not_a_number(witness: Witness) -> Outcome:
-    with _at_the_wheel(witness):
+def not_a_number(component: Component) -> Outcome:
+    with _at_the_wheel(component):
         began = time.monotonic()
         for number in (b"NaN", b"Infinity", b"1e999", b'"nan"', b"null"):
-            witness.send(c.DRIVE, b'{"x": 0, "z": %s}' % number)
-        witness.look(_LATE_S)
-        until = moves_until(witness, began)
+            component.send(c.DRIVE, b'{"x": 0, "z": %s}' % number)
+        component.look(_LATE_S)
+        until = moves_until(component, began)
     if until is None:
         return skipped(_UNSEEN, _SHOW_IT)
     return failed("it moves by a command that is no number", "refuse NaN and infinity") if until > began else ok("no")
 
 
-def clamped(witness: Witness) -> Outcome:
-    with _at_the_wheel(witness) as send:
+def clamped(component: Component) -> Outcome:
+    with _at_the_wheel(component) as send:
         began = time.monotonic()
         send(9, x=-9, valid_ms=150)
-        witness.look(_LATE_S)
-        shown = [_wheels(one.value) for one in witness.of(c.STATUS, began) if one.value is not None]
+        component.look(_LATE_S)
+        shown = [_wheels(one.value) for one in component.of(c.STATUS, began) if one.value is not None]
     wheels = [abs(one) for values in shown for one in values or ()]
     if not wheels:
         return skipped("its status has no wheels", _SHOW_IT)
@@ -167,8 +167,8 @@ def clamped(witness: Witness) -> Outcome:
     return ok(f"{max(wheels):g} at most")
 
 
-def _foreign(witness: Witness) -> str:
-    return "" if witness.view.controlled else "its capabilities offer no control"
+def _foreign(component: Component) -> str:
+    return "" if component.view.controlled else "its capabilities offer no control"
 
 
 _MOVES = (drives, free, commanded)

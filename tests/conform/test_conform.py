@@ -14,9 +14,9 @@ import pytest
 
 from pebble.client.connection import Target
 from pebble.conform.checks import CHECKS, Check, run
+from pebble.conform.component import Component, reached
 from pebble.conform.motion import MOVING
 from pebble.conform.power import CUT
-from pebble.conform.witness import Witness, witnessed
 from pebble.fleet.certificates import CA_CERT
 from pebble.fleet.roles import Account
 from pebble.selftest import State
@@ -42,7 +42,7 @@ VIOLATIONS: dict[str, tuple[str, str]] = {
     "numbers": ('{"wheels": robot.wheels}', '{"wheels": robot.wheels, "amperes": math.nan}'),
     "sizes": ('"the saved state cannot be read" * there', '400 * "x"'),
     "retained": ("qos, retain=True", "qos, retain=False"),
-    "kept commands": (
+    "retained commands": (
         "    def publish(self",
         '        client.publish(IN + "control", "{}", 1, True)\n\n    def publish(self',
     ),
@@ -110,16 +110,16 @@ def broker(tmp_path: Path) -> Iterator[Broker]:
 
 
 @contextmanager
-def switched_on(command: Sequence[str | Path], target: Target) -> Iterator[Witness]:
+def switched_on(command: Sequence[str | Path], target: Target) -> Iterator[Component]:
     """A robot, and who looks at it through its broker."""
     machine = Machine(command)
     machine.on()
     try:
-        with witnessed(target, LOOKS_S) as witness:
-            witness.wait(lambda: witness.view.capabilities, 10)
-            witness.look(LOOKS_S)
-            witness.ask, witness.person_s = machine.ask, 15.0
-            yield witness
+        with reached(target, LOOKS_S) as component:
+            component.wait(lambda: component.view.capabilities, 10)
+            component.look(LOOKS_S)
+            component.ask, component.person_s = machine.ask, 15.0
+            yield component
     finally:
         machine.off()
 
@@ -139,8 +139,8 @@ def at_named(broker: FleetBroker, folder: Path) -> tuple[Command, Target]:
     return ["mine", HOST, str(broker.port), folder / "stop.json", "mine", folder / "mine", ca], target
 
 
-def judged(witness: Witness, *checks: Check) -> dict[str, tuple[State, str]]:
-    return {check.name: (outcome.state, outcome.text) for check, outcome in run(witness, checks)}
+def judged(component: Component, *checks: Check) -> dict[str, tuple[State, str]]:
+    return {check.name: (outcome.state, outcome.text) for check, outcome in run(component, checks)}
 
 
 def lacking(found: dict[str, tuple[State, str]]) -> dict[str, tuple[State, str]]:
@@ -186,8 +186,8 @@ LANGUAGES = (in_python, in_javascript, in_c)
 def test_the_smallest_honest_robot_passes(broker: Broker, tmp_path: Path, language: Language) -> None:
     program = language(tmp_path)
     arguments, target = at_open(broker, tmp_path)
-    with switched_on([*program, *arguments], target) as witness:
-        found = judged(witness, *ALL.values())
+    with switched_on([*program, *arguments], target) as component:
+        found = judged(component, *ALL.values())
     assert lacking(found) == {}
     assert len(found) >= 20
 
@@ -202,8 +202,8 @@ def test_it_passes_where_names_are_checked(tmp_path: Path, language: Language) -
     }
     with FleetBroker(tmp_path / "hall", people, level="named") as broker:
         arguments, target = at_named(broker, tmp_path)
-        with switched_on([*program, *arguments], target) as witness:
-            found = judged(witness, *ALL.values())
+        with switched_on([*program, *arguments], target) as component:
+            found = judged(component, *ALL.values())
     assert lacking(found) == {}
 
 
@@ -215,5 +215,5 @@ def test_a_violation_is_found(broker: Broker, tmp_path: Path, name: str) -> None
     program.write_text(SOURCE.replace(old, new))
     arguments, target = at_open(broker, tmp_path)
     needs = [ALL["will"]] if name == "retained commands" else []
-    with switched_on([sys.executable, program, *arguments], target) as witness:
-        assert judged(witness, *needs, ALL[name])[name][0] is State.FAILED
+    with switched_on([sys.executable, program, *arguments], target) as component:
+        assert judged(component, *needs, ALL[name])[name][0] is State.FAILED

@@ -18,7 +18,7 @@ from pebble.transports import Message, QoS, Transport
 
 _STEP_S = 0.005
 _MOST = 50_000  # messages that are kept; a robot at rest sends some ten a second
-_KEPT_S = 1.0  # some brokers send what is retained a moment after the subscription
+_RETAINED_S = 1.0  # some brokers send what is retained a moment after the subscription
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +34,7 @@ class Record:
     wrong: str = ""
 
 
-class Witness:
+class Component:
     """What arrived of one component. :meth:`wait` lets time pass and reads it."""
 
     def __init__(self, target: Target, transport: Transport, names: Names, base: str) -> None:
@@ -90,14 +90,14 @@ class Witness:
         """Leave a command at the broker; empty bytes remove it. It bears no name: nothing with one is retained."""
         with connected(self._target) as (beside, _):
             beside.publish(channel.topic(self.base), payload, qos=QoS.DELIVERED, retain=True, remember=False)
-            self.wait(lambda: beside.outgoing.waiting == 0, _KEPT_S)
+            self.wait(lambda: beside.outgoing.waiting == 0, _RETAINED_S)
 
-    def kept(self) -> list[Record]:
+    def retained(self) -> list[Record]:
         """What the broker has retained of it and for it, as one gets it who connects now."""
         found: deque[Message] = deque(maxlen=_MOST)
-        with connected(replace(self._target, program="conform-kept")) as (beside, _):
+        with connected(replace(self._target, program="conform-retained")) as (beside, _):
             beside.subscribe(f"{self.base}/#", found.append, qos=QoS.DELIVERED, direct=True)
-            self.wait(lambda: False, _KEPT_S)
+            self.wait(lambda: False, _RETAINED_S)
         return [record_of(one, self.base, 0.0) for one in list(found) if one.retain and one.payload]
 
 
@@ -118,9 +118,9 @@ def record_of(message: Message, base: str, at: float) -> Record:
 
 
 @contextmanager
-def witnessed(target: Target, seconds: float) -> Iterator[Witness]:
+def reached(target: Target, seconds: float) -> Iterator[Component]:
     """Connect, and look on for so long. Raises PebbleError."""
     with connected(target) as (transport, names):
-        witness = Witness(target, transport, names, names.base)
-        witness.look(seconds)
-        yield witness
+        component = Component(target, transport, names, names.base)
+        component.look(seconds)
+        yield component
