@@ -49,6 +49,13 @@ PACKAGES = {
         ("browser/index.js",),
         "AsyncAPI's own parser, which checks docs/asyncapi.yaml",
     ),
+    "mqtt": Package(
+        "mqtt",
+        "5.16.0",
+        "G0VsEtuJz5sJUgZJaaADMVfW7SIFPzkIuHR+d6rk+tBeSwdCfd9BaIRycRfd2AbyFDEmLlFM+SDQeti/+IbOnw==",
+        ("dist/mqtt.esm.js", "package.json"),
+        "MQTT.js, for the robot in JavaScript",
+    ),
     "node_modules/@foxglove/ws-protocol": Package(
         "@foxglove/ws-protocol",
         "0.8.0",

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -15,12 +17,20 @@ from pebble.conform.checks import CHECKS, Check, run
 from pebble.conform.component import Component, reached
 from pebble.conform.motion import MOVING
 from pebble.conform.power import CUT
+from pebble.fleet.certificates import CA_CERT
+from pebble.fleet.roles import Account
 from pebble.selftest import State
-from tests.support import ROOT, Broker
+from tests.fleet.brokers import HOST, FleetBroker
+from tests.fleet.conftest import cheap_hashes as cheap_hashes
+from tests.support import ROOT, Broker, Child, further
 
 pytestmark = pytest.mark.alone  # deadlines of wheels are checked
 
-SOURCE = (ROOT / "examples" / "your-robot" / "robot.py").read_text()
+Command = list[str | Path]
+Language = Callable[[Path], Command]  # makes its robot in a folder, and returns how it is started
+
+ROBOTS = ROOT / "examples" / "your-robot"
+SOURCE = (ROBOTS / "robot.py").read_text()
 ALL = {check.name: check for check in (*CHECKS, *MOVING, *CUT)}
 LOOKS_S = 2.0
 
@@ -28,58 +38,55 @@ LOOKS_S = 2.0
 VIOLATIONS: dict[str, tuple[str, str]] = {
     "heartbeat": ("heartbeat_at = now() + 0.25", "heartbeat_at = now() + 5"),
     "clock": ("int(1000 * time.time())", "int(1000 * time.time()) + 3_600_000"),
-    "payloads": ('{"t": epoch_ms()}), qos=0', '{"t": str(time.time())}), qos=0'),
-    "numbers": ('{"wheels": wheels}', '{"wheels": wheels, "amperes": math.nan}'),
-    "sizes": ('"why": stop.get("why", "")', '"why": 400 * "x"'),
-    "retained": ("qos=0, retain=True", "qos=0, retain=False"),
-    "parked commands": ("publish_control()\n\n\nclient", 'client.publish(IN + "control", "{}", 1, True)\n\n\nclient'),
-    "capabilities": ('"available": True', '"available": "yes"'),
-    "own topics": ('"topic": IN + "drive-values"', '"topic": "pebble/robots/other/incoming/drive-values"'),
-    "identity": ('BASE.split("/")', '("pebble", "robots", "other")'),
-    "junk": ("(ValueError, KeyError, TypeError, OverflowError, RecursionError)", "KeyError"),
-    "stop states": ('publish(f"estop/{OWNER}"', 'publish("estop/others"'),
-    "stop": ("latched=True", "latched=False"),
-    "stop once": ('if name not in stop["recent"]:', "if True:"),
-    "stop unread": ("        claims = {}\n", "        return\n"),
-    "stop holds": (
-        "        return turn(0.0, 0.0, 0.0)\n",
-        '        stop["latched"] = False\n        return publish_stop()\n',
+    "payloads": ('{"t": epoch_ms()}, qos=0', '{"t": str(time.time())}, qos=0'),
+    "numbers": ('{"wheels": robot.wheels}', '{"wheels": robot.wheels, "amperes": math.nan}'),
+    "sizes": ('"the saved state cannot be read" * there', '400 * "x"'),
+    "retained": ("qos, retain=True", "qos, retain=False"),
+    "retained commands": (
+        "    def publish(self",
+        '        client.publish(IN + "control", "{}", 1, True)\n\n    def publish(self',
     ),
-    "reset refused": ("    if refused is None and", "    if"),
-    "control": ('elif take or not holder["key"]', "elif True or take"),
-    "control released": ('if asker["id"] == holder["id"]:\n            pass_on', "if False:\n            pass_on"),
-    "control ends": ('now() > holder["ends"]:', "False:"),
-    "dead man": ("DEAD_MAN_S, PAUSE_S, LONGEST = 0.75", "DEAD_MAN_S, PAUSE_S, LONGEST = 3.0"),
-    "validity": ("max(0.0, valid / 1000)", "valid + DEAD_MAN_S"),
-    "zero": ("        return turn(0.0, 0.0, 0.0)\n", "        return None\n"),
-    "no number": ("if not all(map(math.isfinite, numbers)):", "if False:"),
-    "clamps": ("turn(max(-1.0, min(1.0, z + x))", "turn(z - 2 * x"),
-    "foreign key": ("elif allowed and", "elif"),
-    "stop moving": ('and not stop["latched"]', ""),
+    "capabilities": ('"available": True', '"available": "yes"'),
+    "own topics": ('"controls": True', '"controls": True, "topic": "pebble/robots/other/incoming/drive-values"'),
+    "identity": ('"id": ID', '"id": "other"'),
+    "junk": ("(ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError)", "(KeyError)"),
+    "stop states": ('publish(f"estop/{OWNER}"', 'publish("estop/others"'),
+    "stop": ('self.stop = {"latched": True', 'self.stop = {"latched": False'),
+    "stop once": ('if name not in self.stop["recent"]:', "if True:"),
+    "stop unread": (
+        "            told = dict(json.loads(payload))",
+        "            told = {}\n        told = dict(json.loads(payload))",
+    ),
+    "stop holds": (
+        "        if not x and not z:\n",
+        "        if not x and not z:\n            self.stop = FREE\n            self.publish_stop()\n",
+    ),
+    "reset refused": ("if self.refused is None and", "if"),
+    "control": ('(take or mine or not self.holder["key"])', "True"),
+    "control released": ("NOBODY if mine else self.holder", "self.holder"),
+    "control ends": ("now() > robot.ends:", "False:"),
+    "dead man": ('DEAD_MAN_S, PAUSE_S, LONGEST = "motors", 0.75', 'DEAD_MAN_S, PAUSE_S, LONGEST = "motors", 3.0'),
+    "validity": ('command.get("valid_ms", 1000 * DEAD_MAN_S)', "1000 * DEAD_MAN_S"),
+    "zero": ("            self.turn(0.0, 0.0, 0.0)\n            self.paused_at", "            self.paused_at"),
+    "no number": ("math.isfinite(one) for", "True for"),
+    "clamps": ("self.turn(max(-1.0, min(1.0, z + x))", "self.turn(z - 2 * x"),
+    "foreign key": ('(mine or ("key" not in command and not NAMED))', "True"),
+    "stop moving": ('elif not self.stop["latched"] and', "elif"),
     "will": ('json.dumps({"t": epoch_ms(), "online": False})', 'json.dumps({"t": epoch_ms()})'),
-    "retained commands": ("if message.retain or found is None", "if found is None"),
-    "stop survives": ("os.path.exists(STOP_FILE)", "False"),
+    "retained commands": ("if message.retain:", "if False:"),
+    "stop survives": ("self.stop | json.load(open(STOP_FILE))", "FREE"),
 }
 
 
 class Machine:
     """The computer of the robot, which can be switched off and on."""
 
-    def __init__(self, broker: Broker, folder: Path, source: str) -> None:
-        self._program = folder / "robot.py"
-        self._program.write_text(source)
-        self._command = [
-            sys.executable,
-            str(self._program),
-            "mine",
-            "127.0.0.1",
-            str(broker.port),
-            str(folder / "stop.json"),
-        ]
+    def __init__(self, command: Sequence[str | Path]) -> None:
+        self._command = [str(one) for one in command]
         self._process: subprocess.Popen[bytes] | None = None
 
     def on(self) -> None:
-        self._process = subprocess.Popen(self._command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        self._process = Child(self._command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
     def off(self) -> None:
         assert self._process is not None
@@ -103,11 +110,12 @@ def broker(tmp_path: Path) -> Iterator[Broker]:
 
 
 @contextmanager
-def robot(broker: Broker, folder: Path, source: str) -> Iterator[Component]:
-    machine = Machine(broker, folder, source)
+def switched_on(command: Sequence[str | Path], target: Target) -> Iterator[Component]:
+    """A robot, and who looks at it through its broker."""
+    machine = Machine(command)
     machine.on()
     try:
-        with reached(Target(url=f"mqtt://127.0.0.1:{broker.port}", robot="mine"), LOOKS_S) as component:
+        with reached(target, LOOKS_S) as component:
             component.wait(lambda: component.view.capabilities, 10)
             component.look(LOOKS_S)
             component.ask, component.person_s = machine.ask, 15.0
@@ -116,21 +124,96 @@ def robot(broker: Broker, folder: Path, source: str) -> Iterator[Component]:
         machine.off()
 
 
+def at_open(broker: Broker, folder: Path) -> tuple[Command, Target]:
+    """What a robot's program is started with, and how others reach it."""
+    target = Target(url=f"mqtt://127.0.0.1:{broker.port}", robot="mine")
+    return ["mine", "127.0.0.1", str(broker.port), folder / "stop.json"], target
+
+
+def at_named(broker: FleetBroker, folder: Path) -> tuple[Command, Target]:
+    for name in ("mine", "ann"):
+        (folder / name).write_text(broker.passwords[name])
+        (folder / name).chmod(0o600)
+    url, ca = f"mqtts://ann@{HOST}:{broker.port}", broker.folder / CA_CERT
+    target = Target(url=url, robot="mine", password_file=folder / "ann", ca_cert=ca)
+    return ["mine", HOST, str(broker.port), folder / "stop.json", "mine", folder / "mine", ca], target
+
+
 def judged(component: Component, *checks: Check) -> dict[str, tuple[State, str]]:
     return {check.name: (outcome.state, outcome.text) for check, outcome in run(component, checks)}
 
 
-def test_the_smallest_honest_robot_passes(broker: Broker, tmp_path: Path) -> None:
-    with robot(broker, tmp_path, SOURCE) as component:
+def lacking(found: dict[str, tuple[State, str]]) -> dict[str, tuple[State, str]]:
+    return {name: one for name, one in found.items() if one[0] is not State.OK}
+
+
+def in_python(_folder: Path) -> Command:
+    return [sys.executable, ROBOTS / "robot.py"]
+
+
+def in_javascript(folder: Path) -> Command:
+    """npm's bundle is for browsers: it takes the place of the package, which has twenty others below it."""
+    bundle = ROOT / ".venv" / "mqtt" / "dist" / "mqtt.esm.js"
+    if shutil.which("node") is None or not bundle.exists():
+        missing("needs Node.js (apt install nodejs) and MQTT.js (python tools/fetch_npm.py .venv mqtt)")
+    package = folder / "node_modules" / "mqtt"
+    package.mkdir(parents=True)
+    (package / "package.json").write_text('{"exports": "./index.mjs"}')
+    (package / "index.mjs").write_text(
+        f'globalThis.navigator ??= {{}};\nexport default (await import("{bundle}")).default;\n'
+    )
+    return ["node", shutil.copy(ROBOTS / "robot.mjs", folder)]
+
+
+def in_c(folder: Path) -> Command:
+    headers = (Path("/usr/include/mosquitto.h"), Path("/usr/include/cjson/cJSON.h"))
+    if shutil.which("gcc") is None or not all(one.exists() for one in headers):
+        missing("needs a compiler and libraries (apt install gcc libc6-dev libmosquitto-dev libcjson-dev)")
+    warnings = ("-Wall", "-Wextra", "-Werror", "-O2")
+    libraries = ("-lmosquitto", "-lcjson", "-lm")
+    subprocess.run(["gcc", *warnings, "-o", folder / "robot", ROBOTS / "robot.c", *libraries], check=True)
+    return [folder / "robot"]
+
+
+def missing(what: str) -> None:
+    (pytest.fail if os.environ.get("CI") == "true" else pytest.skip)(what)
+
+
+LANGUAGES = (in_python, in_javascript, in_c)
+
+
+@pytest.mark.parametrize("language", LANGUAGES)
+def test_the_smallest_honest_robot_passes(broker: Broker, tmp_path: Path, language: Language) -> None:
+    program = language(tmp_path)
+    arguments, target = at_open(broker, tmp_path)
+    with switched_on([*program, *arguments], target) as component:
         found = judged(component, *ALL.values())
-    assert {name: one for name, one in found.items() if one[0] is not State.OK} == {}
+    assert lacking(found) == {}
     assert len(found) >= 20
+
+
+@pytest.mark.usefixtures("cheap_hashes")
+@pytest.mark.parametrize("language", [LANGUAGES[0], *map(further, LANGUAGES[1:])])
+def test_it_passes_where_names_are_checked(tmp_path: Path, language: Language) -> None:
+    program = language(tmp_path)
+    people = {
+        "mine": Account(roles=("robot",), bases=("pebble/robots/mine",)),
+        "ann": Account(roles=("driver", "safety")),
+    }
+    with FleetBroker(tmp_path / "hall", people, level="named") as broker:
+        arguments, target = at_named(broker, tmp_path)
+        with switched_on([*program, *arguments], target) as component:
+            found = judged(component, *ALL.values())
+    assert lacking(found) == {}
 
 
 @pytest.mark.parametrize("name", ALL)
 def test_a_violation_is_found(broker: Broker, tmp_path: Path, name: str) -> None:
     old, new = VIOLATIONS[name]
     assert old in SOURCE
+    program = tmp_path / "robot.py"
+    program.write_text(SOURCE.replace(old, new))
+    arguments, target = at_open(broker, tmp_path)
     needs = [ALL["will"]] if name == "retained commands" else []
-    with robot(broker, tmp_path, SOURCE.replace(old, new)) as component:
+    with switched_on([sys.executable, program, *arguments], target) as component:
         assert judged(component, *needs, ALL[name])[name][0] is State.FAILED
