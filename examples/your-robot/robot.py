@@ -15,14 +15,14 @@ CAPABILITIES = {
     "named": NAMED,
 }
 FREE = {"latched": False, "recent": [], "by": "", "why": "", "since": 0}
-NOBODY = {"id": "", "by": "", "device": "", "key": ""}
+NONE = {"id": "", "by": "", "device": "", "key": ""}
 now, epoch_ms = time.monotonic, lambda: int(1000 * time.time())
 
 
 class Robot:
     def __init__(self):
         self.boot, self.count, self.refused, self.paused_at = secrets.token_hex(4), 0, None, -math.inf
-        self.holder, self.account, self.holds_s, self.ends = NOBODY, "", 0.0, 0.0  # who drives, and until when
+        self.holder, self.account, self.holds_s, self.ends = NONE, "", 0.0, 0.0  # who drives, and until when
         self.until, self.wheels, self.shown = 0.0, [0.0, 0.0], None  # when the wheels stop, and what they do
         there = os.path.exists(STOP_FILE)
         self.stop = FREE | {"latched": there, "why": "the saved state cannot be read" * there}
@@ -62,14 +62,14 @@ class Robot:
     def halt(self, payload, account):
         """Whatever arrives here is a stop; what has a name counts once."""
         self.turn(0.0, 0.0, 0.0)
-        told = {}
+        claims = {}
         with suppress(ValueError, TypeError, RecursionError):
-            told = dict(json.loads(payload))
-        name = str(told.get("stop"))
+            claims = dict(json.loads(payload))
+        name = str(claims.get("stop"))
         name = name if re.fullmatch("[0-9a-f]{16}", name) else secrets.token_hex(8)
         if name not in self.stop["recent"]:
             self.count, self.refused = self.count + 1, None
-            by, why = (re.sub(r"[^ !#-\[\]-~]", "_", str(told.get(one, ""))) for one in ("by", "why"))
+            by, why = (re.sub(r"[^ !#-\[\]-~]", "_", str(claims.get(one, ""))) for one in ("by", "why"))
             by = account[:32] or by[:31] + "?" * NAMED  # a name that the broker has not checked
             recent = [name, *self.stop["recent"]][:8]
             self.stop = {"latched": True, "recent": recent, "by": by, "why": why[:40], "since": epoch_ms()}
@@ -87,7 +87,7 @@ class Robot:
         mine = (command["id"], account) == (self.holder["id"], self.account)
         seconds = max(1.0, min(10.0, command.get("for_ms", 3000) / 1000))
         if command.get("want") == "release":
-            self.pass_on(NOBODY if mine else self.holder)
+            self.pass_on(NONE if mine else self.holder)
         elif re.fullmatch("[0-9A-Fa-f]{8}", command["id"]) and (take or mine or not self.holder["key"]):
             self.account, self.holds_s, self.ends = account, seconds, now() + seconds
             by, device = (re.sub("[^a-z0-9_/-]", "_", str(command.get(one, ""))) for one in ("by", "device"))
@@ -143,7 +143,7 @@ while True:
         robot.shown = robot.wheels
         robot.publish("status", {"t": epoch_ms(), "value": {"wheels": robot.wheels}})
     if robot.holder["key"] and now() > robot.ends:
-        robot.pass_on(NOBODY)
+        robot.pass_on(NONE)
     if now() >= heartbeat_at:
         heartbeat_at = now() + 0.25
         robot.publish("online", {"t": epoch_ms()}, qos=0)

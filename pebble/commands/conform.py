@@ -33,7 +33,7 @@ def conform(
     Without --may-move no wheel turns; the robot is stopped and freed several times. Exits 1 if a check fails; each is
     printed with why it matters and what to change.
 
-    \\b
+    \b
         pebble conform rover --url mqtt://broker.example
         pebble conform rover --url mqtt://broker.example --may-move --cut
     """

@@ -46,7 +46,7 @@ class Component:
         self._target, self._transport, self.account = target, transport, names.account
         self._arrived: deque[tuple[Message, float, float]] = deque(maxlen=_MOST)
         put_names(transport, names, lambda of: of == base and self.view.named)
-        transport.subscribe(f"{base}/outgoing/#", self._take, qos=QoS.DELIVERED, direct=True)
+        transport.subscribe(f"{base}/{c.OUTGOING}/#", self._take, qos=QoS.DELIVERED, direct=True)
 
     def _take(self, message: Message) -> None:
         self._arrived.append((message, time.monotonic(), time.time()))

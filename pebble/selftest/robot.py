@@ -179,7 +179,7 @@ def _ignore(_side: Side, _message: Message, _at: float) -> None:
 
 
 def user_of(folder: Path) -> pwd.struct_passwd | None:
-    """As whom root reaches a robot whose folder this is: its own files must not be there. None: as itself."""
+    """Root reaches the robot of this folder as this user, for its own files must not be there; None: as itself."""
     owner = folder.stat().st_uid if folder.is_dir() else 0
     return pwd.getpwuid(owner) if owner and os.geteuid() == 0 else None
 

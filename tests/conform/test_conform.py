@@ -22,7 +22,7 @@ from pebble.fleet.roles import Account
 from pebble.selftest import State
 from tests.fleet.brokers import HOST, FleetBroker
 from tests.fleet.conftest import cheap_hashes as cheap_hashes
-from tests.support import ROOT, Broker, Child, further
+from tests.support import ROOT, Broker, Child, further, some
 
 pytestmark = pytest.mark.alone  # deadlines of wheels are checked
 
@@ -42,7 +42,7 @@ VIOLATIONS: dict[str, tuple[str, str]] = {
     "numbers": ('{"wheels": robot.wheels}', '{"wheels": robot.wheels, "amperes": math.nan}'),
     "sizes": ('"the saved state cannot be read" * there', '400 * "x"'),
     "retained": ("qos, retain=True", "qos, retain=False"),
-    "retained commands": (
+    "parked commands": (
         "    def publish(self",
         '        client.publish(IN + "control", "{}", 1, True)\n\n    def publish(self',
     ),
@@ -54,8 +54,8 @@ VIOLATIONS: dict[str, tuple[str, str]] = {
     "stop": ('self.stop = {"latched": True', 'self.stop = {"latched": False'),
     "stop once": ('if name not in self.stop["recent"]:', "if True:"),
     "stop unread": (
-        "            told = dict(json.loads(payload))",
-        "            told = {}\n        told = dict(json.loads(payload))",
+        "            claims = dict(json.loads(payload))",
+        "            claims = {}\n        claims = dict(json.loads(payload))",
     ),
     "stop holds": (
         "        if not x and not z:\n",
@@ -63,7 +63,7 @@ VIOLATIONS: dict[str, tuple[str, str]] = {
     ),
     "reset refused": ("if self.refused is None and", "if"),
     "control": ('(take or mine or not self.holder["key"])', "True"),
-    "control released": ("NOBODY if mine else self.holder", "self.holder"),
+    "control released": ("NONE if mine else self.holder", "self.holder"),
     "control ends": ("now() > robot.ends:", "False:"),
     "dead man": ('DEAD_MAN_S, PAUSE_S, LONGEST = "motors", 0.75', 'DEAD_MAN_S, PAUSE_S, LONGEST = "motors", 3.0'),
     "validity": ('command.get("valid_ms", 1000 * DEAD_MAN_S)', "1000 * DEAD_MAN_S"),
@@ -182,7 +182,7 @@ def missing(what: str) -> None:
 LANGUAGES = (in_python, in_javascript, in_c)
 
 
-@pytest.mark.parametrize("language", LANGUAGES)
+@pytest.mark.parametrize("language", [LANGUAGES[0], *map(further, LANGUAGES[1:])])
 def test_the_smallest_honest_robot_passes(broker: Broker, tmp_path: Path, language: Language) -> None:
     program = language(tmp_path)
     arguments, target = at_open(broker, tmp_path)
@@ -207,7 +207,7 @@ def test_it_passes_where_names_are_checked(tmp_path: Path, language: Language) -
     assert lacking(found) == {}
 
 
-@pytest.mark.parametrize("name", ALL)
+@pytest.mark.parametrize("name", some(ALL, 3))
 def test_a_violation_is_found(broker: Broker, tmp_path: Path, name: str) -> None:
     old, new = VIOLATIONS[name]
     assert old in SOURCE

@@ -300,9 +300,9 @@ def test_a_bridge_writes_and_answers(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize(("profile", "most"), [("wide", LINES_BYTES), ("thin", THIN_LINES_BYTES)])
 def test_an_answer_is_as_long_as_its_link_permits(monkeypatch: pytest.MonkeyPatch, profile: str, most: int) -> None:
-    chain_files(make_config())["acts"].append([row(number) for number in range(200)])
-    rig = MemoryRig(monkeypatch)
+    rig = MemoryRig(monkeypatch)  # with a state folder of its own
     try:
+        chain_files(make_config())["acts"].append([row(number) for number in range(200)])
         rig.bridge(link={"profile": profile})
         rig.remote.publish("incoming/audit-read", b'{"chain": "acts", "before": 0, "count": 200}')
         assert until(lambda: rig.remote.payloads("outgoing/audit-lines"))
