@@ -23,6 +23,7 @@ from pebble.selftest.stops import retained_commands, stop
 _IN_A_ROW = 10  # heartbeats in a row
 _LONGEST_GAP = 2.5  # times the interval that its config has
 _JUDGED_S = 6.0  # motor owners repeat every 5 s what the others must receive of them
+_VOLTS_S = 6.0  # boards report it every five seconds
 _LEAST_CELL_V = 3.4  # of a lithium cell: below, a robot has minutes
 _SHOWN = 5  # names in one line
 _LOG = "journalctl -u pebble -n 50"
@@ -184,6 +185,7 @@ def _mcu(robot: RobotUnderTest, name: str) -> dict[str, object]:
 
 def battery(robot: RobotUnderTest) -> Outcome:
     """Its voltage, and whether that is too low where its config has the number of cells."""
+    robot.wait(lambda: robot.view.volts is not None, _VOLTS_S)
     volts, cells = robot.view.volts, robot.config.robot.battery_cells
     if volts is None:
         return skipped("it reports no voltage")
