@@ -20,6 +20,7 @@ from pebble.recordings.replay.live import LiveRobots
 from pebble.runtime.by_name import ByName
 from pebble.transports import Message
 from pebble.transports.memory import MemoryHub, MemoryTransport
+from tests.support import until
 
 BASE = "pebble/robots/goob"
 NEAR_S = 0.1
@@ -68,9 +69,14 @@ def lets_a_replay_begin(level: LinkLevel, after_s: float) -> bool:
     robot, replay = (MemoryTransport(name, hub).open() for name in ("robot", "replay"))
     robot.publish(link(level).topic, link(level).payload, retain=True)
     live = LiveRobots([BASE], lambda: now[0])
+    after: list[Message] = []  # what arrives behind that which is retained
+    replay.subscribe("after", after.append)
 
     def wait(seconds: float) -> None:
         now[0] += seconds
+        if not after:
+            robot.publish("after", b"1")
+            assert until(lambda: after)
 
     live.listen(replay, wait)
     robot.close()
