@@ -56,8 +56,9 @@ class Link:
 
     def sends(self, *data: bytes) -> None:
         """The other end does; all of it is in our socket when this returns."""
-        self.other.sendall(b"".join(data))
-        select.select([self.connection.socket], [], [], 5)
+        if whole := b"".join(data):
+            self.other.sendall(whole)
+            select.select([self.connection.socket], [], [], 5)
 
     def pump(self, *, until_read: int = 1) -> None:
         """Go on until so many messages are read."""
