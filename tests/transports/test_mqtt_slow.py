@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import socket
+import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, suppress
 from pathlib import Path
@@ -196,6 +197,10 @@ class Robot:
         self.proxy.sent.clear()
         self.proxy.mend()
         assert until(lambda: self.transport.counters["connected"] > count)
+        read = -1
+        while read != len(self.proxy.sent):  # what it sends at once may be on its way still
+            read = len(self.proxy.sent)
+            time.sleep(0.1)
         return [number for number in range(40) if b"slow/state/%d\0" % number in self.proxy.sent]
 
 
