@@ -20,8 +20,8 @@ def backup(file: TarArgument, root: RootOption = Path("/")) -> int:
     \b
         pebble backup goob.tar
     """
-    from pebble.selftest import backup as backups  # of Linux only
     from pebble.selftest.new_file import write_new
+    from pebble.setup import backup as backups  # of Linux only
 
     if file.exists():
         raise typer.BadParameter(f"{file} exists: name another file, or remove it")

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import json
-import sys
 from typing import Annotated
 
 import typer
 
 from pebble.client.connection import Target, target_of
 from pebble.commands.options import with_target
-from pebble.commands.selftest import printed, row
-from pebble.config.visible import shown
+from pebble.commands.selftest import INDENT, ended, is_clear, printed, row
 from pebble.errors import PebbleError
 from pebble.runtime.signals import interrupted_by_signals
 from pebble.selftest import State
@@ -44,7 +41,7 @@ def conform(
 
     options = target_of(robot, target)
     found: list[dict[str, str]] = []
-    if may_move and not _clear(robot):
+    if may_move and not is_clear(robot, "ahead for half a second, several times, and turn once"):
         typer.echo("nothing was tested", err=True)
         return 1
     with interrupted_by_signals(), reached(options, _LOOKS_S) as component:
@@ -54,17 +51,6 @@ def conform(
             found.append({**row(check.name, outcome), "why": check.why})
             if not as_json:
                 printed(found[-1])
-    states = [one["state"] for one in found]
-    failures = states.count(State.FAILED)
-    if as_json:
-        typer.echo(json.dumps({"ok": not failures, "robot": component.base, "checks": found}, ensure_ascii=False))
-    else:
-        typer.echo(f"checks: {len(found)}, failures: {failures}, skipped: {states.count(State.SKIPPED)}")
-    return 1 if failures else 0
-
-
-def _clear(name: str) -> bool:
-    """Whether a person answers that the robot may move. Standard output is for the result."""
-    typer.echo(f"{shown(name)} will drive ahead for half a second, several times, and turn once.", err=True)
-    typer.echo("Does it stand free, with no person in its way? [y/N]: ", nl=False, err=True)
-    return sys.stdin.readline().strip().lower() in ("y", "yes")
+                if outcome.state is State.FAILED:
+                    typer.echo(f"{INDENT}why: {check.why}")
+    return ended(found, as_json=as_json, robot=component.base)

@@ -19,7 +19,7 @@ from pebble.selftest import Outcome, State
 from pebble.setup.places import Places
 
 _COLOURS = {State.OK: typer.colors.GREEN, State.FAILED: typer.colors.RED, State.SKIPPED: typer.colors.YELLOW}
-_INDENT = " " * 9
+INDENT = " " * 9
 
 
 def selftest(
@@ -43,7 +43,7 @@ def selftest(
 
     loaded = load(config)
     found: list[dict[str, str]] = []
-    if may_move and not _clear(loaded.robot.name or loaded.robot.id):
+    if may_move and not is_clear(loaded.robot.name or loaded.robot.id, "about 3 cm ahead and back, slowly"):
         typer.echo("nothing was tested", err=True)
         return 1
     become_user_of(loaded.run_dir())
@@ -54,18 +54,23 @@ def selftest(
                 printed(found[-1])
         if dropped := sum(side.dropped for side in robot.sides):
             typer.echo(f"pebble: warning: {dropped} messages came too fast to be read", err=True)
+    return ended(found, as_json=as_json)
+
+
+def ended(found: list[dict[str, str]], *, as_json: bool, **more: str) -> int:
+    """Print the end of a table of checks, or all of it as JSON; returns the exit code."""
     states = [one["state"] for one in found]
     failures = states.count(State.FAILED)
     if as_json:
-        typer.echo(json.dumps({"ok": not failures, "checks": found}, ensure_ascii=False))
+        typer.echo(json.dumps({"ok": not failures, **more, "checks": found}, ensure_ascii=False))
     else:
         typer.echo(f"checks: {len(found)}, failures: {failures}, skipped: {states.count(State.SKIPPED)}")
     return 1 if failures else 0
 
 
-def _clear(name: str) -> bool:
+def is_clear(name: str, how: str) -> bool:
     """Whether a person answers that the robot may move. Standard output is for the result."""
-    typer.echo(f"{shown(name)} will drive about 3 cm ahead and back, slowly.", err=True)
+    typer.echo(f"{shown(name)} will drive {how}.", err=True)
     typer.echo("Does it stand free, on the floor, with no person in its way? [y/N]: ", nl=False, err=True)
     return sys.stdin.readline().strip().lower() in ("y", "yes")
 
@@ -82,9 +87,7 @@ def printed(one: dict[str, Any]) -> None:
     state = State(one["state"])
     because = "skipped because " if state is State.SKIPPED else ""
     typer.secho(f"{state.value:<7}  ", fg=_COLOURS[state], nl=False)
-    text = textwrap.fill(
-        f"{one['name']}: {because}{one['text']}", 100, initial_indent=_INDENT, subsequent_indent=_INDENT
-    )
-    typer.echo(text.removeprefix(_INDENT))
+    text = textwrap.fill(f"{one['name']}: {because}{one['text']}", 100, initial_indent=INDENT, subsequent_indent=INDENT)
+    typer.echo(text.removeprefix(INDENT))
     if one["fix"]:  # always on one line: it is to be copied
-        typer.secho(f"{_INDENT}fix: {one['fix']}", bold=True)
+        typer.secho(f"{INDENT}fix: {one['fix']}", bold=True)

@@ -19,7 +19,7 @@ from pebble.contract.identity import parse_topic
 from pebble.contract.levels import silent_after
 from pebble.contract.payloads import ControlRequest, EstopCommand, EstopReset, EstopState
 from pebble.errors import PebbleError
-from pebble.selftest import Outcome, failed, ok, skipped
+from pebble.selftest import Outcome, failed, ok, skipped, why_not_free
 
 ANSWER_S = 1.0  # within which a robot answers
 _CLOCK_S = 60.0  # that its clock may differ
@@ -59,13 +59,7 @@ def controls(component: Component) -> str:
 
 
 def free(component: Component) -> str:
-    """A test takes nothing from people and scripts."""
-    view = component.view
-    if view.stopped_by is not None:
-        return f"it is stopped by {view.stopped_by.by or 'unknown'}: reset it"
-    if view.autonomy is not None and view.autonomy.running:
-        return f"the script {view.autonomy.file} is running"
-    return f"{view.control.who} drives it" if view.control.who else ""
+    return why_not_free(component.view)
 
 
 def commanded(component: Component) -> str:

@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 from enum import StrEnum
 
+from pebble.client.robot_view import RobotView
+
 
 class State(StrEnum):
     OK = "ok"
@@ -30,3 +32,12 @@ def failed(text: str, fix: str) -> Outcome:
 def skipped(why: str, fix: str = "") -> Outcome:
     """``why`` completes "skipped because"; ``fix``: what would let the check be made."""
     return Outcome(State.SKIPPED, why, fix)
+
+
+def why_not_free(view: RobotView) -> str:
+    """A test takes nothing from people and scripts: who has the robot, or has stopped it; empty if it is free."""
+    if view.stopped_by is not None:
+        return f"it is stopped by {view.stopped_by.by or 'unknown'}, which only a person ends"
+    if view.autonomy is not None and view.autonomy.running:
+        return f"the script {view.autonomy.file} is running"
+    return f"{view.control.who} drives it" if view.control.who else ""

@@ -14,7 +14,7 @@ from pebble.contract.levels import LEVELS, silent_after
 from pebble.errors import PebbleError
 from pebble.launcher.capabilities import capabilities as expected_capabilities
 from pebble.runtime.addresses import Addresses
-from pebble.selftest import Outcome, failed, machine, ok, skipped
+from pebble.selftest import Outcome, failed, machine, ok, skipped, why_not_free
 from pebble.selftest.media import picture, sound
 from pebble.selftest.motion import wheels
 from pebble.selftest.robot import RobotUnderTest, Side
@@ -55,13 +55,7 @@ def account(robot: RobotUnderTest) -> str:
 
 
 def free(robot: RobotUnderTest) -> str:
-    """No person and no script has it, and it is not stopped: a test takes nothing from them."""
-    view = robot.view
-    if view.stopped_by is not None:
-        return f"it is stopped by {view.stopped_by.by or 'unknown'}, which only a person ends"
-    if view.autonomy is not None and view.autonomy.running:
-        return f"the script {view.autonomy.file} is running"
-    return f"{view.control.who} drives it" if view.control.who else ""
+    return why_not_free(robot.view)
 
 
 # -- the sides

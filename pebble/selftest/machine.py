@@ -163,7 +163,7 @@ def _visit(settings: WebSettings, host: str) -> tuple[int, float | None]:
 
 
 def _trusting(certificate: Path) -> ssl.SSLContext:
-    """Trusts just this certificate, whoever signed it, and at any name: it is asked at an address of this machine."""
+    """Trusts just this certificate, with any signature, and at any name: it is asked at an address of this machine."""
     context = ssl.create_default_context(cafile=str(certificate))
     context.check_hostname = False
     context.verify_flags |= ssl.VERIFY_X509_PARTIAL_CHAIN

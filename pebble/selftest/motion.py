@@ -1,4 +1,4 @@
-"""The check that turns wheels: a little way, after a person has agreed, and under control that nobody else had."""
+"""The check that turns wheels: a little way, after a person has agreed, and under control that no other person had."""
 
 import time
 from collections.abc import Iterable, Iterator
@@ -83,7 +83,7 @@ def _turns(samples: Iterable[Touch]) -> Iterator[float]:
 
 @contextmanager
 def _in_control(robot: RobotUnderTest, side: Side) -> Iterator[tuple[ControlClient, str]]:
-    """Control for the block, or why there is none; whoever has it is asked for nothing."""
+    """Control for the block, or why there is none; the one who has it is asked for nothing."""
     control = ControlClient(side.view.control, by=robot.by.partition("@")[0], device="selftest")
 
     def held() -> bool:
@@ -95,7 +95,7 @@ def _in_control(robot: RobotUnderTest, side: Side) -> Iterator[tuple[ControlClie
         if side.view.controlled:
             control.ask(time.monotonic())
             robot.wait(held, _CONTROL_S)
-            why = "" if control.held else control.failed or f"{side.view.control.who or 'nobody'} has control"
+            why = "" if control.held else control.failed or f"{side.view.control.who or 'no one'} has control"
         yield control, why
     finally:
         if not why:

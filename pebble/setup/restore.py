@@ -1,26 +1,23 @@
 """Puts the files of a backup in their places: of the same robot, or as a second one with passwords of its own."""
 
 import hashlib
-import tarfile
 from collections.abc import Iterator
 from contextlib import closing
-from pathlib import Path, PurePosixPath
-from typing import Literal, NamedTuple
+from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
-from msgspec import Struct
 
 from pebble.config.config import file_name
 from pebble.fleet.people import People
 from pebble.fleet.whole_file import write
+from pebble.setup import backup as backups
 from pebble.setup import manifest as manifests
 from pebble.setup import own_broker
 from pebble.setup.manifest import Manifest, SetupError
 from pebble.setup.plan import base_of
 from pebble.setup.steps import BESIDE, Engine
 
-_HEAD = "backup.json"
-MOST_FILES, _LARGEST = 10_000, 1 << 30  # files, and bytes of all: a robot has some hundred
 #: What a backup may hold, below the root, and who owns it there.
 _OWNERS = {
     "etc/pebble": "root:pebble",
@@ -32,19 +29,10 @@ _OWNERS = {
 _SECRET = ("etc/mosquitto/", "etc/pebble/tls/", "etc/pebble/broker.password", "etc/pebble/page.password")
 
 
-class Head(Struct, frozen=True, kw_only=True):
-    """The first member of a backup."""
-
-    format: Literal[1]
-    version: str
-    id: str
-    note: str = ""
-
-
 class Backup(NamedTuple):
     """A backup that has been read whole, and checked. ``files``: by their paths below the root: mode and content."""
 
-    head: Head
+    head: backups.About
     files: dict[str, tuple[int, bytes]]
     digest: str
 
@@ -60,40 +48,12 @@ class Backup(NamedTuple):
 
 
 def read(file: Path) -> Backup:
-    """Raises SetupError for what is no backup of ours, or would write elsewhere."""
-    try:
-        digest = hashlib.sha256(file.read_bytes()).hexdigest()
-        with tarfile.open(file) as tar:
-            members = list(_members(tar))
-    except (OSError, tarfile.TarError, EOFError) as error:
-        raise SetupError(f"{file}: {getattr(error, 'strerror', None) or error}") from None
-    if not members or members[0][0] != _HEAD:
-        raise SetupError(f"{file} is no backup of `pebble backup`: it does not begin with {_HEAD}")
-    try:
-        head = msgspec.json.decode(members[0][2], type=Head)
-    except msgspec.MsgspecError as error:
-        raise SetupError(f"{file}: {_HEAD}: {error}") from None
-    return Backup(head, {name: (mode, content) for name, mode, content in members[1:]}, digest)
-
-
-def _members(tar: tarfile.TarFile) -> Iterator[tuple[str, int, bytes]]:
-    size = 0
-    for number, member in enumerate(tar):
-        size += member.size
-        if number >= MOST_FILES or size > _LARGEST:
-            raise SetupError(f"the backup is larger than {MOST_FILES} files or {_LARGEST >> 20} MB")
-        if member.isdir():
-            continue
-        name, path = member.name, PurePosixPath(member.name)
-        usual = name == str(path) and not path.is_absolute() and ".." not in path.parts
-        if number and not (usual and _prefix(name)):
-            raise SetupError(f"the backup would write {name}, which is no file of a robot")
-        if member.issym() and name.startswith("etc/mosquitto/pebble/"):
-            continue  # of ours: they are made again
-        if not member.isfile():
-            raise SetupError(f"the backup's {name} is no plain file")
-        content = tar.extractfile(member)
-        yield name, member.mode & 0o755, b"" if content is None else content.read()
+    """Raises BackupError for what is no backup, and SetupError for one that would write elsewhere."""
+    found = backups.read(file)
+    if foreign := [name for name in found.files if not _prefix(name)]:
+        raise SetupError(f"the backup would write {foreign[0]}, which is no file of a robot")
+    digest = hashlib.sha256(file.read_bytes()).hexdigest()
+    return Backup(found.about, {name: (one.mode & 0o755, one.content) for name, one in found.files.items()}, digest)
 
 
 def _prefix(name: str) -> str:

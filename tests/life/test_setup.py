@@ -5,14 +5,10 @@ from __future__ import annotations
 import json
 from typing import Any
 
-import pytest
-
-from pebble.commands.app import application
 from tests.kit.machine import Machine
 from tests.life.robots import BASE, PORT, ROBOT, Robot
 from tests.support import until
 
-SETUP = any((command.callback or command).__name__ == "setup" for command in application().registered_commands)
 PASSWORD = "correct horse battery"
 ANSWERS: dict[str, Any] = {
     "id": ROBOT,
@@ -37,7 +33,6 @@ print(ask("/"), ask("/api/login", {"user": "ann", "password": "%s"}))
 """
 
 
-@pytest.mark.skipif(not SETUP, reason="needs pebble setup")
 def test_package_and_setup_make_a_robot_with_heartbeats_and_let_its_user_in(machine: Machine) -> None:
     robot = Robot(machine)
     robot.plug_in()

@@ -20,8 +20,8 @@ from pebble.fleet.folder import load as load_fleet
 from pebble.fleet.people import People
 from pebble.motion.latch import Latch
 from pebble.perception.camera_model import CameraModel
-from pebble.selftest.backup import ABOUT, BackupError, make, packed, read, unpacked
 from pebble.services.serial_mcu_bridge.motion.state_file import StateFile
+from pebble.setup.backup import ABOUT, BackupError, make, packed, read, unpacked
 from pebble.setup.places import Places
 from tests.commands.command_line import Run
 from tests.selftest.installed import BROKER, MQTT, PAGE, PEOPLE, ROBOT, config_of, installed

@@ -10,11 +10,12 @@ import stat
 import sys
 import tarfile
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from pebble.setup import manifest, plan
+from pebble.setup.backup import make, packed
 from pebble.setup.detect import Machine
 from pebble.setup.manifest import Manifest
 from pebble.setup.places import Places
@@ -144,14 +145,9 @@ def without_rights(act: Callable[[], str]) -> str:
     return text
 
 
-def backup_of(root: Path, file: Path, robot: str = "goob") -> Path:
-    """A backup as `pebble backup` writes it."""
-    head = {"format": 1, "version": "0.1.0", "id": robot, "note": "it holds keys"}
-    with tarfile.open(file, "w") as tar:
-        _add(tar, "backup.json", json.dumps(head).encode(), 0o600)
-        for path in _of_robot(root):
-            name = str(path.relative_to(root))
-            _add(tar, name, path.read_bytes(), stat.S_IMODE(path.stat().st_mode))
+def backup_of(root: Path, file: Path) -> Path:
+    """What `pebble backup` writes of it."""
+    file.write_bytes(packed(make(Places(root))))
     return file
 
 
@@ -160,11 +156,6 @@ def tar_of(file: Path, members: Sequence[tuple[str, bytes]]) -> Path:
         for name, content in members:
             _add(tar, name, content, 0o600)
     return file
-
-
-def _of_robot(root: Path) -> Iterator[Path]:
-    for folder in ("etc/pebble", "var/lib/pebble", "etc/mosquitto/pebble", "etc/mosquitto/conf.d"):
-        yield from (path for path in sorted((root / folder).rglob("*")) if path.is_file() and not path.is_symlink())
 
 
 def _add(tar: tarfile.TarFile, name: str, content: bytes, mode: int) -> None:

@@ -21,7 +21,7 @@ from pebble.fleet.people import People
 from pebble.fleet.roles import Account, Role
 from pebble.rig.processes import mosquitto_path
 from pebble.runtime.connections import mqtt_settings
-from pebble.setup import restore, retained
+from pebble.setup import retained
 from pebble.setup.places import Places
 from pebble.transports import MqttSettings, QoS
 from pebble.transports.mqtt.transport import MqttTransport
@@ -197,11 +197,12 @@ def test_a_backup_on_a_blank_machine_is_the_same_robot(root: Path, tmp_path: Pat
     places.config.write_text(places.config.read_text().replace("synthetic", "libcamera"))
     (places.state / "estop-serial-pebble+robots+goob.json").write_text('{"stopped": true}')
     other = machine_root(tmp_path / "other")
+    before = tree(root)
     backup = backup_of(root, tmp_path / "goob.tar")
     assert run("setup", "--root", other, "--from", backup, "--dry-run") == 0
     assert not Places(other).etc.exists()
     assert run("setup", "--root", other, "--from", backup, "--yes") == 0
-    assert tree(other) == tree(root)
+    assert tree(other) == before
     assert settings_of(other).password == settings_of(root).password
     with closing(People(Places(other).people)) as people:
         assert people.check("ann", PASSWORD, "")
@@ -237,12 +238,12 @@ def test_a_second_robot_has_a_name_passwords_and_certificates_of_its_own(root: P
 @pytest.mark.parametrize(
     ("members", "why"),
     [
-        ([("etc/pebble/robot.json", b"")], "it does not begin with backup.json"),
+        ([("etc/pebble/robot.json", b"")], "is no backup of Pebble"),
         ([("backup.json", b"{}")], "Object missing required field"),
-        ([("backup.json", b'{"format": 2, "version": "9", "id": "a"}')], "backup.json: Invalid"),
+        ([("backup.json", b'{"format": 2, "version": "9", "id": "a"}')], "has format 2"),
         ([HEAD, ("etc/shadow", b"")], "is no file of a robot"),
-        ([HEAD, ("etc/pebble/../shadow", b"")], "is no file of a robot"),
-        ([HEAD, ("/etc/pebble/a", b"")], "is no file of a robot"),
+        ([HEAD, ("etc/pebble/../shadow", b"")], "is not what a backup has"),
+        ([HEAD, ("/etc/pebble/a", b"")], "is not what a backup has"),
         ([HEAD], "the backup has no answers"),
     ],
 )
@@ -253,13 +254,6 @@ def test_what_is_no_backup_is_refused(
     assert run("setup", "--root", root, "--from", tar_of(tmp_path / "a.tar", members), "--yes") == 1
     assert why in run.err
     assert tree(root) == before
-
-
-def test_a_backup_has_a_bound(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(restore, "MOST_FILES", 1)
-    file = tar_of(tmp_path / "a.tar", [("backup.json", b"{}"), ("etc/pebble/a", b"")])
-    with pytest.raises(restore.SetupError, match="larger than 1 files"):
-        restore.read(file)
 
 
 # -- people

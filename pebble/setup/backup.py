@@ -89,8 +89,11 @@ def make(places: Places) -> Backup:
         raise BackupError(f"there is no {places.config}: no robot is installed there, so there is nothing to back up")
     config = load(places.config, {**os.environ, "STATE_DIRECTORY": str(places.state)})
     backup = Backup(About(format=FORMAT, version=__version__, id=config.robot.id, note=NOTE))
-    for file in dict.fromkeys(_files(places, config)):
-        _add(backup, places.root, file)
+    files = dict.fromkeys(_files(places, config))
+    plain = {file.resolve() for file in files if not file.is_symlink()}
+    for file in files:
+        if not (file.is_symlink() and file.resolve() in plain):  # setup makes such a link again
+            _add(backup, places.root, file)
     for what, folder in _left_out(config):
         if (place := _here(places, folder)).exists():
             backup.left_out[str(place)] = what
@@ -117,7 +120,7 @@ def _files(places: Places, config: Config) -> Iterator[Path]:
 
 def _here(places: Places, path: Path) -> Path:
     """Where a path of the robot is below the root."""
-    path = path.absolute()
+    path = Path(os.path.normpath(path.absolute()))  # a config may name it by ../..
     return path if path.is_relative_to(places.root) else places.root / path.relative_to("/")
 
 
