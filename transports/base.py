@@ -235,6 +235,9 @@ class Transport(ABC):
     #: A retained topic of ours whose values differ: while `is_slow`, if the other end has the newest one after an
     #: outage, it has kept the others. Empty: each is asked for.
     proof: str = ""
+    #: For how many seconds nothing was done that a change of host would disturb; the owner knows. At 0 one with several
+    #: hosts stays where it is as long as it can.
+    idle_s: Callable[[], float] = staticmethod(lambda: 0.0)
     #: What is published in place of a message, in this order; the first one counts as it. None: the message itself.
     forms: Callable[[Message], Iterable[Message]] | None = None
 
@@ -272,6 +275,11 @@ class Transport(ABC):
     def answer(self) -> Answer | None:
         """How long an answer takes now; None while there is none, and from a backend that asks nothing."""
         return None
+
+    @property
+    def host(self) -> str:
+        """The host and port of the other end, where it is one of several that a backend may use; else empty."""
+        return ""
 
     @property
     def untried(self) -> bool:

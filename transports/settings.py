@@ -21,6 +21,10 @@ class MqttSettings:
 
     host: str
     port: int = 1883
+    #: Several brokers, the first one preferred: one at a time is used, and ``host`` and ``port`` are those of the first.
+    hosts: tuple[tuple[str, int], ...] = ()
+    chosen: Path | None = None  # where the program that chooses among them tells the others which one it uses
+    follows: bool = False  # this is one of the others
     keepalive_s: int = 15
     username: str | None = None
     password: str | None = field(default=None, repr=False)

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from pebble.transports import MqttSettings, QoS, State, Transport, create
-from pebble.transports.hosts import HANDSHAKE_S, STEADY_S, Address, Turns
+from pebble.transports.hosts import HANDSHAKE_S, STEADY_S, Address, Place, Turns
 from pebble.transports.settings import TlsSettings
 from tests.fakes.bad_brokers import BEHAVIOURS, mute, serving, showing
 from tests.support import ROOT, Broker, free_port, some, until
@@ -207,7 +207,7 @@ A, B, C = (Address(socket.AF_INET, (f"10.0.0.{number}", 1883)) for number in (1,
 )
 def test_whose_turn_it_is(answers: list[list[Address]], held: list[float], tried: list[Address]) -> None:
     rounds = iter([*answers, *answers[-1:] * 9])
-    turns, seen = Turns("b", 1883, lambda _host, _port: next(rounds)), []
+    turns, seen = Turns(lambda: [Place("b", 1883)], lambda _host, _port: next(rounds)), []
     for seconds in held:
         seen.append(turns.address())
         assert turns.several is (len(answers[0]) > 1)
@@ -234,7 +234,7 @@ WENT: dict[str, Callable[[Turns], object]] = {
     ],
 )
 def test_where_tls_took_long_it_may_be_silent_for_longer(attempts: str, patient: str) -> None:
-    turns, seen = Turns("b", 1883, lambda _host, _port: [A, B]), ""
+    turns, seen = Turns(lambda: [Place("b", 1883)], lambda _host, _port: [A, B]), ""
     for word in attempts.split():
         turns.address()
         seen += "-+"[turns.patience_s == HANDSHAKE_S]
@@ -245,4 +245,4 @@ def test_where_tls_took_long_it_may_be_silent_for_longer(attempts: str, patient:
 
 def test_a_name_without_addresses_is_a_problem() -> None:
     with pytest.raises(OSError, match="no address"):
-        Turns("b", 1883, lambda _host, _port: []).address()
+        Turns(lambda: [Place("b", 1883)], lambda _host, _port: []).address()

@@ -15,7 +15,7 @@ from pebble.transports.base import Answer, Message, Outgoing, QoS, State, Subscr
 from pebble.transports.mqtt.client_kinds import client_class
 from pebble.transports.mqtt.connection import Connection, ignore
 from pebble.transports.mqtt.dialler import Dialler
-from pebble.transports.mqtt.ending import Lost, Silent
+from pebble.transports.mqtt.ending import Leaving, Lost, Silent
 from pebble.transports.mqtt.filters import BrokerFilters, OwnMessageFilter, overlap
 from pebble.transports.mqtt.outgoing import PendingAck
 from pebble.transports.mqtt.refused_topics import RefusedTopics
@@ -34,7 +34,6 @@ _CATCH_UP_S = 0.5  # time for a broker that was suspended to deliver its backlog
 _STEADY_S = 2.0  # after a connection this long the first retry is immediate
 _REPEAT_LOG_S = 30.0  # between two equal log lines
 _TRIED_S = 1.0  # after which a connection shows what the broker has
-_IDLE_S = 60.0  # the connection wakes up earlier, for its pings
 
 
 class _Stop(threading.Event):
@@ -74,6 +73,11 @@ class MqttTransport(Transport):
     @property
     def untried(self) -> bool:
         return self._dialler.turns.untried
+
+    @property
+    def host(self) -> str:
+        dialler = self._dialler
+        return str(dialler.turns.place) if len(dialler.places) > 1 and self._connection is not None else ""
 
     @property
     def outgoing(self) -> Outgoing:
@@ -199,6 +203,10 @@ class MqttTransport(Transport):
             began, problem = time.monotonic(), "failed unexpectedly"
             try:
                 self._run_connection(stopping)
+            except Leaving as leaving:
+                self.problem, self.was_ended, failures = str(leaving), False, 0
+                self._log(logging.INFO, str(leaving))
+                continue
             except Lost as lost:
                 connected = self._state is State.CONNECTED
                 self.was_ended = self._dialler.is_gone(lost, connected=connected, was_ended=self.was_ended)
@@ -247,11 +255,13 @@ class MqttTransport(Transport):
         tried_at = time.monotonic() + _TRIED_S
         try:
             self._synchronize(connection, stopping)
-            if failed := self._dialler.turns.succeeded():
+            if failed := self._dialler.succeeded():
                 self._log(logging.INFO, f"connected to {connection.where}; before it {failed}")
             while not stopping.is_set():
                 receive = self._deliver_all if self._retention.current is None else self._deliver_and_note
-                connection.pump(_IDLE_S, receive)
+                connection.pump(self._dialler.patience_s, receive)
+                if leaving := self._dialler.leave(self.idle_s):
+                    self._leave(connection, leaving)
                 if self._renewal:
                     connection.disconnect()
                     raise Lost(self._renewal)
@@ -365,7 +375,7 @@ class MqttTransport(Transport):
         if self.will is not None and found.get(self.will.topic) == self.will.payload:
             del found[self.will.topic]  # our own will, published although we were running
         older = {topic for topic, payload in found.items() if topic not in unsure and payload != own[topic].payload}
-        self.went_back = bool(older)
+        self.went_back = bool(older) or self._dialler.moved  # another host may have any older value
         return (found.keys() - older) | (proved or set())
 
     def _find_few(
@@ -452,6 +462,14 @@ class MqttTransport(Transport):
 
     def note_refusal(self, topic: str, why: str) -> None:
         self._refused.report(self._dialler.where, topic, why)
+
+    def _leave(self, connection: Connection, why: str) -> None:
+        """End the connection in order: who is still at this broker learns of it by our will. Raises Leaving."""
+        self._set_state(State.CONNECTING)
+        with self._publishing:  # what is published from now on waits for the next connection
+            pass
+        self._finish(connection, self.will)
+        raise Leaving(why)
 
     def _finish(self, connection: Connection, will: Message | None) -> None:
         """Publish the will, wait (bounded) until everything is acknowledged, then send DISCONNECT."""

@@ -1,0 +1,103 @@
+"""Which of several brokers the programs of a robot use: one of them chooses, the others follow, and it returns."""
+
+import logging
+import os
+import threading
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from pebble.transports.hosts import Place
+
+log = logging.getLogger(__name__)
+
+REST_S = 60.0  # so long a robot was not driven before it changes its host without need
+_PROBE_S = 20.0  # between two looks at the first host
+_GOOD_S = 40.0  # so long, in three looks, it has accepted a login
+_WORST_S = 3600.0
+_HELD_S = 600.0  # a return that held for so long was right
+
+
+class ChosenHost:
+    """The file in which the program that chooses tells the others where it is connected. Any of them may be ahead."""
+
+    def __init__(self, file: Path, places: Sequence[Place]) -> None:
+        self._file, self._places = file, {str(one): one for one in places}
+
+    def read(self) -> Place:
+        """The first host until one was chosen, and if the file names none of ours."""
+        try:
+            text = self._file.read_text().strip()
+        except (OSError, UnicodeDecodeError):
+            text = ""
+        return self._places.get(text) or next(iter(self._places.values()))
+
+    def write(self, place: Place) -> None:
+        part = self._file.with_name(f".{self._file.name}.{os.getpid()}")
+        try:
+            part.write_text(f"{place}\n")
+            part.replace(self._file)
+        except OSError as error:
+            log.warning("%s cannot be written, so pictures and sound may go elsewhere: %s", self._file, error.strerror)
+
+
+class Return:
+    """When a robot that rests at another host goes back to the first one. Pure.
+
+    Tools that know only the first host would not find it any more. Each return that did not hold doubles the time for
+    which the first host has to be good.
+    """
+
+    def __init__(self) -> None:
+        self._good_s = _GOOD_S
+        self._good_since: float | None = None
+        self._probe_at = float("inf")  # no probe is due at the first host
+        self._returned_at: float | None = None  # and what became of it is not known yet
+
+    def connected(self, now: float, *, first: bool) -> None:
+        self._good_since = None
+        self._probe_at = float("inf") if first else now + _PROBE_S
+        if not first and self._returned_at is not None:
+            short = now - self._returned_at < _HELD_S
+            self._good_s, self._returned_at = min(2 * self._good_s, _WORST_S) if short else _GOOD_S, None
+
+    def wants_probe(self, now: float) -> bool:
+        """Whether to look now whether the first host accepts a login; the next time is later."""
+        if now < self._probe_at:
+            return False
+        self._probe_at = now + _PROBE_S
+        return True
+
+    def probed(self, now: float, *, good: bool) -> None:
+        if not good:
+            self._good_since = None
+        elif self._good_since is None:
+            self._good_since = now
+
+    def is_due(self, now: float, idle_s: float) -> bool:
+        """``idle_s``: for how long the robot was not driven."""
+        if self._good_since is None or now - self._good_since < self._good_s or idle_s < REST_S:
+            return False
+        self._good_since, self._returned_at = None, now
+        return True
+
+
+class Probes:
+    """Looks at the first host, on a thread of its own: a login may take seconds, and heartbeats must not wait."""
+
+    def __init__(self, probe: Callable[[], bool]) -> None:
+        self._probe = probe
+        self._result: bool | None = None
+        self._thread: threading.Thread | None = None
+
+    def begin(self) -> None:
+        if self._thread is None or not self._thread.is_alive():
+            self._thread = threading.Thread(target=self._run, name="pebble-mqtt first host", daemon=True)
+            self._thread.start()
+
+    def _run(self) -> None:
+        self._result = self._probe()
+
+    def take(self) -> bool | None:
+        """The newest result, once; None: none."""
+        result, self._result = self._result, None
+        return result
