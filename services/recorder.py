@@ -10,7 +10,7 @@ from pebble.recordings.recorder import metrics
 from pebble.recordings.recorder.recorder import Recorder
 from pebble.recordings.recorder.settings import Options
 from pebble.recordings.recorder.source import Source
-from pebble.runtime.connections import REMOTE_RECONNECT_S, local_settings, mqtt_settings
+from pebble.runtime.connections import REMOTE_RECONNECT_S, local_settings, mqtt_settings, with_choice
 from pebble.runtime.process import run
 from pebble.runtime.service import Service, every
 
@@ -70,7 +70,11 @@ class RobotRecorder(Service):
         yield (
             "remote",
             "mqtt",
-            mqtt_settings(bridge.remote_mqtt, reconnect_max_s=REMOTE_RECONNECT_S, program="recorder"),
+            with_choice(
+                self.config,
+                mqtt_settings(bridge.remote_mqtt, reconnect_max_s=REMOTE_RECONNECT_S, program="recorder"),
+                "recorder",
+            ),
         )
 
 

@@ -1,6 +1,6 @@
 """The connection settings of the backends: plain data, so that reading a config imports no client library."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 
@@ -46,6 +46,11 @@ class MqttSettings:
     #: Filters of topics that are sent even to a broker that hangs up on them.
     vital: tuple[str, ...] = ()
     dscp: int = 0  # of our packets (RFC 2474), where the system permits it: 46 is served before 10
+
+    def each(self) -> tuple["MqttSettings", ...]:
+        """The same for each host alone."""
+        each = self.hosts or ((self.host, self.port),)
+        return tuple(replace(self, host=host, port=port, hosts=(), chosen=None, follows=False) for host, port in each)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -14,7 +14,8 @@ from pebble.client.driver_lease import ANSWER_S
 from pebble.client.named_topics import NamedTopics
 from pebble.errors import TransportError
 from pebble.runtime.by_name import EACH_S, ByName
-from pebble.transports import Message, MqttSettings, QoS, State, Subscription, Transport, create
+from pebble.runtime.every_host import operators
+from pebble.transports import Message, MqttSettings, QoS, State, Subscription, Transport
 
 log = logging.getLogger(__name__)
 
@@ -26,7 +27,7 @@ class Broker:
 
     def __init__(self, settings: MqttSettings, name: str = "pebble-web") -> None:
         """``name``: what the broker's log calls it."""
-        self.transport: Transport = create("mqtt", f"{name}-{secrets.token_hex(4)}", settings)
+        self.transport: Transport = operators(f"{name}-{secrets.token_hex(4)}", "mqtt", settings)
         self.transport.on_state(lambda _state: self._call(self._notify))
         self._loop: asyncio.AbstractEventLoop | None = None
         self._watchers: list[Callable[[], None]] = []

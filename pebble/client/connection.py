@@ -1,5 +1,6 @@
 """A command's own short-lived connection to a robot's local transport or to a broker."""
 
+import logging
 import os
 import queue
 import time
@@ -17,11 +18,15 @@ from pebble.config.text_files import password as password
 from pebble.errors import ConfigError, PebbleError, TransportError
 from pebble.runtime.addresses import Addresses
 from pebble.runtime.connections import REMOTE_RECONNECT_S, local_settings, mqtt_settings, zenoh_settings
+from pebble.runtime.every_host import EveryHost, operators
 from pebble.runtime.robot_estop import RobotEstop
-from pebble.transports import Message, MqttSettings, QoS, State, Transport, create
+from pebble.transports import Message, MqttSettings, QoS, State, Transport
+
+log = logging.getLogger(__name__)
 
 _LATE_S = 0.25  # some brokers send what is retained so long after they have acknowledged a subscription
 _OPEN_TIMEOUT_S = 3.0
+_FIND_S = 1.0  # where several brokers are heard: longer than a robot takes between two heartbeats
 _WAITING = 10_000  # messages that wait to be printed before new ones are dropped
 
 
@@ -55,11 +60,13 @@ def target_of(robot: str | None, options: Target) -> Target:
 def connected(target: Target) -> Iterator[tuple[Transport, Names]]:
     """Connect, and disconnect at the end. Raises PebbleError with a remedy if the connection fails."""
     kind, settings, names, where = resolve(target)
-    transport = create(kind, f"pebble-tool-{os.getpid()}", settings)
+    transport = operators(f"pebble-tool-{os.getpid()}", kind, settings)
     with closing(transport.open(_OPEN_TIMEOUT_S)):
         if transport.state is not State.CONNECTED:
             why = transport.problem or f"no answer within {_OPEN_TIMEOUT_S:g} s"
             raise TransportError(f"cannot connect to {where}: {why}")
+        if isinstance(transport, EveryHost) and names.base != ANY_ROBOT and not transport.find(names.base, _FIND_S):
+            log.info("%s is heard at no host", names.base)
         yield transport, names
 
 

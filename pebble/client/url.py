@@ -7,7 +7,7 @@ from pebble.config.hosts import HostError, split
 from pebble.errors import PebbleError
 from pebble.transports import MqttSettings, TlsSettings, ZenohSettings
 
-FORMS = "mqtt://HOST[:PORT], mqtts://HOST[:PORT] or zenoh:RUN_DIR"
+FORMS = "mqtt://HOST[:PORT][,HOST[:PORT]…], mqtts://… or zenoh:RUN_DIR"
 _PORTS = {"mqtt": 1883, "mqtts": 8883}
 
 
@@ -45,6 +45,7 @@ def _zenoh(path: str) -> ZenohSettings:
 
 
 def _mqtt(url: str, password: str | None, ca_cert: Path | None) -> MqttSettings:
+    url, *more = url.split(",")
     try:
         parts = split(url)
     except HostError as error:
@@ -56,13 +57,27 @@ def _mqtt(url: str, password: str | None, ca_cert: Path | None) -> MqttSettings:
         )
     if parts.rest.strip("/"):
         raise UrlError(f"--url must end after the port; topics are named separately: {FORMS}")
+    others = [_another(one, parts.scheme) for one in more]
     encrypted = parts.scheme == "mqtts"
     if ca_cert is not None and not encrypted:
         raise UrlError("--ca-cert has no use with mqtt://: use mqtts://")
+    port = _PORTS[parts.scheme] if parts.port is None else parts.port
     return MqttSettings(
         host=parts.host,
-        port=_PORTS[parts.scheme] if parts.port is None else parts.port,
+        port=port,
+        hosts=((parts.host, port), *others) if others else (),
         username=parts.user,
         password=password,
         tls=TlsSettings(ca_cert=ca_cert) if encrypted else None,
     )
+
+
+def _another(text: str, scheme: str) -> tuple[str, int]:
+    """A further broker of a list, with the same login and encryption."""
+    try:
+        parts = split(f"{scheme}://{text}")
+    except HostError as error:
+        raise UrlError(f"--url {error}; use {FORMS}") from None
+    if parts.user is not None or parts.rest.strip("/"):
+        raise UrlError(f"--url: after a comma only a further HOST[:PORT], all have the same login: {FORMS}")
+    return parts.host, _PORTS[scheme] if parts.port is None else parts.port

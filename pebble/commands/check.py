@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 import typer
 
 from pebble.config import Config, Mqtt, load, resolved
-from pebble.config.doors import place_of
+from pebble.config.doors import places_of
 from pebble.config.secret_text import shown_user, without_secrets
 from pebble.config.visible import shown
 from pebble.contract import CHANNELS, MEDIA_STATUS, STATUS, TOUCH_SENSORS, Channel
@@ -270,7 +270,7 @@ def _scripts(config: Config) -> list[tuple[str, str]]:
     bridge, shared = config.services.mqtt_bridge, config.transport.mqtt_mirror
     if config.transport.kind == "mqtt":
         elsewhere = bridge.remote is not None and bridge.remote.kind != "mqtt"
-        apart = elsewhere or place_of(bridge.remote_mqtt) != place_of(config.local_mqtt)
+        apart = elsewhere or not places_of(bridge.remote_mqtt) & places_of(config.local_mqtt)
         shared = None if bridge.enabled and apart else config.local_mqtt
     if shared is None:
         return []
@@ -282,7 +282,8 @@ def _mqtt(mqtt: Mqtt) -> str:
     password = "" if mqtt.username is None or mqtt.password is None else ", password ***"
     name = " without a check of the name" if mqtt.tls.insecure else ""
     tls = f"TLS{name}" if mqtt.tls.enabled else "not encrypted"
-    return f"{mqtt.host}:{mqtt.port}, MQTT {mqtt.protocol}, {user}{password}, {tls}"
+    places = ", else ".join(f"{host}:{port}" for host, port in mqtt.places)
+    return f"{places}, MQTT {mqtt.protocol}, {user}{password}, {tls}"
 
 
 def _local_media(config: Config) -> Iterator[str]:

@@ -26,11 +26,16 @@ def warn_if_readable(notes: Notes, path: Path, file: FilePath, what: str) -> Non
 def warn_of_logins_in_clear(notes: Notes, root: Root) -> None:
     """Warn of each broker on the network that receives a user name and a password without encryption."""
     for path, mqtt in brokers(root):
-        if mqtt.username is not None and not mqtt.tls.enabled and not is_loopback(mqtt.host):
+        if mqtt.username is not None and not mqtt.tls.enabled and not is_near(mqtt):
             fix = "set tls.enabled"
             if root.robot.platform == "esp8266":
                 fix = "this board has no TLS, so give it a login of its own that may do nothing else"
             notes.warning((*path, "username"), f"its password crosses the network unencrypted: {fix}")
+
+
+def is_near(mqtt: Mqtt) -> bool:
+    """Whether no broker of this section is on another machine."""
+    return all(is_loopback(host) for host, _ in mqtt.places)
 
 
 def brokers(root: Root) -> Iterator[tuple[Path, Mqtt]]:

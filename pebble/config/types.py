@@ -38,6 +38,7 @@ Endpoint = Annotated[
 ]
 Host = Annotated[str, Meta(extra={"parse": hosts.host})]
 BrokerHost = Annotated[str, Meta(extra={"parse": hosts.broker_host})]
+BrokerPlace = Annotated[str, Meta(extra={"parse": hosts.broker_place})]
 Device = Annotated[str, Meta(extra={"parse": hosts.no_login})]
 NameOfPage = Annotated[str, Meta(extra={"parse": hosts.name_of_page})]
 CommonName = Annotated[

@@ -72,15 +72,15 @@ def _robot(config: Config) -> Iterator[Finding]:
     yield from operator_page(config)
     yield from recorder(config)
     for name, mqtt in _brokers(config):
-        settings = mqtt_settings(mqtt, reconnect_max_s=REMOTE_RECONNECT_S, program="doctor")
         bridge = config.services.mqtt_bridge
         answer_s = LEVELS[bridge.link.slowest if mqtt is bridge.remote_mqtt else "wide"].answer_s
-        found = list(broker(name, settings, partial(probe, timeout_s=max(TIMEOUT_S, answer_s))))
-        yield from found
-        if mqtt is bridge.remote_mqtt and found[0].level is Level.OK:
-            yield from publishing(found[0].what, settings, config.base, answer_s)
-        if is_loopback(mqtt.host):
-            yield from beyond_loopback(name, settings, own_addresses())
+        for settings in mqtt_settings(mqtt, reconnect_max_s=REMOTE_RECONNECT_S, program="doctor").each():
+            found = list(broker(name, settings, partial(probe, timeout_s=max(TIMEOUT_S, answer_s))))
+            yield from found
+            if mqtt is bridge.remote_mqtt and found[0].level is Level.OK:
+                yield from publishing(found[0].what, settings, config.base, answer_s)
+            if is_loopback(settings.host):
+                yield from beyond_loopback(name, settings, own_addresses())
 
 
 def operator_page(config: Config) -> Iterator[Finding]:

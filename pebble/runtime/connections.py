@@ -84,11 +84,19 @@ def remote_transport(config: Config, name: str, *, will: Message | None = None) 
         remote, program = bridge.remote_mqtt, "" if name == _BRIDGE else name
         settings = mqtt_settings(remote, as_published=True, reconnect_max_s=REMOTE_RECONNECT_S, program=program)
         settings = replace_settings(settings, vital=(*_VITAL_STATES, *_renamed_vital(config)))
+        settings = with_choice(config, settings, name)
         if bridge.link.profile != "wide":
             settings = replace_settings(settings, dscp=_EXPEDITED if name == _BRIDGE else _ASSURED)
         return create("mqtt", _name(config, "mqtt", name), settings, will=will)
     kind = bridge.remote.kind
     return create(kind, _name(config, kind, name), _remote_settings(config, bridge.remote), will=will)
+
+
+def with_choice(config: Config, settings: MqttSettings, program: str) -> MqttSettings:
+    """Of several hosts the bridge chooses one, and the robot's other programs connect there."""
+    if not settings.hosts:
+        return settings
+    return replace_settings(settings, chosen=config.run_dir() / "remote-host", follows=program != _BRIDGE)
 
 
 def stops_transport(config: Config) -> Transport | None:
@@ -102,7 +110,7 @@ def stops_transport(config: Config) -> Transport | None:
     if bridge.remote is not None or (config.security.level == "open" and bridge.link.profile == "wide"):
         return None
     settings = mqtt_settings(bridge.remote_mqtt, reconnect_max_s=REMOTE_RECONNECT_S, program=_STOPS)
-    return create("mqtt", _name(config, "mqtt", _STOPS), settings)
+    return create("mqtt", _name(config, "mqtt", _STOPS), with_choice(config, settings, _STOPS))
 
 
 def mirror_transport(config: Config, mirror: Mqtt, name: str) -> Transport:
@@ -187,6 +195,7 @@ def mqtt_settings(
     return MqttSettings(
         host=mqtt.host,
         port=mqtt.port,
+        hosts=mqtt.places if mqtt.hosts else (),
         keepalive_s=mqtt.keepalive,
         username=mqtt.username,
         password=mqtt.password,

@@ -17,6 +17,7 @@ from pebble.client.connection import Target, connected, put_names
 from pebble.client.names import Names
 from pebble.client.robot_view import RobotView
 from pebble.config import Config
+from pebble.config.exposure import is_near
 from pebble.config.web import is_loopback
 from pebble.contract import codec
 from pebble.contract.identity import parse_topic
@@ -75,7 +76,7 @@ class Side:
         """Whether it ends on this machine: what other robots have left there can only be left over."""
         if self.own:
             return config.transport.kind != "mqtt" or is_loopback(config.local_mqtt.host)
-        return is_loopback(config.services.mqtt_bridge.remote_mqtt.host)
+        return is_near(config.services.mqtt_bridge.remote_mqtt)
 
     def ask(self) -> None:
         """Some brokers send what is retained only to those who ask by name."""

@@ -10,7 +10,7 @@ from pebble.contract import CHANNELS
 from pebble.errors import TransportError
 from pebble.runtime.addresses import Addresses
 from pebble.runtime.connections import REMOTE_RECONNECT_S, mqtt_settings
-from pebble.transports import QoS, State
+from pebble.transports import MqttSettings, QoS, State
 from pebble.transports.mqtt.transport import MqttTransport
 
 _OPEN_S, _LONGEST_S = 5.0, 10.0
@@ -28,13 +28,17 @@ def topics(config: Config) -> Iterator[str]:
 
 def remove(config: Config) -> int:
     """Remove them with the robot's own login; returns how many there were. Raises TransportError."""
-    mqtt = config.services.mqtt_bridge.remote_mqtt
-    client = MqttTransport("setup", mqtt_settings(mqtt, reconnect_max_s=REMOTE_RECONNECT_S, program="setup"))
+    mqtt = mqtt_settings(config.services.mqtt_bridge.remote_mqtt, reconnect_max_s=REMOTE_RECONNECT_S, program="setup")
+    return sum(_remove_at(one, list(topics(config))) for one in mqtt.each())
+
+
+def _remove_at(settings: MqttSettings, filters: list[str]) -> int:
+    client = MqttTransport("setup", settings)
     with closing(client):
         client.open(_OPEN_S)
         if client.state is not State.CONNECTED:
-            raise TransportError(f"broker {mqtt.host}:{mqtt.port}: {client.problem or 'does not answer'}")
-        return _remove(client, list(topics(config)))
+            raise TransportError(f"broker {settings.host}:{settings.port}: {client.problem or 'does not answer'}")
+        return _remove(client, filters)
 
 
 def _remove(client: MqttTransport, filters: list[str]) -> int:

@@ -91,8 +91,10 @@ class MqttBridge(ForwardingService):
             **{row.channel.suffix: partial(self._on_action, row.channel) for row in ACTIONS},
             AUDIT_READ.suffix: self._on_audit_read,
         }
-        if section.link.profile != "wide":
+        self._moved_at = self.clock()  # of the newest command that moves something
+        if section.link.profile != "wide" or section.remote_mqtt.hosts:
             self._message_reactions[DRIVE.suffix] = self._on_drive
+        self.remote.idle_s = lambda: self.clock() - self._moved_at
         self._flag_reactions: dict[str, Callable[[bytes], None]] = {
             **{row.flag.suffix: partial(self._on_media_flag, row.flag) for row in MEDIA},
             REMOTE_MIRROR.suffix: self._on_remote_mirror,
@@ -364,11 +366,11 @@ class MqttBridge(ForwardingService):
 
     def _on_drive(self, payload: bytes) -> None:
         """On a thin link pictures and sound wait while a person drives; who the robot obeys is decided elsewhere."""
-        if not self._is_thin:
-            return
         with suppress(PayloadError):
             command: Drive = codec.decode(DRIVE, payload)
-            if command.moves and command.source != SCRIPT:
+            if command.moves:
+                self._moved_at = self.clock()
+            if self._is_thin and command.moves and command.source != SCRIPT:
                 self.post_message(DRIVE, lambda: self._hold.drive(self.clock()), newest_of="hold")
 
     def _on_audit_read(self, payload: bytes) -> None:

@@ -4,6 +4,7 @@ import logging
 import re
 import sys
 import time
+from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -117,11 +118,22 @@ def _modern(transport: Any, protocol: str) -> Any:
     return replace(transport, protocol=protocol)
 
 
+def _each_host(kind: str, transport: Any, filters: tuple[str, ...], name: str, where: str) -> Iterator[_Connection]:
+    """A recording tells what each of several brokers has sent."""
+    if not isinstance(transport, MqttSettings) or not transport.hosts:
+        yield kind, transport, filters, name, where
+        return
+    for one in transport.each():
+        place = f"{one.host}:{one.port}"
+        yield kind, one, filters, f"{name} {place}".strip(), place
+
+
 def _run(into: Path, options: Options, connections: list[_Connection], *, length: str | None) -> int:
     logging.getLogger("pebble.recordings").setLevel(logging.INFO)
     ends_at = None if length is None else time.monotonic() + seconds(length)
     about = {"filters": " ".join(filter_ for one in connections for filter_ in one[2])}
     recorder = Recorder(into, options, about)
+    connections = [one for connection in connections for one in _each_host(*connection)]
     sources = [Source(recorder, kind, transport, filters, name) for kind, transport, filters, name, _ in connections]
     with ExitStack() as stack:
         stack.enter_context(interrupted_by_signals())
