@@ -21,7 +21,7 @@ class MqttSettings:
 
     host: str
     port: int = 1883
-    #: Several brokers, the first one preferred: one at a time is used, and ``host`` and ``port`` are those of the first.
+    #: Several brokers, the preferred one first, whose ``host`` and ``port`` are above. One at a time is used.
     hosts: tuple[tuple[str, int], ...] = ()
     chosen: Path | None = None  # where the program that chooses among them tells the others which one it uses
     follows: bool = False  # this is one of the others

@@ -14,7 +14,7 @@ from pebble.client.driver_lease import ANSWER_S
 from pebble.client.named_topics import NamedTopics
 from pebble.errors import TransportError
 from pebble.runtime.by_name import EACH_S, ByName
-from pebble.runtime.every_host import operators
+from pebble.runtime.every_host import EveryHost, operators
 from pebble.transports import Message, MqttSettings, QoS, State, Subscription, Transport
 
 log = logging.getLogger(__name__)
@@ -60,6 +60,17 @@ class Broker:
         if not self.connected:
             return self.transport.problem or "not connected yet"
         return "it does not answer" if self.transport.outgoing.stalled_s > ANSWER_S else ""
+
+    def on_move(self, watcher: Callable[[str, str, bool], None]) -> None:
+        """Of several brokers: call ``watcher`` when a robot is found at one, or at another one than before.
+
+        It gets the robot's base, host and port of the broker, and whether it is the preferred one.
+        """
+        transport = self.transport
+        if isinstance(transport, EveryHost):
+            transport.moved = lambda base: self._call(
+                lambda: watcher(base, transport.host_of(base), transport.is_first(base))
+            )
 
     async def open(self) -> None:
         """Start connecting, and wait a moment for success. Raises TransportError for settings that can never work."""

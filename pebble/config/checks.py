@@ -251,7 +251,9 @@ def _with_hosts(reader: Reader, mqtt: Mqtt, path: Path) -> Mqtt:
     if not mqtt.hosts:
         return mqtt
     if mqtt.host not in ("", Mqtt().host, mqtt.places[0][0]):
-        reader.notes.problem((*path, "host"), f"is given beside hosts: write {mqtt.host} into hosts, and leave out host")
+        reader.notes.problem(
+            (*path, "host"), f"is given beside hosts: write {mqtt.host} into hosts, and leave out host"
+        )
     if len(mqtt.hosts) > _MOST_HOSTS:
         reader.notes.problem((*path, "hosts"), f"must be {_MOST_HOSTS} at most, not {len(mqtt.hosts)}")
     if twice := [host for place, host in enumerate(mqtt.hosts) if mqtt.places[place] in mqtt.places[:place]]:

@@ -41,8 +41,8 @@ class Mqtt(Section, frozen=True, kw_only=True):
         tuple[BrokerPlace, ...],
         doc(
             "Instead of host: up to eight brokers that know nothing of each other, the first one preferred. Each is a "
-            "name or address, with a port after a colon if it has another one. A robot uses one at a time, and operators "
-            "hear all; login and encryption are the same. See docs/fleet.md."
+            "name or address, with a port after a colon if it has another one. A robot uses one at a time, and "
+            "operators hear all; login and encryption are the same. See docs/fleet.md."
         ),
     ] = ()
     keepalive: Annotated[

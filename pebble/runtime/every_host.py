@@ -351,7 +351,7 @@ class EveryHost(Transport):
         self._expected = dict.fromkeys(topics, number)
         host.ask(topics)
         with self._lock:
-            self._lock.wait_for(lambda: not self._expected or self._state is State.CLOSED, 0.0 if self._asked else _LATE_S)
+            self._lock.wait_for(lambda: not self._expected or self._state is State.CLOSED, _LATE_S)
             missing, self._expected = list(self._expected), {}
             if host.state is not State.CONNECTED or (missing and self._home_of(missing[0]) != number):
                 return

@@ -235,10 +235,15 @@ class Driving:
 
     def stop(self, ref: str, now: float) -> list[Command]:
         """A zero from anybody; the gesture that moves the robot is over."""
-        lease = self.leases.get(ref)
-        if lease is not None and lease.tab.live is not None and lease.tab.live_ref == ref:
-            self._end_gesture(lease.tab, lease.tab.live, now)
+        self.interrupt(ref, now)
         return self._final_zero(ref, now)
+
+    def interrupt(self, ref: str, now: float) -> list[Command]:
+        """The gesture that moves the robot is over."""
+        lease = self.leases.get(ref)
+        if lease is None or lease.tab.live is None or lease.tab.live_ref != ref:
+            return []
+        return self._end_gesture(lease.tab, lease.tab.live, now)
 
     def tick(self, now: float) -> list[Command]:
         """End silent gestures and idle leases; to be called every 50 ms."""

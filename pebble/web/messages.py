@@ -324,6 +324,13 @@ class Liveness(Struct, frozen=True, kw_only=True):
     whole_seconds: bool  # its clock counts whole seconds: latency says nothing
 
 
+class HostView(Struct, frozen=True, kw_only=True):
+    """``web/host``: at which of several brokers the component is; not sent where the server knows only one."""
+
+    host: str  # and its port
+    first: bool  # it is the preferred one
+
+
 class OwnerState(Struct, frozen=True, kw_only=True):
     """One motor owner in EstopView."""
 
@@ -425,6 +432,7 @@ class RestartsView(Struct, frozen=True, kw_only=True):
 
 SERVER_METRICS: dict[str, type] = {
     "web/liveness": Liveness,
+    "web/host": HostView,
     "web/estop": EstopView,
     "web/driver": DriverView,
     "web/picture": PictureView,

@@ -93,6 +93,7 @@ class Server:
 
     async def open(self) -> None:
         """Connect to the broker and subscribe. Raises TransportError for settings that can never work."""
+        self.broker.on_move(self._moved)
         await self.broker.open()
         self.broker.on_state(self._show_broker)
         self.broker.on_state(self.driving.renew_key)
@@ -145,6 +146,12 @@ class Server:
         if address.metric == CAPABILITIES.metric:
             for one in (ref, *(page for page, source in self.robots.sources.items() if source == ref)):
                 self.open_components.update(one)
+
+    def _moved(self, ref: str, host: str, first: bool) -> None:
+        """The robot is at another broker: what moves it has an end there, and begins anew."""
+        self.publish(self.driving.interrupt(ref, clock()))
+        if host:
+            self.robots.set_server_metric(ref, "web/host", m.HostView(host=host, first=first))
 
     def _announced(self, message: Message, _now: float) -> None:
         """Another server drives robots."""

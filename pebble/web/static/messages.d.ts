@@ -256,6 +256,11 @@ export interface Liveness {
   whole_seconds: boolean;
 }
 
+export interface HostView {
+  host: string;
+  first: boolean;
+}
+
 export interface EstopView {
   available: boolean;
   latched: boolean;
@@ -325,6 +330,7 @@ export interface BrokerView {
 
 export interface Metrics {
   "web/liveness": Liveness;
+  "web/host": HostView;
   "web/estop": EstopView;
   "web/driver": DriverView;
   "web/picture": PictureView;

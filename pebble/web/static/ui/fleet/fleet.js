@@ -257,6 +257,12 @@ function DoubtFact({ at }) {
   return text ? html`<${Told} sign=${no ? "▲" : "?"} className=${no ? "bad" : "dim"}>${text}<//>` : null;
 }
 
+/** The broker where it is, if that is not the preferred one. */
+function HostFact({ at }) {
+  const view = useValue(at, "web/host");
+  return view && !view.first && html`<li class="fact dim">broker ${view.host}</li>`;
+}
+
 function FleetCard({ at }) {
   const { commands, settings, connection } = usePage();
   useModel(settings);
@@ -287,6 +293,7 @@ function FleetCard({ at }) {
       <ul class="facts">
         <${BatteryFact} at=${at} online=${connection.isOpen} />
         ${connection.isOpen && html`<${DoubtFact} at=${at} />`}
+        <${HostFact} at=${at} />
         <${DriverFact} at=${at} offers=${offers} online=${connection.isOpen} estop=${estop} pictured=${pictured} />
         <${ScriptFact} at=${at} online=${connection.isOpen} />
         ${typeOf(at) !== "robots" ? html`<${StatusFact} at=${at} />` : html`<${ServiceFact} at=${at} />`}
