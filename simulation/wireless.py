@@ -32,7 +32,7 @@ Motors = tuple[float, float]
 class BrokerAddress:
     """Address and login of a robot's broker; ``ca`` (DER) or ``tls`` enables TLS."""
 
-    host: str
+    host: str | tuple[str, ...]  # several: it uses one at a time
     port: int
     username: str | None = None
     password: str | None = None
@@ -40,7 +40,7 @@ class BrokerAddress:
     ca: Path | None = None
 
     def __str__(self) -> str:
-        return f"{self.host}:{self.port}"
+        return ", ".join(f"{one}:{self.port}" for one in ([self.host] if isinstance(self.host, str) else self.host))
 
     def settings(self) -> dict[str, Any]:
         """Return the section ``mqtt`` of a private_config.json."""

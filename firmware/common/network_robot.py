@@ -116,6 +116,7 @@ class NetworkRobot:
             if self.body.drive(*self._next[:3]):
                 self.deadman.limit_ms = self._limit_ms
                 self.deadman.feed(now)
+                self.session.moved = now
             else:
                 self.deadman.rest()
 

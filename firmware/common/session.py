@@ -9,7 +9,7 @@ from micropython import const
 
 from common import mqtt
 from common.connection import Connection
-from common.settings import get, host
+from common.settings import get, hosts
 from common.sockets import Stream, query_name
 from common.ticks import diff
 
@@ -18,6 +18,8 @@ _LONGEST_PAYLOAD = const(512)
 _LONGEST_TOPIC = const(58)  # below the base: /incoming/by/{account}/drive-values
 _OUTGOING = const(420)  # plus three topics: room for a state and the 20 PUBACKs that a broker waits for
 _CHUNKS = const(4)  # reads per turn, at most
+_HUNG_MS = const(3500)
+_REST_MS = const(1800000)  # at rest, before a robot at another broker tries the first one
 _CALM_MS = const(3000)  # with the flood's last two seconds five: the next attempt is soon
 _PACE_MS = const(30)  # between two writes, so that acknowledgements share packets
 # Writes in flight, as far as pings tell. An ESP8266 queues eight; the ninth blocks for up to ten seconds, even if the
@@ -35,7 +37,7 @@ class Session:
         ValueError.
         """
         self.settings = settings
-        self._host = host(settings)
+        self._hosts = hosts(settings)
         self.root = root
         # A broker disconnects a client when another one uses the same id: so it cannot be guessed, and is the same
         # until the next boot. A broker must accept 23 bytes of it, and may refuse more (3.1.3.1).
@@ -45,6 +47,9 @@ class Session:
         self.wrap = wrap
         self._take = take
         self.connection = Connection()
+        self.moved = 0  # the motors, or the connection to another broker than the first one
+        if len(self._hosts) > 1 and not wrap:
+            self.connection.connecting_ms = _HUNG_MS
         self._open: Stream | None = None  # to the broker; before that, the query for its address
         self._in_flight = 0  # writes that may not have arrived yet
         self._behind = 0  # those after the last ping
@@ -68,7 +73,12 @@ class Session:
             self._paused = connection.reason == "silence" and diff(now, self._received) < 500
             raise OSError(connection.reason)
         if due == "resolve":
-            self._open = query_name(self._host, server, now, connection.failures)  # type: ignore[assignment]
+            turn, count = connection.failures, len(self._hosts)
+            self._host = self._hosts[turn % count]
+            self._open = query_name(self._host, server, now, turn // count)  # type: ignore[assignment]
+        if connection.state == "online" and diff(now, self.moved) >= _REST_MS and connection.failures % len(self._hosts):
+            connection.failures = 0
+            raise OSError("back to the first broker")
         if connection.state == "resolving":
             self._connect(now, clock)
             return False
@@ -86,6 +96,7 @@ class Session:
         if not address:
             raise OSError("no address for " + self._host)
         if self.wrap:
+            self.wrap.host = self._host
             self.wrap.set_time(clock.read(now))
         self._open = Stream(address, get(settings, "mqtt", "port", 8883 if self.wrap else 1883), self.wrap)
         self.client.restart()
@@ -139,7 +150,7 @@ class Session:
                         self._take(kind, now)
                     if self.connection.state != "online":
                         self._in_flight = 0
-                        self._since = now
+                        self._since = self.moved = now
                         self.connection.move("online", now)
                 kind = client.take()
             if count < len(space):

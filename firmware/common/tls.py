@@ -13,9 +13,10 @@ import machine
 class Wrapper:
     """Wraps a socket in TLS. ``options``: true, or {"ca": a DER file on the board, "server_name": ...}."""
 
-    def __init__(self, options: bool | dict, host: str) -> None:
+    def __init__(self, options: bool | dict) -> None:
         self._ca = None if options is True else options.get("ca")  # type: ignore[union-attr]  # not False
-        self._name = host if options is True else options.get("server_name", host)  # type: ignore[union-attr]
+        self._name = "" if options is True else options.get("server_name", "")  # type: ignore[union-attr]
+        self.host = ""  # as it is named in the settings, of the next connection
 
     def set_time(self, epoch_ms: int) -> None:
         """Set the board's clock, if the time is known: certificates have a validity period (docs, library/ssl).
@@ -35,4 +36,4 @@ class Wrapper:
             context.verify_mode = ssl.CERT_REQUIRED  # type: ignore[attr-defined]  # not in the stub
         else:
             context.verify_mode = ssl.CERT_NONE  # type: ignore[attr-defined]
-        return context.wrap_socket(plain, server_hostname=self._name, do_handshake_on_connect=False)
+        return context.wrap_socket(plain, server_hostname=self._name or self.host, do_handshake_on_connect=False)

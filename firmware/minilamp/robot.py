@@ -45,5 +45,5 @@ class Body:
 def build(settings: dict) -> NetworkRobot:
     body = Body()  # before anything else: motors off
     tls = get(settings, "mqtt", "tls", False)
-    wrap = Wrapper(tls, get(settings, "mqtt", "host")) if tls else None
+    wrap = Wrapper(tls) if tls else None
     return NetworkRobot(settings, body, b"false", wrap)

@@ -250,7 +250,7 @@ def test_settings_that_are_missing_are_named_when_the_motors_are_off(kind: str) 
 
 def test_a_certificate_needs_the_date() -> None:
     drill = Drill("minilamp", 1)
-    wrapper = drill.board.firmware.module("common.tls").Wrapper({"ca": "/ca.der"}, "broker")
+    wrapper = drill.board.firmware.module("common.tls").Wrapper({"ca": "/ca.der"})
     wrapper.set_time(5_000)  # since boot
     assert drill.board.rtc[0] == 2000
     wrapper.set_time(1_700_000_000_999)

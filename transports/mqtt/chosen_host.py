@@ -26,7 +26,7 @@ class ChosenHost:
     def read(self) -> Place:
         """The first host until one was chosen, and if the file names none of ours."""
         try:
-            text = self._file.read_text().strip()
+            text = self._file.read_text(encoding="utf-8").strip()
         except (OSError, UnicodeDecodeError):
             text = ""
         return self._places.get(text) or next(iter(self._places.values()))
@@ -34,7 +34,7 @@ class ChosenHost:
     def write(self, place: Place) -> None:
         part = self._file.with_name(f".{self._file.name}.{os.getpid()}")
         try:
-            part.write_text(f"{place}\n")
+            part.write_text(f"{place}\n", encoding="utf-8")
             part.replace(self._file)
         except OSError as error:
             log.warning("%s cannot be written, so pictures and sound may go elsewhere: %s", self._file, error.strerror)
