@@ -44,7 +44,10 @@ class Connection:
         elif state == "offline" or (state == "waiting" and age >= self._wait):
             self.move("resolving", now)
             return "resolve"
-        elif state != "waiting" and age >= {"resolving": 3500, "connecting": self.connecting_ms, "subscribing": 2000}[state]:
+        elif (
+            state != "waiting"
+            and age >= {"resolving": 3500, "connecting": self.connecting_ms, "subscribing": 2000}[state]
+        ):
             self.reason = state + " took too long"
             return "drop"
         return ""

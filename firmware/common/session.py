@@ -76,7 +76,11 @@ class Session:
             turn, count = connection.failures, len(self._hosts)
             self._host = self._hosts[turn % count]
             self._open = query_name(self._host, server, now, turn // count)  # type: ignore[assignment]
-        if connection.state == "online" and diff(now, self.moved) >= _REST_MS and connection.failures % len(self._hosts):
+        if (
+            connection.state == "online"
+            and diff(now, self.moved) >= _REST_MS
+            and connection.failures % len(self._hosts)
+        ):
             connection.failures = 0
             raise OSError("back to the first broker")
         if connection.state == "resolving":
