@@ -184,8 +184,8 @@ def fail_while_driving(world: Hosts, fault: str, counts: Counts, *, stops: bool 
 
 def _stop(world: Hosts, failed_at: float, counts: Counts) -> None:
     """A stop takes effect within a second after some host is heard again."""
-    operator, name = world.operator, random.getrandbits(32)
-    body = {"id": f"{name:08x}", "by": "ann", "why": "test"}
+    operator = world.operator
+    body = {"stop": f"{random.getrandbits(64):016x}", "by": "ann", "why": "test"}
     end = time.monotonic() + 15
     latched: list[float] = []
     while not latched and time.monotonic() < end:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
@@ -28,7 +28,7 @@ def test_a_driven_robot_goes_to_another_host(world: Hosts, fault: str) -> None:
     counts = Counts()
     for _ in range(cases(1, 10)):
         fail_while_driving(world, fault, counts)
-    print(f"\n{fault}: {counts}")
+    sys.stdout.write(f"\n{fault}: {counts}\n")
     assert {what: counts.wrong[what] for what in NEVER} == dict.fromkeys(NEVER, 0)
     assert max(counts.took[f"{fault}: heartbeat elsewhere after"]) <= ELSEWHERE_S[fault]
     assert max(counts.took["wheels left turning"]) <= 1.0
@@ -41,7 +41,7 @@ def test_a_stop_while_the_host_changes_takes_effect_once_one_is_heard(world: Hos
     for _ in range(cases(1, 5)):
         fail_while_driving(world, fault, counts, stops=True)
         world.reset()
-    print(f"\n{fault}, stops: {counts}")
+    sys.stdout.write(f"\n{fault}, stops: {counts}\n")
     assert {what: counts.wrong[what] for what in NEVER} == dict.fromkeys(NEVER, 0)
     assert max(counts.took["stop confirmed after a host is heard"]) <= 1.0
     assert max(counts.took["wheels left turning"]) <= 1.0
