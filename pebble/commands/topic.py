@@ -6,6 +6,8 @@ import math
 import shutil
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 from typing import Annotated
 
@@ -23,6 +25,7 @@ from pebble.contract.identity import parse_topic
 from pebble.errors import PayloadError, PebbleError, TransportError
 from pebble.media.rate_meter import RateMeter
 from pebble.runtime.by_name import ByName, ask_beside
+from pebble.runtime.every_host import EveryHost
 from pebble.transports import Message, QoS, Transport
 from pebble.transports.topics import is_pattern
 
@@ -68,8 +71,10 @@ def list_(
         pebble topic list -c goob.json
         pebble topic list 'pebble/+/+/outgoing/#' --url mqtt://127.0.0.1 -s 5
     """
-    with connected(target) as (transport, names):
+    with _connected(target) as (transport, names):
         listing, by_name = show.Listing(names), ByName(CHANNELS)
+        if isinstance(transport, EveryHost):
+            listing.host_of = transport.host_of
 
         def note(message: Message) -> None:
             by_name.receive(message, time.monotonic())
@@ -110,7 +115,7 @@ def echo(
         pebble topic echo capabilities -c goob.json --raw -n 1 | jq .value.drive
     """
     printed = 0
-    with connected(target) as (transport, names):
+    with _connected(target) as (transport, names):
         robot = _estop(transport, names, topic)
         if robot is not None and robot.stopped_by is not None:
             typer.echo(f"pebble: {show.stopped_line(robot, time.time())}", err=True)
@@ -160,7 +165,7 @@ def pub(
         pebble topic pub flags/mqtt-video true -c fred.json
         pebble topic pub lights-flash @party.json --url mqtt://127.0.0.1 -r goob
     """
-    with connected(target) as (transport, names):
+    with _connected(target) as (transport, names):
         message = draft(names, topic, payload, retain=retain, qos=qos, force=force)
         for warning in message.warnings:
             typer.echo(f"pebble: warning: {warning}", err=True)
@@ -201,9 +206,18 @@ def bw(topic: Name, window: WindowOption = 100, seconds: SecondsOption = None, *
     return _measure("bw", topic, window, seconds, target)
 
 
+@contextmanager
+def _connected(target: Target) -> Iterator[tuple[Transport, Names]]:
+    """Of several brokers it tells at which one the robot is."""
+    with connected(target) as (transport, names):
+        if isinstance(transport, EveryHost) and (host := transport.host_of(names.base)):
+            typer.echo(f"pebble: {shown(names.base)} is at broker {host}", err=True)
+        yield transport, names
+
+
 def _measure(what: str, topic: str, window: int, seconds: float | None, target: Target) -> int:
     meter = RateMeter(window_s=math.inf, limit=window + 1)
-    with connected(target) as (transport, names):
+    with _connected(target) as (transport, names):
         listener = Listener(transport, names.filters(topic))
         end, report_at, reported = _end(seconds), time.monotonic() + _REPORT_PERIOD_S, 0
         while time.monotonic() < end:
