@@ -143,3 +143,37 @@ def test_the_address_of_a_stream(url: str, public: str, warned: str) -> None:
 def test_a_config_of_the_original_loads_unchanged() -> None:
     config = load(Path(__file__).parent.parent / "data" / "original-shaped-config.json", {})
     assert config.services.mqtt_bridge.remote_mqtt.host
+
+
+def _remote(**keys: object) -> dict[str, object]:
+    return {"robot": {"id": "r"}, "services": {"mqtt_bridge": {"enabled": True, "remote_mqtt": keys}}}
+
+
+def test_a_list_of_brokers_is_brought_into_one_spelling() -> None:
+    mqtt = parse(_remote(hosts=["a.lan.", "b.lan:8883", "::1", "[::2]:7"], port=1884)).services.mqtt_bridge.remote_mqtt
+    assert mqtt.places == (("a.lan", 1884), ("b.lan", 8883), ("::1", 1884), ("::2", 7))
+    assert (mqtt.host, mqtt.port) == mqtt.places[0]
+    assert parse(_remote(hosts=["a.lan"])) == parse(_remote(host="a.lan"))
+
+
+@pytest.mark.parametrize(
+    ("keys", "problem"),
+    [
+        ({"host": "c", "hosts": ["a", "b"]}, "host: is given beside hosts: write c into hosts, and leave out host"),
+        ({"hosts": ["a", "b", "a:1883"]}, "hosts: names a:1883 twice, leave one of them"),
+        ({"hosts": [f"b{number}" for number in range(9)]}, "hosts: must be 8 at most, not 9"),
+        ({"hosts": ["mqtt://b:1883"]}, "is a URL: write"),
+        ({"hosts": ["ann:s3cr3t@b"]}, "holds a login"),
+        ({"hosts": ["b/topic:7"]}, "holds a path"),
+    ],
+)
+def test_what_is_wrong_with_a_list_is_named(keys: dict[str, object], problem: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        parse(_remote(**keys))
+    assert problem in str(caught.value)
+    assert "s3cr3t" not in str(caught.value)
+
+
+def test_a_robots_own_broker_is_one() -> None:
+    with pytest.raises(ConfigError, match=r"local_mqtt\.hosts: cannot be several"):
+        parse({"robot": {"id": "r"}, "local_mqtt": {"hosts": ["a", "b"]}})
