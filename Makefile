@@ -5,7 +5,7 @@ VENV := .venv/bin/python
 
 .DEFAULT_GOAL := help
 unexport PYTHONDONTWRITEBYTECODE  # every test starts programs: compiling them each time would cost a third of the time
-.PHONY: help demo demo-options test quick thorough stops soak floods schedules script-schedules page-schedules page-tests looks gstreamer gstreamer-tests brokers check firmware report clean lock audit sbom release life life-long check-types check-names check-collection quick-tests test-running test-robots test-computing test-checks test-demo
+.PHONY: help demo demo-options test quick thorough fleet stops soak floods schedules script-schedules page-schedules page-tests looks gstreamer gstreamer-tests brokers check firmware report clean lock audit sbom release life life-long check-types check-names check-collection quick-tests test-running test-robots test-computing test-checks test-demo
 
 help:
 	@echo "make demo             four simulated robots, on Zenoh, on MQTT and on MCUs, driven through a broker; Ctrl-C ends it"
@@ -14,6 +14,7 @@ help:
 	@echo "make test             all checks and tests, some ten minutes"
 	@echo "make quick            what to run before each commit: lint, types, contract, memory transport, one robot; a minute"
 	@echo "make thorough         the same, with all cases of the random tests, and the tests that take longest"
+	@echo "make fleet            brokers that are killed, hung and cut off under driven robots and 300 boards, ten minutes"
 	@echo "make stops            400 random schedules of emergency stops and faults with whole robots, 40 minutes"
 	@echo "make soak             floods, kills, freezes, full disks and more while an operator drives; MINUTES=30 for each transport"
 	@echo "make floods           60,000 retained flags, 10,000 actions a second and more, also while a robot starts, four minutes"
@@ -109,6 +110,12 @@ test-computing:
 
 thorough: gstreamer
 	@PEBBLE_THOROUGH=1 $(MAKE) --no-print-directory test
+
+# Whole fleets; make test has one row of each rule.
+FLEET := tests/fleet/test_hosts.py
+fleet: .venv/.ready-dev
+	@sh tools/debian-packages.sh mosquitto=mosquitto
+	@PEBBLE_THOROUGH=1 $(TESTS) --timeout 900 -s $(FLEET)
 
 # Every state of the operator page on every size, every card, its sound, every interruption, and fingers.
 page-tests: .venv/.ready-dev

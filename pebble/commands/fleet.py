@@ -345,7 +345,7 @@ def _keep_admin(name: str) -> None:
 
 
 def _print_account(place: Path, fleet: Fleet, name: str, secret: str, how: str, *, board: bool = False) -> None:
-    account, server = fleet.accounts[name], fleet.brokers[0]
+    account = fleet.accounts[name]
     typer.echo(f"{name} may log in as {', '.join(account.roles)} ({how})")
     typer.echo(f"    password: {secret}")
     typer.echo("It is shown this once.")
@@ -354,7 +354,7 @@ def _print_account(place: Path, fleet: Fleet, name: str, secret: str, how: str, 
         typer.echo(f"For its config, which no other user may read, with a copy of {ca} beside it:")
         typer.echo(json.dumps(piece_of_config(fleet, name, secret, board=board), indent=2))
         return
-    url = f"mqtts://{name}@{server.host}:{server.port}"
+    url = f"mqtts://{name}@" + ",".join(_place(server) for server in fleet.brokers)
     if ProgramRole.PAGE in account.roles:
         typer.echo(f"    pebble web --url {url} --ca-cert {ca} --password-file FILE")
     elif ProgramRole.GATEWAY not in account.roles:
@@ -363,11 +363,19 @@ def _print_account(place: Path, fleet: Fleet, name: str, secret: str, how: str, 
 
 def piece_of_config(fleet: Fleet, name: str, secret: str, *, board: bool) -> dict[str, Any]:
     """What a robot's config needs, to be at this broker."""
-    server = fleet.brokers[0]
-    login = {"host": server.host, "port": server.port, "username": name, "password": secret}
+    server, *others = fleet.brokers
+    places: dict[str, Any] = {"host": server.host, "port": server.port}
+    if others:
+        places = {"hosts": [one.host if one.port == server.port else _place(one) for one in fleet.brokers]}
+        places["port"] = server.port
+    login = places | {"username": name, "password": secret}
     link = login | {"tls": {"enabled": True, "ca_cert": certificates.CA_CERT}}
     found = {"local_mqtt": link} if board else {"services": {"mqtt_bridge": {"enabled": True, "remote_mqtt": link}}}
     return {"security": {"level": _level(fleet, fleet.accounts[name])}, **found}
+
+
+def _place(server: Server) -> str:
+    return f"[{server.host}]:{server.port}" if ":" in server.host else f"{server.host}:{server.port}"
 
 
 def _level(fleet: Fleet, account: Account) -> str:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from pebble.client.url import settings_of
-from pebble.config import load, parse
+from pebble.config import Config, load, parse
 from pebble.config.hosts import HostError, broker_host, endpoint, name_of_page
 from pebble.errors import ConfigError, PebbleError
 from pebble.fleet.certificates import init
@@ -145,15 +145,19 @@ def test_a_config_of_the_original_loads_unchanged() -> None:
     assert config.services.mqtt_bridge.remote_mqtt.host
 
 
+def _parse(raw: object) -> Config:
+    return parse(raw, folder=Path("/"), env={})
+
+
 def _remote(**keys: object) -> dict[str, object]:
     return {"robot": {"id": "r"}, "services": {"mqtt_bridge": {"enabled": True, "remote_mqtt": keys}}}
 
 
 def test_a_list_of_brokers_is_brought_into_one_spelling() -> None:
-    mqtt = parse(_remote(hosts=["a.lan.", "b.lan:8883", "::1", "[::2]:7"], port=1884)).services.mqtt_bridge.remote_mqtt
+    mqtt = _parse(_remote(hosts=["a.lan.", "b.lan:8883", "::1", "[::2]:7"], port=1884)).services.mqtt_bridge.remote_mqtt
     assert mqtt.places == (("a.lan", 1884), ("b.lan", 8883), ("::1", 1884), ("::2", 7))
     assert (mqtt.host, mqtt.port) == mqtt.places[0]
-    assert parse(_remote(hosts=["a.lan"])) == parse(_remote(host="a.lan"))
+    assert _parse(_remote(hosts=["a.lan"])) == _parse(_remote(host="a.lan"))
 
 
 @pytest.mark.parametrize(
@@ -169,11 +173,11 @@ def test_a_list_of_brokers_is_brought_into_one_spelling() -> None:
 )
 def test_what_is_wrong_with_a_list_is_named(keys: dict[str, object], problem: str) -> None:
     with pytest.raises(ConfigError) as caught:
-        parse(_remote(**keys))
+        _parse(_remote(**keys))
     assert problem in str(caught.value)
     assert "s3cr3t" not in str(caught.value)
 
 
 def test_a_robots_own_broker_is_one() -> None:
     with pytest.raises(ConfigError, match=r"local_mqtt\.hosts: cannot be several"):
-        parse({"robot": {"id": "r"}, "local_mqtt": {"hosts": ["a", "b"]}})
+        _parse({"robot": {"id": "r"}, "local_mqtt": {"hosts": ["a", "b"]}})
