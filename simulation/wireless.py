@@ -46,7 +46,8 @@ class BrokerAddress:
         """Return the section ``mqtt`` of a private_config.json."""
         login = {"username": self.username, "password": self.password}
         tls: Any = {"ca": _CA_FILE} if self.ca is not None else self.tls
-        return {"host": self.host, "port": self.port, "tls": tls, **{k: v for k, v in login.items() if v is not None}}
+        host = self.host if isinstance(self.host, str) else list(self.host)
+        return {"host": host, "port": self.port, "tls": tls, **{k: v for k, v in login.items() if v is not None}}
 
 
 class WirelessRobot:

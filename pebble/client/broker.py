@@ -62,7 +62,7 @@ class Broker:
         return "it does not answer" if self.transport.outgoing.stalled_s > ANSWER_S else ""
 
     def on_move(self, watcher: Callable[[str, str, bool], None]) -> None:
-        """Of several brokers: call ``watcher`` when a robot is found at one, or at another one than before.
+        """Call ``watcher`` when a robot is found at one of several brokers, or at another one than before.
 
         It gets the robot's base, host and port of the broker, and whether it is the preferred one.
         """

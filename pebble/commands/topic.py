@@ -208,7 +208,7 @@ def bw(topic: Name, window: WindowOption = 100, seconds: SecondsOption = None, *
 
 @contextmanager
 def _connected(target: Target) -> Iterator[tuple[Transport, Names]]:
-    """Of several brokers it tells at which one the robot is."""
+    """It tells at which of several brokers the robot is."""
     with connected(target) as (transport, names):
         if isinstance(transport, EveryHost) and (host := transport.host_of(names.base)):
             typer.echo(f"pebble: {shown(names.base)} is at broker {host}", err=True)

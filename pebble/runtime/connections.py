@@ -93,7 +93,7 @@ def remote_transport(config: Config, name: str, *, will: Message | None = None) 
 
 
 def with_choice(config: Config, settings: MqttSettings, program: str) -> MqttSettings:
-    """Of several hosts the bridge chooses one, and the robot's other programs connect there."""
+    """The bridge chooses one of several hosts, and the robot's other programs connect there."""
     if not settings.hosts:
         return settings
     return replace_settings(settings, chosen=config.run_dir() / "remote-host", follows=program != _BRIDGE)

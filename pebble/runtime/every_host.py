@@ -23,7 +23,7 @@ CHANGE_S = 0.5  # a host counts as the robot's own for so long after its newest 
 MAX_ROBOTS = 2000  # whose host is known; of others what all hosts send is shown, and all receive what is meant for them
 _MAX_TOPICS = 64  # of one of them, which are asked for when it changes its host
 _SILENT_S = 10.0  # such robots make room for others, so often at most
-_SETTLE_S = 0.5  # after the first host is connected: until then all others should be, and heartbeats have come
+_READY_S = 0.5  # after the first host is connected: until then all others should be, and heartbeats have come
 _LATE_S = 0.25  # some brokers send what they retain so long after they have answered
 _HEARTBEATS = {one.metric: one for one in CHANNELS if ONLINE.metric in (one.metric, one.synonym_of)}
 
@@ -60,7 +60,7 @@ class Homes:
         home = self._robots.get(base)
         return None if home is None else home.host
 
-    def beat(self, base: str, host: int, now: float) -> bool:
+    def heartbeat(self, base: str, host: int, now: float) -> bool:
         """A live heartbeat has come from ``host``; whether the robot is there only since now."""
         if len(self._robots) >= MAX_ROBOTS and base not in self._robots and now - self._swept_at > _SILENT_S:
             self._swept_at = now
@@ -105,7 +105,7 @@ class EveryHost(Transport):
         self._lock = threading.Condition(threading.RLock())
         self._asked: dict[str, int] = {}  # robots whose states are to be asked for, and where
         self._expected: dict[str, int] = {}  # topics that are asked for now, and where
-        self._settled_at, self._was_connected = float("inf"), False
+        self._ready_at, self._was_connected = float("inf"), False
         self._inner: dict[Subscription, list[Subscription]] = {}
         self._thread: threading.Thread | None = None
         for number, one in enumerate(self._hosts):
@@ -151,7 +151,7 @@ class EveryHost(Transport):
 
     @property
     def outgoing(self) -> Outgoing:
-        """Of the worst of those that are connected."""
+        """What waits at the worst of those that are connected."""
         each = [one.outgoing for one in self._hosts if one.state is State.CONNECTED]
         return max(each, key=lambda one: one.stalled_s, default=Outgoing())
 
@@ -180,7 +180,7 @@ class EveryHost(Transport):
         return None if parsed is None else self._homes.of(parsed.identity.base)
 
     def _open(self, timeout: float) -> None:  # noqa: ARG002  (base waits)
-        self._settled_at, self._was_connected = float("inf"), False
+        self._ready_at, self._was_connected = float("inf"), False
         for number, one in enumerate(self._hosts):
             one.open(timeout=0.0)
             for metric in _HEARTBEATS:
@@ -258,11 +258,11 @@ class EveryHost(Transport):
         with self._lock:
             if state is not State.CONNECTED:
                 self._homes.lost(number)
-            elif self._settled_at == float("inf"):
-                self._settled_at = time.monotonic() + (0.0 if self._was_connected else _SETTLE_S)
+            elif self._ready_at == float("inf"):
+                self._ready_at = time.monotonic() + (0.0 if self._was_connected else _READY_S)
             self._lock.notify_all()
         if state is not State.CONNECTED and not self._is_connected:
-            self._settled_at = float("inf")
+            self._ready_at = float("inf")
             if self._state is State.CONNECTED:
                 self._set_state(State.CONNECTING)
 
@@ -279,7 +279,7 @@ class EveryHost(Transport):
             if not _is_online(parsed.metric, message.payload):
                 self._homes.ended(base, number)
                 return
-            if not self._homes.beat(base, number, time.monotonic()):
+            if not self._homes.heartbeat(base, number, time.monotonic()):
                 return
             if any(hosts != {number} for hosts in self._topics(base).values()):
                 self._asked[base] = number
@@ -329,14 +329,14 @@ class EveryHost(Transport):
         while self._state is not State.CLOSED:
             with self._lock:
                 now = time.monotonic()
-                if self._state is State.CONNECTING and now >= self._settled_at and self._is_connected:
+                if self._state is State.CONNECTING and now >= self._ready_at and self._is_connected:
                     base = ""
                 elif self._asked:
                     base = next(iter(self._asked))
                     number = self._asked.pop(base)
                     topics = list(self._topics(base))
                 else:
-                    waits = self._settled_at - now if self._state is State.CONNECTING else float("inf")
+                    waits = self._ready_at - now if self._state is State.CONNECTING else float("inf")
                     self._lock.wait(min(max(waits, 0.01), 1.0))
                     continue
             if base:

@@ -170,7 +170,7 @@ def fail_while_driving(world: Hosts, fault: str, counts: Counts, *, stops: bool 
     assert until(lambda: world.at not in (before, -1), 15), f"at no other host: {world.rig.log.read_text()[-3000:]}"
     moved_at = operator.moves[-1][0]
     counts.note(f"{fault}: heartbeat elsewhere after", moved_at - failed_at)
-    counts.note(f"{fault}: gap of heartbeats", moved_at - last)
+    counts.note(f"{fault}: gap of heartheartbeats", moved_at - last)
     if not stops:
         assert until(lambda: any(at > moved_at for at, _ in _commands(world, began)), 5), "no driving at the new host"
         counts.note(f"{fault}: driven again after the heartbeat", _first(world, moved_at) - moved_at)
@@ -197,8 +197,8 @@ def _stop(world: Hosts, failed_at: float, counts: Counts) -> None:
             if one.at > failed_at and one.topic.startswith(f"{BASE}/outgoing/estop/") and one.json["latched"]
         ]
     assert latched, "the stop was not confirmed"
-    heard = next((one.at for one in operator.on("outgoing/online", failed_at + 0.3)), latched[0])
-    counts.note("stop confirmed after a host is heard", max(0.0, latched[0] - heard))
+    there = next((one.at for one in operator.on("outgoing/online", failed_at + 0.3)), latched[0])
+    counts.note("stop confirmed after a host is heard", max(0.0, latched[0] - there))
 
 
 def _commands(world: Hosts, since: float) -> list[tuple[float, int]]:
@@ -223,12 +223,13 @@ def _count(
     drives = world.rig.mcu.drives(began)
     rests = [then - at for (at, wheels), (then, _) in itertools.pairwise(drives) if wheels != STOP]
     counts.note("wheels left turning", max(rests, default=0.0))
-    beats = [one for one in world.operator.on("outgoing/online", began) if not one.retain]
+    heartbeats = [one for one in world.operator.on("outgoing/online", began) if not one.retain]
     counts.add(
-        "false wills after the robot was heard elsewhere", sum(not _alive(one) and one.at > moved_at for one in beats)
+        "false wills after the robot was heard elsewhere",
+        sum(not _alive(one) and one.at > moved_at for one in heartbeats),
     )
-    counts.add("wills while it changed", sum(not _alive(one) and failed_at < one.at <= moved_at for one in beats))
-    stamps = [one.json["t"] for one in beats if _alive(one)]
+    counts.add("wills while it changed", sum(not _alive(one) and failed_at < one.at <= moved_at for one in heartbeats))
+    stamps = [one.json["t"] for one in heartbeats if _alive(one)]
     counts.add("values older than the newest", sum(later < earlier for earlier, later in itertools.pairwise(stamps)))
 
 

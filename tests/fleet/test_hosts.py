@@ -46,7 +46,7 @@ def test_a_driven_robot_goes_to_another_host(world: Hosts, fault: str) -> None:
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_stop_while_the_host_changes_takes_effect_once_one_is_heard(world: Hosts, fault: str) -> None:
+def test_a_stop_while_the_host_changes_takes_effect_once_there_is_one(world: Hosts, fault: str) -> None:
     counts = Counts()
     for _ in range(cases(1, 5)):
         fail_while_driving(world, fault, counts, stops=True)

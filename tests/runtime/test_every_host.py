@@ -12,7 +12,7 @@ from pebble.transports import Message, MqttSettings, QoS, State, Transport, crea
 from tests.support import Broker, until
 
 BASE = "pebble/robots/goob"
-BEAT, END = b'{"t": 1, "online": true}', b'{"t": 1, "online": false}'
+HEARTBEAT, END = b'{"t": 1, "online": true}', b'{"t": 1, "online": false}'
 
 
 @pytest.mark.parametrize(
@@ -35,7 +35,7 @@ def test_where_a_robot_is(story: str, where: int | None) -> None:
         host = int(what[-1])
         {"e": lambda: homes.ended("r", host), "l": lambda: homes.lost(host)}.get(  # noqa: B023 - called at once
             what[0],
-            lambda: homes.beat("r", host, float(at)),  # noqa: B023
+            lambda: homes.heartbeat("r", host, float(at)),  # noqa: B023
         )()
     assert homes.of("r") == where
 
@@ -44,7 +44,7 @@ def test_invented_robots_keep_no_real_one_out() -> None:
     homes = Homes()
     for number in range(2 * MAX_ROBOTS):
         homes.get(f"invented-{number}")
-    assert homes.beat("real", 1, 100.0)
+    assert homes.heartbeat("real", 1, 100.0)
     assert homes.of("real") == 1
 
 
@@ -79,7 +79,7 @@ def _put(robot: Transport, metric: str, payload: bytes, *, retain: bool = True) 
 
 
 def _is_at(operator: EveryHost, robot: Transport, broker: Broker) -> bool:
-    _put(robot, "online", BEAT)
+    _put(robot, "online", HEARTBEAT)
     return operator.host_of(BASE) == f"127.0.0.1:{broker.port}"
 
 
@@ -100,7 +100,7 @@ def test_the_state_at_the_robots_own_host_counts(
     _put(there, "online", END)  # the will that a hung host speaks once it goes on
     _put(here, "charging-level", b"7")
     assert until(lambda: seen.get("charging-level") == b"7")
-    assert (seen["status"], seen["online"]) == (b'"new"', BEAT)
+    assert (seen["status"], seen["online"]) == (b'"new"', HEARTBEAT)
     brokers[0].kill()
     assert until(lambda: _is_at(operator, there, brokers[1]), step=0.2)
     assert until(lambda: seen["status"] == b'"older still"'), "it is the newest one where the robot is now"

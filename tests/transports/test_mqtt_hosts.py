@@ -1,4 +1,4 @@
-"""Of several brokers one at a time is used: who chooses it, who follows, and the return to the first one."""
+"""One of several brokers is used at a time: who chooses it, who follows, and the return to the first one."""
 
 from __future__ import annotations
 
