@@ -124,7 +124,7 @@ def test_boards_go_to_the_next_host(tmp_path: Path, fault: str, limit_s: float) 
     brokers = [Broker(tmp_path / host, port=port, host=host) for host in _folders(tmp_path, "127.0.0.2", "127.0.0.3")]
     boards = Boards(300, brokers)
     try:
-        assert until(lambda: boards.all_at(brokers[0]), 60, step=0.2)
+        assert until(lambda: boards.all_at(brokers[0]), 180, step=0.2)
         failed = time.monotonic()
         {"kill": brokers[0].kill, "freeze": brokers[0].freeze}[fault]()
         assert until(lambda: boards.all_at(brokers[1]), 60, step=0.1)
