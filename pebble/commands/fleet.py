@@ -354,7 +354,7 @@ def _print_account(place: Path, fleet: Fleet, name: str, secret: str, how: str, 
         typer.echo(f"For its config, which no other user may read, with a copy of {ca} beside it:")
         typer.echo(json.dumps(piece_of_config(fleet, name, secret, board=board), indent=2))
         return
-    url = f"mqtts://{name}@" + ",".join(_place(server) for server in fleet.brokers)
+    url = f"mqtts://{name}@" + ",".join(_host_and_port(server) for server in fleet.brokers)
     if ProgramRole.PAGE in account.roles:
         typer.echo(f"    pebble web --url {url} --ca-cert {ca} --password-file FILE")
     elif ProgramRole.GATEWAY not in account.roles:
@@ -366,7 +366,7 @@ def piece_of_config(fleet: Fleet, name: str, secret: str, *, board: bool) -> dic
     server, *others = fleet.brokers
     places: dict[str, Any] = {"host": server.host, "port": server.port}
     if others:
-        places = {"hosts": [one.host if one.port == server.port else _place(one) for one in fleet.brokers]}
+        places = {"hosts": [one.host if one.port == server.port else _host_and_port(one) for one in fleet.brokers]}
         places["port"] = server.port
     login = places | {"username": name, "password": secret}
     link = login | {"tls": {"enabled": True, "ca_cert": certificates.CA_CERT}}
@@ -374,7 +374,7 @@ def piece_of_config(fleet: Fleet, name: str, secret: str, *, board: bool) -> dic
     return {"security": {"level": _level(fleet, fleet.accounts[name])}, **found}
 
 
-def _place(server: Server) -> str:
+def _host_and_port(server: Server) -> str:
     return f"[{server.host}]:{server.port}" if ":" in server.host else f"{server.host}:{server.port}"
 
 
