@@ -15,7 +15,7 @@ from pathlib import Path
 
 import serial
 
-from pebble.doctor import Level
+from pebble.check_result import State
 from pebble.doctor.checks import clock, synchronised
 from pebble.fleet.folder import PLAIN_PORT, PORT
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.frame import FrameError, decode
@@ -183,7 +183,7 @@ def bits(largest: int) -> str:
 
 def unset_clock(now: float, known: bool | None) -> str:
     found = clock(now, known)
-    if found.level is not Level.FAIL:
+    if found.state is not State.FAILED:
         return ""
     return f"the clock {found.text.partition(':')[0]}, so certificates would be refused: {found.fix}, then again"
 
