@@ -88,7 +88,7 @@ def clock(_robot: RobotUnderTest) -> CheckResult:
 
 def disk(robot: RobotUnderTest) -> CheckResult:
     """Whether stops, people and the audit can go on being saved."""
-    folder = robot.config.state_dir()
+    folder = Path(os.path.normpath(robot.config.state_dir()))  # a config may name it by ../..
     existing = next(one for one in (folder, *folder.parents) if one.exists())
     try:
         found = os.statvfs(existing)

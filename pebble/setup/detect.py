@@ -206,7 +206,7 @@ def unwritable(places: Places) -> str:
 
 
 def mount_point(path: Path) -> Path:
-    """Of the file system that the path is on; `mount` takes no other folder."""
+    """Where the file system of the path is mounted: `mount` takes no other folder."""
     lines = Path("/proc/self/mounts").read_text(encoding="utf-8", errors="surrogateescape").splitlines()
     points = {Path(re.sub(r"\\([0-7]{3})", lambda found: chr(int(found[1], 8)), line.split()[1])) for line in lines}
     return next((folder for folder in (path, *path.parents) if folder in points), Path("/"))

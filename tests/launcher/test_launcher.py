@@ -322,7 +322,7 @@ def test_who_ignores_the_request_to_stop_is_killed_and_takes_no_time_from_others
 
 
 def test_what_ends_while_the_robot_stops_is_not_started_again(launch: Launch) -> None:
-    """As where all its processes get the signal, by a service manager or `pkill`, or where one had just crashed."""
+    """All its processes may get the signal, by a service manager or `pkill`, and one may have just crashed."""
     robot = launch(
         ("hub", "good", LOCAL_TRANSPORT),
         ("serial", "crash", DEVICE),

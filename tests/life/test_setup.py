@@ -60,12 +60,12 @@ def test_package_and_setup_make_a_robot_with_heartbeats_and_let_its_user_in(mach
         # mosquitto_sub takes passwords from this file, or else only on its command line
         options = f"-P $(cat /etc/pebble/{remote['password_file']})"
         machine.sh(f'mkdir -p /root/.config && echo "{options}" >/root/.config/mosquitto_sub')
-        heard = ("mosquitto_sub", *login, "-R", "-C", "5", "-W", "60", "-t", f"{BASE}/outgoing/online")
-        assert machine.succeeds(*heard)
+        receives = ("mosquitto_sub", *login, "-R", "-C", "5", "-W", "60", "-t", f"{BASE}/outgoing/online")
+        assert machine.succeeds(*receives)
         log_in = ("python3", "-")
         assert until(lambda: machine.run(*log_in, check=False, given=LOG_IN) == "200 200\n", 60, step=1), done
         shown = [done, *(machine.run(*command, check=False, timeout=300) for command in COMMANDS)]
-        assert machine.succeeds(*heard)
+        assert machine.succeeds(*receives)
         again = machine.run(*SETUP, timeout=300)
         assert " new " not in again
         machine.run("env", "PLANTED=in-an-environment", "sleep", "1.5")

@@ -151,7 +151,7 @@ LACKING = {
 
 
 @pytest.mark.parametrize(("machine", "what", "text"), LACKING.values(), ids=LACKING)
-def test_what_a_machine_does_not_allow_is_told_with_what_to_type(
+def test_what_a_machine_does_not_allow_is_named_with_what_to_type(
     machine: dict[str, str], what: str | None, text: str, root: Path
 ) -> None:
     wanted = Plan(Places(root), combined(ANSWERS), Machine(**machine), Manifest(), Secrets())
