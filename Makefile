@@ -104,7 +104,7 @@ test-demo: test-robots
 	@$(TESTS) $(if $(PEBBLE_THOROUGH),,-m "not thorough") tests/test_demo.py
 
 test-computing:
-	@$(GENTLY) $(TESTS) --workers 2 --timeout 600 -m "not alone and not page$(LESS)" $(COMPUTING) >.venv/computing.log 2>&1 || \
+	@$(GENTLY) $(TESTS) --workers 2 --timeout=600 -m "not alone and not page$(LESS)" $(COMPUTING) >.venv/computing.log 2>&1 || \
 		{ cat .venv/computing.log; exit 1; }
 	@echo "pebble: what only computes: $$(tail -n 1 .venv/computing.log)"
 
@@ -181,7 +181,7 @@ page-schedules: .venv/.ready-dev
 # Without root or namespaces its tests are skipped, and name what is missing.
 life: .venv/.ready-dev .venv/wheels/.ready
 	@sh tools/debian-packages.sh mosquitto=mosquitto mosquitto_pub=mosquitto-clients ip=iproute2 systemd-analyze=systemd minisign=minisign
-	@$(TESTS) --timeout 900 -ra tests/configs/test_slot.py tests/update tests/life
+	@$(TESTS) --timeout=900 -ra tests/configs/test_slot.py tests/update tests/life
 
 life-long:
 	@PEBBLE_THOROUGH=1 $(MAKE) --no-print-directory life

@@ -43,7 +43,7 @@ def run(arguments: list[str]) -> int:
         names = "\n  ".join(failed)
         sys.stdout.write(f"pebble: these tests failed and run once more, alone:\n  {names}\n")
         sys.stdout.flush()
-        code = pytest(failed, list_)
+        code = pytest([*(one for one in arguments if one.startswith("--timeout=")), *failed], list_)
         if code == 0:
             sys.stdout.write(f"pebble: UNRELIABLE, passed only the second time: please report\n  {names}\n")
         return code

@@ -6,12 +6,12 @@ from typing import Annotated
 
 import typer
 
+from pebble.check_result import State
 from pebble.client.connection import Target, target_of
 from pebble.commands.options import with_target
 from pebble.commands.selftest import INDENT, ended, is_clear, printed, row
 from pebble.errors import PebbleError
 from pebble.runtime.signals import interrupted_by_signals
-from pebble.selftest import State
 
 _LOOKS_S = 4.0  # heartbeats of one a second need so long
 

@@ -7,12 +7,12 @@ from typing import Annotated
 
 import typer
 
+from pebble.check_result import CheckResult, State
 from pebble.config import load
 from pebble.config.secret_text import without_secrets
-from pebble.doctor import Finding, Level
 from pebble.runtime.environment import withhold
 
-_COLOURS = {Level.OK: typer.colors.GREEN, Level.WARN: typer.colors.YELLOW, Level.FAIL: typer.colors.RED}
+_COLOURS = {State.OK: typer.colors.GREEN, State.WARN: typer.colors.YELLOW, State.FAILED: typer.colors.RED}
 _INDENT = " " * 6
 
 
@@ -29,21 +29,21 @@ def doctor(
     """
     from pebble.doctor.checks import run_checks  # of Linux only
 
-    counts = dict.fromkeys(Level, 0)
+    counts = dict.fromkeys(_COLOURS, 0)
     loaded = None if config is None else load(config)
     if loaded is not None:
         withhold(loaded.password_variables)
     for finding in run_checks(loaded):
-        counts[finding.level] += 1
+        counts[finding.state] += 1
         _print(finding)
-    failed, warned = counts[Level.FAIL], counts[Level.WARN]
+    failed, warned = counts[State.FAILED], counts[State.WARN]
     typer.echo(f"checks: {sum(counts.values())}, warnings: {warned}, failures: {failed}")
     return 1 if failed else 0
 
 
-def _print(finding: Finding) -> None:
+def _print(finding: CheckResult) -> None:
     width = shutil.get_terminal_size().columns
-    typer.secho(f"{finding.level.value:<4}  ", fg=_COLOURS[finding.level], nl=False)
+    typer.secho(f"{finding.state[:4]:<4}  ", fg=_COLOURS[finding.state], nl=False)
     text = without_secrets(f"{finding.what}: {finding.text}")
     text = textwrap.fill(text, width, initial_indent=_INDENT, subsequent_indent=_INDENT)
     typer.echo(text.removeprefix(_INDENT))

@@ -9,13 +9,13 @@ from typing import Annotated, Any
 
 import typer
 
+from pebble.check_result import CheckResult, State
 from pebble.commands.estop import me
 from pebble.commands.options import ConfigArgument, RootOption
 from pebble.config import load
 from pebble.config.secret_text import without_secrets
 from pebble.config.visible import shown
 from pebble.runtime.signals import interrupted_by_signals
-from pebble.selftest import Outcome, State
 from pebble.setup.places import Places
 
 _COLOURS = {State.OK: typer.colors.GREEN, State.FAILED: typer.colors.RED, State.SKIPPED: typer.colors.YELLOW}
@@ -75,7 +75,7 @@ def is_clear(name: str, how: str) -> bool:
     return sys.stdin.readline().strip().lower() in ("y", "yes")
 
 
-def row(name: str, outcome: Outcome, config: str = "CONFIG") -> dict[str, str]:
+def row(name: str, outcome: CheckResult, config: str = "CONFIG") -> dict[str, str]:
     """One check for JSON: texts come from the robot, and fixes name this config."""
     text, fix = (
         shown(without_secrets(one)) for one in (outcome.text, outcome.fix.replace("CONFIG", shlex.quote(config)))

@@ -12,6 +12,7 @@ from typing import Literal
 import msgspec
 
 from pebble import contract as c
+from pebble.check_result import CheckResult
 from pebble.client.robot_topics import section_of
 from pebble.conform.component import Component, Record
 from pebble.contract.capabilities import CapabilitiesValue
@@ -19,7 +20,7 @@ from pebble.contract.identity import parse_topic
 from pebble.contract.levels import silent_after
 from pebble.contract.payloads import ControlRequest, EstopCommand, EstopReset, EstopState
 from pebble.errors import PebbleError
-from pebble.selftest import Outcome, failed, ok, skipped, why_not_free
+from pebble.selftest import failed, ok, skipped, why_not_free
 
 ANSWER_S = 1.0  # within which a robot answers
 _CLOCK_S = 60.0  # that its clock may differ
@@ -39,7 +40,7 @@ class Check:
 
     name: str
     why: str
-    run: Callable[[Component], Outcome]
+    run: Callable[[Component], CheckResult]
     needs: tuple[Callable[[Component], str], ...] = ()
 
 
@@ -71,7 +72,7 @@ def commanded(component: Component) -> str:
 # -- signs of life
 
 
-def heartbeat(component: Component) -> Outcome:
+def heartbeat(component: Component) -> CheckResult:
     found = component.of(c.ONLINE)
     if not found:
         return failed("none arrived", 'publish {"t": <epoch ms>} on outgoing/online every 0.25 s to 1 s')
@@ -88,7 +89,7 @@ def heartbeat(component: Component) -> Outcome:
     return ok(f"every {interval:.2f} s")
 
 
-def clock(component: Component) -> Outcome:
+def clock(component: Component) -> CheckResult:
     newest = component.of(c.ONLINE)[-1:]
     if not newest or newest[0].wrong:
         return skipped("there is no heartbeat")
@@ -103,14 +104,14 @@ def clock(component: Component) -> Outcome:
 # -- what it publishes
 
 
-def payloads(component: Component) -> Outcome:
+def payloads(component: Component) -> CheckResult:
     wrong = {one.metric: one.wrong for one in component.records if one.wrong}
     if wrong:
         return failed(_some(wrong.values()), "docs/topics.md has each payload")
     return ok(f"{len({one.metric for one in component.records if one.channel})} kinds of messages")
 
 
-def numbers(component: Component) -> Outcome:
+def numbers(component: Component) -> CheckResult:
     def strange(record: Record) -> bool:
         try:
             msgspec.json.decode(record.payload)
@@ -126,7 +127,7 @@ def numbers(component: Component) -> Outcome:
     return ok("all JSON is JSON")
 
 
-def sizes(component: Component) -> Outcome:
+def sizes(component: Component) -> CheckResult:
     def limit(record: Record) -> int:
         return _LARGEST_STATE if record.channel is c.ESTOP_STATE else _LARGEST
 
@@ -138,7 +139,7 @@ def sizes(component: Component) -> Outcome:
     return failed(_some(sorted(large)), "send less: readers drop it") if large else ok("no message is too large")
 
 
-def retained(component: Component) -> Outcome:
+def retained(component: Component) -> CheckResult:
     there = {one.metric for one in component.retained()}
     live = {one.metric: one.channel for one in component.records if one.channel is not None and one.payload}
     must = {metric for metric, channel in live.items() if channel.default_retain and channel not in _REPEATED}
@@ -151,7 +152,7 @@ def retained(component: Component) -> Outcome:
     return ok(f"{len(there)} states")
 
 
-def stale_commands(component: Component) -> Outcome:
+def stale_commands(component: Component) -> CheckResult:
     found = sorted(one.metric for one in component.retained() if one.channel is not None and one.channel.one_shot)
     if found:
         topic = f"{component.base}/{found[0]}"
@@ -162,7 +163,7 @@ def stale_commands(component: Component) -> Outcome:
 # -- what it offers
 
 
-def capabilities(component: Component) -> Outcome:
+def capabilities(component: Component) -> CheckResult:
     found = component.of(c.CAPABILITIES, retained=True)
     if not found:
         return failed("it publishes none: pages offer nothing of it", "publish outgoing/capabilities, retained")
@@ -178,7 +179,7 @@ def _offers(component: Component) -> list[str]:
     return sorted(name for name in value if section_of(value, name).get("available") is True)
 
 
-def own_topics(component: Component) -> Outcome:
+def own_topics(component: Component) -> CheckResult:
     foreign = sorted(
         f"{path} is {topic}"
         for path, topic in _topics(component.view.capabilities, "")
@@ -201,7 +202,7 @@ def _topics(value: object, path: str) -> Iterator[tuple[str, str]]:
             yield from _topics(one, where)
 
 
-def identity(component: Component) -> Outcome:
+def identity(component: Component) -> CheckResult:
     section = section_of(component.view.capabilities, "identity")
     listed = "/".join(str(section.get(level)) for level in ("system", "type", "id"))
     if not section:
@@ -216,7 +217,7 @@ def identity(component: Component) -> Outcome:
 # -- what it does with what it cannot read
 
 
-def junk(component: Component) -> Outcome:
+def junk(component: Component) -> CheckResult:
     began = time.monotonic()
     for channel in (c.DRIVE, c.LIGHTS_SOLID, c.CONTROL, c.ESTOP_RESET, c.AUTONOMY_COMMAND):
         for payload in JUNK:
@@ -235,7 +236,7 @@ def _states(component: Component) -> dict[str, EstopState]:
     return component.view.estop.states
 
 
-def owners(component: Component) -> Outcome:
+def owners(component: Component) -> CheckResult:
     lacks = [topic.removeprefix(f"{component.base}/") for topic in component.view.estop.missing]
     if lacks:
         return failed(f"no state of {_some(lacks)}", "publish it, retained, for each owner that capabilities list")
@@ -262,10 +263,10 @@ def _freed(component: Component) -> bool:
     return component.wait(lambda: not component.view.latched, ANSWER_S)
 
 
-def _while_stopped(test: Callable[[Component, str], Outcome]) -> Callable[[Component], Outcome]:
+def _while_stopped(test: Callable[[Component, str], CheckResult]) -> Callable[[Component], CheckResult]:
     """Run a test on the robot while it is stopped by a new stop, and free it afterwards."""
 
-    def run(component: Component) -> Outcome:
+    def run(component: Component) -> CheckResult:
         name = secrets.token_hex(8)
         try:
             if not _stop(component, name):
@@ -281,11 +282,11 @@ def _while_stopped(test: Callable[[Component, str], Outcome]) -> Callable[[Compo
     return run
 
 
-def _confirmed(_component: Component, _name: str) -> Outcome:
+def _confirmed(_component: Component, _name: str) -> CheckResult:
     return ok("each owner latches, confirms it by name, and is free after a reset")
 
 
-def _repeated(component: Component, name: str) -> Outcome:
+def _repeated(component: Component, name: str) -> CheckResult:
     before = {owner: one.count for owner, one in _states(component).items()}
     component.send(c.ESTOP, EstopCommand(stop=name, by=_BY, why=_WHY))
     component.look(ANSWER_S / 2)
@@ -295,7 +296,7 @@ def _repeated(component: Component, name: str) -> Outcome:
     return ok("the same stop counts once")
 
 
-def _unreadable(component: Component, _name: str) -> Outcome:
+def _unreadable(component: Component, _name: str) -> CheckResult:
     before = {owner: one.count for owner, one in _states(component).items()}
     component.send(c.ESTOP, b"stop!")
     if not component.wait(
@@ -308,7 +309,7 @@ def _unreadable(component: Component, _name: str) -> Outcome:
     return ok("what cannot be read stops, too")
 
 
-def _wrong_reset(component: Component, _name: str) -> Outcome:
+def _wrong_reset(component: Component, _name: str) -> CheckResult:
     for more, boot, what in ((-1, "", "an older count"), (0, "ffffffff", "another boot")):
         _reset(component, boot=boot, more=more)
         if component.wait(lambda: not component.view.latched, ANSWER_S / 2):
@@ -316,7 +317,7 @@ def _wrong_reset(component: Component, _name: str) -> Outcome:
     return ok("it is refused")
 
 
-def _driven(component: Component, _name: str) -> Outcome:
+def _driven(component: Component, _name: str) -> CheckResult:
     component.send(c.DRIVE, b'{"x": 0, "z": 0}')
     if component.wait(lambda: not component.view.latched, ANSWER_S / 2):
         return failed("a drive command ends the stop", "only a reset ends it")
@@ -346,8 +347,8 @@ class Driver:
         return self.key != ""
 
 
-def _with_control(test: Callable[[Component, Driver], Outcome]) -> Callable[[Component], Outcome]:
-    def run(component: Component) -> Outcome:
+def _with_control(test: Callable[[Component, Driver], CheckResult]) -> Callable[[Component], CheckResult]:
+    def run(component: Component) -> CheckResult:
         driver = Driver(component)
         driver.asks()
         try:
@@ -361,7 +362,7 @@ def _with_control(test: Callable[[Component, Driver], Outcome]) -> Callable[[Com
     return run
 
 
-def _first_keeps(component: Component, driver: Driver) -> Outcome:
+def _first_keeps(component: Component, driver: Driver) -> CheckResult:
     second = Driver(component)
     second.asks()
     took = component.wait(lambda: second.holds, ANSWER_S / 2)
@@ -372,7 +373,7 @@ def _first_keeps(component: Component, driver: Driver) -> Outcome:
     return ok("the first one keeps it")
 
 
-def _released(component: Component, driver: Driver) -> Outcome:
+def _released(component: Component, driver: Driver) -> CheckResult:
     driver.asks(for_ms=5000)
     driver.asks("release")
     if not component.wait(lambda: not driver.holds, ANSWER_S):
@@ -380,7 +381,7 @@ def _released(component: Component, driver: Driver) -> Outcome:
     return ok("it ends by its release")
 
 
-def _ends(component: Component, driver: Driver) -> Outcome:
+def _ends(component: Component, driver: Driver) -> CheckResult:
     if not component.wait(lambda: not driver.holds, 1.0 + 2 * ANSWER_S):
         return failed("it stays with who went away", "end it for_ms after the last request or command")
     return ok("it ends by itself")
@@ -420,7 +421,7 @@ CHECKS = (
 )
 
 
-def run(component: Component, checks: Iterable[Check]) -> Iterator[tuple[Check, Outcome]]:
+def run(component: Component, checks: Iterable[Check]) -> Iterator[tuple[Check, CheckResult]]:
     """Make one check after the other."""
     for check in checks:
         component.wait(lambda: True, 0.0)

@@ -11,10 +11,11 @@ from typing import Any
 import msgspec
 
 from pebble import contract as c
+from pebble.check_result import CheckResult
 from pebble.conform.checks import ANSWER_S, Check, Driver, commanded, drives, free, stops
 from pebble.conform.component import Component
 from pebble.contract.payloads import EstopCommand, EstopReset
-from pebble.selftest import Outcome, failed, ok, skipped
+from pebble.selftest import failed, ok, skipped
 
 SPEED = 0.2
 DRIVES_S = 0.6
@@ -85,7 +86,7 @@ def _drive(component: Component, send: Callable[..., float], **fields: object) -
     return began, last
 
 
-def _rest(component: Component, began: float, last: float, limit_s: float) -> Outcome:
+def _rest(component: Component, began: float, last: float, limit_s: float) -> CheckResult:
     component.look(limit_s + _LATE_S)
     until = moves_until(component, began)
     if until is None:
@@ -98,23 +99,23 @@ def _rest(component: Component, began: float, last: float, limit_s: float) -> Ou
     return ok(f"it rests {max(0.0, until - last):.2f} s after the last command")
 
 
-def dead_man(component: Component) -> Outcome:
+def dead_man(component: Component) -> CheckResult:
     with _at_the_wheel(component) as send:
         return _rest(component, *_drive(component, send), RESTS_S)
 
 
-def valid_ms(component: Component) -> Outcome:
+def valid_ms(component: Component) -> CheckResult:
     with _at_the_wheel(component) as send:
         return _rest(component, *_drive(component, send, valid_ms=150), 0.15)
 
 
-def zero(component: Component) -> Outcome:
+def zero(component: Component) -> CheckResult:
     with _at_the_wheel(component) as send:
         began, _ = _drive(component, send)
         return _rest(component, began, send(0), 0.1)
 
 
-def stop_moving(component: Component) -> Outcome:
+def stop_moving(component: Component) -> CheckResult:
     """Commands go on, and move nothing."""
     with _at_the_wheel(component) as send:
         began, _ = _drive(component, send)
@@ -128,8 +129,8 @@ def stop_moving(component: Component) -> Outcome:
     return outcome if is_free else failed("a reset does not end the stop", "end it on incoming/estop-reset")
 
 
-def _moves_nothing(why: str, fix: str, **fields: object) -> Callable[[Component], Outcome]:
-    def run(component: Component) -> Outcome:
+def _moves_nothing(why: str, fix: str, **fields: object) -> Callable[[Component], CheckResult]:
+    def run(component: Component) -> CheckResult:
         with _at_the_wheel(component) as send:
             began, _ = _drive(component, send, **fields)
             component.look(_LATE_S)
@@ -141,7 +142,7 @@ def _moves_nothing(why: str, fix: str, **fields: object) -> Callable[[Component]
     return run
 
 
-def not_a_number(component: Component) -> Outcome:
+def not_a_number(component: Component) -> CheckResult:
     with _at_the_wheel(component):
         began = time.monotonic()
         for number in (b"NaN", b"Infinity", b"1e999", b'"nan"', b"null"):
@@ -153,7 +154,7 @@ def not_a_number(component: Component) -> Outcome:
     return failed("it moves by a command that is no number", "refuse NaN and infinity") if until > began else ok("no")
 
 
-def clamped(component: Component) -> Outcome:
+def clamped(component: Component) -> CheckResult:
     with _at_the_wheel(component) as send:
         began = time.monotonic()
         send(9, x=-9, valid_ms=150)

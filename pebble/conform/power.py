@@ -5,16 +5,17 @@ from __future__ import annotations
 import secrets
 
 from pebble import contract as c
+from pebble.check_result import CheckResult, State
 from pebble.conform.checks import ANSWER_S, Check, commanded, drives, free, stops
 from pebble.conform.component import Component
 from pebble.conform.motion import moves_until
 from pebble.contract.payloads import EstopCommand, EstopReset
-from pebble.selftest import Outcome, State, failed, ok, skipped
+from pebble.selftest import failed, ok, skipped
 
 _LOOKS_S = 3.0
 
 
-def will(component: Component) -> Outcome:
+def will(component: Component) -> CheckResult:
     began = component.look(0.0)
     component.ask("cut the robot's power now")
     if not component.wait(lambda: _offline(component, began), component.person_s):
@@ -30,7 +31,7 @@ def _offline(component: Component, since: float) -> bool:
     return any(one.value is not None and one.value.online is False for one in component.of(c.ONLINE, since))
 
 
-def retained_commands(component: Component) -> Outcome:
+def retained_commands(component: Component) -> CheckResult:
     """What a broker keeps is delivered when it starts: a drive command, and a stop."""
     commands = {c.DRIVE: b'{"x": 0, "z": 0.2}', c.ESTOP: b'{"stop": "00000000000000ff", "by": "conform"}'}
     for channel, payload in commands.items():
@@ -60,7 +61,7 @@ def _back(component: Component) -> str:
     return "" if here else f"it is not back within {component.person_s:g} s"
 
 
-def survives(component: Component) -> Outcome:
+def survives(component: Component) -> CheckResult:
     """A stop outlives a power cut where its owner says that it is saved."""
     name = secrets.token_hex(8)
     component.send(c.ESTOP, EstopCommand(stop=name, by="conform", why="conformance test"))

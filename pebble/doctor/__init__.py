@@ -1,24 +1,7 @@
 """Checks whether a machine is ready for a robot; each problem that is found comes with the command that fixes it."""
 
-from dataclasses import dataclass
-from enum import Enum
 from functools import partial
 
+from pebble.check_result import CheckResult, State
 
-class Level(Enum):
-    OK = "ok"
-    WARN = "warn"
-    FAIL = "fail"
-
-
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """The result of one check: its subject, its state, and the command or config change that fixes it."""
-
-    level: Level
-    what: str
-    text: str
-    fix: str = ""
-
-
-ok, warn, fail = (partial(Finding, level) for level in Level)
+ok, warn, fail = (partial(CheckResult, state) for state in (State.OK, State.WARN, State.FAILED))

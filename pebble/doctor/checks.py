@@ -16,12 +16,13 @@ from functools import partial
 from importlib import metadata
 from pathlib import Path
 
+from pebble.check_result import CheckResult, State
 from pebble.client.page_from_config import settings_of
 from pebble.client.page_packages import require_packages
 from pebble.config import Config, Mqtt
 from pebble.config.secret_text import shown_user
 from pebble.contract.levels import LEVELS
-from pebble.doctor import Finding, Level, device_names, fail, ok, warn
+from pebble.doctor import device_names, fail, ok, warn
 from pebble.doctor.broker_probe import REFUSED_ID, REFUSED_LOGINS, TIMEOUT_S, ProbeResult, probe
 from pebble.doctor.driving import driving
 from pebble.doctor.loudspeaker import loudspeaker
@@ -42,7 +43,7 @@ _SOON_S = 14 * 86400
 _TIMEDATECTL_S = 3.0
 
 
-def run_checks(config: Config | None) -> Iterator[Finding]:
+def run_checks(config: Config | None) -> Iterator[CheckResult]:
     """Check this machine, and ``config``'s robot on it. Takes seconds if a broker is unreachable."""
     yield python_version(sys.version_info[:3])
     for package in ("eclipse-zenoh", "paho-mqtt"):
@@ -57,7 +58,7 @@ def run_checks(config: Config | None) -> Iterator[Finding]:
         yield from _robot(config)
 
 
-def _robot(config: Config) -> Iterator[Finding]:
+def _robot(config: Config) -> Iterator[CheckResult]:
     run_dir = config.run_dir()
     yield from who_drives(config)
     yield run_directory(run_dir, os.geteuid())
@@ -77,13 +78,13 @@ def _robot(config: Config) -> Iterator[Finding]:
         for settings in mqtt_settings(mqtt, reconnect_max_s=REMOTE_RECONNECT_S, program="doctor").each():
             found = list(broker(name, settings, partial(probe, timeout_s=max(TIMEOUT_S, answer_s))))
             yield from found
-            if mqtt is bridge.remote_mqtt and found[0].level is Level.OK:
+            if mqtt is bridge.remote_mqtt and found[0].state is State.OK:
                 yield from publishing(found[0].what, settings, config.base, answer_s)
             if is_loopback(settings.host):
                 yield from beyond_loopback(name, settings, own_addresses())
 
 
-def operator_page(config: Config) -> Iterator[Finding]:
+def operator_page(config: Config) -> Iterator[CheckResult]:
     """Whether the page that the robot itself serves can start; whether it has users, only its own user can read."""
     if not config.services.web_handler.enabled:
         return
@@ -101,7 +102,7 @@ def operator_page(config: Config) -> Iterator[Finding]:
         yield _page_certificate(settings.certificate, time.time())
 
 
-def _page_certificate(file: Path, now: float) -> Finding:
+def _page_certificate(file: Path, now: float) -> CheckResult:
     try:
         left_s = certificates.show(file).until.timestamp() - now
     except certificates.CertificateError as error:
@@ -123,21 +124,21 @@ def _brokers(config: Config) -> Iterator[tuple[str, Mqtt]]:
 # -- this machine
 
 
-def python_version(version: tuple[int, ...]) -> Finding:
+def python_version(version: tuple[int, ...]) -> CheckResult:
     text = ".".join(map(str, version))
     if version < (3, 11):
         return fail("python", f"{text} is too old, 3.11 is needed", "sudo apt install python3.11")
     return ok("python", text)
 
 
-def installed(package: str) -> Finding:
+def installed(package: str) -> CheckResult:
     try:
         return ok(package, metadata.version(package))
     except metadata.PackageNotFoundError:
         return fail(package, "is not installed", f"{sys.executable} -m pip install {package}")
 
 
-def memory_lock(limit: int, *, root: bool) -> Finding:
+def memory_lock(limit: int, *, root: bool) -> CheckResult:
     """``limit`` in bytes, or RLIM_INFINITY. A reader that cannot lock a shared segment loses every frame silently."""
     if limit == resource.RLIM_INFINITY or limit >= _ENOUGH_LOCKED or root:
         return ok("memory lock", "no limit that matters")
@@ -148,7 +149,7 @@ def memory_lock(limit: int, *, root: bool) -> Finding:
     )
 
 
-def clock(now: float, synchronised: bool | None) -> Finding:
+def clock(now: float, synchronised: bool | None) -> CheckResult:
     """``now`` in epoch seconds; ``synchronised`` None if unknown."""
     if now < _BUILT:
         year = time.gmtime(now).tm_year
@@ -175,7 +176,7 @@ def synchronised() -> bool | None:
     return {"yes": True, "no": False}.get(done.stdout.strip())
 
 
-def leftover_segments(shm: Path, proc: Path) -> Finding:
+def leftover_segments(shm: Path, proc: Path) -> CheckResult:
     """Finds Zenoh's shared memory of this user that no process has mapped."""
     mine = {path for path in shm.glob("*.zenoh") if _owner(path) == os.geteuid()}
     if not mine:
@@ -212,7 +213,7 @@ def _owner(path: Path) -> int | None:
 # -- one robot on it
 
 
-def run_directory(path: Path, uid: int) -> Finding:
+def run_directory(path: Path, uid: int) -> CheckResult:
     what = "run directory"
     if not fits_socket(path / FRAMES_SOCKET):
         return fail(what, f"{path} is too long for unix sockets", "set transport.run_dir to a shorter path")
@@ -228,7 +229,7 @@ def run_directory(path: Path, uid: int) -> Finding:
     return ok(what, str(path))
 
 
-def _missing_run_directory(path: Path) -> Finding:
+def _missing_run_directory(path: Path) -> CheckResult:
     parent = next(folder for folder in path.parents if folder.exists())
     if not os.access(parent, os.W_OK | os.X_OK):
         owner = _user(os.geteuid())
@@ -236,7 +237,7 @@ def _missing_run_directory(path: Path) -> Finding:
     return ok("run directory", f"{path} will be created")
 
 
-def state_directory(path: Path) -> Finding:
+def state_directory(path: Path) -> CheckResult:
     """Finds a place where an emergency stop cannot be saved: it would end with a power cut."""
     what = "state directory"
     existing = next(folder for folder in (path, *path.parents) if os.access(folder, os.F_OK))
@@ -249,7 +250,7 @@ def state_directory(path: Path) -> Finding:
     return ok(what, str(path) if existing == path else f"{path} will be created")
 
 
-def leftover_sockets(run_dir: Path, answers: Callable[[Path], bool]) -> Finding:
+def leftover_sockets(run_dir: Path, answers: Callable[[Path], bool]) -> CheckResult:
     """Finds sockets without a listening process; harmless, the next start removes those it uses."""
     sockets = sorted(run_dir.glob("*.sock")) if os.access(run_dir, os.R_OK) else []
     dead = [path for path in sockets if not answers(path)]
@@ -271,7 +272,7 @@ def is_listening(path: Path) -> bool:
     return True
 
 
-def serial_port(path: Path, name: str = "", names: Path = Path("/dev/serial")) -> Finding:
+def serial_port(path: Path, name: str = "", names: Path = Path("/dev/serial")) -> CheckResult:
     """``name``: of the instance in the config; ``names``: the folder with by-id/."""
     what, key = f"serial port {path}", _port_key(name)
     try:
@@ -298,7 +299,7 @@ def _port_key(instance: str) -> str:
 
 def broker(
     name: str, settings: MqttSettings, probe_login: Callable[..., ProbeResult] = probe, now: float | None = None
-) -> Iterator[Finding]:
+) -> Iterator[CheckResult]:
     """Check that it answers, accepts the config's login, refuses anonymous ones, and is encrypted."""
     what = f"{name} {settings.host}:{settings.port}"
     own = probe_login(settings, login=True)
@@ -322,7 +323,7 @@ def broker(
     yield _encryption(what, settings, own, time.time() if now is None else now)
 
 
-def _login(what: str, settings: MqttSettings, answer: ProbeResult) -> Finding:
+def _login(what: str, settings: MqttSettings, answer: ProbeResult) -> CheckResult:
     if answer.code == 0:
         return ok(what, f"answers, connected in {answer.connect_ms:.1f} ms")
     if answer.code == REFUSED_ID:
@@ -338,7 +339,7 @@ def _login(what: str, settings: MqttSettings, answer: ProbeResult) -> Finding:
     )
 
 
-def _anonymous_logins(what: str, settings: MqttSettings, answer: ProbeResult) -> Finding:
+def _anonymous_logins(what: str, settings: MqttSettings, answer: ProbeResult) -> CheckResult:
     if answer.code != 0:
         return ok(what, "refuses anonymous logins")
     if is_loopback(settings.host):
@@ -350,7 +351,7 @@ def _anonymous_logins(what: str, settings: MqttSettings, answer: ProbeResult) ->
     )
 
 
-def _encryption(what: str, settings: MqttSettings, answer: ProbeResult, now: float) -> Finding:
+def _encryption(what: str, settings: MqttSettings, answer: ProbeResult, now: float) -> CheckResult:
     if settings.tls is None:
         if is_loopback(settings.host):
             return ok(what, "not encrypted, which is fine on this machine")

@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import time
 
+from pebble.check_result import CheckResult, State
 from pebble.client.connection import Target, connected
 from pebble.client.driveable import Driveable, driveable_of
 from pebble.config import Config
 from pebble.contract import STATUS
-from pebble.doctor import Finding, Level, fail, warn
+from pebble.doctor import fail, warn
 from pebble.errors import PebbleError
 from pebble.runtime.parent import launcher_runs
 from pebble.transports import Message
 
 _ANSWER_S = 2.0
-_LEVELS = {"yes": Level.OK, "unknown": Level.WARN, "no": Level.FAIL}
+_STATES = {"yes": State.OK, "unknown": State.WARN, "no": State.FAILED}
 
 
-def driving(config: Config) -> Finding | None:
+def driving(config: Config) -> CheckResult | None:
     """Read it on the robot's own side; None: it has no motors, or does not run."""
     if not config.motor_lines() or not launcher_runs(config.run_dir()):
         return None
@@ -38,4 +39,4 @@ def driving(config: Config) -> Finding | None:
         return warn("driving", "the running robot does not say whether it can be driven")
     state, why = found[-1]
     text = "commands reach the motors" if state == "yes" else f"{'not possible' if state == 'no' else state}: {why}"
-    return Finding(_LEVELS[state], "driving", text)
+    return CheckResult(_STATES[state], "driving", text)

@@ -9,8 +9,9 @@ from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
+from pebble.check_result import CheckResult
 from pebble.config import Config
-from pebble.doctor import Finding, ok, warn
+from pebble.doctor import ok, warn
 from pebble.media.sound_file import write_wav
 from pebble.services.soundboard_handler.playback import Players
 
@@ -21,7 +22,7 @@ _WHAT = "loudspeaker"
 _DMIX = "echo 'pcm.!default { type plug slave.pcm dmix }' | sudo tee -a /etc/asound.conf"
 
 
-def loudspeaker(config: Config, silence_s: float = SILENCE_S) -> Iterator[Finding]:
+def loudspeaker(config: Config, silence_s: float = SILENCE_S) -> Iterator[CheckResult]:
     """No findings for a robot that plays neither sounds nor an operator's voice."""
     services, players = config.services, Players.of(config)
     talk_back = services.av_daemon.enabled and services.av_daemon.audio.enabled
@@ -41,7 +42,7 @@ def _installation(name: str) -> str:
     return "sudo apt install alsa-utils" if name == "aplay" else f"install {name}, or name another player in the config"
 
 
-def _played(players: Players, wav: Path | None, silence_s: float) -> Finding:
+def _played(players: Players, wav: Path | None, silence_s: float) -> CheckResult:
     """Two players at the same time; of ``wav``, or else of raw sound."""
     words = players.command(wav) if wav is not None else players.raw_command(_RATE, 1)
     running: list[subprocess.Popen[bytes]] = []

@@ -5,9 +5,10 @@ import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from pebble.check_result import CheckResult
 from pebble.config import Config
 from pebble.contract.encodings import NEED_PYAV
-from pebble.doctor import Finding, device_names, fail, ok
+from pebble.doctor import device_names, fail, ok
 from pebble.media import pyav
 
 _DEVICE = "services.av_daemon.video.device"
@@ -16,7 +17,7 @@ _LIBCAMERA = ("rpicam-vid", "libcamera-vid")
 Which = Callable[[str], str | None]
 
 
-def media(config: Config, devices: Path, which: Which = shutil.which) -> Iterator[Finding]:
+def media(config: Config, devices: Path, which: Which = shutil.which) -> Iterator[CheckResult]:
     """No findings for a robot without camera and microphone. ``devices``: folder of device files."""
     daemon = config.services.av_daemon
     if not daemon.enabled:
@@ -30,7 +31,7 @@ def media(config: Config, devices: Path, which: Which = shutil.which) -> Iterato
         yield shm_socket(f"{name} for the original's scripts", path)
 
 
-def shm_socket(what: str, path: Path) -> Finding:
+def shm_socket(what: str, path: Path) -> CheckResult:
     """Whether `gstreamer_mirror` can make the socket."""
     folder = path.parent
     if not folder.is_dir():
@@ -42,7 +43,7 @@ def shm_socket(what: str, path: Path) -> Finding:
     return ok(what, str(path))
 
 
-def camera(backend: str, device: str, devices: Path, which: Which) -> Finding:
+def camera(backend: str, device: str, devices: Path, which: Which) -> CheckResult:
     if backend == "synthetic":
         return ok("camera", "synthetic: needs no device")
     if backend != "v4l2":
@@ -58,7 +59,7 @@ def camera(backend: str, device: str, devices: Path, which: Which) -> Finding:
     return device_names.usable("camera", path, f"{path} readable and writable", _DEVICE, names)
 
 
-def program(what: str, names: tuple[str, ...], fix: str, which: Which) -> Finding:
+def program(what: str, names: tuple[str, ...], fix: str, which: Which) -> CheckResult:
     """One of ``names`` must be installed."""
     found = next((name for name in names if which(name) is not None), None)
     if found is None:
@@ -66,7 +67,7 @@ def program(what: str, names: tuple[str, ...], fix: str, which: Which) -> Findin
     return ok(what, f"uses {found}")
 
 
-def codecs(config: Config, *, installed: bool) -> Finding:
+def codecs(config: Config, *, installed: bool) -> CheckResult:
     """H.264 and Opus; missing codecs are an error only if the config selects them."""
     sent = config.services.mqtt_bridge.media
     asked = [name for name in (sent.video_publisher.encoding, sent.audio_publisher.encoding) if name in NEED_PYAV]

@@ -9,9 +9,10 @@ from contextlib import closing
 from dataclasses import replace
 from statistics import median
 
+from pebble.check_result import CheckResult
 from pebble.contract import BRIDGE_PROBE
 from pebble.contract.levels import LEVELS
-from pebble.doctor import Finding, fail, ok, warn
+from pebble.doctor import fail, ok, warn
 from pebble.forwarding.probes import new_probe
 from pebble.transports import Message, MqttSettings, QoS, State
 from pebble.transports.mqtt.transport import MqttTransport
@@ -28,7 +29,7 @@ _HELD = 0.75  # of a round trip: a thin link itself needs some of it for the sec
 
 def publishing(
     what: str, settings: MqttSettings, base: str, answer_s: float = LEVELS["wide"].answer_s
-) -> Iterator[Finding]:
+) -> Iterator[CheckResult]:
     """Publish probes, which no program takes for anything else, below ``base``, and see when they come back.
 
     After ``answer_s`` one counts as lost.
@@ -52,7 +53,7 @@ def publishing(
             yield from held_back(what, min(pair[0] for pair in pairs), median(pair[1] for pair in pairs))
 
 
-def held_back(what: str, round_trip_s: float, apart_s: float) -> Iterator[Finding]:
+def held_back(what: str, round_trip_s: float, apart_s: float) -> Iterator[CheckResult]:
     """Judge the shortest round trip, and the time by which the second message of a pair usually came after the first.
 
     By Nagle's algorithm a broker sends the second one when the first is acknowledged, so a round trip later.

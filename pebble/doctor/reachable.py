@@ -7,7 +7,8 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from pebble.doctor import Finding, ok, warn
+from pebble.check_result import CheckResult
+from pebble.doctor import ok, warn
 from pebble.doctor.broker_probe import probe
 from pebble.transports.settings import MqttSettings
 
@@ -15,7 +16,7 @@ _TIMEOUT_S = 1.0  # these addresses are this machine's own
 _LOCAL_IPV4 = re.compile(r"\|-- (\S+)\n\s+/32 host LOCAL")
 
 
-def beyond_loopback(name: str, settings: MqttSettings, addresses: Iterable[str]) -> Iterator[Finding]:
+def beyond_loopback(name: str, settings: MqttSettings, addresses: Iterable[str]) -> Iterator[CheckResult]:
     """Try the port of a loopback broker at each of ``addresses``; nothing if there are none."""
     tls = None if settings.tls is None else replace(settings.tls, insecure=True)  # its certificate names the loopback
     found = {

@@ -7,8 +7,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
+from pebble.check_result import CheckResult
 from pebble.config import Config
-from pebble.doctor import Finding, fail, ok, warn
+from pebble.doctor import fail, ok, warn
 from pebble.errors import PebbleError
 from pebble.recordings import catalogue
 from pebble.recordings.recorder.folder import Entry, Folder
@@ -21,7 +22,7 @@ _LITTLE_S: Final = _DAY_S  # room for less is warned of
 _SHORTEST_S: Final = 600.0  # of recording, to know a rate
 
 
-def recorder(config: Config, now: float | None = None) -> Iterator[Finding]:
+def recorder(config: Config, now: float | None = None) -> Iterator[CheckResult]:
     """Nothing for a robot without one. ``now``: seconds since 1970."""
     section = config.services.recorder
     if not section.enabled:
@@ -39,7 +40,7 @@ def recorder(config: Config, now: float | None = None) -> Iterator[Finding]:
         yield fail(_WHAT, f"{folder} cannot be read: {error}")
 
 
-def _running(folder: Path, now: float, entries: list[Entry]) -> Finding:
+def _running(folder: Path, now: float, entries: list[Entry]) -> CheckResult:
     if not Folder.is_in_use(folder):
         left = sum(entry.is_active for entry in entries)
         if left:
@@ -65,7 +66,7 @@ def _status(folder: Path) -> dict[str, Any]:
     return found if isinstance(found, dict) else {}
 
 
-def _missed(entries: list[Entry], now: float) -> Iterator[Finding]:
+def _missed(entries: list[Entry], now: float) -> Iterator[CheckResult]:
     """Gaps of the last hour, and messages that damage has taken in the last day."""
     newest = [entry for entry in entries if now - entry.ended <= _HOUR_S and not entry.is_media]
     since_ms = 1000 * (now - _HOUR_S)
@@ -87,7 +88,7 @@ def _missed(entries: list[Entry], now: float) -> Iterator[Finding]:
         yield warn(_WHAT, f"{missing} messages of the last day are missing: files were damaged")
 
 
-def _room(folder: Path, entries: list[Entry], keep_bytes: int, free_bytes: int) -> Finding:
+def _room(folder: Path, entries: list[Entry], keep_bytes: int, free_bytes: int) -> CheckResult:
     """Seconds for which there is room at the rate of what was recorded in the last files."""
     span_s, size = _rate(entries)
     room = max(0, shutil.disk_usage(folder).free - free_bytes)

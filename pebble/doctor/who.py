@@ -3,9 +3,10 @@
 from collections.abc import Iterator
 from pathlib import Path
 
+from pebble.check_result import CheckResult
 from pebble.config import Config
 from pebble.config.doors import warning_of_open
-from pebble.doctor import Finding, ok, warn
+from pebble.doctor import ok, warn
 from pebble.fleet.folder import FLEET, Fleet, FleetError, load
 from pebble.fleet.roles import ProgramRole, Right, rights
 
@@ -17,7 +18,7 @@ _WORDS = {
 }
 
 
-def who_drives(config: Config) -> Iterator[Finding]:
+def who_drives(config: Config) -> Iterator[CheckResult]:
     """Its level, and who may drive it at that."""
     level = config.security.level
     if open_ := warning_of_open(config):

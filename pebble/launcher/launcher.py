@@ -109,6 +109,7 @@ class Launcher:
             on_note=lambda line: self._receive_note(program, line),
             on_change=lambda: self._status.changed(),
             on_end=lambda: self._ended(program),
+            is_stopping=self._stop_requested,
         )
 
     def _driveable_by(self, running: Collection[str]) -> Driveable:

@@ -39,7 +39,8 @@ class ProcessSupervisor:
 
     An on-demand program is started by :meth:`request`, any other by :meth:`start`. ``on_line(pid, line)`` gets the
     child's output, ``on_note(line)`` its notes other than READY and ALIVE; ``on_change()`` is called when the state
-    that is reported may have changed, ``on_end()`` whenever a child has ended.
+    that is reported may have changed, ``on_end()`` whenever a child has ended. While ``is_stopping()``, whatever ends
+    stays ended: the programs of other stages may still have their turn.
     """
 
     def __init__(
@@ -53,6 +54,7 @@ class ProcessSupervisor:
         on_note: Callable[[str], None],
         on_change: Callable[[], None],
         on_end: Callable[[], None],
+        is_stopping: Callable[[], bool],
     ) -> None:
         self.program, self.policy = program, policy
         self.state = State.IDLE
@@ -60,6 +62,7 @@ class ProcessSupervisor:
         self.held = False  # an on-demand program is requested, and waits for its turn
         self._reactor, self._spawn = reactor, spawn
         self._on_line, self._on_note, self._on_change, self._on_end = on_line, on_note, on_change, on_end
+        self._is_stopping = is_stopping
         self._child: Child | None = None
         self._lines, self._notes = _splitter(), _splitter()
         self._timer: Timer | None = None
@@ -114,6 +117,9 @@ class ProcessSupervisor:
             self._on_change()
 
     def start(self) -> None:
+        if self._is_stopping():
+            self.stop()
+            return
         self._lines, self._notes = _splitter(), _splitter()
         self.policy.started(self._reactor.now())
         try:
@@ -231,15 +237,18 @@ class ProcessSupervisor:
         how = child.end()
         self._child = None
         self._cancel_timer()
-        if self.state in (State.RUNNING, State.STUCK):
-            self._restart("stuck, killed" if self.state is State.STUCK else how)
-        else:
+        if self.state not in (State.RUNNING, State.STUCK):
             self._ended_as_asked(how)
+        elif self._is_stopping():
+            log.info("%s ended (%s) before its turn to stop", self.program.name, how)
+            self._ended_as_asked(how)
+        else:
+            self._restart("stuck, killed" if self.state is State.STUCK else how)
         self._on_end()
 
     def _ended_as_asked(self, how: str) -> None:
         again = self.state is State.REPLACED
-        self.state = State.STOPPED if self.state is State.STOPPING else State.IDLE
+        self.state = State.IDLE if self.state in (State.RELEASED, State.REPLACED) else State.STOPPED
         self.policy.stopped(how)
         self._on_change()
         if again:

@@ -1,37 +1,20 @@
 """Tests a robot that runs, end to end; and packs what others need to repair or to restore it."""
 
-from dataclasses import dataclass
-from enum import StrEnum
-
+from pebble.check_result import CheckResult, State
 from pebble.client.robot_view import RobotView
 
 
-class State(StrEnum):
-    OK = "ok"
-    FAILED = "failed"
-    SKIPPED = "skipped"
+def ok(text: str) -> CheckResult:
+    return CheckResult(State.OK, "", text)
 
 
-@dataclass(frozen=True, slots=True)
-class Outcome:
-    """What one check found; ``fix`` is the command or change that ends a failure."""
-
-    state: State
-    text: str
-    fix: str = ""
+def failed(text: str, fix: str) -> CheckResult:
+    return CheckResult(State.FAILED, "", text, fix)
 
 
-def ok(text: str) -> Outcome:
-    return Outcome(State.OK, text)
-
-
-def failed(text: str, fix: str) -> Outcome:
-    return Outcome(State.FAILED, text, fix)
-
-
-def skipped(why: str, fix: str = "") -> Outcome:
+def skipped(why: str, fix: str = "") -> CheckResult:
     """``why`` completes "skipped because"; ``fix``: what would let the check be made."""
-    return Outcome(State.SKIPPED, why, fix)
+    return CheckResult(State.SKIPPED, "", why, fix)
 
 
 def why_not_free(view: RobotView) -> str:

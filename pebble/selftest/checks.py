@@ -8,13 +8,14 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 
+from pebble.check_result import CheckResult
 from pebble.client.names import id_of
 from pebble.client.robot_topics import section_of
 from pebble.contract.levels import LEVELS, silent_after
 from pebble.errors import PebbleError
 from pebble.launcher.capabilities import capabilities as expected_capabilities
 from pebble.runtime.addresses import Addresses
-from pebble.selftest import Outcome, failed, machine, ok, skipped, why_not_free
+from pebble.selftest import failed, machine, ok, skipped, why_not_free
 from pebble.selftest.media import picture, sound
 from pebble.selftest.motion import wheels
 from pebble.selftest.robot import RobotUnderTest, Side
@@ -61,7 +62,7 @@ def free(robot: RobotUnderTest) -> str:
 # -- the sides
 
 
-def processes(robot: RobotUnderTest) -> Outcome:
+def processes(robot: RobotUnderTest) -> CheckResult:
     """Whether its own side answers, and each of its processes is ready."""
     if why := robot.why_own or running(robot):
         return failed(why, "sudo systemctl start pebble, or pebble up CONFIG; and test it as the robot's user or root")
@@ -86,7 +87,7 @@ def _unready(robot: RobotUnderTest) -> list[str]:
     ]
 
 
-def heartbeats(robot: RobotUnderTest) -> Outcome:
+def heartbeats(robot: RobotUnderTest) -> CheckResult:
     """Whether operators see it, without gaps."""
     side, section = robot.operators, robot.config.services.mqtt_bridge.heartbeat
     if side is None:
@@ -118,7 +119,7 @@ def _gap(side: Side) -> float:
     return max(after - before for before, after in pairwise(newest))
 
 
-def capabilities(robot: RobotUnderTest) -> Outcome:
+def capabilities(robot: RobotUnderTest) -> CheckResult:
     """Whether it offers, on both sides, what its config has."""
     wanted = set(_available(expected_capabilities(robot.config, Addresses(robot.config))))
     lacking: dict[str, str] = {}
@@ -143,7 +144,7 @@ def _available(value: dict[str, object]) -> Iterator[str]:
 # -- what hangs on it
 
 
-def boards(robot: RobotUnderTest) -> Outcome:
+def boards(robot: RobotUnderTest) -> CheckResult:
     """Whether each serial line's board was heard, and commands reach the motors."""
     lines = {name or "serial": line.serial.port for name, line in robot.config.serial_instances().items()}
     if not lines:
@@ -177,7 +178,7 @@ def _mcu(robot: RobotUnderTest, name: str) -> dict[str, object]:
     return section_of(section_of(robot.inside.status or {}, "mcu"), name)
 
 
-def battery(robot: RobotUnderTest) -> Outcome:
+def battery(robot: RobotUnderTest) -> CheckResult:
     """Its voltage, and whether that is too low where its config has the number of cells."""
     robot.wait(lambda: robot.view.volts is not None, _VOLTS_S)
     volts, cells = robot.view.volts, robot.config.robot.battery_cells
@@ -189,7 +190,7 @@ def battery(robot: RobotUnderTest) -> Outcome:
     return ok(f"{volts:.2f} V{charging}")
 
 
-def leftovers(robot: RobotUnderTest) -> Outcome:
+def leftovers(robot: RobotUnderTest) -> CheckResult:
     """What robots of other ids have left retained on this machine: this one before it was renamed, for example."""
     here = [side for side in robot.sides if side.is_here(robot.config)]
     if not here:
@@ -211,7 +212,7 @@ class Check:
     """``needs`` are asked in their order; the first that is lacking is why the check is skipped."""
 
     name: str
-    run: Callable[[RobotUnderTest], Outcome]
+    run: Callable[[RobotUnderTest], CheckResult]
     needs: tuple[Need, ...] = ()
 
 
@@ -237,7 +238,7 @@ CHECKS = (
 MOVING = (Check("wheels", wheels, (running, account, motors, free)),)
 
 
-def run(robot: RobotUnderTest, checks: Iterable[Check]) -> Iterator[tuple[Check, Outcome]]:
+def run(robot: RobotUnderTest, checks: Iterable[Check]) -> Iterator[tuple[Check, CheckResult]]:
     """Make one check after the other."""
     for check in checks:
         robot.wait(lambda: True, 0.0)  # what has arrived meanwhile decides whether it is free

@@ -10,12 +10,12 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 
+from pebble.check_result import CheckResult, State
 from pebble.client.page_from_config import settings_of
 from pebble.client.page_settings import WebSettings
-from pebble.doctor import Finding, Level
 from pebble.doctor import checks as doctor
 from pebble.errors import PebbleError
-from pebble.selftest import Outcome, failed, ok, skipped
+from pebble.selftest import failed, ok, skipped
 from pebble.selftest.robot import RobotUnderTest
 
 UNIT = "pebble.service"
@@ -31,7 +31,7 @@ _ANY_HOST = {"0.0.0.0": "127.0.0.1", "::": "::1"}  # noqa: S104 - where a page t
 # -- how it was installed
 
 
-def unit(robot: RobotUnderTest) -> Outcome:
+def unit(robot: RobotUnderTest) -> CheckResult:
     """Whether systemd runs it, and starts it with the machine."""
     if robot.config.path != robot.places.config:
         return skipped(f"{UNIT} would run {robot.places.config}, which is another file")
@@ -45,7 +45,7 @@ def unit(robot: RobotUnderTest) -> Outcome:
     return unit_of(dict(line.partition("=")[::2] for line in done.stdout.splitlines()))
 
 
-def unit_of(properties: Mapping[str, str]) -> Outcome:
+def unit_of(properties: Mapping[str, str]) -> CheckResult:
     """The same from what ``systemctl show`` prints."""
     if properties.get("LoadState") != "loaded":
         return skipped(f"{UNIT} is not installed")
@@ -59,7 +59,7 @@ def unit_of(properties: Mapping[str, str]) -> Outcome:
     return ok(f"{UNIT} runs" + (f"; restarted {restarts} times" if restarts not in ("0", "?") else ""))
 
 
-def slot(robot: RobotUnderTest) -> Outcome:
+def slot(robot: RobotUnderTest) -> CheckResult:
     """Whether the slot that runs is the active one, and whole."""
     places = robot.places
     if not places.slots.is_dir() or not (places.slots / "active").is_symlink():
@@ -81,14 +81,14 @@ def slot(robot: RobotUnderTest) -> Outcome:
 # -- what it stands on
 
 
-def clock(_robot: RobotUnderTest) -> Outcome:
+def clock(_robot: RobotUnderTest) -> CheckResult:
     """A clock that was never set makes stamps and certificates wrong."""
-    return _outcome(doctor.clock(time.time(), doctor.synchronised()))
+    return _result(doctor.clock(time.time(), doctor.synchronised()))
 
 
-def disk(robot: RobotUnderTest) -> Outcome:
+def disk(robot: RobotUnderTest) -> CheckResult:
     """Whether stops, people and the audit can go on being saved."""
-    folder = robot.config.state_dir()
+    folder = Path(os.path.normpath(robot.config.state_dir()))  # a config may name it by ../..
     existing = next(one for one in (folder, *folder.parents) if one.exists())
     try:
         found = os.statvfs(existing)
@@ -97,7 +97,7 @@ def disk(robot: RobotUnderTest) -> Outcome:
     return disk_of(folder, found)
 
 
-def disk_of(folder: Path, found: os.statvfs_result) -> Outcome:
+def disk_of(folder: Path, found: os.statvfs_result) -> CheckResult:
     free, whole = found.f_bavail * found.f_frsize, found.f_blocks * found.f_frsize
     text = f"{free / 1e9:.1f} of {whole / 1e9:.1f} GB are free at {folder}"
     if found.f_flag & os.ST_RDONLY:
@@ -109,15 +109,15 @@ def disk_of(folder: Path, found: os.statvfs_result) -> Outcome:
     return ok(text)
 
 
-def _outcome(finding: Finding) -> Outcome:
+def _result(found: CheckResult) -> CheckResult:
     """A warning is no failure: a robot without a network has no time server."""
-    return failed(finding.text, finding.fix) if finding.level is Level.FAIL else ok(finding.text)
+    return failed(found.text, found.fix) if found.state is State.FAILED else ok(found.text)
 
 
 # -- what it serves
 
 
-def page(robot: RobotUnderTest) -> Outcome:
+def page(robot: RobotUnderTest) -> CheckResult:
     """Whether the robot's own page answers, with the certificate of its config, and for how long that is valid."""
     if not robot.config.services.web_handler.enabled:
         return skipped("the robot serves no page: services.web_handler is off")

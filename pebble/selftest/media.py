@@ -2,25 +2,26 @@
 
 import time
 
+from pebble.check_result import CheckResult
 from pebble.client.media_receiver import MediaReceiver
 from pebble.client.viewer import Medium
 from pebble.errors import PebbleError
-from pebble.selftest import Outcome, failed, ok, skipped
+from pebble.selftest import failed, ok, skipped
 from pebble.selftest.robot import RobotUnderTest
 
 _LOG = "pebble doctor CONFIG; journalctl -u pebble -n 50"
 _PROGRAMS: dict[Medium, str] = {"video": "camera_publisher", "audio": "audio_publisher"}
 
 
-def picture(robot: RobotUnderTest) -> Outcome:
+def picture(robot: RobotUnderTest) -> CheckResult:
     return _received(robot, "video", "camera")
 
 
-def sound(robot: RobotUnderTest) -> Outcome:
+def sound(robot: RobotUnderTest) -> CheckResult:
     return _received(robot, "audio", "microphone")
 
 
-def _received(robot: RobotUnderTest, medium: Medium, device: str) -> Outcome:
+def _received(robot: RobotUnderTest, medium: Medium, device: str) -> CheckResult:
     if _PROGRAMS[medium] not in robot.config.media_programs():
         return skipped(f"it has no {device}")
     assert robot.operators is not None  # noqa: S101 - the table says so

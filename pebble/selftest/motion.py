@@ -6,11 +6,12 @@ from contextlib import contextmanager
 
 import msgspec
 
+from pebble.check_result import CheckResult
 from pebble.client.control import ControlClient
 from pebble.client.pace_of_link import WIDE
 from pebble.contract import DRIVE, codec
 from pebble.contract.payloads import Drive
-from pebble.selftest import Outcome, failed, ok, skipped
+from pebble.selftest import failed, ok, skipped
 from pebble.selftest.robot import RobotUnderTest, Side, Touch
 from pebble.transports import Message
 
@@ -23,7 +24,7 @@ _SENSORS = "set services.serial_mcu_bridge.telemetry.publish_touch_sensors to tr
 _LOG = "pebble doctor CONFIG; journalctl -u pebble -n 50"
 
 
-def wheels(robot: RobotUnderTest) -> Outcome:
+def wheels(robot: RobotUnderTest) -> CheckResult:
     """Drive a little way ahead and back; between the two, and after it, the robot stops by itself."""
     if robot.view.charging:
         return skipped("it is on its charger")
@@ -34,9 +35,9 @@ def wheels(robot: RobotUnderTest) -> Outcome:
         results = []
         for speed in (SPEED, -SPEED):
             results.append(_drive(robot, side, control, speed))
-            if isinstance(results[-1], Outcome):
+            if isinstance(results[-1], CheckResult):
                 break
-    problem = next((one for one in results if isinstance(one, Outcome)), None)
+    problem = next((one for one in results if isinstance(one, CheckResult)), None)
     if problem is not None:
         return problem
     rested = [one for one in results if isinstance(one, float)]
@@ -45,7 +46,7 @@ def wheels(robot: RobotUnderTest) -> Outcome:
     return ok(f"they turned ahead and back, and rested {max(rested):.2f} s after the last command")
 
 
-def _drive(robot: RobotUnderTest, side: Side, control: ControlClient, speed: float) -> Outcome | float | None:
+def _drive(robot: RobotUnderTest, side: Side, control: ControlClient, speed: float) -> CheckResult | float | None:
     """How long after the last command they turned; None: there are no samples of them."""
     side.publish([_command(side, control, Drive())])  # after a reset it waits for one
     began = sent_at = time.monotonic()

@@ -120,7 +120,7 @@ def _config(here: Here) -> str:
 
 def _doctor(here: Here) -> str:
     found = run_checks(here.config)
-    return "".join(f"{one.level.value:<4}  {one.what}: {one.text}  {one.fix}\n" for one in found) + here.problem
+    return "".join(f"{one.state[:4]:<4}  {one.what}: {one.text}  {one.fix}\n" for one in found) + here.problem
 
 
 def _status(here: Here) -> str:

@@ -3,13 +3,14 @@
 import time
 from contextlib import suppress
 
+from pebble.check_result import CheckResult
 from pebble.client.connection import connected
 from pebble.client.estop import StopSender, new_name
 from pebble.client.estop_states import Reset
 from pebble.contract import ESTOP_RESET, ESTOP_STATE, codec
 from pebble.contract.payloads import EstopReset
 from pebble.errors import PayloadError
-from pebble.selftest import Outcome, failed, ok, skipped
+from pebble.selftest import failed, ok, skipped
 from pebble.selftest.robot import RobotUnderTest, Side, message
 from pebble.transports import Message, QoS
 
@@ -18,7 +19,7 @@ _WHY = "selftest"
 _NO_BOOT, _NO_COUNT = "selftest", 1_000_000  # of no start of a motor owner, and of no stop
 
 
-def stop(robot: RobotUnderTest) -> Outcome:
+def stop(robot: RobotUnderTest) -> CheckResult:
     """Stop it as operators do, and end exactly this stop on its own side."""
     before = {owner: state.recent for owner, state in robot.view.estop.states.items()}
     name = new_name()
@@ -29,7 +30,7 @@ def stop(robot: RobotUnderTest) -> Outcome:
     return failed(left, "pebble estop reset CONFIG") if left else outcome
 
 
-def _stopped(robot: RobotUnderTest, name: str) -> Outcome:
+def _stopped(robot: RobotUnderTest, name: str) -> CheckResult:
     side = robot.way
     sender = StopSender(name, by=robot.by, why=_WHY, now=time.monotonic(), robots=[robot.config.base])
     one = sender.robots[robot.config.base]
@@ -67,7 +68,7 @@ def _ended(robot: RobotUnderTest, name: str, before: dict[str, list[str]]) -> st
     return f"it stays stopped: {', '.join(refused)}" if refused else ""
 
 
-def retained_commands(robot: RobotUnderTest) -> Outcome:
+def retained_commands(robot: RobotUnderTest) -> CheckResult:
     """Leave a command retained at the broker, one that could do no harm, and see that the robot ignores it.
 
     It is a reset that no motor owner could take: who reads it, publishes why it refuses it. A live one of another kind

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import serial
 
-from pebble.doctor import Level
+from pebble.check_result import State
 from pebble.doctor.checks import clock, synchronised
 from pebble.fleet.folder import PLAIN_PORT, PORT
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.frame import FrameError, decode
@@ -156,7 +156,7 @@ def machine(places: Places) -> Machine:
     polkit = ("usr/lib/polkit-1/polkitd", "usr/libexec/polkitd", "usr/lib/policykit-1/polkitd")
     return Machine(
         systemd="" if (root / "run/systemd/system").is_dir() or not places.is_live else NO_SYSTEMD,
-        unit="" if installed else "pebble.service is not installed: sudo apt install ./pebble-robot_….deb",
+        unit="" if installed else NO_UNIT,
         mosquitto=_mosquitto(places),
         polkit="" if any((root / path).exists() for path in polkit) else NO_POLKIT,
         writable=unwritable(places),
@@ -166,12 +166,21 @@ def machine(places: Places) -> Machine:
     )
 
 
-NO_SYSTEMD = "systemd does not run here, so nothing starts the robot with the machine: pebble up /etc/pebble/robot.json"
-NO_POLKIT = "polkit is not installed, so the page cannot restart or reboot the robot: sudo apt install polkitd"
-NO_MOSQUITTO = "mosquitto is not installed: sudo apt install mosquitto, then sudo pebble setup"
-OFFLINE = (
-    "this machine has no network, so no phone reaches it: join one, then pebble cert renew --folder /etc/pebble/tls"
+RENEW = "sudo pebble cert renew --folder /etc/pebble/tls"
+NO_UNIT = (
+    "pebble.service is not installed, so nothing starts the robot with the machine:"
+    " sudo apt install ./pebble-robot_….deb, then sudo pebble setup"
 )
+NO_SYSTEMD = "systemd does not run here, so nothing starts the robot with the machine: pebble up /etc/pebble/robot.json"
+NO_POLKIT = (
+    "polkit is not installed, so the page cannot restart or reboot the robot:"
+    " sudo apt install polkitd, then sudo pebble setup"
+)
+NO_MOSQUITTO = (
+    "mosquitto is not installed, so there is no broker on this robot:"
+    " sudo apt install mosquitto, then sudo pebble setup"
+)
+OFFLINE = f"this machine has no network, so no phone reaches it: join one, such as by sudo nmtui, then {RENEW}"
 
 
 def bits(largest: int) -> str:
@@ -183,17 +192,24 @@ def bits(largest: int) -> str:
 
 def unset_clock(now: float, known: bool | None) -> str:
     found = clock(now, known)
-    if found.level is not Level.FAIL:
+    if found.state is not State.FAILED:
         return ""
-    return f"the clock {found.text.partition(':')[0]}, so certificates would be refused: {found.fix}, then again"
+    return f"the clock {found.text.partition(':')[0]}, so certificates would be refused: {found.fix}, then {RENEW}"
 
 
 def unwritable(places: Places) -> str:
     """Why nothing can be written below the root, for whatever user; empty: it can."""
     folder = next(one for one in (places.etc, *places.etc.parents) if one.exists())
     if os.statvfs(folder).f_flag & os.ST_RDONLY:
-        return f"{folder} is read-only: sudo mount -o remount,rw {folder}"
+        return f"{folder} is read-only: sudo mount -o remount,rw {mount_point(folder)}, then sudo pebble setup"
     return ""
+
+
+def mount_point(path: Path) -> Path:
+    """Where the file system of the path is mounted: `mount` takes no other folder."""
+    lines = Path("/proc/self/mounts").read_text(encoding="utf-8", errors="surrogateescape").splitlines()
+    points = {Path(re.sub(r"\\([0-7]{3})", lambda found: chr(int(found[1], 8)), line.split()[1])) for line in lines}
+    return next((folder for folder in (path, *path.parents) if folder in points), Path("/"))
 
 
 def _mosquitto(places: Places) -> str:

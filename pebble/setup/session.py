@@ -117,6 +117,7 @@ class Session:
             return
         if not self.asks:
             raise AnswersError("yes is missing: standard input is no terminal, so confirm with --yes (or --dry-run)")
+        typer.echo("\n6. These steps are done:")
         for result in engine.states(plan.steps(wanted)):
             _print(result, self.places)
         engine.forget()
@@ -343,6 +344,6 @@ def _ask_passwords(wanted: Plan, answers: Answers, secrets: Secrets) -> Secrets:
         secrets = replace(secrets, broker_password=str(typer.prompt(text, hide_input=True)))
     if answers.page and secrets.password is None and not has_user(wanted.places.people, str(answers.user)):
         text = f"   Password of {answers.user}"
-        typed = str(typer.prompt(text, hide_input=True, confirmation_prompt=True))
+        typed = str(typer.prompt(text, hide_input=True, confirmation_prompt="   Again"))
         secrets = replace(secrets, password=usable(typed))
     return secrets

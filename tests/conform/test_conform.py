@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from pebble.check_result import State
 from pebble.client.connection import Target
 from pebble.conform.checks import CHECKS, Check, run
 from pebble.conform.component import Component, reached
@@ -19,7 +20,6 @@ from pebble.conform.motion import MOVING
 from pebble.conform.power import CUT
 from pebble.fleet.certificates import CA_CERT
 from pebble.fleet.roles import Account
-from pebble.selftest import State
 from tests.fleet.brokers import HOST, FleetBroker
 from tests.fleet.conftest import cheap_hashes as cheap_hashes
 from tests.support import ROOT, Broker, Child, further, some

@@ -14,8 +14,8 @@ from pathlib import Path
 
 import pytest
 
+from pebble.check_result import CheckResult, State
 from pebble.config import load, parse
-from pebble.doctor import Finding, Level
 from pebble.doctor import checks as doctor
 from pebble.doctor.broker_probe import ProbeResult, connect_packet, probe
 from pebble.doctor.publishing import publishing
@@ -47,40 +47,40 @@ def closed_broker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Broker]:
     broker.stop()
 
 
-def levels(findings: Iterator[Finding]) -> list[str]:
-    return [finding.level.value for finding in findings]
+def levels(findings: Iterator[CheckResult]) -> list[str]:
+    return [finding.state.value for finding in findings]
 
 
 # -- the machine
 
 
 def test_versions() -> None:
-    assert doctor.python_version((3, 11, 2)).level is Level.OK
-    assert doctor.python_version((3, 10, 9)).level is Level.FAIL
-    assert doctor.installed("paho-mqtt").level is Level.OK
+    assert doctor.python_version((3, 11, 2)).state is State.OK
+    assert doctor.python_version((3, 10, 9)).state is State.FAILED
+    assert doctor.installed("paho-mqtt").state is State.OK
     missing = doctor.installed("no-such-package")
-    assert missing.level is Level.FAIL
+    assert missing.state is State.FAILED
     assert missing.fix.endswith("-m pip install no-such-package")
 
 
 def test_memory_lock() -> None:
-    assert doctor.memory_lock(resource.RLIM_INFINITY, root=False).level is Level.OK
-    assert doctor.memory_lock(64 * MEGABYTE, root=False).level is Level.OK
-    assert doctor.memory_lock(8 * MEGABYTE, root=True).level is Level.OK
+    assert doctor.memory_lock(resource.RLIM_INFINITY, root=False).state is State.OK
+    assert doctor.memory_lock(64 * MEGABYTE, root=False).state is State.OK
+    assert doctor.memory_lock(8 * MEGABYTE, root=True).state is State.OK
     low = doctor.memory_lock(8 * MEGABYTE, root=False)
-    assert low.level is Level.WARN
+    assert low.state is State.WARN
     assert "8192 kB" in low.text
     assert "LimitMEMLOCK=infinity" in low.fix
 
 
 @pytest.mark.parametrize(
     ("now", "synchronised", "level"),
-    [(0.0, True, Level.FAIL), (1.8e9, True, Level.OK), (1.8e9, None, Level.OK), (1.8e9, False, Level.WARN)],
+    [(0.0, True, State.FAILED), (1.8e9, True, State.OK), (1.8e9, None, State.OK), (1.8e9, False, State.WARN)],
 )
-def test_clock(now: float, synchronised: bool | None, level: Level) -> None:
+def test_clock(now: float, synchronised: bool | None, level: State) -> None:
     finding = doctor.clock(now, synchronised)
-    assert finding.level is level
-    assert bool(finding.fix) == (level is not Level.OK)
+    assert finding.state is level
+    assert bool(finding.fix) == (level is not State.OK)
 
 
 @pytest.mark.parametrize(
@@ -100,13 +100,13 @@ def test_clock_synchronisation_by_systemd(
 
 def test_segments_in_use_are_no_leftovers(tmp_path: Path) -> None:
     used, left = tmp_path / "1.zenoh", tmp_path / "2.zenoh"
-    assert doctor.leftover_segments(tmp_path, Path("/proc")).level is Level.OK
+    assert doctor.leftover_segments(tmp_path, Path("/proc")).state is State.OK
     used.write_bytes(bytes(4096))
     with used.open("r+b") as file, mmap.mmap(file.fileno(), 4096):
-        assert doctor.leftover_segments(tmp_path, Path("/proc")).level is Level.OK
+        assert doctor.leftover_segments(tmp_path, Path("/proc")).state is State.OK
         left.write_bytes(bytes(4096))
         finding = doctor.leftover_segments(tmp_path, Path("/proc"))
-    assert finding.level is Level.WARN
+    assert finding.state is State.WARN
     assert finding.fix == f"rm {left}"
 
 
@@ -117,37 +117,37 @@ def test_run_directory(tmp_path: Path) -> None:
     own, uid = tmp_path / "run", os.geteuid()
     assert doctor.run_directory(own, uid).text.endswith("will be created")
     own.mkdir(mode=0o700)
-    assert doctor.run_directory(own, uid).level is Level.OK
+    assert doctor.run_directory(own, uid).state is State.OK
     own.chmod(0o755)
-    assert doctor.run_directory(own, uid) == Finding(
-        Level.WARN, "run directory", f"{own} is open to other users", f"chmod 700 {own}"
+    assert doctor.run_directory(own, uid) == CheckResult(
+        State.WARN, "run directory", f"{own} is open to other users", f"chmod 700 {own}"
     )
     assert doctor.run_directory(own, uid + 1).fix.startswith("sudo chown")
-    assert doctor.run_directory(tmp_path / ("x" * 100), uid).level is Level.FAIL
+    assert doctor.run_directory(tmp_path / ("x" * 100), uid).state is State.FAILED
     (tmp_path / "file").touch()
     assert doctor.run_directory(tmp_path / "file", uid).text.endswith("is not a directory")
 
 
 def test_leftover_sockets_are_found(tmp_path: Path) -> None:
-    assert doctor.leftover_sockets(tmp_path / "missing", doctor.is_listening).level is Level.OK
+    assert doctor.leftover_sockets(tmp_path / "missing", doctor.is_listening).state is State.OK
     with socket.socket(socket.AF_UNIX) as living, socket.socket(socket.AF_UNIX) as dying:
         living.bind(str(tmp_path / "living.sock"))
         living.listen()
         assert doctor.leftover_sockets(tmp_path, doctor.is_listening).text == "1 in use"
         dying.bind(str(tmp_path / "dead.sock"))
         finding = doctor.leftover_sockets(tmp_path, doctor.is_listening)
-    assert finding.level is Level.WARN
+    assert finding.state is State.WARN
     assert finding.fix == f"rm {tmp_path / 'dead.sock'}"
 
 
 def test_serial_port(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     missing = doctor.serial_port(tmp_path / "ttyACM0")
-    assert missing.level is Level.FAIL
+    assert missing.state is State.FAILED
     assert "plugged in" in missing.text
     (tmp_path / "file").touch()
     assert doctor.serial_port(tmp_path / "file").text == "is not a device"
     tty = os.ttyname(os.openpty()[1])
-    assert doctor.serial_port(Path(tty)).level is Level.OK
+    assert doctor.serial_port(Path(tty)).state is State.OK
     monkeypatch.setattr(os, "access", lambda *_: False)
     assert doctor.serial_port(Path(tty)).fix.startswith("sudo usermod -aG ")
 
@@ -163,14 +163,14 @@ def test_an_open_broker_on_this_machine_is_fine(open_broker: Broker) -> None:
 
 
 def test_a_broker_that_requires_a_login(closed_broker: Broker) -> None:
-    def found(username: str | None, password: str | None) -> list[Finding]:
+    def found(username: str | None, password: str | None) -> list[CheckResult]:
         settings = MqttSettings(host="127.0.0.1", port=closed_broker.port, username=username, password=password)
         return list(doctor.broker("local broker", settings))
 
     right, wrong, none = found("ann", "geheim"), found("ann", "falsch"), found(None, None)
-    assert [finding.level for finding in right] == [Level.OK] * 3
+    assert [finding.state for finding in right] == [State.OK] * 3
     assert right[1].text == "refuses anonymous logins"
-    assert wrong[0].level is Level.FAIL
+    assert wrong[0].state is State.FAILED
     assert wrong[0].text.startswith("refuses user ann: ")
     assert none[0].fix == "set username and password_file of this broker"
     assert "falsch" not in str(wrong)
@@ -180,8 +180,8 @@ def test_an_unreachable_broker_fails() -> None:
     port = free_port()
     finding, *more = doctor.broker("local broker", MqttSettings(host="127.0.0.1", port=port))
     assert more == []
-    assert finding == Finding(
-        Level.FAIL,
+    assert finding == CheckResult(
+        State.FAILED,
         f"local broker 127.0.0.1:{port}",
         "cannot be reached: Connection refused",
         "sudo systemctl start mosquitto",
@@ -192,13 +192,17 @@ def test_an_unreachable_broker_fails() -> None:
 @pytest.mark.parametrize(
     ("allowed", "level", "why"),
     [
-        ("readwrite #", Level.OK, "accepts what this account publishes"),
-        ("read #", Level.FAIL, "may not publish to pebble/robots/goob/outgoing/bridge-probe"),
-        ("readwrite pebble/robots/other/#", Level.FAIL, "may not publish to pebble/robots/goob/outgoing/bridge-probe"),
+        ("readwrite #", State.OK, "accepts what this account publishes"),
+        ("read #", State.FAILED, "may not publish to pebble/robots/goob/outgoing/bridge-probe"),
+        (
+            "readwrite pebble/robots/other/#",
+            State.FAILED,
+            "may not publish to pebble/robots/goob/outgoing/bridge-probe",
+        ),
     ],
 )
 def test_an_account_that_may_not_publish_is_found(
-    tmp_path: Path, protocol: str, allowed: str, level: Level, why: str
+    tmp_path: Path, protocol: str, allowed: str, level: State, why: str
 ) -> None:
     (tmp_path / "acl").write_text(f"topic {allowed}\n")
     broker = Broker(tmp_path, f"acl_file {tmp_path / 'acl'}")
@@ -207,15 +211,15 @@ def test_an_account_that_may_not_publish_is_found(
         finding = next(publishing("b", settings, "pebble/robots/goob"))
     finally:
         broker.stop()
-    assert (finding.level, why in finding.text) == (level, True)
-    assert level is Level.OK or finding.fix == "allow it to write and read pebble/robots/goob/outgoing/# on the broker"
+    assert (finding.state, why in finding.text) == (level, True)
+    assert level is State.OK or finding.fix == "allow it to write and read pebble/robots/goob/outgoing/# on the broker"
 
 
 def test_a_broker_that_hangs_up_on_what_is_published_is_found(open_broker: Broker) -> None:
     with ForbiddingProxy(open_broker.port) as proxy:
         proxy.forbidden = {"pebble/robots/goob/outgoing/bridge-probe"}
         finding = next(publishing("b", MqttSettings(host="127.0.0.1", port=proxy.port), "pebble/robots/goob"))
-    assert (finding.level, "hangs up" in finding.text) == (Level.FAIL, True)
+    assert (finding.state, "hangs up" in finding.text) == (State.FAILED, True)
 
 
 def probe_returning(own: ProbeResult, without_login: ProbeResult) -> Callable[..., ProbeResult]:
@@ -231,22 +235,22 @@ def test_an_open_or_unencrypted_broker_elsewhere_is_a_warning() -> None:
     assert levels(doctor.broker("b", tls, probe_returning(let_in, shut_out))) == ["ok", "ok", "ok"]
     anyone = replace(tls, tls=TlsSettings(insecure=True))
     *_, last = doctor.broker("b", anyone, probe_returning(let_in, shut_out))
-    assert (last.level, last.fix) == (Level.WARN, "set tls.insecure to false")
+    assert (last.state, last.fix) == (State.WARN, "set tls.insecure to false")
 
 
 @pytest.mark.parametrize(
     ("days", "level", "text"),
     [
-        (3, Level.WARN, "its certificate expires in 3 days"),
-        (15, Level.OK, "encrypted, its certificate for 15 more days"),
-        (397, Level.OK, "encrypted, its certificate for 397 more days"),
+        (3, State.WARN, "its certificate expires in 3 days"),
+        (15, State.OK, "encrypted, its certificate for 15 more days"),
+        (397, State.OK, "encrypted, its certificate for 397 more days"),
     ],
 )
-def test_the_days_of_a_brokers_certificate(days: int, level: Level, text: str) -> None:
+def test_the_days_of_a_brokers_certificate(days: int, level: State, text: str) -> None:
     answer, shut_out = ProbeResult(code=0, expires=1000.0 + days * 86400), ProbeResult(code=5)
     settings = MqttSettings(host="b", username="ann", password="geheim", tls=TlsSettings())
     *_, last = doctor.broker("b", settings, probe_returning(answer, shut_out), 1000.0)
-    assert (last.level, last.text) == (level, text)
+    assert (last.state, last.text) == (level, text)
 
 
 def test_the_certificate_of_a_fleets_broker_is_read(tmp_path: Path) -> None:
@@ -291,16 +295,16 @@ def test_loopback(host: str, loopback: bool) -> None:
 @pytest.mark.parametrize(
     ("web", "level", "text"),
     [
-        ({"mqtt": {"host": "127.0.0.1"}}, Level.OK, "port 8080 of 127.0.0.1"),
-        ({}, Level.FAIL, "web_interface.mqtt.host: is missing"),
-        ({"mqtt": {"host": "b"}, "host": "0.0.0.0"}, Level.FAIL, "`pebble cert init` and `pebble web user add`"),
-        ({"mqtt": {"host": "b"}, "host": "0.0.0.0", "plain_http": True}, Level.WARN, "is not encrypted"),
+        ({"mqtt": {"host": "127.0.0.1"}}, State.OK, "port 8080 of 127.0.0.1"),
+        ({}, State.FAILED, "web_interface.mqtt.host: is missing"),
+        ({"mqtt": {"host": "b"}, "host": "0.0.0.0"}, State.FAILED, "`pebble cert init` and `pebble web user add`"),
+        ({"mqtt": {"host": "b"}, "host": "0.0.0.0", "plain_http": True}, State.WARN, "is not encrypted"),
     ],
 )
-def test_the_operator_page_of_a_robot(web: dict[str, object], level: Level, text: str) -> None:
+def test_the_operator_page_of_a_robot(web: dict[str, object], level: State, text: str) -> None:
     raw = {"robot": {"id": "goob"}, "services": {"web_handler": {"enabled": True}}, "web_interface": web}
     (finding,) = doctor.operator_page(parse(raw, folder=Path("/nowhere"), env={}))
-    assert (finding.level, text in finding.text) == (level, True)
+    assert (finding.state, text in finding.text) == (level, True)
 
 
 def test_a_whole_robot_is_examined(tmp_path: Path, open_broker: Broker) -> None:
@@ -314,12 +318,12 @@ def test_a_whole_robot_is_examined(tmp_path: Path, open_broker: Broker) -> None:
     }
     path.write_text(json.dumps(text))
     findings = list(doctor.run_checks(load(path)))
-    failed = [finding.what.split(" ")[0] for finding in findings if finding.level is Level.FAIL]
+    failed = [finding.what.split(" ")[0] for finding in findings if finding.state is State.FAILED]
     assert failed == ["serial", "remote"]
     assert {"python", "eclipse-zenoh", "memory lock", "clock", "shared memory", "run directory", "sockets"} <= {
         finding.what for finding in findings
     }
-    assert [finding for finding in findings if finding.level is not Level.OK and not finding.fix] == []
+    assert [finding for finding in findings if finding.state is not State.OK and not finding.fix] == []
 
 
 # -- who may drive
@@ -365,7 +369,7 @@ def test_who_can_drive_is_shown_by_the_level_and_by_the_fleet_beside_the_config(
     fleet = {"level": "login", "brokers": [{"host": "broker.lab", "port": 8883}], "accounts": roles}
     (tmp_path / "fleet.json").write_text(json.dumps(fleet))
     found = list(who_drives(load(config)))
-    assert [f"{one.level.value} {one.text}" for one in found] == expected
+    assert [f"{one.state.value} {one.text}" for one in found] == expected
 
 
 def test_a_fleet_that_cannot_be_read_is_named(tmp_path: Path) -> None:
@@ -373,5 +377,5 @@ def test_a_fleet_that_cannot_be_read_is_named(tmp_path: Path) -> None:
     config.write_text(json.dumps({"robot": {"id": "goob"}, "security": {"level": "login"}}))
     (tmp_path / "fleet.json").write_text("{")
     (finding,) = list(who_drives(load(config)))[1:]
-    assert finding.level is Level.WARN
+    assert finding.state is State.WARN
     assert "fleet.json" in finding.text

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from pebble.doctor import Level
+from pebble.check_result import State
 from pebble.doctor.checks import serial_port
 from pebble.doctor.device_names import missing, usable
 from pebble.doctor.media import camera
@@ -37,7 +37,7 @@ def test_a_number_that_may_change(tmp_path: Path, device: str, links: dict[str, 
     (tmp_path / "ttyACM7").unlink()
     link(tmp_path, links)
     found = usable("port", tmp_path / device, "readable", KEY, tmp_path / "serial")
-    assert found.level is (Level.WARN if named else Level.OK)
+    assert found.state is (State.WARN if named else State.OK)
     assert found.fix == (f"set {KEY} to {tmp_path / 'serial' / named}" if named else "")
 
 

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
+from pebble.check_result import CheckResult, State
 from pebble.config import parse
-from pebble.doctor import Finding, Level
 from pebble.doctor.loudspeaker import SILENCE_S, loudspeaker
 from pebble.simulation.loudspeaker import playbacks
 
@@ -18,7 +18,9 @@ LOUDSPEAKER = [sys.executable, "-m", "pebble.simulation.loudspeaker"]
 RAW = ["-t", "raw", "-f", "S16_LE", "-c", "{channels}", "-r", "{rate}", "-"]
 
 
-def check(player: Sequence[str], *, sounds: bool = True, voice: bool = False, seconds: float = 0.05) -> list[Finding]:
+def check(
+    player: Sequence[str], *, sounds: bool = True, voice: bool = False, seconds: float = 0.05
+) -> list[CheckResult]:
     services: dict[str, Any] = {
         "soundboard_handler": {"enabled": sounds, "playback": {"player_command": list(player)}},
         "av_daemon": {"enabled": voice},
@@ -35,7 +37,7 @@ def test_a_robot_that_plays_nothing_needs_none() -> None:
 @pytest.mark.parametrize(("sounds", "voice"), [(True, False), (True, True), (False, True)])
 def test_a_loudspeaker_that_mixes(tmp_path: Path, sounds: bool, voice: bool) -> None:
     (finding,) = check([*LOUDSPEAKER, "--record", str(tmp_path)], sounds=sounds, voice=voice, seconds=SILENCE_S)
-    assert finding.level is Level.OK
+    assert finding.state is State.OK
     assert "for two programs at the same time" in finding.text
     assert [one.seconds for one in playbacks(tmp_path)] == [SILENCE_S] * 2
     assert {one.file == "-" for one in playbacks(tmp_path)} == {not sounds}
@@ -45,7 +47,7 @@ def test_a_loudspeaker_that_mixes(tmp_path: Path, sounds: bool, voice: bool) -> 
 def test_a_loudspeaker_for_one_program(tmp_path: Path) -> None:
     player = [*LOUDSPEAKER, "--exclusive", "--record", str(tmp_path)]
     (finding,) = check(player, voice=True, seconds=1.5)
-    assert finding.level is Level.WARN
+    assert finding.state is State.WARN
     assert "plays for one program at a time (loudspeaker: audio open error: Device or resource busy)" in finding.text
     assert "dmix" in finding.fix
 
@@ -66,7 +68,7 @@ def test_a_player_that_does_not_play(
     (tmp_path / "setpriv").symlink_to("/usr/bin/setpriv")
     monkeypatch.setenv("PATH", str(tmp_path))
     (finding,) = check(player)
-    assert finding.level is Level.WARN
+    assert finding.state is State.WARN
     assert text in finding.text
     assert fix in finding.fix
 
@@ -74,4 +76,4 @@ def test_a_player_that_does_not_play(
 def test_a_player_that_does_not_end_is_killed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pebble.doctor.loudspeaker._END_S", 0.2)
     (finding,) = check(["sh", "-c", "exec sleep 60"])
-    assert (finding.level, "sh cannot play: did not end within 0.25 s" in finding.text) == (Level.WARN, True)
+    assert (finding.state, "sh cannot play: did not end within 0.25 s" in finding.text) == (State.WARN, True)

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
+from pebble.check_result import State
 from pebble.config import Config, parse
-from pebble.doctor import Level
 from pebble.doctor.media import camera, codecs, media, shm_socket
 
 
@@ -33,14 +33,14 @@ def test_everything_there(tmp_path: Path) -> None:
     (tmp_path / "video0").touch()
     config = config_of({"enabled": True, "video": {"device": "0"}})
     found = list(media(config, tmp_path, everything))
-    assert {finding.level for finding in found} == {Level.OK}
+    assert {finding.state for finding in found} == {State.OK}
     assert [finding.what for finding in found] == ["camera", "microphone", "codecs"]
 
 
 def test_nothing_there(tmp_path: Path) -> None:
     config = config_of({"enabled": True, "video": {"device": str(tmp_path / "video0")}})
     found = {finding.what: finding for finding in media(config, tmp_path, nothing)}
-    assert [found[what].level for what in ("camera", "microphone")] == [Level.FAIL, Level.FAIL]
+    assert [found[what].state for what in ("camera", "microphone")] == [State.FAILED, State.FAILED]
     assert "alsa-utils" in found["microphone"].fix
     assert "video0 does not exist" in found["camera"].text
 
@@ -53,28 +53,28 @@ def test_sockets_for_scripts_of_the_original(tmp_path: Path) -> None:
         "audio": {"source": "synthetic", "socket_path": str(tmp_path / "none" / "a.sock")},
     }
     found = {finding.what: finding for finding in media(config_of(devices), tmp_path, nothing)}
-    assert found["video for the original's scripts"].level is Level.OK
+    assert found["video for the original's scripts"].state is State.OK
     assert "there is no folder" in found["audio for the original's scripts"].text
     assert shm_socket("x", tmp_path / "file").text.endswith("is a file and no socket")
 
 
 @pytest.mark.parametrize(
-    ("backend", "level"), [("synthetic", Level.OK), ("libcamera", Level.FAIL), ("picamera2", Level.FAIL)]
+    ("backend", "level"), [("synthetic", State.OK), ("libcamera", State.FAILED), ("picamera2", State.FAILED)]
 )
-def test_other_cameras(backend: str, level: Level, tmp_path: Path) -> None:
-    assert camera(backend, "", tmp_path, nothing).level is level
-    assert camera(backend, "", tmp_path, everything).level is Level.OK
+def test_other_cameras(backend: str, level: State, tmp_path: Path) -> None:
+    assert camera(backend, "", tmp_path, nothing).state is level
+    assert camera(backend, "", tmp_path, everything).state is State.OK
 
 
 @pytest.mark.parametrize(
     ("sent", "level"),
     [
-        ({}, Level.OK),
-        ({"video_publisher": {"encoding": "h264"}}, Level.FAIL),
-        ({"audio_publisher": {"encoding": "opus"}}, Level.FAIL),
+        ({}, State.OK),
+        ({"video_publisher": {"encoding": "h264"}}, State.FAILED),
+        ({"audio_publisher": {"encoding": "opus"}}, State.FAILED),
     ],
 )
-def test_codecs_are_missed_where_they_are_asked_for(sent: dict[str, Any], level: Level) -> None:
+def test_codecs_are_missed_where_they_are_asked_for(sent: dict[str, Any], level: State) -> None:
     config = config_of({"enabled": True}, **sent)
-    assert codecs(config, installed=False).level is level
-    assert codecs(config, installed=True).level is Level.OK
+    assert codecs(config, installed=False).state is level
+    assert codecs(config, installed=True).state is State.OK

@@ -12,7 +12,7 @@ import pytest
 
 from pebble.bench.impair.conditions import Condition, Shape
 from pebble.bench.impair.network import REMOTE_HOST, NamespaceNetwork
-from pebble.doctor import Level
+from pebble.check_result import State
 from pebble.doctor.publishing import held_back, publishing
 from pebble.rig.processes import Processes, python
 from pebble.transports.settings import MqttSettings
@@ -64,9 +64,9 @@ def test_a_round_trip_too_short_to_matter_is_not_judged(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("round_trip_s", "apart_s", "levels"),
-    [(0.019, 0.06, []), (0.08, 0.005, [Level.OK]), (0.08, 0.08, [Level.WARN]), (0.5, 0.3, [Level.OK])],
+    [(0.019, 0.06, []), (0.08, 0.005, [State.OK]), (0.08, 0.08, [State.WARN]), (0.5, 0.3, [State.OK])],
 )
 def test_the_second_message_a_round_trip_late_is_a_warning(
-    round_trip_s: float, apart_s: float, levels: list[Level]
+    round_trip_s: float, apart_s: float, levels: list[State]
 ) -> None:
-    assert [finding.level for finding in held_back("b", round_trip_s, apart_s)] == levels
+    assert [finding.state for finding in held_back("b", round_trip_s, apart_s)] == levels

@@ -5,8 +5,8 @@ from __future__ import annotations
 import subprocess
 from pathlib import Path
 
+from pebble.check_result import CheckResult, State
 from pebble.config import parse
-from pebble.doctor import Finding, Level
 from pebble.doctor.checks import run_checks
 from pebble.doctor.reachable import beyond_loopback, own_addresses
 from pebble.transports.settings import MqttSettings
@@ -22,7 +22,7 @@ def with_another_listener(folder: Path, port: int, *options: str) -> Broker:
     return broker
 
 
-def findings(broker: Broker) -> list[Finding]:
+def findings(broker: Broker) -> list[CheckResult]:
     return list(beyond_loopback("local broker", MqttSettings(host="127.0.0.1", port=broker.port), [OUTSIDE, "::1"]))
 
 
@@ -31,7 +31,7 @@ def test_a_broker_for_everybody_is_a_warning(tmp_path: Path) -> None:
     broker = with_another_listener(tmp_path, port)
     (found,) = findings(broker)
     broker.stop()
-    assert (found.level, found.what) == (Level.WARN, f"local broker 127.0.0.1:{port}")
+    assert (found.state, found.what) == (State.WARN, f"local broker 127.0.0.1:{port}")
     assert found.text == f"also answers at {OUTSIDE} and accepts anonymous logins: the network can drive the robot"
     assert found.fix.startswith(f"in mosquitto.conf: listener {port} 127.0.0.1")
 
@@ -42,13 +42,13 @@ def test_one_that_requires_a_login_is_named(tmp_path: Path) -> None:
     broker = with_another_listener(tmp_path, port, "allow_anonymous false", f"password_file {passwords}")
     (found,) = findings(broker)
     broker.stop()
-    assert (found.level, found.text) == (Level.OK, f"also answers at {OUTSIDE}, and refuses anonymous logins there")
+    assert (found.state, found.text) == (State.OK, f"also answers at {OUTSIDE}, and refuses anonymous logins there")
 
 
 def test_one_for_this_machine_alone_is_fine(tmp_path: Path) -> None:
     broker = Broker(tmp_path)
     (found,) = findings(broker)
-    assert (found.level, found.text) == (Level.OK, f"does not answer at {OUTSIDE}, ::1")
+    assert (found.state, found.text) == (State.OK, f"does not answer at {OUTSIDE}, ::1")
     assert list(beyond_loopback("local broker", MqttSettings(host="127.0.0.1", port=broker.port), [])) == []
     broker.stop()
 

@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
+from pebble.check_result import CheckResult, State
 from pebble.config import parse
-from pebble.doctor import Finding, Level
 from pebble.doctor.recordings import recorder
 from pebble.recordings.files.rewrite import rewrite
 from pebble.recordings.recorder.folder import Folder
@@ -22,7 +22,7 @@ BEGAN = ms(0) / 1000
 GB = 1 << 30
 
 
-def findings(folder: Path, now: float = BEGAN + 1000, **section: Any) -> list[Finding]:
+def findings(folder: Path, now: float = BEGAN + 1000, **section: Any) -> list[CheckResult]:
     robot = {"system": "pebble", "type": "robots", "id": "goob"}
     config = {"robot": robot, "services": {"recorder": {"enabled": True, "folder": str(folder), **section}}}
     return list(recorder(parse(config, folder=folder, env={}), now))
@@ -52,7 +52,7 @@ def test_a_robot_without_a_recorder_is_not_asked() -> None:
 
 def test_a_folder_that_is_not_there_yet_is_fine(tmp_path: Path) -> None:
     (found,) = findings(tmp_path / "none")
-    assert (found.level, "has not recorded anything" in found.text) == (Level.OK, True)
+    assert (found.state, "has not recorded anything" in found.text) == (State.OK, True)
 
 
 def test_one_that_runs_and_one_that_does_not(tmp_path: Path) -> None:
@@ -60,22 +60,22 @@ def test_one_that_runs_and_one_that_does_not(tmp_path: Path) -> None:
     assert findings(tmp_path)[0].text == "does not run now"
     owner = running(tmp_path)
     found = findings(tmp_path, time.time())[0]
-    assert (found.level, found.text) == (Level.OK, f"runs, 7 messages into {tmp_path}")
+    assert (found.state, found.text) == (State.OK, f"runs, 7 messages into {tmp_path}")
     owner.release()
 
 
 @pytest.mark.parametrize(
     ("status", "level", "text"),
     [
-        ({"at": 1_700_000_000.0}, Level.WARN, "has stood still for "),
-        ({"blocked": "no room"}, Level.FAIL, "writes nothing: no room"),
-        ({"dropped": 12}, Level.WARN, "has dropped 12 messages"),
+        ({"at": 1_700_000_000.0}, State.WARN, "has stood still for "),
+        ({"blocked": "no room"}, State.FAILED, "writes nothing: no room"),
+        ({"dropped": 12}, State.WARN, "has dropped 12 messages"),
     ],
 )
-def test_what_is_wrong_with_one_that_runs(tmp_path: Path, status: dict[str, Any], level: Level, text: str) -> None:
+def test_what_is_wrong_with_one_that_runs(tmp_path: Path, status: dict[str, Any], level: State, text: str) -> None:
     owner = running(tmp_path, **status)
     found = findings(tmp_path, time.time())[0]
-    assert found.level is level
+    assert found.state is level
     assert text in found.text
     owner.release()
 
@@ -84,7 +84,7 @@ def test_files_that_were_left(tmp_path: Path) -> None:
     path = recorded(tmp_path)
     path.rename(path.with_name(f"{path.name}.active"))
     found = findings(tmp_path)[0]
-    assert (found.level, found.fix) == (Level.WARN, f"pebble recordings finish {tmp_path}")
+    assert (found.state, found.fix) == (State.WARN, f"pebble recordings finish {tmp_path}")
 
 
 def test_gaps_of_the_last_hour_and_no_older_ones(tmp_path: Path) -> None:
@@ -115,7 +115,7 @@ def test_what_could_not_be_finished_is_named(tmp_path: Path) -> None:
     path = recorded(tmp_path)
     path.rename(path.with_name(f"{path.name}.damaged"))
     (found,) = [one for one in findings(tmp_path) if "could not be finished" in one.text]
-    assert (found.level, f"{path}.damaged" in found.text) == (Level.WARN, True)
+    assert (found.state, f"{path}.damaged" in found.text) == (State.WARN, True)
 
 
 def test_how_long_there_is_room(tmp_path: Path) -> None:
@@ -123,7 +123,7 @@ def test_how_long_there_is_room(tmp_path: Path) -> None:
     path = recorded(tmp_path, seconds=3600.0)
     assert "days at this rate" in findings(tmp_path, keep_bytes=0)[-1].text
     limited = findings(tmp_path, keep_bytes=10 * path.stat().st_size)[-1]
-    assert (limited.level, limited.text) == (Level.OK, "the last 10.0 hours are kept")
+    assert (limited.state, limited.text) == (State.OK, "the last 10.0 hours are kept")
 
 
 def test_little_room_is_warned_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -131,11 +131,11 @@ def test_little_room_is_warned_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     usage = type("Usage", (), {"free": GB + 5 * path.stat().st_size})
     monkeypatch.setattr("pebble.doctor.recordings.shutil.disk_usage", lambda _folder: usage)
     found = findings(tmp_path, keep_bytes=0, free_bytes=GB)[-1]
-    assert (found.level, found.text) == (Level.WARN, "for 5.0 hours at this rate; then the oldest are deleted")
+    assert (found.state, found.text) == (State.WARN, "for 5.0 hours at this rate; then the oldest are deleted")
 
 
 def test_links_are_left_alone(tmp_path: Path) -> None:
     path = recorded(tmp_path)
     path.unlink()
     path.symlink_to(tmp_path / "nowhere")
-    assert all(found.level is Level.OK for found in findings(tmp_path))
+    assert all(found.state is State.OK for found in findings(tmp_path))

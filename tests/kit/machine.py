@@ -12,8 +12,9 @@ import re
 import shutil
 import signal
 import subprocess
-from collections.abc import Sequence
-from contextlib import suppress
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, Self
@@ -175,17 +176,47 @@ class Machine:
         for folder, _, _ in os.walk(self._cgroup, topdown=False):
             assert until(partial(_removed, Path(folder)), 10), folder
 
+    @property
+    def root(self) -> Path:
+        """Its files, as they are while it runs."""
+        return Path(f"/proc/{self._init}/root")
+
+    @contextmanager
+    def processes_watched(self) -> Iterator[set[bytes]]:
+        """The command lines and environments that its processes have during the block, as far as they are seen.
+
+        They are read one after the other without a pause; what lives for a few milliseconds may be missed.
+        """
+        seen: set[bytes] = set()
+        ending = threading.Event()
+
+        def watch() -> None:
+            while not ending.wait(0.002):
+                for process in os.listdir(self.root / "proc"):  # noqa: PTH208  (a Path for each costs as much as reading it)
+                    if process.isdecimal():
+                        with suppress(OSError):  # it has ended
+                            seen.add((self.root / "proc" / process / "cmdline").read_bytes())
+                            seen.add((self.root / "proc" / process / "environ").read_bytes())
+
+        thread = threading.Thread(target=watch)
+        thread.start()
+        try:
+            yield seen
+        finally:
+            ending.set()
+            thread.join()
+
     def command(self, *words: str) -> list[str]:
         """Return what runs a command in it, as root."""
         enter = ["nsenter", "-t", str(self._init), "-m", "-p", "-n", "-u", "-i", "-C", "-r", "-w"]
         path = "PATH=/usr/sbin:/usr/bin:/sbin:/bin"
         return [*enter, "env", "-i", path, "HOME=/root", "LANG=C.UTF-8", "TERM=dumb", *words]
 
-    def run(self, *words: str, check: bool = True, timeout: float = 120, **options: Any) -> str:
-        """Run a command in it, and return what it writes to both outputs."""
+    def run(self, *words: str, check: bool = True, timeout: float = 120, given: str = "") -> str:
+        """Run a command in it, with ``given`` as its input, and return what it writes to both outputs."""
         done = subprocess.run(
-            self.command(*words), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL,
-            check=False, timeout=timeout, **options,
+            self.command(*words), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, input=given.encode(),
+            check=False, timeout=timeout,
         )  # fmt: skip
         text: str = done.stdout.decode(errors="replace")
         assert not check or done.returncode == 0, f"{words}: {done.returncode}\n{text}"
@@ -202,10 +233,7 @@ class Machine:
 
     def write(self, path: str, text: str) -> None:
         """Write a file; missing folders are made."""
-        subprocess.run(
-            self.command("sh", "-euc", 'mkdir -p "$(dirname "$1")"; cat >"$1"', "write", path),
-            input=text.encode(), check=True, timeout=30,
-        )  # fmt: skip
+        self.run("sh", "-euc", 'mkdir -p "$(dirname "$1")"; cat >"$1"', "write", path, given=text)
 
     def exposure(self, unit: str) -> float:
         """What systemd-analyze makes of a unit that is loaded."""

@@ -321,6 +321,28 @@ def test_who_ignores_the_request_to_stop_is_killed_and_takes_no_time_from_others
     assert "did not stop in time: bridge" in robot.stderr()
 
 
+def test_what_ends_while_the_robot_stops_is_not_started_again(launch: Launch) -> None:
+    """All its processes may get the signal, by a service manager or `pkill`, and one may have just crashed."""
+    robot = launch(
+        ("hub", "good", LOCAL_TRANSPORT),
+        ("serial", "crash", DEVICE),
+        ("bridge", "stubborn", CONNECTION),
+        shutdown_timeout_seconds=600,
+        restart_delay_seconds=2,
+    )
+    assert robot.ready("hub", "bridge")
+    robot.process.send_signal(signal.SIGINT)
+    assert until(lambda: "[launcher] stopping" in robot.stderr())
+    crashes = robot.stderr().count("serial ended")
+    os.kill(robot.events("hub", "start")[0], signal.SIGKILL)
+    assert until(lambda: "hub ended (signal 9) before its turn to stop" in robot.stderr())
+    assert until(lambda: robot.states().get("serial") == "stopped", 30), "it was waiting for its next start"
+    os.kill(robot.events("bridge", "start")[0], signal.SIGKILL)
+    assert robot.process.wait(20) == 0
+    assert robot.stderr().count("again in") == crashes
+    assert len(robot.events("hub", "start")) == 1
+
+
 def test_a_second_signal_ends_everything_at_once(launch: Launch) -> None:
     robot = launch(("bridge", "stubborn", CONNECTION), shutdown_timeout_seconds=600)
     assert robot.ready("bridge")

@@ -56,6 +56,17 @@ def test_a_newer_package_is_built_beside_and_the_older_one_is_one_command_away(
     assert robot.receives("outgoing/online")
     assert robot.runs_from() == "b"
 
+    machine.run("mv", "/opt/pebble/b/bin/python3", "/opt/pebble/b/bin/python3.gone")
+    machine.run("systemctl", "restart", "pebble.service")
+    assert robot.receives("outgoing/online")
+    assert robot.runs_from() == "a", "a slot that is damaged is passed over"
+    assert "pebble-slot: slot b is damaged, so a starts" in machine.journal("pebble.service")
+    assert machine.run("pebble", "--version") == f"pebble {OLD}\n"
+    machine.run("mv", "/opt/pebble/b/bin/python3.gone", "/opt/pebble/b/bin/python3")
+    machine.run("systemctl", "restart", "pebble.service")
+    assert robot.receives("outgoing/online")
+    assert robot.runs_from() == "b", "mended, it is chosen again"
+
     machine.run("pebble-slot", "back")
     machine.run("systemctl", "restart", "pebble.service")
     assert robot.receives("outgoing/online")

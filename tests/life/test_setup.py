@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 from typing import Any
 
+from pebble.selftest.secrets_here import secrets_of
+from pebble.setup.places import Places
 from tests.kit.machine import Machine
 from tests.life.robots import BASE, PORT, ROBOT, Robot
 from tests.support import until
@@ -21,16 +23,28 @@ ANSWERS: dict[str, Any] = {
     "password_file": "/srv/password",
 }
 #: As a browser does, except that it takes the robot's own certificate as it comes.
-LOG_IN = """
+LOG_IN = f"""
 import json, ssl, urllib.request
 context = ssl._create_unverified_context()
 def ask(path, body=None):
     data = None if body is None else json.dumps(body).encode()
-    headers = {"Content-Type": "application/json", "Origin": "https://127.0.0.1:8080"}
+    headers = {{"Content-Type": "application/json", "Origin": "https://127.0.0.1:8080"}}
     request = urllib.request.Request("https://127.0.0.1:8080" + path, data, headers)
     return urllib.request.urlopen(request, context=context).status
-print(ask("/"), ask("/api/login", {"user": "ann", "password": "%s"}))
+print(ask("/"), ask("/api/login", {{"user": "ann", "password": "{PASSWORD}"}}))
 """
+
+
+SETUP = ("pebble", "setup", "--answers", "/srv/answers.json", "--yes")
+#: What a person types on a robot, with which outputs go to others.
+COMMANDS = (
+    ("pebble", "selftest", "/etc/pebble/robot.json"),
+    ("pebble", "doctor", "/etc/pebble/robot.json"),
+    ("pebble", "report", "/srv/goob.zip"),
+    ("pebble", "backup", "/srv/goob.tar"),
+    ("pebble", "web", "user", "list"),
+    ("systemctl", "restart", "pebble.service"),
+)
 
 
 def test_package_and_setup_make_a_robot_with_heartbeats_and_let_its_user_in(machine: Machine) -> None:
@@ -39,13 +53,25 @@ def test_package_and_setup_make_a_robot_with_heartbeats_and_let_its_user_in(mach
     machine.write("/srv/password", PASSWORD)
     machine.write("/srv/answers.json", json.dumps(ANSWERS))
     machine.run("chmod", "600", "/srv/password")
-    done = machine.run("pebble", "setup", "--answers", "/srv/answers.json", "--yes", timeout=300)
-    assert PASSWORD not in done
-    remote = json.loads(machine.run("cat", "/etc/pebble/robot.json"))["services"]["mqtt_bridge"]["remote_mqtt"]
-    password = machine.sh(f"cd /etc/pebble && cat {remote['password_file']}").strip()
-    login = ("-h", remote["host"], "-p", str(remote.get("port", 1883)), "-u", remote["username"], "-P", password)
-    assert machine.succeeds("mosquitto_sub", *login, "-R", "-C", "5", "-W", "60", "-t", f"{BASE}/outgoing/online")
-    script = LOG_IN % PASSWORD
-    assert until(lambda: machine.run("python3", "-c", script, check=False) == "200 200\n", 60, step=1), done
-    again = machine.run("pebble", "setup", "--answers", "/srv/answers.json", "--yes", timeout=300)
-    assert " new " not in again
+    with machine.processes_watched() as seen:
+        done = machine.run(*SETUP, timeout=300)
+        remote = json.loads(machine.run("cat", "/etc/pebble/robot.json"))["services"]["mqtt_bridge"]["remote_mqtt"]
+        login = ("-h", remote["host"], "-p", str(remote.get("port", 1883)), "-u", remote["username"])
+        # mosquitto_sub takes passwords from this file, or else only on its command line
+        options = f"-P $(cat /etc/pebble/{remote['password_file']})"
+        machine.sh(f'mkdir -p /root/.config && echo "{options}" >/root/.config/mosquitto_sub')
+        receives = ("mosquitto_sub", *login, "-R", "-C", "5", "-W", "60", "-t", f"{BASE}/outgoing/online")
+        assert machine.succeeds(*receives)
+        log_in = ("python3", "-")
+        assert until(lambda: machine.run(*log_in, check=False, given=LOG_IN) == "200 200\n", 60, step=1), done
+        shown = [done, *(machine.run(*command, check=False, timeout=300) for command in COMMANDS)]
+        assert machine.succeeds(*receives)
+        again = machine.run(*SETUP, timeout=300)
+        assert " new " not in again
+        machine.run("env", "PLANTED=in-an-environment", "sleep", "1.5")
+    texts = [*seen, *map(str.encode, shown), machine.run("journalctl", "--output=export").encode()]
+    secrets = secrets_of(Places(machine.root), None, [machine.root / "srv/password"])
+    assert len({one.where for one in secrets.known}) > 5, "passwords, and keys of the page and of the broker"
+    assert [where for text in texts if (where := secrets.found_in("", text))] == []
+    planted = (b"in-an-environment", b"sleep\x001.5", b"mosquitto_sub\0", b"selftest\0", b"report\0", b"backup\0")
+    assert [text for text in planted if not any(text in one for one in seen)] == [], "that is found where it is"

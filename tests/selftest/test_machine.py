@@ -13,9 +13,10 @@ from typing import Any
 
 import pytest
 
+from pebble.check_result import CheckResult
 from pebble.config import parse
 from pebble.fleet import certificates
-from pebble.selftest import Outcome, machine
+from pebble.selftest import machine
 from pebble.selftest.robot import RobotUnderTest
 from pebble.setup.places import Places
 from tests.support import free_port
@@ -36,7 +37,7 @@ UNITS: list[tuple[Mapping[str, str], str, str]] = [
 ]
 
 
-def judged(outcome: Outcome, state: str, text: str) -> None:
+def judged(outcome: CheckResult, state: str, text: str) -> None:
     assert (outcome.state.value, text in outcome.text) == (state, True), outcome
     assert bool(outcome.fix) is (state == "failed")
 

@@ -120,7 +120,7 @@ def test_six_questions_in_a_terminal(root: Path) -> None:
         "Page [",
         "everything [",
         "ann: ",
-        "onfirmation: ",
+        "Again: ",
         "it? [",
     ]
     for prompt, text in zip(prompts, typed, strict=True):

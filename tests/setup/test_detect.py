@@ -18,9 +18,12 @@ import pytest
 from pebble.services.serial_mcu_bridge.pebble_serial_v1 import frame
 from pebble.setup import detect
 from pebble.setup.detect import Machine
+from pebble.setup.manifest import Manifest
 from pebble.setup.places import Places
-from pebble.setup.steps import State
-from tests.setup.rig import machine_root, set_up
+from pebble.setup.plan import Plan, steps
+from pebble.setup.questions import Secrets, combined
+from pebble.setup.steps import Engine, State
+from tests.setup.rig import ANSWERS, machine_root, set_up
 from tests.support import needs_root
 
 _LISTENS = "mosquitto listens with logins, and beyond this machine encrypted"
@@ -86,9 +89,9 @@ def test_a_file_that_is_no_camera_is_none(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("machine", "step", "text"),
     [
-        (Machine(mosquitto=detect.NO_MOSQUITTO), _LISTENS, "sudo apt install mosquitto"),
-        (Machine(polkit=detect.NO_POLKIT), "the page may restart and reboot the robot", "polkit is not installed"),
-        (Machine(writable="/etc is read-only: …"), "config", "/etc is read-only"),
+        (Machine(mosquitto=detect.NO_MOSQUITTO), _LISTENS, detect.NO_MOSQUITTO),
+        (Machine(polkit=detect.NO_POLKIT), "the page may restart and reboot the robot", detect.NO_POLKIT),
+        (Machine(writable="/etc is read-only: …"), "config", "/etc is read-only: …"),
     ],
 )
 def test_a_step_that_the_machine_does_not_allow_gives_the_reason(
@@ -96,21 +99,65 @@ def test_a_step_that_the_machine_does_not_allow_gives_the_reason(
 ) -> None:
     found = {result.step.what: result for result in set_up(root, machine)}
     assert found[step].state is State.CANNOT
-    assert text in found[step].why
+    assert found[step].why == text
     done = {result.step.what: result.state for result in set_up(root)}
     assert done[step] is State.NEW, "the next run does what was left"
 
 
-@pytest.mark.parametrize(
-    ("lacking", "text"),
-    [
-        (detect.bits(2**31), "32 bits, for which the versions of packages are not locked"),
-        (detect.unset_clock(0.0, None), "the clock is set to 1970, so certificates would be refused: sudo timedatectl"),
-        (Machine(network=detect.OFFLINE).lacks()[0], "no network, so no phone reaches it"),
-    ],
-)
-def test_what_no_step_depends_on_is_described(lacking: str, text: str) -> None:
-    assert text in lacking
+SERVICE = "the robot starts with the machine"
+#: What a machine lacks, as a person reads it: the step that is not done, or none, and the whole text.
+LACKING = {
+    "no systemd": (
+        {"systemd": detect.NO_SYSTEMD},
+        SERVICE,
+        "systemd does not run here, so nothing starts the robot with the machine: pebble up /etc/pebble/robot.json",
+    ),
+    "no unit": (
+        {"unit": detect.NO_UNIT},
+        SERVICE,
+        "pebble.service is not installed, so nothing starts the robot with the machine:"
+        " sudo apt install ./pebble-robot_….deb, then sudo pebble setup",
+    ),
+    "no mosquitto": (
+        {"mosquitto": detect.NO_MOSQUITTO},
+        _LISTENS,
+        "mosquitto is not installed, so there is no broker on this robot:"
+        " sudo apt install mosquitto, then sudo pebble setup",
+    ),
+    "no polkit": (
+        {"polkit": detect.NO_POLKIT},
+        "the page may restart and reboot the robot",
+        "polkit is not installed, so the page cannot restart or reboot the robot:"
+        " sudo apt install polkitd, then sudo pebble setup",
+    ),
+    "32 bits": (
+        {"bits": detect.bits(2**31)},
+        None,
+        "this system has 32 bits, for which the versions of packages are not locked: install one of 64 bits",
+    ),
+    "offline": (
+        {"network": detect.OFFLINE},
+        None,
+        "this machine has no network, so no phone reaches it: join one, such as by sudo nmtui,"
+        " then sudo pebble cert renew --folder /etc/pebble/tls",
+    ),
+    "unset clock": (
+        {"clock": detect.unset_clock(0.0, None)},
+        None,
+        "the clock is set to 1970, so certificates would be refused: sudo timedatectl set-ntp true,"
+        " then sudo pebble cert renew --folder /etc/pebble/tls",
+    ),
+}
+
+
+@pytest.mark.parametrize(("machine", "what", "text"), LACKING.values(), ids=LACKING)
+def test_what_a_machine_does_not_allow_is_named_with_what_to_type(
+    machine: dict[str, str], what: str | None, text: str, root: Path
+) -> None:
+    wanted = Plan(Places(root), combined(ANSWERS), Machine(**machine), Manifest(), Secrets())
+    found = Engine(wanted.places, wanted.manifest, is_live=True).states(steps(wanted))
+    cannot = [(result.step.what, result.why) for result in found if result.state is State.CANNOT]
+    assert (what, text) in [*cannot, *((None, why) for why in wanted.machine.lacks())]
 
 
 def test_a_machine_that_lacks_nothing(root: Path) -> None:
@@ -144,4 +191,4 @@ def test_a_read_only_root_is_recognised(tmp_path: Path) -> None:
         check=True,
         timeout=60,
     )
-    assert done.stdout.strip() == f"{root}/etc is read-only: sudo mount -o remount,rw {root}/etc"
+    assert done.stdout.strip() == f"{root}/etc is read-only: sudo mount -o remount,rw {root}, then sudo pebble setup"

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import sqlite3
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
@@ -22,6 +24,7 @@ from pebble.fleet.roles import Account, Role
 from pebble.rig.processes import mosquitto_path
 from pebble.runtime.connections import mqtt_settings
 from pebble.setup import retained
+from pebble.setup.backup import make
 from pebble.setup.places import Places
 from pebble.transports import MqttSettings, QoS
 from pebble.transports.mqtt.transport import MqttTransport
@@ -29,7 +32,7 @@ from pebble.transports.settings import TlsSettings
 from tests.commands.command_line import Run
 from tests.fleet.brokers import HOST, FleetBroker
 from tests.setup.rig import ANSWERS, BROKER_PASSWORD, PASSWORD, backup_of, machine_root, set_up, tar_of, tree
-from tests.support import Broker, Child, free_port, listening, until
+from tests.support import Broker, Child, free_port, listening, needs_root, until
 
 HEAD = ("backup.json", b'{"format": 1, "version": "0", "id": "a"}')
 GOOB, FRED = Identity("pebble", "robots", "goob"), Identity("pebble", "robots", "fred")
@@ -208,6 +211,35 @@ def test_a_backup_on_a_blank_machine_is_the_same_robot(root: Path, tmp_path: Pat
         assert people.check("ann", PASSWORD, "")
     assert run("setup", "--root", other, "--from", backup, "--yes") == 1
     assert "this machine is set up as goob" in run.err
+
+
+@needs_root
+def test_a_backup_by_root_of_a_database_that_is_written_to_is_whole_and_leaves_it_to_its_owner(root: Path) -> None:
+    """SQLite makes files beside a database, and gives them to the owner of that, where it may."""
+    set_up(root)
+    file, owner = Places(root).people, 65534
+    os.chown(file, owner, owner)
+    ending = threading.Event()
+
+    def write() -> None:
+        with closing(People(file)) as people:
+            (ann,) = people.list()
+            while not ending.is_set():
+                people.start_session(ann)
+
+    page = threading.Thread(target=write)
+    page.start()
+    try:
+        saved = [make(Places(root)).files["var/lib/pebble/people.sqlite"].content for _ in range(10)]
+    finally:
+        ending.set()
+        page.join()
+    assert len(set(saved)) > 1, "it was written to meanwhile"
+    make(Places(root))
+    assert {path.stat().st_uid for path in file.parent.glob("people.sqlite*")} == {owner}
+    (root / "saved.sqlite").write_bytes(saved[-1])
+    with closing(People(root / "saved.sqlite")) as people:
+        assert people.check("ann", PASSWORD, "")
 
 
 def test_a_second_robot_has_a_name_passwords_and_certificates_of_its_own(root: Path, tmp_path: Path, run: Run) -> None:
