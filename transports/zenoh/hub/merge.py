@@ -69,7 +69,7 @@ def is_newer(theirs: Row, mine: Row | None, alive: Collection[str]) -> bool:
     if mine.origin == theirs.origin:
         if mine.origin in alive:
             return False
-        if mine.retained_count and theirs.retained_count:
+        if mine.retained_count and theirs.retained_count and mine.retained_count != theirs.retained_count:
             return theirs.retained_count > mine.retained_count
     if abs(mine.age_s - theirs.age_s) > TIE_S:  # false for two infinite ones
         return theirs.age_s < mine.age_s
