@@ -245,7 +245,8 @@ class Mesh:
     def _on_state(self, query: zenoh.Query) -> None:
         with query:
             store, hub = self._hub.store, self._hub
-            counts = len(hub.alive_clients), len(store.wills()), len(store.retained())
+            clients = hub.alive_clients - self._wills.hubs - {self._name}
+            counts = len(clients), len(store.wills()), len(store.retained())
             state = HubState(self._name, sorted(self._wills.hubs), *counts, self.merges)
             query.reply(str(query.key_expr), merge.encode(state))
 
@@ -259,6 +260,9 @@ class HubState(msgspec.Struct, frozen=True):
     wills: int
     retained: int
     merges: int
+
+
+decode_state = msgspec.msgpack.Decoder(HubState).decode
 
 
 def _ask(session: zenoh.Session, key: str, payload: bytes) -> list[bytes]:
