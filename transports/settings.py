@@ -70,4 +70,5 @@ class ZenohSettings:
     wills: tuple[tuple[str, bool], ...] = ()
     unretained: tuple[str, ...] = ()  # filters of topics on which the hub retains nothing
     access: Path | None = None  # of a hub: what each name of a certificate may do, from `pebble fleet zenoh`
+    max_wills: int | None = None  # that the hub stores; None: 1,000
     account: str = ""  # of a client: the name in its certificate, under which a hub with ``access`` knows it

@@ -39,6 +39,7 @@ COMMANDS = {
     "analyse": "recordings.analyse",
     "cert": "cert",
     "fleet": "fleet",
+    "hub": "hub",
     "audit": "audit",
     "conform": "conform",
     "flash": "flash",

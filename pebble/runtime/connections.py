@@ -2,7 +2,8 @@
 
 from collections.abc import Iterator
 from dataclasses import replace as replace_settings
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from msgspec.structs import replace
 
@@ -12,6 +13,9 @@ from pebble.errors import ConfigError, TransportError
 from pebble.runtime.addresses import Addresses
 from pebble.transports import Message, MqttSettings, TlsSettings, Transport, ZenohSettings, check_kind, create
 from pebble.transports.socket_paths import FRAMES_SOCKET, PEER_SOCKET, fits_socket
+
+if TYPE_CHECKING:
+    from pebble.config.hub_file import HubFile
 
 _ANY = "+/+/+"  # the levels of any robot
 #: Topics of the robot's states, and of all commands, that are published even to a broker that hangs up on them.
@@ -157,6 +161,21 @@ def hub_settings(config: Config) -> ZenohSettings:
         journal=transport.journal,
         reserved=(f"{config.base}/{c.OUTGOING}",),
         wills=tuple(dict.fromkeys(_renamed_wills(config))),
+    )
+
+
+def fleet_hub_settings(hub: "HubFile", run_dir: Path) -> ZenohSettings:
+    """A hub of its own, for several robots."""
+    return ZenohSettings(
+        run_dir=run_dir,
+        listen=hub.listen,
+        connect=hub.connect,
+        tls=tls_settings(hub.tls),
+        allowed_names=hub.allowed_names,
+        access=hub.access,
+        lease_ms=hub.lease_ms,
+        journal=hub.journal,
+        max_wills=hub.max_wills,
     )
 
 

@@ -73,13 +73,14 @@ class HubConnection:
 
     # -- queries
 
-    def hello(self) -> bytes:
+    def hello(self, session: zenoh.Session) -> bytes:
         """Our will, and what we have published."""
         gone: dict[str, int | None] = {topic_to_key(topic): None for topic in self._removed}
         retained: dict[str, int | None] = {
             topic_to_key(topic): wire.digest(own.payload) for topic, own in self._own.items() if own.payload
         }
-        return wire.encode(wire.Hello(self.name, self.retained_count, self._will, gone | retained))
+        of = str(session.info.zid())
+        return wire.encode(wire.Hello(self.name, self.retained_count, self._will, gone | retained, of))
 
     def greet(self, session: zenoh.Session, hello: bytes, timeout: float) -> set[str] | None:
         """The topics that the hub lacks; None: no hub answers in time."""

@@ -102,10 +102,16 @@ class Barrier:
     A query is answered only after the declarations sent before it on the same connection have been processed, in both
     directions. So a sibling that has answered ``@sync/<name>`` will send us what we subscribed to, and receive what we
     publish. The answer carries ``retained_count()``. Siblings know this session by its token.
+
+    ``by_name``: each is asked by its name. For clients of hubs elsewhere: there all the others would answer, too
+    (measured with 200 of them: 3.3 to 7.3 s until one had opened, asked by name 1.4 s).
     """
 
-    def __init__(self, session: zenoh.Session, name: str, retained_count: Callable[[], int]) -> None:
+    def __init__(
+        self, session: zenoh.Session, name: str, retained_count: Callable[[], int], *, by_name: bool = False
+    ) -> None:
         self._session, self._name, self._retained_count = session, name, retained_count
+        self._by_name = by_name
         self._silent: set[str] = set()  # hung or stopped: not waited for again until they answer
         session.declare_queryable(SYNC + name, direct(self._answer))
         self._token = session.liveliness().declare_token(LIVE + name)
@@ -136,6 +142,8 @@ class Barrier:
 
     def _ask(self, wanted: set[str], answers: dict[str, int], left: float) -> bool:
         done = threading.Event()
+        asked = wanted if self._by_name else ["*"]
+        ended: list[None] = []
 
         def take(reply: zenoh.Reply) -> None:
             if reply.ok is not None:
@@ -143,13 +151,19 @@ class Barrier:
                 if wanted <= set(answers):
                     done.set()
 
-        self._session.get(
-            SYNC + "*",
-            zenoh.handlers.Callback(take, done.set, indirect=False),
-            target=zenoh.QueryTarget.ALL,
-            consolidation=zenoh.ConsolidationMode.NONE,
-            timeout=left,
-        )
+        def end() -> None:
+            ended.append(None)
+            if len(ended) == len(asked):
+                done.set()
+
+        for one in asked:
+            self._session.get(
+                SYNC + one,
+                zenoh.handlers.Callback(take, end, indirect=False),
+                target=zenoh.QueryTarget.ALL,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                timeout=left,
+            )
         done.wait(min(left, _ASK_AGAIN_S))
         return wanted <= set(answers)
 
@@ -176,12 +190,13 @@ class Siblings:
     def begin(self, session: zenoh.Session, name: str, hub: HubWatch, retained_count: Callable[[], int]) -> None:
         """There is a new session of this process, called ``name``, and with ``retained_count()`` retained messages."""
 
+        remote = bool(self._settings.client and self._settings.connect)
+
         def expected() -> dict[str, str]:
-            remote = self._settings.client and self._settings.connect
             siblings = {} if remote else self._registry.ready(but=name)
             return siblings | dict.fromkeys(hub.hubs, "the hub")
 
-        self._expected, self._barrier = expected, Barrier(session, name, retained_count)
+        self._expected, self._barrier = expected, Barrier(session, name, retained_count, by_name=remote)
 
     def synchronize(self, timeout: float) -> dict[str, int]:
         """Wait until all that run surely know our declarations; returns how many retained messages each has sent."""

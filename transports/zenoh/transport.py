@@ -275,7 +275,7 @@ class ZenohTransport(Transport):
         sent: set[str] = set()
         while time.monotonic() < end:
             with self._publishing:
-                hello = self._hub.hello()
+                hello = self._hub.hello(session)
             lacking = self._hub.greet(session, hello, end - time.monotonic())
             if lacking is None:
                 return False

@@ -26,6 +26,9 @@ UP = "@up/"  # + name: liveliness token of a hub
 LIVE = "@live/"  # + name: liveliness token of a client
 HELLO = "@hub/hello"  # query: name, digests of retained messages, will; the answer lists the keys the hub lacks
 BYE = "@hub/bye"  # query: remove my will, I have published it myself
+PUBLISHED = "@hub/spoken"  # put by a hub: the will of this client was published, others forget it
+MERGE = "@hub/merge/"  # + name of a hub: query of another one that was away from it
+STATE = "@hub/state/"  # + name of a hub: query of people
 # Clients from other machines that have an account say hello and goodbye under it: @hub/hello/<account>. Their sessions
 # are named <account>~…
 OF = "~"
@@ -122,13 +125,14 @@ class Will(msgspec.Struct, frozen=True, array_like=True):
 class Hello(msgspec.Struct, frozen=True, array_like=True):
     """``own`` has a digest for each retained key of this client, None for one it has removed.
 
-    A field may be added at the end: msgspec skips what it does not know.
+    ``session`` is the id by which Zenoh knows it. A field may be added at the end: msgspec skips what it does not know.
     """
 
     name: str
     retained_count: int
     will: Will | None
     own: dict[str, int | None]
+    session: str = ""
 
 
 digest = crc32

@@ -33,8 +33,11 @@ from pebble.transports.zenoh import wire
 from pebble.transports.zenoh.access import Access, read_access
 from pebble.transports.zenoh.callbacks import direct
 from pebble.transports.zenoh.hub.admission import Admission
+from pebble.transports.zenoh.hub.history import History
 from pebble.transports.zenoh.hub.journal import Journal
+from pebble.transports.zenoh.hub.mesh import Mesh
 from pebble.transports.zenoh.hub.store import HubStore, Record, Retained, StoredWill
+from pebble.transports.zenoh.hub.wills import STILL_S, WillTimes
 from pebble.transports.zenoh.keymap import topic_to_key
 from pebble.transports.zenoh.presence import Barrier
 from pebble.transports.zenoh.session import HUB_SOCKET, close_at_exit, close_session, open_session, session_config
@@ -42,10 +45,11 @@ from pebble.transports.zenoh.session import HUB_SOCKET, close_at_exit, close_ses
 log = logging.getLogger(__name__)
 
 QUEUE_LIMIT = 10_000  # events waiting for the hub's thread; beyond it their senders wait
-WILL_DELAY_S = 0.1  # before a dead client's will is published, so that its last messages come first
-RETURN_S = 2.5  # after a restart clients have this long to reconnect before their wills are published
 QUERIES = 1000  # that wait; further ones are answered at once
 PATIENCE_S = 0.5  # a query waits this long for retained messages that are known to be on their way
+_LOOK_S = 0.25  # a hub among others looks so often whether it stood still
+
+_NEVER = float("inf")
 
 _Task = Callable[[], None]
 
@@ -60,7 +64,6 @@ class ZenohHub:
         self._lock: FileLock | None = None
         self._session: zenoh.Session | None = None
         self._worker: HubWorker | None = None
-        self._token: zenoh.LivelinessToken | None = None
         self._store: HubStore | None = None
         self._admission = Admission(settings.wills, settings.unretained)
         self._listening = OwnFile(self._socket)
@@ -171,7 +174,9 @@ class ZenohHub:
 
     def _start(self) -> None:
         journal = None if self._settings.journal is None else Journal(self._settings.journal)
-        self._store = store = HubStore(tuple(topic_to_key(topic) + "/" for topic in self._settings.reserved))
+        linked = bool(self._settings.listen or self._settings.connect)  # others may be
+        reserved = tuple(topic_to_key(topic) + "/" for topic in self._settings.reserved)
+        self._store = store = HubStore(reserved, History() if linked else None, self._settings.max_wills)
         self._worker = HubWorker(self.name, store, self._admission, journal, self.counters)
         self._listen(self._worker)
 
@@ -189,7 +194,6 @@ class ZenohHub:
         self._listening = OwnFile(self._socket)
         Barrier(self._session, self.name, lambda: 0)
         worker.serve(self._session)
-        self._token = self._session.liveliness().declare_token(wire.UP + self.name)
 
     def _is_free(self, endpoint: str) -> bool:
         """Say who has taken an endpoint. A robot's hub runs without it, as any user can take a port; others end."""
@@ -221,8 +225,10 @@ class HubWorker:
         self._admission = admission
         self._recalled = False  # the records of the journal
         self._received: dict[str, int] = {}  # how many retained messages have arrived, by client
-        self._alive_clients: set[str] = set()
-        self._will_due: dict[str, float] = {}  # when to publish a will, by client
+        self.alive_clients: set[str] = set()
+        self._wills = WillTimes(name)
+        self._mesh = Mesh(name, self, self._wills)
+        self._token: zenoh.LivelinessToken | None = None  # clients ask a hub when its token appears
         self._waiting_queries: list[tuple[float, dict[str, int], zenoh.Query]] = []
         self._tasks: queue.Queue[_Task | None] = queue.Queue(QUEUE_LIMIT)
         self._session: zenoh.Session | None = None
@@ -245,6 +251,9 @@ class HubWorker:
             session.declare_queryable(what, self._queued(work))
             session.declare_queryable(f"{what}/*", self._queued(work))
         session.liveliness().declare_subscriber(wire.LIVE + "*", self._queued(self._on_client), history=True)
+        if self._store.has_history:
+            self._mesh.serve(session, self._queued)
+        self._token = session.liveliness().declare_token(wire.UP + self._name)
         if not self._thread.is_alive():
             self._thread.start()
 
@@ -263,15 +272,23 @@ class HubWorker:
     def _queued(self, work: Callable[[Any], None]) -> zenoh.handlers.Callback[Any]:
         return direct(lambda event: self._tasks.put(lambda: work(event)))
 
+    def post(self, task: _Task) -> None:
+        """Do ``task`` on the hub's thread."""
+        self._tasks.put(task)
+
     def _run(self) -> None:
         while True:
+            pause, began = self._pause(), time.monotonic()
             try:
-                task = self._tasks.get(timeout=self._pause())
+                task = self._tasks.get(timeout=pause)
                 if task is None:
                     return
-                self._do(task)
             except queue.Empty:
-                pass
+                task = None
+            if pause is not None and time.monotonic() - began > pause + STILL_S:
+                self._wills.on_standstill(time.monotonic())
+            if task is not None:
+                self._do(task)
             self._answer_waiting()
             self._publish_due_wills()
             if self._journal is not None and self._journal.rewrite_due:
@@ -289,10 +306,13 @@ class HubWorker:
 
     def _pause(self) -> float | None:
         now = time.monotonic()
-        pauses = [due - now for due in (*self._will_due.values(), *(until for until, _, _ in self._waiting_queries))]
+        pauses = [due - now for due in (self._wills.next_due, *(until for until, _, _ in self._waiting_queries))]
         if self._journal is not None:
             pauses.append(self._journal.wait_s)
-        return max(0.0, min(pauses)) if pauses else None
+        if self._wills.met_others:
+            pauses.append(_LOOK_S)
+        pause = max(0.0, min(pauses))
+        return None if pause == _NEVER else pause
 
     # -- retained messages
 
@@ -300,7 +320,8 @@ class HubWorker:
         if sample.attachment is None:
             raise ValueError(f"{sample.key_expr} has no stamp")
         stamp = wire.Stamp.unpack(sample.attachment.to_bytes())
-        self._apply(Retained(str(sample.key_expr).removeprefix(wire.RETAINED), sample.payload.to_bytes(), stamp))
+        self.apply(Retained(str(sample.key_expr).removeprefix(wire.RETAINED), sample.payload.to_bytes(), stamp))
+        self._wills.on_message(stamp.origin, time.monotonic())
         if stamp.retained_count and stamp.origin in self._received:
             self._received[stamp.origin] = max(stamp.retained_count, self._received[stamp.origin])
 
@@ -320,8 +341,10 @@ class HubWorker:
             return
         now = time.monotonic()
         waiting, self._waiting_queries = self._waiting_queries, []
+        merging = now < self._mesh.merging_until
         for until, needs, query in waiting:
-            if now >= until or all(self._received.get(name, -1) >= count for name, count in needs.items()):
+            arrived = all(self._received.get(name, -1) >= count for name, count in needs.items())
+            if now >= until or (arrived and not merging):
                 self._do(lambda query=query: self._answer(query))  # type: ignore[misc]
             else:
                 self._waiting_queries.append((until, needs, query))
@@ -347,13 +370,12 @@ class HubWorker:
             if admitted is None:
                 return
             hello = admitted
-            self._end_predecessor(hello)
-            self._apply(StoredWill(hello.name, hello.will))
-            if hello.name in self._alive_clients:
-                self._will_due.pop(hello.name, None)
-            elif hello.will is not None:
-                # If its token never comes, it has died meanwhile.
-                self._will_due[hello.name] = time.monotonic() + RETURN_S
+            now = time.monotonic()
+            alive, has_will = hello.name in self.alive_clients, hello.will is not None
+            self._wills.on_hello(hello.name, hello.session, now, alive=alive, has_will=has_will)
+            if not self._wills.hubs or not hello.session or self._wills.is_home(hello.name, now):
+                self._end_predecessor(hello)
+            self.apply(StoredWill(hello.name, hello.will))
             lacking = self._store.lacks(hello)
             if lacking:
                 self._received.pop(hello.name, None)
@@ -368,8 +390,8 @@ class HubWorker:
         for name in self._store.wills() - {hello.name}:
             will = self._store.will(name)
             if will is not None and will.client == hello.will.client:
-                self._will_due.pop(name, None)
-                self._apply(StoredWill(name, None))
+                self._mesh.publish(name)
+                self.forget_will(name)
                 if topic_to_key(will.topic) not in hello.own:
                     self._publish_will(name, will)
 
@@ -378,34 +400,45 @@ class HubWorker:
             account = wire.account_of(str(query.key_expr), wire.BYE)
             name = wire.decode_name(_payload(query))
             if self._admission.owns(account, name):
-                self._apply(StoredWill(name, None))
+                self.forget_will(name)
                 query.reply(wire.asked(wire.BYE, account), b"")
 
     def _on_client(self, sample: zenoh.Sample) -> None:
         name = str(sample.key_expr).removeprefix(wire.LIVE)
         if sample.kind == zenoh.SampleKind.PUT:
-            if self._admission.sessions(name, self._alive_clients):
-                self._alive_clients.add(name)
-            self._will_due.pop(name, None)
+            if self._admission.sessions(name, self.alive_clients):
+                self.alive_clients.add(name)
+            self._wills.on_alive(name)
+            self._mesh.on_alive(name)
             return
-        self._alive_clients.discard(name)
+        self.alive_clients.discard(name)
         self._received.pop(name, None)
         if self._store.will(name) is not None:
-            self._will_due[name] = time.monotonic() + WILL_DELAY_S
+            self._wills.on_gone(name, time.monotonic())
 
     def _publish_due_wills(self) -> None:
-        now = time.monotonic()
-        for name in [name for name, due in self._will_due.items() if now >= due]:
-            del self._will_due[name]
+        for name, is_successor in self._wills.take_due(time.monotonic()):
             will = self._store.will(name)
-            if will is not None:
-                self._apply(StoredWill(name, None))
-                self._do(lambda name=name, will=will: self._publish_will(name, will))  # type: ignore[misc]
+            if will is None:
+                continue
+            if is_successor and will.retain and self._wills.met_others:
+                self._mesh.replace(name, topic_to_key(will.topic))
+            self._mesh.publish(name)
+            self.forget_will(name)
+            self._do(partial(self._publish_will, name, will))
+
+    def forget_will(self, name: str) -> None:
+        """The client ``name`` has no will any more."""
+        self._wills.forget(name)
+        self.apply(StoredWill(name, None))
 
     def _publish_will(self, name: str, will: wire.Will) -> None:
         key, qos = topic_to_key(will.topic), QoS(will.qos)
+        stamp = wire.Stamp(qos, 0, name)
         if will.retain:
-            self._apply(Retained(key, will.payload, wire.Stamp(qos, 0, name)))
+            self.apply(Retained(key, will.payload, stamp))
+        if self._session is not None and will.retain and self._wills.met_others:
+            self._session.put(wire.RETAINED + key, will.payload, attachment=stamp.pack(), **wire.BLOCK)
         if self._session is not None:
             self._session.put(
                 key, will.payload, attachment=wire.pack_live(qos, retain_requested=will.retain), **wire.BLOCK
@@ -414,10 +447,19 @@ class HubWorker:
 
     # -- store and journal
 
-    def _apply(self, record: Record) -> None:
+    def apply(self, record: Record, age_s: float = 0.0) -> bool:
+        """Store what is admitted of ``record``; returns whether that changed anything."""
         admitted = self._admission.admitted(record)
-        if admitted is not None and self._store.apply(admitted) and self._journal is not None:
+        changed = admitted is not None and self._store.apply(admitted, age_s)
+        if changed and self._journal is not None:
             self._journal.append(wire.encode(admitted))
+        return changed
+
+    def ask_again(self) -> None:
+        """Have all clients ask what is retained here, as if this hub had just come."""
+        if self._session is not None and self._token is not None:
+            self._token.undeclare()  # type: ignore[no-untyped-call]
+            self._token = self._session.liveliness().declare_token(wire.UP + self._name)
 
     def _write_journal(self, journal: Journal) -> None:
         """Write all records anew, together with those of an earlier hub: these are read once, as soon as they can be.
@@ -438,24 +480,24 @@ class HubWorker:
         for data in loaded:
             try:
                 if (record := self._admission.admitted(decode(data))) is not None:
-                    earlier.apply(record)
+                    earlier.apply(record, _NEVER)
             except msgspec.DecodeError as error:
                 log.warning("journal %s has a record of another kind: %s", journal.path, error)
-        for record in self._store.records():
-            earlier.apply(record)  # newer
+        earlier.take_over(self._store)
         self._store = earlier
         self._await_wills()
         return True
 
     def _await_return(self) -> None:
         """Clients of a session that was closed have as long to come back as after a restart."""
-        self._alive_clients.clear()
+        self.alive_clients.clear()
         self._received.clear()
         self._await_wills()
 
     def _await_wills(self) -> None:
-        due = time.monotonic() + RETURN_S
-        self._will_due |= dict.fromkeys(self._store.wills() - self._alive_clients - self._will_due.keys(), due)
+        absent = self._store.wills() - self.alive_clients
+        self._wills.on_restart(absent, time.monotonic())
+        self._mesh.recall(absent)
 
 
 def _renewed(tls: TlsSettings) -> Renewed[Any]:

@@ -1,0 +1,32 @@
+"""What hubs tell of themselves."""
+
+import zenoh
+
+from pebble.transports.settings import ZenohSettings
+from pebble.transports.zenoh import wire
+from pebble.transports.zenoh.hub.mesh import HubState, decode_state
+from pebble.transports.zenoh.session import HUB_SOCKET, close_session, open_session, session_config
+
+ANSWER_S = 2.0
+
+
+def hub_states(settings: ZenohSettings) -> list[HubState]:
+    """The state of the hub of ``settings.run_dir`` and of those linked to it, by name; empty if it does not run."""
+    config = session_config(
+        ZenohSettings(run_dir=settings.run_dir), "client", listen=[], connect=[settings.run_dir / HUB_SOCKET]
+    )
+    try:
+        session = open_session(config)
+    except zenoh.ZError:
+        return []
+    try:
+        replies = session.get(
+            f"{wire.STATE}*",
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            timeout=ANSWER_S,
+        )
+        states = [decode_state(reply.ok.payload.to_bytes()) for reply in replies if reply.ok is not None]
+    finally:
+        close_session(session)
+    return sorted(states, key=lambda one: one.name)

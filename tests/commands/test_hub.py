@@ -1,0 +1,48 @@
+"""`pebble hub`: two hubs that are linked, what they tell of themselves, and files that are none."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.commands.command_line import Run, running
+from tests.support import free_port, until
+
+
+def hub_file(folder: Path, name: str, **settings: Any) -> Path:
+    file = folder / f"{name}.json"
+    file.write_text(json.dumps({"run_dir": str(folder / name), **settings}), encoding="utf-8")
+    return file
+
+
+def test_linked_hubs_show_each_other(run: Run, tmp_path: Path) -> None:
+    one, two = (f"tcp/127.0.0.1:{free_port()}" for _ in range(2))
+    first = hub_file(tmp_path, "a", listen=[one], journal="a.journal")
+    second = hub_file(tmp_path, "b", listen=[two], connect=[one])
+    with running("hub", str(first)), running("hub", str(second)):
+
+        def state() -> list[str]:
+            run("hub", str(first), "--state")
+            return run.out.splitlines()
+
+        assert until(lambda: len(state()) == 2 and all("linked to no" not in line for line in state()), 20)
+        assert all("0 clients, 0 wills" in line for line in state())
+    assert run("hub", str(first), "--state") == 1
+    assert run.err == f"pebble: no hub runs with {first}: start it with `pebble hub {first}`\n"
+
+
+@pytest.mark.parametrize(
+    ("settings", "complaint"),
+    [
+        ({}, 'hub.json: listen: is missing: a hub is reached there, such as ["tls/0.0.0.0:7447"]'),
+        ({"listen": ["tcp/127.0.0.1:1"], "lisen": []}, 'hub.json: lisen: unknown key, did you mean "listen"?'),
+        ({"listen": ["tcp/127.0.0.1:1"], "max_wills": 0}, "hub.json: max_wills: "),
+        ({"listen": ["tcp/192.0.2.1:7447"]}, "leaves this machine unencrypted: use tls/host:port"),
+    ],
+)
+def test_a_file_that_cannot_work_is_refused(run: Run, tmp_path: Path, settings: dict[str, Any], complaint: str) -> None:
+    assert run("hub", str(hub_file(tmp_path, "hub", **settings))) == 1
+    assert complaint in run.err

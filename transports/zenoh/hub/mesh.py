@@ -1,0 +1,278 @@
+"""What linked hubs tell each other: which wills were published, and after a separation what they retain.
+
+A hub that sees another appear compares tables with it: the one with the smaller name asks. What it asks and is given
+goes by queries on a thread of its own; everything else happens on the hub's thread.
+"""
+
+from __future__ import annotations
+
+import logging
+import queue
+import threading
+import time
+from collections.abc import Callable, Collection, Iterable, Iterator
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+
+import msgspec
+import zenoh
+from msgspec.structs import replace
+
+from pebble.transports.zenoh import wire
+from pebble.transports.zenoh.hub import merge
+from pebble.transports.zenoh.hub.store import HubStore, Retained
+from pebble.transports.zenoh.hub.wills import WillTimes
+from pebble.transports.zenoh.keymap import topic_to_key
+
+log = logging.getLogger(__name__)
+
+PATIENCE_S = 0.5  # queries of clients wait so long for a merge
+ASK_S = 1.0  # for an answer of another hub
+ASKED = 5  # times, before another hub counts as one that does not merge
+MAX_REPLACED = 1000  # values that a will replaced, in case its client comes back
+_PAUSE_S = 0.1
+
+
+if TYPE_CHECKING:
+    _Queued = Callable[[Callable[[Any], None]], zenoh.handlers.Callback[Any]]
+
+
+class Hub(Protocol):
+    """What a mesh uses of its hub, on the hub's thread but for `post`."""
+
+    @property
+    def store(self) -> HubStore: ...
+    @property
+    def alive_clients(self) -> set[str]: ...
+    def post(self, task: Callable[[], None]) -> None: ...
+    def apply(self, record: Retained, age_s: float) -> bool: ...
+    def forget_will(self, name: str) -> None: ...
+    def ask_again(self) -> None: ...
+
+
+class _Decided(NamedTuple):
+    """Keys to ask for, values to give, and the clients whose wills each side forgets."""
+
+    want: list[str]
+    give: list[merge.Value]
+    they_forget: list[str]
+    we_forget: list[str]
+
+
+class Mesh:
+    """The other hubs, seen from the hub ``name``."""
+
+    def __init__(self, name: str, hub: Hub, wills: WillTimes) -> None:
+        self.merges = 0
+        self._name, self._hub, self._wills = name, hub, wills
+        self._session: zenoh.Session | None = None
+        self._unmerged: dict[str, float] = {}  # until when clients wait, by hub
+        self._recalled: set[str] = set()  # clients whose wills are of before a restart
+        # By clients whose wills this hub published as a successor: key, what was there, when that came.
+        self._replaced: dict[str, tuple[str, Retained | None, float]] = {}
+
+    def serve(self, session: zenoh.Session, queued: _Queued) -> None:
+        """Take part in the mesh of ``session``; ``queued`` brings an event to the hub's thread."""
+        self._session = session
+        session.declare_subscriber(wire.PUBLISHED, queued(self._on_published))
+        session.declare_queryable(wire.MERGE + self._name, queued(self._on_merge))
+        session.declare_queryable(wire.STATE + self._name, queued(self._on_state))
+        session.liveliness().declare_subscriber(wire.UP + "*", queued(self._on_hub), history=True)
+        session.info.declare_transport_events_listener(queued(self._on_link), history=True)
+
+    # -- for the hub's other tasks
+
+    @property
+    def merging_until(self) -> float:
+        """Until when queries of clients wait, in the past if there is nothing to wait for."""
+        return max(self._unmerged.values(), default=float("-inf"))
+
+    def recall(self, names: Iterable[str]) -> None:
+        """These clients' wills are of before a restart: another hub may have published them meanwhile."""
+        self._recalled = set(names)
+
+    def publish(self, name: str) -> None:
+        """Have the other hubs forget the will of ``name``, which is published next."""
+        if self._session is not None and self._wills.met_others:
+            self._session.put(wire.PUBLISHED, wire.encode(name), **wire.BLOCK)
+
+    def replace(self, name: str, key: str) -> None:
+        """A successor publishes the will of ``name``, on ``key``."""
+        store = self._hub.store
+        while len(self._replaced) >= MAX_REPLACED:
+            del self._replaced[next(iter(self._replaced))]
+        self._replaced[name] = key, store.get(key), time.monotonic() - store.age_s(key)
+
+    def on_alive(self, name: str) -> None:
+        """A client is there: a will that was published for it in its absence is taken back."""
+        if (replaced := self._replaced.pop(name, None)) is None:
+            return
+        key, before, arrived = replaced
+        now = self._hub.store.get(key)
+        if before is not None and now is not None and now.stamp.origin == name and not now.stamp.retained_count:
+            self._hub.apply(before, max(0.0, time.monotonic() - arrived))
+            self._hub.ask_again()
+
+    # -- other hubs
+
+    def _on_link(self, event: zenoh.TransportEvent) -> None:
+        present = event.kind == zenoh.SampleKind.PUT
+        self._wills.on_link(str(event.transport.zid), time.monotonic(), present=present)
+
+    def _on_published(self, sample: zenoh.Sample) -> None:
+        name = wire.decode_name(sample.payload.to_bytes())
+        if name not in self._hub.alive_clients:  # else it is cut off from the hub that says so
+            self._hub.forget_will(name)
+
+    def _on_hub(self, sample: zenoh.Sample) -> None:
+        name = str(sample.key_expr).removeprefix(wire.UP)
+        if name == self._name:
+            return
+        present = sample.kind == zenoh.SampleKind.PUT
+        is_new = present and name not in self._wills.hubs
+        self._wills.on_hub(name, present=present)
+        if not present:
+            self._unmerged.pop(name, None)
+        elif is_new:
+            self._unmerged[name] = time.monotonic() + PATIENCE_S
+            if self._name < name and self._session is not None:
+                asked = self._session, name
+                threading.Thread(target=self._merge, args=asked, name="pebble-merge", daemon=True).start()
+
+    # -- the one with the smaller name asks, on a thread of its own
+
+    def _merge(self, session: zenoh.Session, name: str) -> None:
+        try:
+            table = self._ask_table(session, name)
+            if table is None:
+                log.warning("hub %s does not merge: it is an older one, which publishes wills a second time", name)
+                return
+            decided = self._on_hub_thread(lambda: self._decide(table))
+            if decided is not None:
+                self._exchange(session, name, decided)
+        except (zenoh.ZError, ValueError, msgspec.DecodeError) as error:
+            log.warning("hub %s: the merge with it failed: %s", name, error)
+
+    def _ask_table(self, session: zenoh.Session, name: str) -> merge.Table | None:
+        """The parts of its table as one; None: it does not answer."""
+        for _ in range(ASKED):
+            parts = [merge.decode_table(data) for data in _ask(session, wire.MERGE + name, b"")]
+            if parts:
+                rows = {key: row for part in parts for key, row in part.rows.items()}
+                return replace(parts[0], rows=rows)
+            time.sleep(_PAUSE_S)  # its queryable is not known here yet
+        return None
+
+    def _on_hub_thread(self, decide: Callable[[], _Decided]) -> _Decided | None:
+        decided: queue.Queue[_Decided] = queue.Queue()
+        self._hub.post(lambda: decided.put(decide()))
+        try:
+            return decided.get(timeout=ASK_S)
+        except queue.Empty:
+            return None
+
+    def _decide(self, theirs: merge.Table) -> _Decided:
+        store = self._hub.store
+        mine, alive = store.table(), self._hub.alive_clients | set(theirs.alive)
+        want, give = merge.compare(mine, theirs.rows, alive)
+        return _Decided(
+            want,
+            list(store.values(give)),
+            merge.published(theirs.recalled, mine, store.wills()),
+            merge.published(self._recalled_keys(), theirs.rows, theirs.wills),
+        )
+
+    def _exchange(self, session: zenoh.Session, name: str, decided: _Decided) -> None:
+        parts = list(merge.in_parts(iter(decided.give)))
+        got: list[merge.Value] = []
+        for number, part in enumerate(parts, 1):
+            last = number == len(parts)
+            exchange = merge.Exchange(
+                self._name, decided.want if last else [], part, decided.they_forget if last else None
+            )
+            for data in _ask(session, wire.MERGE + name, merge.encode(exchange)):
+                got += merge.decode_values(data)
+        self._hub.post(lambda: self._adopt(name, got, decided.we_forget, len(decided.give)))
+
+    # -- on the hub's thread
+
+    def _on_merge(self, query: zenoh.Query) -> None:
+        with query:
+            payload = b"" if query.payload is None else query.payload.to_bytes()
+            key = str(query.key_expr)
+            if not payload:
+                for part in self._table():
+                    query.reply(key, merge.encode(part))
+                return
+            asked = merge.decode_exchange(payload)
+            for values in merge.in_parts(self._hub.store.values(asked.want)):
+                query.reply(key, merge.encode(values))
+        if asked.forget is None:
+            self._take(asked.give)
+        else:
+            self._adopt(asked.asker, asked.give, asked.forget, len(asked.want))
+
+    def _table(self) -> Iterator[merge.Table]:
+        rows = list(self._hub.store.table().items())
+        first = sorted(self._hub.alive_clients), sorted(self._hub.store.wills()), self._recalled_keys()
+        for at in range(0, max(1, len(rows)), merge.MAX_ROWS):
+            part = dict(rows[at : at + merge.MAX_ROWS])
+            yield merge.Table(part, [], [], {}) if at else merge.Table(part, *first)
+
+    def _recalled_keys(self) -> dict[str, str]:
+        wills = {name: self._hub.store.will(name) for name in self._recalled - self._hub.alive_clients}
+        return {name: topic_to_key(will.topic) for name, will in wills.items() if will is not None}
+
+    def _adopt(self, name: str, values: list[merge.Value], forget: Collection[str], gave: int) -> None:
+        taken = self._take(values)
+        recalled, self._recalled = self._recalled - self._hub.alive_clients, set()
+        for client in recalled.intersection(forget):
+            self._hub.forget_will(client)
+        self._wills.on_other_hub(recalled.difference(forget), time.monotonic())
+        self._unmerged.pop(name, None)
+        self.merges += 1
+        log.info("merged with hub %s: took %d retained messages, gave %d", name, taken, gave)
+        if taken:
+            self._hub.ask_again()
+
+    def _take(self, values: Iterable[merge.Value]) -> int:
+        taken = 0
+        for one in values:
+            if not merge.is_overtaken(one, self._hub.store.row(one.key)):
+                stamp = wire.Stamp(one.qos, one.retained_count, one.origin)
+                taken += self._hub.apply(Retained(one.key, one.payload, stamp), one.age_s)
+        return taken
+
+    def _on_state(self, query: zenoh.Query) -> None:
+        with query:
+            store, hub = self._hub.store, self._hub
+            clients = hub.alive_clients - self._wills.hubs - {self._name}
+            counts = len(clients), len(store.wills()), len(store.retained())
+            state = HubState(self._name, sorted(self._wills.hubs), *counts, self.merges)
+            query.reply(str(query.key_expr), merge.encode(state))
+
+
+class HubState(msgspec.Struct, frozen=True):
+    """What a hub tells people of itself. ``hubs``: the others that it sees."""
+
+    name: str
+    hubs: list[str]
+    clients: int
+    wills: int
+    retained: int
+    merges: int
+
+
+decode_state = msgspec.msgpack.Decoder(HubState).decode
+
+
+def _ask(session: zenoh.Session, key: str, payload: bytes) -> list[bytes]:
+    replies = session.get(
+        key,
+        zenoh.handlers.FifoChannel(256),
+        target=zenoh.QueryTarget.ALL,
+        consolidation=zenoh.ConsolidationMode.NONE,
+        timeout=ASK_S,
+        payload=payload,
+        **wire.BLOCK,
+    )
+    return [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]
