@@ -24,7 +24,8 @@ _MESSAGES = (
 )
 IN, OUT = ("ingress",), ("egress",)  # as the hub sees it
 _OTHER_MACHINES = ["tls", "quic"]  # the protocols by which they connect
-_STOPS_FIRST = {"priority": "real_time", "congestion_control": "block"}
+_COMMANDS = {"priority": "interactive_high", "congestion_control": "drop"}
+_STOPS = {"priority": "real_time", "congestion_control": "block"}
 _FIELDS = ("flows", "messages", "key_exprs")
 
 
@@ -111,10 +112,11 @@ def access_control(rows: Iterable[tuple[Sequence[str], Iterable[Grant]]]) -> dic
 def first(commands: Sequence[str], stops: Sequence[str]) -> dict[str, Any]:
     """Zenoh's qos: of what connections from other machines send, ``stops`` alone have the first priority, and wait.
 
-    A sender chooses the priority of what it sends; with this one it would hold up the stops of others. Both are keys,
-    and stops are commands.
+    Else a sender chooses: with that priority it would hold up the stops of others, and with what waits for room it
+    would have the hub close the connection of a receiver that reads slower than it sends. Both are keys; stops are
+    commands.
     """
-    rows = (("commands", commands, {"priority": "interactive_high"}), ("stops", stops, _STOPS_FIRST))
+    rows = (("commands", commands, _COMMANDS), ("stops", stops, _STOPS))
     here = {"messages": ["put"], "flows": [*IN], "link_protocols": _OTHER_MACHINES}
     network = [{"id": name, "key_exprs": [*keys], "overwrite": changes, **here} for name, keys, changes in rows]
     return {"network": network}
