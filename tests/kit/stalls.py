@@ -16,14 +16,14 @@ last = time.monotonic()
 while True:
     time.sleep(0.01)
     now = time.monotonic()
-    if now - last > 0.05:
+    if now - last > 0.02:
         print(last, now, flush=True)
     last = now
 """
 
 
 class Stalls:
-    """One small process for each processor; it wakes every 10 ms, and tells when it did so 40 ms late or more."""
+    """One small process for each processor; it wakes every 10 ms, and tells when it did so 10 ms late or more."""
 
     def __init__(self) -> None:
         self._found: list[tuple[float, float]] = []

@@ -53,6 +53,8 @@ def test_what_the_machine_held_up_is_allowed_as_much_longer() -> None:
     lines = [(1.0, BACK), (2.1, REST)]
     assert problems(History(), lines, lines, [])
     assert problems(History(), lines, lines, [], lambda _since, _until: 0.2) == []
+    read_at_once = [(1.0, BACK), (2.1, BACK), (2.1, REST)]
+    assert problems(History(), read_at_once, read_at_once, []) == []
 
 
 def test_a_seed_makes_one_schedule() -> None:

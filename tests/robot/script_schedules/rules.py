@@ -39,13 +39,24 @@ def problems(
     stalled: Stalled = lambda _since, _until: 0.0,
 ) -> list[str]:
     """What does not hold, in words; empty if everything does."""
-    faults = history.events("fault")
+    faults, unread = history.events("fault"), list(_unread(lines))
+
+    def held_up(since: float, until: float) -> float:
+        return stalled(since, until) + sum(max(0.0, min(until, b) - max(since, a)) for a, b in unread)
+
     return [
         *(f"{at:.3f}: two scripts are alive: {pids}" for at, pids in overlaps),
-        *_too_long(lines, motors, faults, stalled),
+        *_too_long(lines, motors, faults, held_up),
         *_beside_persons(lines),
-        *_after_stops(history, lines, faults, stalled),
+        *_after_stops(history, lines, faults, held_up),
     ]
+
+
+def _unread(lines: Lines) -> Iterator[tuple[float, float]]:
+    """When the simulated MCU did not read, from one line to several at once: they came some time in between."""
+    for (before, _), (at, _), (same, _) in zip(lines, lines[1:], lines[2:], strict=False):
+        if at - before > _SAME_READ_S > same - at:
+            yield before, at
 
 
 def _too_long(lines: Lines, motors: Lines, faults: list[Event], stalled: Stalled) -> Iterator[str]:
