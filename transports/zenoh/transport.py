@@ -379,9 +379,10 @@ class ZenohTransport(Transport):
 
         Retained messages are accepted in any case, because they are not sent again; and stops: none is ever too late.
         """
-        if not stamp.boot or self.is_stop(key_to_topic(str(sample.key_expr))):
+        topic = key_to_topic(str(sample.key_expr))
+        if not stamp.boot or self.is_stop(topic):
             return False
-        age_s = self._ages.age_s(stamp.boot, stamp.sent_ns / 1e9, now)
+        age_s = self._ages.age_s(stamp.boot, topic, stamp.sent_ns / 1e9, now)
         if stamp.retain_requested or age_s <= self._ages.late_s:
             return False
         self.counters.add("late")
