@@ -67,7 +67,8 @@ def _too_long(lines: Lines, motors: Lines, faults: list[Event], stalled: Stalled
         limit = at + _BUSY_S + (_DEADMAN_S if helpless else _DEADLINE_S)
         if wheels == (0.0, 0.0) or following <= limit:
             continue
-        rest = next((when for when, turning in motors if when >= at and turning == (0.0, 0.0)), float("inf"))
+        stops = (when for when, turning in (*motors, *lines[index:]) if when >= at and turning == (0.0, 0.0))
+        rest = min(stops, default=float("inf"))
         if rest > limit + stalled(at, rest):
             yield f"{at:.3f}: the wheels turn for {rest - at:.2f} s after a command"
 
