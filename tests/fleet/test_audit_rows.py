@@ -60,6 +60,7 @@ FLOODS: dict[str, tuple[Callable[[int], dict[str, str]], int]] = {
 }
 
 
+@pytest.mark.timeout(600)  # some seconds of computing, on a machine that may be busy
 @pytest.mark.parametrize("name", some(FLOODS, 2))
 def test_a_flood_displaces_no_act(name: str) -> None:
     fields, most = FLOODS[name]
