@@ -186,7 +186,7 @@ def test_a_robot_leaves_a_will_for_itself_and_no_one_else_leaves_any(hall: Hall)
 
 
 def test_an_account_with_many_sessions_takes_no_ones_will(hall: Hall) -> None:
-    """Of one account the hub keeps as many sessions and wills as it has room for; of another it keeps them as well."""
+    """The hub keeps a number of sessions and wills of one account; those of another have their own room."""
     last = "pebble/robots/fred/outgoing/last"
     hello = partial(wire.Hello, retained_count=0, own={})
     hall.received.clear()
