@@ -325,9 +325,13 @@ class World:
             if drives := until(lambda: any(by_script(wheels) for _, wheels in self.rig.mcu.drives(began)), 10.0):
                 break
         self.do_end(self.people[0], 0)
-        ended = lambda: not (self.alive.groups or self.rig.mcu.moving(began))  # noqa: E731
-        # Sent again: on a busy machine a broker does not answer for two seconds, and what was sent is lost with it.
-        ends = until(lambda: ended() or self._end(self.people[0]), 5.0, step=0.5)
+
+        def ended() -> bool:
+            """Sent again: on a busy machine a broker does not answer for two seconds, and what was sent is lost."""
+            self._end(self.people[0])
+            return not (self.alive.groups or self.rig.mcu.moving(began))
+
+        ends = until(ended, 5.0, step=0.5)
         return [] if drives and ends else ["a script does not drive" if ends else "a script does not end"]
 
     def _up(self) -> bool:
