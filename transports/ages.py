@@ -15,7 +15,7 @@ _DRIFT: Final = 1e-3  # two clocks drift apart by less, seconds per second
 _YOUNG_S: Final = 2.0  # so long a clock is not trusted alone: all its messages may have waited in one queue
 _JUMP_S: Final = 1.0  # a message that is so much faster than all before shows that a clock was set, or a queue ended
 _IDLE_S: Final = 60.0  # a clock that was not heard for so long gives way to another
-_MACHINES: Final = 64  # whose clocks are remembered
+_CLOCKS: Final = 256  # of machines, one for each topic on which they send
 
 K = TypeVar("K", bound=Hashable)
 
@@ -120,20 +120,21 @@ class SenderClocks(Generic[K]):
 class MessageAges:
     """Computes the ages of messages of other processes; one older than ``late_s`` is late. Thread-safe.
 
-    Processes that share a boot share a clock that counts since that boot. A machine whose messages all seem late was
-    stopped, as a virtual one is when it is paused.
+    Processes that share a boot share a clock that counts since that boot. Any sender can claim any boot, and so make
+    all that comes from that machine seem late: so a clock counts for one topic, on which only some may send. A machine
+    whose messages all seem late was stopped, as a virtual one is when it is paused.
     """
 
     def __init__(self, boot: int, late_s: float) -> None:
         self._boot, self.late_s = boot, late_s
-        self._clocks = SenderClocks[int](_MACHINES, Patience(believed_s=5.0, set_back_s=5.0, gap_s=1.0))
+        self._clocks = SenderClocks[tuple[int, str]](_CLOCKS, Patience(believed_s=5.0, set_back_s=5.0, gap_s=1.0))
 
     def __len__(self) -> int:
-        """How many machines are remembered."""
+        """How many clocks are remembered."""
         return len(self._clocks)
 
-    def age_s(self, boot: int, sent: float, now: float) -> float:
-        """Both times in seconds, each since its own machine's boot. The first message of a machine counts as fresh."""
+    def age_s(self, boot: int, topic: str, sent: float, now: float) -> float:
+        """Both times in seconds, each since its own machine's boot. A machine's first message counts as fresh."""
         if boot == self._boot:
             return now - sent
-        return self._clocks.age_s(boot, sent, 0.0, now, self.late_s)
+        return self._clocks.age_s((boot, topic), sent, 0.0, now, self.late_s)

@@ -9,7 +9,7 @@ from typing import Any
 from msgspec.structs import replace
 
 from pebble.config.doors import check_doors
-from pebble.config.exposure import warn_if_readable, warn_of_logins_in_clear
+from pebble.config.exposure import warn_if_readable, warn_of_known_id, warn_of_logins_in_clear
 from pebble.config.hosts import HostError, check_web_url
 from pebble.config.media import AvDaemon, VideoStream
 from pebble.config.problems import Path
@@ -47,6 +47,7 @@ def _root(reader: Reader, root: Root, _path: Path) -> Root:
         for path, other in shared_topics(root):
             reader.notes.problem(path, f"is also the topic of {other.suffix}, choose another")
         warn_of_logins_in_clear(reader.notes, root)
+        warn_of_known_id(reader.notes, root)
     check_doors(reader.notes, root)
     return root
 

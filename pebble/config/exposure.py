@@ -38,6 +38,15 @@ def is_near(mqtt: Mqtt) -> bool:
     return all(is_loopback(host) for host, _ in mqtt.places)
 
 
+def warn_of_known_id(notes: Notes, root: Root) -> None:
+    """Warn where accounts are known, and one of them can end the robot's connection by logging in with its id."""
+    bridge = root.services.mqtt_bridge
+    path = ("services", "mqtt_bridge", "remote_mqtt", "client_id")
+    if root.security.level != "open" and bridge.enabled and bridge.remote is None and bridge.remote_mqtt.client_id:
+        risk = "each account of the broker that knows this id can end the robot's connection with it"
+        notes.warning(path, f"{risk}: leave it out, unless the broker lets only this account use it")
+
+
 def brokers(root: Root) -> Iterator[tuple[Path, Mqtt]]:
     bridge, mirror = root.services.mqtt_bridge, root.transport.mqtt_mirror
     if root.transport.kind == "mqtt":

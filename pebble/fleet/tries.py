@@ -4,6 +4,7 @@ import ipaddress
 import threading
 from collections import OrderedDict, deque
 from collections.abc import Callable
+from functools import lru_cache
 
 TRIES = 5
 WINDOW_S = 60.0
@@ -39,6 +40,7 @@ class Tries:
                 times.pop()
 
 
+@lru_cache(maxsize=256)
 def network_of(address: str) -> str:
     """What counts as one address: with IPv6 the /64, of which one machine can use every address."""
     try:

@@ -2,14 +2,17 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 
-from pebble.contract import CHANNELS, OUTGOING, Kind
+from pebble.contract import CHANNELS, ESTOP, INCOMING, OUTGOING, Kind
 from pebble.contract.channels import ONLINE
+from pebble.contract.names import with_name
 from pebble.fleet.folder import Fleet
 from pebble.fleet.roles import Account, Rule
 from pebble.transports.zenoh import wire
-from pebble.transports.zenoh.access import IN, OUT, Access, Grant, HubAccount, access_control, written
+from pebble.transports.zenoh.access import IN, OUT, Access, Grant, HubAccount, access_control, first, written
 from pebble.transports.zenoh.keymap import filter_to_key
 
+_ANY = "+/+/+"  # the levels of any robot
+_STOP = ESTOP.topic(_ANY)
 _FLAGS = tuple(f"/{one.suffix}" for one in CHANNELS if one.kind is Kind.FLAG)
 
 
@@ -18,7 +21,8 @@ def zenoh_text(fleet: Fleet) -> bytes:
     rules = {name: fleet.rules_of(name) for name in fleet.accounts}
     accounts = {name: _hub_account(fleet.accounts[name], held) for name, held in rules.items()}
     rows = (([name], _grants(name, held, accounts[name].retains)) for name, held in rules.items())
-    return written(Access(access_control(rows), accounts))
+    stops = _keys((_STOP, with_name(_STOP, "+")))
+    return written(Access(access_control(rows), accounts, first(_keys([f"{_ANY}/{INCOMING}/#"]), stops)))
 
 
 def _hub_account(account: Account, held: Iterable[Rule]) -> HubAccount:

@@ -111,10 +111,14 @@ def stops_transport(config: Config) -> Transport | None:
     as-published connection.
     """
     bridge = config.services.mqtt_bridge
-    if bridge.remote is not None or (config.security.level == "open" and bridge.link.profile == "wide"):
+    if config.security.level == "open" and (bridge.remote is not None or bridge.link.profile == "wide"):
         return None
-    settings = mqtt_settings(bridge.remote_mqtt, reconnect_max_s=REMOTE_RECONNECT_S, program=_STOPS)
-    return create("mqtt", _name(config, "mqtt", _STOPS), with_choice(config, settings, _STOPS))
+    if bridge.remote is None:
+        settings = mqtt_settings(bridge.remote_mqtt, reconnect_max_s=REMOTE_RECONNECT_S, program=_STOPS)
+        return create("mqtt", _name(config, "mqtt", _STOPS), with_choice(config, settings, _STOPS))
+    if bridge.remote.kind != "zenoh":  # what another transport makes of a second connection is not known
+        return None
+    return create("zenoh", _name(config, "zenoh", _STOPS), _remote_settings(config, bridge.remote))
 
 
 def mirror_transport(config: Config, mirror: Mqtt, name: str) -> Transport:

@@ -11,7 +11,7 @@ from math import inf
 from typing import Any, ClassVar, TypeVar
 
 from pebble.config import Config
-from pebble.contract import Channel, Kind, codec
+from pebble.contract import ESTOP, Channel, Kind, codec
 from pebble.runtime.addresses import Addresses
 from pebble.runtime.inbox import Inbox
 from pebble.runtime.rate_limit import RateLimitedLog
@@ -98,6 +98,7 @@ class Service:
     ) -> None:
         self.config, self.transport, self.instance, self.clock = config, transport, instance, clock
         self.addresses = Addresses(config)
+        transport.judge_topics(is_stop=self.addresses[ESTOP].topic.__eq__)
         self.log = logging.getLogger(f"pebble.{self.name}")
         self.counters = Counters()
         self.timers = Timers()

@@ -128,7 +128,9 @@ class MqttBridge(ForwardingService):
             return None
         from pebble.services.mqtt_bridge.stop_connection import StopConnection  # only who needs it pays for it
 
-        notices_s = self.config.services.mqtt_bridge.remote_mqtt.silence_seconds + _NOTICED_S
+        section = self.config.services.mqtt_bridge
+        silence_s = section.remote_mqtt.silence_seconds if section.remote is None else section.remote.lease_ms / 1000
+        notices_s = silence_s + _NOTICED_S
         make = partial(StopConnection, transport, self._stop_filters, self._pass_stop, self._forwards, self.clock)
         uplink = self._uplink
         if uplink is None:

@@ -87,6 +87,14 @@ def test_logins_that_cross_the_network_in_clear() -> None:
     assert warnings(services=bridge, local_mqtt=far, transport={"kind": "zenoh"}) == ()
 
 
+def test_a_client_id_by_which_another_account_ends_the_connection() -> None:
+    far = {"host": "broker.example", "username": "goob", "tls": {"enabled": True}, "client_id": "goob"}
+    bridge = {"mqtt_bridge": {"enabled": True, "remote_mqtt": far}}
+    found = {level: warnings(services=bridge, security={"level": level}) for level in ("open", "login")}
+    assert [one.partition(":")[0] for one in found["login"]] == ["services.mqtt_bridge.remote_mqtt.client_id"]
+    assert not any("client_id" in one for one in found["open"])
+
+
 def test_doctor_shows_them_also_for_a_board(tmp_path: Path) -> None:
     robot = {"id": "lamp", "platform": "esp8266"}
     path = written(tmp_path, 0o600, robot=robot, local_mqtt={"host": "broker.lab", **LOCAL})

@@ -87,9 +87,9 @@ def test_an_unknown_name_takes_as_long_as_a_known_one() -> None:
     people.add("alice", PASSWORD, Role.DRIVER)
 
     def took(name: str, address: int) -> float:
-        start = time.perf_counter()
+        start = time.process_time()  # what others do on this machine is not counted
         people.check(name, "wrong horse", f"192.0.2.{address}")
-        return time.perf_counter() - start
+        return time.process_time() - start
 
     known = sorted(took("alice", number) for number in range(4))[1]
     unknown = sorted(took(f"bob{number}", 10 + number) for number in range(4))[1]

@@ -6,6 +6,7 @@ The hub and all clients are processes of their own, with TLS; expected by hand, 
 from __future__ import annotations
 
 import json
+import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -23,6 +24,7 @@ from pebble.fleet.roles import Account
 from pebble.transports import QoS, TlsSettings, ZenohSettings, create
 from pebble.transports.zenoh import session as zenoh_session
 from pebble.transports.zenoh import wire
+from pebble.transports.zenoh.hub.admission import SESSIONS
 from tests.fleet.test_attempts import ACCOUNTS, GOOB, TOPICS, lets_through
 from tests.fleet.zenoh_account import Plan
 from tests.support import free_port, until
@@ -183,6 +185,29 @@ def test_a_robot_leaves_a_will_for_itself_and_no_one_else_leaves_any(hall: Hall)
     assert {topic for name in name_of_will for topic in hall.of(name)} == {name_of_will["lamp"]}
 
 
+def test_an_account_with_many_sessions_takes_no_ones_will(hall: Hall) -> None:
+    """The hub keeps a number of sessions and wills of one account; those of another have their own room."""
+    last = "pebble/robots/fred/outgoing/last"
+    hello = partial(wire.Hello, retained_count=0, own={})
+    hall.received.clear()
+    with raw(hall.settings("fred")) as session:
+        tokens = []
+        for number in range(SESSIONS + 5):
+            will = wire.Will(f"pebble/robots/fred/outgoing/w{number}", b"fred", QoS.DELIVERED, False, f"{number}")
+            greeting = wire.encode(hello(name=f"fred~{number}", will=will))
+            assert [one.ok for one in session.get(wire.asked(wire.HELLO, "fred"), payload=greeting, timeout=10)]
+            tokens.append(session.liveliness().declare_token(f"{wire.LIVE}fred~{number}"))
+        with hall.account("lamp", will="pebble/lamps/lamp/outgoing/online"):
+            pass  # killed
+        assert until(lambda: hall.of("lamp")), "another account's will is published"
+        assert hall.of("fred") == set()
+    assert until(lambda: len(hall.of("fred")) == SESSIONS), hall.of("fred")
+    with hall.account("fred", will=last):
+        pass
+    assert until(lambda: last in hall.of("fred")), "there is room again"
+    assert len(hall.of("fred")) == SESSIONS + 1
+
+
 @contextmanager
 def raw(settings: ZenohSettings) -> Iterator[zenoh.Session]:
     """A program that speaks Zenoh as it likes, with the certificate of an account."""
@@ -232,6 +257,43 @@ def test_a_program_with_a_certificate_poses_as_no_one_else(hall: Hall) -> None:
         assert (asked, [one for one in received if one in posing]) == ([], [])
         del tokens
     zenoh_session.close_session(seen)
+
+
+def test_who_claims_another_machines_clock_holds_up_nothing_of_it(hall: Hall) -> None:
+    """A message is late that is older than all others of its machine; and every sender can claim any machine."""
+    by = "by/{}/" if hall.fleet.level == "named" else ""
+    driving, looking = (
+        f"{GOOB}/incoming/{by.format(name)}{metric}"
+        for name, metric in (("otto", "drive-values"), ("vera", "front-camera"))
+    )
+    received: list[str] = []
+
+    def stamp(ahead_s: float) -> bytes:
+        return struct.pack(">BIQ", 1, 0x1234, wire.since_boot_ns() + int(1e9 * ahead_s))
+
+    with (
+        create("zenoh", "bridge", hall.settings("goob")) as goob,
+        raw(hall.settings("otto")) as otto,
+        raw(hall.settings("vera")) as vera,
+    ):
+        goob.subscribe(f"{GOOB}/incoming/#", lambda message: received.append(message.topic), direct=True)
+        for turn in range(40):
+            otto.put(driving, b"{}", attachment=stamp(0.0))
+            assert until(lambda n=turn: received.count(driving) > n), (turn, goob.counters["late"])
+            vera.put(looking, b"{}", attachment=stamp(10.0))
+            assert until(lambda n=turn: received.count(looking) > n)
+
+
+def test_what_is_retained_is_one_key(hall: Hall) -> None:
+    """A robot's own base has keys with wildcards: what is retained there no one could remove."""
+    stamp = wire.Stamp(QoS.DELIVERED, 0, "goob~1").pack()
+    with raw(hall.settings("goob")) as goob:
+        goob.put(f"{wire.RETAINED}{GOOB}/**", b"goob", attachment=stamp)
+        goob.put(f"{wire.RETAINED}{STATE}", b"goob", attachment=stamp)
+        assert until(lambda: STATE in hall.retained())
+        assert hall.retained() == {STATE}
+        goob.put(f"{wire.RETAINED}{STATE}", b"", attachment=stamp)
+        assert until(lambda: not hall.retained())
 
 
 @pytest.mark.parametrize("what", ["removed", "another role"])

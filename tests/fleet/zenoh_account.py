@@ -1,6 +1,7 @@
 """An account at a Zenoh hub elsewhere, as a process: `main(JSON)` is forked, or run as `python -m … JSON`.
 
-It prints `up`; for each line on its standard input it publishes all that it was given, and prints what it has received.
+It prints its state; for each line on its standard input it publishes all that it was given, and prints what it has
+received. One that floods publishes on and on instead, until its end, as fast as it can.
 """
 
 from __future__ import annotations
@@ -10,8 +11,10 @@ import sys
 from pathlib import Path
 
 import msgspec
+import zenoh
 
-from pebble.transports import Message, QoS, ZenohSettings, create
+from pebble.transports import Message, QoS, ZenohSettings
+from pebble.transports.zenoh.transport import ZenohTransport
 
 
 class Plan(msgspec.Struct):
@@ -23,6 +26,16 @@ class Plan(msgspec.Struct):
     filters: list[str] = []
     retain: bool = False
     will: str = ""
+    flood: bool = False
+
+
+def flood(session: zenoh.Session, topics: list[str]) -> None:
+    """Small messages of the first priority that wait for room, which no client of ours sends."""
+    first, wait = zenoh.Priority.REAL_TIME, zenoh.CongestionControl.BLOCK
+    publishers = [session.declare_publisher(one, priority=first, congestion_control=wait) for one in topics]
+    while True:
+        for one in publishers:
+            one.put(b"[" * 60)
 
 
 def main(text: str) -> int:
@@ -30,11 +43,14 @@ def main(text: str) -> int:
     payload = plan.name.encode()
     will = Message(plan.will, payload, QoS.DELIVERED) if plan.will else None
     received: set[str] = set()
-    client = create("zenoh", f"client-{plan.name}", plan.settings, will=will).open(10)
+    client = ZenohTransport(f"client-{plan.name}", plan.settings, will=will).open(10)
     for one in plan.filters:
         client.subscribe(one, lambda message: received.add(f"{message.topic} {message.retain}"))
     sys.stdout.write(f"{client.state.name}\n")
     sys.stdout.flush()
+    if plan.flood:
+        assert client.session is not None
+        flood(client.session, plan.topics)
     while sys.stdin.readline():
         for topic in plan.topics:
             client.publish(topic, payload, qos=QoS.DELIVERED, retain=plan.retain)

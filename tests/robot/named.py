@@ -62,9 +62,13 @@ class Named(Rig):
         remote: Any = Remote(hall)
         super().__init__(kind, remote=remote, operator=hall.client("boss"), start=False, **options)
         self._people["boss"] = self.operator
-        self.configure(**security)
-        if start:
-            self.start()
+        try:
+            self.configure(**security)
+            if start:
+                self.start()
+        except BaseException:
+            self.close()  # the caller cannot: it has no rig yet
+            raise
 
     def configure(self, **security: str) -> None:
         """Write the config anew; a hub's journal outlives the robot's restart, as the local broker does."""

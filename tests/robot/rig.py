@@ -154,17 +154,21 @@ class Rig:
     def start(self, ready: bool = True, **options: Any) -> float:
         """Start the launcher; returns the monotonic time just before. Waits until the robot is up if asked.
 
-        ``options`` are those of Popen.
+        ``options`` are those of Popen. What was started and does not come up is stopped.
         """
         began, logged = time.monotonic(), self.log.stat().st_size if self.log.exists() else 0
         with self.log.open("ab") as log:
             options = {"cwd": ROOT, "stdout": log, "stderr": log} | options
             self._robot = subprocess.Popen([sys.executable, "-m", "pebble.cli", "up", str(self.config)], **options)
         if ready:
-            self.wait_until_up(began)
-            assert until(lambda: self._listens_since(logged), 10), (
-                f"nothing is forwarded:\n{self.log.read_text()[-4000:]}"
-            )
+            try:
+                self.wait_until_up(began)
+                assert until(lambda: self._listens_since(logged), 30), (
+                    f"nothing is forwarded:\n{self.log.read_text()[-4000:]}"
+                )
+            except BaseException:
+                self.ensure_stopped()
+                raise
         return began
 
     def _listens_since(self, logged: int) -> bool:

@@ -49,6 +49,14 @@ def test_rules_find_what_they_forbid(
     assert [problem in one for one in found] == [True] * bool(problem), found
 
 
+def test_what_the_machine_held_up_is_allowed_as_much_longer() -> None:
+    lines = [(1.0, BACK), (2.1, REST)]
+    assert problems(History(), lines, lines, [])
+    assert problems(History(), lines, lines, [], lambda _since, _until: 0.2) == []
+    read_at_once = [(1.0, BACK), (2.1, BACK), (2.1, REST)]
+    assert problems(History(), read_at_once, read_at_once, []) == []
+
+
 def test_a_seed_makes_one_schedule() -> None:
     assert make("mqtt", 7) == make("mqtt", 7)
     assert make("mqtt", 7) != make("mqtt", 8)

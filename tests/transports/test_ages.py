@@ -6,7 +6,7 @@ import pytest
 
 from pebble.transports.ages import MessageAges
 
-HERE, THERE = 1, 2
+HERE, THERE, TOPIC = 1, 2, "a/b"
 LATE_S = 2.0
 
 
@@ -18,7 +18,7 @@ class Robot:
         self._offset, self._rate = offset, rate
 
     def receives(self, now: float, journey: float = 0.01) -> float:
-        return self.ages.age_s(THERE, (now - journey) * self._rate - self._offset, now)
+        return self.ages.age_s(THERE, TOPIC, (now - journey) * self._rate - self._offset, now)
 
 
 @pytest.mark.parametrize("offset", [5000.0, -5000.0])
@@ -30,7 +30,7 @@ def test_what_piled_up_is_as_old_as_it_is(offset: float) -> None:
 
 
 def test_the_own_clock_needs_no_comparison() -> None:
-    assert MessageAges(HERE, LATE_S).age_s(HERE, 10.0, 16.0) == 6.0
+    assert MessageAges(HERE, LATE_S).age_s(HERE, TOPIC, 10.0, 16.0) == 6.0
 
 
 @pytest.mark.parametrize("rate", [1.0005, 0.9995])
@@ -56,8 +56,15 @@ def test_a_clock_that_stood_still_is_believed_again_soon() -> None:
     assert seemed[-1] == pytest.approx(0.0, abs=0.01)
 
 
+def test_who_claims_to_be_another_machine_makes_nothing_of_it_late_on_other_topics() -> None:
+    robot = Robot()
+    for now in range(60):
+        robot.ages.age_s(THERE, "a/mine", now - 5000.0 + 10.0, now)
+        assert robot.receives(now) < LATE_S
+
+
 def test_many_machines_take_no_memory() -> None:
     ages = MessageAges(HERE, LATE_S)
     for boot in range(10, 1000):
-        ages.age_s(boot, 0.0, 0.0)
-    assert len(ages) <= 64
+        ages.age_s(boot, TOPIC, 0.0, 0.0)
+    assert len(ages) <= 256

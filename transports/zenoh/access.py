@@ -23,6 +23,9 @@ _MESSAGES = (
     "declare_liveliness_subscriber",
 )
 IN, OUT = ("ingress",), ("egress",)  # as the hub sees it
+_OTHER_MACHINES = ["tls", "quic"]  # the protocols by which they connect
+_COMMANDS = {"priority": "interactive_high", "congestion_control": "drop"}
+_STOPS = {"priority": "real_time", "congestion_control": "block"}
 _FIELDS = ("flows", "messages", "key_exprs")
 
 
@@ -53,13 +56,15 @@ class _File(msgspec.Struct, frozen=True):
 
     access_control: dict[str, Any]
     metadata: _Metadata
+    qos: dict[str, Any] = {}
 
 
 class Access(NamedTuple):
-    """The rules, and the accounts by their names, which are those in certificates."""
+    """The rules, the accounts by their names, which are those in certificates, and what goes first: `first`."""
 
     control: Mapping[str, Any]
     accounts: Mapping[str, HubAccount]
+    qos: Mapping[str, Any] = {}  # none in a file that was written before there were any
 
 
 def read_access(file: Path) -> Access:
@@ -72,12 +77,12 @@ def read_access(file: Path) -> Access:
         raise TransportError(f"transport.access: {file}: {error}; `pebble fleet zenoh` makes it") from None
     if found.access_control.get("enabled") is not True or found.access_control.get("default_permission") != "deny":
         raise TransportError(f"transport.access: {file} lets everybody in; `pebble fleet zenoh` makes it anew")
-    return Access(found.access_control, found.metadata.pebble)
+    return Access(found.access_control, found.metadata.pebble, found.qos)
 
 
 def written(access: Access) -> bytes:
     """``access`` as a file."""
-    text = msgspec.json.encode(_File(dict(access.control), _Metadata(dict(access.accounts))))
+    text = msgspec.json.encode(_File(dict(access.control), _Metadata(dict(access.accounts)), dict(access.qos)))
     return msgspec.json.format(text, indent=1) + b"\n"
 
 
@@ -104,9 +109,22 @@ def access_control(rows: Iterable[tuple[Sequence[str], Iterable[Grant]]]) -> dic
     }
 
 
+def first(commands: Sequence[str], stops: Sequence[str]) -> dict[str, Any]:
+    """Zenoh's qos: of what connections from other machines send, ``stops`` alone have the first priority, and wait.
+
+    Else a sender chooses: with that priority it would hold up the stops of others, and with what waits for room it
+    would have the hub close the connection of a receiver that reads slower than it sends. Both are keys; stops are
+    commands.
+    """
+    rows = (("commands", commands, _COMMANDS), ("stops", stops, _STOPS))
+    here = {"messages": ["put"], "flows": [*IN], "link_protocols": _OTHER_MACHINES}
+    network = [{"id": name, "key_exprs": [*keys], "overwrite": changes, **here} for name, keys, changes in rows]
+    return {"network": network}
+
+
 def _rule(number: int, grant: Grant) -> dict[str, Any]:
     return {"id": f"r{number}", "permission": "allow", **dict(zip(_FIELDS, grant, strict=True))}
 
 
 def _named(names: Sequence[str]) -> dict[str, Any]:
-    return {"id": names[0], "link_protocols": ["tls", "quic"], "cert_common_names": list(names)}
+    return {"id": names[0], "link_protocols": _OTHER_MACHINES, "cert_common_names": list(names)}

@@ -145,7 +145,7 @@ def _tls(tls: TlsSettings | None) -> dict[str, Any]:
 
 def _access_control(names: tuple[str, ...] | None, access: Access | None) -> dict[str, Any]:
     if access is not None:
-        return {"access_control": access.control}
+        return {"access_control": access.control, "qos": access.qos}
     return {} if names is None else {"access_control": access_control([(names, EVERYTHING)])}
 
 

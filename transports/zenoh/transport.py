@@ -377,11 +377,12 @@ class ZenohTransport(Transport):
     def _is_late(self, sample: zenoh.Sample, stamp: wire.LiveStamp, now: float) -> bool:
         """Whether it waited in a socket while this process was stopped, longer than the lease of a connection (T19).
 
-        Retained messages are accepted in any case, because they are not sent again.
+        Retained messages are accepted in any case, because they are not sent again; and stops: none is ever too late.
         """
-        if not stamp.boot:
+        topic = key_to_topic(str(sample.key_expr))
+        if not stamp.boot or self.is_stop(topic):
             return False
-        age_s = self._ages.age_s(stamp.boot, stamp.sent_ns / 1e9, now)
+        age_s = self._ages.age_s(stamp.boot, topic, stamp.sent_ns / 1e9, now)
         if stamp.retain_requested or age_s <= self._ages.late_s:
             return False
         self.counters.add("late")

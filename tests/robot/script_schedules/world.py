@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from pebble.client.estop import new_name
+from tests.kit.stalls import Stalls
 from tests.robot.rig import Rig
 from tests.robot.script_schedules.alive import Alive
 from tests.robot.script_schedules.rules import by_script, problems
@@ -54,6 +55,7 @@ class World:
             self.rig = opened.enter_context(Rig(transport, mirror=transport == "zenoh", autonomy_manager=manager))
             self.person = opened.enter_context(closing(Driver(self.rig.remote.port, "rover", self.history)))
             self.alive = opened.enter_context(closing(Alive(self.rig.folder)))
+            self._stalls = opened.enter_context(closing(Stalls()))
             self._timers: list[threading.Timer] = []
             assert until(self._all_listed, _UP_S), self.rig.log.read_text()
             self._opened = opened.pop_all()
@@ -72,7 +74,7 @@ class World:
         time.sleep(max(0.0, began + ACTIVE_S - time.monotonic()))
         left = self._rest()
         lines, motors = self.rig.mcu.drives(began), self.rig.mcu.motors(began)
-        return problems(self.history, lines, motors, list(self.alive.overlaps)) + left
+        return problems(self.history, lines, motors, list(self.alive.overlaps), self._stalls.within) + left
 
     def logs(self) -> str:
         return self.rig.log.read_text()[-4000:]

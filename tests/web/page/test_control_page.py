@@ -105,4 +105,11 @@ def test_two_people_take_ask_let_keep_and_take_over(
         robot.stranger(z=0.3)
         assert ann.until(f"{SLOT}.includes('Someone else drives, too')")
         assert ann.page.evaluate(PLACES) == places
+
+        assert moves(ann, robot)
+        ann.page.evaluate("history.pushState(null, '', '/'); dispatchEvent(new PopStateEvent('popstate'))")
+        assert ann.until("window.pebble.driver.ref !== 'pebble/robots/goob'")
+        otto.test("ask").click()
+        ann.test("bell").click()
+        assert ann.until("document.querySelector('.notice')?.textContent.includes('otto asks to drive')")
         assert ann.complaints() + otto.complaints() == []

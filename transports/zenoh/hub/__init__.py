@@ -317,8 +317,8 @@ class HubWorker:
     # -- retained messages
 
     def _store_retained(self, sample: zenoh.Sample) -> None:
-        if sample.attachment is None:
-            raise ValueError(f"{sample.key_expr} has no stamp")
+        if sample.attachment is None or "*" in str(sample.key_expr):
+            raise ValueError(f"{sample.key_expr} has no stamp, or is no single key")
         stamp = wire.Stamp.unpack(sample.attachment.to_bytes())
         self.apply(Retained(str(sample.key_expr).removeprefix(wire.RETAINED), sample.payload.to_bytes(), stamp))
         self._wills.on_message(stamp.origin, time.monotonic())

@@ -1,0 +1,56 @@
+"""When the machine kept processes from running that were to run: what happened late meanwhile proves nothing."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+
+from tests.support import Child
+
+_PULSE = """
+import os, sys, time
+os.sched_setaffinity(0, {int(sys.argv[1])})
+last = time.monotonic()
+while True:
+    time.sleep(0.01)
+    now = time.monotonic()
+    if now - last > 0.02:
+        print(last, now, flush=True)
+    last = now
+"""
+
+
+class Stalls:
+    """One small process for each processor; it wakes every 10 ms, and tells when it did so 10 ms late or more."""
+
+    def __init__(self) -> None:
+        self._found: list[tuple[float, float]] = []
+        self._processes = [
+            Child([sys.executable, "-S", "-c", _PULSE, str(cpu)], stdout=subprocess.PIPE, text=True)
+            for cpu in sorted(os.sched_getaffinity(0))
+        ]
+        for process in self._processes:
+            threading.Thread(target=self._read, args=(process,), daemon=True).start()
+
+    def close(self) -> None:
+        for process in self._processes:
+            process.kill()
+            process.wait(10)
+
+    def within(self, since: float, until: float) -> float:
+        """Seconds of this time (monotonic) in which a processor did not serve its process."""
+        moments, end = sorted(self._found), since
+        lost = 0.0
+        for began, ended in moments:
+            began, ended = max(began, end), min(ended, until)
+            if ended > began:
+                lost, end = lost + ended - began, ended
+        return lost
+
+    def _read(self, process: Child) -> None:
+        assert process.stdout is not None
+        for line in process.stdout:
+            began, ended = map(float, line.split())
+            self._found.append((began, ended))
