@@ -144,6 +144,28 @@ def test_values_of_any_depth_and_length_have_an_end() -> None:
     assert wide["omitted"] >= 4900
 
 
+# -- what a robot offers
+
+#: What its capabilities list of *drive*, and whether there are controls for an axis besides turning and going.
+AXES: Rows = {
+    f"{listed}": (of("new Offers('pebble/robots/a', v[0]).hasExtraAxis", {"value": {"drive": listed}}), expected)
+    for listed, expected in [
+        ({"available": True, "axes": ["x", "z"]}, False),
+        ({"available": True, "axes": ["x", "y", "z"]}, True),
+        ({"available": True, "axes": []}, False),
+        ({"available": True}, True),  # it does not list them: it may have any
+        ({"available": True, "axes": "xz"}, True),
+        (7, True),
+    ]
+}
+AXES["no capabilities"] = (of("new Offers('pebble/robots/a', null).hasExtraAxis"), True)
+
+
+@rows((script, AXES))
+def test_an_extra_axis_has_its_controls_unless_the_robot_lists_others(found: Callable[[], Any], expected: bool) -> None:
+    assert found() is expected
+
+
 # -- outlets
 
 
