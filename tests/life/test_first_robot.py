@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import hashlib
-import html
+import io
 import re
 import shlex
 import ssl
@@ -22,12 +22,15 @@ import cv2
 import numpy as np
 import pytest
 from playwright.sync_api import Browser
+from rich.console import Console
+from rich.terminal_theme import MONOKAI
+from rich.text import Text
 
 from tests.kit.machine import Machine
 from tests.kit.terminal import Terminal
 from tests.life.conftest import OLD, Packages
 from tests.life.robots import PORT, Robot
-from tests.support import ROOT, Child, until
+from tests.support import ROOT, Child
 from tests.web.browser import Tab, chromium, tab
 from tests.web.fingers import Fingers
 
@@ -37,9 +40,9 @@ BY_ID = "/dev/serial/by-id"
 PICTURES = ROOT / "build" / "first-robot"
 QUESTION = re.compile(r"^(\d)\. .*\?", re.M)
 LONGEST_S = 900.0  # on a busy machine
-#: As a terminal of 100 columns shows it.
-TERMINAL = """<body style="margin:0;background:#14181b"><pre style="margin:0;padding:16px;color:#e6e9eb;display:inline-block;
-font:14px/1.22 'DejaVu Sans Mono',monospace">{}</pre>"""
+#: A terminal of rich's, dark as most are.
+TERMINAL = """<body style="margin:0"><pre style="margin:0;padding:16px;display:inline-block;color:{foreground};
+background:{background};font:14px/1.2 'DejaVu Sans Mono',monospace">{code}</pre>"""
 
 
 @pytest.fixture
@@ -108,8 +111,11 @@ def answered(robot: Robot, clock: Clock) -> str:
 
 def scanned(browser: Browser, shown: str) -> str:
     """What a camera reads from the terminal's QR code. The picture of the terminal is kept."""
+    console = Console(record=True, width=100, file=io.StringIO())
+    console.print(Text.from_ansi(shown))
+    page = console.export_html(theme=MONOKAI, inline_styles=True, code_format=TERMINAL)
     with tab(browser, "about:blank", viewport={"width": 900, "height": 700}) as opened:
-        opened.page.set_content(TERMINAL.format(html.escape(shown)))
+        opened.page.set_content(page)
         picture = opened.page.locator("pre").screenshot(path=PICTURES / "terminal.png")
     found = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR)
     assert found is not None
