@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import typer
-from rich.console import Console
 from msgspec.structs import replace
+from rich.console import Console
 
 from pebble.config.text_files import read_password
 from pebble.contract.serial_protocols import SERIAL_PROTOCOLS

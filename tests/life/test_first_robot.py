@@ -36,6 +36,7 @@ from tests.web.fingers import Fingers
 
 NAME, PASSWORD = "rover", "correct horse battery"
 ADDRESS, PHONE = "10.66.0.1", "10.66.0.2"
+SETUP = ("pebble", "--wheels", "/mnt/wheels", "setup")
 BY_ID = "/dev/serial/by-id"
 PICTURES = ROOT / "build" / "first-robot"
 QUESTION = re.compile(r"^(\d)\. .*\?", re.M)
@@ -85,7 +86,7 @@ class Clock:
 
 def answered(robot: Robot, clock: Clock) -> str:
     """What the terminal of setup has shown, to a person who takes what is offered; the robot's camera is simulated."""
-    terminal = Terminal(robot.machine.command("pebble", "--wheels", "/mnt/wheels", "setup"))
+    terminal = Terminal(robot.machine.command("env", "TERM=xterm-256color", *SETUP))
     terminal.shows("Name [", timeout_s=600)
     clock.did("the package has built its slot, and setup asks")
     robot.plug_in()
