@@ -126,7 +126,7 @@ def scanned(browser: Browser, shown: str) -> str:
 
 
 def fingerprint(opened: Tab, url: str) -> str:
-    """Of the authority that the robot's page offers, as a phone shows it."""
+    """Return that of the authority which the robot's page offers, as a phone shows it."""
     pem = opened.context.request.get(f"{url}ca.pem").text()
     return hashlib.sha256(ssl.PEM_cert_to_DER_cert(pem)).hexdigest().upper()
 

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 import pytest
 from playwright.sync_api import Browser
 
-from tests.web.browser import Size, Tab, Theme
+from tests.web.browser import Size, Theme
 from tests.web.console import BACK, FORWARD, LEFT, REST, RIGHT, Console, Wheels, Wire, console, used
 from tests.web.fingers import Fingers
 from tests.web.stage import Stage
