@@ -43,7 +43,7 @@ QUESTION = re.compile(r"^(\d)\. .*\?", re.M)
 LONGEST_S = 900.0  # on a busy machine
 #: A terminal of rich's, dark as most are.
 TERMINAL = """<body style="margin:0"><pre style="margin:0;padding:16px;display:inline-block;color:{foreground};
-background:{background};font:14px/1.2 'DejaVu Sans Mono',monospace">{code}</pre>"""
+background:{background};font:14px/16px 'DejaVu Sans Mono',monospace">{code}</pre>"""
 
 
 @pytest.fixture
