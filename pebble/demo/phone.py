@@ -53,8 +53,7 @@ class Phone:
 
     def show(self, url: str, console: Console) -> None:
         """Print the QR code, the person and the password."""
-        for line in qr_lines(url):
-            console.print(Text(line, style="#000000 on #ffffff", no_wrap=True, overflow="ignore", end="\n"), crop=False)
+        show_qr(url, console)
         lines = [
             "All of this machine's network can open the page, but not the broker: for a phone in the same Wi-Fi.",
             f"Log in as {NAME} with the password {self._password}",
@@ -63,6 +62,12 @@ class Phone:
         ]
         for line in lines:
             console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+
+def show_qr(text: str, console: Console) -> None:
+    """Print a QR code, black on white in terminals of any colour: most phones read no other."""
+    for line in qr_lines(text):
+        console.print(Text(line, style="#000000 on #ffffff", no_wrap=True, overflow="ignore", end="\n"), crop=False)
 
 
 def qr_lines(text: str) -> Iterator[str]:

@@ -10,10 +10,11 @@ from typing import Any
 
 import typer
 from msgspec.structs import replace
+from rich.console import Console
 
 from pebble.config.text_files import read_password
 from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
-from pebble.demo.phone import qr_lines
+from pebble.demo.phone import show_qr
 from pebble.fleet import certificates
 from pebble.fleet.database import DatabaseError
 from pebble.fleet.people import has_user, usable
@@ -165,8 +166,7 @@ class Session:
         _block("Next", self._next(wanted))
         if wanted.answers.page and (self.places.tls / certificates.SERVER_CERT).is_file():
             typer.echo()
-            for line in qr_lines(_url(self.places)):
-                typer.echo(line)
+            show_qr(_url(self.places), Console())
 
     def _next(self, wanted: Plan) -> Iterator[str]:
         answers, places = wanted.answers, self.places

@@ -3,11 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
-import pty
-import select
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +11,7 @@ import pytest
 
 from pebble.setup.places import Places
 from tests.commands.command_line import Run
+from tests.kit.terminal import Terminal
 from tests.setup.rig import ANSWERS, PASSWORD, tree
 from tests.support import ROOT
 
@@ -104,46 +101,24 @@ def test_without_a_terminal_it_is_confirmed_by_an_option(root: Path, answers: Pa
 
 def test_six_questions_in_a_terminal(root: Path) -> None:
     """Wrong names are asked again, choices are numbers or texts, and no password shows."""
-    typed = ["no/name", "goob", "none", "synthetic", "1", "y", "ann", PASSWORD, PASSWORD, "y"]
-    child, terminal = pty.fork()
-    if child == 0:
-        os.chdir(ROOT)
-        os.environ.pop("SUDO_USER", None)
-        os.execv(sys.executable, [sys.executable, "-m", "pebble.cli", "setup", "--root", str(root)])
-    shown = ""
-    prompts = [
-        "Name [",
-        "Name [",
-        "answer [",
-        "answer [",
-        "answer [",
-        "Page [",
-        "everything [",
-        "ann: ",
-        "Again: ",
-        "it? [",
+    typed = [
+        ("Name [", "no/name"),
+        ("Name [", "goob"),
+        ("answer [", "none"),
+        ("answer [", "synthetic"),
+        ("answer [", "1"),
+        ("Page [", "y"),
+        ("everything [", "ann"),
+        ("ann: ", PASSWORD),
+        ("Again: ", PASSWORD),
+        ("it? [", "y"),
     ]
-    for prompt, text in zip(prompts, typed, strict=True):
-        shown += _until(terminal, prompt)
-        os.write(terminal, f"{text}\n".encode())
-    shown += _until(terminal, None)
-    _, status = os.waitpid(child, 0)
-    assert os.waitstatus_to_exitcode(status) == 0, shown
-    assert "id: must be a topic level" in shown
-    assert PASSWORD not in shown
-    assert "Open https://" in shown
+    program = ["env", "-C", str(ROOT), "-u", "SUDO_USER", sys.executable, "-m", "pebble.cli"]
+    terminal = Terminal([*program, "setup", "--root", str(root)])
+    for prompt, text in typed:
+        terminal.answers(prompt, text)
+    assert terminal.ends() == 0, terminal.shown
+    assert "id: must be a topic level" in terminal.shown
+    assert PASSWORD not in terminal.shown
+    assert "Open https://" in terminal.shown
     assert json.loads(Places(root).config.read_text())["robot"]["id"] == "goob"
-
-
-def _until(terminal: int, text: str | None, timeout_s: float = 60.0) -> str:
-    """What the terminal shows until this text; None: until the program ends."""
-    shown, end = "", time.monotonic() + timeout_s
-    while text is None or text not in shown:
-        assert time.monotonic() < end, shown
-        if select.select([terminal], [], [], 0.1)[0]:
-            try:
-                part = os.read(terminal, 4096)
-            except OSError:  # Linux: the program has ended
-                break
-            shown += part.decode(errors="replace")
-    return shown

@@ -15,7 +15,7 @@ from typing import Any, Literal
 import pytest
 from playwright.sync_api import Browser, BrowserContext, CDPSession, Locator, Page, Route
 
-from pebble.bench import page_rig as program
+from pebble.bench import page_rig
 
 Size = Literal["desktop", "phone", "landscape", "small"]
 Theme = Literal["light", "dark"]
@@ -56,13 +56,13 @@ _HIDE = """(hidden) => {
 
 
 @contextmanager
-def chromium(*flags: str) -> Iterator[Browser]:
-    """A headless browser. Skips the test without one, except where CI says that it must be there."""
-    problem = program.missing()
+def chromium(*flags: str, program: str | None = None) -> Iterator[Browser]:
+    """A headless browser, started by ``program``. Skips the test without one, except where CI says it must be there."""
+    problem = page_rig.missing()
     if problem is not None:
         reason = f"{problem}; or `sh tools/debian-packages.sh chromium=chromium`"
         (pytest.fail if os.environ.get("CI") == "true" else pytest.skip)(reason)
-    with program.chromium(*flags) as browser:
+    with page_rig.chromium(*flags, program=program) as browser:
         yield browser
 
 

@@ -17,8 +17,7 @@ log = logging.getLogger(__name__)
 _HEADER = struct.Struct("<8sHHIQ")
 #: Number, CLOCK_MONOTONIC in ns, three values as the ADC read them, and whether it charges: 0, 1, or -1 for unknown.
 _SLOT = struct.Struct("<QQiiii")
-_NEWEST = struct.Struct("<Q")
-_NEWEST_AT = _HEADER.size - _NEWEST.size
+_NEWEST = 2  # the header's third word of eight bytes
 _MAGIC, _VERSION = b"PBODRAW1", 1
 _MODE = 0o600  # as the original's: its readers open it for writing, too
 _CHECK_NS = 1_000_000_000  # how soon it is made again, and how often that is tried
@@ -34,7 +33,7 @@ class HallMemory:
         self._path, self._slots = SHM / name.removeprefix("/"), slots
         self._size = _HEADER.size + slots * _SLOT.size
         self._number = 0
-        self._opened: tuple[int, mmap.mmap] | None = None
+        self._opened: tuple[int, mmap.mmap, memoryview] | None = None  # the last one is its words of eight bytes
         self._check_at_ns = 0
         self._problem = ""
 
@@ -45,16 +44,17 @@ class HallMemory:
             self._keep()
         if self._opened is None:
             return
-        _, memory = self._opened
+        _, memory, words = self._opened
         self._number += 1
         place = _HEADER.size + (self._number - 1) % self._slots * _SLOT.size
         _SLOT.pack_into(memory, place, self._number, at_ns, *values, -1 if charging is None else int(charging))
-        _NEWEST.pack_into(memory, _NEWEST_AT, self._number)  # last: a reader goes by it
+        words[_NEWEST] = self._number  # last, for a reader goes by it, and at once: struct would write a 0 before it
 
     def close(self) -> None:
         if self._opened is not None:
-            descriptor, memory = self._opened
+            descriptor, memory, words = self._opened
             self._opened = None
+            words.release()
             memory.close()
             os.close(descriptor)
 
@@ -79,18 +79,20 @@ class HallMemory:
             return False
         return os.path.samestat(found, os.fstat(descriptor))
 
-    def _open(self) -> tuple[int, mmap.mmap]:
+    def _open(self) -> tuple[int, mmap.mmap, memoryview]:
         descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, _MODE)
         try:
             memory = self._mapped(descriptor)
         except BaseException:
             os.close(descriptor)
             raise
-        *form, newest = _HEADER.unpack_from(memory)
-        if form == [_MAGIC, _VERSION, self._slots, 0]:
+        form = (_MAGIC, _VERSION, self._slots, 0)
+        *found, newest = _HEADER.unpack_from(memory)
+        if tuple(found) == form:  # its readers go on
             self._number = max(self._number, newest)
-        _HEADER.pack_into(memory, 0, _MAGIC, _VERSION, self._slots, 0, self._number)
-        return descriptor, memory
+        else:
+            _HEADER.pack_into(memory, 0, *form, self._number)
+        return descriptor, memory, memoryview(memory).cast("Q")
 
     def _mapped(self, descriptor: int) -> mmap.mmap:
         """The memory behind ``descriptor``, if it is ours alone. Raises OSError."""

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import signal
 import struct
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +43,17 @@ def fill(memory: HallMemory, count: int, at_ns: int = SECOND) -> None:
         memory.write(at_ns + number, (number, -1, 2), None)
 
 
+@contextmanager
+def always_written(memory: HallMemory) -> Iterator[None]:
+    """Another process writes samples as fast as it can."""
+    child = os.fork()
+    while child == 0:
+        fill(memory, 1000)
+    yield
+    os.kill(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+
+
 def test_every_byte_is_where_the_original_has_it(path: Path, memory: HallMemory) -> None:
     assert not path.exists(), "before the first sample"
     memory.write(5, (512, -498, 7), True)
@@ -61,6 +74,16 @@ def test_a_reader_sees_each_sample_once_and_the_newest_ones_if_it_is_late(path: 
     assert [sample.a0 for sample in reader.read()] == list(range(10))
     fill(memory, 3 * SLOTS)
     assert [sample.a0 for sample in reader.read()] == list(range(2 * SLOTS, 3 * SLOTS))
+
+
+def test_the_newest_number_never_goes_back(path: Path, memory: HallMemory) -> None:
+    """A reader on another processor that saw a 0 in between would take all samples once more."""
+    fill(memory, 1)
+    reader, seen = HallReader(path.name), [0]
+    with always_written(memory):
+        while len(set(seen)) < 1000:
+            seen += [reader.newest for _ in range(5000)]
+    assert seen == sorted(seen)
 
 
 def test_numbers_go_on_where_the_last_writer_ended(path: Path, memory: HallMemory) -> None:

@@ -144,6 +144,28 @@ def test_values_of_any_depth_and_length_have_an_end() -> None:
     assert wide["omitted"] >= 4900
 
 
+# -- what a robot offers
+
+#: What its capabilities list of *drive*, and whether there are controls for an axis besides turning and going.
+AXES: Rows = {
+    json.dumps(value): (of("new Offers('pebble/robots/a', v[0]).hasExtraAxis", value and {"value": value}), expected)
+    for value, expected in [
+        ({"drive": {"available": True, "axes": ["x", "z"]}}, False),
+        ({"drive": {"available": True, "axes": ["x", "y", "z"]}}, True),
+        ({"drive": {"available": True, "axes": []}}, False),
+        ({"drive": {"available": True}}, True),  # it does not list them: it may have any
+        ({"drive": {"available": True, "axes": "xz"}}, True),
+        ({"drive": 7}, True),
+        (None, True),  # no capabilities
+    ]
+}
+
+
+@rows((script, AXES))
+def test_an_extra_axis_has_its_controls_unless_the_robot_lists_others(found: Callable[[], Any], expected: bool) -> None:
+    assert found() is expected
+
+
 # -- outlets
 
 

@@ -93,9 +93,10 @@ const BackLink = () => html`<${RouteLink} to="" className="back" label="Fleet: a
 function Picker({ at }) {
   const { route, store } = usePage();
   const refs = [...new Set([at, ...useRefs()])].sort();
-  return html`<label class="picker">
+  const name = useName(at);
+  return html`<label class=${`picker${name.length > 7 ? " long" : ""}`}>
     <${Face} at=${at} />
-    <span class="picker-name"><b>${useName(at)}</b><${Icon} name="down" /></span>
+    <span class="picker-name"><b>${name}</b><${Icon} name="down" /></span>
     <span class="picker-state"><${IsStopped} at=${at} /><${Liveness} at=${at} /><${Volts} at=${at} /></span>
     <select
       data-test="picker"
