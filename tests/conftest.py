@@ -12,6 +12,7 @@ import pytest
 from hypothesis import settings
 
 from pebble.transports import segments
+from tests.kit import rows
 from tests.recordings.replayed import recording as recording  # a fixture for all tests
 
 # Started in the background of a shell or by nohup, this process ignores signals, and so would every program it starts.
@@ -39,7 +40,10 @@ _LONG = (
 )
 
 
+@pytest.hookimpl(tryfirst=True)  # before tests are chosen by their marks
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for row in rows.fewer(items):
+        row.add_marker(pytest.mark.thorough)
     items.sort(key=lambda item: next((at for at, end in enumerate(_LONG) if item.path.as_posix().endswith(end)), 99))
 
 
