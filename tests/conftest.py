@@ -19,6 +19,9 @@ from tests.recordings.replayed import recording as recording  # a fixture for al
 signal.signal(signal.SIGINT, signal.default_int_handler)
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
+# httpx reads the authorities of the whole web for each client, which takes 50 ms; those that tests meet are here.
+os.environ["SSL_CERT_FILE"] = str(Path(__file__).parent / "data" / "tls" / "ca.crt")
+
 gc.disable()  # until the tests are collected, of which nothing is garbage: a fifth of the time that it takes
 
 # An example may take long on a busy machine.
