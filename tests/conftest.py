@@ -14,6 +14,7 @@ from hypothesis import settings
 from pebble.transports import segments
 from tests.kit import rows
 from tests.recordings.replayed import recording as recording  # a fixture for all tests
+from tests.support import cases
 
 # Started in the background of a shell or by nohup, this process ignores signals, and so would every program it starts.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -25,7 +26,7 @@ os.environ["SSL_CERT_FILE"] = str(Path(__file__).parent / "data" / "tls" / "ca.c
 gc.disable()  # until the tests are collected, of which nothing is garbage: a fifth of the time that it takes
 
 # An example may take long on a busy machine.
-settings.register_profile("pebble", deadline=None)
+settings.register_profile("pebble", deadline=None, max_examples=cases(30, 100))
 settings.load_profile("pebble")
 
 # What robots save belongs to the run, not to the user who runs it.
