@@ -38,7 +38,8 @@ os.environ["XDG_STATE_HOME"] = _STATE
 _LONG = (
     *("web/robots/test_controls.py", "web/robots/test_actions.py", "robot/test_faults.py", "robot/test_media.py"),
     *("robot/test_driveable.py", "robot/test_hostile.py", "robot/test_runs.py", "commands/test_fleet.py"),
-    *("robot/test_surroundings.py", "robot/test_retained.py", "web/test_attacks.py", "web/test_hostile_broker.py", "forwarding/links/test_table.py"),
+    *("robot/test_surroundings.py", "robot/test_retained.py", "web/test_attacks.py", "web/test_hostile_broker.py"),
+    "forwarding/links/test_table.py",
     *("recordings/test_unread.py", "commands/test_estop.py", "commands/test_drive.py", "launcher/test_launcher.py"),
     *("flash/test_steps.py", "web/test_types.py", "firmware/test_deadman_virtual.py", "web/test_driving_lockstep.py"),
 )

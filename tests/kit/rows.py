@@ -1,4 +1,4 @@
-"""Of which rules ``make test`` tries some members only; ``make thorough`` tries them all.
+"""``make test`` tries some members of a rule where there are many; ``make thorough`` tries them all.
 
 Each line of ``rows.txt`` is a test whose rows are one rule for several transports, encodings, kinds of damage or ways
 to fail, and how many of them stay. What stays fails when the rule itself breaks; what is left out fails when it breaks
@@ -33,8 +33,8 @@ def fewer(items: Iterable[pytest.Item]) -> Iterator[pytest.Item]:
     for item in items:
         if item.get_closest_marker("thorough") is None:
             groups[item.nodeid.partition("[")[0].removeprefix("tests/")].append(item)
-    for test, kept in table().items():
+    for test, due in table().items():
         rows = groups[test]
         first = crc32(test.encode())  # so that the tests of a file do not all keep its first transport
-        stay = {(first + number * len(rows) // kept) % len(rows) for number in range(min(kept, len(rows)))}
+        stay = {(first + number * len(rows) // due) % len(rows) for number in range(min(due, len(rows)))}
         yield from (row for at, row in enumerate(rows) if at not in stay)
