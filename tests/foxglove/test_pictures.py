@@ -215,7 +215,7 @@ def test_a_client_that_does_not_read_delays_no_other_and_loses_the_oldest(broker
         stopped = not_reading(server.address)
         channel = watcher.channels[JPEG]["id"]
         stopped.send(json.dumps({"op": "subscribe", "subscriptions": [{"id": 1, "channelId": channel}]}))
-        assert until(lambda: watcher.count(JPEG) >= BACKLOG + 100, 90)
+        assert until(lambda: watcher.count(JPEG) >= 400, 90)
         images = watcher.of(JPEG)
         assert follow_each_other(counters(list(map(decoded, images))))
         robot.mute = True
