@@ -508,9 +508,9 @@ class TestBridge:
         for number in range(400):  # together fewer than the 1000 that mosquitto holds for a slow reader
             rig.local.publish("outgoing/status", b"%d " % number + bytes(2000), retain=True)
             rig.local.publish("outgoing/touch-sensors", b"%d" % number)
-        assert until(lambda: len(other.on("outgoing/touch-sensors")) == 400, 10)
+        assert until(lambda: len(other.on("outgoing/touch-sensors")) == 400, LATEST_S)
         rig.local.publish("incoming/flags/git-pull", b"true")
-        assert until(lambda: (tmp_path / "ran").exists(), 5)
-        assert until(lambda: rig.service.remote.state is State.CONNECTING, 10)
+        assert until(lambda: (tmp_path / "ran").exists(), LATEST_S)
+        assert until(lambda: rig.service.remote.state is State.CONNECTING, LATEST_S)
         broker.thaw()
-        assert until(lambda: rig.retained(REMOTE).get("outgoing/status", b"").startswith(b"399 "), 10, step=0.3)
+        assert until(lambda: rig.retained(REMOTE).get("outgoing/status", b"").startswith(b"399 "), LATEST_S, step=0.3)
