@@ -11,9 +11,9 @@ help:
 	@echo "make demo             four simulated robots, on Zenoh, on MQTT and on MCUs, driven through a broker; Ctrl-C ends it"
 	@echo "make demo SECONDS=30  ends by itself; succeeds only if every robot moved, stopped and obeyed as it should"
 	@echo "make demo PHONE=1     opens its page to the network, by https, with a login and a QR code"
-	@echo "make test             all checks and tests, some ten minutes"
+	@echo "make test             all checks and tests, some rows of each rule, some eight minutes"
 	@echo "make quick            what to run before each commit: lint, types, contract, memory transport, one robot; a minute"
-	@echo "make thorough         the same, with all cases of the random tests, and the tests that take longest"
+	@echo "make thorough         the same, with all rows, all cases of the random tests, and the tests that take longest"
 	@echo "make fleet            brokers that are killed, hung and cut off under driven robots and 300 boards, ten minutes"
 	@echo "make stops            400 random schedules of emergency stops and faults with whole robots, 40 minutes"
 	@echo "make soak             floods, kills, freezes, full disks and more while an operator drives; MINUTES=30 for each transport"
@@ -96,8 +96,8 @@ test-checks:
 	@echo "pebble: lint, types, imports and names are in order"
 
 test-robots: test-running
-	@echo "pebble: whole robots and serial lines, three at a time because these tests check deadlines"
-	@$(TESTS) --workers 3 -m "alone and not page$(LESS)" $(ALONE)
+	@echo "pebble: whole robots and serial lines, four at a time because these tests check deadlines"
+	@$(TESTS) --workers 4 -m "alone and not page$(LESS)" $(ALONE)
 
 test-demo: test-robots
 	@echo "pebble: the demo, whose robots need all processors"

@@ -12,16 +12,21 @@ import pytest
 from hypothesis import settings
 
 from pebble.transports import segments
+from tests.kit import rows
 from tests.recordings.replayed import recording as recording  # a fixture for all tests
+from tests.support import cases
 
 # Started in the background of a shell or by nohup, this process ignores signals, and so would every program it starts.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
+# httpx reads the authorities of the whole web for each client, which takes 50 ms; those that tests meet are here.
+os.environ["SSL_CERT_FILE"] = str(Path(__file__).parent / "data" / "tls" / "ca.crt")
+
 gc.disable()  # until the tests are collected, of which nothing is garbage: a fifth of the time that it takes
 
 # An example may take long on a busy machine.
-settings.register_profile("pebble", deadline=None)
+settings.register_profile("pebble", deadline=None, max_examples=cases(30, 100))
 settings.load_profile("pebble")
 
 # What robots save belongs to the run, not to the user who runs it.
@@ -31,15 +36,19 @@ os.environ["XDG_STATE_HOME"] = _STATE
 
 #: Modules that take longest begin first: begun last, one of them would delay the end of the run.
 _LONG = (
-    *("web/robots/test_controls.py", "robot/test_closed_loop.py", "robot/test_original_media.py"),
-    *("robot/test_surroundings.py", "robot/test_faults.py", "robot/test_driveable.py", "robot/test_hostile.py"),
-    *("web/test_attacks.py", "web/test_hostile_broker.py", "forwarding/links/test_table.py"),
+    *("web/robots/test_controls.py", "web/robots/test_actions.py", "robot/test_faults.py", "robot/test_media.py"),
+    *("robot/test_driveable.py", "robot/test_hostile.py", "robot/test_runs.py", "commands/test_fleet.py"),
+    *("robot/test_surroundings.py", "robot/test_retained.py", "web/test_attacks.py", "web/test_hostile_broker.py"),
+    "forwarding/links/test_table.py",
     *("recordings/test_unread.py", "commands/test_estop.py", "commands/test_drive.py", "launcher/test_launcher.py"),
-    *("flash/test_steps.py", "firmware/test_deadman_virtual.py", "web/test_types.py", "web/test_driving_lockstep.py"),
+    *("flash/test_steps.py", "web/test_types.py", "firmware/test_deadman_virtual.py", "web/test_driving_lockstep.py"),
 )
 
 
+@pytest.hookimpl(tryfirst=True)  # before tests are chosen by their marks
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for row in rows.fewer(items):
+        row.add_marker(pytest.mark.thorough)
     items.sort(key=lambda item: next((at for at, end in enumerate(_LONG) if item.path.as_posix().endswith(end)), 99))
 
 

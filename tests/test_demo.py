@@ -32,7 +32,9 @@ SLOW_S, END_S = 60.0, 5.0
 
 
 def requested(url: str) -> str:
-    with urllib.request.urlopen(url, timeout=5, context=ssl._create_unverified_context()) as answer:
+    unverified = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    unverified.check_hostname, unverified.verify_mode = False, ssl.CERT_NONE
+    with urllib.request.urlopen(url, timeout=5, context=unverified) as answer:
         return str(answer.read().decode())
 
 

@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 
 from pebble.demo.main import SHORTEST_S
+from tests.kit import rows
 from tests.support import ROOT, free_port, gone, until
 
 PATH = "/@micropython/micropython-webassembly-pyscript/-/micropython-webassembly-pyscript-1.29.0-6.tgz"
@@ -93,6 +94,12 @@ def run_tests(folder: Path, content: str, workers: int = 1) -> tuple[int, str]:
     environment = {**os.environ, "PYTHONPATH": str(ROOT), **plugins}
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=100, env=environment)
     return done.returncode, done.stdout
+
+
+def test_each_test_of_which_some_rows_run_is_there() -> None:
+    for name in rows.table():
+        file, *_, test = name.split("::")
+        assert f"def {test}(" in (ROOT / "tests" / file).read_text(), name
 
 
 def test_few_failed_tests_run_once_more_alone_and_are_named(tmp_path: Path) -> None:

@@ -10,39 +10,38 @@ from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
 from pebble.setup.places import Places
 from pebble.setup.questions import AnswersError
 
+_Answers = Annotated[
+    Path | None, typer.Option(help="File with the answers, as JSON; nothing is asked.", metavar="FILE")
+]
+_Camera = Annotated[str | None, typer.Option(help="A device, libcamera, synthetic, or none.", metavar="CAMERA")]
+_BrokerPassword = Annotated[Path | None, typer.Option(help="File with that account's password.", metavar="FILE")]
+_From = Annotated[Path | None, typer.Option("--from", help="Restore a backup of `pebble backup`.", metavar="BACKUP")]
+_As = Annotated[str | None, typer.Option("--as", help="With --from: a second robot, of this name.", metavar="NAME")]
+_Purge = Annotated[
+    bool, typer.Option("--purge", help="With --undo: erase also keys, people, state and what was changed by hand.")
+]
+
 
 def setup(
-    answers: Annotated[
-        Path | None, typer.Option(help="File with the answers, as JSON; nothing is asked.", metavar="FILE")
-    ] = None,
+    answers: _Answers = None,
     robot: Annotated[str | None, typer.Option("--id", help="Name of the robot.", metavar="NAME")] = None,
     port: Annotated[str | None, typer.Option(help="The board's serial port, or none.", metavar="PORT")] = None,
     protocol: Annotated[str | None, typer.Option(help=f"{', '.join(SERIAL_PROTOCOLS)}.", metavar="NAME")] = None,
     baud: Annotated[int | None, typer.Option(help="The board's speed.", metavar="BAUD", min=1)] = None,
-    camera: Annotated[
-        str | None, typer.Option(help="A device, libcamera, synthetic, or none.", metavar="CAMERA")
-    ] = None,
+    camera: _Camera = None,
     broker: Annotated[str | None, typer.Option(help="here, HOST[:PORT], or none.", metavar="BROKER")] = None,
     broker_user: Annotated[str | None, typer.Option(help="The robot's account there.", metavar="NAME")] = None,
-    broker_password_file: Annotated[
-        Path | None, typer.Option(help="File with that account's password.", metavar="FILE")
-    ] = None,
+    broker_password_file: _BrokerPassword = None,
     broker_ca: Annotated[Path | None, typer.Option(help="Certificate authority of the broker.", metavar="FILE")] = None,
     page: Annotated[bool | None, typer.Option("--page/--no-page", help="The operator page, for phones.")] = None,
     user: Annotated[str | None, typer.Option(help="First user of the page.", metavar="NAME")] = None,
     password_file: Annotated[Path | None, typer.Option(help="File with the user's password.", metavar="FILE")] = None,
-    from_: Annotated[
-        Path | None, typer.Option("--from", help="Restore a backup of `pebble backup`.", metavar="BACKUP")
-    ] = None,
-    as_: Annotated[
-        str | None, typer.Option("--as", help="With --from: a second robot, of this name.", metavar="NAME")
-    ] = None,
+    from_: _From = None,
+    as_: _As = None,
     yes: Annotated[bool, typer.Option("--yes", help="Do it without asking.")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Show each step, and write nothing.")] = False,
     undo: Annotated[bool, typer.Option("--undo", help="Remove what setup made; what the robot saved stays.")] = False,
-    purge: Annotated[
-        bool, typer.Option("--purge", help="With --undo: erase also keys, people, state and what was changed by hand.")
-    ] = False,
+    purge: _Purge = False,
     root: Annotated[Path, typer.Option(help="Another root than that of this machine.", metavar="DIR")] = Path("/"),
 ) -> int:
     """Make a robot of this machine: config, passwords, broker, certificate, first user, service.
@@ -59,32 +58,25 @@ def setup(
         sudo pebble setup --undo --purge             before it is given away
     """
     given: dict[str, Any] = {
-        "id": robot,
-        "port": port,
-        "protocol": protocol,
-        "baud": baud,
-        "camera": camera,
-        "broker": broker,
-        "broker_user": broker_user,
+        "id": robot, "port": port, "protocol": protocol, "baud": baud, "camera": camera,
+        "broker": broker, "broker_user": broker_user, "broker_password_file": broker_password_file,
         "broker_ca": None if broker_ca is None else str(broker_ca.absolute()),
-        "page": page,
-        "user": user,
-        "broker_password_file": broker_password_file,
-        "password_file": password_file,
-    }
+        "page": page, "user": user, "password_file": password_file,
+    }  # fmt: skip
     require_packages("pebble setup")
     from pebble.setup.session import Session  # of Linux only
 
     session = Session(Places(root.absolute()), yes=yes, dry=dry_run)
     try:
-        if purge and not undo:
-            raise AnswersError("--purge needs --undo")
-        if as_ is not None and from_ is None:
-            raise AnswersError("--as needs --from BACKUP")
-        if undo:
-            return session.undo(purge=purge)
-        return session.set_up(answers, given, from_, as_)
+        _together("--purge", purge, "--undo", undo)
+        _together("--as", as_, "--from BACKUP", from_)
+        return session.undo(purge=purge) if undo else session.set_up(answers, given, from_, as_)
     except AnswersError as error:
         for line in str(error).splitlines():
             typer.echo(f"pebble: {line}", err=True)
         return 2
+
+
+def _together(option: str, value: object, needed: str, other: object) -> None:
+    if value not in (None, False) and other in (None, False):
+        raise AnswersError(f"{option} needs {needed}")

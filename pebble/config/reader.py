@@ -3,6 +3,7 @@
 import re
 import types
 from collections.abc import Callable, Iterator, Mapping
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
@@ -22,6 +23,11 @@ _NUMBER = re.compile(r"[+-]?[0-9.]{1,10}|true|false", re.ASCII).fullmatch
 _WRONG = object()  # in place of a refused value: the key gets its default
 
 
+@cache  # each name of a type is looked up anew, which takes longer than all else that a reader does
+def _known(kind: type[Section]) -> dict[str, FieldInfo]:
+    return {field.encode_name: field for field in fields(kind)}
+
+
 class Reader:
     """Reads one file. Relative paths start at ``folder``; ``env`` is the environment for secrets."""
 
@@ -35,7 +41,7 @@ class Reader:
         if not isinstance(raw, dict):
             self.notes.problem(path, f"must be an object {{…}}, not {_shown(raw)}")
             raw = {}
-        known = {field.encode_name: field for field in fields(kind)}
+        known = _known(kind)
         values: dict[str, Any] = {}
         for key, value in raw.items():
             self._note_key(kind, known, key, (*path, key))

@@ -7,6 +7,7 @@ import re
 import time
 from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager
+from functools import cache
 from importlib.resources import files
 from typing import Any
 from urllib.parse import quote
@@ -39,9 +40,15 @@ _ENCODINGS = frozenset({"json", "pbvd", "pbvz", "h264", "jpeg"})
 _estop_decoder = msgspec.json.Decoder(EstopOp)
 
 
+@cache
+def page_files() -> StaticFiles:
+    """The page's files, packed: the same for each server of a process."""
+    return StaticFiles(files("pebble.web") / "static")
+
+
 def create_app(settings: WebSettings) -> Starlette:
     """The application of one server; it connects to the broker when it starts."""
-    static = StaticFiles(files("pebble.web") / "static")
+    static = page_files()
     people = People(settings.people)
 
     @asynccontextmanager

@@ -6,6 +6,7 @@ import json
 import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -131,11 +132,16 @@ def _robot_accepts(file: Path, level: str) -> None:
     assert (config.security.level, config.warnings) == (level, ())
 
 
+@pytest.fixture(scope="module")
+def new(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("new")
+    run(f"pebble fleet init hall --host 127.0.0.1 --port {free_port()} --board-port {free_port()}", folder)
+    return folder
+
+
 @pytest.fixture
-def hall(tmp_path: Path) -> Path:
-    port = free_port()
-    done = pebble(f"pebble fleet init hall --host 127.0.0.1 --port {port} --board-port {free_port()}", tmp_path)
-    assert done.returncode == 0, done.stderr
+def hall(new: Path, tmp_path: Path) -> Path:
+    shutil.copytree(new, tmp_path, dirs_exist_ok=True)
     return tmp_path
 
 
@@ -175,6 +181,7 @@ def test_without_a_fleet_or_with_several_one_must_be_named(hall: Path) -> None:
     assert pebble("pebble fleet list --folder second", hall).returncode == 0
 
 
+@pytest.mark.thorough
 def test_accounts_come_and_go_in_the_files_of_a_broker_that_is_down(hall: Path) -> None:
     for line in (
         "pebble fleet add dora --role driver,safety",
@@ -215,6 +222,7 @@ def test_removing_a_person_acts_on_pages_here_and_names_those_elsewhere(hall: Pa
     assert pebble("pebble fleet remove page-2", hall).returncode == 0
 
 
+@pytest.mark.thorough
 def test_zenoh_hubs_have_the_same_accounts(hall: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What is printed for a robot makes a valid config."""
     rules = hall / "hall" / ZENOH

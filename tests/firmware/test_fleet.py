@@ -98,6 +98,7 @@ def case_of(**given: object) -> Case:
     return Case(run=FLEET.run_of(**given), number=0, variant="mqtt", role="mqtt", condition={})
 
 
+@pytest.mark.thorough
 def test_a_small_fleet_is_measured() -> None:
     """Whole: a broker, ten robots, an operator; with bounds that hold on a busy machine too."""
     (cell,) = measure(case_of(robots=10, seconds=5.0))

@@ -54,6 +54,7 @@ def check(found: Samples) -> None:
 
 
 @on_zenoh
+@pytest.mark.thorough
 def test_it_follows_a_tag(rig: WorldRig) -> None:
     found = followed(rig, Start(distance=1.1, beside=15.0, off=20.0), stay_s=1.0)
     latency = sorted(found.pop("latency"))

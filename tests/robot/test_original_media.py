@@ -95,6 +95,7 @@ def rate(rig: OriginalRig, since: float) -> float:
     return float(seen[-1]["count"] - seen[0]["count"]) / (seen[-1]["at"] - seen[0]["at"])
 
 
+@pytest.mark.thorough
 def test_all_at_once_follow_a_tag_obey_a_person_and_end(rig: OriginalRig) -> None:
     rig.world.place(rig.name, *Start(distance=1.1, beside=15.0, off=20.0).pose)
     pid = rig.driving("original-follow", FOLLOW)

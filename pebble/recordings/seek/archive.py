@@ -21,7 +21,7 @@ LOG_LINES: Final = 50  # of the state at a time
 _LOG_NS: Final = 600 * 10**9
 #: A key frame is looked for so far back: robots send one at least every ten seconds.
 _CHAIN_NS, _CHAIN_BYTES = 15 * 10**9, 8 << 20
-_LIST_S: Final = 1.0  # between two looks at the folder
+LIST_S: Final = 1.0  # between two looks at the folder
 _LONGEST_FILE_NS: Final = 25 * 3600 * 10**9
 _MOST_OPEN: Final = 64
 _NAME: Final = re.compile(r"(?P<stamp>\d{8}T\d{6}Z)-\d{6,}\.(?P<lane>.+?)\.mcap(?:\.active)?")
@@ -155,7 +155,7 @@ class Archive:
 
     def _list(self) -> list[_Named]:
         now = time.monotonic()
-        if now - self._listed_at >= _LIST_S:
+        if now - self._listed_at >= LIST_S:
             self._named = sorted(_named(path) for path in self.folder.rglob(f"*{SUFFIX}*") if _is_recording(path))
             self._listed_at = now
             there = {named.path for named in self._named}

@@ -32,6 +32,7 @@ from tests.tcp_proxy import BridgelessProxy, TcpProxy
 STOP, RESET, DRIVE = "incoming/estop", "incoming/estop-reset", "incoming/drive-values"
 VIDEO_FLAG, AUDIO_FLAG = "incoming/flags/mqtt-video", "incoming/flags/mqtt-audio"
 MIRROR_FLAG = "incoming/flags/remote-mirror"
+LATEST_S = 20.0  # for what comes at once on a machine with nothing else to do
 TRUE, FALSE, PRESS = b'{"value": true}', b'{"value": false}', b'{"stop": "00000000000000a1", "by": "test"}'
 
 #: Topics of the contract by the side that publishes on them, and their kinds.
@@ -171,14 +172,14 @@ class TableRig(Rig):
         assert until(lambda: self.synchronized)
         self.publish_table(situation)
         due = self.expected(situation)
-        until(lambda: sum(map(len, self.arrived(situation).values())) >= sum(map(len, due.values())), 5)
+        until(lambda: sum(map(len, self.arrived(situation).values())) >= sum(map(len, due.values())), LATEST_S)
         Quiet(*self.clients.values()).wait(0.1)
         assert _by_quality(self.arrived(situation)) == _by_quality(due)
         for side in Side:
             cells = [cell for cell in TABLE if cell.side is side.other and cell.passes(self.name)]
             newest = {cell.topic: cell.payload(situation) for cell in cells if cell.arrives(situation)[2]}
             found = partial(self.retained_of_others, side)
-            assert until(lambda found=found, newest=newest: found() == newest, 3), found()  # type: ignore[misc]
+            assert until(lambda found=found, newest=newest: found() == newest, LATEST_S), found()  # type: ignore[misc]
 
     def crosses_later(self, situation: str, away: Side) -> None:
         """What survives an outage has arrived (events of its beginning perhaps twice), and nothing else."""
@@ -187,7 +188,7 @@ class TableRig(Rig):
         def came() -> dict[str, set[tuple[bytes, int, bool]]]:
             return {topic: set(messages) for topic, messages in self.arrived(situation).items()}
 
-        until(lambda: came() == due, 5)
+        until(lambda: came() == due, LATEST_S)
         assert until(lambda: self.synchronized)
         Quiet(*self.clients.values()).wait(0.1)
         assert came() == due
@@ -507,9 +508,9 @@ class TestBridge:
         for number in range(400):  # together fewer than the 1000 that mosquitto holds for a slow reader
             rig.local.publish("outgoing/status", b"%d " % number + bytes(2000), retain=True)
             rig.local.publish("outgoing/touch-sensors", b"%d" % number)
-        assert until(lambda: len(other.on("outgoing/touch-sensors")) == 400, 10)
+        assert until(lambda: len(other.on("outgoing/touch-sensors")) == 400, LATEST_S)
         rig.local.publish("incoming/flags/git-pull", b"true")
-        assert until(lambda: (tmp_path / "ran").exists(), 5)
-        assert until(lambda: rig.service.remote.state is State.CONNECTING, 10)
+        assert until(lambda: (tmp_path / "ran").exists(), LATEST_S)
+        assert until(lambda: rig.service.remote.state is State.CONNECTING, LATEST_S)
         broker.thaw()
-        assert until(lambda: rig.retained(REMOTE).get("outgoing/status", b"").startswith(b"399 "), 10, step=0.3)
+        assert until(lambda: rig.retained(REMOTE).get("outgoing/status", b"").startswith(b"399 "), LATEST_S, step=0.3)

@@ -515,7 +515,7 @@ class TestEnds:
         disk = _Disk(monkeypatch)
         running = Running(tmp_path / "rec", Options(free_bytes=0, flush_seconds=0.05, sync_seconds=2.0, level=1))
         rng = random.Random(9)
-        ends = time.monotonic() + cases(3, 5)
+        ends = time.monotonic() + cases(2, 5)
         while time.monotonic() < ends:
             running.send(20, payload=b'{"t": %d, "x": "' + rng.randbytes(150).hex().encode() + b'"}')
             time.sleep(0.01)
@@ -523,7 +523,7 @@ class TestEnds:
         running.stop()
         path = tmp_path / "image.mcap"
         complete = {message.sequence: message.payload for message in recorded(running.root)}
-        missing, images = 0, cases(60, 100)
+        missing, images = 0, cases(20, 100)
         for _ in range(images):
             image, synced = disk.image(log, rng)
             path.write_bytes(image)

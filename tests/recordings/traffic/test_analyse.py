@@ -109,6 +109,7 @@ def test_the_help_needs_no_large_package():
     assert done.stdout == "[]\n"
 
 
+@pytest.mark.thorough
 def test_the_synthetic_day_is_as_an_index_is(run, tmp_path):
     rows = write_day(tmp_path / "day", robots=(0, 8), hours=1)
     assert run("analyse", tmp_path / "day", "--csv") == 0

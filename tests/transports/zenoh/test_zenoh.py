@@ -438,9 +438,10 @@ def test_topics_that_strangers_invent_take_no_memory(robot: Robot) -> None:
     numbers = []
     robot.client("receiver").subscribe("invented/+", lambda message: numbers.append(int(message.payload)))
     before = pss_mb(hub)
-    for number in range(6000):
-        assert sender.publish(f"invented/{number}", b"%d" % number, qos=DELIVERED)
-    assert until(lambda: len(numbers) == 6000)
+    for part in range(0, 6000, 500):  # what waits in the hub would count as its memory
+        for number in range(part, part + 500):
+            assert sender.publish(f"invented/{number}", b"%d" % number, qos=DELIVERED)
+        assert until(lambda due=part + 500: len(numbers) == due)  # type: ignore[misc]
     assert numbers == list(range(6000))
     assert [topic for topic, _ in sender.publishers] == ["invented/0"]  # type: ignore[attr-defined]
     assert pss_mb(hub) < before + 8.0
