@@ -1,1 +1,10 @@
 """Judges a broker: what a robot and its operators have of it, found out below topics of its own."""
+
+from functools import partial
+from typing import Final
+
+from pebble.doctor import Finding, Level
+
+ok, warn, fail, skip = (partial(Finding, level, "") for level in Level)  # a probe has its name in the table of probes
+MOSQUITTO: Final = "in mosquitto.conf: "
+OTHER: Final = "use another broker"

@@ -132,6 +132,11 @@ class Peer(packets.Listener):
     def payloads(self, topic: str | None = None) -> list[bytes]:
         return [one.payload for one in self.received if topic in (None, one.topic)]
 
+    @property
+    def because(self) -> str:
+        """What it was told at the end, to be put behind a sentence."""
+        return f" ({self.problem})" if self.problem else ""
+
     def topics(self) -> set[str]:
         return {one.topic for one in self.received}
 
@@ -191,12 +196,15 @@ class Bench:
     Everything is below ``{below}/{random digits}``, and what is retained there is removed by :meth:`close`.
     """
 
-    def __init__(self, settings: MqttSettings, address: Address, below: str) -> None:
-        self.settings = settings
+    def __init__(
+        self, settings: MqttSettings, address: Address, below: str, restart: Callable[[], bool] | None = None
+    ) -> None:
+        self.settings, self.restart = settings, restart  # which has the broker restarted
         self.root = f"{below}/{secrets.token_hex(8)}"
         self.base = self.root  # of the probe that is made now
         self.round_trip_s = 0.0
         self.qos, self.retains, self.wildcards = 1, True, True  # as found out by the first probes
+        self.silent: tuple[Peer, float] | None = None  # who waits for a will, and since when
         self._address = address
         self._peers: list[Peer] = []
         self._lasting: list[Peer] = []
@@ -256,12 +264,16 @@ class Bench:
                 return False
             select.select(reading, [sock for sock, writes in found if sock and writes], [], min(left, _STEP_S))
 
-    def settle(self, peer: Peer, most_s: float = ANSWER_S) -> None:
-        """Wait until nothing more comes to this peer."""
+    def settle(self, *peers: Peer, most_s: float = ANSWER_S) -> None:
+        """Wait until nothing more comes to these peers."""
         quiet_s, end = _QUIET_S + 4 * self.round_trip_s, time.monotonic() + most_s
+
+        def seen() -> int:
+            return sum(len(peer.received) for peer in peers)
+
         while time.monotonic() < end:
-            before = len(peer.received)
-            if not self.wait(lambda: len(peer.received) > before or peer.closed, quiet_s) or peer.closed:  # noqa: B023
+            before = seen()
+            if not self.wait(lambda: seen() > before, quiet_s):  # noqa: B023
                 return
 
     # -- what is left there
