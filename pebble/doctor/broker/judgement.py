@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Final
 
 from pebble.doctor import Level
 from pebble.doctor.broker.peer import Bench, RefusedError
@@ -12,22 +11,17 @@ from pebble.errors import TransportError
 from pebble.transports.hosts import addresses_of, described
 from pebble.transports.settings import MqttSettings
 
-BELOW: Final = "pebble/doctor"
-
 _RETAINED = ("retained messages", "retained, to + and #")
 
 
 @contextmanager
-def reached(
-    settings: MqttSettings, below: str = BELOW, restart: Callable[[], bool] | None = None
-) -> Iterator[tuple[Bench, list[str]]]:
-    """Connect; at the end everything is removed, and the list has what could not be. Raises TransportError."""
-    left: list[str] = []
+def reached(settings: MqttSettings, below: str, restart: Callable[[], bool] | None = None) -> Iterator[Bench]:
+    """Connect; at the end everything is removed. Raises TransportError."""
     bench = _bench(settings, below, restart)
     try:
-        yield bench, left
+        yield bench
     finally:
-        left += bench.close()
+        bench.close()
 
 
 def _bench(settings: MqttSettings, below: str, restart: Callable[[], bool] | None) -> Bench:
@@ -38,13 +32,12 @@ def _bench(settings: MqttSettings, below: str, restart: Callable[[], bool] | Non
         raise TransportError(f"{where}: {getattr(error, 'strerror', None) or error}") from None
     failures = {}
     for address in addresses:
-        bench = Bench(settings, address, below)
+        bench = Bench(settings, address, below, restart)
         try:
             bench.peer()
         except RefusedError as error:
             failures[f"{address.text}:"] = str(error)
         else:
-            bench.restart = restart
             return bench
     raise TransportError(f"{where} cannot be used: {described(failures)}")
 

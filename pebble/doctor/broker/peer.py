@@ -283,8 +283,13 @@ class Bench:
         if there:
             self._retained[topic] = None
 
-    def close(self) -> list[str]:
-        """Remove all that is retained; returns what could not be removed. Signals wait meanwhile."""
+    @property
+    def left(self) -> list[str]:
+        """Topics that were retained, and are not removed yet."""
+        return [*self._retained]
+
+    def close(self) -> None:
+        """Remove all that is retained. Signals wait meanwhile."""
         with _undisturbed():
             self.begin("end")
             for peer in self._lasting:
@@ -295,7 +300,6 @@ class Bench:
                     break
                 with suppress(TransportError):
                     self._remove()
-        return [*self._retained]
 
     def _remove(self) -> None:
         peer, left = self.peer(), list(self._retained)

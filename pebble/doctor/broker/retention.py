@@ -129,7 +129,7 @@ def restarted(bench: Bench) -> Finding:
     if not bench.retains:
         return skip("it retains nothing")
     if bench.restart is None:
-        return skip("that needs a restart: --restart asks for one")
+        return skip("it was not restarted: doctor --restart and conform --cut ask for that")
     writer = bench.peer()
     mid = writer.publish("state", b"1", qos=bench.qos, retain=True)
     bench.wait(lambda: mid in writer.acks or not bench.qos)
