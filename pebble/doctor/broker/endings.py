@@ -7,7 +7,7 @@ from contextlib import suppress
 
 from pebble.doctor import Finding
 from pebble.doctor.broker import OTHER, fail, ok, skip, warn
-from pebble.doctor.broker.peer import ANSWER_S, NAME, Bench, RefusedError, will
+from pebble.doctor.broker.peer import NAME, Bench, RefusedError, will
 from pebble.transports.mqtt import client_ids
 
 _KEEPALIVE_S = 2
@@ -27,7 +27,7 @@ def last_wills(bench: Bench) -> Finding:
     bench.wait(lambda: reader.received)
     began = time.monotonic()
     robot.cut()
-    bench.wait(lambda: b"gone" in reader.payloads(), 2 * ANSWER_S)
+    bench.wait(lambda: b"gone" in reader.payloads(), 2 * bench.answer_s)
     seconds = time.monotonic() - began
     bench.settle(reader)
     wills = reader.payloads().count(b"gone")

@@ -8,7 +8,7 @@ from statistics import median
 
 from pebble.doctor import Finding
 from pebble.doctor.broker import MOSQUITTO, OTHER, fail, ok, skip, warn
-from pebble.doctor.broker.peer import ANSWER_S, Bench, Peer, RefusedError
+from pebble.doctor.broker.peer import Bench, Peer, RefusedError, number
 
 _BURST = 1000  # messages of QoS 1
 _BEHIND = 500  # messages for a receiver that acknowledges none of them
@@ -105,11 +105,11 @@ def burst(bench: Bench) -> Finding:
     reader, writer = bench.peer(), bench.peer()
     reader.subscribe("#")
     began = time.monotonic()
-    confirmed = writer.publish_all((("x", b"%d" % number) for number in range(_BURST)), qos=1)
-    bench.wait(lambda: len(reader.received) >= _BURST or reader.closed, ANSWER_S)
+    confirmed = writer.publish_all((("x", b"%d" % place) for place in range(_BURST)), qos=1)
+    bench.wait(lambda: len(reader.received) >= _BURST or reader.closed, bench.answer_s)
     seconds = time.monotonic() - began
     bench.settle(reader)
-    found = [int(one) for one in reader.payloads()]
+    found = [number(one) for one in reader.payloads()]
     first, lost = list(dict.fromkeys(found)), _BURST - len(set(found))
     if not confirmed:
         return fail(f"only {len(writer.acks)} of them were acknowledged{writer.because}", OTHER)
@@ -128,9 +128,9 @@ def queue(bench: Bench) -> Finding:
     reader, writer = bench.peer(), bench.peer()
     reader.subscribe("#")
     reader.holds = True
-    writer.publish_all((("x", b"%d" % number) for number in range(_BEHIND)), qos=1)
+    writer.publish_all((("x", b"%d" % place) for place in range(_BEHIND)), qos=1)
     reader.holds = False
-    bench.wait(lambda: len(set(reader.payloads())) >= _BEHIND or reader.closed, ANSWER_S)
+    bench.wait(lambda: len(set(reader.payloads())) >= _BEHIND or reader.closed, bench.answer_s)
     bench.settle(reader)
     came = len(set(reader.payloads()))
     if came < _BEHIND:
@@ -185,7 +185,7 @@ def payloads(bench: Bench) -> Finding:
     }
     for name, payload in wanted.items():
         bench.peer().publish(name, payload, qos=bench.qos)
-    bench.wait(lambda: len(reader.topics()) == len(wanted) or reader.closed, 2 * ANSWER_S)
+    bench.wait(lambda: len(reader.topics()) == len(wanted) or reader.closed, 2 * bench.answer_s)
     came = {one.topic: one.payload for one in reader.received}
     if changed := [name for name, payload in came.items() if payload != wanted.get(name)]:
         return fail(f"it changes them ({', '.join(changed)})", OTHER)
@@ -228,8 +228,8 @@ def pings(bench: Bench) -> Finding:
     if not peer.ping():
         return fail("it does not answer a ping", "use another broker: robots would connect anew all the time")
     seconds = time.monotonic() - began
-    for number in range(20):
-        peer.publish("x", b"%d" % number)
+    for place in range(20):
+        peer.publish("x", b"%d" % place)
     peer.ping()
     bench.settle(peer)
     late = len(peer.received) - peer.pongs[-1]

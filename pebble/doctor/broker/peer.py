@@ -202,7 +202,7 @@ class Bench:
         self.settings, self.restart = settings, restart  # which has the broker restarted
         self.root = f"{below}/{secrets.token_hex(8)}"
         self.base = self.root  # of the probe that is made now
-        self.round_trip_s = 0.0
+        self.round_trip_s, self.patience_s = 0.0, ANSWER_S
         self.qos, self.retains, self.wildcards = 1, True, True  # as found out by the first probes
         self.silent: tuple[Peer, float] | None = None  # who waits for a will, and since when
         self._address = address
@@ -249,9 +249,14 @@ class Bench:
             raise RefusedError(why)
         return peer
 
+    @property
+    def answer_s(self) -> float:
+        """For so long an answer is waited for."""
+        return self.patience_s + 4 * self.round_trip_s
+
     def wait(self, condition: Callable[[], object], seconds: float | None = None) -> bool:
         """Let all peers read until ``condition``; False: not within ``seconds``, or within a broker's usual answer."""
-        end = time.monotonic() + (ANSWER_S + 4 * self.round_trip_s if seconds is None else seconds)
+        end = time.monotonic() + (self.answer_s if seconds is None else seconds)
         while True:
             for peer in (*self._peers, *self._lasting):
                 peer.pump()
@@ -264,9 +269,12 @@ class Bench:
                 return False
             select.select(reading, [sock for sock, writes in found if sock and writes], [], min(left, _STEP_S))
 
-    def settle(self, *peers: Peer, most_s: float = ANSWER_S) -> None:
+    def settle(self, *peers: Peer, most_s: float | None = None) -> None:
         """Wait until nothing more comes to these peers."""
-        quiet_s, end = _QUIET_S + 4 * self.round_trip_s, time.monotonic() + most_s
+        quiet_s, end = (
+            _QUIET_S + 4 * self.round_trip_s,
+            time.monotonic() + (self.answer_s if most_s is None else most_s),
+        )
 
         def seen() -> int:
             return sum(len(peer.received) for peer in peers)
@@ -321,6 +329,11 @@ def _undisturbed() -> Iterator[None]:
     on_main = threading.current_thread() is threading.main_thread()
     with handled_by(later) if on_main else nullcontext():
         yield
+
+
+def number(payload: bytes) -> int:
+    """That of a numbered message; -1: the broker has made something else of it."""
+    return int(payload) if payload.isdigit() else -1
 
 
 def will(topic: str, payload: bytes, *, qos: int = 1, retain: bool = True) -> Message:

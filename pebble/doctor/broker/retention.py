@@ -6,7 +6,7 @@ from itertools import count, pairwise
 
 from pebble.doctor import Finding
 from pebble.doctor.broker import MOSQUITTO, OTHER, fail, ok, skip, warn
-from pebble.doctor.broker.peer import Bench
+from pebble.doctor.broker.peer import Bench, number
 
 _STATES = 200  # retained ones; a robot has some twenty
 _BY_NAME = 8  # filters in one SUBSCRIBE: AWS IoT closes the connection for more
@@ -47,7 +47,7 @@ def by_name(bench: Bench) -> Finding:
 
 
 def _states(bench: Bench, value: bytes) -> list[str]:
-    names = [f"s/{number}" for number in range(_STATES)]
+    names = [f"s/{place}" for place in range(_STATES)]
     bench.peer().publish_all(((name, value) for name in names), qos=bench.qos, retain=True)
     return names
 
@@ -113,7 +113,7 @@ def order(bench: Bench) -> Finding:
         reader.subscribe("state", qos=bench.qos)
     writer.ping()
     bench.settle(*readers)
-    numbers_of = [[int(one) for one in reader.payloads()] for reader in readers]
+    numbers_of = [[number(one) for one in reader.payloads()] for reader in readers]
     newest = next(numbers) - 1
     wrong = [reader for reader, seen in zip(readers, numbers_of, strict=True) if seen[-1:] != [newest]]
     if any(not reader.received or not reader.received[-1].retain for reader in wrong):
