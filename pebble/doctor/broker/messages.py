@@ -71,7 +71,7 @@ def refusals(bench: Bench) -> Finding:
     if bench.wait(lambda: reader.received, 1.0):
         return skip("this account is refused none")
     if _is_forbidden(bench) is False:
-        return warn("it grants them, and then delivers nothing", "mosquitto: rules by its dynamic-security plugin")
+        return warn("it grants them, and then delivers nothing", "")
     return skip("it does not tell whether this account may publish there")
 
 

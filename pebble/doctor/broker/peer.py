@@ -291,6 +291,10 @@ class Bench:
         if there:
             self._retained[topic] = None
 
+    def retained_nothing(self) -> None:
+        """What was published to be retained is not."""
+        self._retained = {}
+
     @property
     def left(self) -> list[str]:
         """Topics that were retained, and are not removed yet."""

