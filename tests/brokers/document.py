@@ -1,4 +1,4 @@
-"""docs/brokers.md: what robots have of each broker that can run here. ``python -m tests.brokers.document`` writes it."""
+"""What robots have of each broker that can run here: ``python -m tests.brokers.document`` writes docs/brokers.md."""
 
 from __future__ import annotations
 
@@ -79,20 +79,22 @@ BROKERS = {
 
 _HEAD = """# Brokers
 
-Written by `python -m tests.brokers.document`, on {date}; `make brokers` compares it with what it finds. It has what `pebble doctor --broker`
-finds at each broker that can run here:
+Written by `python -m tests.brokers.document`, on {date}, with what `pebble doctor --broker` finds at each broker that
+can run here; `make brokers` compares it.
 
-    pebble doctor --broker mqtt://broker.example                          # what is wrong, what it costs, and what to type
+    pebble doctor --broker mqtt://broker.example          # what is wrong, what it costs, and what to type
     pebble doctor --broker mqtts://ann@broker.lab --ca-cert ca.pem --password-file ann-password
-    pebble doctor --broker mqtt://broker.lab --restart                    # asks to restart it: is what it retains still there?
-    pebble doctor --broker mqtts://goob@broker.lab --below pebble/robots/goob    # with an account that may use only that
-    pebble conform --broker mqtt://broker.example                         # the same by the promises T1 to T21
+    pebble doctor --broker mqtt://broker.lab --restart    # asks to restart it: is what it retains still there?
+    pebble doctor --broker mqtts://goob@broker.lab --below pebble/robots/goob    # that account may use only that
+    pebble conform --broker mqtt://broker.example         # the same by the promises T1 to T21
 
-It takes some 15 s, publishes below `pebble/doctor/` and random digits only, removes all that it left there, also when it is interrupted,
-and moves no robot. The exit code of `doctor` is 0, 1 (robots can use the broker, with limits) or 2 (they cannot). What an account may not do is told,
-and nothing that depends on it is tried. Not tested, because they cannot be installed here: EMQX, HiveMQ, VerneMQ, NanoMQ, hosted ones. Run the command.
+It takes some 15 s, publishes below `pebble/doctor/` and random digits only, removes all that it left there, also when
+it is interrupted, and moves no robot. `doctor` exits with 0, with 1 (robots can use the broker, with limits) or with 2
+(they cannot). What an account may not do is told, and nothing that depends on it is tried. Not tested, because they
+cannot be installed here: EMQX, HiveMQ, VerneMQ, NanoMQ, hosted ones. Run the command.
 
 """
+_KEPT = "are kept by the transport, whatever the broker ([transports.md](transports.md))"
 
 
 def judged(row: Row) -> dict[str, Finding]:
@@ -124,9 +126,7 @@ def document(found_of: dict[str, dict[str, Finding]], date: str) -> str:
         cells = [MARKS[findings[probe.name].level] for findings in found_of.values()]
         lines.append(_row(", ".join(probe.promises), probe.name, *cells))
     undecided = [promise for promise in PROMISES if not any(promise in probe.promises for probe in PROBES)]
-    lines += [
-        f"\n–: not tried. {', '.join(undecided)} are kept by the transport, whatever the broker ([transports.md](transports.md)).\n"
-    ]
+    lines.append(f"\n–: not tried. {', '.join(undecided)} {_KEPT}.\n")
     for name, findings in found_of.items():
         lines += [
             f"## {name} {BROKERS[name].version()}\n",

@@ -11,6 +11,7 @@ import socket
 import struct
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
@@ -30,6 +31,7 @@ _QUIET_S = 0.3  # of silence, and four round trips: then nothing more comes
 _STEP_S = 0.05
 _KEEPALIVE_S = 60
 _AT_ONCE = 1000  # packets
+_MOST = 50_000  # messages that are kept; a probe sends a thousand
 _TRIES = 3  # to take back what is retained
 _PASSING = 100  # messages that the broker has not acknowledged
 _RESET = struct.pack("ii", 1, 0)  # SO_LINGER that turns close() into a reset
@@ -55,7 +57,7 @@ class Peer(packets.Listener):
     """One connection. Its topics and filters are below ``base``; :meth:`Bench.wait` lets it read."""
 
     def __init__(self, bench: Bench, base: str, opening: Opening, *, bridge: bool) -> None:
-        self.received: list[Received] = []
+        self.received: deque[Received] = deque(maxlen=_MOST)
         self.acks: dict[int, int] = {}  # by message id: the code of MQTT 5
         self.granted: dict[int, bytes] = {}
         self.pongs: list[int] = []  # how many messages had been received at each answer to a ping

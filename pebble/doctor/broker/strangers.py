@@ -25,7 +25,7 @@ _DEFAULTS = msgspec.json.encode({"commands": [{"command": "getDefaultACLAccess"}
 def unnamed(bench: Bench) -> Finding:
     """What clients without a name have of what an account publishes."""
     if bench.settings.username is None:
-        return skip("this is one: use an account, as in mqtt://ANN@BROKER")
+        return skip("this is one: log in with an account")
     try:
         stranger = bench.peer(login=False)
     except RefusedError:
