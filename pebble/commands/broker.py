@@ -47,7 +47,7 @@ def doctor_of(
     settings: MqttSettings, below: str, *, restart: bool, as_json: bool, show: Callable[[Finding], None]
 ) -> int:
     """Print what is wrong with a broker, and what to type. Returns 0, 1 with limits, 2 if robots cannot use it."""
-    from pebble.doctor.broker.judgement import verdict
+    from pebble.doctor.broker.judgement import assessment
     from pebble.doctor.broker.login import broker
     from pebble.doctor.broker.probes import run
     from pebble.doctor.broker.strangers import other_doors
@@ -71,12 +71,12 @@ def doctor_of(
                 note(finding)
             with _left_as_it_was(settings, below, restart=restart) as bench:
                 levels = {probe.name: note(finding, probe.costs) for probe, finding in run(bench)}
-    words, counted = verdict(levels), [finding.level for finding, _ in found]
+    words, counted = assessment(levels), [finding.level for finding, _ in found]
     code = 2 if Level.FAIL in counted else int(Level.WARN in counted)
     if as_json:
         rows = [{"name": one.what, "level": one.level.value, "text": one.text, "fix": one.fix, "costs": costs}
                 for one, costs in found]  # fmt: skip
-        typer.echo(json.dumps({"ok": not code, "verdict": words, "checks": rows}, ensure_ascii=False))
+        typer.echo(json.dumps({"ok": not code, "assessment": words, "checks": rows}, ensure_ascii=False))
         return code
     for line in words:
         typer.secho(line, bold=True)

@@ -9,17 +9,18 @@ import tempfile
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from pebble.conform.brokers import PROMISES
 from pebble.doctor import Finding, Level
-from pebble.doctor.broker.judgement import reached, verdict
+from pebble.doctor.broker.judgement import assessment, reached
 from pebble.doctor.broker.probes import PROBES, run
 from pebble.transports import MqttSettings
 from tests.support import ROOT, Broker
 from tests.transports.brokers import MAKERS, found
 
 DOCUMENT = ROOT / "docs" / "brokers.md"
+RESULTS = ROOT / "docs" / "results" / "brokers.json"
 MARKS = {Level.OK: "yes", Level.WARN: "limits", Level.FAIL: "**no**", Level.SKIP: "–"}
 _RECOMMENDED = ("set_tcp_nodelay true",)
 
@@ -79,7 +80,7 @@ BROKERS = {
 
 _HEAD = """# Brokers
 
-Written by `python -m tests.brokers.document`, on {date}, with what `pebble doctor --broker` finds at each broker that
+Written by `python -m tests.brokers.document` with what `pebble doctor --broker` finds at each broker that
 can run here; `make brokers` compares it.
 
     pebble doctor --broker mqtt://broker.example          # what is wrong, what it costs, and what to type
@@ -94,7 +95,7 @@ it is interrupted, and moves no robot. `doctor` exits with 0, with 1 (robots can
 cannot be installed here: EMQX, HiveMQ, VerneMQ, NanoMQ, hosted ones. Run the command.
 
 """
-_KEPT = "are kept by the transport, whatever the broker ([transports.md](transports.md))"
+_BY_TRANSPORT = "are kept by the transport, whatever the broker ([transports.md](transports.md))"
 
 
 def judged(row: Row) -> dict[str, Finding]:
@@ -118,33 +119,33 @@ def marks(findings: dict[str, Finding]) -> dict[str, str]:
     return {name: MARKS[finding.level] for name, finding in findings.items()}
 
 
-def document(found_of: dict[str, dict[str, Finding]], date: str) -> str:
-    lines = [_HEAD.format(date=date)]
-    titles = [f"{name} {BROKERS[name].version()}" for name in found_of]
-    lines += [_row("promise", "what", *titles), _row(*["---"] * (len(titles) + 2))]
+def document(rows: dict[str, Any]) -> str:
+    lines = [_HEAD, _row("promise", "what", *(_title(name, rows) for name in rows)), _row(*["---"] * (len(rows) + 2))]
     for probe in PROBES:
-        cells = [MARKS[findings[probe.name].level] for findings in found_of.values()]
+        cells = [MARKS[_level(row, probe.name)] for row in rows.values()]
         lines.append(_row(", ".join(probe.promises), probe.name, *cells))
     undecided = [promise for promise in PROMISES if not any(promise in probe.promises for probe in PROBES)]
-    lines.append(f"\n–: not tried. {', '.join(undecided)} {_KEPT}.\n")
-    for name, findings in found_of.items():
-        lines += [
-            f"## {name} {BROKERS[name].version()}\n",
-            f"{BROKERS[name].about[0].upper()}{BROKERS[name].about[1:]}.\n",
-        ]
-        lines += [
-            f"* {one[0].upper()}{one[1:]}." for one in verdict({what: one.level for what, one in findings.items()})
-        ]
-        lines += list(_lacks(findings))
-        lines.append("")
+    lines.append(f"\n–: not tried. {', '.join(undecided)} {_BY_TRANSPORT}.\n")
+    for name, row in rows.items():
+        about = BROKERS[name].about
+        lines += [f"## {_title(name, rows)}\n", f"{about[0].upper()}{about[1:]}. Seen on {row['date']}.\n"]
+        words = assessment({what: _level(row, what) for what in row["probes"]})
+        lines += [*(f"* {one[0].upper()}{one[1:]}." for one in words), *_lacks(row), ""]
     return "\n".join(lines).rstrip() + "\n"
 
 
-def _lacks(findings: dict[str, Finding]) -> Iterator[str]:
+def _title(name: str, rows: dict[str, Any]) -> str:
+    return f"{name} {rows[name]['version']}"
+
+
+def _level(row: dict[str, Any], probe: str) -> Level:
+    return Level(row["probes"][probe][0])
+
+
+def _lacks(row: dict[str, Any]) -> Iterator[str]:
     for probe in PROBES:
-        finding = findings[probe.name]
-        if finding.level in (Level.WARN, Level.FAIL):
-            yield f"* *{probe.name}*: {finding.text}. Costs: {probe.costs}."
+        if _level(row, probe.name) in (Level.WARN, Level.FAIL):
+            yield f"* *{probe.name}*: {row['probes'][probe.name][1]}. Costs: {probe.costs}."
 
 
 def _row(*cells: str) -> str:
@@ -158,12 +159,18 @@ def columns(text: str) -> dict[str, dict[str, str]]:
     return {name: {row[1]: row[place] for row in rows[2:]} for place, name in enumerate(names, 2)}
 
 
-def main() -> None:
-    if lacks := [name for name, row in BROKERS.items() if row.missing()]:
-        sys.exit(f"{', '.join(lacks)} cannot run here: make brokers installs them")
-    found_of = {name: judged(row) for name, row in BROKERS.items()}
-    DOCUMENT.write_text(document(found_of, f"{datetime.now(UTC):%Y-%m-%d}"), encoding="utf-8")
+def main(names: list[str]) -> None:
+    """Judge these brokers, or all, and write the document with what was found of the others before."""
+    rows = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
+    for name in names or BROKERS:
+        if BROKERS[name].missing():
+            sys.exit(f"{name} cannot run here: make brokers installs it")
+        found_of = judged(BROKERS[name])
+        probes = {probe: [one.level.value, one.text] for probe, one in found_of.items()}
+        rows[name] = {"version": BROKERS[name].version(), "date": f"{datetime.now(UTC):%Y-%m-%d}", "probes": probes}
+        RESULTS.write_text(json.dumps(rows, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    DOCUMENT.write_text(document(rows), encoding="utf-8")
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:])

@@ -14,8 +14,8 @@ import pytest
 from pebble.transports import MqttSettings
 from pebble.transports.mqtt.transport import MqttTransport
 from tests.brokers.document import BROKERS, DOCUMENT, columns, judged, marks
-from tests.commands.conftest import run as run
 from tests.commands.command_line import Run
+from tests.commands.conftest import run as run
 from tests.support import ROOT, Broker, until
 from tests.transports.received import Received
 
@@ -52,14 +52,14 @@ def test_the_document_has_what_is_found(name: str) -> None:
         (["acl_file RULES"], 2, "robots cannot use it: rights"),
     ],
 )
-def test_doctor_tells_whether_robots_can_use_a_broker(
+def test_doctor_finds_whether_robots_can_use_a_broker(
     lines: list[str], code: int, words: str, tmp_path: Path, run: Run
 ) -> None:
     (tmp_path / "rules").write_text("topic read #\n")
     broker = Broker(tmp_path, *(line.replace("RULES", str(tmp_path / "rules")) for line in lines))
     assert run("doctor", "--broker", f"mqtt://127.0.0.1:{broker.port}", "--json") == code, run.out
     broker.stop()
-    assert json.loads(run.out)["verdict"][0] == words
+    assert json.loads(run.out)["assessment"][0] == words
 
 
 def test_conform_judges_each_promise_once(plain: Broker, run: Run) -> None:

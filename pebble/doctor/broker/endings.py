@@ -29,7 +29,7 @@ def last_wills(bench: Bench) -> Finding:
     robot.cut()
     bench.wait(lambda: b"gone" in reader.payloads(), 2 * bench.answer_s)
     seconds = time.monotonic() - began
-    bench.settle(reader)
+    bench.wait_quiet(reader)
     wills = reader.payloads().count(b"gone")
     if not wills:
         return warn("none is published when a connection is reset", "allow wills (an access list may forbid them)")
@@ -53,7 +53,7 @@ def goodbye(bench: Bench) -> Finding:
     except RefusedError:
         return skip("it takes no wills")
     robot.leave()
-    bench.settle(reader, most_s=1.0)
+    bench.wait_quiet(reader, most_s=1.0)
     if reader.received:
         return warn("the will of a client that says goodbye is published as well", OTHER)
     return ok("a client that says goodbye has none")
@@ -110,7 +110,7 @@ def outage(bench: Bench) -> Finding:
     writer.ping()
     back = bench.peer(client_id=name)
     back.subscribe("x", qos=bench.qos)
-    bench.settle(back)
+    bench.wait_quiet(back)
     if back.received:
         return fail(f"{len(back.received)} commands of meanwhile come to a robot that is back", OTHER)
     return ok("what was sent meanwhile does not come to a client that is back")

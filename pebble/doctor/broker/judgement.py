@@ -42,7 +42,7 @@ def _bench(settings: MqttSettings, below: str, restart: Callable[[], bool] | Non
     raise TransportError(f"{where} cannot be used: {described(failures)}")
 
 
-def verdict(found: Mapping[str, Level]) -> list[str]:
+def assessment(found: Mapping[str, Level]) -> list[str]:
     """What robots, operators and a mirror have of a broker, by the findings of the probes."""
     broken = [name for name, level in found.items() if level is Level.FAIL]
     if broken:

@@ -108,7 +108,7 @@ def burst(bench: Bench) -> Finding:
     confirmed = writer.publish_all((("x", b"%d" % place) for place in range(_BURST)), qos=1)
     bench.wait(lambda: len(reader.received) >= _BURST or reader.closed, bench.answer_s)
     seconds = time.monotonic() - began
-    bench.settle(reader)
+    bench.wait_quiet(reader)
     found = [number(one) for one in reader.payloads()]
     first, lost = list(dict.fromkeys(found)), _BURST - len(set(found))
     if not confirmed:
@@ -131,7 +131,7 @@ def queue(bench: Bench) -> Finding:
     writer.publish_all((("x", b"%d" % place) for place in range(_BEHIND)), qos=1)
     reader.holds = False
     bench.wait(lambda: len(set(reader.payloads())) >= _BEHIND or reader.closed, bench.answer_s)
-    bench.settle(reader)
+    bench.wait_quiet(reader)
     came = len(set(reader.payloads()))
     if came < _BEHIND:
         fix = f"{MOSQUITTO}max_queued_messages 1000"
@@ -148,7 +148,7 @@ def filters(bench: Bench) -> Finding:
     for topic in _TOPICS:
         writer.publish(topic)
     bench.wait(lambda: all(expected[one] <= reader.topics() for one, reader in readers.items()))
-    bench.settle(readers["#"])
+    bench.wait_quiet(readers["#"])
     wrong = [
         f"{filter_} {'misses' if expected[filter_] - reader.topics() else 'also gets'} "
         f"{', '.join(sorted(expected[filter_] ^ reader.topics()))}"
@@ -231,7 +231,7 @@ def pings(bench: Bench) -> Finding:
     for place in range(20):
         peer.publish("x", b"%d" % place)
     peer.ping()
-    bench.settle(peer)
+    bench.wait_quiet(peer)
     late = len(peer.received) - peer.pongs[-1]
     if seconds > _PING_S:
         return fail(f"it takes {seconds:.1f} s for one", "use a broker that is nearer, or less busy")
@@ -245,7 +245,7 @@ def overlaps(bench: Bench) -> Finding:
     reader.subscribe("a/b", "a/+", "#", qos=bench.qos)
     writer.publish("a/b", qos=bench.qos)
     bench.wait(lambda: reader.received)
-    bench.settle(reader)
+    bench.wait_quiet(reader)
     copies = len(reader.received)
     if copies > 1:
         return warn(f"a client with three of them gets {copies} copies of a message", "subscribe to one filter only")
@@ -260,8 +260,8 @@ def as_published(bench: Bench) -> Finding:
             found[words] = _keeps_flags(bench, bench.peer(protocol=protocol, bridge=bridge), modern=protocol == "5")
         except RefusedError:
             continue
-    kept = [words for words, lacks in found.items() if not lacks]
-    if kept:
+    working = [words for words, lacks in found.items() if not lacks]
+    if working:
         return ok(
             f"own messages do not come back, and tell whether they were to be retained, with {' and '.join(kept)}"
         )
@@ -275,7 +275,7 @@ def _keeps_flags(bench: Bench, peer: Peer, *, modern: bool) -> str:
     peer.publish("own", qos=bench.qos)
     other.publish("other", b"1", qos=bench.qos, retain=bench.retains)
     bench.wait(lambda: peer.payloads("other"))
-    bench.settle(peer)
+    bench.wait_quiet(peer)
     if not granted or not peer.payloads("other"):
         return "nothing comes"
     if peer.payloads("own"):

@@ -105,7 +105,7 @@ class Peer(packets.Listener):
         return self._bench.wait(lambda: len(self.pongs) > before or self.closed) and not self.closed
 
     def leave(self) -> None:
-        """In order: the broker does not publish the will."""
+        """Say goodbye: the broker does not publish the will."""
         self._client.disconnect()
         self._client.close()
 
@@ -253,7 +253,7 @@ class Bench:
 
     @property
     def answer_s(self) -> float:
-        """For so long an answer is waited for."""
+        """How long an answer is waited for."""
         return self.patience_s + 4 * self.round_trip_s
 
     def wait(self, condition: Callable[[], object], seconds: float | None = None) -> bool:
@@ -271,7 +271,7 @@ class Bench:
                 return False
             select.select(reading, [sock for sock, writes in found if sock and writes], [], min(left, _STEP_S))
 
-    def settle(self, *peers: Peer, most_s: float | None = None) -> None:
+    def wait_quiet(self, *peers: Peer, most_s: float | None = None) -> None:
         """Wait until nothing more comes to these peers."""
         quiet_s, end = (
             _QUIET_S + 4 * self.round_trip_s,

@@ -34,7 +34,7 @@ def by_name(bench: Bench) -> Finding:
     late = bench.peer()
     late.subscribe("state", qos=bench.qos)
     bench.wait(lambda: late.received)
-    bench.settle(late)
+    bench.wait_quiet(late)
     if not late.received:
         bench.retained_nothing()
         return warn("it retains none", fix)
@@ -94,14 +94,14 @@ def removal(bench: Bench) -> Finding:
     for payload in (b"1", b""):
         mid = writer.publish("state", payload, qos=bench.qos, retain=True)
         bench.wait(lambda: not bench.qos or mid in writer.acks or writer.closed)  # noqa: B023
-    told = bench.wait(lambda: b"" in running.payloads())
+    notified = bench.wait(lambda: b"" in running.payloads())
     late = bench.peer()
     late.subscribe("state", qos=bench.qos)
-    bench.settle(late)
+    bench.wait_quiet(late)
     if late.received:
         return fail("an empty message does not remove what is retained", OTHER)
-    if not told:
-        return warn("who is subscribed is not told of it", OTHER)
+    if not notified:
+        return warn("who is subscribed does not learn of it", OTHER)
     return ok("an empty message removes what is retained")
 
 
@@ -114,7 +114,7 @@ def order(bench: Bench) -> Finding:
             writer.publish("state", b"%d" % next(numbers), qos=bench.qos, retain=True)
         reader.subscribe("state", qos=bench.qos)
     writer.ping()
-    bench.settle(*readers)
+    bench.wait_quiet(*readers)
     numbers_of = [[number(one) for one in reader.payloads()] for reader in readers]
     newest = next(numbers) - 1
     wrong = [reader for reader, seen in zip(readers, numbers_of, strict=True) if seen[-1:] != [newest]]

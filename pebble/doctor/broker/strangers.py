@@ -36,7 +36,7 @@ def unnamed(bench: Bench) -> Finding:
     writer.publish("own")
     stranger.publish("strange")
     bench.wait(lambda: reader.payloads("own"))
-    bench.settle(reader)
+    bench.wait_quiet(reader)
     can = [*(["read"] if stranger.payloads("own") else []), *(["publish"] if reader.payloads("strange") else [])]
     if can:
         fix = f"{MOSQUITTO}allow_anonymous false, or no rule for clients without a name in the acl_file"
