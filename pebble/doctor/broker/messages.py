@@ -263,7 +263,7 @@ def as_published(bench: Bench) -> Finding:
     working = [words for words, lacks in found.items() if not lacks]
     if working:
         return ok(
-            f"own messages do not come back, and tell whether they were to be retained, with {' and '.join(kept)}"
+            f"own messages do not come back, and tell whether they were to be retained, with {' and '.join(working)}"
         )
     lacks = "; ".join(f"{words}: {why}" for words, why in found.items()) or "it has neither bridge mode nor MQTT 5"
     return warn(lacks, "a robot works without; mqtt_mirror needs a broker with it, as mosquitto")
