@@ -33,7 +33,7 @@ class SparingBroker:
             back = asyncio.ensure_future(self._back(to_reader, writer, asked))
             with suppress(OSError, asyncio.IncompleteReadError):
                 while True:
-                    first, packet, body = await _packet(reader)
+                    first, packet, body = await packet_of(reader)
                     if first == _CONNECT and body[6] & 0x80:
                         writer.write(_NO_BRIDGE_MODE)
                         break
@@ -47,7 +47,7 @@ class SparingBroker:
     async def _back(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, asked: list[bytes]) -> None:
         with suppress(OSError, asyncio.IncompleteReadError):
             while True:
-                first, packet, body = await _packet(reader)
+                first, packet, body = await packet_of(reader)
                 named = any(body[: 2 + int.from_bytes(body[:2], "big")] in one for one in asked)
                 if first & 0xF1 != _PUBLISH | 1:
                     writer.write(packet)
@@ -55,7 +55,7 @@ class SparingBroker:
                     self._loop.call_later(self._late_s, writer.write, packet)
 
 
-async def _packet(reader: asyncio.StreamReader) -> tuple[int, bytes, bytes]:
+async def packet_of(reader: asyncio.StreamReader) -> tuple[int, bytes, bytes]:
     """Its first byte, all of it, and what follows its length."""
     head, size, shift = await reader.readexactly(2), 0, 0
     while head[-1] > 127:

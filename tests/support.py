@@ -161,7 +161,7 @@ class Broker:
 
     def start(self) -> None:
         self._process = Child(self._command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        assert until(self.answers, 10), f"mosquitto did not start: {self._command}"
+        assert until(self.answers, 30), f"mosquitto did not start: {self._command}"
 
     def stop(self) -> None:
         """SIGTERM: persistence is written. With its security plugin it has been seen to hang then, once."""

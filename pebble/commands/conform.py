@@ -8,6 +8,8 @@ import typer
 
 from pebble.check_result import State
 from pebble.client.connection import Target, target_of
+from pebble.client.names import base_of
+from pebble.commands.broker import BELOW, BrokerOption, conform_of, settings_at
 from pebble.commands.options import with_target
 from pebble.commands.selftest import INDENT, ended, is_clear, printed, row
 from pebble.errors import PebbleError
@@ -18,22 +20,36 @@ _LOOKS_S = 4.0  # heartbeats of one a second need so long
 
 @with_target(program="conform")
 def conform(
-    robot: Annotated[str, typer.Argument(help="Its id, or SYSTEM/TYPE/ID.", metavar="ROBOT", show_default=False)],
+    robot: Annotated[
+        str | None, typer.Argument(help="Its id, or SYSTEM/TYPE/ID.", metavar="ROBOT", show_default=False)
+    ] = None,
     may_move: Annotated[bool, typer.Option("--may-move", help="Ask, then also turn its wheels.")] = False,
-    cut: Annotated[bool, typer.Option("--cut", help="Ask to cut its power, and to switch it on again.")] = False,
+    cut: Annotated[
+        bool,
+        typer.Option("--cut", help="Ask to cut its power, and to switch it on again; with --broker: to restart it."),
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead.")] = False,
+    broker: BrokerOption = None,
     *,
     target: Target,
 ) -> int:
     """Judge a robot, in any language, by the contract: only by what it publishes and how it answers.
 
     Without --may-move no wheel turns; the robot is stopped and freed several times. Exits 1 if a check fails; each is
-    printed with why it matters and what to change.
+    printed with why it matters and what to change. With --broker a broker is judged: which promises of a transport it
+    keeps, and what a robot lacks where it does not; with ROBOT, too, on topics of that robot.
 
     \b
         pebble conform rover --url mqtt://broker.example
         pebble conform rover --url mqtt://broker.example --may-move --cut
+        pebble conform --broker mqtt://broker.example
     """
+    if broker is not None:
+        below = BELOW if robot is None else base_of(robot)
+        settings = settings_at(broker, target.password_file, target.ca_cert)
+        return conform_of(settings, below, restart=cut, as_json=as_json)
+    if robot is None:
+        raise PebbleError("which robot is missing: use either ROBOT or --broker URL")
     from pebble.conform.checks import CHECKS, run
     from pebble.conform.component import reached
     from pebble.conform.motion import MOVING

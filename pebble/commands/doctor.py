@@ -8,25 +8,48 @@ from typing import Annotated
 import typer
 
 from pebble.check_result import CheckResult, State
+from pebble.commands.broker import BELOW, BelowOption, BrokerOption, RestartOption, doctor_of, settings_at
+from pebble.commands.options import CaCert, PasswordFile
 from pebble.config import load
 from pebble.config.secret_text import without_secrets
+from pebble.errors import PebbleError
 from pebble.runtime.environment import withhold
 
-_COLOURS = {State.OK: typer.colors.GREEN, State.WARN: typer.colors.YELLOW, State.FAILED: typer.colors.RED}
+_COLOURS = {
+    State.OK: typer.colors.GREEN,
+    State.WARN: typer.colors.YELLOW,
+    State.FAILED: typer.colors.RED,
+    State.SKIPPED: typer.colors.BLUE,
+}
 _INDENT = " " * 6
 
 
 def doctor(
     config: Annotated[Path | None, typer.Argument(help="Also check what this robot needs.", show_default=False)] = None,
+    broker: BrokerOption = None,
+    below: BelowOption = BELOW,
+    restart: RestartOption = False,
+    as_json: Annotated[bool, typer.Option("--json", help="With --broker: print one JSON object instead.")] = False,
+    password_file: PasswordFile = None,
+    ca_cert: CaCert = None,
 ) -> int:
-    """Check that this machine is ready for the robot.
+    """Check that this machine is ready for the robot, or with --broker what robots have of a broker.
 
     Each problem is printed with the command that fixes it. Exits 1 if a check fails, but not for warnings.
+
+    A broker is tried for about 20 s on topics of its own, which are removed; no robot moves. Exits 1 if it has limits,
+    2 if robots cannot use it.
 
     \b
         pebble doctor
         pebble doctor configs/goob.json
+        pebble doctor --broker mqtts://ann@broker.lab --ca-cert ca.pem --password-file ann-password
     """
+    if broker is not None:
+        if config is not None:
+            raise PebbleError("--broker judges a broker alone: leave out the config file")
+        settings = settings_at(broker, password_file, ca_cert)
+        return doctor_of(settings, below, restart=restart, as_json=as_json, show=_print)
     from pebble.doctor.checks import run_checks  # of Linux only
 
     counts = dict.fromkeys(_COLOURS, 0)

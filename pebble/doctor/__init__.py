@@ -4,4 +4,4 @@ from functools import partial
 
 from pebble.check_result import CheckResult, State
 
-ok, warn, fail = (partial(CheckResult, state) for state in (State.OK, State.WARN, State.FAILED))
+ok, warn, fail, skip = (partial(CheckResult, state) for state in State)

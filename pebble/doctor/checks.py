@@ -1,7 +1,6 @@
 """Checks of a machine and of the robot on it. They change nothing, and return findings."""
 
 import grp
-import ipaddress
 import os
 import pwd
 import resource
@@ -20,10 +19,11 @@ from pebble.check_result import CheckResult, State
 from pebble.client.page_from_config import settings_of
 from pebble.client.page_packages import require_packages
 from pebble.config import Config, Mqtt
-from pebble.config.secret_text import shown_user
+from pebble.config.web import is_loopback
 from pebble.contract.levels import LEVELS
 from pebble.doctor import device_names, fail, ok, warn
-from pebble.doctor.broker_probe import REFUSED_ID, REFUSED_LOGINS, TIMEOUT_S, ProbeResult, probe
+from pebble.doctor.broker.login import SOON_S, broker
+from pebble.doctor.broker_probe import TIMEOUT_S, probe
 from pebble.doctor.driving import driving
 from pebble.doctor.loudspeaker import loudspeaker
 from pebble.doctor.media import media
@@ -34,12 +34,10 @@ from pebble.doctor.who import who_drives
 from pebble.errors import PebbleError
 from pebble.fleet import certificates
 from pebble.runtime.connections import REMOTE_RECONNECT_S, mqtt_settings
-from pebble.transports.settings import MqttSettings
 from pebble.transports.socket_paths import FRAMES_SOCKET, fits_socket
 
 _ENOUGH_LOCKED = 64 * 1024 * 1024  # a camera's pool of frames at 1080p
 _BUILT = 1735689600  # 2025: a clock before this has not been set
-_SOON_S = 14 * 86400
 _TIMEDATECTL_S = 3.0
 
 
@@ -108,7 +106,7 @@ def _page_certificate(file: Path, now: float) -> CheckResult:
     except certificates.CertificateError as error:
         return fail("operator page", str(error), "pebble cert init")
     text = f"its certificate ends in {left_s / 86400:.0f} days"
-    return ok("operator page", text) if left_s >= _SOON_S else warn("operator page", text, "pebble cert renew")
+    return ok("operator page", text) if left_s >= SOON_S else warn("operator page", text, "pebble cert renew")
 
 
 def _brokers(config: Config) -> Iterator[tuple[str, Mqtt]]:
@@ -292,89 +290,6 @@ def serial_port(path: Path, name: str = "", names: Path = Path("/dev/serial")) -
 def _port_key(instance: str) -> str:
     within = f"instances.{instance}." if instance else ""
     return f"services.serial_mcu_bridge.{within}serial.port"
-
-
-# -- brokers
-
-
-def broker(
-    name: str, settings: MqttSettings, probe_login: Callable[..., ProbeResult] = probe, now: float | None = None
-) -> Iterator[CheckResult]:
-    """Check that it answers, accepts the config's login, refuses anonymous ones, and is encrypted."""
-    what = f"{name} {settings.host}:{settings.port}"
-    own = probe_login(settings, login=True)
-    if own.code is None:
-        start = (
-            "sudo systemctl start mosquitto"
-            if is_loopback(settings.host)
-            else f"nc -vz {settings.host} {settings.port}"
-        )
-        yield fail(what, f"cannot be reached: {own.problem}", start)
-        return
-    yield _login(what, settings, own)
-    if own.problem and not is_loopback(settings.host):
-        yield warn(
-            what,
-            f"has addresses that do not answer: {own.problem}",
-            f"correct the addresses of {settings.host} in your DNS, or start the brokers there",
-        )
-    without_login = own if settings.username is None else probe_login(settings, login=False)
-    yield _anonymous_logins(what, settings, without_login)
-    yield _encryption(what, settings, own, time.time() if now is None else now)
-
-
-def _login(what: str, settings: MqttSettings, answer: ProbeResult) -> CheckResult:
-    if answer.code == 0:
-        return ok(what, f"answers, connected in {answer.connect_ms:.1f} ms")
-    if answer.code == REFUSED_ID:
-        fix = "let it admit any client id, or set remote_mqtt.client_id to one that it knows"
-        return fail(what, "refuses the client id", fix)
-    why = REFUSED_LOGINS.get(answer.code or 0, f"code {answer.code}")
-    if settings.username is None:
-        return fail(what, f"refuses the login: {why}", "set username and password_file of this broker")
-    return fail(
-        what,
-        f"refuses user {(user := shown_user(settings.username))}: {why}",
-        f"on the broker: sudo mosquitto_passwd /etc/mosquitto/passwd {user}",
-    )
-
-
-def _anonymous_logins(what: str, settings: MqttSettings, answer: ProbeResult) -> CheckResult:
-    if answer.code != 0:
-        return ok(what, "refuses anonymous logins")
-    if is_loopback(settings.host):
-        return ok(what, "accepts anonymous logins: every program on this machine can drive the robot")
-    return warn(
-        what,
-        "accepts anonymous logins: every client that reaches it can drive the robot",
-        "in mosquitto.conf: allow_anonymous false, password_file /etc/mosquitto/passwd",
-    )
-
-
-def _encryption(what: str, settings: MqttSettings, answer: ProbeResult, now: float) -> CheckResult:
-    if settings.tls is None:
-        if is_loopback(settings.host):
-            return ok(what, "not encrypted, which is fine on this machine")
-        return warn(
-            what, "is not encrypted: commands and passwords can be read on the network", "set tls.enabled to true"
-        )
-    if answer.expires is not None and answer.expires - now < _SOON_S:
-        days = (answer.expires - now) / 86400
-        return warn(what, f"its certificate expires in {days:.0f} days", "renew the broker's certificate")
-    if settings.tls.insecure:
-        return warn(what, "encrypted, but the name in its certificate is not checked", "set tls.insecure to false")
-    left = "" if answer.expires is None else f", its certificate for {(answer.expires - now) / 86400:.0f} more days"
-    return ok(what, f"encrypted{left}")
-
-
-def is_loopback(host: str) -> bool:
-    """By its spelling, without name resolution."""
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
 
 
 def _user(uid: int) -> str:

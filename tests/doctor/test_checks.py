@@ -17,6 +17,7 @@ import pytest
 from pebble.check_result import CheckResult, State
 from pebble.config import load, parse
 from pebble.doctor import checks as doctor
+from pebble.doctor.broker import login
 from pebble.doctor.broker_probe import ProbeResult, connect_packet, probe
 from pebble.doctor.publishing import publishing
 from pebble.doctor.who import who_drives
@@ -156,7 +157,7 @@ def test_serial_port(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_an_open_broker_on_this_machine_is_fine(open_broker: Broker) -> None:
-    findings = list(doctor.broker("local broker", MqttSettings(host="127.0.0.1", port=open_broker.port)))
+    findings = list(login.broker("local broker", MqttSettings(host="127.0.0.1", port=open_broker.port)))
     assert levels(iter(findings)) == ["ok", "ok", "ok"]
     assert " ms" in findings[0].text
     assert "anonymous" in findings[1].text
@@ -165,7 +166,7 @@ def test_an_open_broker_on_this_machine_is_fine(open_broker: Broker) -> None:
 def test_a_broker_that_requires_a_login(closed_broker: Broker) -> None:
     def found(username: str | None, password: str | None) -> list[CheckResult]:
         settings = MqttSettings(host="127.0.0.1", port=closed_broker.port, username=username, password=password)
-        return list(doctor.broker("local broker", settings))
+        return list(login.broker("local broker", settings))
 
     right, wrong, none = found("ann", "geheim"), found("ann", "falsch"), found(None, None)
     assert [finding.state for finding in right] == [State.OK] * 3
@@ -178,7 +179,7 @@ def test_a_broker_that_requires_a_login(closed_broker: Broker) -> None:
 
 def test_an_unreachable_broker_fails() -> None:
     port = free_port()
-    finding, *more = doctor.broker("local broker", MqttSettings(host="127.0.0.1", port=port))
+    finding, *more = login.broker("local broker", MqttSettings(host="127.0.0.1", port=port))
     assert more == []
     assert finding == CheckResult(
         State.FAILED,
@@ -230,11 +231,11 @@ def test_an_open_or_unencrypted_broker_elsewhere_is_a_warning() -> None:
     let_in, shut_out = ProbeResult(code=0, connect_ms=3.0), ProbeResult(code=5)
     plain = MqttSettings(host="broker.example", username="ann", password="geheim")
     tls = MqttSettings(host="broker.example", port=8883, username="ann", password="geheim", tls=TlsSettings())
-    assert levels(doctor.broker("b", plain, probe_returning(let_in, let_in))) == ["ok", "warn", "warn"]
-    assert levels(doctor.broker("b", plain, probe_returning(let_in, shut_out))) == ["ok", "ok", "warn"]
-    assert levels(doctor.broker("b", tls, probe_returning(let_in, shut_out))) == ["ok", "ok", "ok"]
+    assert levels(login.broker("b", plain, probe_returning(let_in, let_in))) == ["ok", "warn", "warn"]
+    assert levels(login.broker("b", plain, probe_returning(let_in, shut_out))) == ["ok", "ok", "warn"]
+    assert levels(login.broker("b", tls, probe_returning(let_in, shut_out))) == ["ok", "ok", "ok"]
     anyone = replace(tls, tls=TlsSettings(insecure=True))
-    *_, last = doctor.broker("b", anyone, probe_returning(let_in, shut_out))
+    *_, last = login.broker("b", anyone, probe_returning(let_in, shut_out))
     assert (last.state, last.fix) == (State.WARN, "set tls.insecure to false")
 
 
@@ -249,7 +250,7 @@ def test_an_open_or_unencrypted_broker_elsewhere_is_a_warning() -> None:
 def test_the_days_of_a_brokers_certificate(days: int, level: State, text: str) -> None:
     answer, shut_out = ProbeResult(code=0, expires=1000.0 + days * 86400), ProbeResult(code=5)
     settings = MqttSettings(host="b", username="ann", password="geheim", tls=TlsSettings())
-    *_, last = doctor.broker("b", settings, probe_returning(answer, shut_out), 1000.0)
+    *_, last = login.broker("b", settings, probe_returning(answer, shut_out), 1000.0)
     assert (last.state, last.text) == (level, text)
 
 
@@ -259,7 +260,7 @@ def test_the_certificate_of_a_fleets_broker_is_read(tmp_path: Path) -> None:
         settings = MqttSettings(
             host="127.0.0.1", port=hall.port, username="viewer", password=hall.passwords["viewer"], tls=tls
         )
-        texts = [one.text for one in doctor.broker("b", settings)]
+        texts = [one.text for one in login.broker("b", settings)]
     assert texts[1:] == ["refuses anonymous logins", "encrypted, its certificate for 397 more days"]
 
 

@@ -110,7 +110,7 @@ class _RabbitMq(_Other):
     def start(self) -> None:
         self._mapper = Child(self._epmd, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         self._process = Child(self._command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        assert until(self.answers, 60, step=0.05), "RabbitMQ did not start"
+        assert until(self.answers, 240, step=0.05), "RabbitMQ did not start"
 
     def answers(self) -> bool:
         """It listens some time before it lets a client in."""

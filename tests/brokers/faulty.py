@@ -1,0 +1,236 @@
+"""Stands before a real broker, and breaks one promise: each fault is a class of a few lines."""
+
+from __future__ import annotations
+
+import asyncio
+import secrets
+import threading
+from contextlib import suppress
+from types import TracebackType
+from typing import Self
+
+from tests.sparing_broker import packet_of
+from tests.support import free_port
+
+CONNECT, CONNACK, PUBLISH, SUBSCRIBE, PINGRESP, DISCONNECT = 0x10, 0x20, 0x30, 0x82, 0xD0, 0xE0
+RETAIN, QOS_1, CLEAN, BRIDGE = 0x01, 0x02, 0x02, 0x80
+_LEVEL, _FLAGS, _ID = 6, 7, 12  # places in the body of a CONNECT
+_LATE_S = 3.0
+
+
+class Fault:
+    """What passes on one connection: a packet becomes those that go on. ``ends``: what the broker gets at a loss."""
+
+    ends = b""
+    late_s = 0.0  # after which the broker notices a loss
+
+    def __init__(self) -> None:
+        self.answers: list[bytes] = []  # to the client, at once
+
+    def up(self, first: int, body: bytes) -> list[bytes]:
+        return [packet(first, body)]
+
+    def down(self, first: int, body: bytes) -> list[bytes]:
+        return [packet(first, body)]
+
+
+def packet(first: int, body: bytes) -> bytes:
+    size, head = len(body), bytes((first,))
+    while size > 127:
+        head, size = head + bytes((size & 127 | 128,)), size >> 7
+    return head + bytes((size,)) + body
+
+
+def kind(first: int) -> int:
+    return first & 0xF0
+
+
+def payload_at(first: int, body: bytes) -> int:
+    """Where the payload of a PUBLISH begins."""
+    return 2 + int.from_bytes(body[:2], "big") + (2 if first & QOS_1 else 0)
+
+
+class DropsWills(Fault):
+    ends = packet(DISCONNECT, b"")
+
+
+class LateWills(Fault):
+    late_s = _LATE_S
+
+
+class WillsAfterGoodbye(Fault):
+    def up(self, first: int, body: bytes) -> list[bytes]:
+        return [] if first == DISCONNECT else super().up(first, body)
+
+
+class Loses(Fault):
+    """Every hundredth message is acknowledged and goes no further."""
+
+    seen = 0
+
+    def up(self, first: int, body: bytes) -> list[bytes]:
+        self.seen += kind(first) == PUBLISH and bool(first & QOS_1)
+        if kind(first) != PUBLISH or not self.seen or self.seen % 100:
+            return super().up(first, body)
+        end = payload_at(first, body)
+        self.answers.append(b"\x40\x02" + body[end - 2 : end])
+        return []
+
+
+class Reorders(Fault):
+    """Every tenth message goes after the one behind it."""
+
+    held = b""
+    seen = 0
+
+    def up(self, first: int, body: bytes) -> list[bytes]:
+        if kind(first) != PUBLISH:
+            return super().up(first, body)
+        self.seen += 1
+        if self.seen % 10 == 3 and not self.held:
+            self.held = packet(first, body)
+            return []
+        held, self.held = self.held, b""
+        return [packet(first, body), *([held] if held else [])]
+
+
+class RetainsNothing(Fault):
+    def up(self, first: int, body: bytes) -> list[bytes]:
+        return super().up(first & ~RETAIN if kind(first) == PUBLISH else first, body)
+
+
+class HidesRetained(Fault):
+    """What is retained looks live."""
+
+    def down(self, first: int, body: bytes) -> list[bytes]:
+        return super().down(first & ~RETAIN if kind(first) == PUBLISH else first, body)
+
+
+class AllRetained(Fault):
+    """What is live looks retained."""
+
+    def down(self, first: int, body: bytes) -> list[bytes]:
+        return super().down(first | RETAIN if kind(first) == PUBLISH else first, body)
+
+
+class Doubles(Fault):
+    def down(self, first: int, body: bytes) -> list[bytes]:
+        return super().down(first, body) * (2 if kind(first) == PUBLISH else 1)
+
+
+class Changes(Fault):
+    """The last byte of large payloads is another one."""
+
+    def down(self, first: int, body: bytes) -> list[bytes]:
+        changed = kind(first) == PUBLISH and len(body) - payload_at(first, body) > 100
+        return super().down(first, body[:-1] + bytes((body[-1] ^ 1,)) if changed else body)
+
+
+class KeepsRemoved(Fault):
+    def up(self, first: int, body: bytes) -> list[bytes]:
+        end = payload_at(first, body) if kind(first) == PUBLISH else -1
+        removes = end == len(body) and bool(first & RETAIN)
+        if removes and first & QOS_1:
+            self.answers.append(b"\x40\x02" + body[end - 2 : end])
+        return [] if removes else super().up(first, body)
+
+
+class Mute(Fault):
+    """Answers no ping."""
+
+    def down(self, first: int, body: bytes) -> list[bytes]:
+        return [] if first == PINGRESP else super().down(first, body)
+
+
+class EagerPongs(Fault):
+    """Answers pings at once, before what waits."""
+
+    def up(self, first: int, body: bytes) -> list[bytes]:
+        if first != 0xC0:
+            return super().up(first, body)
+        self.answers.append(packet(PINGRESP, b""))
+        return []
+
+
+class _Connects(Fault):
+    def up(self, first: int, body: bytes) -> list[bytes]:
+        return super().up(first, self.changed(body) if first == CONNECT else body)
+
+    def changed(self, body: bytes) -> bytes:
+        raise NotImplementedError
+
+
+class KeepsOld(_Connects):
+    """The broker sees another client each time: the old connection of one that is back stays open."""
+
+    def changed(self, body: bytes) -> bytes:
+        size = int.from_bytes(body[_ID - 2 : _ID], "big")
+        return body[:_ID] + secrets.token_hex(size).encode()[:size] + body[_ID + size :]
+
+
+class Remembers(_Connects):
+    """Sessions are never clean: what was sent during an outage comes afterwards."""
+
+    def changed(self, body: bytes) -> bytes:
+        return body[:_FLAGS] + bytes((body[_FLAGS] & ~CLEAN,)) + body[_FLAGS + 1 :]
+
+
+class SendsBack(_Connects):
+    """Takes bridge mode and does not keep it; does not take MQTT 5."""
+
+    def changed(self, body: bytes) -> bytes:
+        return body[:_LEVEL] + bytes((body[_LEVEL] & ~BRIDGE if body[_LEVEL] != 5 else 9,)) + body[_LEVEL + 1 :]
+
+
+class WidensPlus(Fault):
+    """A last + matches as # does."""
+
+    def up(self, first: int, body: bytes) -> list[bytes]:
+        wide = first == SUBSCRIBE and body[-2:-1] == b"+"
+        return super().up(first, body[:-2] + b"#" + body[-1:] if wide else body)
+
+
+class FaultyBroker:
+    """A proxy on a loopback port of its own, until its ``with`` block ends."""
+
+    def __init__(self, to: int, fault: type[Fault]) -> None:
+        self.port, self._to, self._fault = free_port(), to, fault
+        self._loop = asyncio.new_event_loop()
+        self._loop.run_until_complete(asyncio.start_server(self._serve, "127.0.0.1", self.port))
+        self._thread = threading.Thread(target=self._loop.run_forever, daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+        tasks = asyncio.all_tasks(self._loop)
+        for task in tasks:
+            task.cancel()
+        self._loop.run_until_complete(asyncio.gather(*tasks, return_exceptions=True))
+        self._loop.close()
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        fault = self._fault()
+        to_reader, to_writer = await asyncio.open_connection("127.0.0.1", self._to)
+        back = asyncio.ensure_future(self._back(to_reader, writer, fault))
+        with suppress(OSError, asyncio.IncompleteReadError):
+            while True:
+                first, _, body = await packet_of(reader)
+                to_writer.writelines(fault.up(first, body))
+                writer.writelines(fault.answers)
+                fault.answers = []
+        await asyncio.sleep(fault.late_s)
+        with suppress(OSError):
+            to_writer.write(fault.ends)
+        to_writer.close()
+        await back
+
+    async def _back(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, fault: Fault) -> None:
+        with suppress(OSError, asyncio.IncompleteReadError):
+            while True:
+                first, _, body = await packet_of(reader)
+                writer.writelines(fault.down(first, body))
+        writer.close()

@@ -1,0 +1,98 @@
+"""A broker judged as a whole: by both commands, as docs/brokers.md says, and without anything left behind."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from pebble.transports import MqttSettings
+from pebble.transports.mqtt.transport import MqttTransport
+from tests.brokers.document import BROKERS, DOCUMENT, columns, judged, marks
+from tests.commands.command_line import Run
+from tests.commands.conftest import run as run
+from tests.support import ROOT, Broker, until
+from tests.transports.received import Received
+
+pytestmark = pytest.mark.thorough  # make brokers runs it
+COMMAND = (sys.executable, "-m", "pebble.cli")
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Broker]:
+    broker = Broker(tmp_path_factory.mktemp("broker"))
+    yield broker
+    broker.stop()
+
+
+@pytest.mark.alone  # mosquitto's own delays are measured
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.skipif(row.missing(), reason=f"needs {name}: make brokers"))
+        for name, row in BROKERS.items()
+    ],
+)
+def test_the_document_has_what_is_found(name: str) -> None:
+    assert marks(judged(BROKERS[name])) == columns(DOCUMENT.read_text())[name]
+
+
+@pytest.mark.parametrize(
+    ("lines", "code", "words"),
+    [
+        (["set_tcp_nodelay true"], 0, "robots can use it"),
+        ([], 1, "robots can use it, with limits: small messages"),
+        (["set_tcp_nodelay true", "retain_available false"], 1, "robots can use it, with limits: retained messages"),
+        (["set_tcp_nodelay true", "max_qos 0"], 1, "robots can use it, with limits: QoS 1"),
+        (["acl_file RULES"], 2, "robots cannot use it: rights"),
+    ],
+)
+def test_doctor_finds_whether_robots_can_use_a_broker(
+    lines: list[str], code: int, words: str, tmp_path: Path, run: Run
+) -> None:
+    (tmp_path / "rules").write_text("topic read #\n")
+    broker = Broker(tmp_path, *(line.replace("RULES", str(tmp_path / "rules")) for line in lines))
+    assert run("doctor", "--broker", f"mqtt://127.0.0.1:{broker.port}", "--json") == code, run.out
+    broker.stop()
+    assert json.loads(run.out)["assessment"][0] == words
+
+
+def test_conform_judges_each_promise_once(plain: Broker, run: Run) -> None:
+    assert run("conform", "--broker", f"mqtt://127.0.0.1:{plain.port}", "--json") == 0, run.out
+    names = [one["name"].split()[0] for one in json.loads(run.out)["checks"]]
+    assert sorted(names) == sorted(f"T{number}" for number in range(1, 22))
+
+
+def test_what_it_retains_is_removed_when_it_is_interrupted(plain: Broker) -> None:
+    settings, seen = MqttSettings(host="127.0.0.1", port=plain.port, as_published=True), Received()
+    with MqttTransport("watcher", settings) as watcher:
+        watcher.subscribe("pebble/doctor/#", seen)
+        command = [*COMMAND, "doctor", "--broker", f"mqtt://127.0.0.1:{plain.port}"]
+        doctor = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL)
+        assert until(lambda: sum(one.retain_requested is True for one in [*seen.messages]) > 50, 60)
+        doctor.send_signal(signal.SIGTERM)
+        assert doctor.wait(30) == 130
+    with MqttTransport("late", settings) as late:
+        left = Received()
+        late.subscribe("pebble/doctor/#", left)
+        assert left.messages == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["doctor", "--broker", "mqtt://127.0.0.1:1"], "cannot be reached"),
+        (["conform", "--broker", "mqtt://127.0.0.1:1"], "cannot be used"),
+        (["doctor", "--broker", "zenoh:/tmp"], "--broker must be mqtt://"),
+        (["doctor", "--broker", "mqtt://127.0.0.1:1", "robot.json"], "leave out the config file"),
+        (["conform"], "use either ROBOT or --broker URL"),
+    ],
+)
+def test_what_cannot_be_judged_is_one_clear_line(arguments: list[str], words: str, run: Run) -> None:
+    assert run(*arguments) != 0
+    assert words in run.out + run.err
