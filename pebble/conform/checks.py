@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Literal
+from typing import Generic, Literal, Protocol, TypeVar
 
 import msgspec
 
@@ -33,14 +33,24 @@ _BY, _WHY = "conform", "conformance test"
 JUNK = (b"", b"{", b"[]", b"null", b'"x"', b"\xff\xfe\x00", b"[" * 2000, b'{"x": ' + b"9" * 400 + b"}", b"x" * 70_000)
 
 
+class Judged(Protocol):
+    """What is judged: a robot, or a client that drives one."""
+
+    def wait(self, condition: Callable[[], object], seconds: float) -> bool:
+        """Let time pass until ``condition``, and take what arrives; False: not within ``seconds``."""
+
+
+J = TypeVar("J", bound=Judged)
+
+
 @dataclass(frozen=True)
-class Check:
+class Check(Generic[J]):
     """``why`` tells what goes wrong where it fails."""
 
     name: str
     why: str
-    run: Callable[[Component], Outcome]
-    needs: tuple[Callable[[Component], str], ...] = ()
+    run: Callable[[J], Outcome]
+    needs: tuple[Callable[[J], str], ...] = ()
 
 
 # -- what a check needs: empty, or why it is lacking
@@ -106,7 +116,7 @@ def clock(component: Component) -> Outcome:
 def payloads(component: Component) -> Outcome:
     wrong = {one.metric: one.wrong for one in component.records if one.wrong}
     if wrong:
-        return failed(_some(wrong.values()), "docs/topics.md has each payload")
+        return failed(some_of(wrong.values()), "docs/topics.md has each payload")
     return ok(f"{len({one.metric for one in component.records if one.channel})} kinds of messages")
 
 
@@ -121,7 +131,7 @@ def numbers(component: Component) -> Outcome:
     is_json = [one for one in component.records if one.channel and one.channel.payload is not bytes and one.payload]
     if found := {one.metric for one in is_json if strange(one)}:
         return failed(
-            f"not JSON: {_some(sorted(found))}", "NaN, Infinity and comments are no JSON: leave the field out"
+            f"not JSON: {some_of(sorted(found))}", "NaN, Infinity and comments are no JSON: leave the field out"
         )
     return ok("all JSON is JSON")
 
@@ -135,7 +145,7 @@ def sizes(component: Component) -> Outcome:
         for one in component.records
         if (one.channel is None or one.channel.payload is not bytes) and len(one.payload) > limit(one)
     }
-    return failed(_some(sorted(large)), "send less: readers drop it") if large else ok("no message is too large")
+    return failed(some_of(sorted(large)), "send less: readers drop it") if large else ok("no message is too large")
 
 
 def retained(component: Component) -> Outcome:
@@ -144,10 +154,10 @@ def retained(component: Component) -> Outcome:
     must = {metric for metric, channel in live.items() if channel.default_retain and channel not in _REPEATED}
     lacks = sorted(must - there)
     if lacks:
-        return failed(f"not retained: {_some(lacks)}", "publish it with the retain flag: who connects later lacks it")
+        return failed(f"not retained: {some_of(lacks)}", "publish it with the retain flag: who connects later lacks it")
     stale = sorted(metric for metric in there & set(live) if not live[metric].default_retain)
     if stale:
-        return failed(f"retained: {_some(stale)}", "publish it without the retain flag: it is news only once")
+        return failed(f"retained: {some_of(stale)}", "publish it without the retain flag: it is news only once")
     return ok(f"{len(there)} states")
 
 
@@ -155,7 +165,7 @@ def stale_commands(component: Component) -> Outcome:
     found = sorted(one.metric for one in component.retained() if one.channel is not None and one.channel.one_shot)
     if found:
         topic = f"{component.base}/{found[0]}"
-        return failed(_some(found), f"remove it: mosquitto_pub -r -n -t '{topic}'; and find who publishes it so")
+        return failed(some_of(found), f"remove it: mosquitto_pub -r -n -t '{topic}'; and find who publishes it so")
     return ok("none")
 
 
@@ -170,7 +180,7 @@ def capabilities(component: Component) -> Outcome:
         msgspec.convert(found[-1].value.value, CapabilitiesValue)
     except (msgspec.ValidationError, ValueError, AttributeError) as error:
         return failed(str(found[-1].wrong or error), "docs/topics.md, CapabilitiesValue, has each field")
-    return ok(_some(_offers(component), 20) or "nothing is offered")
+    return ok(some_of(_offers(component), 20) or "nothing is offered")
 
 
 def _offers(component: Component) -> list[str]:
@@ -185,7 +195,7 @@ def own_topics(component: Component) -> Outcome:
         if not topic.startswith(f"{component.base}/") or parse_topic(topic) is None
     )
     if foreign:
-        return failed(_some(foreign), f"topics in capabilities begin with {component.base}/: others are not used")
+        return failed(some_of(foreign), f"topics in capabilities begin with {component.base}/: others are not used")
     return ok("all are its own")
 
 
@@ -238,7 +248,7 @@ def _states(component: Component) -> dict[str, EstopState]:
 def owners(component: Component) -> Outcome:
     lacks = [topic.removeprefix(f"{component.base}/") for topic in component.view.estop.missing]
     if lacks:
-        return failed(f"no state of {_some(lacks)}", "publish it, retained, for each owner that capabilities list")
+        return failed(f"no state of {some_of(lacks)}", "publish it, retained, for each owner that capabilities list")
     return ok(", ".join(sorted(_states(component))))
 
 
@@ -291,7 +301,7 @@ def _repeated(component: Component, name: str) -> Outcome:
     component.look(ANSWER_S / 2)
     counted = [owner for owner, one in _states(component).items() if one.count != before.get(owner)]
     if counted:
-        return failed(f"its repetition counts again ({_some(counted)})", "a name in recent is the same stop")
+        return failed(f"its repetition counts again ({some_of(counted)})", "a name in recent is the same stop")
     return ok("the same stop counts once")
 
 
@@ -386,7 +396,7 @@ def _ends(component: Component, driver: Driver) -> Outcome:
     return ok("it ends by itself")
 
 
-def _some(names: Iterable[object], most: int = _SHOWN) -> str:
+def some_of(names: Iterable[object], most: int = _SHOWN) -> str:
     found = [str(one) for one in names]
     more = f" and {len(found) - most} more" if len(found) > most else ""
     return ", ".join(found[:most]) + more
@@ -396,7 +406,7 @@ _LIVE = (drives, free, commanded)
 _STOP = (stops, free, commanded)
 _CONTROL = (controls, free, commanded)
 
-CHECKS = (
+CHECKS: tuple[Check[Component], ...] = (
     Check("heartbeat", "without it the robot is shown as offline, and not driven", heartbeat),
     Check("clock", "people are shown how old messages are", clock),
     Check("payloads", "what does not fit the contract is not read", payloads),
@@ -420,12 +430,12 @@ CHECKS = (
 )
 
 
-def run(component: Component, checks: Iterable[Check]) -> Iterator[tuple[Check, Outcome]]:
+def run(judged: J, checks: Iterable[Check[J]]) -> Iterator[tuple[Check[J], Outcome]]:
     """Make one check after the other."""
     for check in checks:
-        component.wait(lambda: True, 0.0)
-        why = next((why for need in check.needs if (why := need(component))), "")
+        judged.wait(lambda: True, 0.0)
+        why = next((why for need in check.needs if (why := need(judged))), "")
         try:
-            yield check, skipped(why) if why else check.run(component)
+            yield check, skipped(why) if why else check.run(judged)
         except PebbleError as error:  # the connection was lost
             yield check, failed(str(error), "run it again")

@@ -39,7 +39,7 @@ class Component:
 
     def __init__(self, target: Target, transport: Transport, names: Names, base: str) -> None:
         self.base = base
-        self.ask = _ask  # tells the person at the robot what to do
+        self.ask = ask_person  # tells the person at the robot what to do
         self.person_s = 180.0  # until that is done, and a broker has noticed it: 1.5 times a keep-alive of a minute
         self.records: deque[Record] = deque(maxlen=_MOST)
         self.view = RobotView(base)
@@ -101,7 +101,7 @@ class Component:
         return [record_of(one, self.base, 0.0) for one in list(found) if one.retain and one.payload]
 
 
-def _ask(text: str) -> None:
+def ask_person(text: str) -> None:
     print(f"pebble: {text}", file=sys.stderr, flush=True)  # noqa: T201 - standard output is for the result
 
 
