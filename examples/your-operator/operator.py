@@ -9,8 +9,8 @@ import paho.mqtt.client as mqtt
 ID, HOST, PORT, *LOGIN = sys.argv[1:]
 PLAIN, OUT = f"pebble/robots/{ID}/incoming/", f"pebble/robots/{ID}/outgoing/"
 IN = f"{PLAIN}by/{LOGIN[0]}/" if LOGIN else PLAIN
-SILENT_S, LETS_GO_S, REPEATS_S, GIVES_UP_S = {"wide": 1.5, "narrow": 3.0, "thin": 5.0}, 3.0, 0.5, 60.0
-WIDE = {"level": "wide", "drive_hz": 20.0}
+SILENT_S, WIDE = {"wide": 1.5, "narrow": 3.0, "thin": 5.0}, {"level": "wide", "drive_hz": 20.0}
+LETS_GO_S, REPEATS_S, GIVES_UP_S = 3.0, 0.5, 60.0
 now, ms = time.monotonic, lambda: int(1000 * time.monotonic())  # of a clock that is never set
 
 

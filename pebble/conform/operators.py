@@ -153,8 +153,8 @@ def clamps(robot: StandIn) -> Outcome:
     if why := _drives(robot, FULL):
         return failed(why, "publish incoming/drive-values while it is pushed")
     robot.look(_SOON_S)
-    commands = [one.raw for one in robot.moving(began)]
-    largest = max(abs(one.get(axis, 0)) for one in commands for axis in ("x", "z"))
+    axes = [one.raw.get(axis, 0) for one in robot.moving(began) for axis in ("x", "z")]
+    largest = max(map(abs, axes))
     if largest > 1:
         return failed(f"it sends {largest:g}", "clamp both axes to -1..1: some robots do not")
     return ok(f"{largest:g} at most")

@@ -153,6 +153,7 @@ class StandIn:
         wrong = ""
         try:
             raw = json.loads(message.payload)
+            raw = raw["value"] if isinstance(raw, dict) and isinstance(raw.get("value"), dict) else raw
             value = None if channel is None else codec.decode(channel, message.payload)
         except (PayloadError, ValueError, RecursionError) as error:
             wrong = f"{metric}: {error}"
