@@ -64,7 +64,8 @@ class Operator:
             self.request("hold")
         elif self.key and now() > self.moved_at + LETS_GO_S:
             self.request("release")
-            if not pushed or self.why_not or (self.controlled and not self.key) or now() < self.drives_at:
+            self.control = {}
+        if not pushed or self.why_not or (self.controlled and not self.key) or now() < self.drives_at:
             return
         wide = self.link["level"] == "wide"
         self.drives_at = max(self.drives_at, now() - 0.1) + 1 / max(2.0, min(20.0, self.link["drive_hz"]))

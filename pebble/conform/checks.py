@@ -382,6 +382,17 @@ def _first_keeps(component: Component, driver: Driver) -> Outcome:
     return ok("the first one keeps it")
 
 
+def _shows_asker(component: Component, driver: Driver) -> Outcome:
+    driver.asks(for_ms=3000)
+    second = Driver(component)
+    second.asks()
+    shown = component.wait(lambda: component.of(c.CONTROL_STATE)[-1].value.asks_id == second.id, ANSWER_S)
+    second.asks("release")
+    if not shown:
+        return failed("a second request is not shown", "publish its by and id as asks and asks_id while it is repeated")
+    return ok("the one who waits is shown")
+
+
 def _released(component: Component, driver: Driver) -> Outcome:
     driver.asks(for_ms=5000)
     driver.asks("release")
@@ -425,6 +436,7 @@ CHECKS: tuple[Check[Component], ...] = (
     Check("stop holds", "only a person ends it", _while_stopped(_driven), _STOP),
     Check("reset refused", "a reset must end only the stop that its sender saw", _while_stopped(_wrong_reset), _STOP),
     Check("control", "one person drives at a time", _with_control(_first_keeps), _CONTROL),
+    Check("control asked", "who drives must see who waits", _with_control(_shows_asker), _CONTROL),
     Check("control released", "the next one must not wait", _with_control(_released), _CONTROL),
     Check("control ends", "who goes away must not keep it", _with_control(_ends), _CONTROL),
 )

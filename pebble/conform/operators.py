@@ -145,7 +145,7 @@ def _numbers(one: Sent) -> bool:
     except (ValueError, RecursionError):
         return False
     axes = [value.get(axis, 0) for axis in ("x", "y", "z")] if isinstance(value, dict) else [None]
-    return all(type(axis) in (int, float) and abs(axis) < float("inf") for axis in axes)
+    return all(isinstance(axis, int | float) and abs(axis) < float("inf") for axis in axes)
 
 
 def clamps(robot: StandIn) -> Outcome:
@@ -153,7 +153,7 @@ def clamps(robot: StandIn) -> Outcome:
     if why := _drives(robot, FULL):
         return failed(why, "publish incoming/drive-values while it is pushed")
     robot.look(_SOON_S)
-    axes = [one.raw.get(axis, 0) for one in robot.moving(began) for axis in ("x", "z")]
+    axes: list[float] = [one.raw.get(axis, 0) for one in robot.moving(began) for axis in ("x", "z")]
     largest = max(map(abs, axes))
     if largest > 1:
         return failed(f"it sends {largest:g}", "clamp both axes to -1..1: some robots do not")

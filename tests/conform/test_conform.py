@@ -39,7 +39,7 @@ VIOLATIONS: dict[str, tuple[str, str]] = {
     "heartbeat": ("heartbeat_at = now() + 0.25", "heartbeat_at = now() + 5"),
     "clock": ("int(1000 * time.time())", "int(1000 * time.time()) + 3_600_000"),
     "payloads": ('{"t": epoch_ms()}, qos=0', '{"t": str(time.time())}, qos=0'),
-    "numbers": ('{"wheels": robot.wheels}', '{"wheels": robot.wheels, "amperes": math.nan}'),
+    "numbers": ('{"wheels": self.wheels}', '{"wheels": self.wheels, "amperes": math.nan}'),
     "sizes": ('"the saved state cannot be read" * there', '400 * "x"'),
     "retained": ("qos, retain=True", "qos, retain=False"),
     "parked commands": (
@@ -62,7 +62,8 @@ VIOLATIONS: dict[str, tuple[str, str]] = {
         "        if not x and not z:\n            self.stop = FREE\n            self.publish_stop()\n",
     ),
     "reset refused": ("if self.refused is None and", "if"),
-    "control": ('(take or mine or not self.holder["key"])', "True"),
+    "control": ('elif take or mine or not self.holder["key"]:', "elif True:"),
+    "control asked": ('{"asks": new["by"], "asks_id": new["id"]}', "UNASKED"),
     "control released": ("NONE if mine else self.holder", "self.holder"),
     "control ends": ("now() > robot.ends:", "False:"),
     "dead man": ('DEAD_MAN_S, PAUSE_S, LONGEST = "motors", 0.75', 'DEAD_MAN_S, PAUSE_S, LONGEST = "motors", 3.0'),
