@@ -84,7 +84,8 @@ class Operator:
         """An emergency stop is repeated until every owner has its name, or a minute has gone by."""
         stop, at, end = self.pressed
         owners = (self.capabilities.get("estop") or {}).get("owners") or self.stops
-        if owners and all(stop["stop"] in self.stops.get(one, {}).get("recent", ()) for one in owners) or now() > end:
+        confirmed = owners and all(stop["stop"] in self.stops.get(one, {}).get("recent", ()) for one in owners)
+        if confirmed or now() > end:
             self.pressed = None
         elif now() >= at:
             self.pressed = stop, now() + REPEATS_S, end

@@ -63,8 +63,7 @@ static void turn(double to_left, double to_right, double for_s) {  // set your p
     shown = 1;
 }
 static void drive(const cJSON *command, const char *account) {
-    double x = number(get(command, "x"), 0), z = number(get(command, "z"), 0);
-    double valid_s = number(get(command, "valid_ms"), 1000 * DEAD_MAN_S) / 1000;
+    double x = number(get(command, "x"), 0), z = number(get(command, "z"), 0), valid_s = number(get(command, "valid_ms"), 750) / 1000;
     if (!isfinite(x) || !isfinite(z) || !isfinite(valid_s)) return;  // NaN is no number
     int mine = *holder.key && same(get(command, "key"), holder.key) && !strcmp(account, holder.account);
     x = CLAMP(x, -1, 1), z = CLAMP(z, -1, 1);

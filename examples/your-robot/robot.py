@@ -85,12 +85,11 @@ class Robot:
 
     def control(self, command, account, take):
         """Who has control keeps it until it ends, is released or taken. Who asks meanwhile is shown."""
-        if not re.fullmatch("[0-9A-Fa-f]{8}", command["id"]):
-            return
-        mine = (command["id"], account) == (self.holder["id"], self.account)
+        own_id = re.fullmatch("[0-9A-Fa-f]{8}", command["id"])[0]  # else this changes nothing
+        mine = (own_id, account) == (self.holder["id"], self.account)
         seconds = max(1.0, min(10.0, command.get("for_ms", 3000) / 1000))
         by, device = (re.sub("[^a-z0-9_/-]", "_", str(command.get(one, ""))) for one in ("by", "device"))
-        new = {"id": command["id"], "by": f"{account}/{by}".strip("/")[:40], "device": device[:20]}
+        new = {"id": own_id, "by": f"{account}/{by}".strip("/")[:40], "device": device[:20]}
         if command.get("want") == "release":
             self.pass_on(NONE if mine else self.holder)
         elif take or mine or not self.holder["key"]:
@@ -107,7 +106,8 @@ class Robot:
     def show(self):
         """Publish what has changed; after a connection was made, all of it."""
         control = self.holder | self.asker | {"named": NAMED, "boot": self.boot}
-        if self.shown != (self.shown := (self.wheels, control)):
+        if self.shown != (self.wheels, control):
+            self.shown = self.wheels, control
             self.publish("status", {"t": epoch_ms(), "value": {"wheels": self.wheels}})
             self.publish(f"control/{OWNER}", control)
 
@@ -122,11 +122,10 @@ class Robot:
             value = value["value"] if type(value.get("value")) is dict else value
             if metric == "drive-values":
                 self.drive(value, account)
-            elif account or not NAMED:
-                if metric == "estop-reset":
-                    self.reset(value)
-                elif metric in ("control", "control/take"):
-                    self.control(value, account, metric == "control/take")
+            elif metric == "estop-reset" and (account or not NAMED):
+                self.reset(value)
+            elif metric in ("control", "control/take") and (account or not NAMED):
+                self.control(value, account, metric == "control/take")
 
     def connected(self, *_):
         client.subscribe(IN + "#", 1)
