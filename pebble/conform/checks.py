@@ -78,6 +78,12 @@ def commanded(component: Component) -> str:
     return "it takes commands only with a name: use an account, as in --url mqtts://ANN@BROKER" if named else ""
 
 
+def readable(component: Component) -> str:
+    if why := commanded(component):
+        return why
+    return "" if component.reads_commands() else "its broker does not let this account read incoming/: use an admin's"
+
+
 # -- signs of life
 
 
@@ -424,7 +430,9 @@ CHECKS: tuple[Check[Component], ...] = (
     Check("numbers", "NaN is no JSON, and no speed", numbers),
     Check("sizes", "boards and pages have little room", sizes),
     Check("retained", "who connects later must know its state, and must not take old news for new", retained),
-    Check("parked commands", "a command that a broker keeps is carried out at every start", stale_commands),
+    Check(
+        "parked commands", "a command that a broker keeps is carried out at every start", stale_commands, (readable,)
+    ),
     Check("capabilities", "pages offer what they list, and no more", capabilities),
     Check("own topics", "topics of others are not used", own_topics),
     Check("identity", "it is known by its topics", identity),
