@@ -24,7 +24,7 @@ _LOOKS_S = 2.0  # at what it sends
 _SOON_S = 0.5  # within which a client acts on what it is told, a way to the broker and back included
 _TELLS_S = 2.5  # the longest silence of a robot on a wide link after which a client still drives
 _GAP_S = 0.75  # wheels stop so long after the last command
-_LEAST_HZ, _MOST_HZ = 8.0, 25.0
+_SLOWEST_HZ, _FASTEST_HZ = 8.0, 25.0
 _CONFIRMS_S = 1.8  # for so long a stop is not confirmed
 _SLOWER = 1.5  # times the rate of a link, for what was on its way
 _HARMLESS = (c.CONTROL,)
@@ -166,7 +166,7 @@ def rate(robot: StandIn) -> Outcome:
     hz, gap = (len(times) - 2) / _LOOKS_S, max(after - before for before, after in pairwise(times))
     if gap > _GAP_S:
         return failed(f"a gap of {gap:.2f} s", f"repeat it at 20 Hz: wheels stop {_GAP_S:g} s after the last command")
-    if hz > _MOST_HZ or hz < _LEAST_HZ:
+    if hz > _FASTEST_HZ or hz < _SLOWEST_HZ:
         return failed(f"{hz:.0f} commands a second", "send 20 a second")
     return ok(f"{hz:.0f} a second")
 

@@ -35,9 +35,9 @@ from pebble.errors import PayloadError, PebbleError
 from pebble.transports import Message, MqttSettings, QoS, State, Transport, create
 
 _OPENS_S = 3.0
-_HEARS_S = 1.2  # a robot that is there sends a heartbeat
+_PRESENT_S = 1.2  # a robot that is there sends a heartbeat
 _STEP_S = 0.005
-_BEATS_S = 0.25
+_HEARTBEAT_S = 0.25
 _OWNER = "motors"
 _MOST = 50_000  # commands that are kept
 _RECENT = 8
@@ -79,7 +79,7 @@ class StandIn:
         self.confirms = True  # whether a stop is confirmed
         self.stop = EstopState(latched=False, boot=secrets.token_hex(4), count=0, recent=[], by="", why="", since=0)
         self.control = ControlState(by="", id="", key="", named=named, boot=self.stop.boot)
-        self._ends = self._beats = 0.0
+        self._ends = self._heartbeat_at = 0.0
         self._target, self._transport = target, transport
         self._arrived: deque[tuple[Message, float]] = deque(maxlen=_MOST)
         transport.subscribe(f"{base}/{c.INCOMING}/#", self._take, qos=QoS.DELIVERED, direct=True)
@@ -109,8 +109,8 @@ class StandIn:
             while self._arrived:
                 self._receive(*self._arrived.popleft())
             now = time.monotonic()
-            if self.alive and now >= self._beats:
-                self._beats = now + _BEATS_S
+            if self.alive and now >= self._heartbeat_at:
+                self._heartbeat_at = now + _HEARTBEAT_S
                 self._publish(c.ONLINE, Heartbeat(t=_ms()))
             if self.control.key and not self.other and now >= self._ends:
                 self._pass_on("", "")
@@ -243,7 +243,7 @@ def _is_there(transport: Transport, base: str) -> bool:
             found.set()
 
     subscription = transport.subscribe(c.ONLINE.topic(base), take, direct=True)
-    is_there = found.wait(_HEARS_S)
+    is_there = found.wait(_PRESENT_S)
     subscription.close()
     return is_there
 

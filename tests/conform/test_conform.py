@@ -123,7 +123,7 @@ def with_stop_file(arguments: Command, folder: Path) -> Command:
     return [*arguments[:3], folder / "stop.json", *arguments[3:]]
 
 
-def judged(component: Component, *checks: Check) -> dict[str, tuple[State, str]]:
+def judged(component: Component, *checks: Check[Component]) -> dict[str, tuple[State, str]]:
     return {check.name: (outcome.state, outcome.text) for check, outcome in run(component, checks)}
 
 

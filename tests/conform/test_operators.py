@@ -65,7 +65,9 @@ VIOLATIONS: dict[str, tuple[str, str]] = {
 def driven(command: Command, target: Target) -> Iterator[StandIn]:
     """An operator's program, whose person does what is asked, and the robot that is played for it."""
     with played(target) as robot:
-        process = Child(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        process = Child(
+            [str(one) for one in command], stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
         person = process.stdin
         assert person is not None
 
