@@ -31,7 +31,7 @@ class Operator:
 
     @property
     def key(self):
-        """Of several owners all; the first one by name decides who drives."""
+        """It has the keys of all owners; the first owner by name decides who drives."""
         own = [(state.get("id") == self.id and state.get("key")) or "" for _, state in sorted(self.control.items())]
         return " ".join(filter(None, own)) if own and own[0] else ""
 

@@ -22,7 +22,7 @@ STOP, RESET, END = "press the emergency stop", "reset the emergency stop", "end 
 
 _LOOKS_S = 2.0  # at what it sends
 _SOON_S = 0.5  # within which a client acts on what it is told, a way to the broker and back included
-_TELLS_S = 2.5  # the longest silence of a robot on a wide link after which a client still drives
+_SILENT_S = 2.5  # the longest silence of a robot on a wide link after which a client still drives
 _GAP_S = 0.75  # wheels stop so long after the last command
 _SLOWEST_HZ, _FASTEST_HZ = 8.0, 25.0
 _CONFIRMS_S = 1.8  # for so long a stop is not confirmed
@@ -228,7 +228,7 @@ def zero(robot: StandIn) -> Outcome:
 
 def silence(robot: StandIn) -> Outcome:
     robot.alive = False
-    robot.look(_TELLS_S)
+    robot.look(_SILENT_S)
     moved = robot.moving(robot.look(1.0))
     _at_rest_again(robot)
     if moved:
