@@ -15,12 +15,13 @@ const CAPABILITIES = {
   estop: { available: true, owners: [OWNER] },
   named: NAMED,
 };
-const NOBODY = { id: "", by: "", device: "", key: "" };
+const NOBODY = { id: "", by: "", device: "", key: "" }, UNASKED = { asks: "", asks_id: "" };
 const now = () => performance.now(), clamp = (value, least, most) => Math.max(least, Math.min(most, value));
 const text = (value) => (typeof value === "string" ? value : "");
 const boot = randomBytes(4).toString("hex");
 let count = 0, refused = null, pausedAt = -Infinity;
 let holder = NOBODY, lease = { account: "", forMs: 0, ends: 0 }; // who drives, and until when
+let asker = UNASKED, asksUntil = 0; // who waits for control
 let until = 0, wheels = [0, 0], shown = ""; // when the wheels stop, and what they do
 let stop = { latched: fs.existsSync(STOP_FILE), recent: [], by: "", why: "", since: 0 };
 try {
@@ -90,24 +91,25 @@ function reset(command) {
   publishStop();
 }
 
-/** Who has control keeps it until it ends, is released or taken. */
+/** Who has control keeps it until it ends, is released or taken. Who asks meanwhile is shown. */
 function control({ id, want, for_ms = 3000, by = "", device = "" }, account, take) {
-  const mine = id === holder.id && account === lease.account;
-  if (want === "release") {
-    passOn(mine ? NOBODY : holder);
-  } else if (/^[0-9A-Fa-f]{8}$/.test(text(id)) && Number.isFinite(for_ms) && (take || mine || holder.key === "")) {
-    const forMs = clamp(for_ms, 1000, 10_000);
+  if (!/^[0-9A-Fa-f]{8}$/.test(text(id)) || !Number.isFinite(for_ms)) return;
+  const mine = id === holder.id && account === lease.account, forMs = clamp(for_ms, 1000, 10_000);
+  const [who, what] = [by, device].map((one) => text(one).replace(/[^a-z0-9_/-]/g, "_"));
+  const asks = [account, who].filter(Boolean).join("/").slice(0, 40);
+  if (want === "release") return passOn(mine ? NOBODY : holder);
+  if (take || mine || holder.key === "") {
     lease = { account, forMs, ends: now() + forMs };
-    const [who, what] = [by, device].map((one) => text(one).replace(/[^a-z0-9_/-]/g, "_"));
-    const asker = { id, by: [account, who].filter(Boolean).join("/").slice(0, 40), device: what.slice(0, 20) };
-    passOn(mine ? holder : { ...asker, key: randomBytes(4).toString("hex") });
+    return passOn(mine ? holder : { id, by: asks, device: what.slice(0, 20), key: randomBytes(4).toString("hex") });
   }
+  if (["", id].includes(asker.asks_id)) [asker, asksUntil] = [{ asks, asks_id: id }, now() + forMs];
+  passOn(holder);
 }
 
 function passOn(to) {
-  if (to !== holder) turn(0, 0, 0);
+  if (to !== holder) [asker] = [UNASKED, turn(0, 0, 0)];
   holder = to;
-  publish(`control/${OWNER}`, { ...holder, named: NAMED, boot });
+  publish(`control/${OWNER}`, { ...holder, ...asker, named: NAMED, boot });
 }
 
 function receive(topic, payload, packet) {
@@ -120,7 +122,7 @@ function receive(topic, payload, packet) {
     if (metric === "drive-values") drive(value, account);
     else if (account === "" && NAMED) return;
     else if (metric === "estop-reset") reset(value);
-    else control(value, account, metric === "control/take");
+    else if (/^control(\/take)?$/.test(metric)) control(value, account, metric === "control/take");
   } catch {} // what cannot be read changes nothing
 }
 
@@ -135,13 +137,13 @@ const client = new mqtt.MqttClient(dial, options);
 client.on("error", () => {}); // it tries again
 client.on("message", receive);
 client.on("connect", () => {
-  const metrics = ["estop", "estop-reset", "drive-values", "control", "control/take"];
-  client.subscribe(metrics.flatMap((one) => (NAMED ? [IN + one, `${IN}by/+/${one}`] : [IN + one])), { qos: 1 });
+  client.subscribe(IN + "#", { qos: 1 });
   publish("capabilities", { t: Date.now(), schema: "pebble-capabilities/v1", value: CAPABILITIES });
   publishStop(), passOn(holder), (shown = ""), turn(...wheels, until - now());
 });
 setInterval(() => {
   if (now() >= until) turn(0, 0, 0);
   if (holder.key !== "" && now() > lease.ends) passOn(NOBODY);
+  if (asker !== UNASKED && now() > asksUntil) passOn(holder, (asker = UNASKED));
 }, 20);
 setInterval(() => client.connected && publish("online", { t: Date.now() }, 0), 250);

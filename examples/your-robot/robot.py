@@ -15,7 +15,7 @@ CAPABILITIES = {
     "named": NAMED,
 }
 FREE = {"latched": False, "recent": [], "by": "", "why": "", "since": 0}
-NONE = {"id": "", "by": "", "device": "", "key": ""}
+NONE, UNASKED = {"id": "", "by": "", "device": "", "key": ""}, {"asks": "", "asks_id": ""}
 now, epoch_ms = time.monotonic, lambda: int(1000 * time.time())
 
 
@@ -23,6 +23,7 @@ class Robot:
     def __init__(self):
         self.boot, self.count, self.refused, self.paused_at = secrets.token_hex(4), 0, None, -math.inf
         self.holder, self.account, self.holds_s, self.ends = NONE, "", 0.0, 0.0  # who drives, and until when
+        self.asker, self.asks_until = UNASKED, 0.0  # who waits for control
         self.until, self.wheels, self.shown = 0.0, [0.0, 0.0], None  # when the wheels stop, and what they do
         there = os.path.exists(STOP_FILE)
         self.stop = FREE | {"latched": there, "why": "the saved state cannot be read" * there}
@@ -83,22 +84,32 @@ class Robot:
         self.publish_stop()
 
     def control(self, command, account, take):
-        """Who has control keeps it until it ends, is released or taken."""
-        mine = (command["id"], account) == (self.holder["id"], self.account)
+        """Who has control keeps it until it ends, is released or taken. Who asks meanwhile is shown."""
+        own_id = re.fullmatch("[0-9A-Fa-f]{8}", command["id"])[0]  # else this changes nothing
+        mine = (own_id, account) == (self.holder["id"], self.account)
         seconds = max(1.0, min(10.0, command.get("for_ms", 3000) / 1000))
+        by, device = (re.sub("[^a-z0-9_/-]", "_", str(command.get(one, ""))) for one in ("by", "device"))
+        new = {"id": own_id, "by": f"{account}/{by}".strip("/")[:40], "device": device[:20]}
         if command.get("want") == "release":
             self.pass_on(NONE if mine else self.holder)
-        elif re.fullmatch("[0-9A-Fa-f]{8}", command["id"]) and (take or mine or not self.holder["key"]):
+        elif take or mine or not self.holder["key"]:
             self.account, self.holds_s, self.ends = account, seconds, now() + seconds
-            by, device = (re.sub("[^a-z0-9_/-]", "_", str(command.get(one, ""))) for one in ("by", "device"))
-            asker = {"id": command["id"], "by": f"{account}/{by}".strip("/")[:40], "device": device[:20]}
-            self.pass_on(self.holder if mine else asker | {"key": secrets.token_hex(4)})
+            self.pass_on(self.holder if mine else new | {"key": secrets.token_hex(4)})
+        elif self.asker["asks_id"] in ("", new["id"]):
+            self.asker, self.asks_until = {"asks": new["by"], "asks_id": new["id"]}, now() + seconds
 
     def pass_on(self, to):
         if to is not self.holder:
-            self.holder = to
+            self.holder, self.asker = to, UNASKED
             self.turn(0.0, 0.0, 0.0)
-        self.publish(f"control/{OWNER}", self.holder | {"named": NAMED, "boot": self.boot})
+
+    def show(self):
+        """Publish what has changed; after a connection was made, all of it."""
+        control = self.holder | self.asker | {"named": NAMED, "boot": self.boot}
+        if self.shown != (self.wheels, control):
+            self.shown = self.wheels, control
+            self.publish("status", {"t": epoch_ms(), "value": {"wheels": self.wheels}})
+            self.publish(f"control/{OWNER}", control)
 
     def receive(self, _client, _data, message):
         account, metric = re.fullmatch("(?:by/([^/]*)/)?(.+)", message.topic.removeprefix(IN)).groups("")
@@ -111,14 +122,16 @@ class Robot:
             value = value["value"] if type(value.get("value")) is dict else value
             if metric == "drive-values":
                 self.drive(value, account)
-            elif account or not NAMED:
-                self.reset(value) if metric == "estop-reset" else self.control(value, account, metric == "control/take")
+            elif metric == "estop-reset" and (account or not NAMED):
+                self.reset(value)
+            elif metric in ("control", "control/take") and (account or not NAMED):
+                self.control(value, account, metric == "control/take")
 
     def connected(self, *_):
-        for metric in ("estop", "estop-reset", "drive-values", "control", "control/take"):
-            client.subscribe([(IN + metric, 1), *([(f"{IN}by/+/{metric}", 1)] if NAMED else [])])
+        client.subscribe(IN + "#", 1)
         self.publish("capabilities", {"t": epoch_ms(), "schema": "pebble-capabilities/v1", "value": CAPABILITIES})
-        self.publish_stop(), self.pass_on(self.holder)
+        self.shown = None
+        self.publish_stop()
 
     def publish(self, metric, value, qos=1):
         client.publish(OUT + metric, json.dumps(value), qos, retain=True)
@@ -139,11 +152,10 @@ while True:
             client.reconnect()
     if now() >= robot.until:
         robot.turn(0.0, 0.0, 0.0)
-    if robot.wheels != robot.shown:
-        robot.shown = robot.wheels
-        robot.publish("status", {"t": epoch_ms(), "value": {"wheels": robot.wheels}})
     if robot.holder["key"] and now() > robot.ends:
         robot.pass_on(NONE)
+    robot.asker = robot.asker if now() <= robot.asks_until else UNASKED
+    robot.show()
     if now() >= heartbeat_at:
         heartbeat_at = now() + 0.25
         robot.publish("online", {"t": epoch_ms()}, qos=0)

@@ -1,8 +1,9 @@
-"""``pebble conform``: judges a robot, of any maker, by the contract."""
+"""``pebble conform``: judges a robot, or a client that drives, of any maker, by the contract."""
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -15,7 +16,11 @@ from pebble.commands.selftest import INDENT, ended, is_clear, printed, row
 from pebble.errors import PebbleError
 from pebble.runtime.signals import interrupted_by_signals
 
+if TYPE_CHECKING:
+    from pebble.conform.checks import Check, J
+
 _LOOKS_S = 4.0  # heartbeats of one a second need so long
+_STARTS_S = 10.0  # until a person has started a client
 
 
 @with_target(program="conform")
@@ -28,6 +33,7 @@ def conform(
         bool,
         typer.Option("--cut", help="Ask to cut its power, and to switch it on again; with --broker: to restart it."),
     ] = False,
+    operator: Annotated[bool, typer.Option("--operator", help="Judge a client that drives: ROBOT is played.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead.")] = False,
     broker: BrokerOption = None,
     *,
@@ -35,13 +41,15 @@ def conform(
 ) -> int:
     """Judge a robot, in any language, by the contract: only by what it publishes and how it answers.
 
-    Without --may-move no wheel turns; the robot is stopped and freed several times. Exits 1 if a check fails; each is
-    printed with why it matters and what to change. With --broker a broker is judged: which promises of a transport it
-    keeps, and what a robot lacks where it does not; with ROBOT, too, on topics of that robot.
+    Without --may-move no wheel turns; the robot is stopped and freed several times. With --operator pebble plays the
+    robot, asks a person to use the client that drives it, and judges what that publishes. With --broker a broker is
+    judged: which promises of a transport it keeps, and what a robot lacks where it does not; with ROBOT, too, on topics
+    of that robot. Exits 1 if a check fails; each is printed with why it matters and what to change.
 
     \b
         pebble conform rover --url mqtt://broker.example
         pebble conform rover --url mqtt://broker.example --may-move --cut
+        pebble conform played --operator --url mqtt://broker.example
         pebble conform --broker mqtt://broker.example
     """
     if broker is not None:
@@ -50,23 +58,50 @@ def conform(
         return conform_of(settings, below, restart=cut, as_json=as_json)
     if robot is None:
         raise PebbleError("which robot is missing: use either ROBOT or --broker URL")
-    from pebble.conform.checks import CHECKS, run
+    options = target_of(robot, target)
+    if operator and (may_move or cut):
+        raise PebbleError("--operator judges no robot: leave out --may-move and --cut")
+    with interrupted_by_signals():
+        if operator:
+            return _of_operator(options, as_json=as_json)
+        if may_move and not is_clear(robot, "ahead for half a second, several times, and turn once"):
+            typer.echo("nothing was tested", err=True)
+            return 1
+        return _of_robot(options, may_move=may_move, cut=cut, as_json=as_json)
+
+
+def _of_robot(options: Target, *, may_move: bool, cut: bool, as_json: bool) -> int:
+    from pebble.conform.checks import CHECKS
     from pebble.conform.component import reached
     from pebble.conform.motion import MOVING
     from pebble.conform.power import CUT
 
-    options = target_of(robot, target)
-    found: list[dict[str, str]] = []
-    if may_move and not is_clear(robot, "ahead for half a second, several times, and turn once"):
-        typer.echo("nothing was tested", err=True)
-        return 1
-    with interrupted_by_signals(), reached(options, _LOOKS_S) as component:
+    with reached(options, _LOOKS_S) as component:
         if not component.records:
             raise PebbleError(f"nothing came from {component.base} within {_LOOKS_S:g} s: is it on, at this broker?")
-        for check, outcome in run(component, (*CHECKS, *(MOVING if may_move else ()), *(CUT if cut else ()))):
-            found.append({**row(check.name, outcome), "why": check.why})
-            if not as_json:
-                printed(found[-1])
-                if outcome.state is State.FAILED:
-                    typer.echo(f"{INDENT}why: {check.why}")
-    return ended(found, as_json=as_json, robot=component.base)
+        checks = (*CHECKS, *(MOVING if may_move else ()), *(CUT if cut else ()))
+        return ended(_judged(component, checks, as_json=as_json), as_json=as_json, robot=component.base)
+
+
+def _of_operator(options: Target, *, as_json: bool) -> int:
+    from pebble.conform.operators import OPERATOR
+    from pebble.conform.stand_in import played
+
+    with played(options) as robot:
+        robot.ask(f"{robot.base} is played here: start the client, let it drive this robot, and leave it alone")
+        robot.look(_STARTS_S)
+        return ended(_judged(robot, OPERATOR, as_json=as_json), as_json=as_json, played=robot.base)
+
+
+def _judged(judged: J, checks: Iterable[Check[J]], *, as_json: bool) -> list[dict[str, str]]:
+    """Make the checks; print each, unless all are printed at the end."""
+    from pebble.conform.checks import run
+
+    found: list[dict[str, str]] = []
+    for check, outcome in run(judged, checks):
+        found.append({**row(check.name, outcome), "why": check.why})
+        if not as_json:
+            printed(found[-1])
+            if outcome.state is State.FAILED:
+                typer.echo(f"{INDENT}why: {check.why}")
+    return found

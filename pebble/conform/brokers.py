@@ -8,7 +8,7 @@ from typing import Final
 from pebble.check_result import CheckResult, State
 from pebble.doctor.broker.peer import Bench
 from pebble.doctor.broker.probes import PROBES, RIGHTS, Probe, run
-from pebble.selftest import Outcome, failed, ok, skipped
+from pebble.selftest import failed, ok, skipped
 
 PROMISES: Final = {
     "T1": "filters follow MQTT",
@@ -35,7 +35,7 @@ PROMISES: Final = {
 }
 
 
-def judge(bench: Bench) -> Iterator[tuple[str, Outcome, str]]:
+def judge(bench: Bench) -> Iterator[tuple[str, CheckResult, str]]:
     """Each promise, what came of it, and what that costs a robot; those that a broker does not decide come last."""
     left = {promise: [one for one in PROBES if promise in one.promises] for promise in PROMISES}
     found: dict[str, list[tuple[Probe, CheckResult]]] = {promise: [] for promise in PROMISES}
@@ -56,7 +56,7 @@ def judge(bench: Bench) -> Iterator[tuple[str, Outcome, str]]:
             yield promise, skipped("this account has no rights"), ""
 
 
-def _outcome(found: list[tuple[Probe, CheckResult]]) -> tuple[Outcome, str]:
+def _outcome(found: list[tuple[Probe, CheckResult]]) -> tuple[CheckResult, str]:
     lacks = [(probe, one) for probe, one in found if one.state in (State.WARN, State.FAILED)]
     if lacks:
         text = "; ".join(f"{one.what}: {one.text}" for _, one in lacks)

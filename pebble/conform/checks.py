@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Literal
+from typing import Generic, Literal, Protocol, TypeVar
 
 import msgspec
 
@@ -34,14 +34,24 @@ _BY, _WHY = "conform", "conformance test"
 JUNK = (b"", b"{", b"[]", b"null", b'"x"', b"\xff\xfe\x00", b"[" * 2000, b'{"x": ' + b"9" * 400 + b"}", b"x" * 70_000)
 
 
+class Judged(Protocol):
+    """What is judged: a robot, or a client that drives one."""
+
+    def wait(self, condition: Callable[[], object], seconds: float) -> bool:
+        """Let time pass until ``condition``, and take what arrives; False: not within ``seconds``."""
+
+
+J = TypeVar("J", bound=Judged)
+
+
 @dataclass(frozen=True)
-class Check:
+class Check(Generic[J]):
     """``why`` tells what goes wrong where it fails."""
 
     name: str
     why: str
-    run: Callable[[Component], CheckResult]
-    needs: tuple[Callable[[Component], str], ...] = ()
+    run: Callable[[J], CheckResult]
+    needs: tuple[Callable[[J], str], ...] = ()
 
 
 # -- what a check needs: empty, or why it is lacking
@@ -67,6 +77,12 @@ def commanded(component: Component) -> str:
     """At level named a robot hears only accounts."""
     named = component.view.named and not component.account
     return "it takes commands only with a name: use an account, as in --url mqtts://ANN@BROKER" if named else ""
+
+
+def readable(component: Component) -> str:
+    if why := commanded(component):
+        return why
+    return "" if component.reads_commands() else "its broker does not let this account read incoming/: use an admin's"
 
 
 # -- signs of life
@@ -107,7 +123,7 @@ def clock(component: Component) -> CheckResult:
 def payloads(component: Component) -> CheckResult:
     wrong = {one.metric: one.wrong for one in component.records if one.wrong}
     if wrong:
-        return failed(_some(wrong.values()), "docs/topics.md has each payload")
+        return failed(some_of(wrong.values()), "docs/topics.md has each payload")
     return ok(f"{len({one.metric for one in component.records if one.channel})} kinds of messages")
 
 
@@ -122,7 +138,7 @@ def numbers(component: Component) -> CheckResult:
     is_json = [one for one in component.records if one.channel and one.channel.payload is not bytes and one.payload]
     if found := {one.metric for one in is_json if strange(one)}:
         return failed(
-            f"not JSON: {_some(sorted(found))}", "NaN, Infinity and comments are no JSON: leave the field out"
+            f"not JSON: {some_of(sorted(found))}", "NaN, Infinity and comments are no JSON: leave the field out"
         )
     return ok("all JSON is JSON")
 
@@ -136,7 +152,7 @@ def sizes(component: Component) -> CheckResult:
         for one in component.records
         if (one.channel is None or one.channel.payload is not bytes) and len(one.payload) > limit(one)
     }
-    return failed(_some(sorted(large)), "send less: readers drop it") if large else ok("no message is too large")
+    return failed(some_of(sorted(large)), "send less: readers drop it") if large else ok("no message is too large")
 
 
 def retained(component: Component) -> CheckResult:
@@ -145,10 +161,10 @@ def retained(component: Component) -> CheckResult:
     must = {metric for metric, channel in live.items() if channel.default_retain and channel not in _REPEATED}
     lacks = sorted(must - there)
     if lacks:
-        return failed(f"not retained: {_some(lacks)}", "publish it with the retain flag: who connects later lacks it")
+        return failed(f"not retained: {some_of(lacks)}", "publish it with the retain flag: who connects later lacks it")
     stale = sorted(metric for metric in there & set(live) if not live[metric].default_retain)
     if stale:
-        return failed(f"retained: {_some(stale)}", "publish it without the retain flag: it is news only once")
+        return failed(f"retained: {some_of(stale)}", "publish it without the retain flag: it is news only once")
     return ok(f"{len(there)} states")
 
 
@@ -156,7 +172,7 @@ def stale_commands(component: Component) -> CheckResult:
     found = sorted(one.metric for one in component.retained() if one.channel is not None and one.channel.one_shot)
     if found:
         topic = f"{component.base}/{found[0]}"
-        return failed(_some(found), f"remove it: mosquitto_pub -r -n -t '{topic}'; and find who publishes it so")
+        return failed(some_of(found), f"remove it: mosquitto_pub -r -n -t '{topic}'; and find who publishes it so")
     return ok("none")
 
 
@@ -171,7 +187,7 @@ def capabilities(component: Component) -> CheckResult:
         msgspec.convert(found[-1].value.value, CapabilitiesValue)
     except (msgspec.ValidationError, ValueError, AttributeError) as error:
         return failed(str(found[-1].wrong or error), "docs/topics.md, CapabilitiesValue, has each field")
-    return ok(_some(_offers(component), 20) or "nothing is offered")
+    return ok(some_of(_offers(component), 20) or "nothing is offered")
 
 
 def _offers(component: Component) -> list[str]:
@@ -186,7 +202,7 @@ def own_topics(component: Component) -> CheckResult:
         if not topic.startswith(f"{component.base}/") or parse_topic(topic) is None
     )
     if foreign:
-        return failed(_some(foreign), f"topics in capabilities begin with {component.base}/: others are not used")
+        return failed(some_of(foreign), f"topics in capabilities begin with {component.base}/: others are not used")
     return ok("all are its own")
 
 
@@ -239,7 +255,7 @@ def _states(component: Component) -> dict[str, EstopState]:
 def owners(component: Component) -> CheckResult:
     lacks = [topic.removeprefix(f"{component.base}/") for topic in component.view.estop.missing]
     if lacks:
-        return failed(f"no state of {_some(lacks)}", "publish it, retained, for each owner that capabilities list")
+        return failed(f"no state of {some_of(lacks)}", "publish it, retained, for each owner that capabilities list")
     return ok(", ".join(sorted(_states(component))))
 
 
@@ -292,7 +308,7 @@ def _repeated(component: Component, name: str) -> CheckResult:
     component.look(ANSWER_S / 2)
     counted = [owner for owner, one in _states(component).items() if one.count != before.get(owner)]
     if counted:
-        return failed(f"its repetition counts again ({_some(counted)})", "a name in recent is the same stop")
+        return failed(f"its repetition counts again ({some_of(counted)})", "a name in recent is the same stop")
     return ok("the same stop counts once")
 
 
@@ -373,6 +389,17 @@ def _first_keeps(component: Component, driver: Driver) -> CheckResult:
     return ok("the first one keeps it")
 
 
+def _shows_asker(component: Component, driver: Driver) -> CheckResult:
+    driver.asks(for_ms=3000)
+    second = Driver(component)
+    second.asks()
+    shown = component.wait(lambda: component.of(c.CONTROL_STATE)[-1].value.asks_id == second.id, ANSWER_S)
+    second.asks("release")
+    if not shown:
+        return failed("a second request is not shown", "publish its by and id as asks and asks_id while it is repeated")
+    return ok("the one who waits is shown")
+
+
 def _released(component: Component, driver: Driver) -> CheckResult:
     driver.asks(for_ms=5000)
     driver.asks("release")
@@ -387,7 +414,7 @@ def _ends(component: Component, driver: Driver) -> CheckResult:
     return ok("it ends by itself")
 
 
-def _some(names: Iterable[object], most: int = _SHOWN) -> str:
+def some_of(names: Iterable[object], most: int = _SHOWN) -> str:
     found = [str(one) for one in names]
     more = f" and {len(found) - most} more" if len(found) > most else ""
     return ", ".join(found[:most]) + more
@@ -397,14 +424,16 @@ _LIVE = (drives, free, commanded)
 _STOP = (stops, free, commanded)
 _CONTROL = (controls, free, commanded)
 
-CHECKS = (
+CHECKS: tuple[Check[Component], ...] = (
     Check("heartbeat", "without it the robot is shown as offline, and not driven", heartbeat),
     Check("clock", "people are shown how old messages are", clock),
     Check("payloads", "what does not fit the contract is not read", payloads),
     Check("numbers", "NaN is no JSON, and no speed", numbers),
     Check("sizes", "boards and pages have little room", sizes),
     Check("retained", "who connects later must know its state, and must not take old news for new", retained),
-    Check("parked commands", "a command that a broker keeps is carried out at every start", stale_commands),
+    Check(
+        "parked commands", "a command that a broker keeps is carried out at every start", stale_commands, (readable,)
+    ),
     Check("capabilities", "pages offer what they list, and no more", capabilities),
     Check("own topics", "topics of others are not used", own_topics),
     Check("identity", "it is known by its topics", identity),
@@ -416,17 +445,18 @@ CHECKS = (
     Check("stop holds", "only a person ends it", _while_stopped(_driven), _STOP),
     Check("reset refused", "a reset must end only the stop that its sender saw", _while_stopped(_wrong_reset), _STOP),
     Check("control", "one person drives at a time", _with_control(_first_keeps), _CONTROL),
+    Check("control asked", "who drives must see who waits", _with_control(_shows_asker), _CONTROL),
     Check("control released", "the next one must not wait", _with_control(_released), _CONTROL),
     Check("control ends", "who goes away must not keep it", _with_control(_ends), _CONTROL),
 )
 
 
-def run(component: Component, checks: Iterable[Check]) -> Iterator[tuple[Check, CheckResult]]:
+def run(judged: J, checks: Iterable[Check[J]]) -> Iterator[tuple[Check[J], CheckResult]]:
     """Make one check after the other."""
     for check in checks:
-        component.wait(lambda: True, 0.0)
-        why = next((why for need in check.needs if (why := need(component))), "")
+        judged.wait(lambda: True, 0.0)
+        why = next((why for need in check.needs if (why := need(judged))), "")
         try:
-            yield check, skipped(why) if why else check.run(component)
+            yield check, skipped(why) if why else check.run(judged)
         except PebbleError as error:  # the connection was lost
             yield check, failed(str(error), "run it again")

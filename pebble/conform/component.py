@@ -1,5 +1,6 @@
 """One component as any client at its broker sees it: everything it publishes, and what is sent to it."""
 
+import secrets
 import sys
 import time
 from collections import deque
@@ -13,6 +14,7 @@ from pebble.client.connection import Target, connected, put_names
 from pebble.client.names import Names
 from pebble.client.robot_view import RobotView
 from pebble.contract import channel_of, codec
+from pebble.contract.payloads import ControlRequest
 from pebble.errors import PayloadError
 from pebble.transports import Message, QoS, Transport
 
@@ -39,7 +41,7 @@ class Component:
 
     def __init__(self, target: Target, transport: Transport, names: Names, base: str) -> None:
         self.base = base
-        self.ask = _ask  # tells the person at the robot what to do
+        self.ask = ask_person  # tells the person at the robot what to do
         self.person_s = 180.0  # until that is done, and a broker has noticed it: 1.5 times a keep-alive of a minute
         self.records: deque[Record] = deque(maxlen=_MOST)
         self.view = RobotView(base)
@@ -92,6 +94,15 @@ class Component:
             beside.publish(channel.topic(self.base), payload, qos=QoS.DELIVERED, retain=True, remember=False)
             self.wait(lambda: beside.outgoing.waiting == 0, _RETAINED_S)
 
+    def reads_commands(self) -> bool:
+        """Whether this client may read what is sent to the robot: a request that changes nothing comes back."""
+        request = ControlRequest(id=secrets.token_hex(4), want="release")
+        found: deque[Message] = deque(maxlen=_MOST)
+        with connected(replace(self._target, program="conform-commands")) as (beside, _):
+            beside.subscribe(f"{self.base}/{c.INCOMING}/#", found.append, qos=QoS.DELIVERED, direct=True)
+            self.send(c.CONTROL, request)
+            return self.wait(lambda: any(request.id.encode() in one.payload for one in list(found)), _RETAINED_S)
+
     def retained(self) -> list[Record]:
         """What the broker has retained of it and for it, as one gets it who connects now."""
         found: deque[Message] = deque(maxlen=_MOST)
@@ -101,7 +112,7 @@ class Component:
         return [record_of(one, self.base, 0.0) for one in list(found) if one.retain and one.payload]
 
 
-def _ask(text: str) -> None:
+def ask_person(text: str) -> None:
     print(f"pebble: {text}", file=sys.stderr, flush=True)  # noqa: T201 - standard output is for the result
 
 

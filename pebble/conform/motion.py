@@ -174,7 +174,7 @@ def _foreign(component: Component) -> str:
 
 _MOVES = (drives, free, commanded)
 
-MOVING = (
+MOVING: tuple[Check[Component], ...] = (
     Check("dead man", "a driver may vanish at any moment", dead_man, _MOVES),
     Check("validity", "a command tells how long it counts", valid_ms, _MOVES),
     Check("zero", "who lets go expects it to stop at once", zero, _MOVES),

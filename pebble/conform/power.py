@@ -85,7 +85,7 @@ def survives(component: Component) -> CheckResult:
     return outcome if saved else skipped("its state does not claim that it is saved")
 
 
-CUT = (
+CUT: tuple[Check[Component], ...] = (
     Check("will", "a robot that is gone must not look as if it were there", will),
     Check("retained commands", "a parked command must move nothing when it starts", retained_commands, (drives,)),
     Check(

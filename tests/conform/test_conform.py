@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -18,19 +16,15 @@ from pebble.conform.checks import CHECKS, Check, run
 from pebble.conform.component import Component, reached
 from pebble.conform.motion import MOVING
 from pebble.conform.power import CUT
-from pebble.fleet.certificates import CA_CERT
 from pebble.fleet.roles import Account
-from tests.fleet.brokers import HOST, FleetBroker
+from tests.conform.programs import LANGUAGES, Command, Language, at_named, at_open, source
+from tests.fleet.brokers import FleetBroker
 from tests.fleet.conftest import cheap_hashes as cheap_hashes
-from tests.support import ROOT, Broker, Child, further, some
+from tests.support import Broker, Child, further, some
 
 pytestmark = pytest.mark.alone  # deadlines of wheels are checked
 
-Command = list[str | Path]
-Language = Callable[[Path], Command]  # makes its robot in a folder, and returns how it is started
-
-ROBOTS = ROOT / "examples" / "your-robot"
-SOURCE = (ROBOTS / "robot.py").read_text()
+SOURCE = source("robot", "py").read_text()
 ALL = {check.name: check for check in (*CHECKS, *MOVING, *CUT)}
 LOOKS_S = 2.0
 
@@ -39,7 +33,7 @@ VIOLATIONS: dict[str, tuple[str, str]] = {
     "heartbeat": ("heartbeat_at = now() + 0.25", "heartbeat_at = now() + 5"),
     "clock": ("int(1000 * time.time())", "int(1000 * time.time()) + 3_600_000"),
     "payloads": ('{"t": epoch_ms()}, qos=0', '{"t": str(time.time())}, qos=0'),
-    "numbers": ('{"wheels": robot.wheels}', '{"wheels": robot.wheels, "amperes": math.nan}'),
+    "numbers": ('{"wheels": self.wheels}', '{"wheels": self.wheels, "amperes": math.nan}'),
     "sizes": ('"the saved state cannot be read" * there', '400 * "x"'),
     "retained": ("qos, retain=True", "qos, retain=False"),
     "parked commands": (
@@ -62,7 +56,8 @@ VIOLATIONS: dict[str, tuple[str, str]] = {
         "        if not x and not z:\n            self.stop = FREE\n            self.publish_stop()\n",
     ),
     "reset refused": ("if self.refused is None and", "if"),
-    "control": ('(take or mine or not self.holder["key"])', "True"),
+    "control": ('elif take or mine or not self.holder["key"]:', "elif True:"),
+    "control asked": ('{"asks": new["by"], "asks_id": new["id"]}', "UNASKED"),
     "control released": ("NONE if mine else self.holder", "self.holder"),
     "control ends": ("now() > robot.ends:", "False:"),
     "dead man": ('DEAD_MAN_S, PAUSE_S, LONGEST = "motors", 0.75', 'DEAD_MAN_S, PAUSE_S, LONGEST = "motors", 3.0'),
@@ -124,22 +119,11 @@ def switched_on(command: Sequence[str | Path], target: Target) -> Iterator[Compo
         machine.off()
 
 
-def at_open(broker: Broker, folder: Path) -> tuple[Command, Target]:
-    """What a robot's program is started with, and how others reach it."""
-    target = Target(url=f"mqtt://127.0.0.1:{broker.port}", robot="mine")
-    return ["mine", "127.0.0.1", str(broker.port), folder / "stop.json"], target
+def with_stop_file(arguments: Command, folder: Path) -> Command:
+    return [*arguments[:3], folder / "stop.json", *arguments[3:]]
 
 
-def at_named(broker: FleetBroker, folder: Path) -> tuple[Command, Target]:
-    for name in ("mine", "ann"):
-        (folder / name).write_text(broker.passwords[name])
-        (folder / name).chmod(0o600)
-    url, ca = f"mqtts://ann@{HOST}:{broker.port}", broker.folder / CA_CERT
-    target = Target(url=url, robot="mine", password_file=folder / "ann", ca_cert=ca)
-    return ["mine", HOST, str(broker.port), folder / "stop.json", "mine", folder / "mine", ca], target
-
-
-def judged(component: Component, *checks: Check) -> dict[str, tuple[State, str]]:
+def judged(component: Component, *checks: Check[Component]) -> dict[str, tuple[State, str]]:
     return {check.name: (outcome.state, outcome.text) for check, outcome in run(component, checks)}
 
 
@@ -147,46 +131,11 @@ def lacking(found: dict[str, tuple[State, str]]) -> dict[str, tuple[State, str]]
     return {name: one for name, one in found.items() if one[0] is not State.OK}
 
 
-def in_python(_folder: Path) -> Command:
-    return [sys.executable, ROBOTS / "robot.py"]
-
-
-def in_javascript(folder: Path) -> Command:
-    """npm's bundle is for browsers: it takes the place of the package, which has twenty others below it."""
-    bundle = ROOT / ".venv" / "mqtt" / "dist" / "mqtt.esm.js"
-    if shutil.which("node") is None or not bundle.exists():
-        missing("needs Node.js (apt install nodejs) and MQTT.js (python tools/fetch_npm.py .venv mqtt)")
-    package = folder / "node_modules" / "mqtt"
-    package.mkdir(parents=True)
-    (package / "package.json").write_text('{"exports": "./index.mjs"}')
-    (package / "index.mjs").write_text(
-        f'globalThis.navigator ??= {{}};\nexport default (await import("{bundle}")).default;\n'
-    )
-    return ["node", shutil.copy(ROBOTS / "robot.mjs", folder)]
-
-
-def in_c(folder: Path) -> Command:
-    headers = (Path("/usr/include/mosquitto.h"), Path("/usr/include/cjson/cJSON.h"))
-    if shutil.which("gcc") is None or not all(one.exists() for one in headers):
-        missing("needs a compiler and libraries (apt install gcc libc6-dev libmosquitto-dev libcjson-dev)")
-    warnings = ("-Wall", "-Wextra", "-Werror", "-O2")
-    libraries = ("-lmosquitto", "-lcjson", "-lm")
-    subprocess.run(["gcc", *warnings, "-o", folder / "robot", ROBOTS / "robot.c", *libraries], check=True)
-    return [folder / "robot"]
-
-
-def missing(what: str) -> None:
-    (pytest.fail if os.environ.get("CI") == "true" else pytest.skip)(what)
-
-
-LANGUAGES = (in_python, in_javascript, in_c)
-
-
 @pytest.mark.parametrize("language", [LANGUAGES[0], *map(further, LANGUAGES[1:])])
 def test_the_smallest_honest_robot_passes(broker: Broker, tmp_path: Path, language: Language) -> None:
-    program = language(tmp_path)
-    arguments, target = at_open(broker, tmp_path)
-    with switched_on([*program, *arguments], target) as component:
+    program = language("robot", tmp_path)
+    arguments, target = at_open(broker)
+    with switched_on([*program, *with_stop_file(arguments, tmp_path)], target) as component:
         found = judged(component, *ALL.values())
     assert lacking(found) == {}
     assert len(found) >= 20
@@ -195,14 +144,14 @@ def test_the_smallest_honest_robot_passes(broker: Broker, tmp_path: Path, langua
 @pytest.mark.usefixtures("cheap_hashes")
 @pytest.mark.parametrize("language", [LANGUAGES[0], *map(further, LANGUAGES[1:])])
 def test_it_passes_where_names_are_checked(tmp_path: Path, language: Language) -> None:
-    program = language(tmp_path)
+    program = language("robot", tmp_path)
     people = {
         "mine": Account(roles=("robot",), bases=("pebble/robots/mine",)),
         "ann": Account(roles=("driver", "safety")),
     }
     with FleetBroker(tmp_path / "hall", people, level="named") as broker:
-        arguments, target = at_named(broker, tmp_path)
-        with switched_on([*program, *arguments], target) as component:
+        arguments, target = at_named(broker, tmp_path, "mine", "ann")
+        with switched_on([*program, *with_stop_file(arguments, tmp_path)], target) as component:
             found = judged(component, *ALL.values())
     assert lacking(found) == {}
 
@@ -213,7 +162,7 @@ def test_a_violation_is_found(broker: Broker, tmp_path: Path, name: str) -> None
     assert old in SOURCE
     program = tmp_path / "robot.py"
     program.write_text(SOURCE.replace(old, new))
-    arguments, target = at_open(broker, tmp_path)
+    arguments, target = at_open(broker)
     needs = [ALL["will"]] if name == "retained commands" else []
-    with switched_on([sys.executable, program, *arguments], target) as component:
+    with switched_on([sys.executable, program, *with_stop_file(arguments, tmp_path)], target) as component:
         assert judged(component, *needs, ALL[name])[name][0] is State.FAILED

@@ -11,8 +11,10 @@ from typing import Any
 
 import pytest
 
-from pebble.contract import CHANNELS
+from pebble.contract import CHANNELS, asyncapi
 from pebble.contract.asyncapi import document
+from pebble.contract.docs import ASYNCAPI
+from pebble.contract.schemas import schemas
 from tests.support import ROOT
 
 BUNDLE = ROOT / ".venv" / "asyncapi" / "browser" / "index.js"
@@ -53,3 +55,14 @@ def test_its_own_parser_takes_it_and_finds_every_channel(tmp_path: Path) -> None
 def test_a_struct_that_was_renamed_is_found(tmp_path: Path) -> None:
     found = parsed(document().replace("    Drive:\n", "    Motion:\n"), tmp_path)
     assert any("Drive" in error for error in found["errors"])
+
+
+def test_a_field_that_was_renamed_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The file in docs/ is not that of a contract in which one field has another name."""
+    text = json.dumps(schemas())
+    assert '"reset_refused"' in text
+    monkeypatch.setattr(asyncapi, "schemas", lambda: json.loads(text.replace('"reset_refused"', '"reset_denied"')))
+    file = ROOT / "docs" / ASYNCAPI
+    assert asyncapi.document() != file.read_text()
+    monkeypatch.undo()
+    assert asyncapi.document() == file.read_text()

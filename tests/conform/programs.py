@@ -1,0 +1,76 @@
+"""The sample programs of docs/your-robot.md in each language: how they are made, and how they are started."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from pebble.client.connection import Target
+from pebble.fleet.certificates import CA_CERT
+from tests.fleet.brokers import HOST, FleetBroker
+from tests.support import ROOT, Broker
+
+Command = list[str | Path]
+Language = Callable[[str, Path], Command]  # makes its "robot" or "operator" in a folder
+
+EXAMPLES = ROOT / "examples"
+
+
+def source(program: str, ending: str) -> Path:
+    return EXAMPLES / f"your-{program}" / f"{program}.{ending}"
+
+
+def in_python(program: str, _folder: Path) -> Command:
+    return [sys.executable, source(program, "py")]
+
+
+def in_javascript(program: str, folder: Path) -> Command:
+    """npm's bundle is for browsers: it takes the place of the package, which has twenty others below it."""
+    bundle = ROOT / ".venv" / "mqtt" / "dist" / "mqtt.esm.js"
+    if shutil.which("node") is None or not bundle.exists():
+        missing("needs Node.js (apt install nodejs) and MQTT.js (python tools/fetch_npm.py .venv mqtt)")
+    package = folder / "node_modules" / "mqtt"
+    package.mkdir(parents=True, exist_ok=True)
+    (package / "package.json").write_text('{"exports": "./index.mjs"}')
+    (package / "index.mjs").write_text(
+        f'globalThis.navigator ??= {{}};\nexport default (await import("{bundle}")).default;\n'
+    )
+    return ["node", shutil.copy(source(program, "mjs"), folder)]
+
+
+def in_c(program: str, folder: Path) -> Command:
+    headers = (Path("/usr/include/mosquitto.h"), Path("/usr/include/cjson/cJSON.h"))
+    if shutil.which("gcc") is None or not all(one.exists() for one in headers):
+        missing("needs a compiler and libraries (apt install gcc libc6-dev libmosquitto-dev libcjson-dev)")
+    warnings = ("-Wall", "-Wextra", "-Werror", "-O2")
+    libraries = ("-lmosquitto", "-lcjson", "-lm")
+    subprocess.run(["gcc", *warnings, "-o", folder / program, source(program, "c"), *libraries], check=True)
+    return [folder / program]
+
+
+def missing(what: str) -> None:
+    (pytest.fail if os.environ.get("CI") == "true" else pytest.skip)(what)
+
+
+LANGUAGES = (in_python, in_javascript, in_c)
+
+
+def at_open(broker: Broker) -> tuple[Command, Target]:
+    """What a program is started with, and how others reach its robot."""
+    return ["mine", "127.0.0.1", str(broker.port)], Target(url=f"mqtt://127.0.0.1:{broker.port}", robot="mine")
+
+
+def at_named(broker: FleetBroker, folder: Path, program: str, other: str) -> tuple[Command, Target]:
+    """The same for accounts: that of the program, and that of the other side."""
+    for name in (program, other):
+        (folder / name).write_text(broker.passwords[name])
+        (folder / name).chmod(0o600)
+    url, ca = f"mqtts://{other}@{HOST}:{broker.port}", broker.folder / CA_CERT
+    target = Target(url=url, robot="mine", password_file=folder / other, ca_cert=ca)
+    return ["mine", HOST, str(broker.port), program, folder / program, ca], target

@@ -1,0 +1,156 @@
+"""The checker finds every planted violation of the smallest honest operator, and passes it as it is."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from pebble.check_result import State
+from pebble.client.connection import Target
+from pebble.conform import operators
+from pebble.conform.checks import run
+from pebble.conform.operators import OPERATOR
+from pebble.conform.stand_in import StandIn, played
+from pebble.errors import PebbleError
+from pebble.fleet.roles import Account
+from tests.conform.programs import Command, at_named, at_open, in_python, source
+from tests.fleet.brokers import FleetBroker
+from tests.fleet.conftest import cheap_hashes as cheap_hashes
+from tests.support import Broker, Child, some
+
+pytestmark = pytest.mark.alone  # rates and deadlines are checked
+
+SOURCE = source("operator", "py").read_text()
+ALL = {check.name: check for check in OPERATOR}
+#: What a person types who is asked to do something; its end is the end of the program.
+LINES = {
+    operators.DRIVE: "0 0.5\n",
+    operators.FULL: "9 -9\n",
+    operators.LET_GO: "0 0\n",
+    operators.STOP: "stop\n",
+    operators.RESET: "reset\n",
+}
+
+#: By check: what is written into the operator's program, and in place of what.
+VIOLATIONS: dict[str, tuple[str, str]] = {
+    "idle": ("    operator.drive()\n", '    operator.drive()\n    operator.send("drive-values", {"x": 0, "z": 0})\n'),
+    "control": ("or (self.controlled and not self.key) or now() < self.drives_at", "or now() < self.drives_at"),
+    "requests": ('value = {"id": self.id', 'value = {"id": secrets.token_hex(4)'),
+    "rate": ("max(2.0, min(20.0, self.link", "max(2.0, min(50.0, 5 * self.link"),
+    "stamps": ('"t": ms()} if self.key else {})', '"t": ms() // 1000} if self.key else {})'),
+    "thin link": ('self.link["drive_hz"]))', "20.0))"),
+    "clamps": ("(max(-1.0, min(1.0, x)), max(-1.0, min(1.0, z)))", "(x, z)"),
+    "zero": ('            self.send("drive-values", {"x": 0, "z": 0}', '            ({"x": 0, "z": 0}'),
+    "silence": ('SILENT_S.get(self.link["level"], 1.5)', "60"),
+    "offline": ('value.get("online") is False', "False"),
+    "taken": ("self.moves and self.controlled and not self.key", "False"),
+    "refused": ('self.request("hold")', 'self.send("control/take", {"id": self.id})'),
+    "stop": ("self.pressed = stop, now() + REPEATS_S, end", "self.pressed = None"),
+    "stopped": ('if any(state.get("latched") is not False', "if any(False"),
+    "reset": ('"count": state.get("count")', '"count": 0'),
+    "payloads": ('self.send("control", value if', 'self.send("control", {"id": self.id, "want": "drive"} if'),
+    "numbers": ('command = {"x": self.stick[0],', 'command = {"x": math.nan,'),
+    "release": ('operator.request("release")\nclient', "client"),
+    "retained": ("json.dumps(value), qos)", "json.dumps(value), qos, True)"),
+}
+
+
+@contextmanager
+def driven(command: Command, target: Target) -> Iterator[StandIn]:
+    """An operator's program, whose person does what is asked, and the robot that is played for it."""
+    with played(target) as robot:
+        process = Child(
+            [str(one) for one in command], stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+        person = process.stdin
+        assert person is not None
+
+        def ask(text: str) -> None:
+            if text == operators.END:
+                person.close()
+            else:
+                person.write(LINES[text].encode())
+                person.flush()
+
+        try:
+            robot.ask, robot.person_s = ask, 10.0
+            robot.look(2.0)
+            yield robot
+        finally:
+            process.kill()
+            process.wait()
+
+
+def judged(robot: StandIn, *names: str) -> dict[str, tuple[State, str]]:
+    return {check.name: (one.state, one.text) for check, one in run(robot, [ALL[name] for name in names or ALL])}
+
+
+@pytest.fixture
+def broker(tmp_path: Path) -> Iterator[Broker]:
+    broker = Broker(tmp_path)
+    yield broker
+    broker.stop()
+
+
+def test_the_smallest_honest_operator_passes(broker: Broker, tmp_path: Path) -> None:
+    arguments, target = at_open(broker)
+    with driven([*in_python("operator", tmp_path), *arguments], target) as robot:
+        found = judged(robot)
+    assert {name: one for name, one in found.items() if one[0] is not State.OK} == {
+        "names": (State.SKIPPED, "names are not checked here: use an account, as in --url mqtts://ROBOT@BROKER")
+    }
+    assert len(found) >= 10
+
+
+@pytest.mark.usefixtures("cheap_hashes")
+@pytest.mark.thorough
+@pytest.mark.parametrize("without", ["", "names"])
+def test_where_names_are_checked(tmp_path: Path, without: str) -> None:
+    people = {
+        "mine": Account(roles=("robot",), bases=("pebble/robots/mine",)),
+        "ann": Account(roles=("driver", "safety")),
+    }
+    program = tmp_path / "operator.py"
+    program.write_text(SOURCE.replace("{PLAIN, IN}", "{IN}") if without else SOURCE)
+    with FleetBroker(tmp_path / "hall", people, level="named") as broker:
+        arguments, target = at_named(broker, tmp_path, "ann", "mine")
+        with driven([sys.executable, program, *arguments], target) as robot:
+            found = judged(robot)
+    assert [name for name, one in found.items() if one[0] is not State.OK] == [without] * bool(without)
+
+
+@pytest.mark.parametrize("name", some(VIOLATIONS, 5))
+def test_a_violation_is_found(broker: Broker, tmp_path: Path, name: str) -> None:
+    old, new = VIOLATIONS[name]
+    assert old in SOURCE
+    program = tmp_path / "operator.py"
+    program.write_text(SOURCE.replace(old, new))
+    arguments, target = at_open(broker)
+    needs = ["rate"] if name in ("stamps", "payloads", "numbers", "retained") else []
+    with driven([sys.executable, program, *arguments], target) as robot:
+        assert judged(robot, *needs, name)[name][0] is State.FAILED
+
+
+def test_no_robot_is_played_where_it_runs(broker: Broker) -> None:
+    target = at_open(broker)[1]
+    found: list[str] = []
+
+    def play() -> None:
+        try:
+            with played(target):
+                found.append("it is played")
+        except PebbleError as error:
+            found.append(str(error))
+
+    with played(target) as robot:
+        second = threading.Thread(target=play)
+        second.start()
+        robot.wait(lambda: found, 10)
+        second.join()
+    assert "runs at this broker" in found[0]
