@@ -22,7 +22,7 @@ STATE, STREAM, EVENT = (Subject(kind) for kind in (Kind.STATE, Kind.STREAM, Kind
 TOPICS = {f"{subject.kind.name}/{number}": subject for subject in (STATE, STREAM) for number in range(4)}
 SIZES = (20, 20, 150, 700)
 ROOM, DRAINS, TURN_S, STEP_S = 300, 60, 1.0, 0.1
-WAITS_S = 15.0  # for all that can wait before a message, when it is overdue
+WAITS_S, NEXT_S = 15.0, 1.5  # for all that can wait before a message, when it is overdue; for what is on its way
 EVENTS, GONE = 20, 0.02  # that wait, and how often they are dropped
 FORWARD = Forward(QoS.DELIVERED, False, False)
 
@@ -44,7 +44,7 @@ class Walk:
         self.events: deque[tuple[Message, float]] = deque()  # that wait, and since when each was the next one
         self.refused_since = inf
         self.weights = self.chance.choice([(1,) * 4 + (6,) * 4, (6,) * 4 + (1,) * 4])
-        self.event_share = self.chance.choice([0.1, 1.0])
+        self.event_share, self.sizes = self.chance.choice([0.01, 0.1, 1.0]), self.chance.choice([SIZES, SIZES[:2]])
 
     def takes(self, rank: Rank, size: int) -> bool:
         fits = not self.on_way or self.on_way + min(size, ROOM) <= ROOM * rank
@@ -53,7 +53,7 @@ class Walk:
 
     def publish(self, topic: str) -> None:
         number = self.published[topic] = self.published[topic] + 1
-        message = Message(topic, b"%d" % number + b" " * self.chance.choice(SIZES), QoS.DELIVERED)
+        message = Message(topic, b"%d" % number + b" " * self.chance.choice(self.sizes), QoS.DELIVERED)
         self.counts["published"] += 1
         if self.sieve.keeps(TOPICS[topic], message, FORWARD):
             self.waits_since.setdefault(topic, self.now)
@@ -103,7 +103,7 @@ class Walk:
             event, since = self.events[0]
             waited_s = self.now - since
             if not self.sieve.takes_event(event):
-                assert waited_s < module.OVERDUE_S + WAITS_S, "an event waited for too long"
+                assert waited_s < module.OVERDUE_S + NEXT_S, "an event waited for too long"
                 self.refused_since = min(self.refused_since, self.now)
                 return
             refused_s, self.refused_since = self.now - self.refused_since, inf
