@@ -37,7 +37,7 @@ MASKS = [
     (re.compile(rb"-?\d+(\.\d+)?(e-?\d+)?"), b"0"),
 ]
 REPORTS = re.compile(rb"/outgoing/(status|media-status|media-report/.*|log.*)$")  # of what is being done
-TROUBLE = ".last_error"  # none, or like "no frame from the camera for 2 s": the load of the moment decides
+MOMENT = (".last_error", ".reduced")  # none, or "no frame for 2 s" and "rate 1/2": the load of the moment decides
 ROUGHLY = 2.0  # factor by which counts of one packet may differ, beyond
 FEW = 5
 
@@ -139,7 +139,7 @@ def fields(value: Any, path: str = "") -> Iterator[str]:
     if isinstance(value, dict):
         for name, one in value.items():
             yield from fields(one, f"{path}.{name}")
-    elif path.endswith(TROUBLE) and (value is None or isinstance(value, str)):
+    elif path.endswith(MOMENT) and (value is None or isinstance(value, str)):
         yield f"{path}: text or none"
     else:
         yield f"{path}: {'number' if isinstance(value, (int, float)) else type(value).__name__}"

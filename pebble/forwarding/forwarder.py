@@ -165,8 +165,6 @@ class Forwarder:
         """Send what waits in the sieve, as far as there is room."""
         with self._sifting:
             if self._sieve is not None:
-                if self._sieve.event_is_overdue:
-                    self.sides[Side.REMOTE].events.resume()
                 self._send(self._sieve.due(Rank.STATE))
                 self.sides[Side.REMOTE].events.resume()
                 self._send(self._sieve.due(Rank.STREAM))

@@ -56,18 +56,14 @@ class Sieve:
         self._sent_at: dict[str, float] = {}  # of streams, the oldest first
         self._short: set[Rank] = set()  # of which one waits for room
         self._event_since = inf  # since when the next event waits
-        self._event_asked = False  # for room, and there was none
+        self._event_asked = False  # whether there is room, in vain
 
     def __len__(self) -> int:
         return len(self._waiting)
 
-    @property
-    def event_is_overdue(self) -> bool:
-        return self._clock() - self._event_since >= OVERDUE_S
-
     def takes_event(self, message: Message) -> bool:
         """Whether an event is sent now. Each counts, so they wait elsewhere, in order."""
-        overdue = self.event_is_overdue
+        overdue = self._event_is_overdue
         if (overdue or Rank.STATE not in self._short) and self._takes(Rank.STATE, _size(message)):
             self._event_since = inf
             return True
@@ -95,11 +91,10 @@ class Sieve:
         return True
 
     def due(self, rank: Rank) -> Iterator[Waiting]:
-        """What of this rank is sent now, one after the other. Of states none while an event is overdue, if it is asked
-        for before: one that is not has gone."""
-        if rank is Rank.STATE and self.event_is_overdue:
+        """What of this rank is sent now, one after the other; of states none while an event is overdue."""
+        if rank is Rank.STATE and self._event_is_overdue:
             asked, self._event_asked = self._event_asked, False
-            if asked:
+            if asked:  # since the last time: else it has gone
                 self._short.add(rank)
                 return
             self._event_since = inf
@@ -118,6 +113,10 @@ class Sieve:
         self._short.clear()
         while self._waiting:
             yield self._waiting.pop(next(iter(self._waiting)))
+
+    @property
+    def _event_is_overdue(self) -> bool:
+        return self._clock() - self._event_since >= OVERDUE_S
 
     def _is_turn(self, rank: Rank, topic: str) -> bool:
         """Whether the last message of a stream is long enough ago."""
