@@ -62,7 +62,7 @@ class ShortestTrip:
 
 
 class Crowd:
-    """Whether a queue stands. Then operators and streams send less until it has drained, else it would stay for good."""
+    """Whether a queue stands: then operators and streams send less until it has drained, else it would stay."""
 
     def __init__(self) -> None:
         self.stands = False

@@ -151,9 +151,7 @@ class Uplink:
         self._state_at, self._state_queue_s = now, self._meter.queue_s
         trip_ms, queue_ms = self._milliseconds()
         drive_hz = round(self.level.drive_hz * (_CROWDED_DRIVE if self._crowded else 1), 2)
-        state = LinkState(
-            level=self._meter.level, drive_hz=drive_hz, rtt_ms=trip_ms, queue_ms=queue_ms, t=now_ms()
-        )
+        state = LinkState(level=self._meter.level, drive_hz=drive_hz, rtt_ms=trip_ms, queue_ms=queue_ms, t=now_ms())
         address = self._address
         self._remote.publish(address.topic, codec.encode(LINK, state), qos=QoS(address.qos), retain=address.retain)
 

@@ -111,7 +111,7 @@ def test_profiles(profile: str, kbit: float | None, levels: str) -> None:
         ("600x5 1000x1 lost 1000x1", False),
     ],
 )
-def test_a_queue_stands(history: str, stands: bool) -> None:  # noqa: FBT001
+def test_a_queue_stands(history: str, stands: bool) -> None:
     assert Walk("thin").read(history).meter.crowded is stands
 
 
