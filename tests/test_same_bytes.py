@@ -51,6 +51,14 @@ PLANTED = {
     "will": Robot(will="gone"),
     "number": Robot(times=20),
 }
+REPORT = "robot/outgoing/media-report/camera"
+REPORTS = {
+    "none": '{{"last_error": "no frame for {run} s", "t": {run}}}',
+    "other type": '{{"last_error": {run}, "t": {run}}}',
+    "other name": '{{"error": null, "t": {run}}}',
+    "other type beside it": '{{"last_error": null, "t": null}}',
+    "one less": '{{"t": {run}}}',
+}
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +68,18 @@ def broker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Broker]:
     running.stop()
 
 
-def test_each_planted_difference_shows(broker: Broker) -> None:
-    before = Robot().run(broker.port, 1), Robot().run(broker.port, 2)
-    found = {name: list(differences(before, one.run(broker.port, 3))) for name, one in PLANTED.items()}
+@pytest.mark.parametrize(
+    ("usual", "planted"),
+    [
+        (Robot(), PLANTED),
+        (
+            Robot(topic=REPORT, payload='{{"last_error": null, "t": {run}}}'),
+            {name: Robot(topic=REPORT, payload=payload) for name, payload in REPORTS.items()},
+        ),
+    ],
+    ids=["messages", "reports"],
+)
+def test_each_planted_difference_shows(broker: Broker, usual: Robot, planted: dict[str, Robot]) -> None:
+    before = usual.run(broker.port, 1), usual.run(broker.port, 2)
+    found = {name: list(differences(before, one.run(broker.port, 3))) for name, one in planted.items()}
     assert [name for name, lines in found.items() if not lines] == ["none"]

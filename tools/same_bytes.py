@@ -37,6 +37,7 @@ MASKS = [
     (re.compile(rb"-?\d+(\.\d+)?(e-?\d+)?"), b"0"),
 ]
 REPORTS = re.compile(rb"/outgoing/(status|media-status|media-report/.*|log.*)$")  # of what is being done
+MOMENT = (".last_error", ".reduced")  # none, or "no frame for 2 s" and "rate 1/2": the load of the moment decides
 ROUGHLY = 2.0  # factor by which counts of one packet may differ, beyond
 FEW = 5
 
@@ -138,6 +139,8 @@ def fields(value: Any, path: str = "") -> Iterator[str]:
     if isinstance(value, dict):
         for name, one in value.items():
             yield from fields(one, f"{path}.{name}")
+    elif path.endswith(MOMENT) and (value is None or isinstance(value, str)):
+        yield f"{path}: text or none"
     else:
         yield f"{path}: {'number' if isinstance(value, (int, float)) else type(value).__name__}"
 

@@ -16,6 +16,10 @@ _LEAST_S = 0.015  # between two commands on a wide link: what comes together cou
 _EARLY_S = 0.025  # half of what lies between two commands of a page: a slot is met, not missed by a moment
 _LEAST_VALID = 2  # commands within the time that one is valid: a robot may report any rate, and must not halt by it
 
+#: Behind a queue that stays and is so long a command comes too late to move anything: the fewer are sent, the sooner it
+#: has drained.
+_USELESS_MS, _LONGEST_S = 500, 2.0
+
 
 class Pace(NamedTuple):
     """Towards one robot. ``stamped``: what moves anything carries ``t`` and ``key``, a request of control ``t``."""
@@ -47,8 +51,11 @@ def pace_of(link: LinkState | None) -> Pace:
         return WIDE
     level = LEVELS[link.level]
     hz = min(max(link.drive_hz, 1000 * _LEAST_VALID / level.valid_ms), LEVELS["wide"].drive_hz)
+    step_s = 1 / hz - _EARLY_S
+    if link.drive_hz < level.drive_hz and link.queue_ms > _USELESS_MS:
+        step_s = min(link.queue_ms / 1000, _LONGEST_S)
     return Pace(
-        step_s=1 / hz - _EARLY_S,
+        step_s=step_s,
         qos=WIDE.qos if level.drive_qos is None else QoS(level.drive_qos),
         valid_ms=level.valid_ms,
         stamped=level.stamped,

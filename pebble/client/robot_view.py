@@ -8,7 +8,7 @@ from pebble.client.announced import announced
 from pebble.client.control import RobotControl
 from pebble.client.drive_reasons import SILENT_S, Situation
 from pebble.client.driveable import Driveable, driveable_of
-from pebble.client.pace_of_link import WIDE, Pace, pace_of, way_s
+from pebble.client.pace_of_link import Pace, pace_of, way_s
 from pebble.client.robot_topics import section_of
 from pebble.contract import codec
 from pebble.contract.identity import is_of_another
@@ -218,8 +218,8 @@ class RobotView:
 
     @property
     def pace(self) -> Pace:
-        """At what rate, and how, commands go to it. What it has reported of its link ends with it."""
-        return WIDE if self.liveness.reported_offline else pace_of(self.link)
+        """At what rate, and how, commands go to it; also while it is gone, for when it is back over the same link."""
+        return pace_of(self.link)
 
     @property
     def drive_topic(self) -> str | None:

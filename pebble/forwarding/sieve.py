@@ -7,6 +7,7 @@ Stops and whatever else is on its way *to* the robot never come here, nor do fla
 
 from collections.abc import Callable, Iterator
 from enum import IntEnum
+from math import inf
 
 from msgspec import Struct
 
@@ -17,6 +18,7 @@ from pebble.transports import Message, QoS
 from pebble.transports.counters import Counters
 
 TOPICS = 512  # of which the newest message waits, or is known to have been sent
+OVERDUE_S = 10.0  # what has waited for so long gives way no more
 
 
 class Rank(IntEnum):
@@ -34,6 +36,7 @@ class Waiting(Struct, frozen=True):
     subject: Subject
     message: Message
     forward: Forward
+    since: float  # when the first of those began to wait that followed each other here
 
 
 class Sieve:
@@ -41,8 +44,9 @@ class Sieve:
 
     ``stream_s``: seconds between two messages of a stream, at least. Counted as ``thinned`` are those that more of
     their stream followed, and as ``shed`` messages for which there was no room while there was a newer one.
-    What waits for room goes in the order in which it began to wait, and states go before events: else a large message
-    never finds any, while smaller ones take it.
+    What waits for room goes in the order in which it began to wait, and states go before events, which go before
+    streams: else a large message never finds any, while smaller ones take it. After OVERDUE_S a stream has its place
+    among the states, and an event goes before them, so that none waits for ever.
     """
 
     def __init__(self, takes: Callable[[Rank, int], bool], counters: Counters, clock: Callable[[], float]) -> None:
@@ -51,13 +55,20 @@ class Sieve:
         self._waiting: dict[str, Waiting] = {}  # by topic, in the order of their last turns
         self._sent_at: dict[str, float] = {}  # of streams, the oldest first
         self._short: set[Rank] = set()  # of which one waits for room
+        self._event_since = inf  # since when the next event waits
+        self._event_asked = False  # whether there is room, in vain
 
     def __len__(self) -> int:
         return len(self._waiting)
 
     def takes_event(self, message: Message) -> bool:
         """Whether an event is sent now. Each counts, so they wait elsewhere, in order."""
-        return Rank.STATE not in self._short and self._takes(Rank.STATE, _size(message))
+        overdue = self._event_is_overdue
+        if (overdue or Rank.STATE not in self._short) and self._takes(Rank.STATE, _size(message)):
+            self._event_since = inf
+            return True
+        self._event_since, self._event_asked = min(self._event_since, self._clock()), True
+        return False
 
     def keeps(self, subject: Subject, message: Message, forward: Forward) -> bool:
         """Whether ``message`` waits here, for itself or in vain; else it is sent now."""
@@ -66,6 +77,7 @@ class Sieve:
             return False
         waits = topic in self._waiting
         if not waits and self._is_turn(rank, topic) and self._passes(rank, message):
+            self._note(rank, topic)
             return False
         if not waits and len(self._waiting) >= TOPICS:
             if rank is Rank.STATE:
@@ -74,16 +86,25 @@ class Sieve:
             return True
         if waits:
             self._counters.add("thinned" if self._takes(rank, 0) else "shed")  # the older one
-        self._waiting[topic] = Waiting(rank, subject, message, forward)
+        since = self._waiting[topic].since if waits else self._clock()
+        self._waiting[topic] = Waiting(rank, subject, message, forward, since)
         return True
 
     def due(self, rank: Rank) -> Iterator[Waiting]:
-        """What of this rank is sent now, one after the other."""
+        """What of this rank is sent now, one after the other; of states none while an event is overdue."""
+        if rank is Rank.STATE and self._event_is_overdue:
+            asked, self._event_asked = self._event_asked, False
+            if asked:  # since the last time: else it has gone
+                self._short.add(rank)
+                return
+            self._event_since = inf
         self._short.discard(rank)
+        overdue = self._clock() - OVERDUE_S
         for topic, one in list(self._waiting.items()):
-            if one.rank is rank and self._is_turn(rank, topic):
+            if rank is (Rank.STATE if one.since <= overdue else one.rank) and self._is_turn(one.rank, topic):
                 if not self._passes(rank, one.message):
                     return
+                self._note(one.rank, topic)
                 del self._waiting[topic]
                 yield one
 
@@ -93,22 +114,29 @@ class Sieve:
         while self._waiting:
             yield self._waiting.pop(next(iter(self._waiting)))
 
+    @property
+    def _event_is_overdue(self) -> bool:
+        return self._clock() - self._event_since >= OVERDUE_S
+
     def _is_turn(self, rank: Rank, topic: str) -> bool:
         """Whether the last message of a stream is long enough ago."""
-        return rank is Rank.STATE or self._clock() - self._sent_at.get(topic, float("-inf")) >= self.stream_s
+        return rank is Rank.STATE or self._clock() - self._sent_at.get(topic, -inf) >= self.stream_s
 
     def _passes(self, rank: Rank, message: Message) -> bool:
-        """Whether there is room, and none of this rank waits for it; of a stream it is noted then."""
+        """Whether there is room, and none of this rank waits for it."""
         if rank in self._short or not self._takes(rank, _size(message)):
             self._short.add(rank)
             return False
-        if rank is Rank.STREAM:
-            topic = message.topic
-            self._sent_at.pop(topic, None)
-            if len(self._sent_at) >= TOPICS:
-                del self._sent_at[next(iter(self._sent_at))]
-            self._sent_at[topic] = self._clock()
         return True
+
+    def _note(self, rank: Rank, topic: str) -> None:
+        """It is sent: a stream's next turn is later."""
+        if rank is not Rank.STREAM:
+            return
+        self._sent_at.pop(topic, None)
+        if len(self._sent_at) >= TOPICS:
+            del self._sent_at[next(iter(self._sent_at))]
+        self._sent_at[topic] = self._clock()
 
 
 def _size(message: Message) -> int:

@@ -14,6 +14,8 @@ from pebble.media.in_flight import InFlight
 _ORDER: tuple[LinkLevel, ...] = ("wide", "narrow", "thin")
 _LITTLE_KBIT = 32.0  # less does not carry the commands and heartbeats of a robot on a wide link
 _REST_S = 0.05  # a shorter queue is none
+_STANDING_S, _STANDS_S = 0.3, 1.5  # a queue that is longer for so long does not drain by itself: as much comes as goes
+_DRAINED_S, _DRAINED_FOR_S = 0.1, 5.0  # one that is shorter for so long has drained
 _REMEMBERED_S, _PART_S = 600.0, 60.0  # how long a short round trip counts, and how exactly
 _LONGEST_WAIT_S = 600.0
 _PROVED_S = 60.0  # a level that lasts for so long was reached rightly
@@ -59,6 +61,22 @@ class ShortestTrip:
         return min((shortest for _, shortest in self._parts), default=0.0)
 
 
+class Crowd:
+    """Whether a queue stands: then operators and streams send less until it has drained, else it would stay."""
+
+    def __init__(self) -> None:
+        self.stands = False
+        self._turns_since: float | None = None
+
+    def note(self, queue_s: float, now: float) -> None:
+        if not (queue_s < _DRAINED_S if self.stands else queue_s > _STANDING_S):
+            self._turns_since = None
+        elif self._turns_since is None:
+            self._turns_since = now
+        elif now - self._turns_since >= (_DRAINED_FOR_S if self.stands else _STANDS_S):
+            self.stands, self._turns_since = not self.stands, None
+
+
 class LinkMeter:
     """Decides the level from answers: at `auto` by the queue, which is how much longer than the shortest one they take.
 
@@ -76,6 +94,12 @@ class LinkMeter:
         self._rise_s = {level: rule.rise_s for level, rule in _RULES.items()}
         self._rests_since: float | None = None
         self._risen_at = float("-inf")
+        self._crowd = Crowd()
+
+    @property
+    def crowded(self) -> bool:
+        """Whether more is on its way, in either direction, than drains."""
+        return self._crowd.stands
 
     @property
     def round_trip_s(self) -> float:
@@ -86,12 +110,17 @@ class LinkMeter:
         self._shortest.note(seconds, now)
         queue_s = seconds - self._shortest.seconds
         self.queue_s = queue_s if tcp_queue_s is None else min(queue_s, tcp_queue_s)
+        self._crowd.note(self.queue_s, now)
         if not self._fixed:
             self._newest.append(self.queue_s)
             self._decide(now)
 
     def lost(self) -> None:
         """The connection is lost: what is measured next does not follow what was measured."""
+        self._crowd = Crowd()
+        self._forget()
+
+    def _forget(self) -> None:
         self._newest.clear()
         self._rests_since = None
 
@@ -116,7 +145,7 @@ class LinkMeter:
 
     def _change(self, level: LinkLevel) -> None:
         self.level = level
-        self.lost()
+        self._forget()
 
 
 class Room:

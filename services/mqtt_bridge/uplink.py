@@ -21,12 +21,15 @@ log = logging.getLogger(__name__)
 
 POLL_S = 0.1
 _STATE_S, _STATES_S = 2.0, 10.0  # between two publications of the state at least, and at most
+_CROWDED_STATE_S = 1.0  # while a queue stands operators have to know soon how long it still is
 _CHANGE_S = 0.05  # a queue that has changed by less is the same, and by less than half a round trip
 _UNANSWERED_S = 0.5  # how often a question without an answer counts
+_CROWDED_DRIVE, _CROWDED_STREAMS = 2 / 3, 1 / 4  # of what is sent at a level, while a queue stands
 _PAUSE = 25  # so much longer on a thin link what can wait is spread
 _HEARTBEAT_BYTES = 80  # about
 _LATE, _LATE_S = 8, 1.5  # commands, and since when all of them were late: the broker holds more of the kind
 _FLOODED_S = 60.0  # after what was done about it
+RENEW_S = 30.0  # between two connections that are renewed for it, at least: who floods must not keep the robot away
 
 
 class Uplink:
@@ -48,7 +51,7 @@ class Uplink:
         self._guard = threading.Lock()  # of the room: messages take it on the thread that received them
         self._sieve = Sieve(self._takes, forwarder.counters, clock)
         self._quiet_log = RateLimitedLog(log, period_s=60.0)
-        self._level = ""  # that the others know; none yet
+        self._level, self._crowded = "", False  # that the others know; none yet
         self._heartbeat_at = self._state_at = self._answered_at = self._flooded_at = -inf
         self._state_queue_s = 0.0
         self._answers, self._shed = 0, 0
@@ -90,13 +93,14 @@ class Uplink:
         with self._guard:
             self._room.poll(outgoing.waiting, outgoing.round_trip_s, now)
         self._measure(now)
-        if self._meter.level != self._level:
+        if (self._meter.level, self._meter.crowded) != (self._level, self._crowded):
             self._suit()
         self._drop_late()
         self._forwarder.send_waiting()
         self._report_shed()
         change_s = abs(self._meter.queue_s - self._state_queue_s)
-        changed = now - self._state_at >= _STATE_S and change_s >= max(_CHANGE_S, self._meter.round_trip_s / 2)
+        state_s = _CROWDED_STATE_S if self._crowded else _STATE_S
+        changed = now - self._state_at >= state_s and change_s >= max(_CHANGE_S, self._meter.round_trip_s / 2)
         if (changed or now - self._state_at >= _STATES_S) and self._takes(Rank.STATE, _HEARTBEAT_BYTES):
             self._publish(now)
         return self.level.heartbeat_s > 0
@@ -119,18 +123,20 @@ class Uplink:
         connection of their own.
         """
         late, now = self._forwarder.ages.late, self._clock()
-        if self._level == "thin" and late.count >= _LATE and late.seconds(now) >= _LATE_S:
+        since_s = now - self._flooded_at
+        if self._level == "thin" and late.count >= _LATE and late.seconds(now) >= _LATE_S and since_s >= RENEW_S:
             late.count = 0
             self._flooded_at = now
             self._remote.renew_connection("only late commands come over a thin link: those that wait there are dropped")
 
     def _suit(self) -> None:
-        """The level is another one."""
-        before, self._level = self._level, self._meter.level
+        """The level is another one, or a queue begins or ends to stand."""
+        before, self._level, self._crowded = self._level, self._meter.level, self._meter.crowded
         self._suit_transport()
-        self._sieve.stream_s = 1 / self.level.stream_hz if self.level.stream_hz else 0.0
+        stream_hz = (self.level.stream_hz or 0.0) * (_CROWDED_STREAMS if self._crowded else 1)
+        self._sieve.stream_s = 1 / stream_hz if stream_hz else 0.0
         self._forwarder.sift(None if self._level == "wide" else self._sieve)
-        if before:
+        if before not in ("", self._level):
             log.info(
                 "the link to the remote broker is %s now (it was %s): a round trip of %d ms, and %d ms of queue",
                 self._level, before, *self._milliseconds()
@@ -144,9 +150,8 @@ class Uplink:
         """A retained message: without a connection it is sent at the next one."""
         self._state_at, self._state_queue_s = now, self._meter.queue_s
         trip_ms, queue_ms = self._milliseconds()
-        state = LinkState(
-            level=self._meter.level, drive_hz=self.level.drive_hz, rtt_ms=trip_ms, queue_ms=queue_ms, t=now_ms()
-        )
+        drive_hz = round(self.level.drive_hz * (_CROWDED_DRIVE if self._crowded else 1), 2)
+        state = LinkState(level=self._meter.level, drive_hz=drive_hz, rtt_ms=trip_ms, queue_ms=queue_ms, t=now_ms())
         address = self._address
         self._remote.publish(address.topic, codec.encode(LINK, state), qos=QoS(address.qos), retain=address.retain)
 

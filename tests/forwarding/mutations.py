@@ -273,6 +273,52 @@ pebble/forwarding/forwarder.py
 - self._send(before.empty())
 + pass
 
+one late answer is a queue that stands: ../services/mqtt_bridge/test_link.py
+services/mqtt_bridge/link.py
+- else _STANDS_S)
++ else 0.0)
+
+a queue that has nearly drained stands no more: ../services/mqtt_bridge/test_link.py
+services/mqtt_bridge/link.py
+- queue_s < _DRAINED_S if
++ queue_s < _STANDING_S if
+
+a queue that has drained for a moment stands no more: ../services/mqtt_bridge/test_link.py
+services/mqtt_bridge/link.py
+- (_DRAINED_FOR_S if
++ (0.0 if
+
+a queue of the last connection stands: ../services/mqtt_bridge/test_link.py
+services/mqtt_bridge/link.py
+-         self._crowd = Crowd()
+-         self._forget()
++         self._forget()
+
+operators do not learn that a queue stands: test_thin.py::TestLevels
+services/mqtt_bridge/uplink.py
+- (_CROWDED_DRIVE if self._crowded else 1)
++ 1
+
+streams fill a queue that stands: test_thin.py::TestLevels
+services/mqtt_bridge/uplink.py
+- (_CROWDED_STREAMS if self._crowded else 1)
++ 1
+
+the level alone is looked at: test_thin.py::TestLevels
+services/mqtt_bridge/uplink.py
+- if (self._meter.level, self._meter.crowded) != (self._level, self._crowded):
++ if self._meter.level != self._level:
+
+who floods keeps the robot away: test_thin.py::TestFloods
+services/mqtt_bridge/uplink.py
+-  and since_s >= RENEW_S:
++ :
+
+commands that come late renew nothing: test_thin.py::TestFloods
+services/mqtt_bridge/uplink.py
+-         self._drop_late()
++         pass
+
 one late answer lowers the level: ../services/mqtt_bridge/test_link.py
 services/mqtt_bridge/link.py
 - in self._newest) >= 2:

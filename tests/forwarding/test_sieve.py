@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from collections import Counter, deque
+from math import inf
 
 import pytest
 
@@ -21,7 +22,8 @@ STATE, STREAM, EVENT = (Subject(kind) for kind in (Kind.STATE, Kind.STREAM, Kind
 TOPICS = {f"{subject.kind.name}/{number}": subject for subject in (STATE, STREAM) for number in range(4)}
 SIZES = (20, 20, 150, 700)
 ROOM, DRAINS, TURN_S, STEP_S = 300, 60, 1.0, 0.1
-WAITS_S = 20.0  # for all that can wait before a message; seen were 7
+WAITS_S, NEXT_S = 15.0, 1.5  # for all that can wait before a message, when it is overdue; for what is on its way
+EVENTS, GONE = 20, 0.02  # that wait, and how often they are dropped
 FORWARD = Forward(QoS.DELIVERED, False, False)
 
 
@@ -39,6 +41,10 @@ class Walk:
         self.passed = dict.fromkeys(TOPICS, 0)
         self.passed_at = dict.fromkeys(TOPICS, 0.0)
         self.waits_since: dict[str, float] = {}
+        self.events: deque[tuple[Message, float]] = deque()  # that wait, and since when each was the next one
+        self.refused_since = inf
+        self.weights = self.chance.choice([(1,) * 4 + (6,) * 4, (6,) * 4 + (1,) * 4])
+        self.event_share, self.sizes = self.chance.choice([0.01, 0.1, 1.0]), self.chance.choice([SIZES, SIZES[:2]])
 
     def takes(self, rank: Rank, size: int) -> bool:
         fits = not self.on_way or self.on_way + min(size, ROOM) <= ROOM * rank
@@ -47,7 +53,7 @@ class Walk:
 
     def publish(self, topic: str) -> None:
         number = self.published[topic] = self.published[topic] + 1
-        message = Message(topic, b"%d" % number + b" " * self.chance.choice(SIZES), QoS.DELIVERED)
+        message = Message(topic, b"%d" % number + b" " * self.chance.choice(self.sizes), QoS.DELIVERED)
         self.counts["published"] += 1
         if self.sieve.keeps(TOPICS[topic], message, FORWARD):
             self.waits_since.setdefault(topic, self.now)
@@ -63,7 +69,7 @@ class Walk:
             turn_s = TURN_S if TOPICS[topic] is STREAM and not self.ends else 0.0
             assert self.now - self.passed_at[topic] > turn_s - STEP_S / 2, "before its turn"
             assert all(before >= since for before in self.states_wait), "before a state that waits for longer"
-            assert self.now - since < WAITS_S, "it waited for too long"
+            assert self.now - since < module.OVERDUE_S + WAITS_S, "it waited for too long"
         self.passed[topic], self.passed_at[topic] = number, self.now
         self.counts["passed"] += 1
 
@@ -72,8 +78,12 @@ class Walk:
         return [since for topic, since in self.waits_since.items() if TOPICS[topic] is STATE]
 
     def step(self) -> None:
-        for topic in self.chance.choices(list(TOPICS), weights=(1,) * 4 + (6,) * 4, k=self.chance.randrange(3)):
+        for topic in self.chance.choices(list(TOPICS), weights=self.weights, k=self.chance.randrange(3)):
             self.publish(topic)
+        if self.chance.random() < self.event_share and len(self.events) < EVENTS:
+            self.events.append((Message("event", b" " * self.chance.choice(SIZES), QoS.DELIVERED), self.now))
+        if self.chance.random() < GONE:
+            self.events.clear()
         self.send()
 
     def send(self) -> None:
@@ -81,12 +91,23 @@ class Walk:
         self.on_way = max(0, self.on_way - DRAINS)
         for one in self.sieve.due(Rank.STATE):
             self.passes(one.message)
-        event = Message("event", b"1", QoS.DELIVERED)
-        if self.chance.random() < 0.2 and self.sieve.takes_event(event) and self.fair:
-            assert not self.states_wait, "an event before a state that waits"
+        self.send_events()
         for one in self.sieve.due(Rank.STREAM):
             self.passes(one.message)
         assert len(self.sieve) <= module.TOPICS
+
+    def send_events(self) -> None:
+        while self.events:
+            event, since = self.events[0]
+            waited_s = self.now - since
+            if not self.sieve.takes_event(event):
+                assert waited_s < module.OVERDUE_S + NEXT_S, "an event waited for too long"
+                self.refused_since = min(self.refused_since, self.now)
+                return
+            refused_s, self.refused_since = self.now - self.refused_since, inf
+            assert not self.states_wait or not self.fair or refused_s > module.OVERDUE_S - STEP_S, "before a state"
+            self.events.popleft()
+            self.events = deque((one, self.now) for one, _ in self.events)
 
     def end(self, *, at_once: bool) -> None:
         """All that waits is sent: the link carries it, or it is wide again."""
@@ -120,16 +141,21 @@ def test_no_walk_violates_a_rule(seed: int, monkeypatch: pytest.MonkeyPatch) -> 
 BUGS = {
     "what waits is sent after what is newer": ("if not waits and self._is_turn(", "if self._is_turn("),
     "what waits is not replaced": (
-        "self._waiting[topic] = Waiting(rank, subject, message, forward)",
-        "self._waiting.setdefault(topic, Waiting(rank, subject, message, forward))",
+        "self._waiting[topic] = Waiting(rank, subject, message, forward, since)",
+        "self._waiting.setdefault(topic, Waiting(rank, subject, message, forward, since))",
     ),
     "what is sent waits on": ("                del self._waiting[topic]\n", ""),
     "what was replaced is not counted": ('self._counters.add("thinned" if', '("thinned" if'),
     "what has no place is not counted": ('            self._counters.add("shed")\n', ""),
     "streams have no turns": ("rank is Rank.STATE or self._clock()", "True or self._clock()"),
-    "turns are not noted": ("            self._sent_at[topic] = self._clock()\n", ""),
+    "turns are not noted": ("        self._sent_at[topic] = self._clock()\n", ""),
     "a small message goes before a large one": ("rank in self._short or", ""),
-    "events go before states": ("Rank.STATE not in self._short and ", ""),
+    "events go before states": ("(overdue or Rank.STATE not in self._short) and ", ""),
+    "an event gives way for ever": ("(overdue or Rank.STATE", "(Rank.STATE"),
+    "states take the room of an event that is overdue": ("            if asked:  #", "            if False:  #"),
+    "states wait for an event that is gone": ("asked, self._event_asked = self._event_asked, False", "asked = True"),
+    "a stream gives way for ever": ("Rank.STATE if one.since <= overdue else one.rank", "one.rank"),
+    "a newer value begins to wait anew": ("self._waiting[topic].since if waits else self._clock()", "self._clock()"),
     "what was short of room once is so for ever": ("        self._short.discard(rank)\n", ""),
     "a state without a place is lost": ("return False  # no state is lost", "return True"),
     "any number waits": ("len(self._waiting) >= TOPICS", "len(self._waiting) >= 1000"),

@@ -14,6 +14,7 @@ from pebble.contract import LINK, codec
 from pebble.contract.payloads import LinkState
 from pebble.forwarding.event_buffer import LIMIT
 from pebble.forwarding.sieve import TOPICS
+from pebble.services.mqtt_bridge.uplink import RENEW_S
 from pebble.transports import Message, Outgoing, QoS
 from tests.forwarding.virtual import World
 from tests.services.mqtt_bridge.bridge_rig import BASE
@@ -99,6 +100,19 @@ class TestLevels:
         states = link_states(world)[before + 6 :]
         assert 20 <= len(states) <= 26
         assert {(state.rtt_ms, state.queue_ms) for state in states[1:]} <= {(100, 0), (100, 500)}
+
+    def test_while_a_queue_stands_operators_and_streams_send_less(self, start: Start) -> None:
+        world = start()
+        rates, samples = [], []
+        for trip_s in (0.6, 2.0, 0.6):
+            for _ in range(30):
+                world.uplink.answers(trip_s)
+                stream(world, IMU, 0.5)
+            rates.append(link_states(world)[-1].drive_hz)
+            samples.append(len(world.remote.on(IMU)) - sum(samples))
+        assert rates == [4, 2.67, 4]
+        assert samples[1] < samples[0] / 2 < samples[2]
+        assert max(state.queue_ms for state in link_states(world)) == 1400
 
     def test_one_that_is_wide_again_takes_the_state_back(self, start: Start) -> None:
         world = start()
@@ -304,6 +318,11 @@ class TestFloods:
         flood(world, history)
         assert bool(world.uplink.renewed) is renews
         assert not [one for one in world.local.on(DRIVE) if history.startswith("late 2")]
+
+    def test_not_more_often_than_every_half_a_minute(self, start: Start) -> None:
+        world = start()
+        flood(world, "late 100")
+        assert [round(later - before) for before, later in pairwise(world.uplink.renewed)] == [RENEW_S] * 3
 
 
 def flood(world: World, history: str) -> None:

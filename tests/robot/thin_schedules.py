@@ -379,8 +379,8 @@ MUTATIONS = {
     "streams have the room of states": Mutation(f"{_BRIDGE}.link", "self._bytes * rank", "self._bytes * 40"),
     "what waits for room is forgotten": Mutation(
         f"{_FORWARDING}.sieve",
-        "        self._waiting[topic] = Waiting(rank, subject, message, forward)\n",
-        "        self._waiting.setdefault(topic, Waiting(rank, subject, message, forward))\n",
+        "        self._waiting[topic] = Waiting(rank, subject, message, forward, since)\n",
+        "        self._waiting.setdefault(topic, Waiting(rank, subject, message, forward, since))\n",
     ),
     "nothing that waits is sent": Mutation(f"{_BRIDGE}.uplink", "        self._forwarder.send_waiting()\n", ""),
     "a stop leaves the wheels turning": Mutation(

@@ -94,6 +94,27 @@ def test_profiles(profile: str, kbit: float | None, levels: str) -> None:
     assert Walk(profile, kbit).read("20x5 400x2 20x90").levels == levels
 
 
+@pytest.mark.parametrize(
+    ("history", "stands"),
+    [
+        ("600x30", False),
+        ("600x5 1000x1.5", False),  # one answer is late, perhaps by a loss
+        ("600x5 1000x1 600x0.5 1000x1", False),
+        ("600x5 880x60", False),  # not longer than 300 ms
+        ("600x5 1000x2", True),
+        ("600x5 1000x2 750x60", True),  # it has not drained
+        ("600x5 1000x2 620x5", True),
+        ("600x5 1000x2 620x3 750x0.5 620x3", True),
+        ("600x5 1000x2 620x5.5", False),
+        ("600x5 1000x2 620x5.5 1000x1.5", False),
+        ("600x5 1000x2 lost", False),
+        ("600x5 1000x1 lost 1000x1", False),
+    ],
+)
+def test_a_queue_stands(history: str, stands: bool) -> None:
+    assert Walk("thin").read(history).meter.crowded is stands
+
+
 def test_the_state_shows_what_is_measured() -> None:
     walk = Walk("thin").read("620x60 600x0.5 950x0.5")
     assert (round(walk.meter.round_trip_s, 3), round(walk.meter.queue_s, 3)) == (0.6, 0.35)
