@@ -43,7 +43,7 @@ def doctor(
     \b
         pebble doctor
         pebble doctor configs/goob.json
-        pebble doctor --broker mqtts://ann@broker.lab --ca-cert ca.pem --password-file ann-password
+        pebble doctor --broker mqtts://ann@broker.lab --password-file ann-password
     """
     if broker is not None:
         if config is not None:

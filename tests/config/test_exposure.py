@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
+from pebble.check_result import State
 from pebble.config import load, parse
-from pebble.doctor import Level
 from pebble.doctor.checks import run_checks
 
 
@@ -99,6 +99,6 @@ def test_doctor_shows_them_also_for_a_board(tmp_path: Path) -> None:
     robot = {"id": "lamp", "platform": "esp8266"}
     path = written(tmp_path, 0o600, robot=robot, local_mqtt={"host": "broker.lab", **LOCAL})
     found = [finding for finding in run_checks(load(path, env={})) if finding.what == "config"]
-    assert [(finding.level, finding.text.partition(":")[0]) for finding in found] == [
-        (Level.WARN, "local_mqtt.username")
+    assert [(finding.state, finding.text.partition(":")[0]) for finding in found] == [
+        (State.WARN, "local_mqtt.username")
     ]

@@ -177,13 +177,13 @@ class _Mesh:
         getattr(self, f"_{verb}")(name, now)
 
     def _die(self, _: str, now: float) -> None:
-        self._tell(linked(now, False), "a")
-        self._tell(gone(now))
+        self._notify(linked(now, False), "a")
+        self._notify(gone(now))
 
     def _kill(self, name: str, now: float) -> None:
         self._hubs.pop(name)
-        self._tell(hub(name, False))
-        self._tell(gone(now))
+        self._notify(hub(name, False))
+        self._notify(gone(now))
 
     def _hang(self, name: str, now: float) -> None:
         """The others notice after its lease; it notices when it runs again."""
@@ -195,7 +195,7 @@ class _Mesh:
 
     def _move(self, name: str, now: float) -> None:
         self._hubs[name].on_link("z1", now, present=True)
-        self._tell(back)
+        self._notify(back)
 
     def _resume(self, name: str, now: float) -> None:
         wills = self._hubs[name]
@@ -204,7 +204,7 @@ class _Mesh:
             event(wills)
         back(wills)  # the others tell it, once it is linked to them again
 
-    def _tell(self, event: Event, *names: str) -> None:
+    def _notify(self, event: Event, *names: str) -> None:
         for name, wills in self._hubs.items():
             if name not in self._late and (not names or name in names):
                 event(wills)

@@ -27,7 +27,7 @@ from tests.transports.zenoh.mesh_robots import HEARTBEAT, WILL
 NAMES = "abc"
 THOROUGH = bool(os.environ.get("PEBBLE_THOROUGH"))
 #: Longer than any hub waits with a will, and what is due then takes a moment.
-SETTLED_S = 8.0
+QUIET_S = 8.0
 
 
 class Hub:
@@ -57,15 +57,15 @@ class Hub:
         os.kill(self._process.pid, number)
 
 
-class Observer:
+class Listener:
     """A client of one hub that counts wills and heartbeats, by robot."""
 
     def __init__(self, mesh: Mesh, hub: str) -> None:
         self.wills: Counter[str] = Counter()
         self.began = time.monotonic()
         self.seen: list[tuple[float, str, bool]] = []  # for the message of a test that fails
-        self.beats: dict[str, int] = {}
-        self.client = mesh.client(f"observer-{hub}", [hub])
+        self.heartbeats: dict[str, int] = {}
+        self.client = mesh.client(f"listener-{hub}", [hub])
         self.client.subscribe(HEARTBEAT.format("+"), self._take)
 
     def _take(self, message: Message) -> None:
@@ -74,7 +74,7 @@ class Observer:
             self.wills[robot] += not message.retain  # a copy of it comes as often as a hub does
             self.seen.append((round(time.monotonic() - self.began, 2), robot, message.retain))
         else:
-            self.beats[robot] = self.beats.get(robot, 0) + 1
+            self.heartbeats[robot] = self.heartbeats.get(robot, 0) + 1
 
 
 class Mesh:
@@ -140,41 +140,43 @@ class Mesh:
 
 
 class Watch:
-    """An observer at each of several hubs."""
+    """An listener at each of several hubs."""
 
     def __init__(self, mesh: Mesh, hubs: str = NAMES) -> None:
         self._mesh = mesh
-        self._observers = {hub: Observer(mesh, hub) for hub in hubs}
+        self._listeners = {hub: Listener(mesh, hub) for hub in hubs}
 
     def begin(self) -> None:
-        for observer in self._observers.values():
-            observer.wills.clear()
-            observer.seen.clear()
-            observer.began = time.monotonic()
+        for listener in self._listeners.values():
+            listener.wills.clear()
+            listener.seen.clear()
+            listener.began = time.monotonic()
 
     def leave(self, hub: str) -> None:
-        self._observers.pop(hub).client.close()
+        self._listeners.pop(hub).client.close()
 
     def enter(self, hub: str) -> None:
-        self._observers[hub] = Observer(self._mesh, hub)
+        self._listeners[hub] = Listener(self._mesh, hub)
 
     @property
     def wills(self) -> dict[str, dict[str, int]]:
-        return {hub: dict(+observer.wills) for hub, observer in self._observers.items()}
+        return {hub: dict(+listener.wills) for hub, listener in self._listeners.items()}
 
     @property
     def seen(self) -> dict[str, list[tuple[float, str, bool]]]:
-        return {hub: observer.seen for hub, observer in self._observers.items()}
+        return {hub: listener.seen for hub, listener in self._listeners.items()}
 
     def saw(self, wills: dict[str, int]) -> bool:
-        """Whether every observer has seen, or will soon see, exactly these."""
-        return until(lambda: all(seen == wills for seen in self.wills.values()), SETTLED_S)
+        """Whether every listener has seen, or will soon see, exactly these."""
+        return until(lambda: all(seen == wills for seen in self.wills.values()), QUIET_S)
 
-    def hears(self, *robots: str) -> bool:
+    def receives(self, *robots: str) -> bool:
         """Whether everyone has a new heartbeat of each soon."""
-        for observer in self._observers.values():
-            observer.beats.clear()
-        return until(lambda: all(set(robots) <= observer.beats.keys() for observer in self._observers.values()), 15)
+        for listener in self._listeners.values():
+            listener.heartbeats.clear()
+        return until(
+            lambda: all(set(robots) <= listener.heartbeats.keys() for listener in self._listeners.values()), 15
+        )
 
 
 @pytest.fixture
@@ -220,13 +222,13 @@ class TestWills:
             assert watch.saw(expected), (number, kill, robot, watch.seen)
             if kill != "robot":
                 mesh.start(name)
-            time.sleep(SETTLED_S)  # nor does a hub that comes back publish one again
+            time.sleep(QUIET_S)  # nor does a hub that comes back publish one again
             assert watch.saw(expected), (number, kill, robot, watch.seen)
             if kill != "hub":
                 mesh.robots(name, robot)
             if kill != "robot":
                 watch.enter(name)
-            assert watch.hears(robot)
+            assert watch.receives(robot)
 
     @pytest.mark.alone
     @pytest.mark.parametrize(
@@ -246,10 +248,10 @@ class TestWills:
             mesh.hubs[name].signal(signal.SIGSTOP)
             began = time.monotonic()
             time.sleep(3)
-            assert watch.hears(*(f"{one}{robot}" for one in NAMES for robot in range(3))), "at another hub"
+            assert watch.receives(*(f"{one}{robot}" for one in NAMES for robot in range(3))), "at another hub"
             time.sleep(max(0.0, began + 6 - time.monotonic()))
             mesh.hubs[name].signal(signal.SIGCONT)
-            time.sleep(SETTLED_S)
+            time.sleep(QUIET_S)
             assert watch.saw({}), (number, watch.seen)
 
 
