@@ -99,7 +99,7 @@ def answered(robot: Robot, clock: Clock) -> str:
         ("Page [Y/n]", ""),
         ("everything [", "ann"),
         ("Password of ann", PASSWORD),
-        ("onfirmation", PASSWORD),
+        ("Again: ", PASSWORD),
         ("Do it?", "y"),
     ):
         terminal.answers(prompt, text)
