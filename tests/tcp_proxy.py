@@ -74,13 +74,13 @@ class TcpProxy:
         self._thread.start()
 
     def lead_to(self, target: int) -> None:
-        """Connections from now on lead to another port behind it."""
-        self._target = target
-        self.drop()
+        """Connections from now on lead to another port behind it; those of before are reset, and no others."""
+        self.drop(target)
 
-    def drop(self) -> None:
+    def drop(self, target: int | None = None) -> None:
         with self._lock:
             pairs, self._pairs = self._pairs, []
+            self._target = target or self._target
         for pair in pairs:
             pair.reset()
         for pair in pairs:
@@ -106,8 +106,9 @@ class TcpProxy:
                 self._join_to_target(near)
 
     def _join_to_target(self, near: socket.socket) -> None:
+        target = self._target
         try:
-            far = socket.create_connection(("127.0.0.1", self._target), 2)
+            far = socket.create_connection(("127.0.0.1", target), 2)
         except OSError:
             near.close()
             return
@@ -116,7 +117,11 @@ class TcpProxy:
             end.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         with self._lock:
             self._pairs = [pair for pair in self._pairs if not pair.gone]
-            self._pairs.append(_Pair(self, near, far))
+            if target == self._target:
+                self._pairs.append(_Pair(self, near, far))
+                return
+        for end in (near, far):  # it leads elsewhere by now
+            end.close()
 
     def passes(self, _data: bytes) -> bool:
         """Whether what a client sends goes on; otherwise its connection is reset."""

@@ -49,7 +49,10 @@ VIOLATIONS: dict[str, tuple[str, str]] = {
     "zero": ('            self.send("drive-values", {"x": 0, "z": 0}', '            ({"x": 0, "z": 0}'),
     "silence": ('SILENT_S.get(self.link["level"], 1.5)', "60"),
     "offline": ('value.get("online") is False', "False"),
-    "taken": ("self.moves and self.controlled and not self.key", "False"),
+    "taken": (
+        "if pushed and (self.why_not or (self.moves and self.controlled and not self.key)):",
+        'if self.moves and not self.key:\n            self.send("control/take", {"id": self.id})\n        if self.why_not:',
+    ),
     "refused": ('self.request("hold")', 'self.send("control/take", {"id": self.id})'),
     "stop": ("self.pressed = stop, now() + REPEATS_S, end", "self.pressed = None"),
     "stopped": ('if any(state.get("latched") is not False', "if any(False"),

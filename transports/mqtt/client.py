@@ -263,10 +263,20 @@ class Client:
         self._send(packets.PINGREQ)
 
     def disconnect(self) -> None:
-        """Send DISCONNECT, and close so that it arrives: a connection that is reset may lose it."""
+        """Send DISCONNECT, and close so that it arrives: a connection that is reset may lose it.
+
+        One with unread data is reset when it is closed, so what has come meanwhile is read, and thrown away.
+        """
         self._send(packets.DISCONNECT)
-        if not self.waiting:
-            self.close()
+        if self.waiting:
+            return
+        if self.socket is not None:
+            with suppress(OSError, ValueError):  # there is nothing more now; it has ended
+                self.socket.shutdown(socket.SHUT_WR)
+                for _ in range(16):  # a broker that goes on sending is not waited for
+                    if not self.socket.recv(_PIECE):
+                        break
+        self.close()
 
     def _next_id(self) -> int:
         self._mid = self._mid % _MOST_IDS + 1

@@ -136,7 +136,7 @@ def test_a_stop_is_published_at_once_and_again_when_it_is_saved(rig: Rig, path: 
 def test_its_sender_is_published_and_saved_once_that_was_checked(rig: Rig, path: Path) -> None:
     rig.stop(A, by="otto?")
     rig.stop(A, by="ann")
-    assert rig.written()
+    assert until(lambda: rig.written() and rig.states[-1].persisted), "each stop is written by itself"
     assert (rig.states[-1].by, rig.state.count, rig.states[-1].persisted) == ("ann", 1, True)
     assert json.loads(path.read_text())["by"] == "ann"
 

@@ -159,7 +159,7 @@ class WebServer(Process):
         self.loop = VirtualLoop(self.scheduler.clock)
         connection = BrokerConnection(self, self._network)
         connection.rewrite = self._rewrite
-        with patch.object(broker, "create", lambda *_: connection):
+        with patch.object(broker, "operators", lambda *_: connection):
             self.server = server.Server(
                 WebSettings(broker=MqttSettings(host="fair"), server="fair"), _Nothing(), _Nothing()
             )  # type: ignore[arg-type]

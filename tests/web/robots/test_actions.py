@@ -289,6 +289,7 @@ def test_a_screen_that_only_watches_sends_nothing_but_stops(browser: Browser, se
         opened.page.evaluate(
             "() => { for (const one of document.querySelectorAll('main button, .banners button')) one.click() }"
         )
+        assert opened.until("!!pebble.commands.act"), "the rest of the page has come"
         opened.page.evaluate("() => { pebble.commands.take(true); pebble.commands.act(pebble.driver.ref, 'reboot') }")
         opened.page.keyboard.press("Control+Space")
         assert opened.until(lambda: bool(server.sent("estop")), 2)
