@@ -51,7 +51,7 @@ VIOLATIONS: dict[str, tuple[str, str]] = {
     "offline": ('value.get("online") is False', "False"),
     "taken": (
         "if pushed and (self.why_not or (self.moves and self.controlled and not self.key)):",
-        'if self.moves and not self.key:\n            self.send("control/take", {"id": self.id})\n        if self.why_not:',
+        'if not self.key:\n            self.send("control/take", {"id": self.id})\n        if self.why_not:',
     ),
     "refused": ('self.request("hold")', 'self.send("control/take", {"id": self.id})'),
     "stop": ("self.pressed = stop, now() + REPEATS_S, end", "self.pressed = None"),

@@ -468,17 +468,19 @@ class MqttTransport(Transport):
         self._set_state(State.CONNECTING)
         with self._publishing:  # what is published from now on waits for the next connection
             pass
-        self._finish(connection, self.will)
+        self._finish(connection, self.will, self._deliver_all)  # a stop that comes just now counts
         raise Leaving(why)
 
-    def _finish(self, connection: Connection, will: Message | None) -> None:
+    def _finish(
+        self, connection: Connection, will: Message | None, receive: Callable[[list[Message]], None] = ignore
+    ) -> None:
         """Publish the will, wait (bounded) until everything is acknowledged, then send DISCONNECT."""
         if will is not None:
             connection.publish(will)
         last = connection.ping()
         deadline = time.monotonic() + _CLOSING_S
         while time.monotonic() < deadline and not (last.done and connection.drained):
-            connection.pump(deadline - time.monotonic(), ignore)
+            connection.pump(deadline - time.monotonic(), receive)
         connection.disconnect()
 
     def _keep_unconfirmed(self, connection: Connection) -> None:

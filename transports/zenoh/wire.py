@@ -23,6 +23,7 @@ from pebble.transports.base import Message, QoS
 RETAINED = "@retain/"  # + key: the newest retained message, put before the live one and queried by subscribers
 SYNC = "@sync/"  # + name: answers with how many retained messages this session has sent
 UP = "@up/"  # + name: liveliness token of a hub
+RENEWAL = "."  # + number, after that name: the same hub, which has something that its clients should ask for
 LIVE = "@live/"  # + name: liveliness token of a client
 HELLO = "@hub/hello"  # query: name, digests of retained messages, will; the answer lists the keys the hub lacks
 BYE = "@hub/bye"  # query: remove my will, I have published it myself

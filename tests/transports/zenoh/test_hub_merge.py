@@ -23,7 +23,7 @@ from pebble.transports.zenoh.hub.merge import (
     published,
 )
 from pebble.transports.zenoh.hub.store import HubStore, Retained
-from pebble.transports.zenoh.wire import Hello, Stamp
+from pebble.transports.zenoh.wire import Hello, Stamp, digest
 
 OLD = float("inf")
 
@@ -82,10 +82,10 @@ def test_both_are_equal_afterwards_whichever_decides(seed: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("mine", "overtaken"), [(None, False), (row(1, age_s=0.9), False), (row(1, age_s=0.5), True), (row(None), False)]
+    ("mine", "overtaken"), [(None, False), (row(1, age_s=1.1), False), (row(1, age_s=0.9), True), (row(None), False)]
 )
 def test_what_came_while_it_was_asked_for_is_not_overwritten(mine: Row | None, overtaken: bool) -> None:
-    assert is_overtaken(value("k", age_s=1.0), mine) is overtaken
+    assert is_overtaken(mine, 1.0) is overtaken
 
 
 @pytest.mark.parametrize(
@@ -157,10 +157,11 @@ def test_a_store_knows_how_old_its_values_and_removals_are(store: HubStore, cloc
 
 
 def test_a_client_is_not_asked_for_what_another_one_removed(store: HubStore) -> None:
-    for key, by in (("mine", "me"), ("theirs", "you")):
+    for key, by in (("mine", "me"), ("theirs", "you"), ("later", "you")):
         store.apply(retained(key, b"1"))
         store.apply(retained(key, b"", by))
-    assert store.lacks(Hello("me", 1, None, {"mine": 1, "theirs": 1})) == ["mine"]
+    own = {"mine": digest(b"1"), "theirs": digest(b"1"), "later": digest(b"2")}
+    assert store.lacks(Hello("me", 1, None, own)) == ["mine", "later"], "but for what it wrote since"
 
 
 def test_removals_outlive_a_restart_and_come_before_older_values(store: HubStore) -> None:

@@ -94,7 +94,13 @@ HOME = (hub("n"), linked(0), hello(0))
         pytest.param([*HOME, stood_still(1), gone(1)], 1 + SUCCESSOR_S, True, id="the home stood still before"),
         pytest.param([*HOME, gone(1), stood_still(7)], 7 + LAST_S, True, id="the home stood still after"),
         pytest.param([hello(0), gone(1), stood_still(7)], 1 + ALONE_S, False, id="alone it may stand still"),
-        pytest.param([hello(0, alive=False)], RETURN_S, True, id="a hello, and no token"),
+        pytest.param([hello(0, alive=False)], RETURN_S, False, id="a hello, and no token"),
+        pytest.param(
+            [hub("a"), hello(0, alive=False)],
+            RETURN_S + SUCCESSOR_S + RANK_S,
+            True,
+            id="a hello, and no token, elsewhere",
+        ),
         pytest.param([hello(0, alive=False, has_will=False)], NEVER, False, id="a hello without a will"),
         pytest.param([lambda wills: wills.on_restart(["c"], 0.0)], RETURN_S, True, id="a restart"),
         pytest.param([gone(0), lambda wills: wills.on_restart(["c"], 0.05)], ALONE_S, False, id="a restart while due"),
@@ -103,6 +109,9 @@ HOME = (hub("n"), linked(0), hello(0))
             0.1 + LAST_S,
             True,
             id="a restart, and another hub has it",
+        ),
+        pytest.param(
+            [hub("a"), lambda wills: wills.on_restart(["c"], 0.0)], LAST_S + RANK_S, True, id="a journal that is late"
         ),
     ],
 )

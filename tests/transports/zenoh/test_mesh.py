@@ -26,6 +26,7 @@ from tests.transports.zenoh.mesh_robots import HEARTBEAT, WILL
 
 NAMES = "abc"
 THOROUGH = bool(os.environ.get("PEBBLE_THOROUGH"))
+LARGE = bytes(1_500_000)  # more than one message between two hubs
 #: Longer than any hub waits with a will, and what is due then takes a moment.
 QUIET_S = 8.0
 
@@ -231,6 +232,22 @@ class TestWills:
             assert watch.receives(robot)
 
     @pytest.mark.alone
+    @pytest.mark.thorough
+    def test_a_hub_that_makes_its_socket_anew_loses_none(self, mesh: Mesh) -> None:
+        """As with a renewed certificate: its session is closed while a will is due."""
+        mesh.robots("a", "a0")
+        mesh.robots("a", "a1")
+        watch = Watch(mesh, "bc")
+        assert watch.receives("a0", "a1")
+        watch.begin()
+        (mesh.hubs["a"].settings.run_dir / "hub.sock").unlink()
+        time.sleep(0.8)  # it looks each second
+        mesh.kill_robot("a0")
+        time.sleep(QUIET_S)
+        assert watch.saw({"a0": 1}), watch.seen
+        assert watch.receives("a1")
+
+    @pytest.mark.alone
     @pytest.mark.parametrize(
         "hangs",
         [
@@ -295,6 +312,8 @@ def _separate(mesh: Mesh, base: str, *, restart: bool) -> None:
     near, far = mesh.client(f"near-{base}", "a"), mesh.client(f"far-{base}", "c")
     for client, name, payload in (
         (near, "near", b"new"),
+        (near, "large", LARGE),
+        (far, "larger", 2 * LARGE),
         (far, "far", b"new"),
         (near, "near-then-far", b"older"),
         (far, "far-then-near", b"older"),
@@ -316,7 +335,15 @@ def _separate(mesh: Mesh, base: str, *, restart: bool) -> None:
     history.clear()
     for link in mesh.links:
         link.resume()
-    new = {"near": b"new", "far": b"new", "new-near": b"1", "new-far": b"1", "alive": b"said by itself"}
+    new = {
+        "large": LARGE,
+        "larger": 2 * LARGE,
+        "near": b"new",
+        "far": b"new",
+        "new-near": b"1",
+        "new-far": b"1",
+        "alive": b"said by itself",
+    }
     expected = new | {"near-then-far": b"newest", "far-then-near": b"newest", "untouched": b"before"}
     assert until(lambda: _sees_another(mesh, "c"), 15)
     assert until(lambda: all(expected.items() <= found.items() for found in running.values())), running

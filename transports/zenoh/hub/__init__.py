@@ -22,6 +22,7 @@ import msgspec
 import zenoh
 
 from pebble.errors import TransportError
+from pebble.transports import clock
 from pebble.transports.base import QoS
 from pebble.transports.counters import Counters
 from pebble.transports.own_file import OwnFile
@@ -229,6 +230,7 @@ class HubWorker:
         self._wills = WillTimes(name)
         self._mesh = Mesh(name, self, self._wills)
         self._token: zenoh.LivelinessToken | None = None  # clients ask a hub when its token appears
+        self._renewals = 0
         self._waiting_queries: list[tuple[float, dict[str, int], zenoh.Query]] = []
         self._tasks: queue.Queue[_Task | None] = queue.Queue(QUEUE_LIMIT)
         self._session: zenoh.Session | None = None
@@ -245,7 +247,9 @@ class HubWorker:
         if self._session is not None:
             self._tasks.put(self._await_return)
         self._session = session
-        session.declare_subscriber(wire.RETAINED + "**", self._queued(self._store_retained))
+        # Its own messages would wait for room in the queue that this thread empties.
+        others, work_on = zenoh.Locality.REMOTE, self._queued(self._store_retained)
+        session.declare_subscriber(wire.RETAINED + "**", work_on, allowed_origin=others)
         session.declare_queryable(wire.RETAINED + "**", self._queued(self._query), complete=True)
         for what, work in ((wire.HELLO, self._on_hello), (wire.BYE, self._on_bye)):
             session.declare_queryable(what, self._queued(work))
@@ -277,15 +281,16 @@ class HubWorker:
         self._tasks.put(task)
 
     def _run(self) -> None:
+        turn = clock.since_boot()
         while True:
-            pause, began = self._pause(), time.monotonic()
             try:
-                task = self._tasks.get(timeout=pause)
+                task = self._tasks.get(timeout=self._pause())
                 if task is None:
                     return
             except queue.Empty:
                 task = None
-            if pause is not None and time.monotonic() - began > pause + STILL_S:
+            before, turn = turn, clock.since_boot()
+            if self._wills.met_others and turn - before > _LOOK_S + STILL_S:
                 self._wills.on_standstill(time.monotonic())
             if task is not None:
                 self._do(task)
@@ -373,7 +378,7 @@ class HubWorker:
             now = time.monotonic()
             alive, has_will = hello.name in self.alive_clients, hello.will is not None
             self._wills.on_hello(hello.name, hello.session, now, alive=alive, has_will=has_will)
-            if not self._wills.hubs or not hello.session or self._wills.is_home(hello.name, now):
+            if self._wills.ends_predecessors(hello.name, hello.session, now):
                 self._end_predecessor(hello)
             self.apply(StoredWill(hello.name, hello.will))
             lacking = self._store.lacks(hello)
@@ -418,14 +423,19 @@ class HubWorker:
 
     def _publish_due_wills(self) -> None:
         for name, is_successor in self._wills.take_due(time.monotonic()):
-            will = self._store.will(name)
-            if will is None:
-                continue
-            if is_successor and will.retain and self._wills.met_others:
-                self._mesh.replace(name, topic_to_key(will.topic))
+            if (will := self._store.will(name)) is not None:
+                self._do(partial(self._publish_due_will, name, will, is_successor=is_successor))
+
+    def _publish_due_will(self, name: str, will: wire.Will, *, is_successor: bool) -> None:
+        try:
             self._mesh.publish(name)
-            self.forget_will(name)
-            self._do(partial(self._publish_will, name, will))
+        except zenoh.ZError:  # this session is being replaced by another one
+            self._wills.on_restart([name], time.monotonic())
+            raise
+        if is_successor and will.retain and self._wills.met_others:
+            self._mesh.replace(name, topic_to_key(will.topic))
+        self.forget_will(name)
+        self._publish_will(name, will)
 
     def forget_will(self, name: str) -> None:
         """The client ``name`` has no will any more."""
@@ -455,11 +465,23 @@ class HubWorker:
             self._journal.append(wire.encode(admitted))
         return changed
 
-    def ask_again(self) -> None:
-        """Have all clients ask what is retained here, as if this hub had just come."""
-        if self._session is not None and self._token is not None:
-            self._token.undeclare()  # type: ignore[no-untyped-call]
-            self._token = self._session.liveliness().declare_token(wire.UP + self._name)
+    def ask_again(self, *, merge: bool = False) -> None:
+        """Have all clients ask what is retained here, as if a hub had just come: it takes a further name.
+
+        The new one is there before the old one goes, so no client is without a hub for a moment. ``merge``: it goes
+        first, so that other hubs compare with this one again.
+        """
+        session, before = self._session, self._token
+        if session is None or before is None:
+            return
+        if merge:
+            before.undeclare()  # type: ignore[no-untyped-call]
+        self._renewals += 1
+        name = f"{self._name}{wire.RENEWAL}{self._renewals}"
+        session.declare_queryable(wire.SYNC + name, direct(partial(_answer_nothing, wire.SYNC + name)))
+        self._token = session.liveliness().declare_token(wire.UP + name)
+        if not merge:
+            before.undeclare()  # type: ignore[no-untyped-call]
 
     def _write_journal(self, journal: Journal) -> None:
         """Write all records anew, together with those of an earlier hub: these are read once, as soon as they can be.
@@ -490,6 +512,7 @@ class HubWorker:
 
     def _await_return(self) -> None:
         """Clients of a session that was closed have as long to come back as after a restart."""
+        self._wills.on_new_session()
         self.alive_clients.clear()
         self._received.clear()
         self._await_wills()
@@ -498,12 +521,20 @@ class HubWorker:
         absent = self._store.wills() - self.alive_clients
         self._wills.on_restart(absent, time.monotonic())
         self._mesh.recall(absent)
+        if self._wills.hubs:  # a journal that could be read late
+            self._mesh.merge_again()
 
 
 def _renewed(tls: TlsSettings) -> Renewed[Any]:
     from pebble.transports.credentials import renewed_context  # ssl, which few hubs need
 
     return renewed_context(tls)
+
+
+def _answer_nothing(key: str, query: zenoh.Query) -> None:
+    """A hub has sent no retained messages of its own."""
+    with query:
+        query.reply(key, wire.pack_count(0))
 
 
 def _payload(query: zenoh.Query) -> bytes:

@@ -24,15 +24,17 @@ class History:
         self._now = now
         self._arrived: dict[str, float] = {}
         self._removed: dict[str, Retained] = {}
+        self._what: dict[str, int | None] = {}  # digests of what was removed, None where that is not known
         self._bytes = 0
         self._began = now()  # since when removals of a journal are remembered
 
-    def add(self, record: Retained, age_s: float) -> None:
-        """``record`` was stored, or something was removed by it; ``age_s`` seconds ago."""
+    def add(self, record: Retained, age_s: float, before: int | None) -> None:
+        """``record`` was stored, or what has the digest ``before`` was removed by it; ``age_s`` seconds ago."""
         self._forget(record.key)
         self._arrived[record.key] = self._now() - age_s
         if not record.payload:
             self._removed[record.key] = record
+            self._what[record.key] = before
             self._bytes += _size(record)
             self._forget_old()
 
@@ -42,6 +44,11 @@ class History:
     def removal(self, key: str) -> Retained | None:
         """The removal of what was retained under ``key``, if it was the last that happened to it."""
         return self._removed.get(key)
+
+    def removed_by_another(self, key: str, digest: int, name: str) -> bool:
+        """Whether another client than ``name`` has removed just this, and not what it has written since."""
+        removal, what = self._removed.get(key), self._what.get(key)
+        return removal is not None and removal.stamp.origin != name and what in (None, digest)
 
     def removals(self) -> Iterator[Retained]:
         yield from self._removed.values()
@@ -58,7 +65,7 @@ class History:
         removal = self._removed.pop(key, None)
         if removal is not None:
             self._bytes -= _size(removal)
-            del self._arrived[key]
+            del self._arrived[key], self._what[key]
 
 
 def _size(removal: Retained) -> int:

@@ -83,9 +83,9 @@ def compare(mine: Mapping[str, Row], theirs: Mapping[str, Row], alive: Collectio
     return want, give
 
 
-def is_overtaken(value: Value, mine: Row | None) -> bool:
-    """Whether something newer than ``value`` has come since it was asked for."""
-    return mine is not None and mine.age_s + 2 * TIE_S < value.age_s
+def is_overtaken(mine: Row | None, since_s: float) -> bool:
+    """Whether something has come since the hubs compared their tables, ``since_s`` seconds ago."""
+    return mine is not None and mine.age_s < since_s
 
 
 def published(recalled: Mapping[str, str], rows: Mapping[str, Row], wills: Collection[str]) -> list[str]:

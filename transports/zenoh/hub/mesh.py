@@ -11,6 +11,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import msgspec
@@ -18,6 +19,7 @@ import zenoh
 from msgspec.structs import replace
 
 from pebble.transports.zenoh import wire
+from pebble.transports.zenoh.callbacks import direct
 from pebble.transports.zenoh.hub import merge
 from pebble.transports.zenoh.hub.store import HubStore, Retained
 from pebble.transports.zenoh.hub.wills import WillTimes
@@ -26,10 +28,13 @@ from pebble.transports.zenoh.keymap import topic_to_key
 log = logging.getLogger(__name__)
 
 PATIENCE_S = 0.5  # queries of clients wait so long for a merge
-ASK_S = 1.0  # for an answer of another hub
+ASK_S = 1.0  # for a table of another hub, or for our own thread
+VALUES_S = 10.0  # for values, which may be large
 ASKED = 5  # times, before another hub counts as one that does not merge
 MAX_REPLACED = 1000  # values that a will replaced, in case its client comes back
+MAX_REPLACED_BYTES = 4096  # of one of them: heartbeats have a tenth of it
 _PAUSE_S = 0.1
+_LONGEST_NAME = 12  # of a hub; an exchange is longer
 
 
 if TYPE_CHECKING:
@@ -46,7 +51,7 @@ class Hub(Protocol):
     def post(self, task: Callable[[], None]) -> None: ...
     def apply(self, record: Retained, age_s: float) -> bool: ...
     def forget_will(self, name: str) -> None: ...
-    def ask_again(self) -> None: ...
+    def ask_again(self, *, merge: bool = False) -> None: ...
 
 
 class _Decided(NamedTuple):
@@ -56,6 +61,7 @@ class _Decided(NamedTuple):
     give: list[merge.Value]
     they_forget: list[str]
     we_forget: list[str]
+    at: float
 
 
 class Mesh:
@@ -67,16 +73,27 @@ class Mesh:
         self._session: zenoh.Session | None = None
         self._unmerged: dict[str, float] = {}  # until when clients wait, by hub
         self._recalled: set[str] = set()  # clients whose wills are of before a restart
-        # By clients whose wills this hub published as a successor: key, what was there, when that came.
-        self._replaced: dict[str, tuple[str, Retained | None, float]] = {}
+        # By clients whose wills this hub published as a successor: what was there, when that came.
+        self._replaced: dict[str, tuple[Retained, float]] = {}
+        self._names: dict[str, set[str]] = {}  # under which each other hub is there
+        self._compared: dict[str, float] = {}  # when another hub got our table
+        self._taken: dict[str, int] = {}  # values of another hub, in the parts so far
 
     def serve(self, session: zenoh.Session, queued: _Queued) -> None:
         """Take part in the mesh of ``session``; ``queued`` brings an event to the hub's thread."""
+
+        def on_token(sample: zenoh.Sample) -> None:
+            # Our own come on the thread that declares them: it must not wait for room in the queue that it empties.
+            if _named(sample)[0] != self._name:
+                self._hub.post(partial(self._on_hub, sample))
+
         self._session = session
-        session.declare_subscriber(wire.PUBLISHED, queued(self._on_published))
+        self._names.clear()
+        others = zenoh.Locality.REMOTE
+        session.declare_subscriber(wire.PUBLISHED, queued(self._on_published), allowed_origin=others)
         session.declare_queryable(wire.MERGE + self._name, queued(self._on_merge))
         session.declare_queryable(wire.STATE + self._name, queued(self._on_state))
-        session.liveliness().declare_subscriber(wire.UP + "*", queued(self._on_hub), history=True)
+        session.liveliness().declare_subscriber(wire.UP + "*", direct(on_token), history=True)
         session.info.declare_transport_events_listener(queued(self._on_link), history=True)
 
     # -- for the hub's other tasks
@@ -90,6 +107,12 @@ class Mesh:
         """These clients' wills are of before a restart: another hub may have published them meanwhile."""
         self._recalled = set(names)
 
+    def merge_again(self) -> None:
+        """Compare with every other hub once more."""
+        for name in self._wills.hubs:
+            self._begin(name)
+        self._hub.ask_again(merge=True)
+
     def publish(self, name: str) -> None:
         """Have the other hubs forget the will of ``name``, which is published next."""
         if self._session is not None and self._wills.met_others:
@@ -97,18 +120,20 @@ class Mesh:
 
     def replace(self, name: str, key: str) -> None:
         """A successor publishes the will of ``name``, on ``key``."""
-        store = self._hub.store
+        before = self._hub.store.get(key)
+        if before is None or len(before.payload) > MAX_REPLACED_BYTES:
+            return
         while len(self._replaced) >= MAX_REPLACED:
             del self._replaced[next(iter(self._replaced))]
-        self._replaced[name] = key, store.get(key), time.monotonic() - store.age_s(key)
+        self._replaced[name] = before, time.monotonic() - self._hub.store.age_s(key)
 
     def on_alive(self, name: str) -> None:
         """A client is there: a will that was published for it in its absence is taken back."""
         if (replaced := self._replaced.pop(name, None)) is None:
             return
-        key, before, arrived = replaced
-        now = self._hub.store.get(key)
-        if before is not None and now is not None and now.stamp.origin == name and not now.stamp.retained_count:
+        before, arrived = replaced
+        now = self._hub.store.get(before.key)
+        if now is not None and now.stamp.origin == name and not now.stamp.retained_count:
             self._hub.apply(before, max(0.0, time.monotonic() - arrived))
             self._hub.ask_again()
 
@@ -124,51 +149,60 @@ class Mesh:
             self._hub.forget_will(name)
 
     def _on_hub(self, sample: zenoh.Sample) -> None:
-        name = str(sample.key_expr).removeprefix(wire.UP)
-        if name == self._name:
-            return
-        present = sample.kind == zenoh.SampleKind.PUT
-        is_new = present and name not in self._wills.hubs
-        self._wills.on_hub(name, present=present)
-        if not present:
+        name, under = _named(sample)
+        names = self._names.setdefault(name, set())
+        was_there = bool(names)
+        (names.add if sample.kind == zenoh.SampleKind.PUT else names.discard)(under)
+        if not names:
+            del self._names[name]
             self._unmerged.pop(name, None)
-        elif is_new:
+        self._wills.on_hub(name, present=bool(names))
+        if names and not was_there:
             self._unmerged[name] = time.monotonic() + PATIENCE_S
-            if self._name < name and self._session is not None:
-                asked = self._session, name
-                threading.Thread(target=self._merge, args=asked, name="pebble-merge", daemon=True).start()
+            self._begin(name)
+
+    def _begin(self, name: str) -> None:
+        if self._name < name and self._session is not None:
+            asked = self._session, name
+            threading.Thread(target=self._merge, args=asked, name="pebble-merge", daemon=True).start()
 
     # -- the one with the smaller name asks, on a thread of its own
 
     def _merge(self, session: zenoh.Session, name: str) -> None:
-        try:
-            table = self._ask_table(session, name)
-            if table is None:
-                log.warning("hub %s does not merge: it is an older one, which publishes wills a second time", name)
+        for _ in range(ASKED):
+            try:
+                self._merge_once(session, name)
+            except (zenoh.ZError, ValueError, msgspec.DecodeError, queue.Empty) as error:
+                log.warning("hub %s: the merge with it failed, and is tried again: %s", name, str(error) or "no answer")
+                time.sleep(ASK_S)
+            else:
                 return
-            decided = self._on_hub_thread(lambda: self._decide(table))
-            if decided is not None:
-                self._exchange(session, name, decided)
-        except (zenoh.ZError, ValueError, msgspec.DecodeError) as error:
-            log.warning("hub %s: the merge with it failed: %s", name, error)
+            if name not in self._names or session is not self._session:
+                return  # it is gone
+
+    def _merge_once(self, session: zenoh.Session, name: str) -> None:
+        table = self._ask_table(session, name)
+        if table is None:
+            log.warning("hub %s does not merge: an older one, which publishes each will a second time", name)
+        else:
+            self._exchange(session, name, self._on_hub_thread(lambda: self._decide(table)))
 
     def _ask_table(self, session: zenoh.Session, name: str) -> merge.Table | None:
         """The parts of its table as one; None: it does not answer."""
         for _ in range(ASKED):
-            parts = [merge.decode_table(data) for data in _ask(session, wire.MERGE + name, b"")]
+            parts = [merge.decode_table(data) for data in _ask(session, wire.MERGE + name, self._name.encode(), ASK_S)]
             if parts:
+                if parts.pop().rows:
+                    raise ValueError("its table was cut off")
                 rows = {key: row for part in parts for key, row in part.rows.items()}
                 return replace(parts[0], rows=rows)
             time.sleep(_PAUSE_S)  # its queryable is not known here yet
         return None
 
-    def _on_hub_thread(self, decide: Callable[[], _Decided]) -> _Decided | None:
+    def _on_hub_thread(self, decide: Callable[[], _Decided]) -> _Decided:
         decided: queue.Queue[_Decided] = queue.Queue()
         self._hub.post(lambda: decided.put(decide()))
-        try:
-            return decided.get(timeout=ASK_S)
-        except queue.Empty:
-            return None
+        return decided.get(timeout=ASK_S)
 
     def _decide(self, theirs: merge.Table) -> _Decided:
         store = self._hub.store
@@ -179,37 +213,48 @@ class Mesh:
             list(store.values(give)),
             merge.published(theirs.recalled, mine, store.wills()),
             merge.published(self._recalled_keys(), theirs.rows, theirs.wills),
+            time.monotonic(),
         )
 
     def _exchange(self, session: zenoh.Session, name: str, decided: _Decided) -> None:
         parts = list(merge.in_parts(iter(decided.give)))
         got: list[merge.Value] = []
         for number, part in enumerate(parts, 1):
-            last = number == len(parts)
-            exchange = merge.Exchange(
-                self._name, decided.want if last else [], part, decided.they_forget if last else None
-            )
-            for data in _ask(session, wire.MERGE + name, merge.encode(exchange)):
-                got += merge.decode_values(data)
-        self._hub.post(lambda: self._adopt(name, got, decided.we_forget, len(decided.give)))
+            last, waited = number == len(parts), time.monotonic() - decided.at
+            give = [replace(one, age_s=one.age_s + waited) for one in part]
+            want, forget = (decided.want, decided.they_forget) if last else ([], None)
+            asked = merge.encode(merge.Exchange(self._name, want, give, forget))
+            answers = [merge.decode_values(data) for data in _ask(session, wire.MERGE + name, asked, VALUES_S)]
+            if not answers or answers.pop():
+                raise ValueError("its answer was cut off")
+            for values in answers:
+                got += values
+        self._hub.post(lambda: self._adopt(name, self._take(got, decided.at), decided.we_forget, len(decided.give)))
 
     # -- on the hub's thread
 
     def _on_merge(self, query: zenoh.Query) -> None:
+        """Each answer ends with an empty part, so that one that is cut off shows."""
         with query:
             payload = b"" if query.payload is None else query.payload.to_bytes()
             key = str(query.key_expr)
-            if not payload:
-                for part in self._table():
+            if len(payload) <= _LONGEST_NAME:
+                if (asker := payload.decode()) in self._names:
+                    self._compared[asker] = time.monotonic()
+                for part in (*self._table(), merge.Table({}, [], [], {})):
                     query.reply(key, merge.encode(part))
                 return
             asked = merge.decode_exchange(payload)
             for values in merge.in_parts(self._hub.store.values(asked.want)):
-                query.reply(key, merge.encode(values))
-        if asked.forget is None:
-            self._take(asked.give)
-        else:
-            self._adopt(asked.asker, asked.give, asked.forget, len(asked.want))
+                if values:
+                    query.reply(key, merge.encode(values))
+            query.reply(key, merge.encode([]))
+        if (since := self._compared.get(asked.asker)) is None:
+            raise ValueError(f"hub {asked.asker} has not asked for the table")
+        self._taken[asked.asker] = self._taken.get(asked.asker, 0) + self._take(asked.give, since)
+        if asked.forget is not None:
+            del self._compared[asked.asker]
+            self._adopt(asked.asker, self._taken.pop(asked.asker), asked.forget, len(asked.want))
 
     def _table(self) -> Iterator[merge.Table]:
         rows = list(self._hub.store.table().items())
@@ -222,22 +267,24 @@ class Mesh:
         wills = {name: self._hub.store.will(name) for name in self._recalled - self._hub.alive_clients}
         return {name: topic_to_key(will.topic) for name, will in wills.items() if will is not None}
 
-    def _adopt(self, name: str, values: list[merge.Value], forget: Collection[str], gave: int) -> None:
-        taken = self._take(values)
-        recalled, self._recalled = self._recalled - self._hub.alive_clients, set()
-        for client in recalled.intersection(forget):
+    def _adopt(self, name: str, taken: int, forget: Collection[str], gave: int) -> None:
+        self._recalled -= self._hub.alive_clients
+        self._recalled &= self._hub.store.wills()
+        for client in self._recalled.intersection(forget):
             self._hub.forget_will(client)
-        self._wills.on_other_hub(recalled.difference(forget), time.monotonic())
+        self._recalled -= set(forget)
+        self._wills.on_other_hub(self._recalled, time.monotonic())
         self._unmerged.pop(name, None)
         self.merges += 1
         log.info("merged with hub %s: took %d retained messages, gave %d", name, taken, gave)
         if taken:
             self._hub.ask_again()
 
-    def _take(self, values: Iterable[merge.Value]) -> int:
-        taken = 0
+    def _take(self, values: Iterable[merge.Value], since: float) -> int:
+        """Store what was asked for at ``since``, but where something has come meanwhile."""
+        taken, waited = 0, time.monotonic() - since
         for one in values:
-            if not merge.is_overtaken(one, self._hub.store.row(one.key)):
+            if not merge.is_overtaken(self._hub.store.row(one.key), waited):
                 stamp = wire.Stamp(one.qos, one.retained_count, one.origin)
                 taken += self._hub.apply(Retained(one.key, one.payload, stamp), one.age_s)
         return taken
@@ -265,13 +312,19 @@ class HubState(msgspec.Struct, frozen=True):
 decode_state = msgspec.msgpack.Decoder(HubState).decode
 
 
-def _ask(session: zenoh.Session, key: str, payload: bytes) -> list[bytes]:
+def _named(token: zenoh.Sample) -> tuple[str, str]:
+    """The hub that a token is of, and the name under which it is there."""
+    under = str(token.key_expr).removeprefix(wire.UP)
+    return under.partition(wire.RENEWAL)[0], under
+
+
+def _ask(session: zenoh.Session, key: str, payload: bytes, timeout: float) -> list[bytes]:
     replies = session.get(
         key,
         zenoh.handlers.FifoChannel(256),
         target=zenoh.QueryTarget.ALL,
         consolidation=zenoh.ConsolidationMode.NONE,
-        timeout=ASK_S,
+        timeout=timeout,
         payload=payload,
         **wire.BLOCK,
     )

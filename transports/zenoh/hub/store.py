@@ -103,8 +103,7 @@ class HubStore:
     def _differs(self, key: str, own: int | None, name: str) -> bool:
         retained = self._retained.get(key)
         if retained is None:
-            removal = None if self._history is None else self._history.removal(key)
-            return own is not None and (removal is None or removal.stamp.origin == name)
+            return own is not None and (self._history is None or not self._history.removed_by_another(key, own, name))
         return retained.stamp.origin == name and digest(retained.payload) != own
 
     # -- among several hubs
@@ -152,7 +151,7 @@ class HubStore:
         else:
             self._retained[record.key] = record
         if self._history is not None and (after or before or age_s):  # else nothing was removed
-            self._history.add(record, age_s)
+            self._history.add(record, age_s, None if before is None else digest(before.payload))
         return before != after
 
     def _store_will(self, record: StoredWill) -> bool:

@@ -64,8 +64,10 @@ class WillTimes:
             self._sessions[name] = session
         if alive:
             self._due.pop(name, None)
+        elif has_will and (not self._met_others or self.is_home(name, now)):
+            self._put(name, now + RETURN_S, successor=False)
         elif has_will:
-            self._put(name, now + RETURN_S, not self.is_home(name, now))
+            self._put(name, now + RETURN_S + SUCCESSOR_S + RANK_S * self._rank, successor=True)
 
     def on_alive(self, name: str) -> None:
         self._due.pop(name, None)
@@ -90,24 +92,28 @@ class WillTimes:
     def on_standstill(self, now: float) -> None:
         """This hub was stopped, or its machine asleep: what it sees in the next seconds is old."""
         self._still_until = now + LINK_S
-        for due in self._due.values() if self.hubs or self._met_others else ():
-            due.at = max(due.at, now + SUCCESSOR_S + RANK_S * MAX_RANK)
-            due.latest, due.successor = max(due.latest, due.at + PUT_OFF_S), True
+        if self._met_others:
+            self.on_other_hub(list(self._due), now)
 
-    def on_restart(self, names: Iterable[str], now: float) -> None:
-        """This hub begins anew, with the wills of ``names`` and clients that come back, here or at another hub."""
+    def on_new_session(self) -> None:
+        """Hubs, links and clients have to be seen again."""
         self.hubs.clear()
         self._sessions.clear()
         self._links.clear()
+
+    def on_restart(self, names: Iterable[str], now: float) -> None:
+        """There are wills of before; their clients may come back, here or at another hub."""
+        names = [name for name in names if name not in self._due]
         for name in names:
-            if name not in self._due:
-                self._put(name, now + RETURN_S, successor=True)
+            self._put(name, now + RETURN_S, successor=True)
+        if self.hubs:
+            self.on_other_hub(names, now)
 
     def on_other_hub(self, names: Iterable[str], now: float) -> None:
         """Others have had these wills while this hub was away, and come first."""
         for name in names:
             if (due := self._due.get(name)) is not None:
-                self._put(name, max(due.at, now + SUCCESSOR_S + RANK_S * MAX_RANK), successor=True)
+                self._put(name, max(due.at, now + SUCCESSOR_S + RANK_S * (MAX_RANK + self._rank)), successor=True)
 
     def forget(self, name: str) -> None:
         """The client has no will any more."""
@@ -135,6 +141,12 @@ class WillTimes:
         """Whether this hub is, or was just now, the one that the client is linked to."""
         lost = self._links.get(self._sessions.get(name, ""), float("-inf"))
         return lost is None or now - lost < LINK_S
+
+    def ends_predecessors(self, name: str, session: str, now: float) -> bool:
+        """Whether this hub publishes the pending wills of a client that has begun anew: one of several does."""
+        if not self.hubs:
+            return True
+        return self.is_home(name, now) if session else self._rank == 0  # one of before tells no session
 
     @property
     def _rank(self) -> int:
