@@ -34,7 +34,7 @@ VIOLATIONS: dict[str, tuple[str, str]] = {
     "clock": ("int(1000 * time.time())", "int(1000 * time.time()) + 3_600_000"),
     "payloads": ('{"t": epoch_ms()}, qos=0', '{"t": str(time.time())}, qos=0'),
     "numbers": ('{"wheels": self.wheels}', '{"wheels": self.wheels, "amperes": math.nan}'),
-    "sizes": ('"the saved state cannot be read" * there', '400 * "x"'),
+    "sizes": ('"by": "", "why": "", "since"', '"by": "", "why": 400 * "x", "since"'),
     "retained": ("qos, retain=True", "qos, retain=False"),
     "parked commands": (
         "    def publish(self",
@@ -69,7 +69,7 @@ VIOLATIONS: dict[str, tuple[str, str]] = {
     "stop moving": ('elif not self.stop["latched"] and', "elif"),
     "will": ('json.dumps({"t": epoch_ms(), "online": False})', 'json.dumps({"t": epoch_ms()})'),
     "retained commands": ("if message.retain:", "if False:"),
-    "stop survives": ("self.stop | json.load(open(STOP_FILE))", "FREE"),
+    "stop survives": ("self.stop |= json.load(open(STOP_FILE))", "self.stop = FREE"),
 }
 
 
