@@ -17,7 +17,7 @@ from pebble.conform.component import Component, reached
 from pebble.conform.motion import MOVING
 from pebble.conform.power import CUT
 from pebble.fleet.roles import Account
-from tests.conform.programs import LANGUAGES, Command, Language, at_named, at_open, source
+from tests.conform.programs import ROBOTS, Command, Language, at_named, at_open, source
 from tests.fleet.brokers import FleetBroker
 from tests.fleet.conftest import cheap_hashes as cheap_hashes
 from tests.support import Broker, Child, further, some
@@ -131,7 +131,7 @@ def lacking(found: dict[str, tuple[State, str]]) -> dict[str, tuple[State, str]]
     return {name: one for name, one in found.items() if one[0] is not State.OK}
 
 
-@pytest.mark.parametrize("language", [LANGUAGES[0], *map(further, LANGUAGES[1:])])
+@pytest.mark.parametrize("language", [ROBOTS[0], *map(further, ROBOTS[1:])])
 def test_the_smallest_honest_robot_passes(broker: Broker, tmp_path: Path, language: Language) -> None:
     program = language("robot", tmp_path)
     arguments, target = at_open(broker)
@@ -142,7 +142,7 @@ def test_the_smallest_honest_robot_passes(broker: Broker, tmp_path: Path, langua
 
 
 @pytest.mark.usefixtures("cheap_hashes")
-@pytest.mark.parametrize("language", [LANGUAGES[0], *map(further, LANGUAGES[1:])])
+@pytest.mark.parametrize("language", [ROBOTS[0], *map(further, ROBOTS[1:])])
 def test_it_passes_where_names_are_checked(tmp_path: Path, language: Language) -> None:
     program = language("robot", tmp_path)
     people = {
