@@ -16,7 +16,7 @@ static const double LETS_GO_S = 3, REPEATS_S = 0.5, GIVES_UP_S = 60;
 enum { OWNERS = 16 };
 #define EACH(one) for (struct owner *one = owners; one < owners + OWNERS; one++)
 static struct mosquitto *client; static cJSON *capabilities;
-static char id[9], in[128], plain[128], out[128], topic[192], text[512], password[128], *by = "sample";
+static char id[9], in[256], plain[128], out[128], topic[320], text[512], password[128], *by = "sample";
 static double x, z, seen = -INFINITY, drives_at, asks_at, moved_at = -INFINITY;
 static int moves, blocked, offline = 1;  // blocked: until the stick is let go
 static struct link { char level[8]; double drive_hz; } link_ = {"wide", 20};

@@ -19,7 +19,7 @@ from pebble.conform.operators import OPERATOR
 from pebble.conform.stand_in import StandIn, played
 from pebble.errors import PebbleError
 from pebble.fleet.roles import Account
-from tests.conform.programs import OPERATORS, Command, Language, at_named, at_open, in_python, source
+from tests.conform.programs import OPERATORS, Command, Language, at_named, at_open, source
 from tests.fleet.brokers import FleetBroker
 from tests.fleet.conftest import cheap_hashes as cheap_hashes
 from tests.support import Broker, Child, further, some
@@ -110,23 +110,25 @@ def test_the_smallest_honest_operator_passes(broker: Broker, tmp_path: Path, lan
     assert len(found) >= 10
 
 
+def with_named_stops(program: str, folder: Path) -> Command:
+    (folder / program).write_text(SOURCE.replace("{PLAIN, IN}", "{IN}"))
+    return [sys.executable, folder / program]
+
+
 @pytest.mark.usefixtures("cheap_hashes")
 @pytest.mark.thorough
-@pytest.mark.parametrize(("language", "without"), [*((one, "") for one in OPERATORS), (in_python, "names")])
-def test_where_names_are_checked(tmp_path: Path, language: Language, without: str) -> None:
+@pytest.mark.parametrize(("language", "violated"), [*((one, []) for one in OPERATORS), (with_named_stops, ["names"])])
+def test_where_names_are_checked(tmp_path: Path, language: Language, violated: list[str]) -> None:
     people = {
         "mine": Account(roles=("robot",), bases=("pebble/robots/mine",)),
         "ann": Account(roles=("driver", "safety")),
     }
     program = language("operator", tmp_path)
-    if without:
-        program = [sys.executable, tmp_path / "operator.py"]
-        (tmp_path / "operator.py").write_text(SOURCE.replace("{PLAIN, IN}", "{IN}"))
     with FleetBroker(tmp_path / "hall", people, level="named") as broker:
         arguments, target = at_named(broker, tmp_path, "ann", "mine")
         with driven([*program, *arguments], target) as robot:
             found = judged(robot)
-    assert [name for name, one in found.items() if one[0] is not State.OK] == [without] * bool(without)
+    assert [name for name, one in found.items() if one[0] is not State.OK] == violated
 
 
 @pytest.mark.parametrize("name", some(VIOLATIONS, 5))
