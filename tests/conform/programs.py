@@ -55,11 +55,11 @@ def in_c(program: str, folder: Path) -> Command:
 
 
 def in_arduino(program: str, folder: Path) -> Command:
-    """For a board of Arduino, against a stand-in of its libraries, whose TLS is the openssl program."""
+    """A stand-in takes the place of Arduino's libraries; its TLS is the openssl program."""
     if shutil.which("g++") is None or shutil.which("openssl") is None or not CJSON.exists():
         missing("needs a compiler, OpenSSL and cJSON (apt install g++ openssl libcjson-dev)")
     board = ROOT / "tests" / "conform" / "arduino"
-    command = ["g++", "-std=gnu++17", *WARNINGS, "-I", board, "-o", folder / program, board / "main.cpp"]
+    command: Command = ["g++", "-std=gnu++17", *WARNINGS, "-I", board, "-o", folder / program, board / "main.cpp"]
     subprocess.run([*command, source(program, "cpp"), "-lcjson", "-pthread"], check=True)
     return [folder / program]
 
