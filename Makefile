@@ -79,7 +79,7 @@ quick-tests:
 
 # Types, lint and what only computes use what tests that wait and measure leave of the processors.
 test: .venv/.ready-dev
-	@sh tools/debian-packages.sh mosquitto=mosquitto mosquitto_pub=mosquitto-clients chromium=chromium node=nodejs ip=iproute2 tc=iproute2 nft=nftables systemd-analyze=systemd
+	@sh tools/debian-packages.sh mosquitto=mosquitto mosquitto_pub=mosquitto-clients chromium=chromium node=nodejs g++=g++ openssl=openssl ip=iproute2 tc=iproute2 nft=nftables systemd-analyze=systemd
 	@test -e /usr/include/mosquitto.h -a -e /usr/include/cjson/cJSON.h || sh tools/debian-packages.sh =gcc =libc6-dev =libmosquitto-dev =libcjson-dev
 	@rm -f $(TIMES)
 	@$(MAKE) --no-print-directory --jobs=3 test-checks test-computing test-demo

@@ -145,6 +145,15 @@ def test_the_table_of_bounds_names_each() -> None:
     assert found - set(LISTED) == set(), "add a row to docs/bounds.md"
 
 
+def test_the_table_of_samples_has_their_lines() -> None:
+    docs = ROOT / "docs"
+    table = re.findall(r"\| \[(\d+)\]\(([^)]+)\)", (docs / "your-robot.md").read_text())
+    listed = {(docs / path).resolve(): int(lines) for lines, path in table}
+    samples = {path: len(path.read_text().splitlines()) for path in ROOT.glob("examples/your-*/*.*")}
+    assert listed == samples
+    assert max(samples.values()) <= 150
+
+
 def test_the_table_of_bounds_names_nothing_else() -> None:
     def defines(path: str, name: str) -> bool:
         file = ROOT / path if path.startswith("firmware/") else ROOT / "pebble" / path

@@ -126,8 +126,7 @@ class Operator:
 
 operator, client, lines = Operator(), mqtt.Client(mqtt.CallbackAPIVersion.VERSION2), b""
 if LOGIN:
-    client.username_pw_set(LOGIN[0], open(LOGIN[1]).read().strip())
-    client.tls_set(LOGIN[2])
+    client.username_pw_set(LOGIN[0], open(LOGIN[1]).read().strip()), client.tls_set(LOGIN[2])
 client.on_connect, client.on_message = operator.connected, operator.receive
 client.connect_async(HOST, int(PORT), keepalive=5)
 while True:

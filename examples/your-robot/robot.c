@@ -17,14 +17,13 @@ static const double DEAD_MAN_S = 0.75, PAUSE_S = 0.5;
 enum { LONGEST = 512, RECENT = 8, VERSION = 1 };
 static struct mosquitto *client;
 static const char *id, *stop_file, *refused = "null";
-static char boot[9], topic[128], text[1024];
+static char boot[9], topic[128], text[1024], password[128];
 static int named, online, count, shown;  // shown: what the wheels do has been published
 static double paused_at = -INFINITY, until, left, right;  // when the wheels stop, and what they do
 static struct stop { int version, latched; char recent[RECENT][17], by[34], why[41]; double since; } stop = {.version = VERSION};
 static struct client { char id[9], by[75], device[21], key[9], account[33]; double holds_s, ends; } holder, asker;  // who drives, who waits
 static double clock_s(clockid_t of) { struct timespec t; clock_gettime(of, &t); return t.tv_sec + t.tv_nsec / 1e9; }
-static double now(void) { return clock_s(CLOCK_MONOTONIC); }
-static double epoch_ms(void) { return 1000 * clock_s(CLOCK_REALTIME); }
+static double now(void) { return clock_s(CLOCK_MONOTONIC); }  static double epoch_ms(void) { return 1000 * clock_s(CLOCK_REALTIME); }
 static void hex8(char *to) { unsigned n; if (getentropy(&n, sizeof n)) abort(); sprintf(to, "%08x", n); }
 static const cJSON *get(const cJSON *of, const char *name) { return cJSON_GetObjectItemCaseSensitive(of, name); }
 static int same(const cJSON *item, const char *text) { return cJSON_IsString(item) && !strcmp(item->valuestring, text); }
@@ -131,7 +130,6 @@ static void connected(struct mosquitto *, void *, int code) {
 }
 int main(int argc, char **argv) {
     if (argc != 5 && argc != 8) return fputs("robot ID HOST PORT STOP_FILE [USER PASSWORD_FILE CA_FILE]\n", stderr), 2;
-    char password[128] = "";
     id = argv[1], hex8(boot), stop_file = argv[4], named = argc == 8, load_stop();
     mosquitto_lib_init(), client = mosquitto_new(NULL, true, NULL);
     FILE *file = named ? fopen(argv[6], "r") : NULL;

@@ -8,12 +8,9 @@ import paho.mqtt.client as mqtt
 ID, HOST, PORT, STOP_FILE, *LOGIN = sys.argv[1:]
 NAMED, IN, OUT = bool(LOGIN), f"pebble/robots/{ID}/incoming/", f"pebble/robots/{ID}/outgoing/"
 OWNER, DEAD_MAN_S, PAUSE_S, LONGEST = "motors", 0.75, 0.5, 512
-CAPABILITIES = {
-    "identity": {"system": "pebble", "type": "robots", "id": ID},
-    "drive": {"available": True, "controls": True, "control": True},
-    "estop": {"available": True, "owners": [OWNER]},
-    "named": NAMED,
-}
+CAPABILITIES = {"drive": {"available": True, "controls": True, "control": True}, "named": NAMED}
+CAPABILITIES |= {"estop": {"available": True, "owners": [OWNER]}}
+CAPABILITIES |= {"identity": {"system": "pebble", "type": "robots", "id": ID}}
 FREE = {"latched": False, "recent": [], "by": "", "why": "", "since": 0}
 NONE, UNASKED = {"id": "", "by": "", "device": "", "key": ""}, {"asks": "", "asks_id": ""}
 now, epoch_ms = time.monotonic, lambda: int(1000 * time.time())
@@ -25,23 +22,20 @@ class Robot:
         self.holder, self.account, self.holds_s, self.ends = NONE, "", 0.0, 0.0  # who drives, and until when
         self.asker, self.asks_until = UNASKED, 0.0  # who waits for control
         self.until, self.wheels, self.shown = 0.0, [0.0, 0.0], None  # when the wheels stop, and what they do
-        there = os.path.exists(STOP_FILE)
-        self.stop = FREE | {"latched": there, "why": "the saved state cannot be read" * there}
+        self.stop = FREE | {"latched": os.path.exists(STOP_FILE)}  # what cannot be read is a stop
         with suppress(OSError, ValueError, TypeError):
-            self.stop = self.stop | json.load(open(STOP_FILE))
+            self.stop |= json.load(open(STOP_FILE))
 
     def publish_stop(self):
-        saved = False
+        state = {"boot": self.boot, "count": self.count, "reset_refused": self.refused, "persisted": False}
         with suppress(OSError), open(STOP_FILE + ".new", "w") as file:
             json.dump(self.stop, file)
             file.flush(), os.fsync(file.fileno())
             os.replace(STOP_FILE + ".new", STOP_FILE)
-            saved = True
-        state = {"boot": self.boot, "count": self.count, "reset_refused": self.refused, "persisted": saved}
+            state["persisted"] = True
         self.publish(f"estop/{OWNER}", self.stop | state)
 
-    def turn(self, left, right, seconds):
-        """Motors get this, and nothing after so many seconds: here they are shown, a real robot sets its pins."""
+    def turn(self, left, right, seconds):  # set your pins here, and for so long
         self.wheels, self.until = [round(left, 3), round(right, 3)], now() + seconds
 
     def drive(self, command, account):
@@ -60,8 +54,7 @@ class Robot:
             self.ends = max(self.ends, now() + self.holds_s) if mine else self.ends
             self.turn(max(-1.0, min(1.0, z + x)), max(-1.0, min(1.0, z - x)), seconds)
 
-    def halt(self, payload, account):
-        """Whatever arrives here is a stop; what has a name counts once."""
+    def halt(self, payload, account):  # whatever arrives is a stop; what has a name counts once
         self.turn(0.0, 0.0, 0.0)
         claims = {}
         with suppress(ValueError, TypeError, RecursionError):
@@ -76,15 +69,13 @@ class Robot:
             self.stop = {"latched": True, "recent": recent, "by": by, "why": why[:40], "since": epoch_ms()}
         self.publish_stop()
 
-    def reset(self, command):
-        """End the stop that its sender has seen, and no other."""
+    def reset(self, command):  # ends the stop that its sender has seen, and no other
         self.refused = "boot" if command["boot"] != self.boot else "count" if command["count"] != self.count else None
         if self.refused is None and self.stop["latched"]:
             self.stop, self.paused_at = self.stop | {"latched": False}, now()
         self.publish_stop()
 
-    def control(self, command, account, take):
-        """Who has control keeps it until it ends, is released or taken. Who asks meanwhile is shown."""
+    def control(self, command, account, take):  # until it ends, is released or taken; who asks meanwhile is shown
         own_id = re.fullmatch("[0-9A-Fa-f]{8}", command["id"])[0]  # else this changes nothing
         mine = (own_id, account) == (self.holder["id"], self.account)
         seconds = max(1.0, min(10.0, command.get("for_ms", 3000) / 1000))
@@ -103,8 +94,7 @@ class Robot:
             self.holder, self.asker = to, UNASKED
             self.turn(0.0, 0.0, 0.0)
 
-    def show(self):
-        """Publish what has changed; after a connection was made, all of it."""
+    def show(self):  # publishes what has changed; after a connection was made, all of it
         control = self.holder | self.asker | {"named": NAMED, "boot": self.boot}
         if self.shown != (self.wheels, control):
             self.shown = self.wheels, control
@@ -139,8 +129,7 @@ class Robot:
 
 robot, client, heartbeat_at = Robot(), mqtt.Client(mqtt.CallbackAPIVersion.VERSION2), 0.0
 if NAMED:
-    client.username_pw_set(LOGIN[0], open(LOGIN[1]).read().strip())
-    client.tls_set(LOGIN[2])
+    client.username_pw_set(LOGIN[0], open(LOGIN[1]).read().strip()), client.tls_set(LOGIN[2])
 client.will_set(OUT + "online", json.dumps({"t": epoch_ms(), "online": False}), qos=1, retain=True)
 client.on_connect, client.on_message = robot.connected, robot.receive
 client.connect_async(HOST, int(PORT), keepalive=5)

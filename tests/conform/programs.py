@@ -20,6 +20,8 @@ Command = list[str | Path]
 Language = Callable[[str, Path], Command]  # makes its "robot" or "operator" in a folder
 
 EXAMPLES = ROOT / "examples"
+CJSON = Path("/usr/include/cjson/cJSON.h")
+WARNINGS = ("-Wall", "-Wextra", "-Werror", "-O2")
 
 
 def source(program: str, ending: str) -> Path:
@@ -45,12 +47,20 @@ def in_javascript(program: str, folder: Path) -> Command:
 
 
 def in_c(program: str, folder: Path) -> Command:
-    headers = (Path("/usr/include/mosquitto.h"), Path("/usr/include/cjson/cJSON.h"))
-    if shutil.which("gcc") is None or not all(one.exists() for one in headers):
+    if shutil.which("gcc") is None or not Path("/usr/include/mosquitto.h").exists() or not CJSON.exists():
         missing("needs a compiler and libraries (apt install gcc libc6-dev libmosquitto-dev libcjson-dev)")
-    warnings = ("-Wall", "-Wextra", "-Werror", "-O2")
     libraries = ("-lmosquitto", "-lcjson", "-lm")
-    subprocess.run(["gcc", *warnings, "-o", folder / program, source(program, "c"), *libraries], check=True)
+    subprocess.run(["gcc", *WARNINGS, "-o", folder / program, source(program, "c"), *libraries], check=True)
+    return [folder / program]
+
+
+def in_arduino(program: str, folder: Path) -> Command:
+    """A stand-in takes the place of Arduino's libraries; its TLS is the openssl program."""
+    if shutil.which("g++") is None or shutil.which("openssl") is None or not CJSON.exists():
+        missing("needs a compiler, OpenSSL and cJSON (apt install g++ openssl libcjson-dev)")
+    board = ROOT / "tests" / "conform" / "arduino"
+    command: Command = ["g++", "-std=gnu++17", *WARNINGS, "-I", board, "-o", folder / program, board / "main.cpp"]
+    subprocess.run([*command, source(program, "cpp"), "-lcjson", "-pthread"], check=True)
     return [folder / program]
 
 
@@ -58,7 +68,8 @@ def missing(what: str) -> None:
     (pytest.fail if os.environ.get("CI") == "true" else pytest.skip)(what)
 
 
-LANGUAGES = (in_python, in_javascript, in_c)
+ROBOTS = (in_python, in_javascript, in_c, in_arduino)
+OPERATORS = (in_python, in_javascript, in_c)
 
 
 def at_open(broker: Broker) -> tuple[Command, Target]:

@@ -19,10 +19,10 @@ from pebble.conform.operators import OPERATOR
 from pebble.conform.stand_in import StandIn, played
 from pebble.errors import PebbleError
 from pebble.fleet.roles import Account
-from tests.conform.programs import Command, at_named, at_open, in_python, source
+from tests.conform.programs import OPERATORS, Command, Language, at_named, at_open, source
 from tests.fleet.brokers import FleetBroker
 from tests.fleet.conftest import cheap_hashes as cheap_hashes
-from tests.support import Broker, Child, some
+from tests.support import Broker, Child, further, some
 
 pytestmark = pytest.mark.alone  # rates and deadlines are checked
 
@@ -101,9 +101,11 @@ def broker(tmp_path: Path) -> Iterator[Broker]:
     broker.stop()
 
 
-def test_the_smallest_honest_operator_passes(broker: Broker, tmp_path: Path) -> None:
+@pytest.mark.parametrize("language", [OPERATORS[0], *map(further, OPERATORS[1:])])
+def test_the_smallest_honest_operator_passes(broker: Broker, tmp_path: Path, language: Language) -> None:
+    program = language("operator", tmp_path)
     arguments, target = at_open(broker)
-    with driven([*in_python("operator", tmp_path), *arguments], target) as robot:
+    with driven([*program, *arguments], target) as robot:
         found = judged(robot)
     assert {name: one for name, one in found.items() if one[0] is not State.OK} == {
         "names": (State.SKIPPED, "names are not checked here: use an account, as in --url mqtts://ROBOT@BROKER")
@@ -111,21 +113,25 @@ def test_the_smallest_honest_operator_passes(broker: Broker, tmp_path: Path) -> 
     assert len(found) >= 10
 
 
+def with_named_stops(program: str, folder: Path) -> Command:
+    (folder / program).write_text(SOURCE.replace("{PLAIN, IN}", "{IN}"))
+    return [sys.executable, folder / program]
+
+
 @pytest.mark.usefixtures("cheap_hashes")
 @pytest.mark.thorough
-@pytest.mark.parametrize("without", ["", "names"])
-def test_where_names_are_checked(tmp_path: Path, without: str) -> None:
+@pytest.mark.parametrize(("language", "violated"), [*((one, []) for one in OPERATORS), (with_named_stops, ["names"])])
+def test_where_names_are_checked(tmp_path: Path, language: Language, violated: list[str]) -> None:
     people = {
         "mine": Account(roles=("robot",), bases=("pebble/robots/mine",)),
         "ann": Account(roles=("driver", "safety")),
     }
-    program = tmp_path / "operator.py"
-    program.write_text(SOURCE.replace("{PLAIN, IN}", "{IN}") if without else SOURCE)
+    program = language("operator", tmp_path)
     with FleetBroker(tmp_path / "hall", people, level="named") as broker:
         arguments, target = at_named(broker, tmp_path, "ann", "mine")
-        with driven([sys.executable, program, *arguments], target) as robot:
+        with driven([*program, *arguments], target) as robot:
             found = judged(robot)
-    assert [name for name, one in found.items() if one[0] is not State.OK] == [without] * bool(without)
+    assert [name for name, one in found.items() if one[0] is not State.OK] == violated
 
 
 @pytest.mark.parametrize("name", some(VIOLATIONS, 5))
