@@ -89,11 +89,22 @@ can run here; `make brokers` compares it.
     pebble doctor --broker mqtts://goob@broker.lab --below pebble/robots/goob    # that account may use only that
     pebble conform --broker mqtt://broker.example         # the same by the promises T1 to T21
 
-It takes some 15 s, publishes below `pebble/doctor/` and random digits only, removes all that it left there, also when
-it is interrupted, and moves no robot. `doctor` exits with 0, with 1 (robots can use the broker, with limits) or with 2
-(they cannot). What an account may not do is told, and nothing that depends on it is tried. Not tested, because they
-cannot be installed here: EMQX, HiveMQ, VerneMQ, NanoMQ, hosted ones. Run the command.
+It takes some 15 s and moves no robot. It publishes below `pebble/doctor/` and random digits, and removes all that it
+left there, also when it is interrupted. `doctor` exits with 0, with 1 (robots can use the broker, and something is to
+be mended) or with 2 (they cannot, with this account). Where an account may not publish and read there, nothing else is
+tried: people at a broker of [`pebble fleet`](fleet.md) may not, so use the account of a robot, as in the fourth line.
 
+Two probes leave those topics, because their question has no answer inside:
+
+* *refused subscriptions* asks for `{random digits}/doctor/one/#`, and publishes one byte there where that is granted.
+  Only a topic that no rule mentions shows how an account is refused; no robot and no program has that name, and the
+  message is not retained.
+* *accounts* asks mosquitto's plugin, at `$CONTROL/dynamic-security/v1`, for the rights that every account has. It
+  changes nothing, and only who may change accounts is answered: that is what you want to know of a robot's account.
+
+A broker that logs what it refuses shows both, with a client id that begins with `pebble_doctor`.
+
+Not tested, because they cannot be installed here: EMQX, HiveMQ, VerneMQ, NanoMQ, hosted ones. Run the command.
 """
 _BY_TRANSPORT = "are kept by the transport, whatever the broker ([transports.md](transports.md))"
 
@@ -169,7 +180,7 @@ def main(names: list[str]) -> None:
         probes = {probe: [one.state.value, one.text] for probe, one in found_of.items()}
         rows[name] = {"version": BROKERS[name].version(), "date": f"{datetime.now(UTC):%Y-%m-%d}", "probes": probes}
         RESULTS.write_text(json.dumps(rows, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-    DOCUMENT.write_text(document(rows), encoding="utf-8")
+    DOCUMENT.write_text(document({name: rows[name] for name in BROKERS if name in rows}), encoding="utf-8")
 
 
 if __name__ == "__main__":
