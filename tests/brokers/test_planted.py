@@ -34,26 +34,29 @@ SETTINGS = [
     ("set_tcp_nodelay false", "small messages", "holds them back"),
     ("retain_available false", "retained messages", "hangs up on them"),
     further("max_qos 0", "QoS 1", "hangs up on messages of QoS 1"),
-    ("max_queued_messages 50", "a receiver that is behind", "of 500 messages"),
+    further("max_queued_messages 50", "a receiver that is behind", "of 500 messages"),
     further("message_size_limit 20000", "payloads", "does not carry 35 kB"),
     further("max_packet_size 20000", "payloads", "does not carry 35 kB"),
     further("message_size_limit 100000", "payloads", "35 kB and not 256 kB"),
 ]
 #: Rules of mosquitto's acl_file.
 RULES = [
-    ("topic read #", "rights", State.FAILED, "may not publish"),
+    further("topic read #", "rights", State.FAILED, "may not publish"),
     further("topic write #", "rights", State.FAILED, "may not read"),
     further(
-        "topic readwrite pebble/doctor/#", "refused subscriptions", State.SKIPPED, "whether this account may publish"
+        "topic readwrite pebble/doctor/#",
+        "refused subscriptions",
+        State.SKIPPED,
+        "may not publish there, or may not read",
     ),
     ("topic write #\ntopic readwrite pebble/doctor/#", "refused subscriptions", State.WARN, "then delivers nothing"),
 ]
 #: A fault, the probe that finds it, and words of what it tells.
 FAULTS = [
-    (faulty.DropsWills, "wills", "none is published"),
+    further(faulty.DropsWills, "wills", "none is published"),
     further(faulty.LateWills, "wills", "s after the connection is reset"),
     (faulty.WillsAfterGoodbye, "no will after a goodbye", "is published as well"),
-    (faulty.Loses, "1,000 messages", "acknowledged and lost"),
+    further(faulty.Loses, "1,000 messages", "acknowledged and lost"),
     (faulty.Reorders, "1,000 messages", "out of order"),
     further(faulty.RetainsNothing, "retained messages", "retains none"),
     (faulty.HidesRetained, "retained messages", "without the retain flag"),

@@ -75,7 +75,7 @@ def refusals(bench: Bench) -> CheckResult:
         return skip("this account is refused none")
     if _is_forbidden(bench) is False:
         return warn("it grants them, and then delivers nothing", "")
-    return skip("it does not tell whether this account may publish there")
+    return skip("it grants them, and nothing comes: this account may not publish there, or may not read")
 
 
 def acknowledged(bench: Bench) -> CheckResult:
