@@ -79,7 +79,7 @@ def test_what_it_retains_is_removed_when_it_is_interrupted(command: str, number:
         return {topic: payload for topic, payload in newest.items() if payload}
 
     with MqttTransport("watcher", settings) as watcher:
-        watcher.subscribe("pebble/doctor/#", seen)
+        watcher.subscribe("pebble/doctor/#", seen, echo=False)
         with running(command, "--broker", f"mqtt://127.0.0.1:{plain.port}", stdout=subprocess.DEVNULL) as process:
             assert until(lambda: len(retained()) > 50, 60)
             process.send_signal(number)
