@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pebble.check_result import CheckResult, State
-from pebble.client.url import UrlError, settings_of
+from pebble.client.url import FORMS, UrlError, settings_of
 from pebble.commands.selftest import INDENT, ended, printed, row
 from pebble.config.text_files import password
 from pebble.runtime.signals import interrupted_by_signals
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from pebble.doctor.broker.peer import Bench
 
 BELOW = "pebble/doctor"
+_FORMS = "mqtt://[USER@]HOST[:PORT] or mqtts://[USER@]HOST[:PORT]"
 
 BrokerOption = Annotated[
     str | None, typer.Option("--broker", help="Judge this broker instead: mqtt://[USER@]HOST[:PORT].", metavar="URL")
@@ -37,9 +38,14 @@ RestartOption = Annotated[
 
 def settings_at(url: str, password_file: Path | None, ca_cert: Path | None) -> MqttSettings:
     """Raises UrlError."""
-    _, settings = settings_of(url, password=password(password_file), password_file=password_file, ca_cert=ca_cert)
+    try:
+        _, settings = settings_of(url, password=password(password_file), password_file=password_file, ca_cert=ca_cert)
+    except UrlError as error:
+        raise UrlError(str(error).replace("--url", "--broker").replace(FORMS, _FORMS)) from None
     if not isinstance(settings, MqttSettings):
-        raise UrlError("--broker must be mqtt://HOST[:PORT] or mqtts://HOST[:PORT]")
+        raise UrlError(f"--broker must be {_FORMS}")
+    if settings.hosts:
+        raise UrlError("--broker judges one broker: use one HOST[:PORT], and the command again for each further one")
     return settings
 
 
@@ -52,6 +58,7 @@ def doctor_of(
     from pebble.doctor.broker.probes import run
     from pebble.doctor.broker.strangers import other_doors
 
+    check_topic(below)
     found: list[tuple[CheckResult, str]] = []
 
     def note(finding: CheckResult, costs: str = "") -> State:
@@ -74,8 +81,7 @@ def doctor_of(
     words, counted = assessment(levels), [finding.state for finding, _ in found]
     code = 2 if State.FAILED in counted else int(State.WARN in counted)
     if as_json:
-        rows = [{"name": one.what, "level": one.state.value, "text": one.text, "fix": one.fix, "costs": costs}
-                for one, costs in found]  # fmt: skip
+        rows = [{**row(one.what, one), "costs": costs} for one, costs in found]
         typer.echo(json.dumps({"ok": not code, "assessment": words, "checks": rows}, ensure_ascii=False))
         return code
     for line in words:
@@ -96,7 +102,7 @@ def conform_of(settings: MqttSettings, below: str, *, restart: bool, as_json: bo
     with interrupted_by_signals(), _left_as_it_was(settings, below, restart=restart) as bench:
         for promise, outcome, costs in judge(bench):
             name = f"{promise} {PROMISES.get(promise, '')}".strip()
-            found.append({**row(name, outcome), "why": costs})
+            found.append({**row(name, outcome), "costs": costs})
             if not as_json:
                 printed(found[-1])
                 if costs:
@@ -108,7 +114,7 @@ def conform_of(settings: MqttSettings, below: str, *, restart: bool, as_json: bo
 def _left_as_it_was(settings: MqttSettings, below: str, *, restart: bool) -> Iterator[Bench]:
     from pebble.doctor.broker.judgement import reached
 
-    with reached(settings, check_topic(below), _ask_to_restart if restart else None) as bench:
+    with reached(settings, below, _ask_to_restart if restart else None) as bench:
         yield bench
     if bench.left:
         more = f" and {len(bench.left) - 1} more" if bench.left[1:] else ""
@@ -119,4 +125,4 @@ def _ask_to_restart() -> bool:
     typer.echo(
         "Restart the broker now (sudo systemctl restart mosquitto), then press Enter; q to go without: ", err=True
     )
-    return sys.stdin.readline().strip().lower() == ""
+    return sys.stdin.readline().isspace()  # nothing at all: no person is there

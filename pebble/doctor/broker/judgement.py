@@ -46,7 +46,7 @@ def assessment(found: Mapping[str, State]) -> list[str]:
     """What robots, operators and a mirror have of a broker, by the findings of the probes."""
     broken = [name for name, level in found.items() if level is State.FAILED]
     if broken:
-        return [f"robots cannot use it: {', '.join(broken)}"]
+        return [f"robots cannot use it with this account: {', '.join(broken)}"]
     limits = [name for name, level in found.items() if level is State.WARN]
     idle = all(found.get(name) is State.OK for name in _RETAINED)
     named = found.get(_RETAINED[0]) is State.OK
@@ -54,5 +54,5 @@ def assessment(found: Mapping[str, State]) -> list[str]:
     return [
         f"robots can use it{', with limits: ' + ', '.join(limits) if limits else ''}",
         f"operators see robots at rest {'by + and #, and by name' if idle else unless}",
-        f"mqtt_mirror {'can' if found.get('bridge mode') is State.OK else 'cannot'} use it",
+        f"a mirror {'can' if found.get('bridge mode') is State.OK else 'cannot'} use it",
     ]

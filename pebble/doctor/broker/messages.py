@@ -35,7 +35,10 @@ def rights(bench: Bench) -> CheckResult:
     reader, writer = bench.peer(), bench.peer()
     granted = reader.subscribe("#", qos=0)
     writer.publish("x")
-    fix = f"allow it (in mosquitto.conf: an acl_file with {allow}), or name topics that it may use: --below TOPIC"
+    fix = (
+        "use a robot's account and its topics: --below pebble/robots/ID; "
+        f"or allow these ({MOSQUITTO}an acl_file with {allow})"
+    )
     if not granted or granted[0] >= _REFUSED:
         return fail(f"this account may not subscribe to {bench.base}/#", fix)
     if bench.wait(lambda: reader.received or writer.closed) and not writer.closed:
@@ -72,7 +75,7 @@ def refusals(bench: Bench) -> CheckResult:
         return skip("this account is refused none")
     if _is_forbidden(bench) is False:
         return warn("it grants them, and then delivers nothing", "")
-    return skip("it does not tell whether this account may publish there")
+    return skip("it grants them, and nothing comes: this account may not publish there, or may not read")
 
 
 def acknowledged(bench: Bench) -> CheckResult:

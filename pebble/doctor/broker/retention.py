@@ -6,7 +6,7 @@ from itertools import count, pairwise
 
 from pebble.check_result import CheckResult
 from pebble.doctor.broker import MOSQUITTO, OTHER, fail, ok, skip, warn
-from pebble.doctor.broker.peer import Bench, number
+from pebble.doctor.broker.peer import Bench, RefusedError, number
 
 _STATES = 200  # retained ones; a robot has some twenty
 _BY_NAME = 8  # filters in one SUBSCRIBE: AWS IoT closes the connection for more
@@ -135,10 +135,14 @@ def restarted(bench: Bench) -> CheckResult:
     writer = bench.peer()
     mid = writer.publish("state", b"1", qos=bench.qos, retain=True)
     bench.wait(lambda: mid in writer.acks or not bench.qos)
-    writer.leave()
     if not bench.restart():
         return skip("it was not restarted")
-    late = bench.peer()
+    if writer.ping():
+        return skip("it was not restarted: a connection from before is still open")
+    try:
+        late = bench.peer()
+    except RefusedError as error:
+        return fail(f"it takes no connection since: {error}", "see why in its log")
     late.subscribe("state", qos=bench.qos)
     if bench.wait(lambda: late.received):
         return ok("it is there again")

@@ -45,13 +45,13 @@ def unnamed(bench: Bench) -> CheckResult:
 
 
 def administers(bench: Bench) -> CheckResult:
-    """Ask mosquitto's plugin what an account may do by default, which it answers administrators only."""
+    """Ask mosquitto's plugin what an account may do by default: it answers administrators only, and changes nothing."""
     bench.base, _, version = CONTROL_TOPIC.rpartition("/")
     peer = bench.peer()
     peer.subscribe(f"{version}/response", qos=0)
     peer.publish(version, _DEFAULTS)
     if not bench.wait(lambda: peer.received or peer.closed, _WAIT_S) or peer.closed:
-        return ok("this account does not change them")
+        return ok("this account does not change them over MQTT")
     opens = b'"publishClientSend","allow":true' in peer.received[0].payload.replace(b" ", b"").replace(b"\t", b"")
     more = ", and every account may publish everything by default" if opens else ""
     return warn(f"this account changes them{more}", "give robots and people accounts of their own: pebble fleet add")
