@@ -234,7 +234,7 @@ class TestWills:
     @pytest.mark.alone
     @pytest.mark.thorough
     def test_a_hub_that_makes_its_socket_anew_loses_none(self, mesh: Mesh) -> None:
-        """As with a renewed certificate: its session is closed while a will is due."""
+        """Its session is closed while a will is due, as with a renewed certificate."""
         mesh.robots("a", "a0")
         mesh.robots("a", "a1")
         watch = Watch(mesh, "bc")
