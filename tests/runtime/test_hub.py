@@ -16,7 +16,7 @@ from pebble.runtime.hub import WILLS
 from pebble.transports import Message, QoS, ZenohSettings, create
 from pebble.transports.zenoh.hub.admission import Admission
 from pebble.transports.zenoh.hub.journal import Journal
-from pebble.transports.zenoh.hub.store import StoredWill
+from pebble.transports.zenoh.hub.records import StoredWill
 from pebble.transports.zenoh.wire import Will
 from tests.support import ROOT, Child, until
 from tests.transports.zenoh_net import HubProcess

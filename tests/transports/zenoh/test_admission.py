@@ -9,7 +9,7 @@ import pytest
 from pebble.transports import QoS
 from pebble.transports.zenoh.access import HubAccount
 from pebble.transports.zenoh.hub.admission import SESSIONS, Admission
-from pebble.transports.zenoh.hub.store import Retained
+from pebble.transports.zenoh.hub.records import Retained
 from pebble.transports.zenoh.wire import Hello, Stamp, Will, account_of, asked
 
 GOOB = "pebble/robots/goob"

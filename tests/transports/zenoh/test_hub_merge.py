@@ -22,7 +22,8 @@ from pebble.transports.zenoh.hub.merge import (
     is_overtaken,
     published,
 )
-from pebble.transports.zenoh.hub.store import HubStore, Retained
+from pebble.transports.zenoh.hub.records import Retained
+from pebble.transports.zenoh.hub.store import HubStore
 from pebble.transports.zenoh.wire import Hello, Stamp, digest
 
 OLD = float("inf")

@@ -7,7 +7,8 @@ from msgspec.structs import replace
 
 from pebble.transports import QoS
 from pebble.transports.zenoh.hub import store as hub_store
-from pebble.transports.zenoh.hub.store import MAX_WILLS, RESERVED_WILLS, HubStore, Record, Retained, StoredWill
+from pebble.transports.zenoh.hub.records import Record, Retained, StoredWill
+from pebble.transports.zenoh.hub.store import MAX_WILLS, RESERVED_WILLS, HubStore
 from pebble.transports.zenoh.wire import Hello, Stamp, Will, digest
 
 WILL = Will("status", b"gone", QoS.DELIVERED, True)

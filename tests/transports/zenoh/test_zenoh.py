@@ -31,7 +31,8 @@ from pebble.transports.zenoh import session as zenoh_session
 from pebble.transports.zenoh.hub import ZenohHub
 from pebble.transports.zenoh.hub import journal as hub_journal
 from pebble.transports.zenoh.hub import store as hub_store
-from pebble.transports.zenoh.hub.store import HubStore, Retained, StoredWill
+from pebble.transports.zenoh.hub.records import Retained, StoredWill
+from pebble.transports.zenoh.hub.store import HubStore
 from tests.support import ROOT, free_port, some, until
 from tests.transports.forked import Forked
 from tests.transports.zenoh_net import HubProcess

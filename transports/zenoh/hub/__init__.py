@@ -37,7 +37,8 @@ from pebble.transports.zenoh.hub.admission import Admission
 from pebble.transports.zenoh.hub.history import History
 from pebble.transports.zenoh.hub.journal import Journal
 from pebble.transports.zenoh.hub.mesh import Mesh
-from pebble.transports.zenoh.hub.store import HubStore, Record, Retained, StoredWill
+from pebble.transports.zenoh.hub.records import Record, Retained, StoredWill
+from pebble.transports.zenoh.hub.store import HubStore
 from pebble.transports.zenoh.hub.wills import STILL_S, WillTimes
 from pebble.transports.zenoh.keymap import topic_to_key
 from pebble.transports.zenoh.presence import Barrier

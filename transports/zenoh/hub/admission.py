@@ -10,7 +10,7 @@ from msgspec.structs import replace
 
 from pebble.transports.topics import matches
 from pebble.transports.zenoh.access import HubAccount
-from pebble.transports.zenoh.hub.store import Record, Retained, StoredWill
+from pebble.transports.zenoh.hub.records import Record, Retained, StoredWill
 from pebble.transports.zenoh.keymap import key_to_topic
 from pebble.transports.zenoh.wire import OF, Hello, Will
 

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING
 
 from pebble.transports import clock
-
-if TYPE_CHECKING:
-    from pebble.transports.zenoh.hub.store import Retained
+from pebble.transports.zenoh.hub.records import Retained
 
 MAX_REMOVALS = 10_000  # that are remembered; the oldest are forgotten first
 MAX_BYTES = 4 << 20  # of their keys and origins

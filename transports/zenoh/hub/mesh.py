@@ -21,7 +21,8 @@ from msgspec.structs import replace
 from pebble.transports.zenoh import wire
 from pebble.transports.zenoh.callbacks import direct
 from pebble.transports.zenoh.hub import merge
-from pebble.transports.zenoh.hub.store import HubStore, Retained
+from pebble.transports.zenoh.hub.records import Retained
+from pebble.transports.zenoh.hub.store import HubStore
 from pebble.transports.zenoh.hub.wills import WillTimes
 from pebble.transports.zenoh.keymap import topic_to_key
 

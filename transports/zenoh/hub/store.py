@@ -5,12 +5,11 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable, Iterator
 
-import msgspec
-
 from pebble.transports.zenoh.hub.history import History
 from pebble.transports.zenoh.hub.merge import Row, Value
+from pebble.transports.zenoh.hub.records import Record, Retained, StoredWill
 from pebble.transports.zenoh.keymap import topic_to_key
-from pebble.transports.zenoh.wire import Hello, Stamp, Will, digest
+from pebble.transports.zenoh.wire import Hello, Will, digest
 
 log = logging.getLogger(__name__)
 
@@ -19,24 +18,6 @@ RESERVED_BYTES = 16 << 20  # of them, for keys that are reserved: other clients 
 MAX_WILLS = 1000
 RESERVED_WILLS = 100  # of them, for the same keys
 _OVERHEAD = 400  # bytes of Python's objects for one record, about
-
-
-class Retained(msgspec.Struct, frozen=True, array_like=True, tag="kept"):
-    """One retained message, or the removal of one if ``payload`` is empty."""
-
-    key: str
-    payload: bytes
-    stamp: Stamp
-
-
-class StoredWill(msgspec.Struct, frozen=True, array_like=True, tag="will"):
-    """A client's will, or its withdrawal."""
-
-    name: str
-    will: Will | None
-
-
-Record = Retained | StoredWill
 
 
 class HubStore:

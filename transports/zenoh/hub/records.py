@@ -1,0 +1,25 @@
+"""What a hub stores, and its journal has: retained messages and wills."""
+
+from __future__ import annotations
+
+import msgspec
+
+from pebble.transports.zenoh.wire import Stamp, Will
+
+
+class Retained(msgspec.Struct, frozen=True, array_like=True, tag="kept"):
+    """One retained message, or the removal of one if ``payload`` is empty."""
+
+    key: str
+    payload: bytes
+    stamp: Stamp
+
+
+class StoredWill(msgspec.Struct, frozen=True, array_like=True, tag="will"):
+    """A client's will, or its withdrawal."""
+
+    name: str
+    will: Will | None
+
+
+Record = Retained | StoredWill
