@@ -272,7 +272,7 @@ def test_another_device_at_the_same_line(memory_rig: SerialRig) -> None:
     mcu.manifest = LAMP.but(uid="lamp-2", hash="other")
     mcu.plug()
     memory_rig.described("lamp-2")
-    assert memory_rig.world.newest_raw("mcu/lamp-1/describe") == []
+    assert until(lambda: memory_rig.world.newest_raw("mcu/lamp-1/describe") == [])
     memory_rig.world.command("mcu/lamp-1/lamp", {"level": 40, "on": True})
     memory_rig.world.command("mcu/lamp-2/lamp", {"level": 1, "on": True})
     assert mcu.obeyed() == [(1, b"\2\1")]
@@ -422,7 +422,7 @@ def test_the_process_may_end_when_the_port_fails(memory_rig: SerialRig) -> None:
     mcu.unplug()
     assert until(lambda: not running.alive, 3)
     assert running.error is not None
-    assert memory_rig.world.newest_raw("mcu/lamp-1/describe") == []
+    assert until(lambda: memory_rig.world.newest_raw("mcu/lamp-1/describe") == [])
 
 
 def test_a_refused_alias_is_logged_and_its_interface_still_works(
