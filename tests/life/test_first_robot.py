@@ -98,7 +98,7 @@ def answered(robot: Robot, clock: Clock) -> str:
         ("answer [here]", ""),
         ("Page [Y/n]", ""),
         ("everything [", "ann"),
-        ("Password of ann", PASSWORD),
+        ("Password of ann: ", PASSWORD),
         ("Again: ", PASSWORD),
         ("Do it?", "y"),
     ):
@@ -149,7 +149,8 @@ class Phone:
         self.page.get_by_label("User").fill("ann")
         self.page.get_by_label("Password").fill(PASSWORD)
         self.shows("login")
-        self.page.get_by_role("button", name="Log in").tap()
+        with self.page.expect_navigation():
+            self.page.get_by_role("button", name="Log in").tap()
 
     def drives(self, moves: Callable[[], bool]) -> None:
         """The stick is held until the wheels turn; again, where a busy machine has ended the gesture, as it should."""
