@@ -227,24 +227,22 @@ def zero(robot: StandIn) -> CheckResult:
     return ok("a zero at once")
 
 
-def silence(robot: StandIn) -> CheckResult:
-    robot.alive = False
-    robot.look(_SILENT_S)
+def _gives_up(robot: StandIn, after_s: float, state: str, fix: str) -> CheckResult:
+    """Whether it moves nothing any more, once the robot has been in this state for so long."""
+    robot.look(after_s)
     moved = robot.moving(robot.look(1.0))
     _at_rest_again(robot)
-    if moved:
-        return failed("it drives a robot that is silent", "end when no heartbeat came for 1.5 s")
-    return ok("it ends when the robot is silent")
+    return failed(f"it drives a robot that is {state}", fix) if moved else ok(f"it ends when the robot is {state}")
+
+
+def silence(robot: StandIn) -> CheckResult:
+    robot.alive = False
+    return _gives_up(robot, _SILENT_S, "silent", "end when no heartbeat came for 1.5 s")
 
 
 def offline(robot: StandIn) -> CheckResult:
     robot.gone()
-    robot.look(_SOON_S)
-    moved = robot.moving(robot.look(1.0))
-    _at_rest_again(robot)
-    if moved:
-        return failed("it drives a robot that is offline", 'end at outgoing/online {"online": false}')
-    return ok("it ends when the robot is offline")
+    return _gives_up(robot, _SOON_S, "offline", 'end at outgoing/online {"online": false}')
 
 
 def taken(robot: StandIn) -> CheckResult:

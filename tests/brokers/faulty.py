@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import secrets
 import threading
+from abc import ABC, abstractmethod
 from contextlib import suppress
 from types import TracebackType
 from typing import Self
@@ -152,12 +153,13 @@ class EagerPongs(Fault):
         return []
 
 
-class _Connects(Fault):
+class _Connects(Fault, ABC):
     def up(self, first: int, body: bytes) -> list[bytes]:
         return super().up(first, self.changed(body) if first == CONNECT else body)
 
+    @abstractmethod
     def changed(self, body: bytes) -> bytes:
-        raise NotImplementedError
+        """The CONNECT that the broker sees."""
 
 
 class KeepsOld(_Connects):
