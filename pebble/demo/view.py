@@ -4,6 +4,7 @@ import math
 import threading
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from types import TracebackType
 from typing import Self, TypeVar
 
@@ -60,13 +61,15 @@ class View:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
-        self._notice_closed_terminal()
-        if self._live is not None:
-            self._live.stop()
+        with self._until_closed():
+            if self._live is not None:
+                self._live.stop()
 
     def update(self) -> None:
-        self._notice_closed_terminal()
-        now = time.monotonic()
+        with self._until_closed():
+            self._draw(time.monotonic())
+
+    def _draw(self, now: float) -> None:
         self._print_events()
         if self._live is not None:
             activity = f"{now - self._began:5.1f} s  operator: {self._operator.activity}"
@@ -101,6 +104,17 @@ class View:
             at, line = self._operator.events.popleft()
             self._print(at, line, "bold yellow")
             self._step = line.removeprefix("operator ")  # it is one of them
+
+    @contextmanager
+    def _until_closed(self) -> Iterator[None]:
+        """A terminal may be closed before, or while, something is written to it: that ends the demo in order."""
+        self._notice_closed_terminal()
+        try:
+            yield
+        except OSError:
+            self._notice_closed_terminal()
+            if not self._console.quiet:
+                raise
 
     def _notice_closed_terminal(self) -> None:
         if self._live is not None and not self._console.is_terminal:
