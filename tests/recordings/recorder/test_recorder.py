@@ -223,9 +223,9 @@ def _unmounted(disk: SmallDisk) -> Iterator[None]:
 
 #: What happens to the disk, and what the log says.
 FAULTS: dict[str, tuple[Callable[[SmallDisk], AbstractContextManager[None]], str]] = {
-    "full": (SmallDisk.full, "the disk is full: nothing is recorded until that is mended"),
-    "removed": (_removed, "was removed, or is on another disk now"),
     "unmounted": (_unmounted, "was removed, or is on another disk now"),
+    "removed": (_removed, "was removed, or is on another disk now"),
+    "full": (SmallDisk.full, "the disk is full: nothing is recorded until that is mended"),
 }
 
 
