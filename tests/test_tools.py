@@ -86,9 +86,9 @@ def test_first_time(): pass
 """
 
 
-def run_tests(folder: Path, content: str, workers: int = 1) -> tuple[int, str]:
+def run_tests(folder: Path, content: str, workers: int = 1, *more: str) -> tuple[int, str]:
     (folder / "test_it.py").write_text(content)
-    options = ["-q", "--workers", str(workers), f"--rootdir={folder}"]
+    options = ["-q", "--workers", str(workers), f"--rootdir={folder}", *more]
     command = [sys.executable, str(ROOT / "tools/run_tests.py"), *options]
     plugins = {"PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", "PYTEST_PLUGINS": ""}  # others take seconds to import
     environment = {**os.environ, "PYTHONPATH": str(ROOT), **plugins}
@@ -142,6 +142,28 @@ def test_tests_are_collected_once_and_a_worker_that_dies_fails_its_test_only(tmp
     once_and_for_the_second_time = "xx"
     assert (tmp_path / "collected").read_text() == once_and_for_the_second_time
     assert (tmp_path / "made").read_text() == "xxx"  # by two workers, and for the second time
+
+
+MEET = """
+import pathlib, pytest, time
+def meet(own, other):
+    pathlib.Path(own).touch()
+    deadline = time.monotonic() + 10
+    while not pathlib.Path(other).exists():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+@pytest.fixture(scope="module")
+def made(): pathlib.Path("made").open("a").write("x")
+def test_first(made): pass
+def test_second(made): pass
+def test_one(): meet("one", "other")
+def test_other(): meet("other", "one")
+"""
+
+
+def test_tests_that_share_no_fixture_need_not_wait_for_each_other(tmp_path: Path) -> None:
+    assert run_tests(tmp_path, MEET, 2, "--spread")[0] == 0
+    assert (tmp_path / "made").read_text() == "x"
 
 
 LEAVES = """

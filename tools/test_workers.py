@@ -1,7 +1,8 @@
 """A pytest plugin that runs tests in several processes: ``--workers 4``. They are forked once all tests are collected.
 
-A worker gets one module after another, in the order in which they were collected, so each fixture of a module is made
-once. One that dies fails its test, and another goes on with the rest.
+A worker gets the tests of one module after another, in the order in which they were collected, so each fixture of a
+module is made once. With ``--spread``, for few tests that take long, tests that share no fixture are given one by one,
+after the modules. A worker that dies fails its test, and another goes on with the rest.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ Indexes = list[int]  # of items, in the order in which they are collected
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--workers", type=int, default=0, help="processes that run tests; 0: the one that collects them")
+    parser.addoption("--spread", action="store_true", help="give tests that share no fixture to workers one by one")
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -47,8 +49,11 @@ class Workers:
     def pytest_runtestloop(self, session: pytest.Session) -> bool | None:
         if session.testsfailed or session.config.option.collectonly:
             return None  # pytest's own loop runs nothing then, either
-        numbered = groupby(range(len(session.items)), key=lambda index: session.items[index].path)
+        together = shared if session.config.getoption("--spread") else path_of
+        numbered = groupby(range(len(session.items)), key=lambda index: together(session.items[index]))
         self._modules.extend(list(indexes) for _, indexes in numbered)
+        if together is shared:
+            self._modules = deque(sorted(self._modules, key=len, reverse=True))
         try:
             for _ in range(min(session.config.getoption("--workers"), len(self._modules))):
                 self._fork(session)
@@ -121,6 +126,16 @@ class Workers:
     def _reap(self, connection: Connection) -> None:
         connection.close()
         os.waitpid(self._workers.pop(connection).pid, 0)
+
+
+def path_of(item: pytest.Item) -> str:
+    return str(item.path)
+
+
+def shared(item: pytest.Item) -> str:
+    """The same for tests that share a fixture which lives longer than one of them."""
+    fixtures = cast(Any, item)._fixtureinfo.name2fixturedefs.values()
+    return item.nodeid if all(one[-1].scope in ("function", "session") for one in fixtures) else str(item.path)
 
 
 class Reports:
