@@ -151,7 +151,7 @@ class Session:
     # -- the end
 
     def _summary(self, results: Sequence[Result], wanted: Plan, checked: int | None) -> None:
-        done = [result.step.what for result in results if result.state is State.NEW]
+        done = sum(result.state is State.NEW for result in results)
         could_not = [f"{result.step.what}: {result.why}" for result in results if result.state is State.CANNOT]
         skipped = [result.step.what for result in results if result.state is State.SKIPPED]
         by_hand = [result for result in results if result.state is State.BY_HAND]
@@ -161,7 +161,7 @@ class Session:
         could_not += [*self.notes, *wanted.machine.lacks()]
         if checked:
             could_not.append(f"pebble selftest ended with {checked}: pebble selftest {self.places.config}")
-        _block("Done", done or ["nothing: all was so before"])
+        _block("Done", [f"{done} steps that were new, see above" if done else "nothing: all was so before"])
         _block("Could not", could_not or ["nothing"])
         _block("Next", self._next(wanted))
         if wanted.answers.page and (self.places.tls / certificates.SERVER_CERT).is_file():
