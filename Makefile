@@ -88,7 +88,7 @@ test: .venv/.ready-dev
 
 test-running:
 	@echo "pebble: tests"
-	@$(TESTS) --workers 12 -m "not alone and not page$(LESS)" $(addprefix --ignore=,$(COMPUTING) tests/life) tests
+	@$(TESTS) --workers 7 -m "not alone and not page$(LESS)" $(addprefix --ignore=,$(COMPUTING) tests/life) tests
 
 test-checks:
 	@$(GENTLY) $(MAKE) --no-print-directory --jobs=2 check-types check-names >.venv/checks.log 2>&1 || \
@@ -96,8 +96,8 @@ test-checks:
 	@echo "pebble: lint, types, imports and names are in order"
 
 test-robots: test-running
-	@echo "pebble: whole robots and serial lines, six at a time because these tests check deadlines"
-	@$(TESTS) --workers 6 --spread -m "alone and not page$(LESS)" $(ALONE)
+	@echo "pebble: whole robots and serial lines, five at a time because these tests check deadlines"
+	@$(TESTS) --workers 5 --spread -m "alone and not page$(LESS)" $(ALONE)
 
 test-demo: test-robots
 	@echo "pebble: the demo, whose robots need all processors"
