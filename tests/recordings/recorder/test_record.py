@@ -91,15 +91,17 @@ def publish_all(robot: Transport, reference: Reference, number: int = 300) -> No
     assert until(lambda: len(reference.of(DRIVE)) == number, 10)
 
 
-@pytest.mark.parametrize("protocol", ["5", "3.1.1"])
-def test_what_a_subscriber_sees_is_recorded_byte_for_byte_with_its_flags(tmp_path: Path, protocol: str) -> None:
+@pytest.mark.parametrize(("protocol", "filters"), [("5", ()), ("3.1.1", ("--filter", "#", "--filter", "pebble/#"))])
+def test_what_a_subscriber_sees_is_recorded_byte_for_byte_with_its_flags(
+    tmp_path: Path, protocol: str, filters: tuple[str, ...]
+) -> None:
     broker = Broker(tmp_path)
     robot = client(broker.port)
     for count in range(1500):
         robot.publish(f"{GOOB}/outgoing/many/{count}", b"%d" % count, retain=True)
     robot.publish(FLAG, b"true", qos=QoS.DELIVERED, retain=True)
     reference = Reference(broker.port)
-    with recording(tmp_path / "rec", broker.port, "--protocol", protocol):
+    with recording(tmp_path / "rec", broker.port, "--protocol", protocol, *filters):
         publish_all(robot, reference)
         robot.publish(STATUS, b"{}", qos=QoS.DELIVERED, retain=True)
         robot.publish("replay/robots/goob/outgoing/online", b"{}", retain=True)
