@@ -446,20 +446,6 @@ class TestClock:
         assert [round(event["by_s"]) for event in jump] == [round(by_s)]
         assert len(payloads(running.root)) == 40
 
-    def test_times_in_a_file_never_go_back_by_a_little_either(self, tmp_path: Path) -> None:
-        back = [0]
-        clocks = Clocks(boot_ns=lambda: time.monotonic_ns() - back[0])
-        running = Running(tmp_path / "rec", Options(free_bytes=0, flush_seconds=0.05), clocks=clocks)
-        for number, back[0] in enumerate((0, 400_000_000), 1):
-            running.send(5)
-            assert running.written(5 * number)
-        running.stop()
-        (path,) = library.files([running.root])
-        with mapped(path) as data:
-            times = [message.log_ns for message in read(data)]
-        assert len(times) > 10
-        assert times == sorted(times)
-
     def test_a_suspended_machine_is_a_gap(self, tmp_path: Path) -> None:
         asleep = [0]
         clocks = Clocks(wall_ns=lambda: time.time_ns() + asleep[0], boot_ns=lambda: time.monotonic_ns() + asleep[0])
