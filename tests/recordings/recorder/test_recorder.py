@@ -513,11 +513,11 @@ class TestEnds:
     def test_power_is_lost(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         """Images of the disk: what was synced, and random pages of the rest. Each opens, and says what is missing."""
         disk = _Disk(monkeypatch)
-        running = Running(tmp_path / "rec", Options(free_bytes=0, flush_seconds=0.05, sync_seconds=1.0, level=1))
+        running = Running(tmp_path / "rec", Options(free_bytes=0, flush_seconds=0.05, sync_seconds=2.0, level=1))
         rng = random.Random(9)
-        ends = time.monotonic() + cases(2, 5)
+        ends = time.monotonic() + cases(3, 5)
         while time.monotonic() < ends:
-            running.send(20, payload=b'{"t": %d, "x": "' + rng.randbytes(600).hex().encode() + b'"}')
+            running.send(20, payload=b'{"t": %d, "x": "' + rng.randbytes(150).hex().encode() + b'"}')
             time.sleep(0.01)
         log = list(disk.log)
         running.stop()
