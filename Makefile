@@ -11,7 +11,7 @@ help:
 	@echo "make demo             four simulated robots, on Zenoh, on MQTT and on MCUs, driven through a broker; Ctrl-C ends it"
 	@echo "make demo SECONDS=30  ends by itself; succeeds only if every robot moved, stopped and obeyed as it should"
 	@echo "make demo PHONE=1     opens its page to the network, by https, with a login and a QR code"
-	@echo "make test             all checks and tests, some rows of each rule, some eight minutes"
+	@echo "make test             all checks and tests, some rows of each rule, some twelve minutes"
 	@echo "make quick            what to run before each commit: lint, types, contract, memory transport, one robot; a minute"
 	@echo "make thorough         the same, with all rows, all cases of the random tests, and the tests that take longest"
 	@echo "make fleet            brokers and hubs that are killed, hung and cut off under driven robots and 300 boards, half an hour"
