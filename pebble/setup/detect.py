@@ -180,7 +180,10 @@ NO_MOSQUITTO = (
     "mosquitto is not installed, so there is no broker on this robot:"
     " sudo apt install mosquitto, then sudo pebble setup"
 )
-OFFLINE = f"this machine has no network, so no phone reaches it: join one, such as by sudo nmtui, then {RENEW}"
+OFFLINE = (
+    "this machine has no network, so no phone reaches it: join one, such as by sudo nmtui,"
+    f" then {RENEW} NAME.local ADDRESS"
+)
 
 
 def bits(largest: int) -> str:

@@ -139,7 +139,7 @@ LACKING = {
         {"network": detect.OFFLINE},
         None,
         "this machine has no network, so no phone reaches it: join one, such as by sudo nmtui,"
-        " then sudo pebble cert renew --folder /etc/pebble/tls",
+        " then sudo pebble cert renew --folder /etc/pebble/tls NAME.local ADDRESS",
     ),
     "unset clock": (
         {"clock": detect.unset_clock(0.0, None)},
