@@ -6,9 +6,19 @@ from pebble.contract import CHANNELS, ESTOP, INCOMING, OUTGOING, Kind
 from pebble.contract.channels import ONLINE
 from pebble.contract.names import with_name
 from pebble.fleet.folder import Fleet
-from pebble.fleet.roles import Account, Rule
+from pebble.fleet.roles import Account, ProgramRole, Rule
 from pebble.transports.zenoh import wire
-from pebble.transports.zenoh.access import IN, OUT, Access, Grant, HubAccount, access_control, first, written
+from pebble.transports.zenoh.access import (
+    EVERYTHING,
+    IN,
+    OUT,
+    Access,
+    Grant,
+    HubAccount,
+    access_control,
+    first,
+    written,
+)
 from pebble.transports.zenoh.keymap import filter_to_key
 
 _ANY = "+/+/+"  # the levels of any robot
@@ -20,7 +30,10 @@ def zenoh_text(fleet: Fleet) -> bytes:
     """The file that a hub reads as ``transport.access``."""
     rules = {name: fleet.rules_of(name) for name in fleet.accounts}
     accounts = {name: _hub_account(fleet.accounts[name], held) for name, held in rules.items()}
-    rows = (([name], _grants(name, held, accounts[name].retains)) for name, held in rules.items())
+    rows = (
+        ([name], EVERYTHING if ProgramRole.HUB in account.roles else _grants(name, rules[name], accounts[name].retains))
+        for name, account in fleet.accounts.items()
+    )
     stops = _keys((_STOP, with_name(_STOP, "+")))
     return written(Access(access_control(rows), accounts, first(_keys([f"{_ANY}/{INCOMING}/#"]), stops)))
 
