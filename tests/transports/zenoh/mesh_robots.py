@@ -22,7 +22,7 @@ def certificate_of(fleet: Path, account: str) -> TlsSettings:
 
 
 def settings_of(run_dir: Path, endpoints: tuple[str, ...], account: str, fleet: Path | None) -> ZenohSettings:
-    """Of a client; ``fleet``: the folder of one, with the certificate of ``account``."""
+    """Return those of a client; ``fleet``: the folder of one, with the certificate of ``account``."""
     if fleet is None:
         return ZenohSettings(run_dir=run_dir, connect=endpoints, client=True)
     tls = certificate_of(fleet, account)
