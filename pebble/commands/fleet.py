@@ -49,7 +49,11 @@ _LEVELS: dict[str, Literal["login", "named"]] = {"login": "login", "named": "nam
 def init(
     folder_: Annotated[Path, typer.Argument(metavar="FOLDER", help="A new folder.", show_default=False)],
     host: Annotated[
-        str | None, typer.Option(help="Name or address by which robots and people reach the broker.", metavar="HOST")
+        str | None,
+        typer.Option(
+            help="Name or address by which robots and people reach the broker; then those of spare ones and hubs.",
+            metavar="HOST[,HOST]",
+        ),
     ] = None,
     level: Annotated[str | None, typer.Option(help="login, or named: names in topics, too.", metavar="LEVEL")] = None,
     port: Annotated[int, typer.Option(help="Port of the broker, which is encrypted.", min=1, max=65535)] = folder.PORT,
@@ -70,6 +74,7 @@ def init(
 
     \b
         pebble fleet init hall --host broker.lab
+        pebble fleet init hall --host broker.lab,spare.lab,hub1.lab
         pebble fleet init hall --level named --plain
     """
     require_packages("pebble fleet")
@@ -80,11 +85,12 @@ def init(
         return _init_again(place, host, level, plain)
     if host is None:
         raise PebbleError("--host is missing: the name or address by which robots and people reach the broker")
-    server = Server(host=host_of("--host", host), port=port, unencrypted=unencrypted)
+    first, *others = (host_of("--host", one) for one in split_names(host))
+    server = Server(host=first, port=port, unencrypted=unencrypted)
     plugin = None if without_plugin else applying.found_plugin()
     rules: Literal["plugin", "files"] = "files" if plugin is None else "plugin"
     fleet = Fleet(level=_LEVELS[level or "login"], brokers=(server,), rules=rules, plain=bool(plain))
-    applying.make(place, fleet, plugin)
+    applying.make(place, fleet, plugin, others=others)
     typer.echo(f"{_shown(place)} has all files of a broker at {server.host}:{server.port}, level {fleet.level}.")
     if plugin is None and not without_plugin:
         typer.echo("mosquitto's plugin is not installed: it reads rules from files, and again after each change.")
