@@ -33,7 +33,7 @@ from tests.transports.zenoh.mesh_robots import HEARTBEAT, WILL, certificate_of, 
 NAMES = "abc"
 EYE = "eye"  # the account of all clients that are no robots
 KILLS = ("robot", "hub", "both")
-LARGE = bytes(1_500_000)  # more than one message between two hubs
+LARGE = bytes(200_000)  # more than one message between two hubs
 #: Longer than any hub waits with a will, and what is due then takes a moment.
 QUIET_S = 8.0
 

@@ -12,8 +12,9 @@ import msgspec
 from pebble.transports.base import QoS
 
 TIE_S = 0.1  # ages that differ by less are equal: two hubs receive a message at different times
-MAX_ROWS = 5000  # of a table in one message
-MAX_BYTES = 1 << 20  # of values in one message, about
+#: What does not fit into a link within `session.BLOCK_MS` ends it, so messages are small: in one, about,
+MAX_ROWS = 1000  # of a table
+MAX_BYTES = 1 << 16  # of values
 
 
 class Row(msgspec.Struct, frozen=True, array_like=True):

@@ -28,7 +28,7 @@ from pebble.transports.zenoh.keymap import topic_to_key
 
 log = logging.getLogger(__name__)
 
-PATIENCE_S = 0.5  # queries of clients wait so long for a merge
+PATIENCE_S = 2.0  # queries of clients wait so long for a merge: until then an older value may be here
 ASK_S = 1.0  # for a table of another hub, or for our own thread
 VALUES_S = 10.0  # for values, which may be large
 ASKED = 5  # times, before another hub counts as one that does not merge
@@ -170,12 +170,12 @@ class Mesh:
     # -- the one with the smaller name asks, on a thread of its own
 
     def _merge(self, session: zenoh.Session, name: str) -> None:
-        for _ in range(ASKED):
+        for turn in range(ASKED):
             try:
                 self._merge_once(session, name)
             except (zenoh.ZError, ValueError, msgspec.DecodeError, queue.Empty) as error:
                 log.warning("hub %s: the merge with it failed, and is tried again: %s", name, str(error) or "no answer")
-                time.sleep(ASK_S)
+                time.sleep(_PAUSE_S * 3**turn)  # a second link to it has appeared meanwhile, or it is gone
             else:
                 return
             if name not in self._names or session is not self._session:
@@ -211,7 +211,7 @@ class Mesh:
         want, give = merge.compare(mine, theirs.rows, alive)
         return _Decided(
             want,
-            list(store.values(give)),
+            sorted(store.values(give), key=_size),  # a large one holds up no small one
             merge.published(theirs.recalled, mine, store.wills()),
             merge.published(self._recalled_keys(), theirs.rows, theirs.wills),
             time.monotonic(),
@@ -246,7 +246,7 @@ class Mesh:
                     query.reply(key, merge.encode(part))
                 return
             asked = merge.decode_exchange(payload)
-            for values in merge.in_parts(self._hub.store.values(asked.want)):
+            for values in merge.in_parts(iter(sorted(self._hub.store.values(asked.want), key=_size))):
                 if values:
                     query.reply(key, merge.encode(values))
             query.reply(key, merge.encode([]))
@@ -317,6 +317,10 @@ def _named(token: zenoh.Sample) -> tuple[str, str]:
     """The hub that a token is of, and the name under which it is there."""
     under = str(token.key_expr).removeprefix(wire.UP)
     return under.partition(wire.RENEWAL)[0], under
+
+
+def _size(value: merge.Value) -> int:
+    return len(value.payload)
 
 
 def _ask(session: zenoh.Session, key: str, payload: bytes, timeout: float) -> list[bytes]:
