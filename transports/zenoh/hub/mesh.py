@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator
 from functools import partial
+from itertools import chain, islice
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import msgspec
@@ -56,10 +57,11 @@ class Hub(Protocol):
 
 
 class _Decided(NamedTuple):
-    """Keys to ask for, values to give, and the clients whose wills each side forgets."""
+    """Keys to ask for, values and ages to give, and the clients whose wills each side forgets."""
 
     want: list[str]
     give: list[merge.Value]
+    ages: dict[str, float]
     they_forget: list[str]
     we_forget: list[str]
     at: float
@@ -209,27 +211,31 @@ class Mesh:
         store = self._hub.store
         mine, alive = store.table(), self._hub.alive_clients | set(theirs.alive)
         want, give = merge.compare(mine, theirs.rows, alive)
+        store.know(merge.known_ages(mine, theirs.rows))
         return _Decided(
             want,
             sorted(store.values(give), key=_size),  # a large one holds up no small one
+            merge.known_ages(theirs.rows, mine),
             merge.published(theirs.recalled, mine, store.wills()),
             merge.published(self._recalled_keys(), theirs.rows, theirs.wills),
             time.monotonic(),
         )
 
     def _exchange(self, session: zenoh.Session, name: str, decided: _Decided) -> None:
-        parts = list(merge.in_parts(iter(decided.give)))
+        ages = iter(decided.ages.items())
+        parts = [(part, {}) for part in merge.in_parts(iter(decided.give))]
+        parts += [([], some) for some in iter(lambda: dict(islice(ages, merge.MAX_ROWS)), {})]
         got: list[merge.Value] = []
-        for number, part in enumerate(parts, 1):
+        for number, (values, some) in enumerate(parts, 1):
             last, waited = number == len(parts), time.monotonic() - decided.at
-            give = [replace(one, age_s=one.age_s + waited) for one in part]
+            give = [replace(one, age_s=one.age_s + waited) for one in values]
+            older = {key: age_s + waited for key, age_s in some.items()}
             want, forget = (decided.want, decided.they_forget) if last else ([], None)
-            asked = merge.encode(merge.Exchange(self._name, want, give, forget))
+            asked = merge.encode(merge.Exchange(self._name, want, give, older, forget))
             answers = [merge.decode_values(data) for data in _ask(session, wire.MERGE + name, asked, VALUES_S)]
             if not answers or answers.pop():
                 raise ValueError("its answer was cut off")
-            for values in answers:
-                got += values
+            got += chain.from_iterable(answers)
         self._hub.post(lambda: self._adopt(name, self._take(got, decided.at), decided.we_forget, len(decided.give)))
 
     # -- on the hub's thread
@@ -252,6 +258,7 @@ class Mesh:
             query.reply(key, merge.encode([]))
         if (since := self._compared.get(asked.asker)) is None:
             raise ValueError(f"hub {asked.asker} has not asked for the table")
+        self._hub.store.know(asked.ages)
         self._taken[asked.asker] = self._taken.get(asked.asker, 0) + self._take(asked.give, since)
         if asked.forget is not None:
             del self._compared[asked.asker]
@@ -282,10 +289,11 @@ class Mesh:
             self._hub.ask_again()
 
     def _take(self, values: Iterable[merge.Value], since: float) -> int:
-        """Store what was asked for at ``since``, but where something has come meanwhile."""
+        """Store what was asked for at ``since``, but where something has come meanwhile, or its age became known."""
         taken, waited = 0, time.monotonic() - since
         for one in values:
-            if not merge.is_overtaken(self._hub.store.row(one.key), waited):
+            mine, theirs = self._hub.store.row(one.key), merge.row_of(one)
+            if not merge.is_overtaken(mine, waited) and merge.is_newer(theirs, mine, ()):
                 stamp = wire.Stamp(one.qos, one.retained_count, one.origin)
                 taken += self._hub.apply(Retained(one.key, one.payload, stamp), one.age_s)
         return taken
