@@ -36,7 +36,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hosts]:
 @pytest.mark.parametrize("fault", ["kill", *map(further, sorted(FAULTS.keys() - {"kill"}))])
 def test_a_driven_robot_goes_to_another_host(world: Hosts, fault: str) -> None:
     counts = Counts()
-    for _ in range(cases(1, 10)):
+    for _ in range(cases(1, 6)):
         fail_while_driving(world, fault, counts)
     sys.stdout.write(f"\n{fault}: {counts}\n")
     assert {what: counts.wrong[what] for what in NEVER} == dict.fromkeys(NEVER, 0)
@@ -59,7 +59,7 @@ def test_so_it_does_over_tls(tmp_path: Path) -> None:
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_stop_while_the_host_changes_takes_effect_once_there_is_one(world: Hosts, fault: str) -> None:
     counts = Counts()
-    for _ in range(cases(1, 5)):
+    for _ in range(cases(1, 3)):
         fail_while_driving(world, fault, counts, stops=True)
         world.reset()
     sys.stdout.write(f"\n{fault}, stops: {counts}\n")
