@@ -31,7 +31,7 @@ def zenoh_text(fleet: Fleet) -> bytes:
     rules = {name: fleet.rules_of(name) for name in fleet.accounts}
     accounts = {name: _hub_account(fleet.accounts[name], held) for name, held in rules.items()}
     rows = (
-        ([name], EVERYTHING if ProgramRole.HUB in account.roles else _grants(name, rules[name], accounts[name].retains))
+        ([name], _grants(name, rules[name], accounts[name].retains, is_hub=ProgramRole.HUB in account.roles))
         for name, account in fleet.accounts.items()
     )
     stops = _keys((_STOP, with_name(_STOP, "+")))
@@ -48,8 +48,11 @@ def _hub_account(account: Account, held: Iterable[Rule]) -> HubAccount:
     return HubAccount(tuple(wills), tuple(dict.fromkeys((*wills, *whole, *flags))))
 
 
-def _grants(name: str, held: Sequence[Rule], retains: Iterable[str]) -> Iterator[Grant]:
+def _grants(name: str, held: Sequence[Rule], retains: Iterable[str], *, is_hub: bool) -> Iterator[Grant]:
     """Only what its client needs; so it cannot pose as a hub, nor answer queries of others."""
+    if is_hub:
+        yield from EVERYTHING
+        return
     reads, writes = (_keys(rule.filter for rule in held if rule.access == one) for one in ("read", "write"))
     asks = tuple(wire.asked(one, name) for one in (wire.HELLO, wire.BYE))
     retained, hubs, counts = _retained(reads), (f"{wire.UP}*",), (f"{wire.SYNC}*",)

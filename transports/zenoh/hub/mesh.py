@@ -12,7 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator
 from functools import partial
-from itertools import chain, islice
+from itertools import chain
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import msgspec
@@ -222,9 +222,10 @@ class Mesh:
         )
 
     def _exchange(self, session: zenoh.Session, name: str, decided: _Decided) -> None:
-        ages = iter(decided.ages.items())
+        ages = list(decided.ages.items())
+        parts: list[tuple[list[merge.Value], dict[str, float]]]
         parts = [(part, {}) for part in merge.in_parts(iter(decided.give))]
-        parts += [([], some) for some in iter(lambda: dict(islice(ages, merge.MAX_ROWS)), {})]
+        parts += [([], dict(ages[at : at + merge.MAX_ROWS])) for at in range(0, len(ages), merge.MAX_ROWS)]
         got: list[merge.Value] = []
         for number, (values, some) in enumerate(parts, 1):
             last, waited = number == len(parts), time.monotonic() - decided.at
