@@ -38,7 +38,7 @@ _Roles = Annotated[
     str,
     typer.Option(
         "--role",
-        help="viewer, driver, maintainer, safety, admin, or several of them: driver,safety; else page, robot, gateway.",
+        help="viewer, driver, maintainer, safety, admin, or several: driver,safety; else page, robot, gateway, hub.",
         metavar="ROLE[,ROLE]",
     ),
 ]
@@ -49,7 +49,11 @@ _LEVELS: dict[str, Literal["login", "named"]] = {"login": "login", "named": "nam
 def init(
     folder_: Annotated[Path, typer.Argument(metavar="FOLDER", help="A new folder.", show_default=False)],
     host: Annotated[
-        str | None, typer.Option(help="Name or address by which robots and people reach the broker.", metavar="HOST")
+        str | None,
+        typer.Option(
+            help="Name or address by which robots and people reach the broker; then those of spare ones and hubs.",
+            metavar="HOST[,HOST]",
+        ),
     ] = None,
     level: Annotated[str | None, typer.Option(help="login, or named: names in topics, too.", metavar="LEVEL")] = None,
     port: Annotated[int, typer.Option(help="Port of the broker, which is encrypted.", min=1, max=65535)] = folder.PORT,
@@ -70,6 +74,7 @@ def init(
 
     \b
         pebble fleet init hall --host broker.lab
+        pebble fleet init hall --host broker.lab,spare.lab,hub1.lab
         pebble fleet init hall --level named --plain
     """
     require_packages("pebble fleet")
@@ -80,11 +85,12 @@ def init(
         return _init_again(place, host, level, plain)
     if host is None:
         raise PebbleError("--host is missing: the name or address by which robots and people reach the broker")
-    server = Server(host=host_of("--host", host), port=port, unencrypted=unencrypted)
+    first, *others = (host_of("--host", one) for one in split_names(host))
+    server = Server(host=first, port=port, unencrypted=unencrypted)
     plugin = None if without_plugin else applying.found_plugin()
     rules: Literal["plugin", "files"] = "files" if plugin is None else "plugin"
     fleet = Fleet(level=_LEVELS[level or "login"], brokers=(server,), rules=rules, plain=bool(plain))
-    applying.make(place, fleet, plugin)
+    applying.make(place, fleet, plugin, others=others)
     typer.echo(f"{_shown(place)} has all files of a broker at {server.host}:{server.port}, level {fleet.level}.")
     if plugin is None and not without_plugin:
         typer.echo("mosquitto's plugin is not installed: it reads rules from files, and again after each change.")
@@ -225,6 +231,9 @@ def certificate(
     require_packages("pebble fleet")
     with _changing(folder_) as (place, fleet):
         account = _account(place, fleet, name)
+        is_hub = ProgramRole.HUB in account.roles
+        if is_hub and not hosts:
+            raise FleetError(f"{name} is a hub: name where others reach it, `pebble fleet certificate {name} HOST`")
         files = certificates.of_account(place, name, hosts or ())
         until = certificates.show(files[0]).until
     typer.echo(f"{' and '.join(map(_shown, files))} are for {name}, until {until:%Y-%m-%d}.")
@@ -232,10 +241,14 @@ def certificate(
     typer.echo(
         f"Move the key to its machine, with copies of {copies} beside it. `pebble fleet check` watches the date."
     )
+    tls = {"enabled": True, "ca_cert": certificates.CA_CERT, "client_cert": f"{name}.pem", "client_key": f"{name}.key"}
+    if is_hub:
+        typer.echo(f"And a copy of {_shown(place / ZENOH)}. The file of that hub, with the other hubs in connect:")
+        file = {"listen": [f"tls/0.0.0.0:{_ZENOH_PORT}"], "connect": [], "tls": tls, "access": ZENOH}
+        typer.echo(json.dumps({**file, "journal": f"{name}.journal"}, indent=2))
     if ProgramRole.ROBOT in account.roles:
-        tls = {"enabled": True, "ca_cert": certificates.CA_CERT, "client_cert": f"{name}.pem"}
         link = {"kind": "zenoh", "account": name, "connect": [f"tls/{fleet.brokers[0].host}:{_ZENOH_PORT}"]}
-        remote = {**link, "tls": {**tls, "client_key": f"{name}.key"}}
+        remote = {**link, "tls": tls}
         piece = {"services": {"mqtt_bridge": {"enabled": True, "remote": remote}}}
         typer.echo(json.dumps({"security": {"level": _level(fleet, account)}, **piece}, indent=2))
     return 0
@@ -357,6 +370,9 @@ def _print_account(place: Path, fleet: Fleet, name: str, secret: str, how: str, 
     url = f"mqtts://{name}@" + ",".join(_host_and_port(server) for server in fleet.brokers)
     if ProgramRole.PAGE in account.roles:
         typer.echo(f"    pebble web --url {url} --ca-cert {ca} --password-file FILE")
+    elif ProgramRole.HUB in account.roles:
+        typer.echo("A hub needs none, but a certificate:")
+        typer.echo(f"    pebble fleet certificate {name} HOST")
     elif ProgramRole.GATEWAY not in account.roles:
         typer.echo(f"    pebble drive ROBOT --url {url} --ca-cert {ca} --password-file FILE")
 

@@ -51,6 +51,7 @@ def hub(file: FileArgument, state: StateOption = False) -> int:
     stop = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
-    typer.echo(f"hub at {', '.join(settings.listen)}; Ctrl-C ends it", err=True)
+    here = f"on this machine --url zenoh:{settings.run_dir}"
+    typer.echo(f"hub at {', '.join(settings.listen)}, {here}; Ctrl-C ends it", err=True)
     run_hub(settings, stop)
     return 0

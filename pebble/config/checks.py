@@ -253,7 +253,8 @@ def _with_hosts(reader: Reader, mqtt: Mqtt, path: Path) -> Mqtt:
         return mqtt
     if mqtt.host not in ("", Mqtt().host, mqtt.places[0][0]):
         reader.notes.problem(
-            (*path, "host"), f"is given beside hosts: write {mqtt.host} into hosts, and leave out host"
+            (*path, "host"),
+            f"is given beside hosts, which takes its place: leave out host ({mqtt.host})",
         )
     if len(mqtt.hosts) > _MOST_HOSTS:
         reader.notes.problem((*path, "hosts"), f"must be {_MOST_HOSTS} at most, not {len(mqtt.hosts)}")

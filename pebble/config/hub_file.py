@@ -40,8 +40,6 @@ def load_hub(path: Path, env: Mapping[str, str] = os.environ) -> tuple[HubFile, 
     hub = reader.section(HubFile, plain(raw, reader.notes))
     if not hub.listen:
         reader.notes.problem(("listen",), 'is missing: a hub is reached there, such as ["tls/0.0.0.0:7447"]')
-    if hub.access is not None and hub.connect:
-        reader.notes.problem(("access",), "grants accounts, not hubs: for linked hubs use allowed_names")
     if reader.notes.problems:
         raise ConfigError(list(dict.fromkeys(f"{path.name}: {one}" for one in reader.notes.problems)))
     return hub, hub.run_dir or default_run_folder(f"hub {path}", env)

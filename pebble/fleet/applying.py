@@ -7,7 +7,7 @@ import getpass
 import os
 import signal
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -47,17 +47,24 @@ def found_plugin() -> Path | None:
     return None
 
 
-def make(folder: Path, fleet: Fleet, plugin: Path | None, passwords: Mapping[str, str] | None = None) -> str:
+def make(
+    folder: Path,
+    fleet: Fleet,
+    plugin: Path | None,
+    passwords: Mapping[str, str] | None = None,
+    others: Sequence[str] = (),
+) -> str:
     """Write all files of a new fleet, and its account for changes. Returns that one's password. Raises PebbleError.
 
-    ``passwords``: of the accounts that it begins with. A broker that is ``included`` has its configuration elsewhere.
+    ``passwords``: of the accounts that it begins with. ``others``: machines of the fleet that the broker's certificate
+    names, too, and that its authority may sign for. A broker that is ``included`` has its configuration elsewhere.
     """
     if (folder / CONF).exists():
         raise FleetError(f"{folder / CONF} exists already: name another folder")
     server = fleet.brokers[0]
     password = broker_files.new_password()
     fleet = fleet.with_account(ADMIN, Account(roles=(Role.ADMIN,)))
-    certificates.init(folder, names_of(server))
+    certificates.init(folder, [*names_of(server), *others])
     folder.chmod(0o700)
     given = {**(passwords or {}), ADMIN: password}
     _write_rules(folder, fleet, {name: broker_files.hashed(one) for name, one in given.items()})

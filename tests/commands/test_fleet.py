@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 
 from pebble.config import load
+from pebble.config.hub_file import load_hub
 from pebble.config.raw import deep_merge
 from pebble.fleet import certificates
 from pebble.fleet.broker_client import BrokerClient, Place
@@ -235,6 +236,12 @@ def test_zenoh_hubs_have_the_same_accounts(hall: Path, monkeypatch: pytest.Monke
     (hall / "ca.pem").write_bytes((hall / "hall" / "ca.pem").read_bytes())
     _robot_accepts(_written({"robot": {"id": "goob"}, **piece}, hall, "goob"), "login")
     assert set(read_access(rules).accounts) == {"admin", "ann", "goob"}
+    run("pebble fleet add hub1 --role hub", hall)
+    assert "name where others reach it" in pebble("pebble fleet certificate hub1", hall).stderr
+    printed = run("pebble fleet certificate hub1 hub1.local", hall)
+    (hall / "hub1.json").write_text(printed[printed.index("{") :])
+    assert load_hub(hall / "hub1.json")[0].access == hall / ZENOH
+    assert pebble("pebble fleet remove hub1", hall).returncode == 1
     done = pebble("pebble fleet remove ann", hall)
     assert (done.returncode, set(read_access(rules).accounts)) == (1, {"admin", "goob"})
     assert "Zenoh hubs with a copy of hall/zenoh.json admit ann until they have the new one" in done.stderr

@@ -40,10 +40,6 @@ def test_linked_hubs_show_each_other(run: Run, tmp_path: Path) -> None:
         ({}, 'hub.json: listen: is missing: a hub is reached there, such as ["tls/0.0.0.0:7447"]'),
         ({"listen": ["tcp/127.0.0.1:1"], "lisen": []}, 'hub.json: lisen: unknown key, did you mean "listen"?'),
         ({"listen": ["tcp/127.0.0.1:1"], "max_wills": 0}, "hub.json: max_wills: "),
-        (
-            {"listen": ["tcp/127.0.0.1:1"], "connect": ["tcp/127.0.0.1:2"], "access": "zenoh.json"},
-            "hub.json: access: grants accounts, not hubs: for linked hubs use allowed_names",
-        ),
         ({"listen": ["tcp/192.0.2.1:7447"]}, "leaves this machine unencrypted: use tls/host:port"),
     ],
 )

@@ -13,24 +13,21 @@ from pathlib import Path
 from typing import Any
 
 from pebble.runtime.every_host import EveryHost
-from pebble.transports import Message, MqttSettings, QoS, State
+from pebble.transports import Message, MqttSettings, QoS, State, TlsSettings, Transport
 from tests.robot.operator import Driver, Operator, ReceivedMessage, number_of
 from tests.robot.rig import BASE, STOP, Rig
-from tests.support import Broker, until
+from tests.support import ROOT, Broker, until
 from tests.tcp_proxy import TcpProxy
 
 _numbers = itertools.count(1, 5000)
+CERTS = ROOT / "tests" / "data" / "tls"
 
 
-class HostsOperator(Operator):
-    """The operator of the rig, at all brokers at once, by the transport of page and tools."""
+class TransportOperator(Operator):
+    """The operator of the rig by a transport of Pebble's, which is not open yet."""
 
-    def __init__(self, ports: list[int]) -> None:
-        self.base, self.seen = BASE, []
-        places = tuple(("127.0.0.1", port) for port in ports)
-        self.transport = EveryHost("operator", MqttSettings(host=places[0][0], port=places[0][1], hosts=places))
-        self.moves: list[tuple[float, str]] = []
-        self.transport.moved = lambda base: self.moves.append((time.monotonic(), self.transport.host_of(base)))
+    def __init__(self, transport: Transport) -> None:
+        self.base, self.seen, self.transport = BASE, [], transport
         self.transport.open(5.0)
         assert until(lambda: self.transport.state is State.CONNECTED)
         self.transport.subscribe(f"{BASE}/outgoing/#", self._note)
@@ -44,6 +41,16 @@ class HostsOperator(Operator):
 
     def _note(self, message: Message) -> None:
         self.seen.append(ReceivedMessage(time.monotonic(), message.topic, message.payload, message.retain))
+
+
+class HostsOperator(TransportOperator):
+    """At all brokers at once, by the transport of page and tools."""
+
+    def __init__(self, settings: MqttSettings) -> None:
+        self.hosts = EveryHost("operator", settings)
+        self.moves: list[tuple[float, str]] = []
+        self.hosts.moved = lambda base: self.moves.append((time.monotonic(), self.hosts.host_of(base)))
+        super().__init__(self.hosts)
 
 
 @dataclass
@@ -67,16 +74,20 @@ class Counts:
 class Hosts:
     """Brokers behind a proxy each, through which the robot reaches them; the operator does so without."""
 
-    def __init__(self, folder: Path, stack: ExitStack, count: int = 2) -> None:
+    def __init__(self, folder: Path, stack: ExitStack, count: int = 2, *, tls: bool = False) -> None:
         self.brokers, self.proxies = [], []
+        own = (f"certfile {CERTS}/server.crt", f"keyfile {CERTS}/server.key") if tls else ()
         for _ in range(count):
-            broker = Broker(folder)
+            broker = Broker(folder, *own)
             stack.callback(broker.kill)
             self.brokers.append(broker)
             proxy = TcpProxy(broker.port)
             stack.callback(proxy.stop)
             self.proxies.append(proxy)
-        self.operator = HostsOperator([one.port for one in self.brokers])
+        name = "localhost" if tls else "127.0.0.1"  # as the certificate has it
+        places = tuple((name, one.port) for one in self.brokers)
+        authority = TlsSettings(ca_cert=CERTS / "ca.crt") if tls else None
+        self.operator = HostsOperator(MqttSettings(host=name, port=places[0][1], hosts=places, tls=authority))
         self.rig = stack.enter_context(
             Rig(
                 "mqtt",
@@ -84,7 +95,10 @@ class Hosts:
                 operator=self.operator,
                 mqtt_bridge={
                     "enabled": True,
-                    "remote_mqtt": {"hosts": [f"127.0.0.1:{one.port}" for one in self.proxies]},
+                    "remote_mqtt": {
+                        "hosts": [f"{name}:{one.port}" for one in self.proxies],
+                        "tls": {"enabled": tls} | ({"ca_cert": str(CERTS / "ca.crt")} if tls else {}),
+                    },
                 },
             )
         )
@@ -95,7 +109,7 @@ class Hosts:
     @property
     def at(self) -> int:
         """At which host the robot is, as the operator hears it."""
-        place = self.operator.transport.host_of(BASE)
+        place = self.operator.hosts.host_of(BASE)
         return next((n for n, one in enumerate(self.brokers) if place.endswith(f":{one.port}")), -1)
 
     def reset(self) -> None:
@@ -136,18 +150,25 @@ def _cut(hosts: Hosts, one: int) -> Callable[[], None]:
     return hosts.proxies[one].mend
 
 
+def _freeze_two(hosts: Hosts, one: int) -> Callable[[], None]:
+    """The next one, too."""
+    heal = [_freeze(hosts, number % len(hosts.brokers)) for number in (one, one + 1)]
+    return lambda: [each() for each in heal] and None
+
+
 FAULTS: dict[str, Callable[[Hosts, int], Callable[[], None]]] = {
     "kill": _kill,
     "freeze": _freeze,
     "part": _part,
     "cut": _cut,
+    "freeze two": _freeze_two,
 }
 
 
 @contextmanager
-def hosts(folder: Path, count: int = 2) -> Iterator[Hosts]:
+def hosts(folder: Path, count: int = 2, *, tls: bool = False) -> Iterator[Hosts]:
     with ExitStack() as stack:
-        yield Hosts(folder, stack, count)
+        yield Hosts(folder, stack, count, tls=tls)
 
 
 def fail_while_driving(world: Hosts, fault: str, counts: Counts, *, stops: bool = False, held_s: float = 3.0) -> None:
@@ -170,7 +191,7 @@ def fail_while_driving(world: Hosts, fault: str, counts: Counts, *, stops: bool 
     assert until(lambda: world.at not in (before, -1), 15), f"at no other host: {world.rig.log.read_text()[-3000:]}"
     moved_at = operator.moves[-1][0]
     counts.note(f"{fault}: heartbeat elsewhere after", moved_at - failed_at)
-    counts.note(f"{fault}: gap of heartheartbeats", moved_at - last)
+    counts.note(f"{fault}: gap of heartbeats", moved_at - last)
     if not stops:
         assert until(lambda: any(at > moved_at for at, _ in _commands(world, began)), 5), "no driving at the new host"
         counts.note(f"{fault}: driven again after the heartbeat", _first(world, moved_at) - moved_at)

@@ -1,4 +1,4 @@
-"""Robots with a list of brokers: killed, hung and cut off ones, while they are driven and stopped."""
+"""Robots with a list of three brokers: killed, hung and cut off ones, while they are driven and stopped."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ pytestmark = pytest.mark.alone
 NEVER = ("twice", "out of order", "older than 1 s", "false wills after the robot was heard elsewhere",
          "values older than the newest")  # fmt: skip
 #: Seconds until the first heartbeat at another host.
-ELSEWHERE_S = {"kill": 1.0, "freeze": 6.0, "part": 6.0, "cut": 1.0}
+ELSEWHERE_S = {"kill": 1.0, "freeze": 6.0, "part": 6.0, "cut": 1.0, "freeze two": 6.0}
 
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hosts]:
-    with hosts(tmp_path_factory.mktemp("hosts")) as made:
+    with hosts(tmp_path_factory.mktemp("hosts"), 3) as made:
         yield made
 
 
 @pytest.mark.parametrize("fault", ["kill", *map(further, sorted(FAULTS.keys() - {"kill"}))])
 def test_a_driven_robot_goes_to_another_host(world: Hosts, fault: str) -> None:
     counts = Counts()
-    for _ in range(cases(1, 10)):
+    for _ in range(cases(1, 6)):
         fail_while_driving(world, fault, counts)
     sys.stdout.write(f"\n{fault}: {counts}\n")
     assert {what: counts.wrong[what] for what in NEVER} == dict.fromkeys(NEVER, 0)
@@ -45,10 +45,21 @@ def test_a_driven_robot_goes_to_another_host(world: Hosts, fault: str) -> None:
 
 
 @pytest.mark.thorough
+def test_so_it_does_over_tls(tmp_path: Path) -> None:
+    counts = Counts()
+    with hosts(tmp_path, tls=True) as world:
+        for fault in ("kill", "freeze", "part", "cut"):
+            fail_while_driving(world, fault, counts)
+    sys.stdout.write(f"\nTLS: {counts}\n")
+    assert {what: counts.wrong[what] for what in NEVER} == dict.fromkeys(NEVER, 0)
+    assert max(counts.took["wheels left turning"]) <= 1.0
+
+
+@pytest.mark.thorough
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_stop_while_the_host_changes_takes_effect_once_there_is_one(world: Hosts, fault: str) -> None:
     counts = Counts()
-    for _ in range(cases(1, 5)):
+    for _ in range(cases(1, 3)):
         fail_while_driving(world, fault, counts, stops=True)
         world.reset()
     sys.stdout.write(f"\n{fault}, stops: {counts}\n")

@@ -22,6 +22,9 @@ HEARTBEAT, END = b'{"t": 1, "online": true}', b'{"t": 1, "online": false}'
         ("0@0 1@0.2", 0),  # one that was on its way for long
         ("0@0 0@0.25 1@0.3 0@0.5 1@0.6", 0),
         (f"0@0 1@{CHANGE_S}", 1),
+        ("0@0 0@1 1@1.9 0@2", 0),  # over a slow link its heartbeats are further apart
+        ("0@0 0@1 1@2.5", 1),
+        ("0@0 0@20 1@23", 1),  # it stood still
         ("0@0 e0@0.1 1@0.1", 1),  # it has left in order
         ("0@0 e1@0.1", 0),  # the other host has noticed late that it is gone
         ("0@0 l0@0.1", None),

@@ -6,6 +6,7 @@ import itertools
 import random
 
 import pytest
+from msgspec.structs import replace
 
 from pebble.transports import QoS
 from pebble.transports.zenoh.hub import history as hub_history
@@ -20,6 +21,7 @@ from pebble.transports.zenoh.hub.merge import (
     in_parts,
     is_newer,
     is_overtaken,
+    known_ages,
     published,
 )
 from pebble.transports.zenoh.hub.records import Retained
@@ -89,6 +91,18 @@ def test_what_came_while_it_was_asked_for_is_not_overwritten(mine: Row | None, o
     assert is_overtaken(mine, 1.0) is overtaken
 
 
+def test_what_a_journal_had_is_as_old_as_another_hub_knows_and_no_third_ones_older_value_replaces_it() -> None:
+    first = {"k": row(2, age_s=5.0), "gone": row(None, "you", age_s=5.0), "other": row(1)}
+    restarted = {"k": row(2, age_s=OLD), "gone": row(None, "you", age_s=OLD), "other": row(2, age_s=OLD)}
+    third = {"k": row(1, age_s=12.0), "gone": row(1, age_s=12.0)}
+    ages = known_ages(restarted, first)
+    assert ages == {"k": 5.0, "gone": 5.0}
+    assert known_ages(first, restarted) == {}
+    known = {key: replace(one, age_s=ages.get(key, one.age_s)) for key, one in restarted.items()}
+    assert compare(restarted, third, ()) == (["k", "gone"], ["other"])
+    assert compare(known, third, ()) == ([], ["k", "gone", "other"])
+
+
 @pytest.mark.parametrize(
     ("wills", "rows", "there"),
     [
@@ -155,6 +169,15 @@ def test_a_store_knows_how_old_its_values_and_removals_are(store: HubStore, cloc
     ages = {key: (one.digest is None, one.origin, one.age_s) for key, one in store.table().items()}
     assert ages == {"a": (False, "me", 2), "b": (True, "you", 0), "c": (False, "me", OLD)}
     assert [one.payload for one in store.values(["a", "b", "never"])] == [b"1", b""]
+
+
+def test_a_store_learns_how_old_that_of_a_journal_is(store: HubStore) -> None:
+    store.apply(retained("a", b"1"), OLD)
+    store.apply(retained("b", b"1"))
+    store.apply(retained("c", b"1"))
+    store.apply(retained("c", b"", "you"), OLD)
+    store.know({"a": 3.0, "b": 3.0, "c": 4.0, "never": 3.0})
+    assert {key: one.age_s for key, one in store.table().items()} == {"a": 3.0, "b": 0.0, "c": 4.0}
 
 
 def test_a_client_is_not_asked_for_what_another_one_removed(store: HubStore) -> None:

@@ -64,7 +64,10 @@ HOME = (hub("n"), linked(0), hello(0))
         pytest.param([hello(0, ""), gone(1)], 1 + ALONE_S, False, id="alone, an old client"),
         pytest.param([hello(0, ""), gone(1), message(1.05)], 1 + ALONE_S, False, id="alone nothing puts it off"),
         pytest.param([*HOME, gone(1)], 1 + HOME_S, False, id="the home"),
-        pytest.param([*HOME, linked(1, False), gone(2)], 2 + HOME_S, False, id="its link was lost just now"),
+        pytest.param([*HOME, linked(1, False), gone(1.1)], 1.1 + HOME_S, False, id="its link was lost just now"),
+        pytest.param(
+            [*HOME, linked(1, False), gone(2)], 2 + HOME_S + RANK_S, False, id="another is the home by now, perhaps"
+        ),
         pytest.param(
             [*HOME, linked(1, False), gone(1 + LINK_S)], 1 + LINK_S + SUCCESSOR_S, True, id="its link was lost long ago"
         ),

@@ -312,7 +312,9 @@ class HubWorker:
 
     def _pause(self) -> float | None:
         now = time.monotonic()
-        pauses = [due - now for due in (self._wills.next_due, *(until for until, _, _ in self._waiting_queries))]
+        merged = self._mesh.merging_until
+        answers = (max(until, merged) for until, _, _ in self._waiting_queries)
+        pauses = [due - now for due in (self._wills.next_due, *answers)]
         if self._journal is not None:
             pauses.append(self._journal.wait_s)
         if self._wills.met_others:
@@ -350,7 +352,7 @@ class HubWorker:
         merging = now < self._mesh.merging_until
         for until, needs, query in waiting:
             arrived = all(self._received.get(name, -1) >= count for name, count in needs.items())
-            if now >= until or (arrived and not merging):
+            if (now >= until or arrived) and not merging:
                 self._do(lambda query=query: self._answer(query))  # type: ignore[misc]
             else:
                 self._waiting_queries.append((until, needs, query))

@@ -35,6 +35,11 @@ class History:
             self._bytes += _size(record)
             self._forget_old()
 
+    def know(self, key: str, age_s: float) -> None:
+        """What a journal had under ``key`` is ``age_s`` seconds old."""
+        if self.age_s(key) == float("inf") and key in self._arrived:
+            self._arrived[key] = self._now() - age_s
+
     def age_s(self, key: str) -> float:
         return max(0.0, self._now() - self._arrived.get(key, _NEVER))
 

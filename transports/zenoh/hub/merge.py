@@ -10,10 +10,14 @@ from collections.abc import Collection, Iterator, Mapping
 import msgspec
 
 from pebble.transports.base import QoS
+from pebble.transports.zenoh.wire import digest
 
 TIE_S = 0.1  # ages that differ by less are equal: two hubs receive a message at different times
-MAX_ROWS = 5000  # of a table in one message
-MAX_BYTES = 1 << 20  # of values in one message, about
+#: What does not fit into a link within `session.BLOCK_MS` ends it, so messages are small: in one, about,
+MAX_ROWS = 1000  # of a table
+MAX_BYTES = 1 << 16  # of values
+
+_UNKNOWN = float("inf")
 
 
 class Row(msgspec.Struct, frozen=True, array_like=True):
@@ -48,15 +52,22 @@ class Value(msgspec.Struct, frozen=True, array_like=True):
     age_s: float
 
 
+def row_of(value: Value) -> Row:
+    of = digest(value.payload) if value.payload else None
+    return Row(of, value.origin, value.retained_count, value.age_s)
+
+
 class Exchange(msgspec.Struct, frozen=True, array_like=True):
     """What the hub ``asker`` wants and gives, or a part of it.
 
-    ``forget``: the clients whose wills it, or another, has published; in the last part, else None.
+    ``ages``: of what the other one has, too, from before a restart. ``forget``: the clients whose wills it, or another,
+    has published; in the last part, else None.
     """
 
     asker: str
     want: list[str]
     give: list[Value]
+    ages: dict[str, float]
     forget: list[str] | None
 
 
@@ -86,6 +97,15 @@ def compare(mine: Mapping[str, Row], theirs: Mapping[str, Row], alive: Collectio
 def is_overtaken(mine: Row | None, since_s: float) -> bool:
     """Whether something has come since the hubs compared their tables, ``since_s`` seconds ago."""
     return mine is not None and mine.age_s < since_s
+
+
+def known_ages(mine: Mapping[str, Row], theirs: Mapping[str, Row]) -> dict[str, float]:
+    """The ages in ``theirs`` of what is the same here, from before a restart.
+
+    Without them a third hub's older value, whose age is known, would count as the newer one.
+    """
+    same = {key: row for key, row in theirs.items() if key in mine and mine[key].digest == row.digest}
+    return {key: row.age_s for key, row in same.items() if mine[key].age_s == _UNKNOWN > row.age_s}
 
 
 def published(recalled: Mapping[str, str], rows: Mapping[str, Row], wills: Collection[str]) -> list[str]:
@@ -125,8 +145,8 @@ def decode_table(data: bytes) -> Table:
 
 def decode_exchange(data: bytes) -> Exchange:
     exchange = _exchanges.decode(data)
-    for value in exchange.give:
-        _check_age(value.age_s)
+    for age_s in (*(value.age_s for value in exchange.give), *exchange.ages.values()):
+        _check_age(age_s)
     return exchange
 
 

@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator
 from functools import partial
+from itertools import chain
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import msgspec
@@ -28,7 +29,7 @@ from pebble.transports.zenoh.keymap import topic_to_key
 
 log = logging.getLogger(__name__)
 
-PATIENCE_S = 0.5  # queries of clients wait so long for a merge
+PATIENCE_S = 2.0  # queries of clients wait so long for a merge: until then an older value may be here
 ASK_S = 1.0  # for a table of another hub, or for our own thread
 VALUES_S = 10.0  # for values, which may be large
 ASKED = 5  # times, before another hub counts as one that does not merge
@@ -56,10 +57,11 @@ class Hub(Protocol):
 
 
 class _Decided(NamedTuple):
-    """Keys to ask for, values to give, and the clients whose wills each side forgets."""
+    """Keys to ask for, values and ages to give, and the clients whose wills each side forgets."""
 
     want: list[str]
     give: list[merge.Value]
+    ages: dict[str, float]
     they_forget: list[str]
     we_forget: list[str]
     at: float
@@ -170,12 +172,12 @@ class Mesh:
     # -- the one with the smaller name asks, on a thread of its own
 
     def _merge(self, session: zenoh.Session, name: str) -> None:
-        for _ in range(ASKED):
+        for turn in range(ASKED):
             try:
                 self._merge_once(session, name)
             except (zenoh.ZError, ValueError, msgspec.DecodeError, queue.Empty) as error:
                 log.warning("hub %s: the merge with it failed, and is tried again: %s", name, str(error) or "no answer")
-                time.sleep(ASK_S)
+                time.sleep(_PAUSE_S * 3**turn)  # a second link to it has appeared meanwhile, or it is gone
             else:
                 return
             if name not in self._names or session is not self._session:
@@ -209,27 +211,32 @@ class Mesh:
         store = self._hub.store
         mine, alive = store.table(), self._hub.alive_clients | set(theirs.alive)
         want, give = merge.compare(mine, theirs.rows, alive)
+        store.know(merge.known_ages(mine, theirs.rows))
         return _Decided(
             want,
-            list(store.values(give)),
+            sorted(store.values(give), key=_size),  # a large one holds up no small one
+            merge.known_ages(theirs.rows, mine),
             merge.published(theirs.recalled, mine, store.wills()),
             merge.published(self._recalled_keys(), theirs.rows, theirs.wills),
             time.monotonic(),
         )
 
     def _exchange(self, session: zenoh.Session, name: str, decided: _Decided) -> None:
-        parts = list(merge.in_parts(iter(decided.give)))
+        ages = list(decided.ages.items())
+        parts: list[tuple[list[merge.Value], dict[str, float]]]
+        parts = [(part, {}) for part in merge.in_parts(iter(decided.give))]
+        parts += [([], dict(ages[at : at + merge.MAX_ROWS])) for at in range(0, len(ages), merge.MAX_ROWS)]
         got: list[merge.Value] = []
-        for number, part in enumerate(parts, 1):
+        for number, (values, some) in enumerate(parts, 1):
             last, waited = number == len(parts), time.monotonic() - decided.at
-            give = [replace(one, age_s=one.age_s + waited) for one in part]
+            give = [replace(one, age_s=one.age_s + waited) for one in values]
+            older = {key: age_s + waited for key, age_s in some.items()}
             want, forget = (decided.want, decided.they_forget) if last else ([], None)
-            asked = merge.encode(merge.Exchange(self._name, want, give, forget))
+            asked = merge.encode(merge.Exchange(self._name, want, give, older, forget))
             answers = [merge.decode_values(data) for data in _ask(session, wire.MERGE + name, asked, VALUES_S)]
             if not answers or answers.pop():
                 raise ValueError("its answer was cut off")
-            for values in answers:
-                got += values
+            got += chain.from_iterable(answers)
         self._hub.post(lambda: self._adopt(name, self._take(got, decided.at), decided.we_forget, len(decided.give)))
 
     # -- on the hub's thread
@@ -246,12 +253,13 @@ class Mesh:
                     query.reply(key, merge.encode(part))
                 return
             asked = merge.decode_exchange(payload)
-            for values in merge.in_parts(self._hub.store.values(asked.want)):
+            for values in merge.in_parts(iter(sorted(self._hub.store.values(asked.want), key=_size))):
                 if values:
                     query.reply(key, merge.encode(values))
             query.reply(key, merge.encode([]))
         if (since := self._compared.get(asked.asker)) is None:
             raise ValueError(f"hub {asked.asker} has not asked for the table")
+        self._hub.store.know(asked.ages)
         self._taken[asked.asker] = self._taken.get(asked.asker, 0) + self._take(asked.give, since)
         if asked.forget is not None:
             del self._compared[asked.asker]
@@ -282,10 +290,11 @@ class Mesh:
             self._hub.ask_again()
 
     def _take(self, values: Iterable[merge.Value], since: float) -> int:
-        """Store what was asked for at ``since``, but where something has come meanwhile."""
+        """Store what was asked for at ``since``, but where something has come meanwhile, or its age became known."""
         taken, waited = 0, time.monotonic() - since
         for one in values:
-            if not merge.is_overtaken(self._hub.store.row(one.key), waited):
+            mine, theirs = self._hub.store.row(one.key), merge.row_of(one)
+            if not merge.is_overtaken(mine, waited) and merge.is_newer(theirs, mine, ()):
                 stamp = wire.Stamp(one.qos, one.retained_count, one.origin)
                 taken += self._hub.apply(Retained(one.key, one.payload, stamp), one.age_s)
         return taken
@@ -317,6 +326,10 @@ def _named(token: zenoh.Sample) -> tuple[str, str]:
     """The hub that a token is of, and the name under which it is there."""
     under = str(token.key_expr).removeprefix(wire.UP)
     return under.partition(wire.RENEWAL)[0], under
+
+
+def _size(value: merge.Value) -> int:
+    return len(value.payload)
 
 
 def _ask(session: zenoh.Session, key: str, payload: bytes, timeout: float) -> list[bytes]:

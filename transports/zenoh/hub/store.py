@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 
 from pebble.transports.zenoh.hub.history import History
 from pebble.transports.zenoh.hub.merge import Row, Value
@@ -96,6 +96,12 @@ class HubStore:
 
     def age_s(self, key: str) -> float:
         return 0.0 if self._history is None else self._history.age_s(key)
+
+    def know(self, ages: Mapping[str, float]) -> None:
+        """How old are those of ``ages`` that were here before a restart."""
+        for key, age_s in ages.items():
+            if self._history is not None:
+                self._history.know(key, age_s)
 
     def table(self) -> dict[str, Row]:
         """What is here, and what was removed, for another hub."""

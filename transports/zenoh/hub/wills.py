@@ -15,7 +15,8 @@ HOME_S = 0.3  # the same among several hubs: the last messages may come by anoth
 SUCCESSOR_S = 3.0
 RANK_S = 0.5  # between one successor and the next
 MAX_RANK = 7
-LINK_S = 5.0  # a hub stays the home of a client for so long after their link was lost
+LINK_S = 5.0  # a hub stays the home of a client for so long after their link was lost,
+SAME_S = 0.25  # though another one may be its home by now, unless its token went with the link
 RETURN_S = 2.5  # after a restart clients have this long to reconnect before their wills are published
 STILL_S = 1.0  # a hub that stood still for longer has lost its clients to others, without having seen it
 PUT_OFF_S = 10.0  # messages put off a will by no more: their sender's name is believed
@@ -80,7 +81,9 @@ class WillTimes:
         if not self._met_others:
             self._put(name, now + ALONE_S, successor=False)
         elif self.is_home(name, now) and now >= self._still_until:
-            self._put(name, now + HOME_S, successor=False)
+            lost = self._link_lost(name)
+            roamed = lost is not None and now - lost > SAME_S
+            self._put(name, now + HOME_S + RANK_S * roamed, successor=False)
         else:
             self._put(name, now + SUCCESSOR_S + RANK_S * self._rank, successor=True)
 
@@ -139,8 +142,12 @@ class WillTimes:
 
     def is_home(self, name: str, now: float) -> bool:
         """Whether this hub is, or was just now, the one that the client is linked to."""
-        lost = self._links.get(self._sessions.get(name, ""), float("-inf"))
+        lost = self._link_lost(name)
         return lost is None or now - lost < LINK_S
+
+    def _link_lost(self, name: str) -> float | None:
+        """When; None: it is there."""
+        return self._links.get(self._sessions.get(name, ""), float("-inf"))
 
     def ends_predecessors(self, name: str, session: str, now: float) -> bool:
         """Whether this hub publishes the pending wills of a client that has begun anew: one of several does."""
