@@ -64,7 +64,7 @@ def conform(
     with interrupted_by_signals():
         if operator:
             return _of_operator(options, as_json=as_json)
-        if may_move and not is_clear(robot, "ahead for half a second, several times, and turn once"):
+        if may_move and not is_clear(robot, "ahead for half a second, several times, and turn and go back once"):
             typer.echo("nothing was tested", err=True)
             return 1
         return _of_robot(options, may_move=may_move, cut=cut, as_json=as_json)
@@ -73,13 +73,14 @@ def conform(
 def _of_robot(options: Target, *, may_move: bool, cut: bool, as_json: bool) -> int:
     from pebble.conform.checks import CHECKS
     from pebble.conform.component import reached
+    from pebble.conform.control import CONTROL
     from pebble.conform.motion import MOVING
     from pebble.conform.power import CUT
 
     with reached(options, _LOOKS_S) as component:
         if not component.records:
             raise PebbleError(f"nothing came from {component.base} within {_LOOKS_S:g} s: is it on, at this broker?")
-        checks = (*CHECKS, *(MOVING if may_move else ()), *(CUT if cut else ()))
+        checks = (*CHECKS, *CONTROL, *(MOVING if may_move else ()), *(CUT if cut else ()))
         return ended(_judged(component, checks, as_json=as_json), as_json=as_json, robot=component.base)
 
 

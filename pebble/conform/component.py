@@ -14,6 +14,7 @@ from pebble.client.connection import Target, connected, put_names
 from pebble.client.names import Names
 from pebble.client.robot_view import RobotView
 from pebble.contract import channel_of, codec
+from pebble.contract.names import with_name
 from pebble.contract.payloads import ControlRequest
 from pebble.errors import PayloadError
 from pebble.transports import Message, QoS, Transport
@@ -93,6 +94,16 @@ class Component:
         with connected(self._target) as (beside, _):
             beside.publish(channel.topic(self.base), payload, qos=QoS.DELIVERED, retain=True, remember=False)
             self.wait(lambda: beside.outgoing.waiting == 0, _RETAINED_S)
+
+    def send_as(self, account: str, channel: c.Channel, value: object) -> bool:
+        """Publish a command with another account in its topic, or "": without one; whether the broker delivers it."""
+        payload = value if isinstance(value, bytes) else codec.encode(channel, value)
+        topic = channel.topic(self.base)
+        found: deque[Message] = deque(maxlen=_MOST)
+        with connected(replace(self._target, program="conform-other")) as (beside, _):
+            beside.subscribe(f"{self.base}/{c.INCOMING}/#", found.append, qos=QoS.DELIVERED, direct=True)
+            beside.publish(with_name(topic, account) if account else topic, payload, qos=QoS.DELIVERED, urgent=True)
+            return self.wait(lambda: any(one.payload == payload for one in list(found)), _RETAINED_S)
 
     def reads_commands(self) -> bool:
         """Whether this client may read what is sent to the robot: a request that changes nothing comes back."""

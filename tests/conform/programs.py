@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from pebble.client.connection import Target
+from pebble.fleet import certificates
 from pebble.fleet.certificates import CA_CERT
 from tests.fleet.brokers import HOST, FleetBroker
 from tests.support import ROOT, Broker
@@ -72,12 +73,25 @@ ROBOTS = (in_python, in_javascript, in_c, in_arduino)
 OPERATORS = (in_python, in_javascript, in_c)
 
 
+class BelievingBroker(Broker):
+    """A mosquitto with TLS that believes every name: by it, one account sends as another, and without any."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.passwords = folder, {"mine": "any", "ann": "any"}
+        certificates.init(folder, [HOST])
+        files = {"certfile": certificates.SERVER_CERT, "keyfile": certificates.SERVER_KEY}
+        super().__init__(folder, *(f"{option} {folder / file}" for option, file in files.items()))
+
+    def close(self) -> None:
+        self.stop()
+
+
 def at_open(broker: Broker) -> tuple[Command, Target]:
     """What a program is started with, and how others reach its robot."""
     return ["mine", "127.0.0.1", str(broker.port)], Target(url=f"mqtt://127.0.0.1:{broker.port}", robot="mine")
 
 
-def at_named(broker: FleetBroker, folder: Path, program: str, other: str) -> tuple[Command, Target]:
+def at_named(broker: FleetBroker | BelievingBroker, folder: Path, program: str, other: str) -> tuple[Command, Target]:
     """The same for accounts: that of the program, and that of the other side."""
     for name in (program, other):
         (folder / name).write_text(broker.passwords[name])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import pytest
@@ -14,10 +14,11 @@ from pebble.check_result import State
 from pebble.client.connection import Target
 from pebble.conform.checks import CHECKS, Check, run
 from pebble.conform.component import Component, reached
+from pebble.conform.control import CONTROL, UNSEEN
 from pebble.conform.motion import MOVING
 from pebble.conform.power import CUT
 from pebble.fleet.roles import Account
-from tests.conform.programs import ROBOTS, Command, Language, at_named, at_open, source
+from tests.conform.programs import ROBOTS, BelievingBroker, Command, Language, at_named, at_open, source
 from tests.fleet.brokers import FleetBroker
 from tests.fleet.conftest import cheap_hashes as cheap_hashes
 from tests.support import Broker, Child, further, some
@@ -25,52 +26,89 @@ from tests.support import Broker, Child, further, some
 pytestmark = pytest.mark.alone  # deadlines of wheels are checked
 
 SOURCE = source("robot", "py").read_text()
-ALL = {check.name: check for check in (*CHECKS, *MOVING, *CUT)}
+ALL = {check.name: check for check in (*CHECKS, *CONTROL, *MOVING, *CUT)}
 LOOKS_S = 2.0
 
-#: By check: what is written into the robot's program, and in place of what.
-VIOLATIONS: dict[str, tuple[str, str]] = {
-    "heartbeat": ("heartbeat_at = now() + 0.25", "heartbeat_at = now() + 5"),
-    "clock": ("int(1000 * time.time())", "int(1000 * time.time()) + 3_600_000"),
-    "payloads": ('{"t": epoch_ms()}, qos=0', '{"t": str(time.time())}, qos=0'),
-    "numbers": ('{"wheels": self.wheels}', '{"wheels": self.wheels, "amperes": math.nan}'),
-    "sizes": ('"by": "", "why": "", "since"', '"by": "", "why": 400 * "x", "since"'),
-    "retained": ("qos, retain=True", "qos, retain=False"),
-    "parked commands": (
+#: The check that finds it, and what is written into the robot's program, in place of what.
+VIOLATIONS = (
+    ("heartbeat", "heartbeat_at = now() + 0.25", "heartbeat_at = now() + 5"),
+    ("heartbeat", "heartbeat_at = now() + 0.25", "heartbeat_at = now() + 1.5"),
+    ("clock", "int(1000 * time.time())", "int(1000 * time.time()) + 3_600_000"),
+    ("payloads", '{"t": epoch_ms()}, qos=0', '{"t": str(time.time())}, qos=0'),
+    ("numbers", '{"wheels": self.wheels}', '{"wheels": self.wheels, "amperes": math.nan}'),
+    ("sizes", '"by": "", "why": "", "since"', '"by": "", "why": 400 * "x", "since"'),
+    ("retained", "qos, retain=True", "qos, retain=False"),
+    (
+        "parked commands",
         "    def publish(self",
         '        client.publish(IN + "control", "{}", 1, True)\n\n    def publish(self',
     ),
-    "capabilities": ('"available": True', '"available": "yes"'),
-    "own topics": ('"controls": True', '"controls": True, "topic": "pebble/robots/other/incoming/drive-values"'),
-    "identity": ('"id": ID', '"id": "other"'),
-    "junk": ("(ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError)", "(KeyError)"),
-    "stop states": ('publish(f"estop/{OWNER}"', 'publish("estop/others"'),
-    "stop": ('self.stop = {"latched": True', 'self.stop = {"latched": False'),
-    "stop once": ('if name not in self.stop["recent"]:', "if True:"),
-    "stop unread": (
+    ("capabilities", '"available": True', '"available": "yes"'),
+    ("own topics", '"controls": True', '"controls": True, "topic": "pebble/robots/other/incoming/drive-values"'),
+    ("identity", '"id": ID', '"id": "other"'),
+    ("junk", "(ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError)", "(KeyError)"),
+    ("stop states", 'publish(f"estop/{OWNER}"', 'publish("estop/others"'),
+    ("stop", 'self.stop = {"latched": True', 'self.stop = {"latched": False'),
+    ("stop once", 'if name not in self.stop["recent"]:', "if True:"),
+    ("stop once", 'self.stop | {"latched": False}', 'self.stop | {"latched": False, "recent": []}'),
+    (
+        "stop unread",
         "            claims = dict(json.loads(payload))",
         "            claims = {}\n        claims = dict(json.loads(payload))",
     ),
-    "stop holds": (
+    ("stop unread", "account) if message.payload else", "account) if message.payload.strip() else"),
+    (
+        "stop holds",
         "        if not x and not z:\n",
         "        if not x and not z:\n            self.stop = FREE\n            self.publish_stop()\n",
     ),
-    "reset refused": ("if self.refused is None and", "if"),
-    "control": ('elif take or mine or not self.holder["key"]:', "elif True:"),
-    "control asked": ('{"asks": new["by"], "asks_id": new["id"]}', "UNASKED"),
-    "control released": ("NONE if mine else self.holder", "self.holder"),
-    "control ends": ("now() > robot.ends:", "False:"),
-    "dead man": ('DEAD_MAN_S, PAUSE_S, LONGEST = "motors", 0.75', 'DEAD_MAN_S, PAUSE_S, LONGEST = "motors", 3.0'),
-    "validity": ('command.get("valid_ms", 1000 * DEAD_MAN_S)', "1000 * DEAD_MAN_S"),
-    "zero": ("            self.turn(0.0, 0.0, 0.0)\n            self.paused_at", "            self.paused_at"),
-    "no number": ("math.isfinite(one) for", "True for"),
-    "clamps": ("self.turn(max(-1.0, min(1.0, z + x))", "self.turn(z - 2 * x"),
-    "foreign key": ('(mine or ("key" not in command and not NAMED))', "True"),
-    "stop moving": ('elif not self.stop["latched"] and', "elif"),
-    "will": ('json.dumps({"t": epoch_ms(), "online": False})', 'json.dumps({"t": epoch_ms()})'),
-    "retained commands": ("if message.retain:", "if False:"),
-    "stop survives": ("self.stop |= json.load(open(STOP_FILE))", "self.stop = FREE"),
-}
+    ("reset refused", "if self.refused is None and", "if"),
+    ("control", 'elif take or mine or not self.holder["key"]:', "elif True:"),
+    ("control asked", '{"asks": new["by"], "asks_id": new["id"]}', "UNASKED"),
+    ("control asked", "now() <= robot.asks_until", "True"),
+    ("control released", "NONE if mine else self.holder", "self.holder"),
+    ("control released", "NONE if mine else self.holder", "NONE"),
+    ("control taken", "elif take or mine or", "elif mine or"),
+    ("control taken", "secrets.token_hex(4)})", '"0badf00e"})'),
+    ("control ends", "now() > robot.ends:", "False:"),
+    ("control ends", "if mine else self.ends", "if False else self.ends"),
+    ("dead man", 'DEAD_MAN_S, PAUSE_S, LONGEST = "motors", 0.75', 'DEAD_MAN_S, PAUSE_S, LONGEST = "motors", 3.0'),
+    ("validity", 'command.get("valid_ms", 1000 * DEAD_MAN_S)', "1000 * DEAD_MAN_S"),
+    ("validity", "min(DEAD_MAN_S, max(", "max(0.0, max("),
+    ("zero", "            self.turn(0.0, 0.0, 0.0)\n            self.paused_at", "            self.paused_at"),
+    (
+        "zero",
+        "        if not x and not z:\n",
+        '        if not (x or z or mine) and "key" in command:\n            return\n        if not x and not z:\n',
+    ),
+    ("steering", 'command.get("x", 0), command.get("z", 0)', 'command.get("z", 0), command.get("x", 0)'),
+    ("steering", "min(1.0, z + x)), max(-1.0, min(1.0, z - x))", "min(1.0, z - x)), max(-1.0, min(1.0, z + x))"),
+    ("steering", 'value["value"] if type', "value if type"),
+    ("no number", "math.isfinite(one) for", "True for"),
+    ("clamps", "self.turn(max(-1.0, min(1.0, z + x))", "self.turn(z - 2 * x"),
+    ("foreign key", '(mine or ("key" not in command and not NAMED))', "True"),
+    ("foreign key", '(mine or ("key"', '(mine or not self.holder["key"] or ("key"'),
+    ("control passes", "to, UNASKED\n            self.turn(0.0, 0.0, 0.0)", "to, UNASKED"),
+    ("stop moving", 'elif not self.stop["latched"] and', "elif"),
+    ("reset waits", "elif now() < self.paused_at + PAUSE_S:", "elif False:"),
+    ("reset waits", '-math.inf if mine or not self.holder["key"] else self.paused_at', "-math.inf"),
+    ("will", 'json.dumps({"t": epoch_ms(), "online": False})', 'json.dumps({"t": epoch_ms()})'),
+    ("retained commands", "if message.retain:", "if False:"),
+    ("stop survives", "self.stop |= json.load(open(STOP_FILE))", "self.stop = FREE"),
+)
+
+#: The same at level named.
+NAMED_VIOLATIONS = (
+    ("control", 'f"{account}/{by}".strip("/")[:40]', "by"),
+    ("nameless", 'metric == "estop-reset" and (account or not NAMED)', 'metric == "estop-reset"'),
+    ("nameless", '"control/take") and (account or not NAMED)', '"control/take")'),
+    ("keyless", '("key" not in command and not NAMED)', '"key" not in command'),
+    (
+        "foreign account",
+        '(command.get("key"), account) == (self.holder["key"], self.account)',
+        'command.get("key") == self.holder["key"]',
+    ),
+)
 
 
 class Machine:
@@ -141,6 +179,14 @@ def test_the_smallest_honest_robot_passes(broker: Broker, tmp_path: Path, langua
     assert len(found) >= 20
 
 
+#: What a driver's account is not shown at a broker that checks names.
+REFUSED = {
+    "parked commands": (State.SKIPPED, "its broker does not let this account read incoming/: use an admin's"),
+    "nameless": (State.SKIPPED, UNSEEN),
+    "foreign account": (State.SKIPPED, UNSEEN),
+}
+
+
 @pytest.mark.usefixtures("cheap_hashes")
 @pytest.mark.parametrize("language", [ROBOTS[0], *map(further, ROBOTS[1:])])
 def test_it_passes_where_names_are_checked(tmp_path: Path, language: Language) -> None:
@@ -152,18 +198,36 @@ def test_it_passes_where_names_are_checked(tmp_path: Path, language: Language) -
     with FleetBroker(tmp_path / "hall", people, level="named") as broker:
         arguments, target = at_named(broker, tmp_path, "mine", "ann")
         with switched_on([*program, *with_stop_file(arguments, tmp_path)], target) as component:
-            found = judged(component, *ALL.values())
-    unseen = "its broker does not let this account read incoming/: use an admin's"
-    assert lacking(found) == {"parked commands": (State.SKIPPED, unseen)}
+            assert lacking(judged(component, *ALL.values())) == REFUSED
 
 
-@pytest.mark.parametrize("name", some(ALL, 3))
-def test_a_violation_is_found(broker: Broker, tmp_path: Path, name: str) -> None:
-    old, new = VIOLATIONS[name]
+@pytest.mark.thorough
+@pytest.mark.parametrize("language", ROBOTS)
+def test_it_passes_where_its_broker_believes_every_name(tmp_path: Path, language: Language) -> None:
+    program = language("robot", tmp_path)
+    with closing(BelievingBroker(tmp_path / "hall")) as broker:
+        arguments, target = at_named(broker, tmp_path, "mine", "ann")
+        with switched_on([*program, *with_stop_file(arguments, tmp_path)], target) as component:
+            assert lacking(judged(component, *ALL.values())) == {}
+
+
+def mutant(folder: Path, old: str, new: str) -> Command:
     assert old in SOURCE
-    program = tmp_path / "robot.py"
-    program.write_text(SOURCE.replace(old, new))
+    (folder / "robot.py").write_text(SOURCE.replace(old, new))
+    return [sys.executable, folder / "robot.py"]
+
+
+@pytest.mark.parametrize(("name", "old", "new"), some(VIOLATIONS, 5))
+def test_a_violation_is_found(broker: Broker, tmp_path: Path, name: str, old: str, new: str) -> None:
     arguments, target = at_open(broker)
     needs = [ALL["will"]] if name == "retained commands" else []
-    with switched_on([sys.executable, program, *with_stop_file(arguments, tmp_path)], target) as component:
+    with switched_on([*mutant(tmp_path, old, new), *with_stop_file(arguments, tmp_path)], target) as component:
         assert judged(component, *needs, ALL[name])[name][0] is State.FAILED
+
+
+@pytest.mark.parametrize(("name", "old", "new"), some(NAMED_VIOLATIONS, 5))
+def test_a_violation_at_level_named_is_found(tmp_path: Path, name: str, old: str, new: str) -> None:
+    with closing(BelievingBroker(tmp_path / "hall")) as broker:
+        arguments, target = at_named(broker, tmp_path, "mine", "ann")
+        with switched_on([*mutant(tmp_path, old, new), *with_stop_file(arguments, tmp_path)], target) as component:
+            assert judged(component, ALL[name])[name][0] is State.FAILED
