@@ -5,7 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -17,9 +17,21 @@ from pebble.conform.component import Component, reached
 from pebble.conform.control import CONTROL, UNSEEN
 from pebble.conform.motion import MOVING
 from pebble.conform.power import CUT
-from pebble.fleet.roles import Account
-from tests.conform.programs import ROBOTS, BelievingBroker, Command, Language, at_named, at_open, source
-from tests.fleet.brokers import FleetBroker
+from tests.conform.programs import (
+    NATS,
+    ROBOTS,
+    WITHOUT_NATS,
+    Command,
+    Hall,
+    Language,
+    at_named,
+    at_open,
+    believing,
+    ended,
+    named_by_nats,
+    named_by_the_fleet,
+    source,
+)
 from tests.fleet.conftest import cheap_hashes as cheap_hashes
 from tests.support import Broker, Child, further, some
 
@@ -161,11 +173,14 @@ def with_stop_file(arguments: Command, folder: Path) -> Command:
     return [*arguments[:3], folder / "stop.json", *arguments[3:]]
 
 
-def judged(component: Component, *checks: Check[Component]) -> dict[str, tuple[State, str]]:
+Found = dict[str, tuple[State, str]]
+
+
+def judged(component: Component, *checks: Check[Component]) -> Found:
     return {check.name: (outcome.state, outcome.text) for check, outcome in run(component, checks)}
 
 
-def lacking(found: dict[str, tuple[State, str]]) -> dict[str, tuple[State, str]]:
+def lacking(found: Found) -> Found:
     return {name: one for name, one in found.items() if one[0] is not State.OK}
 
 
@@ -188,25 +203,30 @@ REFUSED = {
 
 
 @pytest.mark.usefixtures("cheap_hashes")
-@pytest.mark.parametrize("language", [ROBOTS[0], *map(further, ROBOTS[1:])])
-def test_it_passes_where_names_are_checked(tmp_path: Path, language: Language) -> None:
+@pytest.mark.parametrize(
+    ("hall", "language", "unseen"),
+    [
+        (named_by_the_fleet, ROBOTS[0], REFUSED),
+        *(further(named_by_the_fleet, one, REFUSED) for one in ROBOTS[1:]),
+        *(pytest.param(named_by_nats, one, REFUSED, marks=(pytest.mark.thorough, WITHOUT_NATS)) for one in ROBOTS),
+        *(further(believing, one, {}) for one in ROBOTS),
+    ],
+)
+def test_it_passes_where_names_are_checked(hall: Hall, tmp_path: Path, language: Language, unseen: Found) -> None:
     program = language("robot", tmp_path)
-    people = {
-        "mine": Account(roles=("robot",), bases=("pebble/robots/mine",)),
-        "ann": Account(roles=("driver", "safety")),
-    }
-    with FleetBroker(tmp_path / "hall", people, level="named") as broker:
+    with hall(tmp_path / "hall") as broker:
         arguments, target = at_named(broker, tmp_path, "mine", "ann")
         with switched_on([*program, *with_stop_file(arguments, tmp_path)], target) as component:
-            assert lacking(judged(component, *ALL.values())) == REFUSED
+            assert lacking(judged(component, *ALL.values())) == unseen
 
 
 @pytest.mark.thorough
+@WITHOUT_NATS
 @pytest.mark.parametrize("language", ROBOTS)
-def test_it_passes_where_its_broker_believes_every_name(tmp_path: Path, language: Language) -> None:
+def test_it_passes_at_another_broker(tmp_path: Path, language: Language) -> None:
     program = language("robot", tmp_path)
-    with closing(BelievingBroker(tmp_path / "hall")) as broker:
-        arguments, target = at_named(broker, tmp_path, "mine", "ann")
+    with ended(NATS.make(tmp_path)) as broker:
+        arguments, target = at_open(broker)
         with switched_on([*program, *with_stop_file(arguments, tmp_path)], target) as component:
             assert lacking(judged(component, *ALL.values())) == {}
 
@@ -227,7 +247,7 @@ def test_a_violation_is_found(broker: Broker, tmp_path: Path, name: str, old: st
 
 @pytest.mark.parametrize(("name", "old", "new"), some(NAMED_VIOLATIONS, 5))
 def test_a_violation_at_level_named_is_found(tmp_path: Path, name: str, old: str, new: str) -> None:
-    with closing(BelievingBroker(tmp_path / "hall")) as broker:
+    with believing(tmp_path / "hall") as broker:
         arguments, target = at_named(broker, tmp_path, "mine", "ann")
         with switched_on([*mutant(tmp_path, old, new), *with_stop_file(arguments, tmp_path)], target) as component:
             assert judged(component, ALL[name])[name][0] is State.FAILED
