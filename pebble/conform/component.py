@@ -45,6 +45,8 @@ class Component:
         self.ask = ask_person  # tells the person at the robot what to do
         self.person_s = 180.0  # until that is done, and a broker has noticed it: 1.5 times a keep-alive of a minute
         self.records: deque[Record] = deque(maxlen=_MOST)
+        #: When its wheels changed (monotonic), and to what, left and right: from where it is seen besides.
+        self.eyes: Callable[[], list[tuple[float, list[float]]]] = list
         self.view = RobotView(base)
         self._target, self._transport, self.account = target, transport, names.account
         self._arrived: deque[tuple[Message, float, float]] = deque(maxlen=_MOST)

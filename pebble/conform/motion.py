@@ -33,8 +33,7 @@ def moves_until(component: Component, since: float) -> float | None:
 
     Shown by ``wheels`` in the status, which is published on change, or by readings of hall sensors.
     """
-    reports = [(one.at, _wheels(one.value)) for one in component.of(c.STATUS) if one.value is not None]
-    turning = [(at, any(wheels)) for at, wheels in reports if wheels is not None]
+    turning = [(at, any(wheels)) for at, wheels in _shown(component)]
     touches = [(one.at, msgspec.structs.astuple(one.value.value)) for one in component.of(c.TOUCH_SENSORS) if one.value]
     if not turning and not touches:
         return None
@@ -50,10 +49,14 @@ def moves_until(component: Component, since: float) -> float | None:
     return last
 
 
-def _wheels(status: Any) -> list[float] | None:
-    found = status.value.get("wheels")
-    is_list = isinstance(found, list) and all(isinstance(one, int | float) for one in found)
-    return found if is_list else None
+def _shown(component: Component) -> list[tuple[float, list[float]]]:
+    """What its wheels did, and since when."""
+    reports = [(one.at, one.value.value.get("wheels")) for one in component.of(c.STATUS) if one.value is not None]
+    return component.eyes() or [(at, wheels) for at, wheels in reports if _are_wheels(wheels)]
+
+
+def _are_wheels(value: Any) -> bool:
+    return isinstance(value, list) and len(value) > 0 and all(isinstance(one, int | float) for one in value)
 
 
 class _Wheel:
@@ -149,22 +152,14 @@ def steering(component: Component) -> CheckResult:
         for fields, signs in ways:
             began = wheel.send(valid_ms=300, **fields)
             component.look(_LATE_S)
-            found = _turned(component, began)
-            if found is None:
-                return skipped("its status has no wheels", _SHOW_IT)
+            shown = _shown(component)
+            if not shown:
+                return skipped(_NOT_SHOWN, _SHOW_IT)
+            found = next((wheels for at, wheels in reversed(shown) if at >= began and any(wheels)), [])
             if [one * sign > 0 for one, sign in zip(found, signs, strict=False)] != [True, True]:
                 sent = msgspec.json.encode({"x": 0, **fields}).decode()
                 return failed(f"{sent}: its wheels do {found}", "left is z + x, right is z - x, also within value")
     return ok("x to the right, z ahead")
-
-
-def _turned(component: Component, since: float) -> list[float] | None:
-    """What the wheels did at last; empty: nothing, None: it is not shown."""
-    reports = [_wheels(one.value) for one in component.of(c.STATUS) if one.value is not None]
-    if not any(reports):
-        return None
-    new = [_wheels(one.value) for one in component.of(c.STATUS, since) if one.value is not None]
-    return next((one for one in reversed(new) if one and any(one)), [])
 
 
 def stop_moving(component: Component) -> CheckResult:
@@ -213,10 +208,12 @@ def clamped(component: Component) -> CheckResult:
     with _at_the_wheel(component) as wheel:
         began = wheel.send(9, x=-9, valid_ms=150)
         component.look(_LATE_S)
-        shown = [_wheels(one.value) for one in component.of(c.STATUS, began) if one.value is not None]
-    wheels = [abs(one) for values in shown for one in values or ()]
-    if not wheels:
-        return skipped("its status has no wheels", _SHOW_IT)
+        shown = _shown(component)
+    if not shown:
+        return skipped(_NOT_SHOWN, _SHOW_IT)
+    wheels = [abs(one) for at, of in shown if at >= began for one in of]
+    if not any(wheels):
+        return failed("x -9, z 9 does not move it", "clamp both axes to -1..1, and obey")
     if max(wheels) > 1.0:
         return failed(f"a wheel got {max(wheels):g}", "clamp both axes to -1..1, and the sum of them for each wheel")
     return ok(f"{max(wheels):g} at most")
