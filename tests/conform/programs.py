@@ -69,12 +69,21 @@ def in_arduino(program: str, folder: Path) -> Command:
     return [folder / program]
 
 
+def in_micropython(program: str, _folder: Path) -> Command:
+    """The real interpreter, as WebAssembly; sockets, flash and console of a board are this machine's."""
+    if shutil.which("node") is None or not (ROOT / ".venv" / "micropython").exists():
+        missing("needs Node.js (apt install nodejs) and MicroPython (python tools/fetch_npm.py .venv micropython)")
+    board, mqtt = ROOT / "tests" / "conform" / "micropython", source("robot", "py").with_name("mqtt.py")
+    sample = source(program, "py").with_name(f"{program}-micropython.py")
+    return ["node", board / "run.mjs", ROOT / ".venv" / "micropython", mqtt, sample]
+
+
 def missing(what: str) -> None:
     (pytest.fail if os.environ.get("CI") == "true" else pytest.skip)(what)
 
 
-ROBOTS = (in_python, in_javascript, in_c, in_arduino)
-OPERATORS = (in_python, in_javascript, in_c)
+ROBOTS = (in_python, in_javascript, in_c, in_arduino, in_micropython)
+OPERATORS = (in_python, in_javascript, in_c, in_micropython)
 
 
 NATS = MAKERS["nats"]
