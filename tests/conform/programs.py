@@ -83,7 +83,7 @@ def missing(what: str) -> None:
 
 
 ROBOTS = (in_python, in_javascript, in_c, in_arduino, in_micropython)
-OPERATORS = (in_python, in_javascript, in_c, in_micropython)
+OPERATORS = ROBOTS
 
 
 NATS = MAKERS["nats"]
