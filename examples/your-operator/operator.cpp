@@ -94,8 +94,8 @@ static void receive(char *full, uint8_t *payload, unsigned int size) {
     char *metric = full + strlen(out), *name = strchr(metric, '/');
     JsonDocument whole; deserializeJson(whole, payload, size);
     JsonVariantConst value = whole, told = value["value"];
-    double t = number(value["t"], 0);
-    if (!strcmp(metric, "online") && t != beat && beat) seen = now(), offline = value["online"].is<bool>() && !yes(value["online"]);
+    double t = number(value["t"], 0); bool gone = value["online"].is<bool>() && !yes(value["online"]);
+    if (!strcmp(metric, "online") && (gone || (t != beat && beat))) seen = now(), offline = gone;
     if (!strcmp(metric, "online")) beat = t;  // the first may be retained, which PubSubClient does not tell
     if (!strcmp(metric, "link")) snprintf(level, sizeof level, "%s", value["level"] | "wide"), drive_hz = number(value["drive_hz"], 20);
     else if (!strcmp(metric, "capabilities")) {
