@@ -13,7 +13,7 @@ struct Owner {  // of motors: what its states tell
 static Owner owners[OWNERS];  // by name
 static WiFiClient plain_link; static WiFiClientSecure secure_link; static Client *link_; static PubSubClient mqtt;
 static char id[9], in[160], plain[128], out[128], topic[256], text[512], line[64], level[8] = "wide";
-static double x, z, drive_hz = 20, beat, seen = -INFINITY, drives_at, asks_at, moved_at = -INFINITY;
+static double x, z, drive_hz = 20, heartbeat, seen = -INFINITY, drives_at, asks_at, moved_at = -INFINITY;
 static bool moves, blocked, offline = true, controlled;  // blocked: until the stick is let go
 static struct { char name[17]; double at, end; } pressed;  // an emergency stop that is not confirmed, and when it is repeated
 static double now() { return esp_timer_get_time() / 1e6; }  // of a clock that is never set
@@ -95,8 +95,8 @@ static void receive(char *full, uint8_t *payload, unsigned int size) {
     JsonDocument whole; deserializeJson(whole, payload, size);
     JsonVariantConst value = whole, told = value["value"];
     double t = number(value["t"], 0); bool gone = value["online"].is<bool>() && !yes(value["online"]);
-    if (!strcmp(metric, "online") && (gone || (t != beat && beat))) seen = now(), offline = gone;
-    if (!strcmp(metric, "online")) beat = t;  // the first may be retained, which PubSubClient does not tell
+    if (!strcmp(metric, "online") && (gone || (t != heartbeat && heartbeat))) seen = now(), offline = gone;
+    if (!strcmp(metric, "online")) heartbeat = t;  // the first may be retained, which PubSubClient does not tell
     if (!strcmp(metric, "link")) snprintf(level, sizeof level, "%s", value["level"] | "wide"), drive_hz = number(value["drive_hz"], 20);
     else if (!strcmp(metric, "capabilities")) {
         controlled = yes(told["drive"]["control"]);
@@ -116,7 +116,7 @@ static void receive(char *full, uint8_t *payload, unsigned int size) {
 }
 static void connect() {
     static const char *const METRICS[] = {"online", "capabilities", "link", "estop/+", "control/+"};
-    offline = true, beat = 0, forget_control();
+    offline = true, heartbeat = 0, forget_control();
     if (!mqtt.connect((std::string("operator-") + id).c_str(), USER, PASSWORD)) return delay(200);
     for (const char *one : METRICS) snprintf(topic, sizeof topic, "%s%s", out, one), mqtt.subscribe(topic, 1);
 }

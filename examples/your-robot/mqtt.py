@@ -1,4 +1,4 @@
-"""As much MQTT 3.1.1 as the robot and the operator in MicroPython need. Only connecting waits."""
+"""This is as much MQTT 3.1.1 as the robot and the operator in MicroPython need. Only connecting waits."""
 
 import json, select, socket, struct, time
 
@@ -45,7 +45,7 @@ class Mqtt:
         )  # a clean session; a will that is retained
         login = text(self.login[0]) + text(self.login[1]) if self.login else b""
         self.send(0x10, text("MQTT") + bytes((4, flags, 0, ALIVE_S)) + text(self.name) + will + login)
-        self.heard = self.pinged = time.ticks_ms()
+        self.received_at = self.pinged = time.ticks_ms()
         while not self.into:
             self.turn(20)
         if self.into[:1] != b"\x20" or self.into[3]:
@@ -73,8 +73,8 @@ class Mqtt:
             more = self.socket.read(LONGEST)  # None: of TLS there is only a part of a record
             if more == b"":
                 raise OSError("the broker has closed the connection")
-            self.into, self.heard = self.into + (more or b""), time.ticks_ms()
-        if time.ticks_diff(time.ticks_ms(), self.heard) > 1000 * ALIVE_S:
+            self.into, self.received_at = self.into + (more or b""), time.ticks_ms()
+        if time.ticks_diff(time.ticks_ms(), self.received_at) > 1000 * ALIVE_S:
             raise OSError("the broker is silent")
         if time.ticks_diff(time.ticks_ms(), self.pinged) > 400 * ALIVE_S:
             self.pinged = time.ticks_ms()

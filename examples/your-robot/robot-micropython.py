@@ -17,7 +17,7 @@ now, epoch_ms = time.ticks_ms, lambda: time.time_ns() // 1000000 + EPOCH * 1000 
 left_ms, token = lambda at: time.ticks_diff(at, now()), lambda size: binascii.hexlify(os.urandom(size)).decode()
 later, clamp = lambda ms: time.ticks_add(now(), int(ms)), lambda value, least, most: max(least, min(most, value))
 number = lambda value: type(value) in (int, float) and value - value == 0  # noqa: E731 - NaN and infinity are none
-kept = lambda of, letters, size: "".join([one if one in letters else "_" for one in str(of)[:size]])  # noqa: E731
+letters = lambda of, allowed, size: "".join([one if one in allowed else "_" for one in str(of)[:size]])  # noqa: E731
 
 
 class Robot:
@@ -65,11 +65,11 @@ class Robot:
     def halt(self, claims, account):  # whatever arrives is a stop; what has a name counts once
         self.turn(0, 0, 0)
         name = str(claims.get("stop"))
-        name = name if len(name) == 16 and kept(name, HEX, 16) == name else token(8)
+        name = name if len(name) == 16 and letters(name, HEX, 16) == name else token(8)
         if name not in self.stop["recent"]:
             self.count, self.refused = self.count + 1, None
-            by = account[:32] or kept(claims.get("by", ""), PLAIN, 31) + "?" * NAMED  # no broker has checked it
-            why, recent = kept(claims.get("why", ""), PLAIN, 40), [name] + self.stop["recent"][:7]  # noqa: RUF005
+            by = account[:32] or letters(claims.get("by", ""), PLAIN, 31) + "?" * NAMED  # no broker has checked it
+            why, recent = letters(claims.get("why", ""), PLAIN, 40), [name] + self.stop["recent"][:7]  # noqa: RUF005
             self.stop = {"latched": True, "recent": recent, "by": by, "why": why, "since": epoch_ms()}
         self.publish_stop()
 
@@ -82,15 +82,15 @@ class Robot:
 
     def control(self, command, account, take):  # until it ends, is released or taken; who asks meanwhile is shown
         own_id, ms = str(command.get("id")), command.get("for_ms", 3000)
-        if len(own_id) != 8 or kept(own_id, HEX + HEX.upper(), 8) != own_id or not number(ms):
+        if len(own_id) != 8 or letters(own_id, HEX + HEX.upper(), 8) != own_id or not number(ms):
             return
         mine, ms = (own_id, account) == (self.holder["id"], self.account), int(clamp(ms, 1000, 10000))
-        by = (account + "/" + kept(command.get("by", ""), LETTERS, 40)).strip("/")[:40]
+        by = (account + "/" + letters(command.get("by", ""), LETTERS, 40)).strip("/")[:40]
         if command.get("want") == "release":
             self.pass_on(NONE if mine else self.holder)
         elif take or mine or not self.holder["key"]:
             self.account, self.holds_ms, self.ends = account, ms, later(ms)
-            new = {"id": own_id, "by": by, "device": kept(command.get("device", ""), LETTERS, 20), "key": token(4)}
+            new = {"id": own_id, "by": by, "device": letters(command.get("device", ""), LETTERS, 20), "key": token(4)}
             self.pass_on(self.holder if mine else new)
         elif self.asker["asks_id"] in ("", own_id):
             self.asker, self.asks_end = {"asks": by, "asks_id": own_id}, later(ms)
@@ -119,7 +119,7 @@ class Robot:
         self.publish_stop()
 
     def receive(self, topic, payload, retained):
-        account, metric = "", "" if retained else topic[len(IN) :]  # a kept command is stale
+        account, metric = "", "" if retained else topic[len(IN) :]  # a letters command is stale
         if metric.startswith("by/"):
             _, account, metric = metric.split("/", 2)
         try:
@@ -137,7 +137,7 @@ class Robot:
             self.control(value, account, metric == "control/take")
 
 
-robot, beat, publish = Robot(), now(), lambda metric, value, qos=1: client.publish(OUT + metric, value, qos, True)
+robot, sign_at, publish = Robot(), now(), lambda metric, value, qos=1: client.publish(OUT + metric, value, qos, True)
 will, lost = (OUT + "online", json.dumps({"t": epoch_ms(), "online": False})), lambda: robot.turn(0, 0, 0)
 client, wifi = Mqtt(HOST, PORT, f"robot-{ID}", LOGIN, robot.connected, lost, will), network.WLAN(network.STA_IF)
 wifi.active(True), wifi.connect(WIFI, WIFI_PASSWORD)
@@ -145,6 +145,6 @@ while True:
     for message in client.messages(20):
         robot.receive(*message)
     robot.tick()
-    if left_ms(beat) <= 0:
-        beat = later(250)
+    if left_ms(sign_at) <= 0:
+        sign_at = later(250)
         publish("online", {"t": epoch_ms()}, 0)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,11 +15,16 @@ import pytest
 
 from pebble.check_result import State
 from pebble.client.connection import Target
-from pebble.conform.checks import CHECKS, Check, run
+from pebble.conform.checks import CHECKS, Check
+from pebble.conform.checks import run as results
 from pebble.conform.component import Component, reached
 from pebble.conform.control import CONTROL, UNSEEN
 from pebble.conform.motion import MOVING
 from pebble.conform.power import CUT
+from pebble.transports import MqttSettings, QoS
+from pebble.transports.mqtt.transport import MqttTransport
+from tests.commands.command_line import Run
+from tests.commands.conftest import run as run
 from tests.conform.programs import (
     NATS,
     ROBOTS,
@@ -33,7 +41,7 @@ from tests.conform.programs import (
     source,
 )
 from tests.fleet.conftest import cheap_hashes as cheap_hashes
-from tests.support import Broker, Child, further, some
+from tests.support import Broker, Child, beside, further, some
 
 pytestmark = pytest.mark.alone  # deadlines of wheels are checked
 
@@ -177,7 +185,7 @@ Found = dict[str, tuple[State, str]]
 
 
 def judged(component: Component, *checks: Check[Component]) -> Found:
-    return {check.name: (outcome.state, outcome.text) for check, outcome in run(component, checks)}
+    return {check.name: (outcome.state, outcome.text) for check, outcome in results(component, checks)}
 
 
 def lacking(found: Found) -> Found:
@@ -237,7 +245,7 @@ def mutant(folder: Path, old: str, new: str) -> Command:
     return [sys.executable, folder / "robot.py"]
 
 
-@pytest.mark.parametrize(("name", "old", "new"), some(VIOLATIONS, 5))
+@pytest.mark.parametrize(("name", "old", "new"), some(VIOLATIONS, 10))
 def test_a_violation_is_found(broker: Broker, tmp_path: Path, name: str, old: str, new: str) -> None:
     arguments, target = at_open(broker)
     needs = [ALL["will"]] if name == "retained commands" else []
@@ -251,3 +259,24 @@ def test_a_violation_at_level_named_is_found(tmp_path: Path, name: str, old: str
         arguments, target = at_named(broker, tmp_path, "mine", "ann")
         with switched_on([*mutant(tmp_path, old, new), *with_stop_file(arguments, tmp_path)], target) as component:
             assert judged(component, ALL[name])[name][0] is State.FAILED
+
+
+def test_what_was_not_judged_is_no_pass(
+    broker: Broker, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A robot that offers nothing: most checks cannot be made, and some were not asked for."""
+    run = Run(monkeypatch, capsys)
+    with MqttTransport("silent", MqttSettings(host="127.0.0.1", port=broker.port)) as robot:
+        ending = threading.Event()
+
+        def send_heartbeats() -> None:
+            while not ending.wait(0.25):
+                payload = b'{"t": %d}' % int(1000 * time.time())
+                robot.publish("pebble/robots/mine/outgoing/online", payload, qos=QoS.LATEST, retain=True)
+
+        with beside(send_heartbeats, ending):
+            assert run("conform", "mine", "--url", f"mqtt://127.0.0.1:{broker.port}", "--json") == 1
+    found = json.loads(run.out)
+    failures = [one["name"] for one in found["checks"] if one["state"] == "failed"]
+    assert (found["ok"], failures) == (False, ["capabilities"])
+    assert {"stop", "control", "dead man", "will"} <= set(found["not_judged"])

@@ -65,7 +65,7 @@ def _nats(folder: Path) -> Broker:
 
 
 def named_nats(folder: Path, robot: str, person: str, passwords: Mapping[str, str], tls: tuple[Path, Path]) -> Broker:
-    """With the rules of level named for one robot and one person. ``tls``: its certificate and its key."""
+    """It has the rules of level named for one robot and one person. ``tls``: its certificate and its key."""
     subject = f"pebble.robots.{robot}"
     mqtt = ["$MQTT.>"]  # what NATS itself uses for messages with QoS 1
     may = {
