@@ -119,7 +119,7 @@ class Robot:
         self.publish_stop()
 
     def receive(self, topic, payload, retained):
-        account, metric = "", "" if retained else topic[len(IN) :]  # a letters command is stale
+        account, metric = "", "" if retained else topic[len(IN) :]  # a kept command is stale
         if metric.startswith("by/"):
             _, account, metric = metric.split("/", 2)
         try:

@@ -81,14 +81,17 @@ def named_nats(folder: Path, robot: str, person: str, passwords: Mapping[str, st
 
 
 def _nats_of(folder: Path, tls: str, other: str, *users: str) -> Broker:
-    port, rules = free_port(), folder / "nats.conf"
+    port, rules, separator = free_port(), folder / "nats.conf", "\n"
     rules.write_text(f"""
         server_name: one
         listen: "127.0.0.1:{free_port()}"
         jetstream {{ store_dir: "{folder}/store" }}
-        mqtt {{ host: "127.0.0.1", port: {port}, {tls} }}
+        mqtt {{ host: "127.0.0.1", port: {port}
+            {tls} }}
         {other}
-        authorization {{ users: [ {" ".join(users)} ] }}
+        authorization {{ users: [
+            {separator.join(users)}
+        ] }}
     """)
     return _Other(port, [found("nats-server") or "nats-server", "-c", str(rules)])
 
