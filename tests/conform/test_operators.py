@@ -94,7 +94,7 @@ def driven(command: Command, target: Target) -> Iterator[StandIn]:
 
         try:
             robot.ask, robot.person_s = ask, 10.0
-            robot.look(2.0)
+            robot.look(3.0)
             yield robot
         finally:
             process.kill()
