@@ -70,7 +70,10 @@ def named_nats(folder: Path, robot: str, person: str, passwords: Mapping[str, st
     mqtt = ["$MQTT.>"]  # what NATS itself uses for messages with QoS 1
     may = {
         robot: ([f"{subject}.>"], [f"{subject}.>"]),
-        person: ([f"{subject}.incoming.by.{person}.>", f"{subject}.incoming.estop"], [f"{subject}.outgoing.>"]),
+        person: (
+            [f"{subject}.incoming.by.{person}.>", f"{subject}.incoming.estop"],
+            [f"{subject}.outgoing", f"{subject}.outgoing.>"],
+        ),
     }
     users = (
         f"{{ user: {name}, password: {json.dumps(passwords[name])}, permissions {{ "
