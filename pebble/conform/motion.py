@@ -157,8 +157,8 @@ def steering(component: Component) -> CheckResult:
                 return skipped(_NOT_SHOWN, _SHOW_IT)
             found = next((wheels for at, wheels in reversed(shown) if at >= began and any(wheels)), [])
             if [one * sign > 0 for one, sign in zip(found, signs, strict=False)] != [True, True]:
-                sent = msgspec.json.encode({"x": 0, **fields}).decode()
-                return failed(f"{sent}: its wheels do {found}", "left is z + x, right is z - x, also within value")
+                sent = f"x {fields.get('x', 0):g}, z {fields['z']:g}" + " within value" * ("wrapped" in fields)
+                return failed(f"at {sent} its wheels do {found}", "left is z + x, right is z - x, also within value")
     return ok("x to the right, z ahead")
 
 
