@@ -120,7 +120,8 @@ class Component:
         """What the broker has retained of it and for it, as one gets it who connects now."""
         found: deque[Message] = deque(maxlen=_MOST)
         with connected(replace(self._target, program="conform-retained")) as (beside, _):
-            beside.subscribe(f"{self.base}/#", found.append, qos=QoS.DELIVERED, direct=True)
+            for direction in (c.OUTGOING, c.INCOMING):  # of which some brokers refuse one
+                beside.subscribe(f"{self.base}/{direction}/#", found.append, qos=QoS.DELIVERED, direct=True)
             self.wait(lambda: False, _RETAINED_S)
         return [record_of(one, self.base, 0.0) for one in list(found) if one.retain and one.payload]
 

@@ -17,7 +17,7 @@ from pebble.conform.component import Component
 from pebble.conform.control import UNSEEN, Driver, named
 from pebble.selftest import failed, ok, skipped
 
-SPEED = 0.2
+SPEED = 0.4  # some motors are on or off, and on from 0.3
 DRIVES_S = 0.6
 RESTS_S = 0.75  # after the last command, at the latest
 _LATE_S = 0.5  # until a report of it is here
@@ -53,6 +53,17 @@ def _shown(component: Component) -> list[tuple[float, list[float]]]:
     """What its wheels did, and since when."""
     reports = [(one.at, one.value.value.get("wheels")) for one in component.of(c.STATUS) if one.value is not None]
     return component.eyes() or [(at, wheels) for at, wheels in reports if _are_wheels(wheels)]
+
+
+def _moves(component: Component, since: float) -> list[float] | None:
+    """What its wheels do by a command of then; empty: nothing, None: it is not shown."""
+
+    def moving() -> list[float]:
+        return next((wheels for at, wheels in reversed(_shown(component)) if at >= since and any(wheels)), [])
+
+    component.wait(moving, ANSWER_S)
+    component.look(_LATE_S)
+    return moving() if _shown(component) else None
 
 
 def _are_wheels(value: Any) -> bool:
@@ -151,11 +162,9 @@ def steering(component: Component) -> CheckResult:
     with _at_the_wheel(component) as wheel:
         for fields, signs in ways:
             began = wheel.send(valid_ms=300, **fields)
-            component.look(_LATE_S)
-            shown = _shown(component)
-            if not shown:
+            found = _moves(component, began)
+            if found is None:
                 return skipped(_NOT_SHOWN, _SHOW_IT)
-            found = next((wheels for at, wheels in reversed(shown) if at >= began and any(wheels)), [])
             if [one * sign > 0 for one, sign in zip(found, signs, strict=False)] != [True, True]:
                 sent = f"x {fields.get('x', 0):g}, z {fields['z']:g}" + " within value" * ("wrapped" in fields)
                 return failed(f"at {sent} its wheels do {found}", "left is z + x, right is z - x, also within value")
@@ -206,17 +215,15 @@ def not_a_number(component: Component) -> CheckResult:
 
 def clamped(component: Component) -> CheckResult:
     with _at_the_wheel(component) as wheel:
-        began = wheel.send(9, x=-9, valid_ms=150)
-        component.look(_LATE_S)
-        shown = _shown(component)
-    if not shown:
+        wheels = _moves(component, wheel.send(9, x=-9, valid_ms=300))
+    if wheels is None:
         return skipped(_NOT_SHOWN, _SHOW_IT)
-    wheels = [abs(one) for at, of in shown if at >= began for one in of]
-    if not any(wheels):
+    if not wheels:
         return failed("x -9, z 9 does not move it", "clamp both axes to -1..1, and obey")
-    if max(wheels) > 1.0:
-        return failed(f"a wheel got {max(wheels):g}", "clamp both axes to -1..1, and the sum of them for each wheel")
-    return ok(f"{max(wheels):g} at most")
+    largest = max(map(abs, wheels))
+    if largest > 1.0:
+        return failed(f"a wheel got {largest:g}", "clamp both axes to -1..1, and the sum of them for each wheel")
+    return ok(f"{largest:g} at most")
 
 
 def foreign_key(component: Component) -> CheckResult:

@@ -76,7 +76,6 @@ VIOLATIONS = (
         "            claims = dict(json.loads(payload))",
         "            claims = {}\n        claims = dict(json.loads(payload))",
     ),
-    ("stop unread", "account) if message.payload else", "account) if message.payload.strip() else"),
     (
         "stop holds",
         "        if not x and not z:\n",
