@@ -17,7 +17,7 @@ from pebble.conform.component import Component
 from pebble.conform.control import UNSEEN, Driver, named
 from pebble.selftest import failed, ok, skipped
 
-SPEED = 0.4  # some motors are on or off, and on from 0.3
+SPEED = 0.4  # some motors are on or off, by a threshold
 DRIVES_S = 0.6
 RESTS_S = 0.75  # after the last command, at the latest
 _LATE_S = 0.5  # until a report of it is here

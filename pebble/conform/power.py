@@ -32,7 +32,7 @@ def _offline(component: Component, since: float) -> bool:
 
 def retained_commands(component: Component) -> CheckResult:
     """What a broker keeps is delivered when it starts: a drive command, and a stop."""
-    commands = {c.DRIVE: b'{"x": 0, "z": 0.2}', c.ESTOP: b'{"stop": "00000000000000ff", "by": "conform"}'}
+    commands = {c.DRIVE: b'{"x": 0, "z": 0.4}', c.ESTOP: b'{"stop": "00000000000000ff", "by": "conform"}'}
     for channel, payload in commands.items():
         component.retain(channel, payload)
     since = component.look(0.0)
