@@ -56,7 +56,7 @@ def _shown(component: Component) -> list[tuple[float, list[float]]]:
 
 
 def _moves(component: Component, since: float) -> list[float] | None:
-    """What its wheels do by a command of then; empty: nothing, None: it is not shown."""
+    """What its wheels do by commands since then; empty: nothing, None: it is not shown."""
 
     def moving() -> list[float]:
         return next((wheels for at, wheels in reversed(_shown(component)) if at >= since and any(wheels)), [])
@@ -161,8 +161,7 @@ def steering(component: Component) -> CheckResult:
     )
     with _at_the_wheel(component) as wheel:
         for fields, signs in ways:
-            began = wheel.send(valid_ms=300, **fields)
-            found = _moves(component, began)
+            found = _moves(component, wheel.drive(DRIVES_S / 2, **fields)[0])
             if found is None:
                 return skipped(_NOT_SHOWN, _SHOW_IT)
             if [one * sign > 0 for one, sign in zip(found, signs, strict=False)] != [True, True]:
@@ -215,7 +214,7 @@ def not_a_number(component: Component) -> CheckResult:
 
 def clamped(component: Component) -> CheckResult:
     with _at_the_wheel(component) as wheel:
-        wheels = _moves(component, wheel.send(9, x=-9, valid_ms=300))
+        wheels = _moves(component, wheel.drive(DRIVES_S / 2, z=9, x=-9)[0])
     if wheels is None:
         return skipped(_NOT_SHOWN, _SHOW_IT)
     if not wheels:
@@ -233,7 +232,7 @@ def foreign_key(component: Component) -> CheckResult:
         outcome = _moved(component, wheel.drive(key=_OTHER_KEY)[0], why, fix)
     if outcome.state is not State.OK:
         return outcome
-    return _moved(component, wheel.send(key=_OTHER_KEY), f"{why} while no one has control", fix)
+    return _moved(component, wheel.drive(DRIVES_S / 2, key=_OTHER_KEY)[0], f"{why} while no one has control", fix)
 
 
 def control_passes(component: Component) -> CheckResult:
