@@ -17,8 +17,10 @@ pytestmark = [pytest.mark.alone, pytest.mark.thorough]
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_a_robot_of_ours_passes(name: str) -> None:
-    with Stage(name, room=False) as stage:
-        with reached(Target(url=f"mqtt://127.0.0.1:{stage.broker_port}", robot=name), 4.0) as component:
-            component.eyes = lambda: [(ns / 1e9, [*wheels]) for ns, wheels in stage.motors(name)]
-            found = [(one.name, result) for one, result in run(component, (*CHECKS, *CONTROL, *MOVING))]
+    with (
+        Stage(name, room=False) as stage,
+        reached(Target(url=f"mqtt://127.0.0.1:{stage.broker_port}", robot=name), 4.0) as component,
+    ):
+        component.eyes = lambda: [(ns / 1e9, [*wheels]) for ns, wheels in stage.motors(name)]
+        found = [(one.name, result) for one, result in run(component, (*CHECKS, *CONTROL, *MOVING))]
     assert {name: result.text for name, result in found if result.state is not State.OK} == {}
