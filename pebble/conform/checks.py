@@ -170,7 +170,7 @@ def retained(component: Component) -> CheckResult:
     stale = sorted(
         metric
         for metric in there & set(live)
-        if not live[metric].default_retain and live[metric] is not c.MCU_SAMPLE  # whose manifest decides it
+        if not live[metric].default_retain and live[metric] is not c.MCU_VALUE  # whose manifest decides it
     )
     if stale:
         return failed(f"retained: {some_of(stale)}", "publish it without the retain flag: it is news only once")
