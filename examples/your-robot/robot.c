@@ -66,11 +66,11 @@ static void drive(const cJSON *command, const char *account) {
     if (!isfinite(x) || !isfinite(z) || !isfinite(valid_s)) return;  // NaN is no number
     int mine = *holder.key && same(get(command, "key"), holder.key) && !strcmp(account, holder.account);
     x = CLAMP(x, -1, 1), z = CLAMP(z, -1, 1);
+    if (mine) holder.ends = fmax(holder.ends, now() + holder.holds_s);
     if (x == 0 && z == 0 && (mine || !*holder.key)) paused_at = -INFINITY;  // who lets go after a reset may drive again
     if (x == 0 && z == 0) return turn(0, 0, 0);
     if (now() < paused_at + PAUSE_S) return (void)(paused_at = now());  // a stick that is held down moves nothing
     if (stop.latched || !(mine || (!get(command, "key") && !named))) return;
-    if (mine) holder.ends = fmax(holder.ends, now() + holder.holds_s);
     turn(CLAMP(z + x, -1, 1), CLAMP(z - x, -1, 1), CLAMP(valid_s, 0, DEAD_MAN_S));
 }
 static void halt(const cJSON *told, const char *account) {  // whatever arrives is a stop; what has a name counts once

@@ -71,11 +71,11 @@ static void drive(JsonVariantConst command, const char *account) {
     if (!std::isfinite(x) || !std::isfinite(z) || !std::isfinite(valid_s)) return;  // NaN is no number
     bool mine = *holder.key && same(command["key"], holder.key) && !strcmp(account, holder.account);
     x = constrain(x, -1, 1), z = constrain(z, -1, 1);
+    if (mine) holder.ends = fmax(holder.ends, now() + holder.holds_s);
     if (x == 0 && z == 0 && (mine || !*holder.key)) paused_at = -INFINITY;  // who lets go after a reset may drive again
     if (x == 0 && z == 0) return turn(0, 0, 0);
     if (now() < paused_at + PAUSE_S) return (void)(paused_at = now());  // a stick that is held down moves nothing
     if (stop.latched || !(mine || (command["key"].isUnbound() && !named))) return;
-    if (mine) holder.ends = fmax(holder.ends, now() + holder.holds_s);
     turn(constrain(z + x, -1, 1), constrain(z - x, -1, 1), constrain(valid_s, 0, DEAD_MAN_S));
 }
 static void halt(JsonVariantConst told, const char *account) {  // whatever arrives is a stop; what has a name counts once

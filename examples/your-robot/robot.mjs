@@ -56,13 +56,13 @@ function drive({ x = 0, z = 0, key, valid_ms = DEAD_MAN_MS }, account) {
   if (!Number.isFinite(x) || !Number.isFinite(z) || !Number.isFinite(valid_ms)) return; // NaN is no speed
   [x, z] = [clamp(x, -1, 1), clamp(z, -1, 1)];
   const mine = holder.key !== "" && key === holder.key && account === lease.account;
+  if (mine) lease.ends = Math.max(lease.ends, now() + lease.forMs);
   if (x === 0 && z === 0) {
     turn(0, 0, 0);
     if (mine || holder.key === "") pausedAt = -Infinity; // who lets go after a reset may drive again
   } else if (now() < pausedAt + PAUSE_MS) {
     pausedAt = now(); // a stick that is held down moves nothing
   } else if (!stop.latched && (mine || (key === undefined && !NAMED))) {
-    if (mine) lease.ends = Math.max(lease.ends, now() + lease.forMs);
     turn(clamp(z + x, -1, 1), clamp(z - x, -1, 1), clamp(valid_ms, 0, DEAD_MAN_MS));
   }
 }

@@ -44,6 +44,7 @@ class Robot:
             return  # NaN is no speed
         x, z = (max(-1.0, min(1.0, one)) for one in axes)
         mine = self.holder["key"] and (command.get("key"), account) == (self.holder["key"], self.account)
+        self.ends = max(self.ends, now() + self.holds_s) if mine else self.ends
         if not x and not z:
             self.turn(0.0, 0.0, 0.0)
             self.paused_at = -math.inf if mine or not self.holder["key"] else self.paused_at  # the driver has let go
@@ -51,7 +52,6 @@ class Robot:
             self.paused_at = now()  # a stick that is held down moves nothing
         elif not self.stop["latched"] and (mine or ("key" not in command and not NAMED)):
             seconds = min(DEAD_MAN_S, max(0.0, command.get("valid_ms", 1000 * DEAD_MAN_S) / 1000))
-            self.ends = max(self.ends, now() + self.holds_s) if mine else self.ends
             self.turn(max(-1.0, min(1.0, z + x)), max(-1.0, min(1.0, z - x)), seconds)
 
     def halt(self, payload, account):  # whatever arrives is a stop; what has a name counts once

@@ -14,6 +14,7 @@ from pebble.client.connection import Target, connected, put_names
 from pebble.client.names import Names
 from pebble.client.robot_view import RobotView
 from pebble.contract import channel_of, codec
+from pebble.contract.names import with_name
 from pebble.contract.payloads import ControlRequest
 from pebble.errors import PayloadError
 from pebble.transports import Message, QoS, Transport
@@ -44,6 +45,8 @@ class Component:
         self.ask = ask_person  # tells the person at the robot what to do
         self.person_s = 180.0  # until that is done, and a broker has noticed it: 1.5 times a keep-alive of a minute
         self.records: deque[Record] = deque(maxlen=_MOST)
+        #: When its wheels changed (monotonic), and to what, left and right: from where it is seen besides.
+        self.eyes: Callable[[], list[tuple[float, list[float]]]] = list
         self.view = RobotView(base)
         self._target, self._transport, self.account = target, transport, names.account
         self._arrived: deque[tuple[Message, float, float]] = deque(maxlen=_MOST)
@@ -94,6 +97,16 @@ class Component:
             beside.publish(channel.topic(self.base), payload, qos=QoS.DELIVERED, retain=True, remember=False)
             self.wait(lambda: beside.outgoing.waiting == 0, _RETAINED_S)
 
+    def send_as(self, account: str, channel: c.Channel, value: object) -> bool:
+        """Publish a command with another account in its topic, or "": without one; whether the broker delivers it."""
+        payload = value if isinstance(value, bytes) else codec.encode(channel, value)
+        topic = channel.topic(self.base)
+        found: deque[Message] = deque(maxlen=_MOST)
+        with connected(replace(self._target, program="conform-other")) as (beside, _):
+            beside.subscribe(f"{self.base}/{c.INCOMING}/#", found.append, qos=QoS.DELIVERED, direct=True)
+            beside.publish(with_name(topic, account) if account else topic, payload, qos=QoS.DELIVERED, urgent=True)
+            return self.wait(lambda: any(one.payload == payload for one in list(found)), _RETAINED_S)
+
     def reads_commands(self) -> bool:
         """Whether this client may read what is sent to the robot: a request that changes nothing comes back."""
         request = ControlRequest(id=secrets.token_hex(4), want="release")
@@ -107,7 +120,8 @@ class Component:
         """What the broker has retained of it and for it, as one gets it who connects now."""
         found: deque[Message] = deque(maxlen=_MOST)
         with connected(replace(self._target, program="conform-retained")) as (beside, _):
-            beside.subscribe(f"{self.base}/#", found.append, qos=QoS.DELIVERED, direct=True)
+            for direction in (c.OUTGOING, c.INCOMING):  # of which some brokers refuse one
+                beside.subscribe(f"{self.base}/{direction}/#", found.append, qos=QoS.DELIVERED, direct=True)
             self.wait(lambda: False, _RETAINED_S)
         return [record_of(one, self.base, 0.0) for one in list(found) if one.retain and one.payload]
 

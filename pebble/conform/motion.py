@@ -4,26 +4,27 @@ from __future__ import annotations
 
 import secrets
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
 import msgspec
 
 from pebble import contract as c
-from pebble.check_result import CheckResult
-from pebble.conform.checks import ANSWER_S, Check, Driver, commanded, drives, free, stops
+from pebble.check_result import CheckResult, State
+from pebble.conform.checks import ANSWER_S, Check, commanded, controls, drives, free, freed, reset, stop, stops
 from pebble.conform.component import Component
-from pebble.contract.payloads import EstopCommand, EstopReset
+from pebble.conform.control import UNSEEN, Driver, named
 from pebble.selftest import failed, ok, skipped
 
-SPEED = 0.2
+SPEED = 0.4  # some motors are on or off, by a threshold
 DRIVES_S = 0.6
 RESTS_S = 0.75  # after the last command, at the latest
 _LATE_S = 0.5  # until a report of it is here
 _STEP_S = 0.05
 _SWING = 30  # of a hall sensor's value: less is noise
-_UNSEEN = "nothing that it publishes shows whether it moves"
+_OTHER_KEY, _OTHER_ACCOUNT = "0badf00d", "conform-other"
+_NOT_SHOWN = "nothing that it publishes shows whether it moves"
 _SHOW_IT = 'publish {"value": {"wheels": [left, right]}} on outgoing/status whenever they change, or touch-sensors'
 
 
@@ -32,8 +33,7 @@ def moves_until(component: Component, since: float) -> float | None:
 
     Shown by ``wheels`` in the status, which is published on change, or by readings of hall sensors.
     """
-    reports = [(one.at, _wheels(one.value)) for one in component.of(c.STATUS) if one.value is not None]
-    turning = [(at, any(wheels)) for at, wheels in reports if wheels is not None]
+    turning = [(at, any(wheels)) for at, wheels in _shown(component)]
     touches = [(one.at, msgspec.structs.astuple(one.value.value)) for one in component.of(c.TOUCH_SENSORS) if one.value]
     if not turning and not touches:
         return None
@@ -49,97 +49,159 @@ def moves_until(component: Component, since: float) -> float | None:
     return last
 
 
-def _wheels(status: Any) -> list[float] | None:
-    found = status.value.get("wheels")
-    is_list = isinstance(found, list) and all(isinstance(one, int | float) for one in found)
-    return found if is_list else None
+def _shown(component: Component) -> list[tuple[float, list[float]]]:
+    """What its wheels did, and since when."""
+    reports = [(one.at, one.value.value.get("wheels")) for one in component.of(c.STATUS) if one.value is not None]
+    return component.eyes() or [(at, wheels) for at, wheels in reports if _are_wheels(wheels)]
+
+
+def _moves(component: Component, since: float) -> list[float] | None:
+    """What its wheels do by commands since then; empty: nothing, None: it is not shown."""
+
+    def moving() -> list[float]:
+        return next((wheels for at, wheels in reversed(_shown(component)) if at >= since and any(wheels)), [])
+
+    component.wait(moving, ANSWER_S)
+    component.look(_LATE_S)
+    return moving() if _shown(component) else None
+
+
+def _are_wheels(value: Any) -> bool:
+    return isinstance(value, list) and len(value) > 0 and all(isinstance(one, int | float) for one in value)
+
+
+class _Wheel:
+    """Sends drive commands, with the key of control where the robot has one."""
+
+    def __init__(self, component: Component) -> None:
+        self._component, self.driver = component, Driver(component)
+
+    def send(self, z: object = SPEED, *, key: str | None = None, wrapped: bool = False, **fields: object) -> float:
+        """One command; ``key``: instead of its own, "" for none. Returns when."""
+        of = self.driver.key if key is None else key
+        command = {"x": 0, "z": z, **({"key": of} if of else {}), **fields}
+        return self._component.send(c.DRIVE, msgspec.json.encode({"value": command} if wrapped else command))
+
+    def drive(self, seconds: float = DRIVES_S, **fields: Any) -> tuple[float, float]:
+        """Commands for so long; when the first and the last one left."""
+        began = last = time.monotonic()
+        while time.monotonic() < began + seconds:
+            last = self.send(**fields)
+            self._component.look(_STEP_S)
+        return began, last
 
 
 @contextmanager
-def _at_the_wheel(component: Component) -> Iterator[Callable[..., float]]:
-    """A function that sends one drive command, with the key of control where the robot has one; zero at the end."""
-    driver = Driver(component)
-
-    def send(z: object = SPEED, **fields: object) -> float:
-        key = {"key": driver.key} if driver.holds else {}
-        return component.send(c.DRIVE, msgspec.json.encode({"x": 0, "z": z, **key, **fields}))
-
+def _at_the_wheel(component: Component) -> Iterator[_Wheel]:
+    """Its driver has control, and has let go, so that a wait after a reset is over; at the end, too."""
+    wheel = _Wheel(component)
     if component.view.controlled:
-        driver.asks(for_ms=10_000)
-        component.wait(lambda: driver.holds, ANSWER_S)
-    send(0)  # after a reset a robot waits for one
+        wheel.driver.asks(for_ms=10_000)
+        component.wait(lambda: wheel.driver.holds, ANSWER_S)
+    wheel.send(0)
     component.wait(lambda: moves_until(component, time.monotonic()) != float("inf"), ANSWER_S)
     try:
-        yield send
+        yield wheel
     finally:
-        send(0)
-        driver.asks("release")
-        component.wait(lambda: not driver.holds, ANSWER_S)
+        wheel.send(0)
+        wheel.driver.leaves()
 
 
-def _drive(component: Component, send: Callable[..., float], **fields: object) -> tuple[float, float]:
-    """Drive for a moment; when the first and the last command left."""
-    began = last = time.monotonic()
-    while time.monotonic() < began + DRIVES_S:
-        last = send(**fields)
-        component.look(_STEP_S)
-    return began, last
-
-
-def _rest(component: Component, began: float, last: float, limit_s: float) -> CheckResult:
+def _rest(
+    component: Component, began: float, last: float, limit_s: float, what: str = "the last command"
+) -> CheckResult:
     component.look(limit_s + _LATE_S)
     until = moves_until(component, began)
     if until is None:
-        return skipped(_UNSEEN, _SHOW_IT)
+        return skipped(_NOT_SHOWN, _SHOW_IT)
     if until == 0.0:
         return failed(f"z {SPEED} for {DRIVES_S} s does not move it", "drive by incoming/drive-values, live ones")
     if until > last + limit_s + _LATE_S / 2:
         shown = "still moves" if until == float("inf") else f"moved for {until - last:.2f} s"
-        return failed(f"it {shown} after the last command", f"stop {limit_s:g} s after the last drive command")
-    return ok(f"it rests {max(0.0, until - last):.2f} s after the last command")
+        return failed(f"it {shown} after {what}", f"stop {limit_s:g} s after {what}, at the latest")
+    return ok(f"it rests {max(0.0, until - last):.2f} s after {what}")
+
+
+def _moved(component: Component, since: float, why: str, fix: str) -> CheckResult:
+    """A failure if it has moved."""
+    component.look(_LATE_S)
+    until = moves_until(component, since)
+    if until is None:
+        return skipped(_NOT_SHOWN, _SHOW_IT)
+    return failed(why, fix) if until > since else ok("it moves nothing")
 
 
 def dead_man(component: Component) -> CheckResult:
-    with _at_the_wheel(component) as send:
-        return _rest(component, *_drive(component, send), RESTS_S)
+    with _at_the_wheel(component) as wheel:
+        return _rest(component, *wheel.drive(), RESTS_S)
 
 
 def valid_ms(component: Component) -> CheckResult:
-    with _at_the_wheel(component) as send:
-        return _rest(component, *_drive(component, send, valid_ms=150), 0.15)
+    """A short time, and one that is too long."""
+    with _at_the_wheel(component) as wheel:
+        outcome = _rest(component, *wheel.drive(valid_ms=150), 0.15)
+        if outcome.state is not State.OK:
+            return outcome
+        last = _rest(component, *wheel.drive(0.2, valid_ms=4000), RESTS_S)
+        return outcome if last.state is State.OK else failed(f"valid_ms 4000: {last.text}", last.fix)
 
 
 def zero(component: Component) -> CheckResult:
-    with _at_the_wheel(component) as send:
-        began, _ = _drive(component, send)
-        return _rest(component, began, send(0), 0.1)
+    """It comes from another than the driver: it needs no key."""
+    with _at_the_wheel(component) as wheel:
+        began, _ = wheel.drive()
+        return _rest(component, began, wheel.send(0, key=_OTHER_KEY), 0.1, "a zero with another key")
+
+
+def steering(component: Component) -> CheckResult:
+    ways: tuple[tuple[dict[str, Any], tuple[int, int]], ...] = (
+        ({"z": 0, "x": SPEED}, (1, -1)),
+        ({"z": SPEED}, (1, 1)),
+        ({"z": -SPEED, "wrapped": True}, (-1, -1)),
+    )
+    with _at_the_wheel(component) as wheel:
+        for fields, signs in ways:
+            found = _moves(component, wheel.drive(DRIVES_S / 2, **fields)[0])
+            if found is None:
+                return skipped(_NOT_SHOWN, _SHOW_IT)
+            if [one * sign > 0 for one, sign in zip(found, signs, strict=False)] != [True, True]:
+                sent = f"x {fields.get('x', 0):g}, z {fields['z']:g}" + " within value" * ("wrapped" in fields)
+                return failed(f"at {sent} its wheels do {found}", "left is z + x, right is z - x, also within value")
+    return ok("x to the right, z ahead")
 
 
 def stop_moving(component: Component) -> CheckResult:
     """Commands go on, and move nothing."""
-    with _at_the_wheel(component) as send:
-        began, _ = _drive(component, send)
-        name = secrets.token_hex(8)
-        at = component.send(c.ESTOP, EstopCommand(stop=name, by="conform", why="conformance test"))
-        _drive(component, send)
-        outcome = _rest(component, began, at, 0.25)
-    for state in component.view.estop.states.values():
-        component.send(c.ESTOP_RESET, EstopReset(boot=state.boot, count=state.count, by="conform"))
-    is_free = component.wait(lambda: not component.view.latched, ANSWER_S)
+    with _at_the_wheel(component) as wheel:
+        began, _ = wheel.drive()
+        at = time.monotonic()
+        stop(component, secrets.token_hex(8))
+        wheel.drive()
+        outcome = _rest(component, began, at, 0.25, "the stop")
+    return outcome if freed(component) else failed("a reset does not end the stop", "end it on incoming/estop-reset")
+
+
+def reset_waits(component: Component) -> CheckResult:
+    """The stick is held down meanwhile. A zero of another ends no wait while one has control."""
+    with _at_the_wheel(component) as wheel:
+        stop(component, secrets.token_hex(8))
+        began = time.monotonic()
+        reset(component)
+        is_free = component.wait(lambda: not component.view.latched, ANSWER_S)
+        if component.view.controlled:
+            wheel.drive(DRIVES_S / 2)
+            wheel.send(0, key=_OTHER_KEY)
+        wheel.drive()
+        outcome = _moved(
+            component,
+            began,
+            "a stick that is held down moves it after a reset",
+            "wait for a zero of who has control, or for 0.5 s without commands",
+        )
+        if outcome.state is State.OK:
+            wheel.send(0)
+            outcome = _rest(component, *wheel.drive(), RESTS_S)
     return outcome if is_free else failed("a reset does not end the stop", "end it on incoming/estop-reset")
-
-
-def _moves_nothing(why: str, fix: str, **fields: object) -> Callable[[Component], CheckResult]:
-    def run(component: Component) -> CheckResult:
-        with _at_the_wheel(component) as send:
-            began, _ = _drive(component, send, **fields)
-            component.look(_LATE_S)
-            until = moves_until(component, began)
-        if until is None:
-            return skipped(_UNSEEN, _SHOW_IT)
-        return failed(why, fix) if until > began else ok("it moves nothing")
-
-    return run
 
 
 def not_a_number(component: Component) -> CheckResult:
@@ -147,44 +209,76 @@ def not_a_number(component: Component) -> CheckResult:
         began = time.monotonic()
         for number in (b"NaN", b"Infinity", b"1e999", b'"nan"', b"null"):
             component.send(c.DRIVE, b'{"x": 0, "z": %s}' % number)
-        component.look(_LATE_S)
-        until = moves_until(component, began)
-    if until is None:
-        return skipped(_UNSEEN, _SHOW_IT)
-    return failed("it moves by a command that is no number", "refuse NaN and infinity") if until > began else ok("no")
+        return _moved(component, began, "it moves by a command that is no number", "refuse NaN and infinity")
 
 
 def clamped(component: Component) -> CheckResult:
-    with _at_the_wheel(component) as send:
-        began = time.monotonic()
-        send(9, x=-9, valid_ms=150)
-        component.look(_LATE_S)
-        shown = [_wheels(one.value) for one in component.of(c.STATUS, began) if one.value is not None]
-    wheels = [abs(one) for values in shown for one in values or ()]
+    with _at_the_wheel(component) as wheel:
+        wheels = _moves(component, wheel.drive(DRIVES_S / 2, z=9, x=-9)[0])
+    if wheels is None:
+        return skipped(_NOT_SHOWN, _SHOW_IT)
     if not wheels:
-        return skipped("its status has no wheels", _SHOW_IT)
-    if max(wheels) > 1.0:
-        return failed(f"a wheel got {max(wheels):g}", "clamp both axes to -1..1, and the sum of them for each wheel")
-    return ok(f"{max(wheels):g} at most")
+        return failed("x -9, z 9 does not move it", "clamp both axes to -1..1, and obey")
+    largest = max(map(abs, wheels))
+    if largest > 1.0:
+        return failed(f"a wheel got {largest:g}", "clamp both axes to -1..1, and the sum of them for each wheel")
+    return ok(f"{largest:g} at most")
 
 
-def _foreign(component: Component) -> str:
-    return "" if component.view.controlled else "its capabilities offer no control"
+def foreign_key(component: Component) -> CheckResult:
+    """While one has control, and while none has."""
+    why, fix = "it moves by another's key", "refuse what moves and has another key"
+    with _at_the_wheel(component) as wheel:
+        outcome = _moved(component, wheel.drive(key=_OTHER_KEY)[0], why, fix)
+    if outcome.state is not State.OK:
+        return outcome
+    return _moved(component, wheel.drive(DRIVES_S / 2, key=_OTHER_KEY)[0], f"{why} while no one has control", fix)
+
+
+def control_passes(component: Component) -> CheckResult:
+    with _at_the_wheel(component) as wheel:
+        began, _ = wheel.drive()
+        key, second = wheel.driver.key, Driver(component)
+        at = second.takes()
+        component.wait(lambda: second.holds, ANSWER_S)
+        wheel.drive(key=key)
+        outcome = _rest(component, began, at, 0.25, "another took control")
+        second.leaves()
+    return outcome
+
+
+def keyless(component: Component) -> CheckResult:
+    with _at_the_wheel(component) as wheel:
+        began, _ = wheel.drive(key="")
+        return _moved(component, began, "it moves by a command without a key", "at level named refuse those")
+
+
+def foreign_account(component: Component) -> CheckResult:
+    """The key of control, behind another account and behind none."""
+    with _at_the_wheel(component) as wheel:
+        command = msgspec.json.encode({"x": 0, "z": SPEED, "key": wheel.driver.key})
+        began = time.monotonic()
+        delivered = [component.send_as(account, c.DRIVE, command) for account in (_OTHER_ACCOUNT, "")]
+        outcome = _moved(
+            component, began, "it moves by a key that another sends", "a key counts with the account that asked for it"
+        )
+    return outcome if all(delivered) or outcome.state is State.FAILED else skipped(UNSEEN)
 
 
 _MOVES = (drives, free, commanded)
+_BY_TURNS = (*_MOVES, controls)
 
 MOVING: tuple[Check[Component], ...] = (
     Check("dead man", "a driver may vanish at any moment", dead_man, _MOVES),
-    Check("validity", "a command tells how long it counts", valid_ms, _MOVES),
-    Check("zero", "who lets go expects it to stop at once", zero, _MOVES),
+    Check("validity", "a command tells how long it counts, but never long", valid_ms, _MOVES),
+    Check("zero", "who lets go expects it to stop at once, and anyone may halt it", zero, _MOVES),
+    Check("steering", "a person must know where it will go", steering, _MOVES),
     Check("no number", "a speed that is no number must not be one", not_a_number, _MOVES),
     Check("clamps", "motors get no more than everything", clamped, _MOVES),
-    Check(
-        "foreign key",
-        "who had control before must not drive on",
-        _moves_nothing("it moves by another's key", "refuse what moves and has another key", key="0badf00d"),
-        (*_MOVES, _foreign),
-    ),
+    Check("foreign key", "who had control before must not drive on", foreign_key, _BY_TURNS),
+    Check("control passes", "the next driver must not get a robot that moves", control_passes, _BY_TURNS),
     Check("stop moving", "a stopped robot does not move, whatever is sent", stop_moving, (*_MOVES, stops)),
+    Check("reset waits", "who resets must not be surprised by a stick", reset_waits, (*_MOVES, stops)),
+    Check("keyless", "where names are checked, who drives is known", keyless, _BY_TURNS, binds=named),
+    Check("foreign account", "a key can be read by all", foreign_account, _BY_TURNS, binds=named),
 )

@@ -6,10 +6,9 @@ import secrets
 
 from pebble import contract as c
 from pebble.check_result import CheckResult, State
-from pebble.conform.checks import ANSWER_S, Check, commanded, drives, free, stops
+from pebble.conform.checks import ANSWER_S, Check, commanded, drives, free, freed, stop, stops
 from pebble.conform.component import Component
 from pebble.conform.motion import moves_until
-from pebble.contract.payloads import EstopCommand, EstopReset
 from pebble.selftest import failed, ok, skipped
 
 _LOOKS_S = 3.0
@@ -33,7 +32,7 @@ def _offline(component: Component, since: float) -> bool:
 
 def retained_commands(component: Component) -> CheckResult:
     """What a broker keeps is delivered when it starts: a drive command, and a stop."""
-    commands = {c.DRIVE: b'{"x": 0, "z": 0.2}', c.ESTOP: b'{"stop": "00000000000000ff", "by": "conform"}'}
+    commands = {c.DRIVE: b'{"x": 0, "z": 0.4}', c.ESTOP: b'{"stop": "00000000000000ff", "by": "conform"}'}
     for channel, payload in commands.items():
         component.retain(channel, payload)
     since = component.look(0.0)
@@ -64,8 +63,7 @@ def _back(component: Component) -> str:
 def survives(component: Component) -> CheckResult:
     """A stop outlives a power cut where its owner says that it is saved."""
     name = secrets.token_hex(8)
-    component.send(c.ESTOP, EstopCommand(stop=name, by="conform", why="conformance test"))
-    component.wait(lambda: component.view.latched, ANSWER_S)
+    stop(component, name)
     states = component.view.estop.states
     saved = bool(states) and all(one.persisted is True for one in states.values())
     boots = {one.boot for one in states.values()}
@@ -78,9 +76,7 @@ def survives(component: Component) -> CheckResult:
     outcome = (
         ok("it starts stopped") if component.view.latched else failed("it is free after a power cut", "save the stop")
     )
-    for one in component.view.estop.states.values():
-        component.send(c.ESTOP_RESET, EstopReset(boot=one.boot, count=one.count, by="conform"))
-    if not component.wait(lambda: not component.view.latched, ANSWER_S) and outcome.state is State.OK:
+    if not freed(component) and outcome.state is State.OK:
         return failed("a reset does not end the stop after a power cut", "publish the new boot, and reset by it")
     return outcome if saved else skipped("its state does not claim that it is saved")
 

@@ -6,15 +6,20 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
 from pebble.client.connection import Target
+from pebble.fleet import certificates
 from pebble.fleet.certificates import CA_CERT
+from pebble.fleet.roles import Account
 from tests.fleet.brokers import HOST, FleetBroker
 from tests.support import ROOT, Broker
+from tests.transports.brokers import MAKERS, named_nats
 
 Command = list[str | Path]
 Language = Callable[[str, Path], Command]  # makes its "robot" or "operator" in a folder
@@ -64,12 +69,75 @@ def in_arduino(program: str, folder: Path) -> Command:
     return [folder / program]
 
 
+def in_micropython(program: str, _folder: Path) -> Command:
+    """The real interpreter, as WebAssembly; sockets, flash and console of a board are this machine's."""
+    if shutil.which("node") is None or not (ROOT / ".venv" / "micropython").exists():
+        missing("needs Node.js (apt install nodejs) and MicroPython (python tools/fetch_npm.py .venv micropython)")
+    board, mqtt = ROOT / "tests" / "conform" / "micropython", source("robot", "py").with_name("mqtt.py")
+    sample = source(program, "py").with_name(f"{program}-micropython.py")
+    return ["node", board / "run.mjs", ROOT / ".venv" / "micropython", mqtt, sample]
+
+
 def missing(what: str) -> None:
     (pytest.fail if os.environ.get("CI") == "true" else pytest.skip)(what)
 
 
-ROBOTS = (in_python, in_javascript, in_c, in_arduino)
-OPERATORS = (in_python, in_javascript, in_c)
+ROBOTS = (in_python, in_javascript, in_c, in_arduino, in_micropython)
+OPERATORS = ROBOTS
+
+
+NATS = MAKERS["nats"]
+WITHOUT_NATS = pytest.mark.skipif(NATS.missing(), reason="needs NATS: make brokers")
+PASSWORDS = {"mine": "any robot", "ann": "any person"}
+
+
+class Named(NamedTuple):
+    """A broker with TLS where the robot ``mine`` and the person ``ann`` have accounts, and what they need to know."""
+
+    port: int
+    folder: Path
+    passwords: Mapping[str, str] = PASSWORDS
+
+
+Hall = Callable[[Path], AbstractContextManager[Named]]
+
+
+@contextmanager
+def ended(broker: Broker) -> Iterator[Broker]:
+    try:
+        yield broker
+    finally:
+        broker.stop()
+
+
+@contextmanager
+def believing(folder: Path) -> Iterator[Named]:
+    """A mosquitto that believes every name: by it, one account sends as another, and without any."""
+    certificate, key = _certificate(folder)
+    with ended(Broker(folder, f"certfile {certificate}", f"keyfile {key}")) as broker:
+        yield Named(broker.port, folder)
+
+
+@contextmanager
+def named_by_nats(folder: Path) -> Iterator[Named]:
+    with ended(named_nats(folder, "mine", "ann", PASSWORDS, _certificate(folder))) as broker:
+        yield Named(broker.port, folder)
+
+
+@contextmanager
+def named_by_the_fleet(folder: Path) -> Iterator[Named]:
+    """A mosquitto with the files of `pebble fleet`."""
+    people = {
+        "mine": Account(roles=("robot",), bases=("pebble/robots/mine",)),
+        "ann": Account(roles=("driver", "safety")),
+    }
+    with FleetBroker(folder, people, level="named") as broker:
+        yield Named(broker.port, folder, broker.passwords)
+
+
+def _certificate(folder: Path) -> tuple[Path, Path]:
+    certificates.init(folder, [HOST])
+    return folder / certificates.SERVER_CERT, folder / certificates.SERVER_KEY
 
 
 def at_open(broker: Broker) -> tuple[Command, Target]:
@@ -77,7 +145,7 @@ def at_open(broker: Broker) -> tuple[Command, Target]:
     return ["mine", "127.0.0.1", str(broker.port)], Target(url=f"mqtt://127.0.0.1:{broker.port}", robot="mine")
 
 
-def at_named(broker: FleetBroker, folder: Path, program: str, other: str) -> tuple[Command, Target]:
+def at_named(broker: Named, folder: Path, program: str, other: str) -> tuple[Command, Target]:
     """The same for accounts: that of the program, and that of the other side."""
     for name in (program, other):
         (folder / name).write_text(broker.passwords[name])

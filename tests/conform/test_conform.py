@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,65 +15,119 @@ import pytest
 
 from pebble.check_result import State
 from pebble.client.connection import Target
-from pebble.conform.checks import CHECKS, Check, run
+from pebble.conform.checks import CHECKS, Check
+from pebble.conform.checks import run as results
 from pebble.conform.component import Component, reached
+from pebble.conform.control import CONTROL, UNSEEN
 from pebble.conform.motion import MOVING
 from pebble.conform.power import CUT
-from pebble.fleet.roles import Account
-from tests.conform.programs import ROBOTS, Command, Language, at_named, at_open, source
-from tests.fleet.brokers import FleetBroker
+from pebble.transports import MqttSettings, QoS
+from pebble.transports.mqtt.transport import MqttTransport
+from tests.commands.command_line import Run
+from tests.commands.conftest import run as run
+from tests.conform.programs import (
+    NATS,
+    ROBOTS,
+    WITHOUT_NATS,
+    Command,
+    Hall,
+    Language,
+    at_named,
+    at_open,
+    believing,
+    ended,
+    named_by_nats,
+    named_by_the_fleet,
+    source,
+)
 from tests.fleet.conftest import cheap_hashes as cheap_hashes
-from tests.support import Broker, Child, further, some
+from tests.support import Broker, Child, beside, further, some
 
 pytestmark = pytest.mark.alone  # deadlines of wheels are checked
 
 SOURCE = source("robot", "py").read_text()
-ALL = {check.name: check for check in (*CHECKS, *MOVING, *CUT)}
+ALL = {check.name: check for check in (*CHECKS, *CONTROL, *MOVING, *CUT)}
 LOOKS_S = 2.0
 
-#: By check: what is written into the robot's program, and in place of what.
-VIOLATIONS: dict[str, tuple[str, str]] = {
-    "heartbeat": ("heartbeat_at = now() + 0.25", "heartbeat_at = now() + 5"),
-    "clock": ("int(1000 * time.time())", "int(1000 * time.time()) + 3_600_000"),
-    "payloads": ('{"t": epoch_ms()}, qos=0', '{"t": str(time.time())}, qos=0'),
-    "numbers": ('{"wheels": self.wheels}', '{"wheels": self.wheels, "amperes": math.nan}'),
-    "sizes": ('"by": "", "why": "", "since"', '"by": "", "why": 400 * "x", "since"'),
-    "retained": ("qos, retain=True", "qos, retain=False"),
-    "parked commands": (
+#: The check that finds it, and what is written into the robot's program, in place of what.
+VIOLATIONS = (
+    ("heartbeat", "heartbeat_at = now() + 0.25", "heartbeat_at = now() + 5"),
+    ("heartbeat", "heartbeat_at = now() + 0.25", "heartbeat_at = now() + 1.5"),
+    ("clock", "int(1000 * time.time())", "int(1000 * time.time()) + 3_600_000"),
+    ("payloads", '{"t": epoch_ms()}, qos=0', '{"t": str(time.time())}, qos=0'),
+    ("numbers", '{"wheels": self.wheels}', '{"wheels": self.wheels, "amperes": math.nan}'),
+    ("sizes", '"by": "", "why": "", "since"', '"by": "", "why": 400 * "x", "since"'),
+    ("retained", "qos, retain=True", "qos, retain=False"),
+    (
+        "parked commands",
         "    def publish(self",
         '        client.publish(IN + "control", "{}", 1, True)\n\n    def publish(self',
     ),
-    "capabilities": ('"available": True', '"available": "yes"'),
-    "own topics": ('"controls": True', '"controls": True, "topic": "pebble/robots/other/incoming/drive-values"'),
-    "identity": ('"id": ID', '"id": "other"'),
-    "junk": ("(ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError)", "(KeyError)"),
-    "stop states": ('publish(f"estop/{OWNER}"', 'publish("estop/others"'),
-    "stop": ('self.stop = {"latched": True', 'self.stop = {"latched": False'),
-    "stop once": ('if name not in self.stop["recent"]:', "if True:"),
-    "stop unread": (
+    ("capabilities", '"available": True', '"available": "yes"'),
+    ("own topics", '"controls": True', '"controls": True, "topic": "pebble/robots/other/incoming/drive-values"'),
+    ("identity", '"id": ID', '"id": "other"'),
+    ("junk", "(ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError)", "(KeyError)"),
+    ("stop states", 'publish(f"estop/{OWNER}"', 'publish("estop/others"'),
+    ("stop", 'self.stop = {"latched": True', 'self.stop = {"latched": False'),
+    ("stop once", 'if name not in self.stop["recent"]:', "if True:"),
+    ("stop once", 'self.stop | {"latched": False}', 'self.stop | {"latched": False, "recent": []}'),
+    (
+        "stop unread",
         "            claims = dict(json.loads(payload))",
         "            claims = {}\n        claims = dict(json.loads(payload))",
     ),
-    "stop holds": (
+    (
+        "stop holds",
         "        if not x and not z:\n",
         "        if not x and not z:\n            self.stop = FREE\n            self.publish_stop()\n",
     ),
-    "reset refused": ("if self.refused is None and", "if"),
-    "control": ('elif take or mine or not self.holder["key"]:', "elif True:"),
-    "control asked": ('{"asks": new["by"], "asks_id": new["id"]}', "UNASKED"),
-    "control released": ("NONE if mine else self.holder", "self.holder"),
-    "control ends": ("now() > robot.ends:", "False:"),
-    "dead man": ('DEAD_MAN_S, PAUSE_S, LONGEST = "motors", 0.75', 'DEAD_MAN_S, PAUSE_S, LONGEST = "motors", 3.0'),
-    "validity": ('command.get("valid_ms", 1000 * DEAD_MAN_S)', "1000 * DEAD_MAN_S"),
-    "zero": ("            self.turn(0.0, 0.0, 0.0)\n            self.paused_at", "            self.paused_at"),
-    "no number": ("math.isfinite(one) for", "True for"),
-    "clamps": ("self.turn(max(-1.0, min(1.0, z + x))", "self.turn(z - 2 * x"),
-    "foreign key": ('(mine or ("key" not in command and not NAMED))', "True"),
-    "stop moving": ('elif not self.stop["latched"] and', "elif"),
-    "will": ('json.dumps({"t": epoch_ms(), "online": False})', 'json.dumps({"t": epoch_ms()})'),
-    "retained commands": ("if message.retain:", "if False:"),
-    "stop survives": ("self.stop |= json.load(open(STOP_FILE))", "self.stop = FREE"),
-}
+    ("reset refused", "if self.refused is None and", "if"),
+    ("control", 'elif take or mine or not self.holder["key"]:', "elif True:"),
+    ("control asked", '{"asks": new["by"], "asks_id": new["id"]}', "UNASKED"),
+    ("control asked", "now() <= robot.asks_until", "True"),
+    ("control released", "NONE if mine else self.holder", "self.holder"),
+    ("control released", "NONE if mine else self.holder", "NONE"),
+    ("control taken", "elif take or mine or", "elif mine or"),
+    ("control taken", "secrets.token_hex(4)})", '"0badf00e"})'),
+    ("control ends", "now() > robot.ends:", "False:"),
+    ("control ends", "if mine else self.ends", "if False else self.ends"),
+    ("dead man", 'DEAD_MAN_S, PAUSE_S, LONGEST = "motors", 0.75', 'DEAD_MAN_S, PAUSE_S, LONGEST = "motors", 3.0'),
+    ("validity", 'command.get("valid_ms", 1000 * DEAD_MAN_S)', "1000 * DEAD_MAN_S"),
+    ("validity", "min(DEAD_MAN_S, max(", "max(0.0, max("),
+    ("zero", "            self.turn(0.0, 0.0, 0.0)\n            self.paused_at", "            self.paused_at"),
+    (
+        "zero",
+        "        if not x and not z:\n",
+        '        if not (x or z or mine) and "key" in command:\n            return\n        if not x and not z:\n',
+    ),
+    ("steering", 'command.get("x", 0), command.get("z", 0)', 'command.get("z", 0), command.get("x", 0)'),
+    ("steering", "min(1.0, z + x)), max(-1.0, min(1.0, z - x))", "min(1.0, z - x)), max(-1.0, min(1.0, z + x))"),
+    ("steering", 'value["value"] if type', "value if type"),
+    ("no number", "math.isfinite(one) for", "True for"),
+    ("clamps", "self.turn(max(-1.0, min(1.0, z + x))", "self.turn(z - 2 * x"),
+    ("foreign key", '(mine or ("key" not in command and not NAMED))', "True"),
+    ("foreign key", '(mine or ("key"', '(mine or not self.holder["key"] or ("key"'),
+    ("control passes", "to, UNASKED\n            self.turn(0.0, 0.0, 0.0)", "to, UNASKED"),
+    ("stop moving", 'elif not self.stop["latched"] and', "elif"),
+    ("reset waits", "elif now() < self.paused_at + PAUSE_S:", "elif False:"),
+    ("reset waits", '-math.inf if mine or not self.holder["key"] else self.paused_at', "-math.inf"),
+    ("will", 'json.dumps({"t": epoch_ms(), "online": False})', 'json.dumps({"t": epoch_ms()})'),
+    ("retained commands", "if message.retain:", "if False:"),
+    ("stop survives", "self.stop |= json.load(open(STOP_FILE))", "self.stop = FREE"),
+)
+
+#: The same at level named.
+NAMED_VIOLATIONS = (
+    ("control", 'f"{account}/{by}".strip("/")[:40]', "by"),
+    ("nameless", 'metric == "estop-reset" and (account or not NAMED)', 'metric == "estop-reset"'),
+    ("nameless", '"control/take") and (account or not NAMED)', '"control/take")'),
+    ("keyless", '("key" not in command and not NAMED)', '"key" not in command'),
+    (
+        "foreign account",
+        '(command.get("key"), account) == (self.holder["key"], self.account)',
+        'command.get("key") == self.holder["key"]',
+    ),
+)
 
 
 class Machine:
@@ -123,11 +180,14 @@ def with_stop_file(arguments: Command, folder: Path) -> Command:
     return [*arguments[:3], folder / "stop.json", *arguments[3:]]
 
 
-def judged(component: Component, *checks: Check[Component]) -> dict[str, tuple[State, str]]:
-    return {check.name: (outcome.state, outcome.text) for check, outcome in run(component, checks)}
+Found = dict[str, tuple[State, str]]
 
 
-def lacking(found: dict[str, tuple[State, str]]) -> dict[str, tuple[State, str]]:
+def judged(component: Component, *checks: Check[Component]) -> Found:
+    return {check.name: (outcome.state, outcome.text) for check, outcome in results(component, checks)}
+
+
+def lacking(found: Found) -> Found:
     return {name: one for name, one in found.items() if one[0] is not State.OK}
 
 
@@ -141,29 +201,81 @@ def test_the_smallest_honest_robot_passes(broker: Broker, tmp_path: Path, langua
     assert len(found) >= 20
 
 
+#: What a driver's account is not shown at a broker that checks names.
+REFUSED = {
+    "parked commands": (State.SKIPPED, "its broker does not let this account read incoming/: use an admin's"),
+    "nameless": (State.SKIPPED, UNSEEN),
+    "foreign account": (State.SKIPPED, UNSEEN),
+}
+
+
 @pytest.mark.usefixtures("cheap_hashes")
-@pytest.mark.parametrize("language", [ROBOTS[0], *map(further, ROBOTS[1:])])
-def test_it_passes_where_names_are_checked(tmp_path: Path, language: Language) -> None:
+@pytest.mark.parametrize(
+    ("hall", "language", "unseen"),
+    [
+        (named_by_the_fleet, ROBOTS[0], REFUSED),
+        *(further(named_by_the_fleet, one, REFUSED) for one in ROBOTS[1:]),
+        *(pytest.param(named_by_nats, one, REFUSED, marks=(pytest.mark.thorough, WITHOUT_NATS)) for one in ROBOTS),
+        *(further(believing, one, {}) for one in ROBOTS),
+    ],
+)
+def test_it_passes_where_names_are_checked(hall: Hall, tmp_path: Path, language: Language, unseen: Found) -> None:
     program = language("robot", tmp_path)
-    people = {
-        "mine": Account(roles=("robot",), bases=("pebble/robots/mine",)),
-        "ann": Account(roles=("driver", "safety")),
-    }
-    with FleetBroker(tmp_path / "hall", people, level="named") as broker:
+    with hall(tmp_path / "hall") as broker:
         arguments, target = at_named(broker, tmp_path, "mine", "ann")
         with switched_on([*program, *with_stop_file(arguments, tmp_path)], target) as component:
-            found = judged(component, *ALL.values())
-    unseen = "its broker does not let this account read incoming/: use an admin's"
-    assert lacking(found) == {"parked commands": (State.SKIPPED, unseen)}
+            assert lacking(judged(component, *ALL.values())) == unseen
 
 
-@pytest.mark.parametrize("name", some(ALL, 3))
-def test_a_violation_is_found(broker: Broker, tmp_path: Path, name: str) -> None:
-    old, new = VIOLATIONS[name]
+@pytest.mark.thorough
+@WITHOUT_NATS
+@pytest.mark.parametrize("language", ROBOTS)
+def test_it_passes_at_another_broker(tmp_path: Path, language: Language) -> None:
+    program = language("robot", tmp_path)
+    with ended(NATS.make(tmp_path)) as broker:
+        arguments, target = at_open(broker)
+        with switched_on([*program, *with_stop_file(arguments, tmp_path)], target) as component:
+            assert lacking(judged(component, *ALL.values())) == {}
+
+
+def mutant(folder: Path, old: str, new: str) -> Command:
     assert old in SOURCE
-    program = tmp_path / "robot.py"
-    program.write_text(SOURCE.replace(old, new))
+    (folder / "robot.py").write_text(SOURCE.replace(old, new))
+    return [sys.executable, folder / "robot.py"]
+
+
+@pytest.mark.parametrize(("name", "old", "new"), some(VIOLATIONS, 10))
+def test_a_violation_is_found(broker: Broker, tmp_path: Path, name: str, old: str, new: str) -> None:
     arguments, target = at_open(broker)
     needs = [ALL["will"]] if name == "retained commands" else []
-    with switched_on([sys.executable, program, *with_stop_file(arguments, tmp_path)], target) as component:
+    with switched_on([*mutant(tmp_path, old, new), *with_stop_file(arguments, tmp_path)], target) as component:
         assert judged(component, *needs, ALL[name])[name][0] is State.FAILED
+
+
+@pytest.mark.parametrize(("name", "old", "new"), some(NAMED_VIOLATIONS, 5))
+def test_a_violation_at_level_named_is_found(tmp_path: Path, name: str, old: str, new: str) -> None:
+    with believing(tmp_path / "hall") as broker:
+        arguments, target = at_named(broker, tmp_path, "mine", "ann")
+        with switched_on([*mutant(tmp_path, old, new), *with_stop_file(arguments, tmp_path)], target) as component:
+            assert judged(component, ALL[name])[name][0] is State.FAILED
+
+
+def test_what_was_not_judged_is_no_pass(
+    broker: Broker, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A robot that offers nothing: most checks cannot be made, and some were not asked for."""
+    run = Run(monkeypatch, capsys)
+    with MqttTransport("silent", MqttSettings(host="127.0.0.1", port=broker.port)) as robot:
+        ending = threading.Event()
+
+        def send_heartbeats() -> None:
+            while not ending.wait(0.25):
+                payload = b'{"t": %d}' % int(1000 * time.time())
+                robot.publish("pebble/robots/mine/outgoing/online", payload, qos=QoS.LATEST, retain=True)
+
+        with beside(send_heartbeats, ending):
+            assert run("conform", "mine", "--url", f"mqtt://127.0.0.1:{broker.port}", "--json") == 1
+    found = json.loads(run.out)
+    failures = [one["name"] for one in found["checks"] if one["state"] == "failed"]
+    assert (found["ok"], failures) == (False, ["capabilities"])
+    assert {"stop", "control", "dead man", "will"} <= set(found["not_judged"])

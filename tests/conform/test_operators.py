@@ -18,9 +18,20 @@ from pebble.conform.checks import run
 from pebble.conform.operators import OPERATOR
 from pebble.conform.stand_in import StandIn, played
 from pebble.errors import PebbleError
-from pebble.fleet.roles import Account
-from tests.conform.programs import OPERATORS, Command, Language, at_named, at_open, source
-from tests.fleet.brokers import FleetBroker
+from tests.conform.programs import (
+    NATS,
+    OPERATORS,
+    WITHOUT_NATS,
+    Command,
+    Hall,
+    Language,
+    at_named,
+    at_open,
+    ended,
+    named_by_nats,
+    named_by_the_fleet,
+    source,
+)
 from tests.fleet.conftest import cheap_hashes as cheap_hashes
 from tests.support import Broker, Child, further, some
 
@@ -83,7 +94,7 @@ def driven(command: Command, target: Target) -> Iterator[StandIn]:
 
         try:
             robot.ask, robot.person_s = ask, 10.0
-            robot.look(2.0)
+            robot.look(3.0)
             yield robot
         finally:
             process.kill()
@@ -118,16 +129,31 @@ def with_named_stops(program: str, folder: Path) -> Command:
     return [sys.executable, folder / program]
 
 
+@pytest.mark.thorough
+@WITHOUT_NATS
+@pytest.mark.parametrize("language", OPERATORS)
+def test_it_passes_at_another_broker(tmp_path: Path, language: Language) -> None:
+    program = language("operator", tmp_path)
+    with ended(NATS.make(tmp_path)) as broker:
+        arguments, target = at_open(broker)
+        with driven([*program, *arguments], target) as robot:
+            found = judged(robot)
+    assert [name for name, one in found.items() if one[0] is not State.OK] == ["names"]
+
+
 @pytest.mark.usefixtures("cheap_hashes")
 @pytest.mark.thorough
-@pytest.mark.parametrize(("language", "violated"), [*((one, []) for one in OPERATORS), (with_named_stops, ["names"])])
-def test_where_names_are_checked(tmp_path: Path, language: Language, violated: list[str]) -> None:
-    people = {
-        "mine": Account(roles=("robot",), bases=("pebble/robots/mine",)),
-        "ann": Account(roles=("driver", "safety")),
-    }
+@pytest.mark.parametrize(
+    ("hall", "language", "violated"),
+    [
+        *((named_by_the_fleet, one, []) for one in OPERATORS),
+        *(pytest.param(named_by_nats, one, [], marks=WITHOUT_NATS) for one in OPERATORS),
+        (named_by_the_fleet, with_named_stops, ["names"]),
+    ],
+)
+def test_where_names_are_checked(hall: Hall, tmp_path: Path, language: Language, violated: list[str]) -> None:
     program = language("operator", tmp_path)
-    with FleetBroker(tmp_path / "hall", people, level="named") as broker:
+    with hall(tmp_path / "hall") as broker:
         arguments, target = at_named(broker, tmp_path, "ann", "mine")
         with driven([*program, *arguments], target) as robot:
             found = judged(robot)

@@ -59,17 +59,41 @@ def _mosquitto(folder: Path) -> Broker:
 
 
 def _nats(folder: Path) -> Broker:
-    port, rules = free_port(), folder / "nats.conf"
     deny = json.dumps([f"pebble.robots.*.outgoing.{one}" for one in FORBIDDEN])
+    own = f"user: {ROBOT['username']}, password: {ROBOT['password']}, permissions {{ publish {{ deny: {deny} }} }}"
+    return _nats_of(folder, "", "no_auth_user: anyone", "{ user: anyone, password: anyone }", f"{{ {own} }}")
+
+
+def named_nats(folder: Path, robot: str, person: str, passwords: Mapping[str, str], tls: tuple[Path, Path]) -> Broker:
+    """It has the rules of level named for one robot and one person. ``tls``: its certificate and its key."""
+    subject = f"pebble.robots.{robot}"
+    mqtt = ["$MQTT.>"]  # what NATS itself uses for messages with QoS 1
+    may = {
+        robot: ([f"{subject}.>"], [f"{subject}.>"]),
+        person: (
+            [f"{subject}.incoming.by.{person}.>", f"{subject}.incoming.estop"],
+            [f"{subject}.outgoing", f"{subject}.outgoing.>"],
+        ),
+    }
+    users = (
+        f"{{ user: {name}, password: {json.dumps(passwords[name])}, permissions {{ "
+        f"publish {{ allow: {json.dumps(publish + mqtt)} }}, subscribe {{ allow: {json.dumps(read + mqtt)} }} }} }}"
+        for name, (publish, read) in may.items()
+    )
+    return _nats_of(folder, f'tls {{ cert_file: "{tls[0]}", key_file: "{tls[1]}" }}', "", *users)
+
+
+def _nats_of(folder: Path, tls: str, other: str, *users: str) -> Broker:
+    port, rules, separator = free_port(), folder / "nats.conf", "\n"
     rules.write_text(f"""
         server_name: one
         listen: "127.0.0.1:{free_port()}"
         jetstream {{ store_dir: "{folder}/store" }}
-        mqtt {{ host: "127.0.0.1", port: {port} }}
-        no_auth_user: anyone
+        mqtt {{ host: "127.0.0.1", port: {port}
+            {tls} }}
+        {other}
         authorization {{ users: [
-            {{ user: anyone, password: anyone }}
-            {{ user: {ROBOT["username"]}, password: {ROBOT["password"]}, permissions {{ publish {{ deny: {deny} }} }} }}
+            {separator.join(users)}
         ] }}
     """)
     return _Other(port, [found("nats-server") or "nats-server", "-c", str(rules)])

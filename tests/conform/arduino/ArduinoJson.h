@@ -4,6 +4,7 @@
 #include <cjson/cJSON.h>
 
 struct JsonObjectConst;
+class JsonArrayConst;
 
 class JsonVariantConst {
 public:
@@ -22,6 +23,21 @@ template <> inline bool JsonVariantConst::is<bool>() const { return cJSON_IsBool
 template <> inline bool JsonVariantConst::is<const char *>() const { return cJSON_IsString(item_); }
 template <> inline bool JsonVariantConst::is<JsonObjectConst>() const { return cJSON_IsObject(item_); }
 template <> inline double JsonVariantConst::as<double>() const { return item_->valuedouble; }
+template <> inline bool JsonVariantConst::as<bool>() const { return cJSON_IsTrue(item_); }
+
+class JsonArrayConst {
+public:
+    struct iterator {
+        const cJSON *item;
+        JsonVariantConst operator*() const { return item; }
+        void operator++() { item = item->next; }
+        bool operator!=(iterator other) const { return item != other.item; }
+    };
+    iterator begin() const { return {first_}; }
+    iterator end() const { return {nullptr}; }
+    const cJSON *first_;
+};
+template <> inline JsonArrayConst JsonVariantConst::as<JsonArrayConst>() const { return {cJSON_IsArray(item_) ? item_->child : nullptr}; }
 
 class JsonDocument {
 public:

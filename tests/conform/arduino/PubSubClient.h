@@ -14,11 +14,12 @@ public:
     bool setBufferSize(uint16_t size) { return buffer_.resize(size), true; }
     bool connected() { return up_ && client_->connected(); }
 
+    bool connect(const char *id, const char *user, const char *password) { return connect(id, user, password, nullptr, 0, false, nullptr); }
     bool connect(const char *id, const char *user, const char *password, const char *will, uint8_t qos, bool retain, const char *message) {
         up_ = false;
         if (!client_->connect(host_, port_)) return false;
-        begin(0x10), text("MQTT"), byte(4), byte(0x02 | 0x04 | qos << 3 | retain << 5 | (user ? 0xc0 : 0)), number(alive_s_);
-        text(id), text(will), text(message);
+        begin(0x10), text("MQTT"), byte(4), byte(0x02 | (will ? 0x04 | qos << 3 | retain << 5 : 0) | (user ? 0xc0 : 0)), number(alive_s_), text(id);
+        if (will) text(will), text(message);
         if (user) text(user), text(password);
         up_ = finish() && read() == 4 && buffer_[0] == 0x20 && buffer_[3] == 0;
         if (!up_) client_->stop();

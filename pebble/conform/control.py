@@ -1,0 +1,165 @@
+"""What a robot owes those who drive it by turns, as a table: control, and names where they are checked."""
+
+from __future__ import annotations
+
+import secrets
+import time
+from collections.abc import Callable
+from typing import Literal
+
+from pebble import contract as c
+from pebble.check_result import CheckResult
+from pebble.conform.checks import ANSWER_S, BY, Check, commanded, controls, drives, free, states, stops, while_stopped
+from pebble.conform.component import Component
+from pebble.contract.payloads import ControlRequest, ControlState, EstopReset
+from pebble.selftest import failed, ok, skipped
+
+_SHORTEST_MS = 1000  # control ends so long after the last request or command, or later
+_RENEWS_S = 0.3
+#: Where the broker itself refuses what has another name, or none, the robot never gets it.
+UNSEEN = "its broker does not show this account that it delivers such a message"
+
+
+class Driver:
+    """Requests control as one program of a person."""
+
+    def __init__(self, component: Component) -> None:
+        self._component, self.id = component, secrets.token_hex(4)
+
+    def request(self, want: Literal["hold", "release"] = "hold", for_ms: float = _SHORTEST_MS) -> ControlRequest:
+        return ControlRequest(id=self.id, want=want, for_ms=for_ms, by=BY)
+
+    def asks(self, want: Literal["hold", "release"] = "hold", for_ms: float = _SHORTEST_MS) -> None:
+        self._component.send(c.CONTROL, self.request(want, for_ms))
+
+    def leaves(self) -> bool:
+        """Release it; False: the robot keeps it."""
+        self.asks("release")
+        return self._component.wait(lambda: not self.holds, ANSWER_S)
+
+    def takes(self) -> float:
+        """Ask nobody; returns when."""
+        return self._component.send(c.CONTROL_TAKE, self.request())
+
+    @property
+    def state(self) -> ControlState | None:
+        """The newest of the robot."""
+        newest = self._component.of(c.CONTROL_STATE, retained=True)[-1:]
+        return newest[0].value if newest else None
+
+    @property
+    def key(self) -> str:
+        """That of its control; empty while it has none."""
+        return str(self.state.key) if self.state and self.state.id == self.id else ""
+
+    @property
+    def holds(self) -> bool:
+        return self.key != ""
+
+
+def _with_control(test: Callable[[Component, Driver], CheckResult]) -> Callable[[Component], CheckResult]:
+    def run(component: Component) -> CheckResult:
+        driver = Driver(component)
+        driver.asks()
+        try:
+            if not component.wait(lambda: driver.holds, ANSWER_S):
+                return failed(f"no key within {ANSWER_S:g} s", "answer incoming/control on outgoing/control/{owner}")
+            return test(component, driver)
+        finally:
+            driver.leaves()
+
+    return run
+
+
+def _first_keeps(component: Component, driver: Driver) -> CheckResult:
+    by = "" if driver.state is None else driver.state.by
+    if component.view.named and by.partition("/")[0] != component.account:
+        return failed(f"its state tells that {by!r} has it", "at level named, by begins with the account in the topic")
+    second = Driver(component)
+    second.asks()
+    took = component.wait(lambda: second.holds, ANSWER_S / 2)
+    second.leaves()
+    if took:
+        return failed("a second request takes it", "while one holds control, others wait: show them in asks")
+    return ok("the first one keeps it")
+
+
+def _shows_asker(component: Component, driver: Driver) -> CheckResult:
+    driver.asks(for_ms=5 * _SHORTEST_MS)
+    second = Driver(component)
+    second.asks()
+
+    def shown() -> bool:
+        return driver.state is not None and driver.state.asks_id == second.id
+
+    if not component.wait(shown, ANSWER_S):
+        return failed("a second request is not shown", "publish its by and id as asks and asks_id while it is repeated")
+    if not component.wait(lambda: not shown(), _SHORTEST_MS / 1000 + ANSWER_S):
+        return failed("it is shown after its end", "who asks is shown until for_ms after the last request")
+    return ok("the one who waits is shown, while it repeats that")
+
+
+def _released(component: Component, driver: Driver) -> CheckResult:
+    driver.asks(for_ms=5 * _SHORTEST_MS)
+    Driver(component).asks("release")
+    if component.wait(lambda: not driver.holds, ANSWER_S / 4):
+        return failed("another's release ends it", "a release counts with the id, and account, of who has control")
+    if not driver.leaves():
+        return failed("it is kept after its release", 'end it by {"want": "release"}')
+    return ok("it ends by its release")
+
+
+def _taken(component: Component, driver: Driver) -> CheckResult:
+    key, second = driver.key, Driver(component)
+    second.takes()
+    took = component.wait(lambda: second.holds, ANSWER_S)
+    same = second.key == key
+    second.leaves()
+    if not took:
+        return failed("the one who has it keeps it", "give control to who asks on incoming/control/take")
+    return failed("its key stays", "make a new key for each new holder") if same else ok("it passes on, with a new key")
+
+
+def _ends(component: Component, driver: Driver) -> CheckResult:
+    """Commands prolong it: here zeros, which move nothing."""
+    began = time.monotonic()
+    while driver.holds and time.monotonic() < began + 1.5 * _SHORTEST_MS / 1000:
+        component.send(c.DRIVE, b'{"x": 0, "z": 0, "key": "%s"}' % driver.key.encode())
+        component.look(_RENEWS_S)
+    if not driver.holds:
+        return failed("it ends in the middle of its commands", "end it for_ms after the last request or command")
+    if not component.wait(lambda: not driver.holds, _SHORTEST_MS / 1000 + 2 * ANSWER_S):
+        return failed("it stays with who went away", "end it for_ms after the last request or command")
+    return ok("commands prolong it, and it ends by itself")
+
+
+def _nameless(component: Component, _name: str) -> CheckResult:
+    fix = "at level named take requests and resets on incoming/by/{account}/… only"
+    stranger = Driver(component)
+    if not component.send_as("", c.CONTROL, stranger.request()):
+        return skipped(UNSEEN)
+    if component.wait(lambda: stranger.holds, ANSWER_S / 4):
+        return failed("it gives control to a request without an account", fix)
+    for one in states(component).values():
+        component.send_as("", c.ESTOP_RESET, EstopReset(boot=one.boot, count=one.count, by=BY))
+    if component.wait(lambda: not component.view.latched, ANSWER_S / 4):
+        return failed("a reset without an account ends a stop", fix)
+    return ok("requests and resets without an account do nothing")
+
+
+def named(component: Component) -> bool:
+    return component.view.named
+
+
+_CONTROL = (controls, free, commanded)
+
+CONTROL: tuple[Check[Component], ...] = (
+    Check("control", "one person drives at a time", _with_control(_first_keeps), _CONTROL),
+    Check("control asked", "who drives must see who waits", _with_control(_shows_asker), _CONTROL),
+    Check("control released", "the next one must not wait", _with_control(_released), _CONTROL),
+    Check("control taken", "who is responsible must get it from who does not answer", _with_control(_taken), _CONTROL),
+    Check("control ends", "who goes away must not keep it", _with_control(_ends), (drives, *_CONTROL)),
+    Check(
+        "nameless", "what has no account can be anybody's", while_stopped(_nameless), (stops, *_CONTROL), binds=named
+    ),
+)
