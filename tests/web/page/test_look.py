@@ -381,8 +381,8 @@ _SCROLLS_NEAR = """(selector) => {
   }
   return found;
 }"""
-#: A name of usual length is read whole.
-_CUT = """() => [...document.querySelectorAll(".picker-name b")]
+#: A name of usual length is read whole, and so is what is beside it.
+_CUT = """() => [...document.querySelectorAll(".picker-name b, .picker-state")]
   .filter((one) => one.checkVisibility() && one.scrollWidth > one.clientWidth)
   .map((one) => `cut: ${one.textContent}`)"""
 #: What lies beside the bar that it belongs to, and over something else.
