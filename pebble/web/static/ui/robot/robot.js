@@ -198,7 +198,7 @@ function Immersive({ at, offers, view, video, source, drawer, onPanel }) {
       ? html`<${Boundary} what="The picture"
           ><${Stage} at=${at} video=${video} source=${source} offers=${offers} layout="immersive"
         /><//>`
-      : html`<div class="stage"><div class="picture"><p class="cover">no camera</p><${Bands} at=${at} /></div></div>`}
+      : html`<div class="stage"><div class="picture"><p class="cover"><${Face} at=${at} />No camera</p><${Bands} at=${at} /></div></div>`}
     <${Extras} at=${at} offers=${offers} />
     ${offers.drives &&
     html`<${Boundary} vital what="Driving"><${Floating} at=${at} /><//>`}
