@@ -166,7 +166,15 @@ class Screen(NamedTuple):
 
 
 ALL: tuple[Size, ...] = ("desktop", "phone", "landscape")
-WHOLE = ("driving", "taken", "others-ask", "stopped", "lost")  # states that are looked at in all sizes
+WHOLE = (
+    "driving",
+    "taken",
+    "others-ask",
+    "stopped",
+    "lost",
+    "silent",
+    "no-camera",
+)  # states that are looked at in all sizes
 #: Text that shows that a state has been reached, where it takes a while.
 WHEN = {
     "recordings": "Sunday, 22 November 2026",

@@ -138,7 +138,7 @@ def test_a_stop_that_is_not_confirmed_is_shown_in_the_fleet(show: Show) -> None:
         assert opened.test("stopped").inner_text() == "1 not confirmed"
 
 
-@pytest.mark.parametrize("size", ["desktop", "phone"])
+@pytest.mark.parametrize("size", ["desktop", "phone", "landscape"])
 def test_a_page_that_connects_offers_nothing_and_has_its_shape(show: Show, size: Size) -> None:
     places = []
     for script, button in ((UNANSWERED, "Connecting…"), ("", "Take control")):
