@@ -99,7 +99,7 @@ LOOKS: dict[str, Look] = {
     ),
     "robot": Look(STATES["full"], size="tall"),
     "free": Look(STATES["free"], theme="dark"),
-    "hint": Look(STATES["free"], act=lambda page: page.keyboard.down("KeyW")),
+    "hint": Look(STATES["free"], act=lambda page: page.locator("[data-test=stick]").click(force=True)),
     "gear": Look(STATES["driving"], act=_press("gear")),
     "script": Look(STATES["asked"], act=_press("script-apriltag-follow"), size="tall", theme="dark"),
     "stopped": Look(STATES["stopped"], theme="dark"),
