@@ -45,9 +45,12 @@ class _Robot:
         """Whether it goes on sending heartbeats: it takes more to invent many such robots."""
         return self._began is not None and self._newest_at - self._began >= _LASTS_S
 
+    def is_silent(self, now: float) -> bool:
+        return now - self._newest_at > silent_after(link=self.link)
+
     def may_go(self, now: float) -> bool:
         """Whether its place may be another one's."""
-        return self.due == inf or now - self._newest_at > silent_after(link=self.link)
+        return self.due == inf or self.is_silent(now)
 
     def heartbeat(self, now: float) -> None:
         self._newest_at = now
@@ -131,16 +134,17 @@ class ByName:
     def take(self, now: float) -> list[str]:
         """The topics of one robot to ask for now; empty: none."""
         due = [] if now < self._next else [one for one in list(self._robots.values()) if one.due <= now]
-        due.sort(key=self._rank)
+        due.sort(key=lambda robot: self._rank(robot, now))
         for robot in due:
             if topics := robot.ask(now, self._channels):
                 self._next = now + EACH_S
                 return topics
         return []
 
-    def _rank(self, robot: _Robot) -> tuple[bool, bool, bool, int, float]:
+    def _rank(self, robot: _Robot, now: float) -> tuple[bool, bool, bool, bool, int, float]:
+        is_known, is_silent = self._is_known(robot.base), robot.is_silent(now)
         has_answered = robot.estop is not None and robot.estop.has_capabilities
-        return not self._is_known(robot.base), not has_answered, not robot.lasts, robot.asked, robot.due
+        return not is_known, is_silent, not has_answered, not robot.lasts, robot.asked, robot.due
 
     def _robot(self, base: str, now: float) -> _Robot | None:
         robot = self._robots.get(base)

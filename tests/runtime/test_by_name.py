@@ -121,9 +121,10 @@ def flood(count: int, *, lasting: bool, last: float = 100.0) -> Arriving:
         (flood(5 * MAX_ROBOTS, lasting=False), False, 5.0),
         further(flood(1000, lasting=True), True, 2.0),
         further(flood(1000, lasting=True), False, 60.0),
+        (flood(1000, lasting=True, last=4.0), False, 7.0),
         (flood(MAX_ROBOTS + 500, lasting=True, last=50.0), True, 2.0),
     ],
-    ids=["1,000", "more than there is room for", "that last", "that last, and it is new", "the same, too many"],
+    ids=["1,000", "more than there is room for", "that last", "and it is new", "that have ended", "the same, too many"],
 )
 def test_robots_that_are_invented_cause_no_flood_and_keep_none_waiting(
     invented: Arriving, known: bool, within_s: float

@@ -56,6 +56,8 @@ _STYLED = """(rules) => {
 _HERE = """!document.querySelector('.loading') && document.fonts.status === 'loaded' &&
   [...document.images].every((one) => one.complete || one.hidden) &&
   (!pebble.video.ref || Boolean(pebble.video.info))"""
+#: The first picture of a recording is drawn, and its timeline.
+_REPLAYED = "Boolean(pebble.replay?.drawnAt && document.querySelector('.timeline-strip img'))"
 
 Pixels = npt.NDArray[np.uint8]
 
@@ -92,11 +94,12 @@ LOOKS: dict[str, Look] = {
     "fleet-empty": Look(STATES["fleet-empty"]),
     "connecting": Look(
         DRIVING,
-        here="!document.querySelector('.loading') && Boolean(document.querySelector('.key-place'))",
+        here=_PARTS,
         script=UNANSWERED,
     ),
     "robot": Look(STATES["full"], size="tall"),
     "free": Look(STATES["free"], theme="dark"),
+    "hint": Look(STATES["free"], act=lambda page: page.locator("[data-test=stick]").click(force=True)),
     "gear": Look(STATES["driving"], act=_press("gear")),
     "script": Look(STATES["asked"], act=_press("script-apriltag-follow"), size="tall", theme="dark"),
     "stopped": Look(STATES["stopped"], theme="dark"),
@@ -108,6 +111,7 @@ LOOKS: dict[str, Look] = {
     "landscape": Look(STATES["odometry"], size="landscape", theme="dark"),
     "settings": Look(STATES["driving"], act=_press("settings"), theme="dark"),
     "recordings": Look(STATES["recordings"], size="phone"),
+    "replay": Look(STATES["replay"], here=_REPLAYED),
 }
 
 

@@ -360,8 +360,10 @@ FORMS: Rows = {
     "a form with mistakes is not sent": ("""
         const reasons = (mistakes, config = {}) => whyNotSent({ config, mistakes: new Map(mistakes) });
         const long = Object.fromEntries([...Array(64).keys()].map((n) => [`k${n}`, "x".repeat(256)]));
-        result = [reasons([]), reasons([["a", "x"]]), reasons([["a", "x"], ["b", "y"]]), reasons([], long)];""",
-        ["", "The form has 1 mistake", "The form has 2 mistakes", "The settings are too long together"]),
+        result = [reasons([]), reasons([["a", "x"]]), reasons([["a", "x"], ["b", "y"], ["c", "required"]]),
+          reasons([["c", "required"]]), reasons([], long)];""",
+        ["", "The form has 1 mistake", "The form has 2 mistakes", "Fill in what is required",
+         "The settings are too long together"]),
     "forms are remembered by robot and script": ("""
         remember("goob", "a", new Map([["x", "1"]]));
         remember("goob", "b", new Map([["x", "2"], ["y", "?"]]));

@@ -166,7 +166,15 @@ class Screen(NamedTuple):
 
 
 ALL: tuple[Size, ...] = ("desktop", "phone", "landscape")
-WHOLE = ("driving", "taken", "others-ask", "stopped", "lost")  # states that are looked at in all sizes
+WHOLE = (
+    "driving",
+    "taken",
+    "others-ask",
+    "stopped",
+    "lost",
+    "silent",
+    "no-camera",
+)  # states that are looked at in all sizes
 #: Text that shows that a state has been reached, where it takes a while.
 WHEN = {
     "recordings": "Sunday, 22 November 2026",
@@ -381,8 +389,8 @@ _SCROLLS_NEAR = """(selector) => {
   }
   return found;
 }"""
-#: A name of usual length is read whole.
-_CUT = """() => [...document.querySelectorAll(".picker-name b")]
+#: A name of usual length is read whole, and so is what is beside it.
+_CUT = """() => [...document.querySelectorAll(".picker-name b, .picker-state")]
   .filter((one) => one.checkVisibility() && one.scrollWidth > one.clientWidth)
   .map((one) => `cut: ${one.textContent}`)"""
 #: What lies beside the bar that it belongs to, and over something else.

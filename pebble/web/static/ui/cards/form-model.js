@@ -25,6 +25,9 @@ const NOT_PRINTABLE = /\p{C}|(?! )\p{Z}/u;
 /** The text of a number that is none yet, as a lone sign: browsers do not report it. */
 export const UNREADABLE = "?";
 
+/** Nothing was filled in yet where something has to be: no mistake of a person's. */
+export const MISSING = "required";
+
 /**
  * ``summary`` says what it does; ``main`` are the fields that come first, ``more`` the others.
  * @typedef {{file: string, label: string, summary: string, fields: Field[], main: Field[], more: Field[], omitted: number}} Script
@@ -94,7 +97,7 @@ function typeOf(type, options) {
 
 /** What is wrong with a text, for people; "" nothing. @param {Field} field @param {string} text @returns {string} */
 export function mistake(field, text) {
-  if (text === "") return field.required && field.default === null ? "required" : "";
+  if (text === "") return field.required && field.default === null ? MISSING : "";
   switch (field.type) {
     case "int":
     case "float":
@@ -146,7 +149,9 @@ function typed({ type }, text) {
 
 /** @param {{config: object, mistakes: Map<string, string>}} form @returns {string} why it cannot be sent; "" it can */
 export function whyNotSent({ config, mistakes }) {
-  if (mistakes.size) return `The form has ${mistakes.size === 1 ? "1 mistake" : `${mistakes.size} mistakes`}`;
+  const wrong = [...mistakes.values()].filter((one) => one !== MISSING).length;
+  if (wrong) return `The form has ${wrong === 1 ? "1 mistake" : `${wrong} mistakes`}`;
+  if (mistakes.size) return "Fill in what is required";
   return JSON.stringify(config).length > LONGEST_CONFIG ? "The settings are too long together" : "";
 }
 

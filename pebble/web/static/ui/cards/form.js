@@ -1,7 +1,7 @@
 // A form made of what a robot lists: one field for each setting of a script.
 
 import { html } from "../parts/hooks.js";
-import { UNREADABLE, hint, option } from "./form-model.js";
+import { MISSING, UNREADABLE, hint, option } from "./form-model.js";
 import { plain } from "../parts/more-words.js";
 
 /**
@@ -16,13 +16,14 @@ export const Form = ({ id, fields, texts, mistakes, onText }) => html`<div class
       id=${`${id}-${index}`}
       field=${field}
       text=${texts.get(field.key)}
-      wrong=${mistakes.get(field.key)}
+      mistake=${mistakes.get(field.key)}
       onText=${(text) => onText(field.key, text)}
     />`,
   )}
 </div>`;
 
-function FormField({ id, field, text, wrong, onText }) {
+function FormField({ id, field, text, mistake, onText }) {
+  const wrong = mistake === MISSING ? "" : mistake;
   const Input = INPUTS[field.type === "bool" && field.default === null ? "enum" : field.type];
   const restore = (event) => {
     const input = document.getElementById(id);
@@ -47,7 +48,7 @@ function FormField({ id, field, text, wrong, onText }) {
       </button>`}
     </div>
     <span class="why" id=${`${id}-why`} data-test=${`why-${field.key}`}
-      >${wrong && html`<b class="bad">${wrongWords(wrong, hint(field))}</b>`}</span
+      >${wrong ? html`<b class="bad">${wrongWords(wrong, hint(field))}</b>` : mistake && hint(field)}</span
     >
   </div>`;
 }

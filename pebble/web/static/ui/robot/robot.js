@@ -55,24 +55,27 @@ function Unknown({ at, layout }) {
   useTick(500); // the first state may have nothing of it
   const name = useName(at);
   const isOpen = connection.isOpen && !connection.socket.outdated;
-  if (isOpen || layout === "immersive" || !hasFace(at)) {
+  if (isOpen || !hasFace(at)) {
     const text = isOpen ? `Nothing was received from ${at} yet.` : "Connecting to the server…";
     return html`<div class="empty"><${Icon} name="robot" /><h1 class="sr">${name}</h1><p>${text}</p></div>`;
   }
+  const isWhole = layout === "immersive";
   return html`<div class="robot" aria-busy="true">
     <h1 class="sr">${name}</h1>
-    <div class=${layout === "desktop" ? "bench connecting" : "phone-drive"}>
+    <div class=${layout === "desktop" ? "bench connecting" : isWhole ? "" : "phone-drive"}>
       <div class="stage" data-span="main">
         <div class="picture">
           <div class="canvas"><canvas width="640" height="360" aria-hidden="true"></canvas></div>
           <p class="cover"><${Face} at=${at} />Connecting to the server…</p>
           <${Bands} at=${at} />
         </div>
-        <div class="picture-bar"></div>
+        ${!isWhole && html`<div class="picture-bar"></div>`}
       </div>
       ${layout === "desktop"
         ? html`<${DriveCard} at=${at} />`
-        : html`<section class="phone-pad" aria-label="Drive"><${Slot} at=${at} /><${DrivePad} /><${Speed} /></section>`}
+        : isWhole
+          ? html`<${Floating} at=${at} />`
+          : html`<section class="phone-pad" aria-label="Drive"><${Slot} at=${at} /><${DrivePad} /><${Speed} /></section>`}
     </div>
   </div>`;
 }
@@ -195,13 +198,10 @@ function Immersive({ at, offers, view, video, source, drawer, onPanel }) {
       ? html`<${Boundary} what="The picture"
           ><${Stage} at=${at} video=${video} source=${source} offers=${offers} layout="immersive"
         /><//>`
-      : html`<div class="stage"><div class="picture"><p class="cover">no camera</p><${Bands} at=${at} /></div></div>`}
+      : html`<div class="stage"><div class="picture"><p class="cover"><${Face} at=${at} />No camera</p><${Bands} at=${at} /></div></div>`}
     <${Extras} at=${at} offers=${offers} />
     ${offers.drives &&
-    html`<${Boundary} vital what="Driving">
-      <div class="float-pad"><${DrivePad} /></div>
-      <div class="float-why"><${Slot} at=${at} /></div>
-    <//>`}
+    html`<${Boundary} vital what="Driving"><${Floating} at=${at} /><//>`}
     ${drawer &&
     html`<aside class="drawer" aria-label="Everything else">
       ${offers.drives &&
@@ -215,6 +215,10 @@ function Immersive({ at, offers, view, video, source, drawer, onPanel }) {
     </aside>`}
   </div>`;
 }
+
+/** What drives, over a picture that is the whole page. */
+const Floating = ({ at }) => html`<div class="float-pad"><${DrivePad} /></div>
+  <div class="float-why"><${Slot} at=${at} /></div>`;
 
 /** Over a picture that is the whole page: how fast, how full, and where. They come later, and take no place. */
 function Extras({ at, offers }) {
