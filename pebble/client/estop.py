@@ -20,7 +20,7 @@ from pebble.transports import Message, QoS
 REPEAT_S = 0.5
 COLLECT_S = silent_after(link="thin")  # so long a stop of all is sent to further robots, which may be at any level
 GIVE_UP_S = 60.0
-MAX_ROBOTS = 1000  # to which a stop of all is repeated; one beyond gets it whenever anything arrives from it
+MAX_ROBOTS = 2000  # to which a stop of all is repeated; one beyond gets it whenever anything arrives from it
 MAX_PASSED = 4096  # robots beyond whose last stop is remembered; where there are more, they get it more often
 
 _ZERO = codec.encode(DRIVE, Drive(valid_ms=0))
