@@ -1,9 +1,9 @@
 """Measures fleets of several sizes at one broker: what each robot costs, and what a person at the page notices.
 
-Processes on this machine: a stock mosquitto; a crowd of cheap robots (:mod:`pebble.simulation.crowd`); some boards with the
-real firmware (:mod:`pebble.simulation.fleet`), which the operator drives: ``python -m pebble.bench.fleet PORT SECONDS ID…``
-writes a JSON line when every board is online, and the results when it has driven for ``SECONDS``; and a server of the
-operator page with a viewer.
+Processes on this machine: a stock mosquitto; a server of the operator page, with a viewer; a crowd of cheap robots
+(:mod:`pebble.simulation.crowd`); and some boards with the real firmware (:mod:`pebble.simulation.fleet`), which the
+operator drives: ``python -m pebble.bench.fleet PORT SECONDS ID…`` writes a JSON line when every board is online, and
+after a line of input drives them for ``SECONDS`` and writes the results.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import threading
 import time
 from bisect import bisect_left
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import Any, Final
@@ -29,7 +30,7 @@ from pebble.bench.comparison import Budget, Case, Comparison, Measuring, Option,
 from pebble.bench.judging.aims import Aim, with_lost
 from pebble.bench.pictures import growth
 from pebble.bench.results import Cell, grouped, rounded
-from pebble.bench.tables import COUNT, LOST, Grid, figure, medians, median_column, percentile_column, single_column
+from pebble.bench.tables import COUNT, LOST, Grid, figure, median_column, medians, percentile_column, single_column
 from pebble.bench.usage import cpu_s, pss_mb
 from pebble.bench.viewer import Viewer
 from pebble.contract import DRIVE, ONLINE
@@ -108,7 +109,7 @@ class World(Processes):
         dropped = self.server_of_robots.log.read_text(errors="replace").count("messages are being dropped for client")
         if dropped:
             yield (
-                f"{self.robots} robots: the broker's queue for a client was full {dropped} times, and messages were lost;"
+                f"{self.robots} robots: the broker's queue for a client was full {dropped} times, and messages are lost;"
                 " raise max_queued_messages in mosquitto.conf"
             )
 
@@ -144,12 +145,12 @@ def measure(case: Case) -> Iterator[Cell]:
     run, robots = case.run, int(case.condition["robots"])
     boards = min(run["boards"], robots - 1)
     with World(robots, boards, run.show) as world:
-        for name, values, figures in _phases(world, run, case):
+        for name, values, figures in _phases(world, run):
             yield case.cell(name, _UNITS[name], values, **figures)
         run.notes.extend(world.notes())
 
 
-def _phases(world: World, run: Run, case: Case) -> Iterator[tuple[str, list[float], dict[str, Any]]]:
+def _phases(world: World, run: Run) -> Iterator[tuple[str, list[float], dict[str, Any]]]:
     ids = [identity.id for _, identity in members(world.boards, KINDS)]
     operator = world.worker("operator", "pebble.bench.fleet", world.server_of_robots.port, run["seconds"], *ids)
     operator.answer(_UP_S)
@@ -168,7 +169,7 @@ def _phases(world: World, run: Run, case: Case) -> Iterator[tuple[str, list[floa
         yield BROKER_MB, [pss_mb(world.server_of_robots.pid)], {}
         yield PAGE_MB, [pss_mb(world.page.pid)], {}
         run.show(f"{world.boards} of {world.robots} robots are driven")
-        yield PINS, *_driven(world, operator, run, case)
+        yield PINS, *_driven(world, operator, run)
         for _ in range(run["stops"]):
             yield from _stopped(world, viewer)
         yield from _ended(world, viewer, run["ends"])
@@ -185,7 +186,7 @@ def _show_all(world: World, run: Run, viewer: Viewer) -> None:
         run.notes.append(f"{world.robots} robots are more than a page shows: give each page server fewer")
 
 
-def _driven(world: World, operator: Worker, run: Run, case: Case) -> tuple[list[float], dict[str, Any]]:
+def _driven(world: World, operator: Worker, run: Run) -> tuple[list[float], dict[str, Any]]:
     operator.send("drive")
     found: dict[str, Any] = {}
     cpu = world.cpu(lambda: found.update(operator.answer(run["seconds"] + _UP_S)))
@@ -196,7 +197,7 @@ def _driven(world: World, operator: Worker, run: Run, case: Case) -> tuple[list[
 def driven(
     found: Mapping[str, Any], moves: Mapping[str, Sequence[Moved]], cost: Mapping[str, float]
 ) -> tuple[list[float], dict[str, Any]]:
-    """``found`` is the operator's answer; ``cost`` has the CPU by process, % of a core, and the memory of a board, MB."""
+    """``found`` is the operator's answer; ``cost`` has the CPU by process, %, and the memory of a board, MB."""
     sent = found["sent"]
     began, ended = min(map(min, sent.values())), max(map(max, sent.values()))
     heartbeats = [[ns for ns in own if began <= ns <= ended] for own in found["heartbeats"]]
@@ -231,153 +232,4 @@ def _ended(world: World, viewer: Viewer, ends: int) -> Iterator[tuple[str, list[
         for base in bases:
             at[base] = world.crowd.ask(f"{command} {base.rpartition('/')[2]}", _NOTICED_S)["ns"]
             time.sleep(_BETWEEN_S)
-        viewer.until(lambda bases=bases: set(bases) <= set(viewer.offline_at), _NOTICED_S, lambda: "dead robots look alive")  # type: ignore[misc]
-        yield measure_, [(viewer.offline_at[base] - ns) / 1e6 for base, ns in at.items()], {}
-
-
-def latencies_ms(sent: Mapping[str, Sequence[int]], moves: Mapping[str, Sequence[Moved]]) -> list[float]:
-    """Latencies of all commands that the motors obeyed before another command asked for the same speeds."""
-    found = []
-    for robot, times in sent.items():
-        changes = grouped(moves.get(robot, ()), lambda moved: tuple(round(motor, 1) for motor in moved.motors))
-        for number, time_ns in enumerate(times):
-            own, again = changes.get(STEPS[number % len(STEPS)], []), number + len(STEPS)
-            at = bisect_left(own, time_ns, key=lambda moved: moved.ns)
-            if at < len(own) and (again >= len(times) or own[at].ns < times[again]):
-                found.append((own[at].ns - time_ns) / 1e6)
-    return found
-
-
-def read_moves(trace: Path) -> dict[str, list[Moved]]:
-    moves = (msgspec.json.decode(line, type=Moved) for line in complete_lines(trace)[0])
-    return grouped(moves, lambda moved: moved.robot)
-
-
-def longest_gap_s(robots: Sequence[Sequence[int]], began: int, ended: int) -> float:
-    """The longest gap of any robot between the first and the last command; a robot that stops counts until the end."""
-    return max(b - a for own in robots for a, b in itertools.pairwise([began, *own, ended])) / 1e9
-
-
-def drive_fleet(port: int, seconds: float, ids: Sequence[str], begin: Callable[[], object]) -> None:
-    """Drives a whole fleet in :data:`STEPS`, evenly spread, and subscribes to all heartbeats.
-
-    It waits for a line when all are online. Then it answers when each robot's commands were published (CLOCK_MONOTONIC,
-    ns) and its heartbeats arrived, and how many commands were more than a period late.
-    """
-    bases = [Identity("pebble", "robots", name).base for name in ids]
-    heartbeats: dict[str, list[int]] = {ONLINE.topic(base): [] for base in bases}
-    sent: dict[str, list[int]] = {name: [] for name in ids}
-    topics = [DRIVE.topic(base) for base in bases]
-    bodies = [json.dumps(axes_of(left, right)) for left, right in STEPS]
-
-    def receive(message: MQTTMessage) -> None:
-        if not message.retain and b"true" in message.payload:
-            heartbeats[message.topic].append(time.monotonic_ns())
-
-    client = StockClient(receive, [(topic, 0) for topic in heartbeats])
-    client.paho.max_inflight_messages_set(MANY)
-    client.open(port)
-    while not all(heartbeats.values()):
-        time.sleep(_POLL_S)
-    answer({})
-    begin()
-    began, late, gap = time.monotonic(), 0, 1 / RATE_HZ / len(ids)
-    for number in range(round(seconds * RATE_HZ) * len(ids)):
-        step, robot = divmod(number, len(ids))
-        left = began + number * gap - time.monotonic()
-        time.sleep(max(0.0, left))
-        late += left < -1 / RATE_HZ
-        sent[ids[robot]].append(time.monotonic_ns())
-        client.paho.publish(topics[robot], bodies[step % len(STEPS)], qos=DRIVE.default_qos)
-    answer({"late": late, "sent": sent, "heartbeats": list(heartbeats.values())})
-    client.close()
-
-
-def at_ten_thousand(cells: Sequence[Cell]) -> Iterator[str]:
-    """What one robot more costs, from the second largest to the largest fleet, and what ten thousand would."""
-    for name in _GROWS:
-        found = {int(cell.params["robots"]): median(medians(cell)) for cell in cells if cell.measure == name and cell.samples}
-        if len(found) > 1:
-            less, more = sorted(found)[-2:]
-            each = (found[more] - found[less]) / (more - less)
-            whole, unit = found[more] + each * (_TEN_THOUSAND - more), _UNITS[name]
-            yield (
-                f"{name}: {figure(found[more])} {unit} with {more:,} robots, {figure(1000 * each)} {unit} for each 1,000 more;"
-                f" 10,000 would be {figure(whole)} {unit} if it goes on so"
-            )
-
-
-def _of(name: str) -> Callable[[Cell], bool]:
-    return lambda cell: cell.measure == name
-
-
-_FIGURES = {
-    "late": "late", "gap, s": "longest_gap_s", "broker": "cpu_broker", "boards": "cpu_fleet", "MB": "mb_per_board",
-}  # fmt: skip
-FLEET = Comparison(
-    name="fleet",
-    title="A fleet on one broker",
-    what="Robots of the contract at one stock broker, with a page server and one viewer. Most are cheap: a connection, a will, "
-    "retained state and four heartbeats a second each, but no firmware. Some boards run the real firmware on simulated pins, "
-    "and are driven by one operator at 10 Hz each: that latency is from the publish call to the change of the pins.",
-    help="Fleets of several sizes at one broker: what each robot costs broker and page, how fast a stop of all, a robot's end and "
-    "a drive command are. Cheap simulated robots, and some with the real firmware. Needs mosquitto.",
-    options=(
-        Option(name="robots", kind=int, many=True, least=2, most=MOST, metavar="NUMBERS", help="Sizes, separated by commas."),
-        Option(name="boards", kind=int, least=1, most=100, help="How many of them have the real firmware, and are driven."),
-        rounds("How often each size is measured."),
-        seconds("Of each phase.", least=1),
-    ),
-    full=Budget(240, robots=[100, 300, 1000], boards=10, rounds=1, seconds=10.0, stops=3, ends=10),
-    quick=Budget(40, robots=[30, 60], boards=5, rounds=1, seconds=2.0, stops=1, ends=2),
-    constants={"rate_hz": RATE_HZ},
-    variants=("mqtt",),
-    conditions=lambda run: [{"robots": one} for one in run["robots"]],
-    measuring=Measuring(prepare=prepare, measure=measure, measures=tuple(_UNITS), alone=True),
-    report=Report(
-        tables=(
-            Grid(
-                title="Idle: CPU, % of a core; PSS, MB; what a viewer of the fleet gets",
-                rows=("robots",),
-                columns=(
-                    median_column("broker %", BROKER_CPU), median_column("page %", PAGE_CPU),
-                    median_column("with viewer %", VIEWER_CPU), median_column("broker MB", BROKER_MB),
-                    median_column("page MB", PAGE_MB), median_column("viewer kB/s", VIEWER_RATE),
-                ),
-            ),
-            Grid(
-                title="Driven boards among them: command to pins, ms; longest gap of heartbeats; CPU, % of a core; memory of a board",
-                rows=("robots",),
-                of=_of(PINS),
-                columns=(
-                    *map(percentile_column, (50, 95, 99, 100)), COUNT, LOST, single_column("sent", "sent"),
-                    *(single_column(head, name) for head, name in _FIGURES.items()),
-                ),
-            ),
-            Grid(
-                title="ms",
-                rows=("measure", "robots"),
-                heads=("", "robots"),
-                of=lambda cell: cell.measure in (LAST, CONFIRMED, KILLED, MUTE),
-                columns=(*map(percentile_column, (50, 100)), COUNT),
-            ),
-        ),
-        assessment=(
-            at_ten_thousand,
-            Aim(
-                what="{robots} robots, {measure}, p99 at most {bound:g} ms", of=_of(PINS), value=with_lost(99),
-                at_most=50.0, unit="ms", least=100,
-            ),
-            Aim(
-                what="{robots} robots, {measure}, at most {bound:g} ms", of=_of(CONFIRMED), value=with_lost(100),
-                at_most=1000.0, unit="ms", least=1,
-            ),
-        ),
-        pictures=(growth("A fleet on one broker", _GROWS, over="robots"),),
-    ),
-)  # fmt: skip
-
-if __name__ == "__main__":
-    begin = threading.Event()
-    serve_on_thread(lambda _line: begin.set(), lambda: os._exit(0))
-    drive_fleet(int(sys.argv[1]), float(sys.argv[2]), sys.argv[3:], begin.wait)
+        viewer.until(partial(viewer.all_offline, bases), _NOTICED_S, lambda: "dead robots look alive")

@@ -6,7 +6,7 @@ import json
 import secrets
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, Self
 from urllib.parse import urlsplit
 
@@ -49,6 +49,9 @@ class Viewer:
     def confirmed(self, name: str) -> int:
         """How many components have confirmed this stop, as the page shows them."""
         return sum(one["stop"] == name and one["sending"] == "confirmed" for one in list(self._stops.values()))
+
+    def all_offline(self, bases: Iterable[str]) -> bool:
+        return set(bases) <= set(self.offline_at)
 
     def until(self, condition: Callable[[], bool], timeout: float, problem: Callable[[], str]) -> int:
         """When the condition became true. Raises PebbleError."""

@@ -3,12 +3,12 @@
 Each has a TCP connection, a client id and a will of its own, and publishes what a board with Wi-Fi does: capabilities,
 the state of its emergency stop, four heartbeats a second, every five seconds its battery, and a status as Linux robots
 have. It latches stops, and confirms them. It has no firmware, no motors and no dead-man's switch, takes drive commands
-without obeying them, and knows no TLS and no names; it is cheap, so that what is measured is not the simulation. For what a
-robot does there is :mod:`pebble.simulation.fleet`, with the real firmware.
+without obeying them, and knows no TLS and no names; it is cheap, so that what is measured is not the simulation. For
+what a robot does there is :mod:`pebble.simulation.fleet`, with the real firmware.
 
 It is a worker: lines in, JSON lines out. The first answer comes when all are online, or cannot be. ``kill NAME`` breaks
-its connection, ``mute NAME`` lets it fall silent; both answer with the time (CLOCK_MONOTONIC, ns). ``stops`` answers with when
-each robot latched its newest stop, ``free`` ends all stops.
+a connection, ``mute NAME`` lets a robot fall silent; both answer with the time (CLOCK_MONOTONIC, ns). ``stops`` answers
+with when each robot latched its newest stop.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ import struct
 import sys
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any, Final
 
 from pebble.contract import CAPABILITIES, CHARGING_LEVEL, DRIVE, ESTOP, ESTOP_RESET, ESTOP_STATE, ONLINE, STATUS
@@ -135,12 +136,6 @@ class Robot:
         self._rest = data
         return came
 
-    def free(self) -> None:
-        """End its stop, as a person who resets it."""
-        if self.latch.latched and self.state == "online":
-            self.latch.reset(self.latch.boot, self.latch.count, 0, _now_ms())
-            self._publish_stop()
-
     def end(self, *, abruptly: bool) -> None:
         self.state = "dead"
         if abruptly:
@@ -153,8 +148,8 @@ class Robot:
             raise ConnectionError(f"the broker refuses the connection ({body[1]})")
         if kind == _SUBACK:
             self.state = "online"
-            self._publish(CAPABILITIES.topic(self.base), json.dumps(
-                {"schema": "pebble-capabilities/v1", "t": _epoch_ms(), "value": capabilities(self.identity)}).encode())  # fmt: skip
+            payload = {"schema": "pebble-capabilities/v1", "t": _epoch_ms(), "value": capabilities(self.identity)}
+            self._publish(CAPABILITIES.topic(self.base), json.dumps(payload).encode())
             self._publish_stop()
             self.beat()
             return True
@@ -237,11 +232,11 @@ class Crowd:
         going = True
         while going:
             self._connect_some()
-            for descriptor, events in self._epoll.poll(self._pause_s()):
+            for descriptor, _ in self._epoll.poll(self._pause_s()):
                 if descriptor == 0:
                     going = handle(os.read(0, 65536))
                 elif (robot := self._of.get(descriptor)) is not None:
-                    self._guarded(robot, lambda robot=robot, events=events: self._serve(robot, events))
+                    self._guarded(robot, partial(self._serve, robot))
             self._beat()
             self._tell()
 
@@ -257,11 +252,11 @@ class Crowd:
             try:
                 robot = self.robots[identity.id] = Robot(identity)
             except OSError as error:
-                self.problems[identity.id] = f"{os.strerror(error.errno or 0)}: this process needs a file for each robot"
+                self.problems[identity.id] = f"{error.strerror}: this process needs a file for each robot"
                 continue
             busy += 1
             self._of[robot.sock.fileno()] = robot
-            self._guarded(robot, lambda robot=robot: robot.connect(self._broker))
+            self._guarded(robot, partial(robot.connect, self._broker))
             if robot.state != "dead":
                 self._epoll.register(robot.sock, select.EPOLLOUT)
         if not self._told:
@@ -269,7 +264,7 @@ class Crowd:
                 if robot.late:
                     self._guarded(robot, _not_answered)
 
-    def _serve(self, robot: Robot, events: int) -> None:
+    def _serve(self, robot: Robot) -> None:
         if robot.state == "connecting":
             robot.begin()
             self._epoll.modify(robot.sock, select.EPOLLIN)
@@ -320,10 +315,6 @@ class Crowd:
         elif what == "mute":
             self.robots[name].state = "muted"
             answer({"ns": time.monotonic_ns()})
-        elif what == "free":
-            for robot in self.robots.values():
-                self._guarded(robot, robot.free)
-            answer({})
         elif what == "stops":
             answer({name: robot.stopped_ns for name, robot in self.robots.items()})
 
