@@ -109,7 +109,7 @@ class World(Processes):
         dropped = self.server_of_robots.log.read_text(errors="replace").count("messages are being dropped for client")
         if dropped:
             yield (
-                f"{self.robots} robots: the broker's queue for a client was full {dropped} times, and messages are lost;"
+                f"{self.robots} robots: the broker's queue for a client was full {dropped} times: messages are lost;"
                 " raise max_queued_messages in mosquitto.conf"
             )
 
@@ -233,3 +233,154 @@ def _ended(world: World, viewer: Viewer, ends: int) -> Iterator[tuple[str, list[
             at[base] = world.crowd.ask(f"{command} {base.rpartition('/')[2]}", _NOTICED_S)["ns"]
             time.sleep(_BETWEEN_S)
         viewer.until(partial(viewer.all_offline, bases), _NOTICED_S, lambda: "dead robots look alive")
+        yield measure_, [(viewer.offline_at[base] - ns) / 1e6 for base, ns in at.items()], {}
+
+
+def latencies_ms(sent: Mapping[str, Sequence[int]], moves: Mapping[str, Sequence[Moved]]) -> list[float]:
+    """Latencies of all commands that the motors obeyed before another command asked for the same speeds."""
+    found = []
+    for robot, times in sent.items():
+        changes = grouped(moves.get(robot, ()), lambda moved: tuple(round(motor, 1) for motor in moved.motors))
+        for number, time_ns in enumerate(times):
+            own, again = changes.get(STEPS[number % len(STEPS)], []), number + len(STEPS)
+            at = bisect_left(own, time_ns, key=lambda moved: moved.ns)
+            if at < len(own) and (again >= len(times) or own[at].ns < times[again]):
+                found.append((own[at].ns - time_ns) / 1e6)
+    return found
+
+
+def read_moves(trace: Path) -> dict[str, list[Moved]]:
+    moves = (msgspec.json.decode(line, type=Moved) for line in complete_lines(trace)[0])
+    return grouped(moves, lambda moved: moved.robot)
+
+
+def longest_gap_s(robots: Sequence[Sequence[int]], began: int, ended: int) -> float:
+    """The longest gap of any robot between the first and the last command; a robot that stops counts until the end."""
+    return max(b - a for own in robots for a, b in itertools.pairwise([began, *own, ended])) / 1e9
+
+
+def drive_fleet(port: int, seconds: float, ids: Sequence[str], begin: Callable[[], object]) -> None:
+    """Drives a whole fleet in :data:`STEPS`, evenly spread, and subscribes to all heartbeats.
+
+    It waits for a line when all are online. Then it answers when each robot's commands were published (CLOCK_MONOTONIC,
+    ns) and its heartbeats arrived, and how many commands were more than a period late.
+    """
+    bases = [Identity("pebble", "robots", name).base for name in ids]
+    heartbeats: dict[str, list[int]] = {ONLINE.topic(base): [] for base in bases}
+    sent: dict[str, list[int]] = {name: [] for name in ids}
+    topics = [DRIVE.topic(base) for base in bases]
+    bodies = [json.dumps(axes_of(left, right)) for left, right in STEPS]
+
+    def receive(message: MQTTMessage) -> None:
+        if not message.retain and b"true" in message.payload:
+            heartbeats[message.topic].append(time.monotonic_ns())
+
+    client = StockClient(receive, [(topic, 0) for topic in heartbeats])
+    client.paho.max_inflight_messages_set(MANY)
+    client.open(port)
+    while not all(heartbeats.values()):
+        time.sleep(_POLL_S)
+    answer({})
+    begin()
+    began, late, gap = time.monotonic(), 0, 1 / RATE_HZ / len(ids)
+    for number in range(round(seconds * RATE_HZ) * len(ids)):
+        step, robot = divmod(number, len(ids))
+        left = began + number * gap - time.monotonic()
+        time.sleep(max(0.0, left))
+        late += left < -1 / RATE_HZ
+        sent[ids[robot]].append(time.monotonic_ns())
+        client.paho.publish(topics[robot], bodies[step % len(STEPS)], qos=DRIVE.default_qos)
+    answer({"late": late, "sent": sent, "heartbeats": list(heartbeats.values())})
+    client.close()
+
+
+def at_ten_thousand(cells: Sequence[Cell]) -> Iterator[str]:
+    """What one robot more costs, from the second largest to the largest fleet, and what ten thousand would."""
+    for name in _GROWS:
+        some = [cell for cell in cells if cell.measure == name and cell.samples]
+        found = {int(cell.params["robots"]): median(medians(cell)) for cell in some}
+        if len(found) > 1:
+            less, more = sorted(found)[-2:]
+            each = (found[more] - found[less]) / (more - less)
+            whole, unit = found[more] + each * (_TEN_THOUSAND - more), _UNITS[name]
+            yield (
+                f"{name}: {figure(found[more])} {unit} with {more:,} robots, {figure(1000 * each)} {unit} for each"
+                f" 1,000 more; 10,000 would be {figure(whole)} {unit} if it goes on so"
+            )
+
+
+def _of(name: str) -> Callable[[Cell], bool]:
+    return lambda cell: cell.measure == name
+
+
+_FIGURES = {
+    "late": "late", "gap, s": "longest_gap_s", "broker": "cpu_broker", "boards": "cpu_fleet", "MB": "mb_per_board",
+}  # fmt: skip
+FLEET = Comparison(
+    name="fleet",
+    title="A fleet on one broker",
+    what="Robots of the contract at one stock broker, with a page server and one viewer. Most are cheap: a connection, "
+    "a will, retained state and four heartbeats a second each, but no firmware. Some boards run the real firmware on "
+    "simulated pins, and are driven by one operator at 10 Hz each: that latency is from the publish call to the change "
+    "of the pins.",
+    help="Fleets of several sizes at one broker: what each robot costs broker and page, how fast a stop of all, a "
+    "robot's end and a drive command are. Cheap simulated robots, and some with the real firmware. Needs mosquitto.",
+    options=(
+        Option(name="robots", kind=int, many=True, least=2, most=MOST, metavar="NUMBERS", help="Sizes, with commas."),
+        Option(name="boards", kind=int, least=1, most=100, help="How many of them run the firmware, and are driven."),
+        rounds("How often each size is measured."),
+        seconds("Of each phase.", least=1),
+    ),
+    full=Budget(240, robots=[100, 300, 1000], boards=10, rounds=1, seconds=10.0, stops=3, ends=10),
+    quick=Budget(40, robots=[30, 60], boards=5, rounds=1, seconds=2.0, stops=1, ends=2),
+    constants={"rate_hz": RATE_HZ},
+    variants=("mqtt",),
+    conditions=lambda run: [{"robots": one} for one in run["robots"]],
+    measuring=Measuring(prepare=prepare, measure=measure, measures=tuple(_UNITS), alone=True),
+    report=Report(
+        tables=(
+            Grid(
+                title="Idle: CPU, % of a core; PSS, MB; what a viewer of the fleet gets",
+                rows=("robots",),
+                columns=(
+                    median_column("broker %", BROKER_CPU), median_column("page %", PAGE_CPU),
+                    median_column("with viewer %", VIEWER_CPU), median_column("broker MB", BROKER_MB),
+                    median_column("page MB", PAGE_MB), median_column("viewer kB/s", VIEWER_RATE),
+                ),
+            ),
+            Grid(
+                title="Driven boards: command to pins, ms; longest gap of heartbeats; CPU, %; memory of a board",
+                rows=("robots",),
+                of=_of(PINS),
+                columns=(
+                    *map(percentile_column, (50, 95, 99, 100)), COUNT, LOST, single_column("sent", "sent"),
+                    *(single_column(head, name) for head, name in _FIGURES.items()),
+                ),
+            ),
+            Grid(
+                title="ms",
+                rows=("measure", "robots"),
+                heads=("", "robots"),
+                of=lambda cell: cell.measure in (LAST, CONFIRMED, KILLED, MUTE),
+                columns=(*map(percentile_column, (50, 100)), COUNT),
+            ),
+        ),
+        assessment=(
+            at_ten_thousand,
+            Aim(
+                what="{robots} robots, {measure}, p99 at most {bound:g} ms", of=_of(PINS), value=with_lost(99),
+                at_most=50.0, unit="ms", least=100,
+            ),
+            Aim(
+                what="{robots} robots, {measure}, at most {bound:g} ms", of=_of(CONFIRMED), value=with_lost(100),
+                at_most=1000.0, unit="ms", least=1,
+            ),
+        ),
+        pictures=(growth("A fleet on one broker", _GROWS, over="robots"),),
+    ),
+)  # fmt: skip
+
+if __name__ == "__main__":
+    begin = threading.Event()
+    serve_on_thread(lambda _line: begin.set(), lambda: os._exit(0))
+    drive_fleet(int(sys.argv[1]), float(sys.argv[2]), sys.argv[3:], begin.wait)
