@@ -28,7 +28,7 @@ from paho.mqtt.client import MQTTMessage
 from pebble.bench.clients import MANY, StockClient, axes_of
 from pebble.bench.comparison import Budget, Case, Comparison, Measuring, Option, Report, Run, rounds, seconds
 from pebble.bench.judging.aims import Aim, with_lost
-from pebble.bench.pictures import growth
+from pebble.bench.pictures import ecdf, growth
 from pebble.bench.results import Cell, grouped, rounded
 from pebble.bench.tables import COUNT, LOST, Grid, figure, median_column, medians, percentile_column, single_column
 from pebble.bench.usage import cpu_s, pss_mb
@@ -53,6 +53,8 @@ _NOTICED_S = 10.0  # of a robot that ends, or of a stop, until the page shows it
 _BETWEEN_S = 0.2  # two robots that end
 _FILES = 64  # of a process besides one for each robot
 _TEN_THOUSAND = 10_000
+#: What mosquitto's log has where it may open no more files: the second where it cannot open the file of tcpd's rules.
+_NO_FILES = ("socket count has been exceeded", "denied access by tcpd")
 
 PINS, LAST, CONFIRMED = "command to pins", "stop of all, until the last has it", "stop of all, until all have confirmed"
 KILLED, MUTE = "connection lost, until the page shows it", "silent, until the page shows it"
@@ -119,7 +121,8 @@ def check_online(found: Mapping[str, Any], wanted: int, broker: Broker) -> None:
     if found["online"] == wanted:
         return
     why = found["problem"] or "no reason is known"
-    if "socket count has been exceeded" in broker.log.read_text(errors="replace"):
+    log = broker.log.read_text(errors="replace")
+    if any(sign in log for sign in _NO_FILES):
         why = "the broker may open no more files: raise LimitNOFILE in its unit, or ulimit -n"
     raise PebbleError(f"{found['online']} of {wanted} robots are online: {why}")
 
@@ -376,7 +379,7 @@ FLEET = Comparison(
                 at_most=1000.0, unit="ms", least=1,
             ),
         ),
-        pictures=(growth("A fleet on one broker", _GROWS, over="robots"),),
+        pictures=(growth("A fleet on one broker", _GROWS, over="robots"), ecdf("Fleet", measures=(PINS,))),
     ),
 )  # fmt: skip
 

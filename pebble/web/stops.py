@@ -33,6 +33,7 @@ class Stops:
     def __init__(self) -> None:
         self.changed: set[str] = set()  # robots whose view may be another one now
         self._senders: dict[str, tuple[StopSender, float]] = {}  # by name, the newest last
+        self._over: set[str] = set()  # those that send nothing more: of a thousand robots that is not asked at each beat
         self._users: dict[str, str] = {}  # who has pressed each of them
         self._refs: dict[str, str] = {}  # for which robot; "": all
         self._shown: dict[str, tuple[str, str]] = {}  # by robot: progress and words, as pages see them
@@ -83,7 +84,7 @@ class Stops:
             return []
         ref, messages = address.identity.base, []
         for name, (sender, began) in self._senders.items():
-            if self._refs[name] in ("", ref) and (not sender.finished or now - began < COLLECT_S):
+            if self._refs[name] in ("", ref) and (name not in self._over or now - began < COLLECT_S):
                 sender.receive(message, now)
                 messages += sender.tick_robot(ref, now)
                 self._note_progress(sender, ref)
@@ -93,10 +94,13 @@ class Stops:
         """What to publish now; to be called every 50 ms."""
         messages = []
         for name, (sender, began) in list(self._senders.items()):
-            messages += sender.tick(now)
-            for ref in sender.robots:
-                self._note_progress(sender, ref)
-            if sender.finished and now - began > _SHOWN_S:
+            if name not in self._over:
+                messages += sender.tick(now)
+                for ref in sender.robots:
+                    self._note_progress(sender, ref)
+                if sender.finished:
+                    self._over.add(name)
+            if name in self._over and now - began > _SHOWN_S:
                 self._remove(name)
         return messages
 
@@ -142,6 +146,7 @@ class Stops:
         sender, _ = self._senders.pop(name)
         sender.end()
         self.changed |= set(sender.robots)
+        self._over.discard(name)
         del self._users[name], self._refs[name]
 
     def _newest(self, ref: str) -> tuple[str, RobotStop | None]:
