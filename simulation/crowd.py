@@ -29,7 +29,6 @@ from typing import Any, Final
 from pebble.contract import CAPABILITIES, CHARGING_LEVEL, DRIVE, ESTOP, ESTOP_RESET, ESTOP_STATE, ONLINE, STATUS
 from pebble.contract.identity import Identity
 from pebble.motion.latch import Latch
-from pebble.rig.worker_end import answer
 from pebble.transports import Message, QoS
 from pebble.transports.mqtt import packets
 
@@ -52,7 +51,7 @@ def names(count: int, first: int = 1) -> Iterator[Identity]:
 
 
 def capabilities(identity: Identity) -> dict[str, Any]:
-    """As a board's firmware publishes them; ``value`` of the payload."""
+    """They are what a board's firmware publishes: ``value`` of the payload."""
     none = {"available": False, "controls": False}
     base = identity.base
     return {
@@ -218,7 +217,7 @@ class Crowd:
         self._epoll = select.epoll()
         self._of: dict[int, Robot] = {}
         self._began = time.monotonic()
-        self._told = False
+        self._answered = False
         self._order: list[Robot] = []
         self._place, self._beats_at = 0, time.monotonic()
 
@@ -238,7 +237,7 @@ class Crowd:
                 elif (robot := self._of.get(descriptor)) is not None:
                     self._guarded(robot, partial(self._serve, robot))
             self._beat()
-            self._tell()
+            self._answer()
 
     def _pause_s(self) -> float:
         if not self._order:
@@ -259,7 +258,7 @@ class Crowd:
             self._guarded(robot, partial(robot.connect, self._broker))
             if robot.state != "dead":
                 self._epoll.register(robot.sock, select.EPOLLOUT)
-        if not self._told:
+        if not self._answered:
             for robot in list(self.robots.values()):
                 if robot.late:
                     self._guarded(robot, _not_answered)
@@ -297,10 +296,10 @@ class Crowd:
             self._beats_at += step
         self._beats_at = max(self._beats_at, now - HEARTBEAT_S)
 
-    def _tell(self) -> None:
-        if self._told or self.online + len(self.problems) < self._count:
+    def _answer(self) -> None:
+        if self._answered or self.online + len(self.problems) < self._count:
             return
-        self._told = True
+        self._answered = True
         problem = next(iter(self.problems.values()), "")
         answer({"online": self.online, "took_s": time.monotonic() - self._began, "problem": problem})
 
@@ -317,6 +316,11 @@ class Crowd:
             answer({"ns": time.monotonic_ns()})
         elif what == "stops":
             answer({name: robot.stopped_ns for name, robot in self.robots.items()})
+
+
+def answer(what: dict[str, Any]) -> None:
+    sys.stdout.write(json.dumps(what) + "\n")
+    sys.stdout.flush()
 
 
 def _not_answered() -> None:

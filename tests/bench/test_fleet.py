@@ -22,7 +22,7 @@ from tests.bench import synthetic
 MS = 1_000_000
 
 
-def test_ten_thousand_are_told_by_what_each_of_the_largest_fleet_costs() -> None:
+def test_ten_thousand_are_reckoned_by_what_each_of_the_largest_fleet_costs() -> None:
     lines = list(at_ten_thousand(synthetic.fleet().cells))
     assert lines[0] == (
         "CPU, broker: 10.0 % with 1,000 robots, 10.0 % for each 1,000 more; 10,000 would be 100 % if it goes on so"
@@ -38,7 +38,7 @@ def test_growth_is_drawn_in_a_panel_for_each_unit() -> None:
     assert memory.get_ylabel() == "memory (PSS), MB"
 
 
-def test_commands_are_told_by_wheel_speeds_and_the_longest_silence_counts() -> None:
+def test_wheel_speeds_identify_commands_and_the_longest_silence_counts() -> None:
     sent = {"a": [0, 100 * MS], "b": [50 * MS, 150 * MS]}
     moves = {
         "a": [Moved(2 * MS, "a", (1.0, 1.0)), Moved(104 * MS, "a", (-1.0, -1.0))],
