@@ -48,7 +48,7 @@ from pebble.simulation.wireless import KINDS
 STEPS: Final = ((1, 1), (-1, -1), (1, 0), (-1, 0), (1, -1), (0, 1), (-1, 1), (0, -1))
 RATE_HZ: Final = 10.0  # of each board
 MOST: Final = 5000
-_UP_S, _ARRIVE_S, _POLL_S, _SETTLE_S = 90.0, 1.0, 0.05, 3.0
+_UP_S, _ARRIVE_S, _POLL_S, _QUIET_S = 90.0, 1.0, 0.05, 3.0
 _NOTICED_S = 10.0  # of a robot that ends, or of a stop, until the page shows it
 _BETWEEN_S = 0.2  # two robots that end
 _FILES = 64  # of a process besides one for each robot
@@ -157,7 +157,7 @@ def _phases(world: World, run: Run) -> Iterator[tuple[str, list[float], dict[str
     ids = [identity.id for _, identity in members(world.boards, KINDS)]
     operator = world.worker("operator", "pebble.bench.fleet", world.server_of_robots.port, run["seconds"], *ids)
     operator.answer(_UP_S)
-    time.sleep(_SETTLE_S)
+    time.sleep(_QUIET_S)
     run.show(f"{world.robots} robots beat")
     idle = world.cpu(lambda: time.sleep(run["seconds"]))
     yield BROKER_CPU, [idle["broker"]], {"crowd": rounded(idle["crowd"], 1)}

@@ -80,7 +80,7 @@ class Robot:
         self.stopped_ns = 0
         self.drives = 0  # commands
         self._since = time.monotonic()
-        self._beats = 0
+        self._heartbeats = 0
         self._rest = b""
         self.sock = socket.socket()
         self.sock.setblocking(False)
@@ -110,13 +110,13 @@ class Robot:
         wanted = [packets.Filter(one.topic(self.base), 1) for one in (ESTOP, DRIVE, ESTOP_RESET)]
         self._send(packets.subscribe(1, wanted, modern=False))
 
-    def beat(self) -> None:
+    def heartbeat(self) -> None:
         """Publish what is due with this heartbeat."""
         if self.state != "online":
             return
         self._publish(ONLINE.topic(self.base), b'{"t": %d, "online": true}' % _epoch_ms())
-        self._beats += 1
-        if self._beats % _REPORT_EVERY == 1:
+        self._heartbeats += 1
+        if self._heartbeats % _REPORT_EVERY == 1:
             volts = 7.6 + 0.4 * (hash(self.base) % 100) / 100
             self._publish(CHARGING_LEVEL.topic(self.base), b'{"value": %.3f, "unit": "v"}' % volts)
             services = {"mcu": {"state": "ready"}, "mqtt_bridge": {"state": "ready"}}
@@ -150,7 +150,7 @@ class Robot:
             payload = {"schema": "pebble-capabilities/v1", "t": _epoch_ms(), "value": capabilities(self.identity)}
             self._publish(CAPABILITIES.topic(self.base), json.dumps(payload).encode())
             self._publish_stop()
-            self.beat()
+            self.heartbeat()
             return True
         if kind == _PUBLISH:
             length = int.from_bytes(body[:2], "big")
@@ -219,7 +219,7 @@ class Crowd:
         self._began = time.monotonic()
         self._answered = False
         self._order: list[Robot] = []
-        self._place, self._beats_at = 0, time.monotonic()
+        self._place, self._heartbeats_at = 0, time.monotonic()
 
     @property
     def online(self) -> int:
@@ -236,13 +236,13 @@ class Crowd:
                     going = handle(os.read(0, 65536))
                 elif (robot := self._of.get(descriptor)) is not None:
                     self._guarded(robot, partial(self._serve, robot))
-            self._beat()
+            self._publish_heartbeats()
             self._answer()
 
     def _pause_s(self) -> float:
         if not self._order:
             return _POLL_S
-        return min(_POLL_S, max(0.0, self._beats_at - time.monotonic()))
+        return min(_POLL_S, max(0.0, self._heartbeats_at - time.monotonic()))
 
     def _connect_some(self) -> None:
         busy = sum(robot.state in ("connecting", "asking") for robot in self.robots.values()) if self._waiting else 0
@@ -282,19 +282,19 @@ class Crowd:
         self._of.pop(robot.sock.fileno(), None)
         robot.end(abruptly=abruptly)
 
-    def _beat(self) -> None:
+    def _publish_heartbeats(self) -> None:
         """Heartbeats of all robots are evenly spread; those that are overdue are not published twice."""
         now = time.monotonic()
-        if not self._order or now < self._beats_at:
+        if not self._order or now < self._heartbeats_at:
             return
         step = HEARTBEAT_S / len(self._order)
-        due = 1 + int((now - self._beats_at) / step)
+        due = 1 + int((now - self._heartbeats_at) / step)
         for _ in range(min(due, _TOGETHER, len(self._order))):
             self._place = (self._place + 1) % len(self._order)
             robot = self._order[self._place]
-            self._guarded(robot, robot.beat)
-            self._beats_at += step
-        self._beats_at = max(self._beats_at, now - HEARTBEAT_S)
+            self._guarded(robot, robot.heartbeat)
+            self._heartbeats_at += step
+        self._heartbeats_at = max(self._heartbeats_at, now - HEARTBEAT_S)
 
     def _answer(self) -> None:
         if self._answered or self.online + len(self.problems) < self._count:

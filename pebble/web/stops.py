@@ -33,7 +33,7 @@ class Stops:
     def __init__(self) -> None:
         self.changed: set[str] = set()  # robots whose view may be another one now
         self._senders: dict[str, tuple[StopSender, float]] = {}  # by name, the newest last
-        self._over: set[str] = set()  # those that send nothing more: of a thousand robots that is not asked at each beat
+        self._over: set[str] = set()  # those that send nothing more: to ask a thousand robots at each heartbeat is slow
         self._users: dict[str, str] = {}  # who has pressed each of them
         self._refs: dict[str, str] = {}  # for which robot; "": all
         self._shown: dict[str, tuple[str, str]] = {}  # by robot: progress and words, as pages see them
