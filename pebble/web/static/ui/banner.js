@@ -11,7 +11,7 @@ import { clockTime, roughly } from "./parts/words.js";
 const NOTICE_MS = 6000;
 const NO_ANSWER_MS = 1500;
 const MOST_ALSO = 3; // others that are named
-const MOST_LISTED = 20;
+const MOST_LISTED = 50;
 const STOP = "web/estop";
 const HINT_MS = 3000;
 const SHOWN_MS = 60_000; // a finished stop
@@ -137,7 +137,7 @@ export function StopChip() {
   const chip = html`<span class="chip stopped"><${Icon} name="stop" />${words}</span>`;
   return html`<${Drop} test="stopped" className="stops" summary=${chip}>
     ${first.map((ref) => html`<${StopBanner} key=${ref} at=${ref} />`)}
-    ${refs.length > first.length && html`<p class="also">${refs.length - first.length} more: open them from the fleet.</p>`}
+    ${refs.length > first.length && html`<p class="also">${refs.length - first.length} more: their cards open them.</p>`}
   <//>`;
 }
 

@@ -23,7 +23,7 @@ export function Many({ groups, away, card, row }) {
   kept.show = show;
   useEffect(() => {
     const { top } = kept;
-    const timer = setTimeout(() => scrollTo(0, top)); // the rows have their height now
+    const timer = setTimeout(() => top && scrollTo(0, top)); // the rows have their height now
     const follow = () => void (kept.top = scrollY);
     addEventListener("scroll", follow, { passive: true });
     return () => {
@@ -76,7 +76,8 @@ function Rows({ refs, look, draw }) {
     const step = parseFloat(style.gridAutoRows) + gap;
     const top = -place.current.getBoundingClientRect().top;
     const within = (row) => Math.min(Math.ceil(refs.length / columns), Math.max(0, row));
-    const next = [columns, step, gap, within(Math.floor(top / step) - BEYOND), within(Math.ceil((top + innerHeight) / step) + BEYOND)];
+    const first = within(Math.floor(top / step) - BEYOND);
+    const next = [columns, step, gap, first, within(Math.ceil((top + innerHeight) / step) + BEYOND)];
     see((old) => (String(old) === String(next) ? old : next));
   };
   const newest = useRef(measure);
