@@ -143,12 +143,12 @@ export function StopChip() {
 
 /** Where no component is open: the first that does not confirm its stop. */
 function Unconfirmed() {
-  const { store } = usePage();
+  const { estop, store } = usePage();
   useTick(500);
   const refs = useRefs(STOP).filter((ref) => progressOf(store, ref)?.kind === "bad").sort();
   if (!refs.length) return null;
   const more = refs.length > 1 ? ` So for ${refs.length - 1} more.` : "";
-  return html`<${Banner} kind="bad" icon="stop"><p role="alert">${progressOf(store, refs[0]).text}${more}</p><//>`;
+  return html`<${Banner} kind="bad" icon="stop"><p role="alert">${tally(estop, store)} ${progressOf(store, refs[0]).text}${more}</p><//>`;
 }
 
 function StopBanner({ at }) {
@@ -279,6 +279,17 @@ function SlowLink({ at }) {
     html`<p class="also slow" data-test="slow-link">Slow connection: commands take ${(ms / 1000).toFixed(1)} s</p>`;
 }
 
+const stops = (store) => store.refs().map((ref) => store.get(ref, STOP)?.value).filter(Boolean);
+
+/** How many have confirmed a stop of all that was pressed here; null: none was. */
+function tally({ pressed }, store) {
+  if (!pressed || pressed.ref || Date.now() - pressed.at > SHOWN_MS) return null;
+  const sent = stops(store).filter(({ stop, sending }) => stop === pressed.stop && sending !== "spared");
+  const confirmed = sent.filter(({ sending }) => sending === "confirmed").length;
+  return sent.length > 1 &&
+    html`<b data-test="tally">STOP ALL: ${confirmed === sent.length ? "all" : `${confirmed} of`} ${sent.length} confirmed.</b>`;
+}
+
 /** A stop that was pressed here and of which no robot shows anything yet. */
 function PressBanner() {
   const { estop, store, connection } = usePage();
@@ -286,11 +297,11 @@ function PressBanner() {
   const age = pressed ? Date.now() - pressed.at : Infinity;
   useTick(age < SHOWN_MS ? 250 : 5000);
   if (!pressed || age > SHOWN_MS) return null;
-  const views = store.refs().map((ref) => store.get(ref, STOP)?.value).filter(Boolean);
-  const sent = views.filter(({ stop, sending }) => stop === pressed.stop && sending !== "spared");
-  if (!pressed.ref && sent.length > 1 && connection.isOpen) return html`<${Tally} sent=${sent} age=${age} />`;
-  const known = views.some(({ stop, latched }) => stop === pressed.stop || (latched && age > NO_ANSWER_MS));
-  if (known && connection.isOpen) return null;
+  const known = stops(store).some(({ stop, latched }) => stop === pressed.stop || (latched && age > NO_ANSWER_MS));
+  if (known && connection.isOpen) {
+    const words = age < TALLY_MS && tally(estop, store);
+    return words && html`<${Banner} kind="warn" icon="stop"><p role="status">${words}</p><//>`;
+  }
   const whom = pressed.ref ? nameIn(store, pressed.ref) : "all robots";
   if (age < NO_ANSWER_MS) {
     return html`<${Banner} kind="warn" icon="stop"><p role="alert">STOP of ${whom}: sent…</p><//>`;
@@ -310,16 +321,6 @@ function PressBanner() {
   if (age > 10_000) return null;
   return html`<${Banner} kind="bad" icon="stop">
     <p role="alert"><b>STOP of ${whom} is NOT CONFIRMED.</b> ${pressed.ref ? "" : "No robot has answered."}</p>
-  <//>`;
-}
-
-/** How many have confirmed a stop of all. */
-function Tally({ sent, age }) {
-  const confirmed = sent.filter(({ sending }) => sending === "confirmed").length;
-  const whole = confirmed === sent.length;
-  if (whole && age > TALLY_MS) return null;
-  return html`<${Banner} kind=${whole || age < NO_ANSWER_MS ? "warn" : "bad"} icon="stop">
-    <p role="status" data-test="tally">STOP ALL: ${whole ? "all" : `${confirmed} of`} ${sent.length} confirmed.</p>
   <//>`;
 }
 

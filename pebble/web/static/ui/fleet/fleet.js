@@ -108,7 +108,7 @@ function matcher(store, filter) {
   const value = (ref, metric) => store.get(ref, metric)?.value;
   const text = (ref) => {
     const { name, description } = looksOf(ref, value(ref, "capabilities"));
-    const is = [isPresent(store, ref) ? "online" : "offline", value(ref, "web/estop")?.latched && "stopped"];
+    const is = [isPresent(store, ref) ? "online" : "offline", value(ref, "web/estop")?.latched ? "stopped" : ""];
     return [ref, name, description, value(ref, "web/driver")?.by, value(ref, "web/host")?.host, ...is].join(" ").toLowerCase();
   };
   return (ref) => !words.length || ((all) => words.every((word) => all.includes(word)))(text(ref));
