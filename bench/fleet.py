@@ -67,7 +67,7 @@ _UNITS = {
     VIEWER_RATE: "kB/s",
 }
 #: What grows with the fleet, and is told for ten thousand.
-_GROWS = (BROKER_CPU, BROKER_MB, PAGE_CPU, VIEWER_CPU, PAGE_MB, VIEWER_RATE)
+_GROWS = (BROKER_CPU, BROKER_MB, VIEWER_CPU, PAGE_MB, VIEWER_RATE)
 
 
 class World(Processes):
@@ -145,7 +145,7 @@ def prepare(run: Run) -> None:
 
 def measure(case: Case) -> Iterator[Cell]:
     """One fleet, with processes of its own. Raises PebbleError if a process does not start, or not all are online."""
-    run, robots = case.run, int(case.condition["robots"])
+    run, robots = case.run, int(str(case.condition["robots"]))
     boards = min(run["boards"], robots - 1)
     with World(robots, boards, run.show) as world:
         for name, values, figures in _phases(world, run):
@@ -301,7 +301,7 @@ def at_ten_thousand(cells: Sequence[Cell]) -> Iterator[str]:
     """What one robot more costs, from the second largest to the largest fleet, and what ten thousand would."""
     for name in _GROWS:
         some = [cell for cell in cells if cell.measure == name and cell.samples]
-        found = {int(cell.params["robots"]): median(medians(cell)) for cell in some}
+        found = {int(str(cell.params["robots"])): median(medians(cell)) for cell in some}
         if len(found) > 1:
             less, more = sorted(found)[-2:]
             each = (found[more] - found[less]) / (more - less)
