@@ -3,7 +3,7 @@
 The robot remembers the stop; see docs/emergency-stop.md.
 """
 
-from collections.abc import Collection, Iterable
+from collections.abc import Callable, Collection, Iterable
 
 from pebble.client.estop import COLLECT_S, Progress, RobotStop, StopSender
 from pebble.client.rank import Rank
@@ -30,7 +30,9 @@ _SENDING = {
 class Stops:
     """Publish what its methods return, and pass every message of the robots to ``receive``."""
 
-    def __init__(self) -> None:
+    def __init__(self, again: Callable[[], bool] = lambda: True) -> None:
+        """``again``: whether what was sent may be sent again; not while that still waits, behind which it would be."""
+        self._again = again
         self.changed: set[str] = set()  # robots whose view may be another one now
         self._senders: dict[str, tuple[StopSender, float]] = {}  # by name, the newest last
         self._over: set[str] = set()  # those that send nothing more: to ask a thousand robots at each heartbeat is slow
@@ -86,7 +88,7 @@ class Stops:
         for name, (sender, began) in self._senders.items():
             if self._refs[name] in ("", ref) and (name not in self._over or now - began < COLLECT_S):
                 sender.receive(message, now)
-                messages += sender.tick_robot(ref, now)
+                messages += sender.tick_robot(ref, now, again=self._again())
                 self._note_progress(sender, ref)
         return messages
 
@@ -95,7 +97,7 @@ class Stops:
         messages = []
         for name, (sender, began) in list(self._senders.items()):
             if name not in self._over:
-                messages += sender.tick(now)
+                messages += sender.tick(now, again=self._again())
                 for ref in sender.robots:
                     self._note_progress(sender, ref)
                 if sender.finished:

@@ -62,6 +62,19 @@ def test_other_stops_end_none_that_is_repeated(
     assert ESTOP.topic(A) in repeated
 
 
+def test_a_stop_is_repeated_once_what_was_sent_has_gone_and_sent_first_in_any_case() -> None:
+    """Repeated while it still waits, the stop of a thousand robots holds up their confirmations for seconds."""
+    waits = [True]
+    stops = Stops(lambda: not waits[0])
+    stops.press(A, FIRST, by="ann", why="", now=1.0, known=[], user="ann")
+    all_ = stops.press("", new_name(), by="ann", why="", now=1.0, known=[], user="ann")
+    assert all_ == []
+    assert ESTOP.topic(B) in [one.topic for one in stops.receive(capabilities_of(B), 1.1)]
+    assert (stops.tick(2.0), stops.receive(capabilities_of(B), 2.0)) == ([], [])
+    waits[0] = False
+    assert {ESTOP.topic(A), ESTOP.topic(B)} <= {one.topic for one in stops.tick(2.1)}
+
+
 def test_a_stop_that_is_over_asks_none_of_its_robots_at_each_heartbeat(monkeypatch: pytest.MonkeyPatch) -> None:
     """A thousand that are stopped would cost a thousand looks for each of 4,000 heartbeats a second."""
     stops, asked = Stops(), list[StopSender]()
