@@ -32,7 +32,7 @@ class Stops:
 
     def __init__(self, again: Callable[[], bool] = lambda: True) -> None:
         """``again``: whether what was sent may be sent again; not while that still waits, behind which it would be."""
-        self._again = again
+        self._again, self._repeats = again, True
         self.changed: set[str] = set()  # robots whose view may be another one now
         self._senders: dict[str, tuple[StopSender, float]] = {}  # by name, the newest last
         self._over: set[str] = set()  # those that send nothing more: to ask a thousand robots at each heartbeat is slow
@@ -66,6 +66,7 @@ class Stops:
             if not ref or robot.base == ref:
                 for message in robot.remembered.values():
                     sender.receive(message, now)
+        self.changed |= set(sender.robots)
         return self.tick(now)
 
     def end(self, name: str) -> None:
@@ -88,20 +89,20 @@ class Stops:
         for name, (sender, began) in self._senders.items():
             if self._refs[name] in ("", ref) and (name not in self._over or now - began < COLLECT_S):
                 sender.receive(message, now)
-                messages += sender.tick_robot(ref, now, again=self._again())
+                messages += sender.tick_robot(ref, now, again=self._repeats)
                 self._note_progress(sender, ref)
         return messages
 
     def tick(self, now: float) -> list[Message]:
         """What to publish now; to be called every 50 ms."""
-        messages = []
+        messages, self._repeats = [], self._again()
         for name, (sender, began) in list(self._senders.items()):
             if name not in self._over:
-                messages += sender.tick(now, again=self._again())
-                for ref in sender.robots:
-                    self._note_progress(sender, ref)
-                if sender.finished:
+                messages += sender.tick(now, again=self._repeats)
+                if sender.finished:  # else what has come of it was noted with the robot's message
                     self._over.add(name)
+                    for ref in sender.robots:
+                        self._note_progress(sender, ref)
             if name in self._over and now - began > _SHOWN_S:
                 self._remove(name)
         return messages

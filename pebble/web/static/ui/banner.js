@@ -141,11 +141,14 @@ export function StopChip() {
   <//>`;
 }
 
+const unconfirmed = (store) => store.refs().filter((ref) => progressOf(store, ref)?.kind === "bad").sort();
+
 /** Where no component is open: the first that does not confirm its stop. */
 function Unconfirmed() {
   const { estop, store } = usePage();
   useTick(500);
-  const refs = useRefs(STOP).filter((ref) => progressOf(store, ref)?.kind === "bad").sort();
+  useRefs(STOP);
+  const refs = unconfirmed(store);
   if (!refs.length) return null;
   const more = refs.length > 1 ? ` So for ${refs.length - 1} more.` : "";
   return html`<${Banner} kind="bad" icon="stop"><p role="alert">${tally(estop, store)} ${progressOf(store, refs[0]).text}${more}</p><//>`;
@@ -299,7 +302,7 @@ function PressBanner() {
   if (!pressed || age > SHOWN_MS) return null;
   const known = stops(store).some(({ stop, latched }) => stop === pressed.stop || (latched && age > NO_ANSWER_MS));
   if (known && connection.isOpen) {
-    const words = age < TALLY_MS && tally(estop, store);
+    const words = age < TALLY_MS && !unconfirmed(store).length && tally(estop, store);
     return words && html`<${Banner} kind="warn" icon="stop"><p role="status">${words}</p><//>`;
   }
   const whom = pressed.ref ? nameIn(store, pressed.ref) : "all robots";
