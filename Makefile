@@ -14,7 +14,7 @@ help:
 	@echo "make test             all checks and tests, some rows of each rule, some twelve minutes"
 	@echo "make quick            what to run before each commit: lint, types, contract, memory transport, one robot; a minute"
 	@echo "make thorough         the same, with all rows, all cases of the random tests, and the tests that take longest"
-	@echo "make fleet            brokers and hubs that are killed, hung and cut off under driven robots and 300 boards, half an hour"
+	@echo "make fleet            brokers and hubs that are killed, hung and cut off under driven robots and 300 boards; 300 robots at a page; half an hour"
 	@echo "make stops            400 random schedules of emergency stops and faults with whole robots, 40 minutes"
 	@echo "make soak             floods, kills, freezes, full disks and more while an operator drives; MINUTES=30 for each transport"
 	@echo "make floods           60,000 retained flags, 10,000 actions a second and more, also while a robot starts, four minutes"
@@ -112,7 +112,7 @@ thorough: gstreamer
 	@PEBBLE_THOROUGH=1 $(MAKE) --no-print-directory test
 
 # Whole fleets; make test has one row of each rule.
-FLEET := tests/fleet/test_hosts.py tests/fleet/test_hubs.py tests/transports/zenoh/test_mesh.py
+FLEET := tests/fleet/test_hosts.py tests/fleet/test_hubs.py tests/transports/zenoh/test_mesh.py tests/bench/test_fleet.py
 fleet: .venv/.ready-dev
 	@sh tools/debian-packages.sh mosquitto=mosquitto
 	@PEBBLE_THOROUGH=1 $(TESTS) --timeout 900 -s $(FLEET)

@@ -211,7 +211,7 @@ def crowd(rig: Rig, scale: float) -> Samples:
     broker = f"mqtt://127.0.0.1:{rig.stage.broker_port}"
     rig.stage.robot("the fleet", "pebble.cli", "sim", "fleet", "-n", 100, "--broker", broker)
     page = rig.page()
-    rig.until(page, "document.querySelectorAll('[data-test^=\"card-\"]').length > 100", "too few robots", 60.0)
+    rig.until(page, "parseInt(document.querySelector('h1')?.textContent) > 100", "too few robots", 60.0)
     rig.pause(page, 5.0)
     page.evaluate("new MutationObserver(() => bench.updates++).observe(document.body, "
                   "{ subtree: true, childList: true, characterData: true, attributes: true })")  # fmt: skip

@@ -84,6 +84,12 @@ def tails(title: str) -> Declared:
     return _declared(_tails, f"{title}: bars to the median, lines to the 99th percentile", name="bars")
 
 
+def growth(title: str, measures: Sequence[str], *, over: str) -> Declared:
+    """Lines through the medians of each measure as the parameter ``over`` grows; one panel for each unit."""
+    make = partial(_lines, over=over)
+    return _declared(make, f"{title}: what it costs, by {over}", measures=measures, name="growth")
+
+
 def _declared(
     make: Make, caption: str, *, measures: Sequence[str] = (), least: int = 1, name: str | None = None
 ) -> Declared:
@@ -231,6 +237,20 @@ def _amounts(cells: Sequence[Cell], title: str, *, panel: str, group: str) -> Fi
     return _bar_panels(title, bars, 5.2 if panel else 8.5, lambda axes: axes.set(xlim=(0, right), xlabel=label))
 
 
+def _lines(cells: Sequence[Cell], title: str, *, over: str) -> Figure:
+    by_unit, style_of = grouped(cells, _by_unit), plots.styles(unique([cell.measure for cell in cells]))
+    figure, every = plots.panels(len(by_unit), 3, (3.9, 3.0), title)
+    for axes, (unit, some) in zip(every, by_unit.items(), strict=True):
+        for name, points in grouped(some, lambda cell: cell.measure).items():
+            found = sorted((float(cell.params[over]), _p(50, cell)) for cell in points)  # type: ignore[arg-type]
+            style = style_of[name]
+            axes.plot(*zip(*found, strict=True), color=style.colour, linestyle=style.dash, marker=style.marker)
+            axes.annotate(f" {digits(found[-1][1])}", found[-1], fontsize=8, va="center", annotation_clip=False)
+        axes.set(xlim=(0, None), ylim=(0, None), xlabel=over, ylabel=unit)
+    plots.legend(figure, style_of)
+    return figure
+
+
 def _tails(cells: Sequence[Cell], title: str) -> Figure:
     ends = [(cell, _p(50, cell), _p(99, cell)) for cell in cells]
     left, right = 0.5 * min((p50 for _, p50, _ in ends if p50 > 0), default=1.0), 9 * max(p99 for *_, p99 in ends)
@@ -244,6 +264,10 @@ def _tails(cells: Sequence[Cell], title: str) -> Figure:
 
 def _p(percent: float, cell: Cell) -> float:
     return percentile(finite(cell.samples), percent)
+
+
+def _by_unit(cell: Cell) -> str:
+    return {"%": "CPU, % of a core", "MB": "memory (PSS), MB"}.get(cell.unit, cell.unit)
 
 
 def _unit(cells: Sequence[Cell]) -> str:

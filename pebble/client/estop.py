@@ -20,7 +20,7 @@ from pebble.transports import Message, QoS
 REPEAT_S = 0.5
 COLLECT_S = silent_after(link="thin")  # so long a stop of all is sent to further robots, which may be at any level
 GIVE_UP_S = 60.0
-MAX_ROBOTS = 1000  # to which a stop of all is repeated; one beyond gets it whenever anything arrives from it
+MAX_ROBOTS = 2000  # to which a stop of all is repeated; one beyond gets it whenever anything arrives from it
 MAX_PASSED = 4096  # robots beyond whose last stop is remembered; where there are more, they get it more often
 
 _ZERO = codec.encode(DRIVE, Drive(valid_ms=0))
@@ -132,8 +132,8 @@ class RobotStop:
             self._began = now
             self.next = max(now, self._sent_at + REPEAT_S)
 
-    def tick(self, now: float) -> list[Message]:
-        if not self.sending or now < self.next:
+    def tick(self, now: float, *, again: bool = True) -> list[Message]:
+        if not self.sending or now < self.next or not (again or self._sent_at == float("-inf")):
             return []
         self._sent_at, self.next, self._names_due = now, now + REPEAT_S, False
         messages = []
@@ -246,20 +246,23 @@ class StopSender:
         elif self.collecting and message.payload and not address.identity.is_server:
             self._receive_first(base, address.metric, message, now)
 
-    def tick(self, now: float) -> list[Message]:
-        """What to publish now, to the robots of the highest rank first; some of it again in 0.5 s."""
+    def tick(self, now: float, *, again: bool = True) -> list[Message]:
+        """What to publish now, to the robots of the highest rank first; some of it again in 0.5 s.
+
+        ``again`` False: only to robots that it was not sent to yet, because what was sent still waits.
+        """
         self._now = now
         if not self.hold and now >= self._began + GIVE_UP_S:
             self.end()
         due = sorted((one for one in self.robots.values() if one.next <= now), key=lambda one: one.rank, reverse=True)
         passing, self._passing = self._passing, []
-        return [message for robot in due for message in robot.tick(now)] + passing
+        return [message for robot in due for message in robot.tick(now, again=again)] + passing
 
-    def tick_robot(self, base: str, now: float) -> list[Message]:
+    def tick_robot(self, base: str, now: float, *, again: bool = True) -> list[Message]:
         """What ``tick`` would return of this robot, from which a message was just received."""
         passing, self._passing = self._passing, []
         robot = self.robots.get(base)
-        return passing if robot is None else robot.tick(now) + passing
+        return passing if robot is None else robot.tick(now, again=again) + passing
 
     def end(self) -> None:
         """Send no more. Robots that are stopped stay so."""

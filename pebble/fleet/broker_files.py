@@ -18,7 +18,7 @@ from pebble.fleet.roles import Rule
 #: random, with 79 bits.
 ITERATIONS = 101
 _ALPHABET = "abcdefghjkmnpqrstuvwxyz23456789"  # no 0 o, 1 l i
-_MAX_MESSAGE, MAX_CONNECTIONS = 1024 * 1024, 1000
+_MAX_MESSAGE, MAX_CONNECTIONS = 1024 * 1024, 4000  # twice what one page shows
 _SUBSCRIBES = {"publishClientSend": False, "publishClientReceive": False, "subscribe": True, "unsubscribe": True}
 _ACL_TYPES, _SUBSCRIBE = {"write": "publishClientSend", "read": "publishClientReceive"}, "subscribePattern"
 

@@ -385,6 +385,8 @@ class Control:
         self._interest.dirty -= drivers
         found, large = self._server.robots.take(self._interest, now, large=self._large_due)
         self._large_due = self._large_due and not large
+        if self._interest.more:
+            self._wake.set()
         values = found + tuple((ref, "web/driver", self._driver(ref), 0.0) for ref, _ in drivers)
         gone, self._interest.gone = tuple(self._interest.gone), set()
         if values or gone:

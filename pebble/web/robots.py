@@ -3,6 +3,7 @@
 No queue forms: a slow page receives the newest value less often. A page that connects again receives everything.
 """
 
+import logging
 import re
 import time
 from collections import deque
@@ -25,15 +26,19 @@ from pebble.web.log_lines import LogLines
 from pebble.web.recent import Recent
 from pebble.web.restarts import Restarts
 
-MAX_COMPONENTS, MAX_METRICS, MAX_VALUE_BYTES = 500, 200, 64 * 1024
+log = logging.getLogger(__name__)
+
+MAX_COMPONENTS, MAX_METRICS, MAX_VALUE_BYTES = 2000, 200, 64 * 1024
 _SHARES = 16  # shares of a rank: of eight, so half of the places are left for what is known from before
 _MAX_CLIPS_BYTES = 400 * 1024  # of the list of clips, which has up to 256 KiB of names
 LARGE_BYTES = 16 * 1024  # a value beyond holds up a slow connection: one is sent, then the page has to answer
-MAX_BYTES = 32 * 1024 * 1024  # of all values together
+MAX_STATE_BYTES = 128 * 1024  # of values in one message: pings, by which pages drive, do not wait for thousands
+MAX_BYTES = 64 * 1024 * 1024  # of all values together
 RESERVED_BYTES = 16 * 1024  # of them for each component, whatever the others send
 MAX_ALIASES = 64  # of one component: topics that its microcontrollers declare besides the contract's
 _SERVERS = "servers"  # the type of other servers of this page: they are no components to be shown
-_REFRESH_S = 1.0  # values that change with every heartbeat are sent this often
+_REFRESH_S = 1.0  # values that change with every heartbeat are sent this often,
+_REFRESHES_PER_S = 100  # but of so many components at most, and of those that are open
 _LONGEST_ALIAS = 200  # characters
 _STAMPS = 5  # heartbeats by which a clock of whole seconds is recognised
 
@@ -103,6 +108,7 @@ class Interest:
     def __init__(self, changed: Callable[[], None]) -> None:
         self.watched = ""
         self.dirty: set[tuple[str, str]] = set()
+        self.more = False  # what is dirty did not fit into the last message
         self.gone: set[str] = set()
         self.notify = changed
 
@@ -152,18 +158,21 @@ class Robots:
     ) -> tuple[tuple[tuple[str, str, Any, float], ...], bool]:
         """What this page has not received yet, None for what was removed; it counts as received from now on.
 
-        With it, whether there is a large value among them: one if it may be ``large``, the others wait.
+        With it, whether there is a large value among them: one if it may be ``large``, the others wait. What is open is
+        taken first; what does not fit into a message waits for the next one.
         """
         dirty, interest.dirty = interest.dirty, set()
-        taken, has_large = [], False
-        for ref, metric in dirty:
+        taken, has_large, left = [], False, MAX_STATE_BYTES
+        for ref, metric in sorted(dirty, key=lambda one: one[0] != interest.watched):
             one = self._find(ref, metric)
-            if one is not None and len(bytes(one.raw)) > LARGE_BYTES:
-                if has_large or not large:
-                    interest.dirty.add((ref, metric))
-                    continue
-                has_large = True
+            size = 0 if one is None else len(bytes(one.raw))
+            if left <= 0 or (size > LARGE_BYTES and (has_large or not large)):
+                interest.dirty.add((ref, metric))
+                continue
+            has_large = has_large or size > LARGE_BYTES
+            left -= size
             taken.append((ref, metric, None, 0.0) if one is None else (ref, metric, one.raw, 1000 * (now - one.at)))
+        interest.more = left <= 0
         return tuple(taken), has_large
 
     def _find(self, ref: str, metric: str) -> _Value | None:
@@ -252,17 +261,24 @@ class Robots:
     def refresh(self, now: float) -> None:
         """Send what changes with time; to be called every 0.25 s.
 
-        What is merely older than before is sent of a third of the components: no page has to draw all of them at once.
+        Whether a component is there is sent at once. What is merely older than before is sent of what is open, and of a
+        third of the others, or fewer: no page has to draw all of them at once, and a thousand robots are no flood.
         """
         self.components.ranks_have_changed()
         older: list[Component] = []
+        opened = {interest.watched for interest in self.interests}
+        every_s = max(_REFRESH_S, len(self.components) / _REFRESHES_PER_S)
         for component in self.components.values():
-            if component.robot.online(now) is not component.sent_online or component.refreshed_at == float("-inf"):
+            age_s = now - component.refreshed_at
+            if component.robot.online(now) is not component.sent_online or age_s == float("inf"):
                 self._refresh(component, now)
-            elif now - component.refreshed_at >= _REFRESH_S and (component.live or component.sent_online is not None):
-                older.append(component)
+            elif age_s >= _REFRESH_S and (component.live or component.sent_online is not None):
+                if component.ref in opened:
+                    self._refresh(component, now)
+                elif age_s >= every_s:
+                    older.append(component)
         older.sort(key=lambda one: one.refreshed_at)
-        for component in older[: 1 + len(self.components) // 3]:
+        for component in older[: 1 + min(len(self.components), _REFRESHES_PER_S) // 3]:
             self._refresh(component, now)
 
     def _refresh(self, component: Component, now: float) -> None:
@@ -278,7 +294,10 @@ class Robots:
 
     def _add(self, ref: str, metric: str, message: Message) -> Component | None:
         known, live = self._is_known(ref), not message.retain
-        self.omitted += len(self.components) >= MAX_COMPONENTS
+        if len(self.components) >= MAX_COMPONENTS:
+            if not self.omitted:
+                log.warning("more than %d components at this broker: pages do not show all", MAX_COMPONENTS)
+            self.omitted += 1
         if self.components.refuses(Rank.at_most(metric, known=known, live=live)):
             return None
         rank = Rank.of_message(ref, message, known=known, live=live)

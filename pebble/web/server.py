@@ -51,6 +51,7 @@ log = logging.getLogger(__name__)
 TICK_S = 0.05
 PEOPLE_S = 0.5  # between two looks at whether people or sessions were changed
 _REFRESH_S = 0.25
+_MANY_WAIT = 16 * 1024  # bytes that the broker has not confirmed
 _ESTOP_METRIC = "web/estop"
 _STREAM_ADDRESS = "stream-address "  # what a setting of the server begins with; then the component
 _DAY_S = 24 * 3600
@@ -64,7 +65,7 @@ class Server:
         server = f"{settings.name}-{secrets.token_hex(2)}"
         self.broker = Broker(settings.broker)
         self.media_connection = MediaConnection(Broker(settings.broker, "pebble-web-media"))
-        self.robots, self.stops, self.driving = Robots(), Stops(), Driving(server)
+        self.robots, self.stops, self.driving = Robots(), Stops(self._has_sent), Driving(server)
         self.controls = Controls(self.driving, self._robot)
         self.driving.held_elsewhere = self.controls.elsewhere
         self.driving.pace_of = self._pace_of
@@ -180,6 +181,10 @@ class Server:
 
     def _send(self, messages: list[Message]) -> None:
         send(self.broker.publish, messages)
+
+    def _has_sent(self) -> bool:
+        """Whether little waits to be sent. To repeat the stop of a thousand robots before would only delay its end."""
+        return self.broker.transport.outgoing.waiting < _MANY_WAIT
 
     def stop(self, ref: str, name: str, session: Session, device: str, why: str, address: str = "") -> None:
         """An emergency stop of one component, or of all (""): sent at once, and repeated until it is confirmed."""

@@ -3,7 +3,7 @@
 The robot remembers the stop; see docs/emergency-stop.md.
 """
 
-from collections.abc import Collection, Iterable
+from collections.abc import Callable, Collection, Iterable
 
 from pebble.client.estop import COLLECT_S, Progress, RobotStop, StopSender
 from pebble.client.rank import Rank
@@ -30,9 +30,12 @@ _SENDING = {
 class Stops:
     """Publish what its methods return, and pass every message of the robots to ``receive``."""
 
-    def __init__(self) -> None:
+    def __init__(self, again: Callable[[], bool] = lambda: True) -> None:
+        """``again``: whether what was sent may be sent again; not while that still waits, behind which it would be."""
+        self._again, self._repeats = again, True
         self.changed: set[str] = set()  # robots whose view may be another one now
         self._senders: dict[str, tuple[StopSender, float]] = {}  # by name, the newest last
+        self._over: set[str] = set()  # those that send nothing more: to ask a thousand robots at each heartbeat is slow
         self._users: dict[str, str] = {}  # who has pressed each of them
         self._refs: dict[str, str] = {}  # for which robot; "": all
         self._shown: dict[str, tuple[str, str]] = {}  # by robot: progress and words, as pages see them
@@ -63,6 +66,7 @@ class Stops:
             if not ref or robot.base == ref:
                 for message in robot.remembered.values():
                     sender.receive(message, now)
+        self.changed |= set(sender.robots)
         return self.tick(now)
 
     def end(self, name: str) -> None:
@@ -83,20 +87,23 @@ class Stops:
             return []
         ref, messages = address.identity.base, []
         for name, (sender, began) in self._senders.items():
-            if self._refs[name] in ("", ref) and (not sender.finished or now - began < COLLECT_S):
+            if self._refs[name] in ("", ref) and (name not in self._over or now - began < COLLECT_S):
                 sender.receive(message, now)
-                messages += sender.tick_robot(ref, now)
+                messages += sender.tick_robot(ref, now, again=self._repeats)
                 self._note_progress(sender, ref)
         return messages
 
     def tick(self, now: float) -> list[Message]:
         """What to publish now; to be called every 50 ms."""
-        messages = []
+        messages, self._repeats = [], self._again()
         for name, (sender, began) in list(self._senders.items()):
-            messages += sender.tick(now)
-            for ref in sender.robots:
-                self._note_progress(sender, ref)
-            if sender.finished and now - began > _SHOWN_S:
+            if name not in self._over:
+                messages += sender.tick(now, again=self._repeats)
+                if sender.finished:  # else what has come of it was noted with the robot's message
+                    self._over.add(name)
+                    for ref in sender.robots:
+                        self._note_progress(sender, ref)
+            if name in self._over and now - began > _SHOWN_S:
                 self._remove(name)
         return messages
 
@@ -142,6 +149,7 @@ class Stops:
         sender, _ = self._senders.pop(name)
         sender.end()
         self.changed |= set(sender.robots)
+        self._over.discard(name)
         del self._users[name], self._refs[name]
 
     def _newest(self, ref: str) -> tuple[str, RobotStop | None]:

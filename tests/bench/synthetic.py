@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from pebble.bench.fleet import BROKER_CPU, BROKER_MB, PAGE_MB, PINS, VIEWER_CPU
 from pebble.bench.results import Cell, Judged, Results
 from pebble.bench.traffic import cells_of
 from pebble.recordings.traffic.results import (
@@ -158,8 +159,15 @@ def frames(small: bool = False) -> Results:
 
 
 def fleet() -> Results:
-    cells = [Cell(variant="mqtt", params={"robots": 100}, measure="command", unit="ms", rounds=latencies(2.0, 900, 1))]
-    return _results("fleet", cells, [])
+    """A broker that takes 10 % and 5 MB for each thousand robots, and a page that takes 40 % and 50 MB."""
+    each = {BROKER_CPU: ("%", 10), VIEWER_CPU: ("%", 40), BROKER_MB: ("MB", 5), PAGE_MB: ("MB", 50)}
+    cells = [
+        Cell(variant="mqtt", params={"robots": robots}, measure=name, unit=unit, rounds=[[slope * robots / 1000]])
+        for robots in (100, 300, 1000)
+        for name, (unit, slope) in each.items()
+    ]
+    pins = Cell(variant="mqtt", params={"robots": 1000}, measure=PINS, unit="ms", rounds=latencies(2.0, 900, 1))
+    return _results("fleet", [*cells, pins], [])
 
 
 def video() -> Results:

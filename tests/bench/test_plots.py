@@ -121,7 +121,7 @@ def test_a_quick_run_is_marked_in_the_picture(tmp_path: Path) -> None:
 def test_a_distribution_ends_below_100_percent_by_what_was_lost() -> None:
     whole = Cell(variant="mqtt", measure="way", unit="ms", rounds=[[1.0] * 90])
     lossy = Cell(variant="mqtt", measure="way", unit="ms", rounds=[[1.0] * 90], figures={"sent": 100})
-    (all_of_it,), (most_of_it,) = (pictures(Results(bench="fleet", cells=[cell])) for cell in (whole, lossy))
+    (all_of_it,), (most_of_it,) = (pictures(Results(bench="estop", cells=[cell])) for cell in (whole, lossy))
     assert "lost ones included" in most_of_it.caption
     for picture, top in ((all_of_it, 100), (most_of_it, 90)):
         (curve, *_) = picture.make().axes[0].get_lines()

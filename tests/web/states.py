@@ -143,6 +143,21 @@ def goob(now: int) -> list[Value]:
     ]
 
 
+def thousand(now: int) -> list[Value]:
+    """A thousand robots, of which some are stopped, driven, away or low."""
+    values = []
+    for number in range(1, 1001):
+        ref = f"pebble/robots/robot-{number:04d}"
+        values += robot(now, ref, "mqtt", 7.2 + 0.001 * number, video=False)
+        if number % 97 == 0:
+            values.append((ref, "web/estop", estop(now, "eve on phone"), 0))
+        if number % 53 == 0:
+            values.append((ref, "web/driver", driver("bob", "phone"), 0))
+        if number % 41 == 0:
+            values.append((ref, "web/liveness", liveness(online=False, silent_s=300.0), 0))
+    return values
+
+
 def fleet(now: int) -> list[Value]:
     """Four robots, one of them off, and three components of other types."""
     lamp = liveness(latency_ms=900.0, whole_seconds=True)
@@ -370,6 +385,7 @@ STATES: dict[str, State] = {
     "fleet-stopped": of("/", stopped(GOOB, "eve on phone"), stopped(FRED, "eve on phone", why="button, all")),
     "fleet-undriveable": of("/", *UNDRIVEABLE),
     "undriveable": of(GOOB_PATH, MINE, *UNDRIVEABLE),
+    "fleet-thousand": State("/", thousand),
     "fleet-empty": State("/", lambda _now: []),
     "fleet-lost": State("/", fleet, silent=True),
     "fleet-watching": of("/?watch"),

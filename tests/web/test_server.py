@@ -13,7 +13,7 @@ from pebble.fleet.audit import Audit
 from pebble.fleet.people import People
 from pebble.transports import Message, MqttSettings
 from pebble.web import robots as robots_module
-from pebble.web.robots import Robots
+from pebble.web.robots import Interest, Robots
 from pebble.web.server import Server
 from tests.web.served import FREE
 
@@ -96,3 +96,42 @@ def test_pages_get_what_a_stranger_subscribes_to_until_it_publishes_what_it_can_
     robots.receive(published(GOOB, "capabilities", _CAPABILITIES), 2.0)
     robots.receive(published(GOOB, "online", {"t": 2, "subscribes": ["incoming/drive-values"]}), 3.0)
     assert "announced" not in shown()
+
+
+def test_many_are_refreshed_rarely_and_the_open_one_and_the_dead_one_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Forty at ten a second: each every four seconds."""
+    monkeypatch.setattr(robots_module, "_REFRESHES_PER_S", 10)
+    refs = [f"pebble/robots/r{number}" for number in range(40)]
+    opened, dead, died = refs[7], refs[8], 10.0
+    robots, page = Robots(), Interest(lambda: None)
+    robots.join(page)
+    robots.watch(page, opened)
+    seen: dict[str, list[tuple[float, bool | None]]] = {ref: [] for ref in refs}
+    for now in (quarter / 4 for quarter in range(4 * 20)):
+        for ref in refs if now < died else [one for one in refs if one != dead]:
+            robots.receive(published(ref, "online", {"t": 1}), now)
+        robots.refresh(now + now / 1000)  # an age that did not change is not sent
+        taken, _ = robots.take(page, now, large=False)
+        for ref, _metric, value, _age in (one for one in taken if one[1] == "web/liveness"):
+            seen[ref].append((now, json.loads(bytes(value))["online"]))
+    late = {ref: [now for now, _ in found if now >= 4.0] for ref, found in seen.items()}
+    assert len(late[opened]) == 16
+    assert {len(found) for ref, found in late.items() if ref not in (opened, dead)} <= {3, 4, 5}
+    assert next(now for now, online in seen[dead] if online is False) - died <= 1.5 + 0.25
+    assert not [now for now, online in seen[dead] if online and now > died + 1.75]
+
+
+def test_what_does_not_fit_into_a_message_waits_behind_what_is_open(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(robots_module, "MAX_STATE_BYTES", 1000)
+    refs = [f"pebble/robots/r{number}" for number in range(40)]
+    robots, page = Robots(), Interest(lambda: None)
+    for ref in refs:
+        robots.receive(published(ref, "capabilities", _CAPABILITIES), 1.0)
+    robots.join(page)
+    robots.watch(page, refs[30])
+    parts = []
+    while not parts or page.more:
+        parts.append([ref for ref, *_ in robots.take(page, 1.0, large=False)[0]])
+    assert parts[0][0] == refs[30]
+    assert len(parts) > 3
+    assert sorted(ref for part in parts for ref in part) == sorted(refs)

@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from pebble.client.estop import new_name
+from pebble.client.estop import GIVE_UP_S, StopSender, new_name
 from pebble.client.page_settings import WebSettings
 from pebble.contract import CAPABILITIES, ESTOP, ONLINE, codec
 from pebble.contract.payloads import Capabilities, Heartbeat
@@ -60,6 +60,30 @@ def test_other_stops_end_none_that_is_repeated(
         press(stops, other, user)
     repeated = [message.topic for message in [*stops.tick(1.6), *stops.receive(capabilities_of(A), 1.7)]]
     assert ESTOP.topic(A) in repeated
+
+
+def test_a_stop_is_repeated_once_what_was_sent_has_gone_and_sent_first_in_any_case() -> None:
+    """Repeated while it still waits, the stop of a thousand robots holds up their confirmations for seconds."""
+    waits = [True]
+    stops = Stops(lambda: not waits[0])
+    stops.press(A, FIRST, by="ann", why="", now=1.0, known=[], user="ann")
+    all_ = stops.press("", new_name(), by="ann", why="", now=1.0, known=[], user="ann")
+    assert all_ == []
+    assert ESTOP.topic(B) in [one.topic for one in stops.receive(capabilities_of(B), 1.1)]
+    assert (stops.tick(2.0), stops.receive(capabilities_of(B), 2.0)) == ([], [])
+    waits[0] = False
+    assert {ESTOP.topic(A), ESTOP.topic(B)} <= {one.topic for one in stops.tick(2.1)}
+
+
+def test_a_stop_that_is_over_asks_none_of_its_robots_at_each_heartbeat(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A thousand that are stopped would cost a thousand looks for each of 4,000 heartbeats a second."""
+    stops, asked = Stops(), list[StopSender]()
+    press(stops, "")
+    stops.receive(capabilities_of(A), 1.0)
+    stops.tick(1.0 + GIVE_UP_S)
+    monkeypatch.setattr(StopSender, "finished", property(lambda sender: asked.append(sender) or True))
+    stops.receive(capabilities_of(A), 1.0 + GIVE_UP_S)
+    assert (stops.tick(1.0 + GIVE_UP_S), asked) == ([], [])
 
 
 def test_a_stop_that_makes_room_for_others_is_shown_no_longer() -> None:

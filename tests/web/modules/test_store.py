@@ -30,6 +30,13 @@ RUN: Rows = {
         store.set("a", "m", 1); store.set("a", "m", 2); store.set("a", "n", 1); frame();
         const first = [...calls]; store.set("a", "m", 3); frame();
         result = [first, calls];""", [["m"], ["m", "m"]]),
+    "a metric of any component is noticed, also that it goes": ("""
+        store.subscribe(null, "m", () => calls.push(store.refs().join()));
+        store.set("a", "m", 1); store.set("b", "m", 1); frame();
+        store.set("a", "n", 1); frame();
+        store.drop("b", "m"); frame();
+        store.remove("a"); frame();
+        result = calls;""", ["a,b", "a,b", "b"]),
     "a subscriber that fails keeps no other from being called": ("""
         process.on("uncaughtException", (error) => calls.push(error.message));
         store.subscribe("a", "m", () => { throw new Error("bad"); });

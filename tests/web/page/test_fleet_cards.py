@@ -1,6 +1,7 @@
 """The cards of the fleet: what a press opens, many robots in groups, and the first steps of a newcomer."""
 
 import pytest
+from playwright.sync_api import Locator
 
 from tests.web.canned import CannedServer, Show, State
 from tests.web.states import GOOB, STATES, estop, robot
@@ -61,3 +62,57 @@ def test_robots_without_a_camera_show_their_face(show: Show) -> None:
         assert opened.test("card-minilamp").locator(".thumbnail use").get_attribute("href", timeout=3000)
         assert "no camera" in opened.test("card-minilamp").inner_text()
         assert opened.test("card-goob").get_by_text("live").is_visible()
+
+
+def shown(cards: Locator) -> list[str]:
+    return cards.locator("h2").all_inner_texts()
+
+
+def test_of_a_thousand_only_those_on_the_screen_are_drawn(show: Show) -> None:
+    with show(STATES["fleet-thousand"]) as opened:
+        page, cards, online = (
+            opened.page,
+            opened.page.locator(".fleet-card"),
+            opened.page.get_by_label("Online", exact=True).locator("li"),
+        )
+        assert opened.until(lambda: opened.test("show-all").text_content().split() == ["All", "1000"])
+        assert opened.until(lambda: 10 < cards.count() < 90)
+        assert page.evaluate("document.querySelectorAll('*').length") < 2500
+        total = online.first.get_attribute("aria-setsize")
+        page.evaluate(
+            "scrollTo(0, document.body.scrollHeight - innerHeight - document.querySelector('.away-rows').offsetHeight)"
+        )
+        assert opened.until(lambda: online.last.get_attribute("aria-posinset") == total)
+        assert cards.count() < 90
+        page.keyboard.press("End")
+        assert opened.until(lambda: "robot-0984" in page.get_by_label("Offline", exact=True).inner_text())
+
+
+def test_one_of_a_thousand_is_found_by_name_driver_and_state(show: Show) -> None:
+    with show(STATES["fleet-thousand"]) as opened:
+        cards = opened.page.locator(".fleet-card")
+        opened.test("filter").fill("0053 BOB")
+        assert opened.until(lambda: shown(cards) == ["robot-0053"])
+        opened.test("card-robot-0053").get_by_role("link").click()
+        assert opened.until("location.pathname !== '/'", 3)
+        opened.page.go_back()
+        assert opened.until(lambda: shown(cards) == ["robot-0053"])  # what was looked for is kept
+        opened.test("filter").fill("")
+        opened.test("show-stopped").click()
+        assert opened.until(lambda: len(shown(cards)) == 10)
+        opened.test("show-offline").click()
+        assert opened.until(lambda: cards.count() == 0 and opened.page.locator(".away-row").count() > 5)
+
+
+def test_a_stop_of_all_shows_how_many_have_confirmed_it(show: Show) -> None:
+    with show(STATES["fleet-thousand"]) as opened:
+        opened.test("show-all").wait_for()
+        opened.test("stop-all").click()
+        confirm = """(number) => pebble.store.refs().forEach((ref, at) => pebble.store.set(ref, "web/estop", {
+          ...pebble.store.get(ref, "web/estop").value, latched: true, stop: pebble.estop.pressed.stop,
+          sending: at < number - 3 ? "confirmed" : "sent" }))"""
+        opened.page.evaluate(confirm, 1000)
+        assert opened.until(lambda: opened.test("tally").inner_text() == "STOP ALL: 997 of 1000 confirmed.")
+        opened.page.evaluate(confirm.replace("number - 3", "number"), 1000)
+        assert opened.until(lambda: opened.test("tally").inner_text() == "STOP ALL: all 1000 confirmed.")
+        assert opened.page.locator(".stops .banner").count() <= 50

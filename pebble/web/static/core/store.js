@@ -97,12 +97,17 @@ export class Store {
       metrics.set(metric, new Value(this, value, receivedAt));
       this.mark("\n" + ref);
     }
+    this.markMetric(ref, metric);
+  }
+
+  markMetric(ref, metric) {
     this.mark(metric + "\n" + ref);
+    this.mark(metric + "\n");
   }
 
   /** @param {string} ref */
   remove(ref) {
-    for (const metric of this.metrics(ref)) this.mark(metric + "\n" + ref);
+    for (const metric of this.metrics(ref)) this.markMetric(ref, metric);
     if (this.components.delete(ref)) {
       this.mark("\n");
       this.mark("\n" + ref);
@@ -113,7 +118,7 @@ export class Store {
   drop(ref, metric) {
     if (!this.components.get(ref)?.delete(metric)) return;
     this.mark("\n" + ref);
-    this.mark(metric + "\n" + ref);
+    this.markMetric(ref, metric);
   }
 
   /** Remove everything: after a new connection the server sends all that there is. */
@@ -122,12 +127,12 @@ export class Store {
   }
 
   /**
-   * Call ``fn`` after changes: of one metric; with ``metric`` null when a component receives a metric it had not, or
+   * Call ``fn`` after changes: of one metric, with ``ref`` null of any component; with ``metric`` null when a component receives a metric it had not, or
    * loses one; with both null when a component appears or disappears.
    * @param {string | null} ref @param {string | null} metric @param {() => void} fn @returns {() => void} unsubscribe
    */
   subscribe(ref, metric, fn) {
-    const key = ref === null ? "\n" : `${metric ?? ""}\n${ref}`;
+    const key = `${metric ?? ""}\n${ref ?? ""}`;
     let group = this.subscribers.get(key);
     if (!group) this.subscribers.set(key, (group = new Set()));
     group.add(fn);

@@ -11,8 +11,11 @@ import { clockTime, roughly } from "./parts/words.js";
 const NOTICE_MS = 6000;
 const NO_ANSWER_MS = 1500;
 const MOST_ALSO = 3; // others that are named
+const MOST_LISTED = 50;
+const STOP = "web/estop";
 const HINT_MS = 3000;
 const SHOWN_MS = 60_000; // a finished stop
+const TALLY_MS = 10_000;
 
 /** Whether the screen has a place of its own for them: then it is not said twice. */
 const places = new (class extends Model {
@@ -124,33 +127,38 @@ export function StopChip() {
   const { connection, store } = usePage();
   useModel(connection, (one) => one.isOpen);
   useTick(500);
-  const found = useStops(useRefs()).sort();
-  const refs = found.filter((ref) => wants(store.get(ref, "web/estop")));
+  const refs = useRefs(STOP).filter((ref) => wants(store.get(ref, STOP))).sort();
   if (!refs.length || !connection.isOpen) return null;
-  const bad = refs.filter((ref) => progressOf(store, ref)?.kind === "bad").length;
-  const latched = refs.filter((ref) => store.get(ref, "web/estop").value.latched).length;
-  const words = bad ? `${bad} not confirmed` : latched ? `${latched} stopped` : `${refs.length} stopping`;
+  const isBad = (ref) => progressOf(store, ref)?.kind === "bad";
+  const bad = refs.filter(isBad);
+  const latched = refs.filter((ref) => store.get(ref, STOP).value.latched).length;
+  const words = bad.length ? `${bad.length} not confirmed` : latched ? `${latched} stopped` : `${refs.length} stopping`;
+  const first = [...new Set([...bad, ...refs])].slice(0, MOST_LISTED);
   const chip = html`<span class="chip stopped"><${Icon} name="stop" />${words}</span>`;
   return html`<${Drop} test="stopped" className="stops" summary=${chip}>
-    ${refs.map((ref) => html`<${StopBanner} key=${ref} at=${ref} />`)}
+    ${first.map((ref) => html`<${StopBanner} key=${ref} at=${ref} />`)}
+    ${refs.length > first.length && html`<p class="also">${refs.length - first.length} more: their cards open them.</p>`}
   <//>`;
 }
 
+const unconfirmed = (store) => store.refs().filter((ref) => progressOf(store, ref)?.kind === "bad").sort();
+
 /** Where no component is open: the first that does not confirm its stop. */
 function Unconfirmed() {
-  const { store } = usePage();
+  const { estop, store } = usePage();
   useTick(500);
-  const refs = useStops(useRefs()).filter((ref) => progressOf(store, ref)?.kind === "bad").sort();
+  useRefs(STOP);
+  const refs = unconfirmed(store);
   if (!refs.length) return null;
   const more = refs.length > 1 ? ` So for ${refs.length - 1} more.` : "";
-  return html`<${Banner} kind="bad" icon="stop"><p role="alert">${progressOf(store, refs[0]).text}${more}</p><//>`;
+  return html`<${Banner} kind="bad" icon="stop"><p role="alert">${tally(estop, store)} ${progressOf(store, refs[0]).text}${more}</p><//>`;
 }
 
 function StopBanner({ at }) {
   const { commands, connection } = usePage();
   useModel(connection);
   useTick(500);
-  const entry = useMetric(at, "web/estop");
+  const entry = useMetric(at, STOP);
   const view = entry?.value;
   const name = useName(at);
   const [asked, ask] = useState(false);
@@ -214,7 +222,7 @@ const wants = (entry) => Boolean(entry && (entry.value.latched === true || stopP
 
 /** @param {any} store @param {string} ref @returns {{kind: string, text: string} | null} what became of its stop */
 export function progressOf(store, ref) {
-  const entry = store.get(ref, "web/estop");
+  const entry = store.get(ref, STOP);
   return entry ? stopProgress(entry.value, nameIn(store, ref), entry.age) : null;
 }
 
@@ -255,8 +263,7 @@ function resetReason(connection, named) {
 /** Others than the open one. */
 function AlsoStopped({ at }) {
   const { store } = usePage();
-  const others = useStops(useRefs().filter((ref) => ref !== at));
-  const stopped = others.filter((ref) => store.get(ref, "web/estop")?.value?.latched === true).sort();
+  const stopped = useRefs(STOP).filter((ref) => ref !== at && store.get(ref, STOP)?.value?.latched === true).sort();
   if (!stopped.length) return null;
   return html`<p class="also links">
     <${Icon} name="stop" /><span>Also stopped:</span> ${stopped.slice(0, MOST_ALSO).map(
@@ -275,16 +282,15 @@ function SlowLink({ at }) {
     html`<p class="also slow" data-test="slow-link">Slow connection: commands take ${(ms / 1000).toFixed(1)} s</p>`;
 }
 
-/** Draw again when the stop of one of them changes. @param {string[]} refs @returns {string[]} */
-function useStops(refs) {
-  const { store } = usePage();
-  const [, redraw] = useState(0);
-  const key = refs.join();
-  useEffect(() => {
-    const stops = refs.map((ref) => store.subscribe(ref, "web/estop", () => redraw((n) => n + 1)));
-    return () => stops.forEach((stop) => stop());
-  }, [store, key]);
-  return refs;
+const stops = (store) => store.refs().map((ref) => store.get(ref, STOP)?.value).filter(Boolean);
+
+/** How many have confirmed a stop of all that was pressed here; null: none was. */
+function tally({ pressed }, store) {
+  if (!pressed || pressed.ref || Date.now() - pressed.at > SHOWN_MS) return null;
+  const sent = stops(store).filter(({ stop, sending }) => stop === pressed.stop && sending !== "spared");
+  const confirmed = sent.filter(({ sending }) => sending === "confirmed").length;
+  return sent.length > 1 &&
+    html`<b data-test="tally">STOP ALL: ${confirmed === sent.length ? "all" : `${confirmed} of`} ${sent.length} confirmed.</b>`;
 }
 
 /** A stop that was pressed here and of which no robot shows anything yet. */
@@ -294,11 +300,11 @@ function PressBanner() {
   const age = pressed ? Date.now() - pressed.at : Infinity;
   useTick(age < SHOWN_MS ? 250 : 5000);
   if (!pressed || age > SHOWN_MS) return null;
-  const known = store.refs().some((ref) => {
-    const view = store.get(ref, "web/estop")?.value;
-    return view && (view.stop === pressed.stop || (view.latched && age > NO_ANSWER_MS));
-  });
-  if (known && connection.isOpen) return null;
+  const known = stops(store).some(({ stop, latched }) => stop === pressed.stop || (latched && age > NO_ANSWER_MS));
+  if (known && connection.isOpen) {
+    const words = age < TALLY_MS && !unconfirmed(store).length && tally(estop, store);
+    return words && html`<${Banner} kind="warn" icon="stop"><p role="status">${words}</p><//>`;
+  }
   const whom = pressed.ref ? nameIn(store, pressed.ref) : "all robots";
   if (age < NO_ANSWER_MS) {
     return html`<${Banner} kind="warn" icon="stop"><p role="alert">STOP of ${whom}: sent…</p><//>`;

@@ -11,9 +11,11 @@ import {
   useMetric,
   useModel,
   usePage,
+  usePart,
   useRef,
   useRefs,
   useState,
+  styled,
   useTick,
   useValue,
 } from "../parts/hooks.js";
@@ -27,10 +29,14 @@ import { battery, driverName, inner, isObject, kindOf, nameOf, roughly, typeOf, 
 const THUMBNAIL_MS = 10_000;
 const LIVE_MS = 12_000; // a thumbnail that young is of now
 const DENSE = 13; // so many components are shown in small cards, and by what they need
+const MANY = 100; // beyond, only those on the screen are drawn
 const NEEDS_MS = 10_000; // so long a card stays among those that need a look
 const LOW_PERCENT = 20;
 const isRobot = (ref) => typeOf(ref) === "robots";
 const SORTS = { name: "name", type: "type", battery: "battery" };
+
+const MANY_PART = styled(async () => (await import("./many.js")).Many, "many.css");
+const kept = { filter: "" }; // while a robot is looked at
 
 export function Fleet() {
   const { connection, settings, store } = usePage();
@@ -39,20 +45,24 @@ export function Fleet() {
   useTick(1000); // robots come and go
   const refs = useRefs();
   const omitted = useValue("", "web/broker")?.robots_omitted ?? 0;
-  const [filter, setFilter] = useState("");
-  const online = refs.filter((ref) => isPresent(store, ref));
-  const away = refs.filter((ref) => !isPresent(store, ref) && !settings.forgotten.has(ref));
+  const [filter, setFilter] = useState(kept.filter);
+  kept.filter = filter;
+  const present = new Set(refs.filter((ref) => isPresent(store, ref)));
+  const online = [...present];
+  const away = refs.filter((ref) => !present.has(ref) && !settings.forgotten.has(ref));
   useEffect(() => {
     online.forEach((ref) => settings.forgotten.has(ref) && settings.forget(ref, false));
   }, [online.join()]);
-  const matches = (ref) => `${ref} ${nameIn(store, ref)}`.toLowerCase().includes(filter.trim().toLowerCase());
+  const matches = matcher(store, filter);
   const shown = sorted(store, online.filter(matches), settings.sort);
   const shownAway = away.filter(matches).sort();
   const total = online.length + away.length;
-  const robots = refs.filter((ref) => isRobot(ref) && (online.includes(ref) || away.includes(ref)));
-  const present = robots.filter((ref) => online.includes(ref));
+  const robots = [...online, ...away].filter(isRobot);
+  const there = robots.filter((ref) => present.has(ref));
   const others = total - robots.length;
   const dense = total >= DENSE;
+  const many = total > MANY;
+  const { body: Many } = usePart(MANY_PART, many);
   const needing = useNeeding(store, dense ? shown : []);
   const groups = [
     { title: dense ? "Need a look" : "", list: shown.filter((ref) => dense ? needing.has(ref) : isRobot(ref)) },
@@ -64,30 +74,44 @@ export function Fleet() {
         <h1>
         ${total === 0
           ? "Robots"
-          : `${robots.length} ${robots.length === 1 ? "robot" : "robots"}${connection.isOpen ? `, ${present.length} online` : ""}`}
+          : `${robots.length} ${robots.length === 1 ? "robot" : "robots"}${connection.isOpen ? `, ${there.length} online` : ""}`}
         ${others > 0 && html`<span class="dim"> and ${others} ${others === 1 ? "other" : "others"}</span>`}
         </h1>
         <${Bands} at="" />
       </div>
-      ${total > 0 ? html`<${FleetTools} filter=${filter} onFilter=${setFilter} />` : html`<${RecordingsLink} />`}
+      ${total > 0 ? html`<${FleetTools} filter=${filter} onFilter=${setFilter} many=${many} />` : html`<${RecordingsLink} />`}
     </div>
     ${omitted > 0 &&
     html`<p class="dim" data-test="omitted">
-      Too much is sent at this broker: ${omitted} messages of further components, or values, are not shown. STOP ALL
-      reaches all.
+      Too much is sent at this broker: beside these ${total}, ${omitted} messages of further components, or values, are
+      not shown. STOP ALL reaches all.
     </p>`}
     ${total === 0 && html`<${Empty} />`}
     ${total > 0 && !shown.length && !shownAway.length && html`<p class="empty">Nothing matches “${filter}”.</p>`}
-    ${groups.map(({ title, list }) => html`<${Group} key=${title} title=${title} dense=${dense} refs=${list} />`)}
-    ${total > 0 && !dense && !WATCHES && html`<${FirstTime} refs=${present} />`}
-    ${shownAway.length > 0 &&
+    ${many
+      ? Many && html`<${Many} groups=${groups} away=${shownAway} card=${plainCardOf} row=${rowOf} />`
+      : groups.map(({ title, list }) => html`<${Group} key=${title} title=${title} dense=${dense} refs=${list} />`)}
+    ${total > 0 && !dense && !WATCHES && html`<${FirstTime} refs=${there} />`}
+    ${!many && shownAway.length > 0 &&
     html`<section class="away" aria-labelledby="away-title">
       <h2 id="away-title">Offline</h2>
       <ul>
-        ${shownAway.map((ref) => html`<${AwayRow} key=${ref} at=${ref} />`)}
+        ${shownAway.map((ref) => html`<li key=${ref} class="away-item">${rowOf(ref)}</li>`)}
       </ul>
     </section>`}
   </div>`;
+}
+
+/** Whether all words are found in what is known of a component. @returns {(ref: string) => boolean} */
+function matcher(store, filter) {
+  const words = filter.toLowerCase().split(/\s+/).filter(Boolean);
+  const value = (ref, metric) => store.get(ref, metric)?.value;
+  const text = (ref) => {
+    const { name, description } = looksOf(ref, value(ref, "capabilities"));
+    const is = [isPresent(store, ref) ? "online" : "offline", value(ref, "web/estop")?.latched ? "stopped" : ""];
+    return [ref, name, description, value(ref, "web/driver")?.by, value(ref, "web/host")?.host, ...is].join(" ").toLowerCase();
+  };
+  return (ref) => !words.length || ((all) => words.every((word) => all.includes(word)))(text(ref));
 }
 
 /** Components of which it is not yet known whether they are there are shown as cards, too. */
@@ -102,10 +126,12 @@ function sorted(store, refs, by) {
     const value = inner(store.get(ref, "charging-level")?.value);
     return typeof value === "number" ? value : Infinity;
   };
-  const robotsFirst = (ref) => `${typeOf(ref) === "robots" ? 0 : 1} ${nameIn(store, ref).toLowerCase()}`;
+  const robotsFirst = (ref) => `${isRobot(ref) ? 0 : 1} ${nameIn(store, ref).toLowerCase()}`;
   const keys = { name: robotsFirst, type: (ref) => `${typeOf(ref)} ${nameIn(store, ref).toLowerCase()}`, battery: level };
   const key = keys[by] ?? robotsFirst;
-  return [...refs].sort((a, b) => (key(a) < key(b) ? -1 : key(a) > key(b) ? 1 : a < b ? -1 : 1));
+  const keyed = refs.map((ref) => ({ ref, key: key(ref) }));
+  keyed.sort((a, b) => (a.key < b.key ? -1 : a.key > b.key ? 1 : a.ref < b.ref ? -1 : 1));
+  return keyed.map(({ ref }) => ref);
 }
 
 /** Those which a person should look at: at once, and for a while after the reason is gone. @returns {Set<string>} */
@@ -127,14 +153,14 @@ function needs(store, ref) {
   );
 }
 
-function FleetTools({ filter, onFilter }) {
+function FleetTools({ filter, onFilter, many }) {
   const { panels, settings } = usePage();
   return html`<div class="fleet-tools">
     <input
       type="search"
       data-test="filter"
       placeholder="Filter"
-      aria-label="Filter by name"
+      aria-label="Filter by name, driver or state"
       value=${filter}
       onInput=${(event) => onFilter(event.currentTarget.value)}
     />
@@ -155,6 +181,7 @@ function FleetTools({ filter, onFilter }) {
           </select></label
         >
         ${!WATCHES &&
+        !many &&
         html`<label class="check"
           ><input
             type="checkbox"
@@ -263,7 +290,8 @@ function HostFact({ at }) {
   return view && !view.first && html`<li class="fact dim">broker ${view.host}</li>`;
 }
 
-function FleetCard({ at }) {
+/** ``plain``: without a picture. @param {{at: string, plain?: boolean}} props */
+function FleetCard({ at, plain }) {
   const { commands, settings, connection } = usePage();
   useModel(settings);
   useModel(connection, (one) => one.state);
@@ -274,7 +302,7 @@ function FleetCard({ at }) {
   const id = nameOf(at);
   const called = looks.name.toLowerCase() === id.toLowerCase() ? "" : visible(id);
   const what = hasFace(at) ? looks.description : kindOf(at);
-  const pictured = (settings.thumbnails || WATCHES) && hasFace(at);
+  const pictured = (settings.thumbnails || WATCHES) && hasFace(at) && !plain;
   return html`<article
     class=${`fleet-card tint-${looks.colour} ${estop?.latched ? "is-stopped" : ""}`}
     data-test=${`card-${id}`}
@@ -412,7 +440,7 @@ function AwayRow({ at }) {
         ? heartbeat.t
         : null;
   const since = seen === null ? "never seen" : `last seen ${shortTime(seen)} (${roughly(store.now() - seen)} ago)`;
-  return html`<li class=${`away-row tint-${looks.colour}`}>
+  return html`<div class=${`away-row tint-${looks.colour}`}>
     <${Badge} at=${at} looks=${looks} />
     <span class="away-name"
       ><${RouteLink} to=${at}>${looks.name}<//> <span class="dim">${since}</span> ${level &&
@@ -426,7 +454,7 @@ function AwayRow({ at }) {
     >
       Forget
     </button>
-  </li>`;
+  </div>`;
 }
 
 /**
@@ -436,7 +464,7 @@ function AwayRow({ at }) {
 function Group({ title, dense, refs }) {
   const cards = useRef(new Map());
   const old = cards.current;
-  cards.current = new Map(refs.map((ref) => [ref, old.get(ref) ?? cardOf(ref)]));
+  cards.current = new Map(refs.map((ref) => [ref, old.get(ref) ?? html`<li key=${ref}>${cardOf(ref)}</li>`]));
   return html`<section aria-label=${title || "Robots"}>
     ${title && html`<h2 class="fleet-group">${title}</h2>`}
     <ul class=${`fleet-cards ${dense ? "dense" : ""}`}>
@@ -445,4 +473,6 @@ function Group({ title, dense, refs }) {
   </section>`;
 }
 
-const cardOf = (ref) => html`<li key=${ref}><${Boundary} what=${nameOf(ref)}><${FleetCard} at=${ref} /><//></li>`;
+const cardOf = (ref, plain = false) => html`<${Boundary} what=${nameOf(ref)}><${FleetCard} at=${ref} plain=${plain} /><//>`;
+const plainCardOf = (ref) => cardOf(ref, true);
+const rowOf = (ref) => html`<${AwayRow} at=${ref} />`;

@@ -52,8 +52,8 @@ export const useMetric = (ref, metric) => useStore(ref, metric).get(ref, metric)
  */
 export const useValue = (ref, metric) => useMetric(ref, metric)?.value;
 
-/** @returns {string[]} all components */
-export const useRefs = () => useStore(null, null).refs();
+/** @param {string | null} [metric] draw again when it changes at any; else when one comes or goes @returns {string[]} all components */
+export const useRefs = (metric = null) => useStore(null, metric).refs();
 
 /** @param {string} ref @returns {string[]} the metrics that were received of it */
 export const useMetrics = (ref) => useStore(ref, null).metrics(ref);
