@@ -185,11 +185,10 @@ def reset_waits(component: Component) -> CheckResult:
     """The stick is held down meanwhile. A zero of another ends no wait while one has control."""
     with _at_the_wheel(component) as wheel:
         stop(component, secrets.token_hex(8))
-        began = time.monotonic()
+        began, _ = wheel.drive(2 * _STEP_S)  # from before the reset on: a pause would end the wait
         reset(component)
-        is_free = component.wait(lambda: not component.view.latched, ANSWER_S)
+        wheel.drive(DRIVES_S / 2)
         if component.view.controlled:
-            wheel.drive(DRIVES_S / 2)
             wheel.send(0, key=_OTHER_KEY)
         wheel.drive()
         outcome = _moved(
@@ -201,7 +200,9 @@ def reset_waits(component: Component) -> CheckResult:
         if outcome.state is State.OK:
             wheel.send(0)
             outcome = _rest(component, *wheel.drive(), RESTS_S)
-    return outcome if is_free else failed("a reset does not end the stop", "end it on incoming/estop-reset")
+    if component.wait(lambda: not component.view.latched, ANSWER_S):
+        return outcome
+    return failed("a reset does not end the stop", "end it on incoming/estop-reset")
 
 
 def not_a_number(component: Component) -> CheckResult:
