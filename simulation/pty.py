@@ -62,7 +62,7 @@ class PtyMcu:
         self.symlink = symlink
         self.trace = Trace(trace)
         self.dropped = 0  # bytes of the MCU that no host received
-        self._tells_late = trace is not None
+        self._traces_late = trace is not None
         self._on_relay = on_relay
         self._mcu = SimulatedMcu(
             kind,
@@ -177,7 +177,7 @@ class PtyMcu:
         while not self._stopping:
             self._wait()
             before, looked = looked, time.monotonic()
-            if self._tells_late and looked - before > self._tick_s + _LATE_S:
+            if self._traces_late and looked - before > self._tick_s + _LATE_S:
                 self.trace.add(Entry(round(looked * 1e9), "late", f"{looked - before:.3f}"))
             if self._master is not None:
                 self._poll_host(self._master)

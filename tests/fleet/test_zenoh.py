@@ -313,7 +313,7 @@ def test_what_an_account_asks_of_the_hub_holds_up_no_one_who_comes(hall: Hall, w
 
 
 def memory(pid: int) -> int:
-    """Of a process, in MB."""
+    """Return the MB that a process has in memory."""
     (line,) = [one for one in Path(f"/proc/{pid}/status").read_text().splitlines() if one.startswith("VmRSS")]
     return int(line.split()[1]) // 1024
 

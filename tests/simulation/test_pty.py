@@ -158,7 +158,7 @@ def test_the_program(tmp_path: Path) -> None:
     assert not symlink.is_symlink()
 
 
-def test_what_kept_it_from_its_port_is_in_the_file(tmp_path: Path) -> None:
+def test_how_long_it_did_not_look_at_its_port_is_in_the_file(tmp_path: Path) -> None:
     with PtyMcu("goob", tmp_path / "port", trace=tmp_path / "trace") as mcu:
         mcu._call(lambda: time.sleep(0.2))
         assert until(lambda: max(entry.late_s for entry in read_trace(tmp_path / "trace")) >= 0.2)
