@@ -36,7 +36,7 @@ def flood(session: zenoh.Session, plan: Plan) -> None:
     """What has the first priority and waits for room, as no client of ours sends it; a line once it flows."""
     first: dict[str, Any] = {"priority": zenoh.Priority.REAL_TIME, "congestion_control": zenoh.CongestionControl.BLOCK}
     publishers = [session.declare_publisher(one, **first) for one in plan.topics]
-    own = dict.fromkeys(map(str, range(20_000)), 1)
+    own = dict.fromkeys(map(str, range(12_000)), 1)
     hello = wire.encode(wire.Hello(f"{plan.name}{wire.OF}1", 0, None, own))
     asked: dict[str, tuple[str, bytes]] = {
         "hellos": (wire.asked(wire.HELLO, plan.name), hello),

@@ -52,8 +52,8 @@ QUEUE_LIMIT = 10_000  # events waiting for the hub's thread; beyond it their sen
 QUERIES = 1000  # that wait for what is on its way; further ones are answered at once
 ASKED = 2000  # queries that wait for the hub's thread, which does all else first; beyond it …
 _ASKERS = 8  # … their senders wait, each connection in its turn; more would take the threads that receive stops
-HELLOS = 20  # of one account that wait
-HELLO_BYTES = 256 << 10  # of one; some 4,000 retained topics
+HELLOS = 8  # of one account that wait
+HELLO_BYTES = 128 << 10  # of one; some 2,000 retained topics
 PATIENCE_S = 0.5  # a query waits this long for retained messages that are known to be on their way
 _LOOK_S = 0.25  # a hub among others looks so often whether it stood still
 
@@ -321,7 +321,7 @@ class HubWorker:
                 self._hellos -= Counter((account,))
             work(query)
 
-        self.post(greet)
+        self.post(greet, _QUERY)
 
     def _run(self) -> None:
         turn = clock.since_boot()
