@@ -27,6 +27,7 @@ from pebble.simulation.trace import Entry, Event, Trace, motors_entry
 log = logging.getLogger(__name__)
 
 _NO_HOST_S = 0.005  # a master whose slave is closed is always "ready", so it is polled with this period
+_LATE_S = 0.03  # that a turn of the MCU may come after its time
 _ANSWER_S = 5.0
 _CHUNK = 65_536
 _TRACED_LINE = 4096  # bytes; far longer than any line that the MCU accepts
@@ -39,9 +40,9 @@ class PtyMcu:
 
     The symlink's folder must exist; only a symlink is replaced. Unplugging closes the pty but leaves the MCU powered:
     its motors stop by failsafe, as on a robot whose MCU is powered by the battery. Each replug makes a new pty behind
-    the same symlink. ``motion`` is where the robot stands, used by that thread alone. With ``trace_output`` the trace
-    also has the MCU's own lines that the host received. ``settings`` are those of the firmware; ``on_relay`` is called
-    with ``o1 on`` when a relay has changed.
+    the same symlink. ``motion`` is where the robot stands, used by that thread alone. The file ``trace`` also has when
+    the MCU was late, and with ``trace_output`` the trace has the MCU's own lines that the host received. ``settings``
+    are those of the firmware; ``on_relay`` is called with ``o1 on`` when a relay has changed.
     """
 
     def __init__(
@@ -61,6 +62,7 @@ class PtyMcu:
         self.symlink = symlink
         self.trace = Trace(trace)
         self.dropped = 0  # bytes of the MCU that no host received
+        self._traces_late = trace is not None
         self._on_relay = on_relay
         self._mcu = SimulatedMcu(
             kind,
@@ -171,8 +173,12 @@ class PtyMcu:
     # -- the MCU's thread
 
     def _run(self) -> None:
+        looked = time.monotonic()
         while not self._stopping:
             self._wait()
+            before, looked = looked, time.monotonic()
+            if self._traces_late and looked - before > self._tick_s + _LATE_S:
+                self.trace.add(Entry(round(looked * 1e9), "late", f"{looked - before:.3f}"))
             if self._master is not None:
                 self._poll_host(self._master)
             self._transmit(self._mcu.tick(time.monotonic()))

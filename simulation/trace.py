@@ -9,7 +9,7 @@ import msgspec
 
 _RETAINED = 100_000  # entries in memory; a file has all of them
 
-Event = Literal["plugged", "opened", "line", "closed", "unplugged", "motors", "relay", "said"]
+Event = Literal["plugged", "opened", "line", "closed", "unplugged", "motors", "relay", "said", "late"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,7 +18,8 @@ class Entry:
 
     ``ns`` is time.monotonic_ns() when the line's last byte was received, just before it was written, or when the
     outputs changed. The line of ``motors`` is ``<left> <right>`` with three decimals, -1..1, + = forward of the robot,
-    however its motors are mounted. That of ``relay`` is ``<outlet> on`` or ``<outlet> off``.
+    however its motors are mounted. That of ``relay`` is ``<outlet> on`` or ``<outlet> off``. That of ``late`` are the
+    seconds for which a busy machine kept the MCU from its port until now: what it receives next came at any time since.
     """
 
     ns: int
@@ -35,6 +36,11 @@ class Entry:
     def motors(self) -> tuple[float, float] | None:
         """The new speeds of the motors: left and right, -1..1."""
         return _pair(self.line.split(" ")) if self.event == "motors" else None
+
+    @property
+    def late_s(self) -> float:
+        """How long the MCU did not look at its port until now; 0 for any other entry."""
+        return float(self.line) if self.event == "late" else 0.0
 
 
 def _pair(tokens: list[str]) -> tuple[float, float] | None:

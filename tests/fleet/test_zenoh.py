@@ -296,6 +296,28 @@ def test_what_is_retained_is_one_key(hall: Hall) -> None:
         assert until(lambda: not hall.retained())
 
 
+@pytest.mark.parametrize("what", ["hellos", "queries"])
+def test_what_an_account_asks_of_the_hub_holds_up_no_one_who_comes(hall: Hall, what: str) -> None:
+    """A hub had ten thousand hellos of a viewer wait, 2 GB of them, and a client that came heard nothing meanwhile."""
+    hall.eye.publish(STATE, b"before", qos=QoS.DELIVERED, retain=True)
+    before = memory(hall.hub.pid)
+    with hall.account("vera", flood=what) as vera:
+        assert vera.stdout.readline() == "flows\n"
+        for number in range(5):
+            received: list[str] = []
+            with create("zenoh", f"late-{number}", hall.settings("otto")) as late:
+                late.subscribe(f"{GOOB}/outgoing/#", lambda message: received.append(message.topic))  # noqa: B023
+                assert until(lambda: received, 10), number  # noqa: B023
+    assert memory(hall.hub.pid) - before < 300
+    hall.eye.publish(STATE, b"", qos=QoS.DELIVERED, retain=True)
+
+
+def memory(pid: int) -> int:
+    """Return the MB that a process has in memory."""
+    (line,) = [one for one in Path(f"/proc/{pid}/status").read_text().splitlines() if one.startswith("VmRSS")]
+    return int(line.split()[1]) // 1024
+
+
 @pytest.mark.parametrize("what", ["removed", "another role"])
 def test_a_change_counts_for_sessions_that_are_there(hall: Hall, what: str) -> None:
     topic = f"{GOOB}/incoming/{'by/otto/' * (hall.fleet.level == 'named')}drive-values"

@@ -6,14 +6,17 @@ received. One that floods publishes on and on instead, until its end, as fast as
 
 from __future__ import annotations
 
+import itertools
 import json
 import sys
 from pathlib import Path
+from typing import Any, Literal
 
 import msgspec
 import zenoh
 
 from pebble.transports import Message, QoS, ZenohSettings
+from pebble.transports.zenoh import wire
 from pebble.transports.zenoh.transport import ZenohTransport
 
 
@@ -26,16 +29,29 @@ class Plan(msgspec.Struct):
     filters: list[str] = []
     retain: bool = False
     will: str = ""
-    flood: bool = False
+    flood: Literal["", "messages", "hellos", "queries"] = ""
 
 
-def flood(session: zenoh.Session, topics: list[str]) -> None:
-    """Small messages of the first priority that wait for room, which no client of ours sends."""
-    first, wait = zenoh.Priority.REAL_TIME, zenoh.CongestionControl.BLOCK
-    publishers = [session.declare_publisher(one, priority=first, congestion_control=wait) for one in topics]
-    while True:
+def flood(session: zenoh.Session, plan: Plan) -> None:
+    """What has the first priority and waits for room, as no client of ours sends it; a line once it flows."""
+    first: dict[str, Any] = {"priority": zenoh.Priority.REAL_TIME, "congestion_control": zenoh.CongestionControl.BLOCK}
+    publishers = [session.declare_publisher(one, **first) for one in plan.topics]
+    own = dict.fromkeys(map(str, range(12_000)), 1)
+    hello = wire.encode(wire.Hello(f"{plan.name}{wire.OF}1", 0, None, own))
+    asked: dict[str, tuple[str, bytes]] = {
+        "hellos": (wire.asked(wire.HELLO, plan.name), hello),
+        "queries": (f"{wire.RETAINED}*/*/*/outgoing/**", wire.encode({})),
+    }
+    ignore = zenoh.handlers.Callback(lambda _reply: None, indirect=False)
+    for number in itertools.count():
         for one in publishers:
             one.put(b"[" * 60)
+        if plan.flood in asked:
+            key, payload = asked[plan.flood]
+            session.get(key, ignore, payload=payload, timeout=0.5, **first)
+        if number == 500:
+            sys.stdout.write("flows\n")
+            sys.stdout.flush()
 
 
 def main(text: str) -> int:
@@ -50,7 +66,7 @@ def main(text: str) -> int:
     sys.stdout.flush()
     if plan.flood:
         assert client.session is not None
-        flood(client.session, plan.topics)
+        flood(client.session, plan)
     while sys.stdin.readline():
         for topic in plan.topics:
             client.publish(topic, payload, qos=QoS.DELIVERED, retain=plan.retain)

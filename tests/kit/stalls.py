@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import threading
+from collections.abc import Iterable
 
 from tests.support import Child
 
@@ -21,12 +22,25 @@ while True:
     last = now
 """
 
+#: From when until when (monotonic).
+Stall = tuple[float, float]
+
+
+def lost_s(stalls: Iterable[Stall], since: float, until: float) -> float:
+    """Seconds of this time that are in one stall at least."""
+    lost, end = 0.0, since
+    for began, ended in sorted(stalls):
+        began, ended = max(began, end), min(ended, until)
+        if ended > began:
+            lost, end = lost + ended - began, ended
+    return lost
+
 
 class Stalls:
     """One small process for each processor; it wakes every 10 ms, and tells when it did so 10 ms late or more."""
 
     def __init__(self) -> None:
-        self._found: list[tuple[float, float]] = []
+        self._found: list[Stall] = []
         self._processes = [
             Child([sys.executable, "-S", "-c", _PULSE, str(cpu)], stdout=subprocess.PIPE, text=True)
             for cpu in sorted(os.sched_getaffinity(0))
@@ -39,15 +53,9 @@ class Stalls:
             process.kill()
             process.wait(10)
 
-    def within(self, since: float, until: float) -> float:
-        """Seconds of this time (monotonic) in which a processor did not serve its process."""
-        moments, end = sorted(self._found), since
-        lost = 0.0
-        for began, ended in moments:
-            began, ended = max(began, end), min(ended, until)
-            if ended > began:
-                lost, end = lost + ended - began, ended
-        return lost
+    @property
+    def found(self) -> list[Stall]:
+        return list(self._found)
 
     def _read(self, process: Child) -> None:
         assert process.stdout is not None

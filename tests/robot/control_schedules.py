@@ -7,6 +7,7 @@ level named each person also commands by the other's name and with the other's k
 
 from __future__ import annotations
 
+import os
 import secrets
 import shutil
 import tempfile
@@ -17,10 +18,12 @@ from contextlib import ExitStack, closing, contextmanager
 from itertools import groupby
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 from pebble.client.estop import new_name
+from tests.kit.mutations import Mutation, in_copy
 from tests.kit.schedules import Engine, Outcome, RandomSteps, Steps
-from tests.kit.stalls import Stalls
+from tests.kit.stalls import Stalls, lost_s
 from tests.robot.named import Hall, Named
 from tests.robot.operator import Operator, ReceivedMessage
 from tests.robot.rig import BASE, Rig
@@ -138,13 +141,16 @@ class World:
         ended = time.monotonic()
         left = self._rest()
         lines = self.rig.mcu.drives(began)
-        motors, stalled = self.rig.mcu.motors(began), self._stalls.within
-        found = problems(self.history, lines, motors, list(self.alive.overlaps), stalled)
+        seen = (self.history, lines, self.rig.mcu.motors(began), list(self.alive.overlaps))
+        stalls = [*self._stalls.found, *self.rig.mcu.late(began)]
+        found = problems(*seen, stalls)
+        allowed = len(problems(*seen)) - len(found)
         found += [*self._out_of_turn(began), *self._by_another_name(began)]
         counts = {
             "lines": float(len(lines)),
             "passed on": float(len(self._holders(began, ended))),
-            "stalled s": stalled(began, ended),
+            "stalled s": round(lost_s(stalls, began, ended), 2),
+            "allowed": float(allowed),
         }
         return Outcome(found + left, counts, log=lambda: self._log(began))
 
@@ -363,10 +369,38 @@ def _account(state: ReceivedMessage) -> str:
 
 
 @contextmanager
-def _world(kind: str, _bug: Any) -> Iterator[World]:
-    with closing(World(kind)) as world:
+def _world(kind: str, bug: dict[str, str] | None) -> Iterator[World]:
+    """``bug``: what the robot's processes have in their environment."""
+    with patch.dict(os.environ, bug or {}), closing(World(kind)) as world:
         yield world
 
+
+@contextmanager
+def _mutated(mutation: Mutation) -> Iterator[dict[str, str]]:
+    """A copy of the product, from which processes import in place of their working folder."""
+    with in_copy(
+        mutation, ROOT, "pebble", *(link.name for link in (ROOT / "pebble").iterdir() if link.is_symlink())
+    ) as root:
+        yield {"PYTHONPATH": str(root), "PYTHONSAFEPATH": "1"}
+
+
+_LEASE, _ARBITER = "firmware/common/lease.py", "firmware/common/arbiter.py"
+MUTATIONS = {
+    "a key counts for every account": Mutation(_LEASE, " and self.holder[:1] == (by,)", "", kind="mqtt named"),
+    "a sender chooses its name": Mutation(
+        "pebble/forwarding/names.py", 'body["by"] = by\n', 'body["by"] = claim or by\n', kind="mqtt named"
+    ),
+    "who takes over gets the key of before": Mutation(
+        _LEASE, "self._random(4) if ms else", "(self.key or self._random(4)) if ms else", kind="mqtt"
+    ),
+    "a person does not hold a script": Mutation(_ARBITER, "        self._held = True\n", "", kind="mqtt"),
+    "wheels turn until the MCU stops them": Mutation(
+        "services/serial_mcu_bridge/text/motor_bridge.py",
+        "self._set_deadline(now + valid_s)",
+        "self._set_deadline(now + 9)",
+        kind="mqtt",
+    ),
+}
 
 _BEGIN = (("take", 0, None), ("drive", 0, None))
 _AS_THEMSELVES = RandomSteps(_WEIGHTS, length=22, layouts=1, begin=_BEGIN)
@@ -380,4 +414,6 @@ ENGINE = Engine(
     schedules=200,
     per_world=20,
     repeats=False,
+    mutations=MUTATIONS,
+    bug=_mutated,
 )

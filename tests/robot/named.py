@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
@@ -88,6 +88,10 @@ class Named(Rig):
         """Publish under one's own name."""
         self.person(name).send(f"incoming/by/{name}/{metric}", body, **options)
 
+    def sends(self, name: str, metric: str, body: Any, has_effect: Callable[[], object], timeout: float = 10) -> bool:
+        """Publish again and again until it has its effect: what a busy machine holds up is dropped as too late."""
+        return until(lambda: has_effect() or self.send(name, metric, body) or has_effect(), timeout, step=0.2)
+
     def state(self) -> dict[str, Any]:
         last = self.operator.last(STATE)
         return {} if last is None else last.json
@@ -96,8 +100,8 @@ class Named(Rig):
     def held(self, name: str, metric: str = CONTROL, for_ms: int = 10_000) -> Iterator[str]:
         """The key of this person's control, which is released at the end."""
         client = {"id": f"{next(_ids):08x}", "for_ms": for_ms}
-        self.send(name, metric, client)
-        assert until(lambda: self.state().get("id") == client["id"], 5), self.state()
+        held = lambda: self.state().get("id") == client["id"]  # noqa: E731
+        assert self.sends(name, metric, client, held), self.state()
         assert (self.state()["by"], self.state()["named"]) == (name, True)
         try:
             yield self.state()["key"]
@@ -106,7 +110,7 @@ class Named(Rig):
 
     def judged(self, name: str, key: str, z: float) -> None:
         """What was sent before has been judged: the holder's command, which moves so, has come after it."""
-        assert until(lambda: self.send(name, DRIVE, {"x": 0, "z": z, "key": key}) or lines(self, z), 5, step=0.05)
+        assert self.sends(name, DRIVE, {"x": 0, "z": z, "key": key}, lambda: lines(self, z)), z
 
     def close(self) -> None:
         for name, client in self._people.items():

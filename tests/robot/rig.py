@@ -15,6 +15,7 @@ from typing import Any, Self
 
 from pebble.rig.processes import children
 from pebble.simulation.trace import Entry, read_trace
+from tests.kit.stalls import Stall
 from tests.robot.operator import Operator
 from tests.support import ROOT, Broker, gone, process_name, until
 from tests.tcp_proxy import TcpProxy
@@ -61,6 +62,11 @@ class Motors:
     def motors(self, since: float = 0.0) -> list[tuple[float, tuple[float, float]]]:
         """Every change of the motors' outputs after ``since`` as (monotonic seconds, (left, right))."""
         return [(entry.ns / 1e9, entry.motors) for entry in self.entries(since) if entry.motors is not None]
+
+    def late(self, since: float = 0.0) -> list[Stall]:
+        """When a busy machine kept the MCU from its port."""
+        found = [(entry.ns / 1e9, entry.late_s) for entry in self.entries(since) if entry.late_s]
+        return [(at - seconds, at) for at, seconds in found]
 
     def turning(self) -> bool:
         motors = self.motors()

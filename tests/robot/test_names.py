@@ -44,8 +44,7 @@ def rig(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 def test_only_who_has_control_drives(rig: Named) -> None:
     """Not another with the holder's key, nor without, nor without a name, nor with an old key."""
     with rig.held("otto") as old:
-        rig.send("otto", DRIVE, {"x": 0, "z": 0.11, "key": old})
-        assert until(lambda: lines(rig, 0.11), 5)
+        rig.judged("otto", old, 0.11)
     robot = rig.person("rover")  # whose account may publish everything below its base
     with rig.held("mia") as key:
         rig.send("otto", DRIVE, {"x": 0, "z": 0.12, "key": key})
@@ -60,8 +59,7 @@ def test_only_who_has_control_drives(rig: Named) -> None:
         rig.send("mia", DRIVE, {"x": 0, "z": 0.19, "key": key}, retain=True)
         wanted = [round(0.2 + number / 1000, 3) for number in range(10)]
         for z in wanted:
-            rig.send("mia", DRIVE, {"x": 0, "z": z, "key": key})
-            assert until(lambda z=z: lines(rig, z), 5), z
+            rig.judged("mia", key, z)
         for name, suffix, more in (
             ("otto", f"incoming/by/otto/{DRIVE}", {"key": "ffffffff"}),
             ("rover", f"incoming/{DRIVE}", {}),
@@ -88,9 +86,8 @@ def test_who_takes_control_over_drives_and_only_they_start_scripts(rig: Named) -
             rig.judged("boss", key, 0.6)
             assert not [at for at in lines(rig, 0.5) if at > taken + 0.5]
             for name, error in (("otto", "boss has control"), ("boss", "Unknown autonomy file")):
-                rig.send(name, "autonomy-command", start)
                 found = lambda e=error: e in str(rig.operator.last("outgoing/autonomy-status").json["error"])  # type: ignore[union-attr]  # noqa: E731
-                assert until(found, 5), error
+                assert rig.sends(name, "autonomy-command", start, found), error
 
 
 def test_a_terminal_takes_control_by_its_account_is_asked_and_is_taken_over(rig: Named, tmp_path: Path) -> None:
@@ -105,7 +102,8 @@ def test_a_terminal_takes_control_by_its_account_is_asked_and_is_taken_over(rig:
         began = time.monotonic()
         console.hold(b"w")
         assert until(lambda: rig.mcu.moving(began), 5)
-        rig.send("mia", CONTROL, {"id": "cccccccc", "for_ms": 10_000})
+        asks = {"id": "cccccccc", "for_ms": 10_000}
+        assert rig.sends("mia", CONTROL, asks, lambda: rig.state()["asks_id"] == "cccccccc")
         assert console.sees("mia asks for control: l lets mia drive"), console.shown
         with rig.held("boss", "control/take") as key:
             rig.judged("boss", key, 0.33)
@@ -131,8 +129,7 @@ def test_everybody_stops_it_and_only_a_safety_officer_resets_it(rig: Named) -> N
             rig.send("otto", "estop-reset", reset)
             rig.person("rover").send("incoming/estop-reset", reset)
             assert state_of(rig)["latched"]
-            rig.send("boss", "estop-reset", reset | {"by": "ann"})
-            assert until(lambda: not state_of(rig)["latched"], 5)
+            assert rig.sends("boss", "estop-reset", reset | {"by": "ann"}, lambda: not state_of(rig)["latched"])
             rig.send("otto", DRIVE, {"x": 0, "z": 0, "key": key})  # lets go
 
 
@@ -249,8 +246,7 @@ def test_what_another_account_sends_holds_up_no_stop(flooded: Named) -> None:
             took.append(time.monotonic() - pressed)
     assert statistics.median(took) < 1, took
     order = {one: state_of(rig)[one] for one in ("boot", "count")}
-    free = lambda: rig.send("boss", "estop-reset", order) or until(lambda: not state_of(rig)["latched"], 0.5)  # noqa: E731
-    assert until(free, 30), state_of(rig)  # a reset waits behind what is left of it, and is too late then
+    assert rig.sends("boss", "estop-reset", order, lambda: not state_of(rig)["latched"], 30), state_of(rig)
 
 
 # -- from a broker with logins to names, as docs/fleet.md has it

@@ -132,7 +132,7 @@ def test_small_messages_of_another_account_hold_up_no_stop(where: Any, level: An
         rig = opened.enter_context(where(hall))
         sam = opened.enter_context(closing(create("zenoh", "sam", hall.settings("sam")).open(10)))
         program = Program(rig, opened)
-        opened.enter_context(hall.account(floods, topics=[f"{GOOB}/incoming/{metric}"], flood=True))
+        opened.enter_context(hall.account(floods, topics=[f"{GOOB}/incoming/{metric}"], flood="messages"))
         assert until(lambda: "front-camera" in rig.log.read_text() or level == "login", 10)
         name = ""
         for number in range(cases(3, 20)):

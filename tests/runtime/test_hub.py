@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import pytest
@@ -14,9 +15,12 @@ from pebble.config import parse
 from pebble.runtime.connections import hub_settings
 from pebble.runtime.hub import WILLS
 from pebble.transports import Message, QoS, ZenohSettings, create
+from pebble.transports.counters import Counters
+from pebble.transports.zenoh.hub import HELLO_BYTES, HELLOS, HubWorker
 from pebble.transports.zenoh.hub.admission import Admission
 from pebble.transports.zenoh.hub.journal import Journal
 from pebble.transports.zenoh.hub.records import StoredWill
+from pebble.transports.zenoh.hub.store import HubStore
 from pebble.transports.zenoh.wire import Will
 from tests.support import ROOT, Child, until
 from tests.transports.zenoh_net import HubProcess
@@ -123,6 +127,37 @@ def test_those_of_a_journal(settings: ZenohSettings, topic: str) -> None:
     assert [message.topic for message in received] == ["status", "the/last"]
     hub.kill()
     assert topic.encode() not in settings.journal.read_bytes()
+
+
+class Asked:
+    """A query; ``dropped``: it is answered with nothing."""
+
+    def __init__(self, key: str, size: int) -> None:
+        self.key_expr, self.payload, self.dropped = key, bytes(size), False
+
+    def drop(self) -> None:
+        self.dropped = True
+
+
+def test_hellos_of_one_account_that_wait_are_few_and_short() -> None:
+    hub = HubWorker("hub", HubStore(), Admission(WILLS), None, Counters())
+    greeted: list[Asked] = []
+
+    def greet(account: str, size: int = 1) -> bool:
+        asked: Any = Asked(f"@hub/hello/{account}", size)
+        hub._greeted(greeted.append, asked)
+        return not asked.dropped
+
+    assert [greet("vera") for _ in range(HELLOS + 2)] == [True] * HELLOS + [False] * 2
+    assert greet("otto", HELLO_BYTES)
+    assert not greet("otto", HELLO_BYTES + 1)
+    hub.close()
+    while not hub._tasks.empty():
+        *_, task = hub._tasks.get()
+        assert task is not None
+        task()
+    assert len(greeted) == HELLOS + 1
+    assert greet("vera"), "there is room again"
 
 
 def test_each_client_is_logged_once_and_a_flood_of_them_not_without_end(caplog: pytest.LogCaptureFixture) -> None:

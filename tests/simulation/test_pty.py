@@ -32,7 +32,7 @@ def test_a_host_talks_to_it_and_everything_is_traced_in_time(tmp_path: Path) -> 
     assert all(before <= entry.ns <= after for entry in entries[1:])
     moved = [entry for entry in entries if entry.event == "motors"]
     assert moved[0].motors == (0.5, 0.25)
-    others = [entry for entry in entries if entry.event != "motors"]
+    others = [entry for entry in entries if entry.event not in ("motors", "late")]
     assert [entry.event for entry in others] == ["plugged", "opened", "line", "line", "closed"]
     assert others[2].drive == (0.5, 0.25)
     assert others[2].motors is None
@@ -156,6 +156,12 @@ def test_the_program(tmp_path: Path) -> None:
         assert program.wait(10) == 0
     assert [entry.line for entry in read_trace(trace) if entry.event == "line"] == ["M 1 1"]
     assert not symlink.is_symlink()
+
+
+def test_how_long_it_did_not_look_at_its_port_is_in_the_file(tmp_path: Path) -> None:
+    with PtyMcu("goob", tmp_path / "port", trace=tmp_path / "trace") as mcu:
+        mcu._call(lambda: time.sleep(0.2))
+        assert until(lambda: max(entry.late_s for entry in read_trace(tmp_path / "trace")) >= 0.2)
 
 
 def test_it_never_takes_a_file_away(tmp_path: Path) -> None:

@@ -183,7 +183,8 @@ class RecordingRobot:
     """Publishes heartbeats and capabilities, and records what arrives; it also takes stops.
 
     ``keeps``: it keeps control itself, as ``keeping`` does. ``named``: it takes commands with names, as a bridge gives
-    them to a robot, and drive commands of strangers; ``wire`` has the topics as they arrived.
+    them to a robot, and drive commands of strangers; ``wire`` has the topics as they arrived. ``pace``: of the clock by
+    which it keeps control.
     """
 
     def __init__(
@@ -194,9 +195,10 @@ class RecordingRobot:
         capabilities: dict[str, Any] | None = None,
         keeps: bool = False,
         named: bool = False,
+        pace: float = 1.0,
         **login: str,
     ) -> None:
-        self.base, self.named = base, named
+        self.base, self.named, self._pace = base, named, pace
         self.wire: set[str] = set()
         self.received: list[tuple[float, str, Any]] = []
         self.latched = False
@@ -267,7 +269,7 @@ class RecordingRobot:
     def answer(self, messages: list[Message]) -> None:
         """Requests for control reach it, or only time."""
         with self._answering:
-            self._publish_all(self.keeping.take(messages, time.monotonic()) if self.keeping else [])
+            self._publish_all(self.keeping.take(messages, self._pace * time.monotonic()) if self.keeping else [])
 
     def stranger(self, **drive: float) -> None:
         """A program publishes a drive command without any control, as the original's page does."""

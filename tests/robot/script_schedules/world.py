@@ -74,7 +74,8 @@ class World:
         time.sleep(max(0.0, began + ACTIVE_S - time.monotonic()))
         left = self._rest()
         lines, motors = self.rig.mcu.drives(began), self.rig.mcu.motors(began)
-        return problems(self.history, lines, motors, list(self.alive.overlaps), self._stalls.within) + left
+        stalls = [*self._stalls.found, *self.rig.mcu.late(began)]
+        return problems(self.history, lines, motors, list(self.alive.overlaps), stalls) + left
 
     def logs(self) -> str:
         return self.rig.log.read_text()[-4000:]

@@ -28,7 +28,10 @@ def stated(**identity: Any) -> str:
 WHOLE = {"name": "Otto", "description": "A boat", "colour": "rose", "picture": "boat"}
 FACES: Rows = {
     "it looks as it says": (
-        f"result = look('r7', {stated(**WHOLE, battery_cells=2)});", {**WHOLE, "cells": 2}),
+        f"result = look('otto', {stated(**WHOLE, battery_cells=2)});", {**WHOLE, "cells": 2}),
+    "a name that is not its id has it behind": (
+        f"result = ['mini-lamp', 'fred'].map((id) => look(id, {stated(name='Mini Lamp')}).name);",
+        ["Mini Lamp", "Mini Lamp (fred)"]),
     "the original's robots are known": (
         "result = ['goob', 'bumperbot'].map((id) => look(id)).map((one) => [one.colour, one.picture]);",
         [["blue", "goob"], ["green", "benjr"]]),
@@ -38,8 +41,8 @@ FACES: Rows = {
     "what is no look is not used": (
         f"result = brief(look('constructor', {stated(name=7, colour='url(x)', picture='__proto__', battery_cells=-1)}));",  # noqa: E501
         ["constructor", "wheeled", "string", 0]),
-    "a long name is cut": (f"result = look('r7', {stated(name='x' * 40)}).name.length;", 32),
-    "a name steers nothing": (f"result = look('r7', {stated(name=chr(0x202E) + 'x')}).name;", "\\u202ex"),
+    "a long name is cut": (f"result = look('r7', {stated(name='x' * 40)}).name;", "x" * 32 + " (r7)"),
+    "a name steers nothing": (f"result = look('r7', {stated(name=chr(0x202E) + 'x')}).name;", "\\u202ex (r7)"),
     "a battery is in percent where its cells are known": (
         "result = [[8.4, 2], [6, 2], [7.64, 2], [9, 2], [8, 0]].map(([value, cells]) => percent(value, 'V', cells));",
         [100, 0, 50, 100, None]),

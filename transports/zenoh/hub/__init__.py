@@ -12,9 +12,11 @@ import queue
 import socket
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -47,13 +49,18 @@ from pebble.transports.zenoh.session import HUB_SOCKET, close_at_exit, close_ses
 log = logging.getLogger(__name__)
 
 QUEUE_LIMIT = 10_000  # events waiting for the hub's thread; beyond it their senders wait
-QUERIES = 1000  # that wait; further ones are answered at once
+QUERIES = 1000  # that wait for what is on its way; further ones are answered at once
+ASKED = 2000  # queries that wait for the hub's thread, which does all else first; beyond it …
+_ASKERS = 8  # … their senders wait, each connection in its turn; more would take the threads that receive stops
+HELLOS = 8  # of one account that wait
+HELLO_BYTES = 128 << 10  # of one; some 2,000 retained topics
 PATIENCE_S = 0.5  # a query waits this long for retained messages that are known to be on their way
 _LOOK_S = 0.25  # a hub among others looks so often whether it stood still
 
 _NEVER = float("inf")
 
 _Task = Callable[[], None]
+_FIRST, _QUERY, _LAST = range(3)  # in the order of their turns
 
 
 class ZenohHub:
@@ -233,7 +240,10 @@ class HubWorker:
         self._token: zenoh.LivelinessToken | None = None  # clients ask a hub when its token appears
         self._renewals = 0
         self._waiting_queries: list[tuple[float, dict[str, int], zenoh.Query]] = []
-        self._tasks: queue.Queue[_Task | None] = queue.Queue(QUEUE_LIMIT)
+        self._tasks: queue.PriorityQueue[tuple[int, int, _Task | None]] = queue.PriorityQueue(QUEUE_LIMIT)
+        self._turns, self._places, self._askers = count(), threading.Semaphore(ASKED), threading.Semaphore(_ASKERS)
+        self._hellos = Counter[str]()  # that wait, of accounts
+        self._guard = threading.Lock()  # of these
         self._session: zenoh.Session | None = None
         self._thread = threading.Thread(target=self._run, name="pebble-hub", daemon=True)
         if journal is not None:
@@ -246,15 +256,15 @@ class HubWorker:
     def serve(self, session: zenoh.Session) -> None:
         """Serve the clients of ``session`` instead of those of the one before, which is closed."""
         if self._session is not None:
-            self._tasks.put(self._await_return)
+            self.post(self._await_return)
         self._session = session
         # Its own messages would wait for room in the queue that this thread empties.
         others, work_on = zenoh.Locality.REMOTE, self._queued(self._store_retained)
         session.declare_subscriber(wire.RETAINED + "**", work_on, allowed_origin=others)
-        session.declare_queryable(wire.RETAINED + "**", self._queued(self._query), complete=True)
+        session.declare_queryable(wire.RETAINED + "**", direct(self._ask), complete=True)
         for what, work in ((wire.HELLO, self._on_hello), (wire.BYE, self._on_bye)):
             session.declare_queryable(what, self._queued(work))
-            session.declare_queryable(f"{what}/*", self._queued(work))
+            session.declare_queryable(f"{what}/*", direct(partial(self._greeted, work)))
         session.liveliness().declare_subscriber(wire.LIVE + "*", self._queued(self._on_client), history=True)
         if self._store.has_history:
             self._mesh.serve(session, self._queued)
@@ -264,7 +274,7 @@ class HubWorker:
 
     def close(self) -> None:
         if self._thread.is_alive():
-            self._tasks.put(None)
+            self._tasks.put((_LAST, 0, None))
             self._thread.join(5)
         for _, _, query in self._waiting_queries:
             query.drop()  # type: ignore[no-untyped-call]
@@ -275,17 +285,49 @@ class HubWorker:
     # -- the thread
 
     def _queued(self, work: Callable[[Any], None]) -> zenoh.handlers.Callback[Any]:
-        return direct(lambda event: self._tasks.put(lambda: work(event)))
+        return direct(lambda event: self.post(lambda: work(event)))
 
-    def post(self, task: _Task) -> None:
+    def post(self, task: _Task, turn: int = _FIRST) -> None:
         """Do ``task`` on the hub's thread."""
-        self._tasks.put(task)
+        self._tasks.put((turn, next(self._turns), task))
+
+    def _ask(self, query: zenoh.Query) -> None:
+        """Have a query for retained messages answered after all else: what an account asks holds up nothing of it."""
+        if not self._places.acquire(blocking=False):
+            if not self._askers.acquire(blocking=False):
+                query.drop()  # type: ignore[no-untyped-call]
+                return
+            self._places.acquire()
+            self._askers.release()
+
+        def work() -> None:
+            self._places.release()
+            self._query(query)
+
+        self.post(work, _QUERY)
+
+    def _greeted(self, work: Callable[[zenoh.Query], None], query: zenoh.Query) -> None:
+        """Queue the hello or goodbye of an account, unless it is too long, or too many of it wait already."""
+        account = str(query.key_expr).rpartition("/")[2]
+        with self._guard:
+            fits = self._hellos[account] < HELLOS and (query.payload is None or len(query.payload) <= HELLO_BYTES)
+            self._hellos[account] += fits
+        if not fits:
+            query.drop()  # type: ignore[no-untyped-call]
+            return
+
+        def greet() -> None:
+            with self._guard:
+                self._hellos -= Counter((account,))
+            work(query)
+
+        self.post(greet, _QUERY)
 
     def _run(self) -> None:
         turn = clock.since_boot()
         while True:
             try:
-                task = self._tasks.get(timeout=self._pause())
+                *_, task = self._tasks.get(timeout=self._pause())
                 if task is None:
                     return
             except queue.Empty:
@@ -306,7 +348,9 @@ class HubWorker:
         # What another program or a lost connection can cause:
         except (ValueError, msgspec.DecodeError, zenoh.ZError) as error:
             self._counters.add("bad")
-            log.warning("the hub received something it does not understand: %s", error)
+            bad = self._counters["bad"]
+            if bad & (bad - 1) == 0:  # the 1st, 2nd, 4th, 8th…
+                log.warning("the hub received something it does not understand: %s (%d so far)", error, bad)
         except Exception:  # no client may end the hub
             log.exception("the hub failed on one of its tasks")
 

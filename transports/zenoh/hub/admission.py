@@ -57,7 +57,8 @@ class Admission:
         if known is None or not self.owns(account, hello.name):
             self._log(account, "hello", "its session must be named after an account that is known")
             return None
-        own = {key: digest for key, digest in hello.own.items() if _any(known.retains, key_to_topic(key))}
+        offered = hello.own if known.retains else {}
+        own = {key: digest for key, digest in offered.items() if _any(known.retains, key_to_topic(key))}
         return replace(hello, will=self._of_account(account, known, hello, stored), own=own)
 
     def owns(self, account: str, session: str) -> bool:

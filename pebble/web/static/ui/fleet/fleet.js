@@ -24,7 +24,7 @@ import { charge, hasFace, looksOf, nameIn } from "../parts/looks.js";
 import { plain, shortTime } from "../parts/more-words.js";
 import { Charge, Drawing, Drop, Icon, RouteLink, StopButton } from "../parts/parts.js";
 import { RecordingsLink } from "./recordings-link.js";
-import { battery, driverName, inner, isObject, kindOf, nameOf, roughly, typeOf, visible } from "../parts/words.js";
+import { battery, driverName, inner, isObject, kindOf, nameOf, roughly, typeOf } from "../parts/words.js";
 
 const THUMBNAIL_MS = 10_000;
 const LIVE_MS = 12_000; // a thumbnail that young is of now
@@ -300,7 +300,6 @@ function FleetCard({ at, plain }) {
   const looks = looksOf(at, capabilities);
   const estop = useValue(at, "web/estop");
   const id = nameOf(at);
-  const called = looks.name.toLowerCase() === id.toLowerCase() ? "" : visible(id);
   const what = hasFace(at) ? looks.description : kindOf(at);
   const pictured = (settings.thumbnails || WATCHES) && hasFace(at) && !plain;
   return html`<article
@@ -313,7 +312,7 @@ function FleetCard({ at, plain }) {
       <${Badge} at=${at} looks=${looks} />
       <${RouteLink} to=${at} className="fleet-card-link">
         <h2>${looks.name}</h2>
-        <span class="dim">${[called, what].filter(Boolean).join(" · ")}</span>
+        <span class="dim">${what}</span>
       <//>
       <${Liveness} at=${at} />
     </div>

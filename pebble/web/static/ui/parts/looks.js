@@ -40,7 +40,7 @@ export function looksOf(ref, capabilities) {
   const body = Object.hasOwn(BODIES, id) ? BODIES[id] : id;
   const picture = Object.hasOwn(PICTURES, identity.picture) ? identity.picture : assumed(body, isObject(value) ? value : {});
   return {
-    name: text(identity.name, 32) || visible(id),
+    name: called(text(identity.name, 32), visible(id)),
     description: text(identity.description, 60) || PICTURES[picture],
     colour: TINTS.includes(identity.colour) ? identity.colour : Object.hasOwn(COLOURS, body) ? COLOURS[body] : TINTS[hash(id) % TINTS.length],
     picture,
@@ -56,6 +56,12 @@ export const drawing = (picture) => `${FACES}#face-${picture}`;
 
 /** @param {string} ref @returns {boolean} whether it has a face: towers and others have the icon of their type */
 export const hasFace = (ref) => typeOf(ref) === "robots";
+
+/** A name is what the robot's account says, and another robot may say the same: only the id is one robot's. */
+function called(name, id) {
+  const [one, other] = [name, id].map((each) => each.toLowerCase().replace(/[ _-]/g, ""));
+  return !name ? id : one === other ? name : `${name} (${id})`;
+}
 
 function assumed(body, value) {
   if (Object.hasOwn(PICTURES, body)) return body;
