@@ -32,7 +32,6 @@ LARGE_BYTES = 16 * 1024  # a value beyond holds up a slow connection: one is sen
 MAX_BYTES = 32 * 1024 * 1024  # of all values together
 RESERVED_BYTES = 16 * 1024  # of them for each component, whatever the others send
 MAX_ALIASES = 64  # of one component: topics that its microcontrollers declare besides the contract's
-_SERVERS = "servers"  # the type of other servers of this page: they are no components to be shown
 _REFRESH_S = 1.0  # values that change with every heartbeat are sent this often
 _LONGEST_ALIAS = 200  # characters
 _STAMPS = 5  # heartbeats by which a clock of whole seconds is recognised
@@ -212,7 +211,7 @@ class Robots:
     def receive(self, message: Message, now: float) -> None:
         """Take a message of any component."""
         address = parse_topic(message.topic)
-        if address is None or address.direction is not Direction.OUTGOING or address.identity.type == _SERVERS:
+        if address is None or address.direction is not Direction.OUTGOING or address.identity.is_server:
             return
         self.receive_as(address.identity.base, address.metric, message, now)
 

@@ -1,0 +1,45 @@
+"""Gateways that share robots: killed, hung and cut off from either side, while the robots are driven and stopped."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Iterator
+
+import pytest
+
+from tests.fleet.gateway_rig import FAULTS, NEVER, World, world
+from tests.support import cases, further, until
+
+FAULT_S = 5.0  # longer than everything that notices it takes
+OUTAGE_S, STOP_S = 4.0, 1.0
+
+
+@pytest.fixture(scope="module", params=[2, pytest.param(3, marks=pytest.mark.thorough)])
+def hall(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
+    with world(tmp_path_factory.mktemp("gateways"), request.param) as made:
+        yield made
+
+
+@pytest.mark.parametrize("fault", ["kill", *map(further, sorted(FAULTS.keys() - {"kill"}))])
+def test_a_gateway_that_fails_loses_its_robots_to_another(hall: World, fault: str) -> None:
+    outages, stops = [], []
+    names = sorted(hall.gateways)
+    for case in range(cases(1, 10)):
+        began = time.monotonic()
+        mend = FAULTS[fault](hall.gateways[names[case % len(names)]])
+        stops.append(hall.stop_all())
+        assert until(lambda began=began: hall.driven(began + 1.5), 10)
+        while time.monotonic() < began + cases(0, int(FAULT_S)):
+            stops.append(hall.stop_all())
+            time.sleep(0.5)
+        mend()
+        stops.append(hall.stop_all())
+        hall.settle()
+        outages.append(hall.outage_s(began))
+    figures = {"outage": max(outages), "stop": max(stops), "cases": len(outages), **hall.wrong()}
+    sys.stdout.write(f"\n{len(names)} gateways, {fault}: {json.dumps(figures)}\n")
+    assert hall.wrong() == dict.fromkeys(NEVER, 0)
+    assert max(outages) <= OUTAGE_S
+    assert max(stops) <= STOP_S
