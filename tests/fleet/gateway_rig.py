@@ -113,9 +113,8 @@ class World:
         self.sent: dict[int, float] = {}
         self._numbers, self._stops, self._ending = itertools.count(1), itertools.count(1), threading.Event()
         self.operator.subscribe("pebble/robots/+/outgoing/#", self._note, direct=True)
-        self.gateways = {
-            f"gate-{n}": Process(folder, f"gate-{n}", self.hub_port, self.broker.port) for n in range(gateways)
-        }
+        names = [f"gate-{n}" for n in range(gateways)]
+        self.gateways = {name: Process(folder, name, self.hub_port, self.broker.port) for name in names}
         for one in self.gateways.values():
             stack.callback(one.close)
         thread = threading.Thread(target=self._drive, daemon=True)
@@ -125,9 +124,8 @@ class World:
 
     def _client(self, name: str, stack: ExitStack) -> Transport:
         connect = (f"tcp/127.0.0.1:{self.hub_port}",)
-        client = create("zenoh", name, ZenohSettings(run_dir=self._folder / name, connect=connect, client=True)).open(
-            20
-        )
+        settings = ZenohSettings(run_dir=self._folder / name, connect=connect, client=True)
+        client = create("zenoh", name, settings).open(20)
         stack.callback(client.close)
         assert until(lambda: client.state is State.CONNECTED, 30), client.problem
         return client
