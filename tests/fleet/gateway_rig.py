@@ -6,6 +6,7 @@ import itertools
 import json
 import os
 import signal
+import statistics
 import threading
 import time
 from collections import defaultdict
@@ -113,6 +114,10 @@ class World:
         self.sent: dict[int, float] = {}
         self._numbers, self._stops, self._ending = itertools.count(1), itertools.count(1), threading.Event()
         self.operator.subscribe("pebble/robots/+/outgoing/#", self._note, direct=True)
+        self.direct: list[Seen] = []  # the first robot's commands, as a robot at the broker receives them
+        beside = create("mqtt", "beside", MqttSettings(host="127.0.0.1", port=self.broker.port)).open(10)
+        stack.callback(beside.close)
+        beside.subscribe(DRIVE.topic(self.robots[0].base), self._note_direct, direct=True)
         names = [f"gate-{n}" for n in range(gateways)]
         self.gateways = {name: Process(folder, name, self.hub_port, self.broker.port) for name in names}
         for one in self.gateways.values():
@@ -154,7 +159,18 @@ class World:
         else:
             self.retained[message.topic] = message.payload
 
+    def _note_direct(self, message: Message) -> None:
+        self.direct.append(Seen(json.loads(message.payload)["n"], time.monotonic()))
+
     # -- what is asked of it
+
+    def p50_ms(self) -> tuple[float, float]:
+        """What a command takes to the first robot, and to one at the broker."""
+        each = (
+            [1000 * (one.at - self.sent[one.number]) for one in seen] for seen in (self.robots[0].commands, self.direct)
+        )
+        through, direct = (statistics.median(times) for times in each)
+        return round(through, 2), round(direct, 2)
 
     def driven(self, since: float) -> bool:
         """Whether each robot has had a command that was sent after ``since``."""

@@ -38,7 +38,13 @@ def test_a_gateway_that_fails_loses_its_robots_to_another(hall: World, fault: st
         stops.append(hall.stop_all())
         hall.settle()
         outages.append(hall.outage_s(began))
-    figures = {"outage": max(outages), "stop": max(stops), "cases": len(outages), **hall.wrong()}
+    figures = {
+        "outage": max(outages),
+        "stop": max(stops),
+        "cases": len(outages),
+        "p50 ms": hall.p50_ms(),
+        **hall.wrong(),
+    }
     sys.stdout.write(f"\n{len(names)} gateways, {fault}: {json.dumps(figures)}\n")
     assert hall.wrong() == dict.fromkeys(NEVER, 0)
     assert max(outages) <= OUTAGE_S
