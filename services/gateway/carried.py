@@ -47,17 +47,21 @@ class NamedSubjects(Subjects):
 
 
 class Carried:
-    """A robot of the hub. ``holds`` is asked for each message: whether this gateway carries it at this moment."""
+    """A robot of the hub, since ``since``.
+
+    ``holds`` is asked for each message: whether this gateway carries it at this moment, and has done so since then.
+    """
 
     def __init__(
         self,
         base: str,
+        since: float,
         hub: Transport,
         broker: Transport,
         holds: Callable[[], bool],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self.base = base
+        self.base, self.since = base, since
         self._hub, self._broker, self._holds = hub, broker, holds
         self._subscriptions: list[Subscription] = []
         #: By the channel of each medium: what allows it, and whether it was requested at the broker; None: not known.
@@ -73,18 +77,23 @@ class Carried:
             clock=clock,
         )
 
-    def begin(self) -> None:
-        """Forward from now on; first what the hub retains. Waits, bounded, for both sides."""
+    def begin(self) -> bool:
+        """Forward from now on; first what the hub retains. Waits, bounded, for both sides.
+
+        False: meanwhile this gateway does not carry the robot any more.
+        """
         sides, incoming = self.forwarder.sides, f"{self.base}/{INCOMING}"
         sides[Side.LOCAL].subscribing()
         self._subscribe(Side.LOCAL, self._hub, f"{self.base}/{OUTGOING}/#", f"{incoming}/flags/#")
         self.forwarder.subscribed(Side.LOCAL)
-        if self._holds():
-            self.forwarder.open()
+        if not self._holds():
+            return False
+        self.forwarder.open()
         sides[Side.REMOTE].subscribing()
         self._subscribe(Side.REMOTE, self._broker, f"{incoming}/#")
         self._broker.ask(self.subjects.flags)
         self.forwarder.subscribed(Side.REMOTE)
+        return True
 
     def end(self) -> None:
         self.forwarder.shut()

@@ -8,7 +8,7 @@ import logging
 import secrets
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
 import msgspec
@@ -162,9 +162,10 @@ class Gateway:
             self._publish_heartbeat(now)
         self.ownership.judge(now)
         held = self.ownership.held(now)
-        for robot in self._carried.keys() - set(held):
-            self._end(robot)
-        self._begin([robot for robot in held if robot not in self._carried])
+        for robot, one in list(self._carried.items()):
+            if held.get(robot) != one.since:
+                self._end(robot)
+        self._begin({robot: since for robot, since in held.items() if robot not in self._carried})
         for robot, due in list(self._synchronize.items()):
             if self._clock() >= due:
                 del self._synchronize[robot]
@@ -187,16 +188,18 @@ class Gateway:
         beat = GatewayHeartbeat(t=int(time.time() * 1000), run=self._run, number=self._number, hears=hears)
         self._broker.publish(self._topic, _encode(beat), qos=QoS.DELIVERED, retain=True, urgent=True)
 
-    def _begin(self, robots: Sequence[str]) -> None:
+    def _begin(self, robots: Mapping[str, float]) -> None:
         end = self._clock() + BEGINNING_S
-        for robot in robots:
-            one = Carried(robot, self._hub, self._broker, partial(self._holds, robot), self._clock)
+        for robot, since in robots.items():
+            one = Carried(robot, since, self._hub, self._broker, partial(self._holds, robot, since), self._clock)
             for transport in (self._hub, self._broker):
                 transport.judge_topics(is_stop=_is_stop)  # of all robots, not of this one
             self._carried[robot] = one
-            one.begin()
-            self._synchronize[robot] = self._clock() + INITIAL_SYNC_S
-            log.info("carries %s", robot)
+            if one.begin():
+                self._synchronize[robot] = self._clock() + INITIAL_SYNC_S
+                log.info("carries %s", robot)
+            else:
+                self._end(robot)
             if self._clock() >= end:
                 self._wake.set()
                 return
@@ -206,8 +209,8 @@ class Gateway:
         self._carried.pop(robot).end()
         log.info("carries %s no more", robot)
 
-    def _holds(self, robot: str) -> bool:
-        return self.ownership.holds(robot, self._clock())
+    def _holds(self, robot: str, since: float) -> bool:
+        return self.ownership.since(robot, self._clock()) == since
 
     # -- the transports' threads
 

@@ -123,18 +123,19 @@ class Ownership:
 
     # -- what follows from it
 
-    def holds(self, robot: str, now: float) -> bool:
-        """Whether this gateway carries ``robot`` at this moment. Hot: asked for each message."""
+    def since(self, robot: str, now: float) -> float | None:
+        """Since when this gateway carries ``robot`` without a break; None: it does not. Hot: asked for each message."""
         if now - self._mine.at > FRESH_S:
             self.judge(now)
-            return False
+            return None
         due = self._due.get(robot)
-        return due is not None and due <= now
+        return due if due is not None and due <= now else None
 
-    def held(self, now: float) -> list[str]:
-        """The robots that it carries at this moment."""
+    def held(self, now: float) -> dict[str, float]:
+        """The robots that it carries at this moment, and since when."""
         with self._lock:
-            return [robot for robot in self._due if self.holds(robot, now)]
+            each = {robot: self.since(robot, now) for robot in list(self._due)}
+        return {robot: since for robot, since in each.items() if since is not None}
 
     def next_due(self, now: float) -> float:
         """When the next robot is due that it does not carry yet; infinity: none is."""

@@ -70,7 +70,11 @@ class Broker:
             self._step()
 
     def holders(self, robot: str) -> list[str]:
-        return [one.name for one in self.gateways.values() if not one.hung and one.ownership.holds(robot, self.now)]
+        return [
+            one.name
+            for one in self.gateways.values()
+            if not one.hung and one.ownership.since(robot, self.now) is not None
+        ]
 
     def _step(self) -> None:
         for one in self.random.sample(sorted(self.gateways.values(), key=lambda each: each.name), len(self.gateways)):
@@ -79,7 +83,7 @@ class Broker:
             if one.hung:
                 continue
             for robot in ROBOTS:  # what waits at it is judged first: as when it wakes up with commands in its socket
-                one.ownership.holds(robot, self.now)
+                one.ownership.since(robot, self.now)
             while one.down and one.down[0][0] + one.down_s <= self.now:
                 self._receive(one, one.down.popleft()[1])
             if self.now - one.beat_at >= HEARTBEAT_S:
@@ -147,7 +151,7 @@ def test_one_that_hung_forwards_nothing_when_it_goes_on() -> None:
     broker.gateways["a"].hung = True
     broker.run(6)
     broker.gateways["a"].hung = False
-    assert [robot for robot in ROBOTS if broker.gateways["a"].ownership.holds(robot, broker.now)] == []
+    assert [robot for robot in ROBOTS if broker.gateways["a"].ownership.since(robot, broker.now)] == []
     broker.run(4)
     assert broker.twice == []
     assert sorted({name for robot in ROBOTS for name in broker.holders(robot)}) == ["a", "b"]
