@@ -63,16 +63,17 @@ class Robot:
 
 
 class Process:
-    """`pebble gateway FILE`, through a proxy on each side."""
+    """`pebble gateway FILE`, through a proxy on each side, unless it is not ``proxied``."""
 
-    def __init__(self, folder: Path, name: str, hub: int, broker: int) -> None:
+    def __init__(self, folder: Path, name: str, hub: int, broker: int, *, proxied: bool) -> None:
         self.name = name
         self.hub, self.broker = TcpProxy(hub), TcpProxy(broker)
+        ports = (self.hub.port, self.broker.port) if proxied else (hub, broker)
         self._file = folder / f"{name}.json"
         settings = {
             "id": name,
-            "hub": {"connect": [f"tcp/127.0.0.1:{self.hub.port}"]},
-            "mqtt": {"host": "127.0.0.1", "port": self.broker.port},
+            "hub": {"connect": [f"tcp/127.0.0.1:{ports[0]}"]},
+            "mqtt": {"host": "127.0.0.1", "port": ports[1]},
         }
         self._file.write_text(json.dumps(settings))
         self._process: Forked | None = None
@@ -98,7 +99,7 @@ class Process:
 
 
 class World:
-    def __init__(self, folder: Path, stack: ExitStack, gateways: int, robots: int) -> None:
+    def __init__(self, folder: Path, stack: ExitStack, gateways: int, robots: int, *, proxied: bool) -> None:
         self._folder = folder
         self.broker = Broker(folder, "max_queued_messages 20000")
         stack.callback(self.broker.kill)
@@ -119,7 +120,8 @@ class World:
         stack.callback(beside.close)
         beside.subscribe(DRIVE.topic(self.robots[0].base), self._note_direct, direct=True)
         names = [f"gate-{n}" for n in range(gateways)]
-        self.gateways = {name: Process(folder, name, self.hub_port, self.broker.port) for name in names}
+        ports = self.hub_port, self.broker.port
+        self.gateways = {name: Process(folder, name, *ports, proxied=proxied) for name in names}
         for one in self.gateways.values():
             stack.callback(one.close)
         thread = threading.Thread(target=self._drive, daemon=True)
@@ -247,8 +249,8 @@ FAULTS: dict[str, Callable[[Process], Callable[[], None]]] = {
 
 
 @contextmanager
-def world(folder: Path, gateways: int = 2, robots: int = 6) -> Iterator[World]:
+def world(folder: Path, gateways: int = 2, robots: int = 6, *, proxied: bool = True) -> Iterator[World]:
     with ExitStack() as stack:
-        made = World(folder, stack, gateways, robots)
+        made = World(folder, stack, gateways, robots, proxied=proxied)
         made.settle()
         yield made

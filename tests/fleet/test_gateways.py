@@ -49,3 +49,12 @@ def test_a_gateway_that_fails_loses_its_robots_to_another(hall: World, fault: st
     assert hall.wrong() == dict.fromkeys(NEVER, 0)
     assert max(outages) <= OUTAGE_S
     assert max(stops) <= STOP_S
+
+
+@pytest.mark.thorough
+def test_what_a_command_takes_through_a_gateway(tmp_path: Path) -> None:
+    """A figure for docs/fleet.md: how long commands take, and those that a robot at the broker itself receives."""
+    with world(tmp_path, 1, 2, proxied=False) as hall:
+        assert until(lambda: len(hall.robots[0].commands) > cases(200, 1000), 60)
+        sys.stdout.write(f"\np50 in ms through a gateway, and without: {hall.p50_ms()}\n")
+        assert hall.wrong() == dict.fromkeys(NEVER, 0)
