@@ -37,7 +37,6 @@ BEGINNING_S = 0.1  # in one turn: taking many robots must not hold up the heartb
 LONGEST_GAP_S, SHORTEST_GAP_S = 10.0, 0.75
 RIVAL_S = 5.0  # so long another gateway of the same name is there after its last heartbeat
 _SENT = 16  # heartbeats that may come back
-_MAX_BYTES = 128 * 1024  # of a heartbeat
 _STOP = Subject(Kind.COMMAND, ESTOP)
 _ANY = f"+/{GATEWAYS}/+"
 
@@ -186,7 +185,8 @@ class Gateway:
         if len(self._sent) > _SENT:
             del self._sent[next(iter(self._sent))]
         beat = GatewayHeartbeat(t=int(time.time() * 1000), run=self._run, number=self._number, hears=hears)
-        self._broker.publish(self._topic, _encode(beat), qos=QoS.DELIVERED, retain=True, urgent=True)
+        # Not stored: an old one must not be sent after an outage.
+        self._broker.publish(self._topic, _encode(beat), qos=QoS.DELIVERED, retain=True, urgent=True, remember=False)
 
     def _begin(self, robots: Mapping[str, float]) -> None:
         end = self._clock() + BEGINNING_S
@@ -243,7 +243,7 @@ class Gateway:
             return
         name = address.identity.id
         try:
-            beat = _decode(message.payload) if 0 < len(message.payload) <= _MAX_BYTES else None
+            beat = _decode(message.payload) if message.payload else None
         except msgspec.MsgspecError:
             self._quiet_log.warning(name[:40], "%s is no heartbeat of a gateway", message.topic[:200])
             return
