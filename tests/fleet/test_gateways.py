@@ -13,6 +13,7 @@ import pytest
 from tests.fleet.gateway_rig import FAULTS, NEVER, World, world
 from tests.support import cases, further, until
 
+pytestmark = pytest.mark.alone
 FAULT_S = 5.0  # longer than everything that notices it takes
 OUTAGE_S, STOP_S = 4.0, 1.0
 
