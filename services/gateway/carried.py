@@ -23,8 +23,8 @@ from pebble.contract import (
 )
 from pebble.contract.names import BY, stop_topic, without_name
 from pebble.errors import PayloadError
-from pebble.forwarding.forwarder import Forwarder, Routed
-from pebble.forwarding.routing import GATEWAY, Drop, Side
+from pebble.forwarding.forwarder import Forwarder
+from pebble.forwarding.routing import GATEWAY, Side
 from pebble.forwarding.subjects import Subject, Subjects
 from pebble.transports import Message, State, Subscription, Transport
 
@@ -120,18 +120,18 @@ class Carried:
 
     # -- the transports' threads
 
-    def receive(self, side: Side, message: Message) -> Routed | None:
-        """Pass a message on; None: this gateway does not carry the robot now."""
+    def receive(self, side: Side, message: Message) -> None:
+        """Pass a message on, unless this gateway does not carry the robot now."""
         if not self._holds():
-            return None
+            return
         subject = self.subjects[message.topic]
         channel = None if subject is None else subject.channel
         if channel is not None and (side is Side.REMOTE or channel in self._requested):
             if side is Side.REMOTE:
                 self._note_request(channel, message)
             elif not self._is_wanted(channel):
-                return Routed(subject, Drop.MEDIA)
-        return self.forwarder.receive(side, message)
+                return
+        self.forwarder.receive(side, message)
 
     def _subscribe(self, side: Side, transport: Transport, *filters: str) -> None:
         receive = partial(self.receive, side)

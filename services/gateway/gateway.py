@@ -264,7 +264,7 @@ class Gateway:
     def _on_rival(self, beat: GatewayHeartbeat, message: Message, now: float) -> None:
         if not message.retain and beat.run > self._run:
             self._rival_at = now
-            self._quiet_log.error("rival", "another gateway is called %s: this one rests", self.ownership.me)
+            self._quiet_log.warning("rival", "another gateway is called %s: this one rests", self.ownership.me)
 
     def _on_stop(self, message: Message) -> None:
         if message.retain or self._stops.examine(Side.REMOTE, _STOP, message) is not Finding.PASS:
