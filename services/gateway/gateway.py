@@ -53,26 +53,26 @@ def will(name: str) -> Message:
     return Message(ONLINE.topic(identity(name).base), b"", QoS.DELIVERED, True)
 
 
-class Heard:
+class PresentRobots:
     """The robots that publish heartbeats at the hub. Silence is judged by their own pace."""
 
     def __init__(self) -> None:
-        self._heard: dict[str, tuple[float, float]] = {}  # when, and after how many seconds of silence it is away
+        self._received: dict[str, tuple[float, float]] = {}  # when, and after how many seconds of silence it is away
 
     def note(self, robot: str, now: float) -> None:
-        before = self._heard.get(robot)
-        if before is None and len(self._heard) >= MAX_ROBOTS:
+        before = self._received.get(robot)
+        if before is None and len(self._received) >= MAX_ROBOTS:
             self._forget(now)
-            if len(self._heard) >= MAX_ROBOTS:
+            if len(self._received) >= MAX_ROBOTS:
                 return
         gap = 0.0 if before is None else now - before[0]
-        self._heard[robot] = now, silent_after(max(gap, SHORTEST_GAP_S) if gap <= LONGEST_GAP_S else SHORTEST_GAP_S)
+        self._received[robot] = now, silent_after(max(gap, SHORTEST_GAP_S) if gap <= LONGEST_GAP_S else SHORTEST_GAP_S)
 
     def robots(self, now: float) -> tuple[str, ...]:
-        return tuple(sorted(robot for robot, (at, silent_s) in list(self._heard.items()) if now - at <= silent_s))
+        return tuple(sorted(robot for robot, (at, silent_s) in list(self._received.items()) if now - at <= silent_s))
 
     def _forget(self, now: float) -> None:
-        self._heard = {robot: one for robot, one in self._heard.items() if now - one[0] <= one[1]}
+        self._received = {robot: one for robot, one in self._received.items() if now - one[0] <= one[1]}
 
 
 class Gateway:
@@ -96,12 +96,12 @@ class Gateway:
         self._topic = will(name).topic
         self._run, self._number = secrets.token_hex(4), 0
         self._sent: dict[int, tuple[float, tuple[str, ...]]] = {}  # heartbeats that have not come back
-        self._heard = Heard()
+        self._present = PresentRobots()
         self._carried: dict[str, Carried] = {}
         self._synchronize: dict[str, float] = {}  # when what is retained of it has arrived
         self._stops = Cycles(clock)
         self._quiet_log = RateLimitedLog(log, period_s=60.0)
-        self._rival_at = self._beat_at = self._probed_at = float("-inf")
+        self._rival_at = self._heartbeat_at = self._probed_at = float("-inf")
         self._states = threading.Lock()
         self._at_broker, self._at_hub = False, False
         self._wake = threading.Event()
@@ -157,7 +157,7 @@ class Gateway:
     def tick(self) -> None:
         """A turn: heartbeat, who carries what, what is due."""
         now = self._clock()
-        if now - self._beat_at >= HEARTBEAT_S - TICK_S / 2:
+        if now - self._heartbeat_at >= HEARTBEAT_S - TICK_S / 2:
             self._publish_heartbeat(now)
         self.ownership.judge(now)
         held = self.ownership.held(now)
@@ -178,15 +178,17 @@ class Gateway:
     def _publish_heartbeat(self, now: float) -> None:
         if self._broker.state is not State.CONNECTED or now - self._rival_at < RIVAL_S:
             return
-        self._beat_at = now
-        hears = self._heard.robots(now) if self._hub.state is State.CONNECTED else ()
+        self._heartbeat_at = now
+        robots = self._present.robots(now) if self._hub.state is State.CONNECTED else ()
         self._number += 1
-        self._sent[self._number] = now, hears
+        self._sent[self._number] = now, robots
         if len(self._sent) > _SENT:
             del self._sent[next(iter(self._sent))]
-        beat = GatewayHeartbeat(t=int(time.time() * 1000), run=self._run, number=self._number, hears=hears)
+        heartbeat = GatewayHeartbeat(t=int(time.time() * 1000), run=self._run, number=self._number, robots=robots)
         # Not stored: an old one must not be sent after an outage.
-        self._broker.publish(self._topic, _encode(beat), qos=QoS.DELIVERED, retain=True, urgent=True, remember=False)
+        self._broker.publish(
+            self._topic, _encode(heartbeat), qos=QoS.DELIVERED, retain=True, urgent=True, remember=False
+        )
 
     def _begin(self, robots: Mapping[str, float]) -> None:
         end = self._clock() + BEGINNING_S
@@ -235,7 +237,7 @@ class Gateway:
     def _on_robot(self, message: Message) -> None:
         address = parse_topic(message.topic)
         if not message.retain and message.payload and address is not None and not address.identity.is_server:
-            self._heard.note(address.identity.base, self._clock())
+            self._present.note(address.identity.base, self._clock())
 
     def _on_gateway(self, message: Message) -> None:
         address, now = parse_topic(message.topic), self._clock()
@@ -243,26 +245,28 @@ class Gateway:
             return
         name = address.identity.id
         try:
-            beat = _decode(message.payload) if message.payload else None
+            heartbeat = _decode(message.payload) if message.payload else None
         except msgspec.MsgspecError:
             self._quiet_log.warning(name[:40], "%s is no heartbeat of a gateway", message.topic[:200])
             return
         if name != self.ownership.me:
-            if beat is None:
+            if heartbeat is None:
                 self.ownership.left(name, now)
             else:
-                self.ownership.heard(name, beat.hears[:MAX_ROBOTS], now)
-        elif beat is None:
-            self._beat_at = float("-inf")  # of an earlier connection: the others have to learn that this one is here
-        elif beat.run != self._run:
-            self._on_rival(beat, message, now)
-        elif beat.number in self._sent:
-            sent_at, hears = self._sent.pop(beat.number)
-            self.ownership.came_back(sent_at, hears, now)
+                self.ownership.received(name, heartbeat.robots[:MAX_ROBOTS], now)
+        elif heartbeat is None:
+            self._heartbeat_at = float(
+                "-inf"
+            )  # of an earlier connection: the others have to learn that this one is here
+        elif heartbeat.run != self._run:
+            self._on_rival(heartbeat, message, now)
+        elif heartbeat.number in self._sent:
+            sent_at, robots = self._sent.pop(heartbeat.number)
+            self.ownership.came_back(sent_at, robots, now)
         self._wake.set()
 
-    def _on_rival(self, beat: GatewayHeartbeat, message: Message, now: float) -> None:
-        if not message.retain and beat.run > self._run:
+    def _on_rival(self, heartbeat: GatewayHeartbeat, message: Message, now: float) -> None:
+        if not message.retain and heartbeat.run > self._run:
             self._rival_at = now
             self._quiet_log.warning("rival", "another gateway is called %s: this one rests", self.ownership.me)
 

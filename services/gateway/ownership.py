@@ -31,7 +31,7 @@ class _Known:
     """The newest heartbeat of a gateway. Of this one ``at`` is when it was sent, of others when it was received."""
 
     at: float
-    hears: frozenset[str]
+    robots: frozenset[str]
 
 
 _NONE = _Known(_NEVER, frozenset())
@@ -70,15 +70,15 @@ class Ownership:
                 known.clear()
             self._will_at = _NEVER
 
-    def came_back(self, sent_at: float, hears: Collection[str], now: float) -> None:
+    def came_back(self, sent_at: float, robots: Collection[str], now: float) -> None:
         """The broker has sent back a heartbeat of this gateway."""
         with self._lock:
             self.judge(now)  # what was too late for it is over before it counts again
             if self._connected_at is not None and sent_at >= max(self._connected_at, self._mine.at):
-                self._mine = _Known(sent_at, frozenset(hears))
+                self._mine = _Known(sent_at, frozenset(robots))
             self.judge(now)
 
-    def heard(self, gateway: str, hears: Collection[str], now: float) -> None:
+    def received(self, gateway: str, robots: Collection[str], now: float) -> None:
         """The broker has sent a heartbeat of another gateway; a retained one counts as fresh."""
         with self._lock:
             if gateway not in self._others and len(self._others) >= MAX_GATEWAYS:
@@ -87,7 +87,7 @@ class Ownership:
                     return
                 del self._others[oldest]
             self._wills.pop(gateway, None)
-            self._others[gateway] = _Known(now, frozenset(hears))
+            self._others[gateway] = _Known(now, frozenset(robots))
             self.judge(now)
 
     def left(self, gateway: str, now: float) -> None:
@@ -106,10 +106,10 @@ class Ownership:
                 self._due.clear()
                 self._owners.clear()
                 return
-            fresh = {name: one.hears for name, one in self._others.items() if now - one.at <= FRESH_S}
-            fresh[self.me] = self._mine.hears
-            for robot in self._mine.hears:
-                owner = max((self._score(name, robot), name) for name, hears in fresh.items() if robot in hears)[1]
+            fresh = {name: one.robots for name, one in self._others.items() if now - one.at <= FRESH_S}
+            fresh[self.me] = self._mine.robots
+            for robot in self._mine.robots:
+                owner = max((self._score(name, robot), name) for name, robots in fresh.items() if robot in robots)[1]
                 before, since = self._owners.get(robot, ("", now))
                 if owner != before:
                     self._owners[robot] = owner, now
@@ -117,7 +117,7 @@ class Ownership:
                     self._due.pop(robot, None)
                 elif robot not in self._due:
                     self._due[robot] = now + self._wait(before, now - since, now)
-            for robot in self._owners.keys() - self._mine.hears:
+            for robot in self._owners.keys() - self._mine.robots:
                 del self._owners[robot]
                 self._due.pop(robot, None)
 
@@ -146,7 +146,7 @@ class Ownership:
     def others(self) -> Mapping[str, frozenset[str]]:
         """The other gateways that are known, fresh or not, and what each hears."""
         with self._lock:
-            return {name: one.hears for name, one in self._others.items()}
+            return {name: one.robots for name, one in self._others.items()}
 
     # -- with the lock held
 

@@ -28,7 +28,7 @@ NEVER = ("commands twice", "commands out of order", "commands older than 1 s", "
 _EVENT = "outgoing/counted"  # the contract does not know it: an event
 
 
-class Seen(NamedTuple):
+class Arrival(NamedTuple):
     number: int
     at: float
 
@@ -38,7 +38,7 @@ class Robot:
 
     def __init__(self, name: str, client: Transport) -> None:
         self.base, self.client = f"pebble/robots/{name}", client
-        self.commands: list[Seen] = []
+        self.commands: list[Arrival] = []
         self.stops: dict[str, float] = {}
         self.flags: list[bytes] = []
         self.events = itertools.count(1)
@@ -47,16 +47,16 @@ class Robot:
         client.subscribe(ESTOP.topic(self.base), self._on_stop, direct=True)
         client.subscribe(MQTT_VIDEO.topic(self.base), lambda message: self.flags.append(message.payload), direct=True)
 
-    def beat(self) -> None:
-        beat = json.dumps({"t": int(time.time() * 1000)}).encode()
-        self.client.publish(ONLINE.topic(self.base), beat, qos=QoS.DELIVERED, retain=True)
+    def publish_heartbeat(self) -> None:
+        heartbeat = json.dumps({"t": int(time.time() * 1000)}).encode()
+        self.client.publish(ONLINE.topic(self.base), heartbeat, qos=QoS.DELIVERED, retain=True)
 
-    def tell(self) -> None:
+    def publish_event(self) -> None:
         self.client.publish(f"{self.base}/{_EVENT}", str(next(self.events)).encode(), qos=QoS.DELIVERED)
 
     def _on_drive(self, message: Message) -> None:
         if message.payload.strip():  # else a probe for cycles
-            self.commands.append(Seen(json.loads(message.payload)["n"], time.monotonic()))
+            self.commands.append(Arrival(json.loads(message.payload)["n"], time.monotonic()))
 
     def _on_stop(self, message: Message) -> None:
         self.stops.setdefault(json.loads(message.payload)["stop"], time.monotonic())
@@ -110,12 +110,12 @@ class World:
         self.robots = [Robot(f"r{n}", self._client(f"r{n}", stack)) for n in range(robots)]
         self.operator = create("mqtt", "operator", MqttSettings(host="127.0.0.1", port=self.broker.port)).open(10)
         stack.callback(self.operator.close)
-        self.events: defaultdict[str, list[Seen]] = defaultdict(list)
+        self.events: defaultdict[str, list[Arrival]] = defaultdict(list)
         self.retained: dict[str, bytes] = {}
         self.sent: dict[int, float] = {}
         self._numbers, self._stops, self._ending = itertools.count(1), itertools.count(1), threading.Event()
         self.operator.subscribe("pebble/robots/+/outgoing/#", self._note, direct=True)
-        self.direct: list[Seen] = []  # the first robot's commands, as a robot at the broker receives them
+        self.direct: list[Arrival] = []  # the first robot's commands, as a robot at the broker receives them
         beside = create("mqtt", "beside", MqttSettings(host="127.0.0.1", port=self.broker.port)).open(10)
         stack.callback(beside.close)
         beside.subscribe(DRIVE.topic(self.robots[0].base), self._note_direct, direct=True)
@@ -150,19 +150,19 @@ class World:
             for robot in self.robots:
                 self.operator.publish(DRIVE.topic(robot.base), command, qos=QoS.DELIVERED)
                 if number % HEARTBEAT_EACH == 0:
-                    robot.beat()
+                    robot.publish_heartbeat()
                 if number % EVENT_EACH == 0:
-                    robot.tell()
+                    robot.publish_event()
 
     def _note(self, message: Message) -> None:
         _, _, robot, metric = message.topic.split("/", 3)
         if metric == _EVENT:
-            self.events[robot].append(Seen(int(message.payload), time.monotonic()))
+            self.events[robot].append(Arrival(int(message.payload), time.monotonic()))
         else:
             self.retained[message.topic] = message.payload
 
     def _note_direct(self, message: Message) -> None:
-        self.direct.append(Seen(json.loads(message.payload)["n"], time.monotonic()))
+        self.direct.append(Arrival(json.loads(message.payload)["n"], time.monotonic()))
 
     # -- what is asked of it
 
@@ -178,7 +178,7 @@ class World:
         """Whether each robot has had a command that was sent after ``since``."""
         return all(one.commands and self.sent[one.commands[-1].number] > since for one in self.robots)
 
-    def settle(self) -> None:
+    def wait_until_shared(self) -> None:
         """Wait until every gateway may have its share: after its start, or a fault."""
         now = time.monotonic()
         assert until(lambda: self.driven(now + 2.5), 30), [len(one.commands) for one in self.robots]
@@ -202,8 +202,8 @@ class World:
         counts = dict.fromkeys(NEVER, 0)
         for one in self.robots:
             counts["commands older than 1 s"] += sum(seen.at - self.sent[seen.number] > 1 for seen in one.commands)
-        told = ("commands", [one.commands for one in self.robots]), ("events", list(self.events.values()))
-        for what, each in told:
+        both = ("commands", [one.commands for one in self.robots]), ("events", list(self.events.values()))
+        for what, each in both:
             for seen in each:
                 numbers = [one.number for one in seen]
                 counts[f"{what} twice"] += len(numbers) - len(set(numbers))
@@ -252,5 +252,5 @@ FAULTS: dict[str, Callable[[Process], Callable[[], None]]] = {
 def world(folder: Path, gateways: int = 2, robots: int = 6, *, proxied: bool = True) -> Iterator[World]:
     with ExitStack() as stack:
         made = World(folder, stack, gateways, robots, proxied=proxied)
-        made.settle()
+        made.wait_until_shared()
         yield made

@@ -38,7 +38,7 @@ def test_a_gateway_that_fails_loses_its_robots_to_another(hall: World, fault: st
             time.sleep(0.5)
         mend()
         stops.append(hall.stop_all())
-        hall.settle()
+        hall.wait_until_shared()
         outages.append(hall.outage_s(began))
     figures = {
         "outage": max(outages),

@@ -17,7 +17,7 @@ from tests.forwarding.virtual import Connection, Hub
 from tests.services.mqtt_bridge.bridge_rig import Client
 from tests.support import cases
 
-STEP_S, SETTLED_S = 0.05, 8.0
+STEP_S, RECOVERY_S = 0.05, 8.0
 GOOB = "pebble/robots/goob"
 
 
@@ -262,6 +262,6 @@ def test_nothing_comes_twice_or_out_of_order_whatever_fails(monkeypatch: pytest.
         for each in one.connections:
             each.mend()
         one.go_on()
-    world.run(SETTLED_S)
+    world.run(RECOVERY_S)
     assert world.wrong() == 0
     assert world.all_pass()

@@ -13,16 +13,16 @@ from tests.support import cases
 
 STEP_S, HEARTBEAT_S = 0.02, 0.25
 ROBOTS = [f"pebble/robots/r{n}" for n in range(4)]
-SETTLED_S = 2 * TAKING_S + ALONE_S
+RECOVERY_S = 2 * TAKING_S + ALONE_S
 
 
 @dataclass
-class Beat:
-    """What a gateway publishes; ``hears`` None: its will."""
+class Published:
+    """What a gateway publishes; ``robots`` None: its will."""
 
     sender: str
     sent_at: float
-    hears: frozenset[str] | None
+    robots: frozenset[str] | None
 
 
 @dataclass(eq=False)
@@ -34,10 +34,10 @@ class Simulated:
     up_s: float = 0.01
     down_s: float = 0.01
     hung: bool = False
-    hears: frozenset[str] = frozenset(ROBOTS)
-    beat_at: float = 0.0
-    up: deque[tuple[float, Beat]] = field(default_factory=deque)
-    down: deque[tuple[float, Beat]] = field(default_factory=deque)
+    robots: frozenset[str] = frozenset(ROBOTS)
+    heartbeat_at: float = 0.0
+    up: deque[tuple[float, Published]] = field(default_factory=deque)
+    down: deque[tuple[float, Published]] = field(default_factory=deque)
 
 
 class Broker:
@@ -46,7 +46,7 @@ class Broker:
     def __init__(self, seed: int, names: list[str]) -> None:
         self.random, self.now = random.Random(seed), 100.0
         self.gateways: dict[str, Simulated] = {}
-        self.retained: dict[str, Beat] = {}
+        self.retained: dict[str, Published] = {}
         self.twice: list[str] = []
         for name in names:
             self.start(name)
@@ -54,14 +54,14 @@ class Broker:
     def start(self, name: str) -> None:
         one = self.gateways[name] = Simulated(name, Ownership(name))
         one.ownership.connected(self.now)
-        one.down.extend((self.now, beat) for beat in self.retained.values())
+        one.down.extend((self.now, heartbeat) for heartbeat in self.retained.values())
 
     def kill(self, name: str) -> None:
         """What it had sent arrives; then the broker publishes its will."""
         one = self.gateways.pop(name)
-        for _, beat in one.up:
-            self._distribute(beat)
-        self._distribute(Beat(name, self.now, None))
+        for _, heartbeat in one.up:
+            self._distribute(heartbeat)
+        self._distribute(Published(name, self.now, None))
 
     def run(self, seconds: float) -> None:
         end = self.now + seconds
@@ -86,28 +86,28 @@ class Broker:
                 one.ownership.since(robot, self.now)
             while one.down and one.down[0][0] + one.down_s <= self.now:
                 self._receive(one, one.down.popleft()[1])
-            if self.now - one.beat_at >= HEARTBEAT_S:
-                one.beat_at = self.now
-                one.up.append((self.now, Beat(one.name, self.now, one.hears)))
+            if self.now - one.heartbeat_at >= HEARTBEAT_S:
+                one.heartbeat_at = self.now
+                one.up.append((self.now, Published(one.name, self.now, one.robots)))
             one.ownership.judge(self.now)
         self.twice += [f"{self.now:.2f} {robot}: {who}" for robot in ROBOTS if len(who := self.holders(robot)) > 1]
 
-    def _distribute(self, beat: Beat) -> None:
-        if beat.hears is None:
-            self.retained.pop(beat.sender, None)
+    def _distribute(self, heartbeat: Published) -> None:
+        if heartbeat.robots is None:
+            self.retained.pop(heartbeat.sender, None)
         else:
-            self.retained[beat.sender] = beat
+            self.retained[heartbeat.sender] = heartbeat
         for one in self.gateways.values():
-            one.down.append((self.now, beat))
+            one.down.append((self.now, heartbeat))
 
-    def _receive(self, one: Simulated, beat: Beat) -> None:
-        if beat.sender == one.name:
-            if beat.hears is not None:
-                one.ownership.came_back(beat.sent_at, beat.hears, self.now)
-        elif beat.hears is None:
-            one.ownership.left(beat.sender, self.now)
+    def _receive(self, one: Simulated, heartbeat: Published) -> None:
+        if heartbeat.sender == one.name:
+            if heartbeat.robots is not None:
+                one.ownership.came_back(heartbeat.sent_at, heartbeat.robots, self.now)
+        elif heartbeat.robots is None:
+            one.ownership.left(heartbeat.sender, self.now)
         else:
-            one.ownership.heard(beat.sender, beat.hears, self.now)
+            one.ownership.received(heartbeat.sender, heartbeat.robots, self.now)
 
 
 def test_one_alone_carries_all_after_it_would_have_heard_another() -> None:
@@ -139,7 +139,7 @@ def test_a_robot_has_another_gateway_soon(fault: str, most_s: float) -> None:
     elif fault == "hang":
         broker.gateways["a"].hung = True
     else:
-        broker.gateways["a"].hears = frozenset()
+        broker.gateways["a"].robots = frozenset()
     broker.run(most_s + 0.1)
     assert all(len(broker.holders(robot)) == 1 for robot in ROBOTS)
     assert broker.twice == []
@@ -174,7 +174,7 @@ def test_no_robot_has_two_whatever_fails(seed: int) -> None:
             case 1:
                 one.hung = not one.hung
             case 2:
-                one.hears = frozenset(robot for robot in ROBOTS if chance.random() < 0.7)
+                one.robots = frozenset(robot for robot in ROBOTS if chance.random() < 0.7)
             case _:
                 one.up_s, one.down_s = (chance.choice((0.0, 0.02, 0.2, 0.45, 0.7, 1.1, 3.0)) for _ in range(2))
         assert broker.twice == []
@@ -183,7 +183,7 @@ def test_no_robot_has_two_whatever_fails(seed: int) -> None:
             broker.start(name)
     for one in broker.gateways.values():
         one.up_s = one.down_s = 0.01
-        one.hung, one.hears = False, frozenset(ROBOTS)
-    broker.run(SETTLED_S)
+        one.hung, one.robots = False, frozenset(ROBOTS)
+    broker.run(RECOVERY_S)
     assert broker.twice == []
     assert all(len(broker.holders(robot)) == 1 for robot in ROBOTS)
