@@ -185,7 +185,7 @@ def fleet_hub_settings(hub: "HubFile", run_dir: Path) -> ZenohSettings:
 
 
 def gateway_transports(gateway: "GatewayFile", run_dir: Path, will: Message) -> tuple[Transport, Transport, Transport]:
-    """Of a gateway: to the hub, to the broker for what it forwards, and to the broker for presence and stops."""
+    """The connections of a gateway: to the hub, and two to the broker, one of them for presence and stops alone."""
     hub, mqtt = gateway.hub, gateway.mqtt
     zenoh = ZenohSettings(
         run_dir=run_dir,

@@ -185,10 +185,8 @@ class Gateway:
         if len(self._sent) > _SENT:
             del self._sent[next(iter(self._sent))]
         heartbeat = GatewayHeartbeat(t=int(time.time() * 1000), run=self._run, number=self._number, robots=robots)
-        # Not stored: an old one must not be sent after an outage.
-        self._broker.publish(
-            self._topic, _encode(heartbeat), qos=QoS.DELIVERED, retain=True, urgent=True, remember=False
-        )
+        raw = _encode(heartbeat)  # not stored: an old one must not be sent after an outage
+        self._broker.publish(self._topic, raw, qos=QoS.DELIVERED, retain=True, urgent=True, remember=False)
 
     def _begin(self, robots: Mapping[str, float]) -> None:
         end = self._clock() + BEGINNING_S
@@ -254,10 +252,8 @@ class Gateway:
                 self.ownership.left(name, now)
             else:
                 self.ownership.received(name, heartbeat.robots[:MAX_ROBOTS], now)
-        elif heartbeat is None:
-            self._heartbeat_at = float(
-                "-inf"
-            )  # of an earlier connection: the others have to learn that this one is here
+        elif heartbeat is None:  # the will of an earlier connection
+            self._heartbeat_at = float("-inf")
         elif heartbeat.run != self._run:
             self._on_rival(heartbeat, message, now)
         elif heartbeat.number in self._sent:
@@ -293,5 +289,5 @@ _STOP_END = f"/{ESTOP.metric}".encode()
 
 
 def _is_stop(topic: str) -> bool:
-    """With the name of a sender or without."""
+    """Whether it is a stop, with the name of a sender or without."""
     return f"/{ESTOP.direction}/" in topic and topic.endswith(f"/{ESTOP.metric}")

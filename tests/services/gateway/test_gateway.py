@@ -209,7 +209,7 @@ def test_pictures_pass_while_they_are_allowed_until_an_operator_ends_them(alone:
     assert not passes()
 
 
-def test_every_gateway_forwards_a_live_stop_whoever_carries_the_robot(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_gateway_forwards_a_live_stop_in_every_state(monkeypatch: pytest.MonkeyPatch) -> None:
     world = World(monkeypatch, "a", "b")
     stop = b'{"stop": "s%d"}'
     for number, seconds in enumerate((STEP_S, 0.5, 2.0)):  # not heard; taking; carried

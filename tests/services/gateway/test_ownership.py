@@ -110,7 +110,7 @@ class Broker:
             one.ownership.received(heartbeat.sender, heartbeat.robots, self.now)
 
 
-def test_one_alone_carries_all_after_it_would_have_heard_another() -> None:
+def test_one_alone_carries_all() -> None:
     broker = Broker(1, ["a"])
     broker.run(TAKING_S + HEARTBEAT_S)
     assert [broker.holders(robot) for robot in ROBOTS] == [["a"]] * len(ROBOTS)
