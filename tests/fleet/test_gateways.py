@@ -11,6 +11,8 @@ from pathlib import Path
 import pytest
 
 from tests.fleet.gateway_rig import FAULTS, NEVER, World, world
+from tests.robot.operator import Driver, retained_messages
+from tests.robot.rig import BASE, Rig
 from tests.support import cases, further, until
 
 pytestmark = pytest.mark.alone
@@ -59,4 +61,26 @@ def test_what_a_command_takes_through_a_gateway(tmp_path: Path) -> None:
     with world(tmp_path, 1, 2, proxied=False) as hall:
         assert until(lambda: len(hall.robots[0].commands) > cases(200, 1000), 60)
         sys.stdout.write(f"\np50 in ms through a gateway, and without: {hall.p50_ms()}\n")
+        assert hall.wrong() == dict.fromkeys(NEVER, 0)
+
+
+@pytest.mark.thorough
+def test_a_whole_robot_is_driven_and_stopped_through_a_gateway_that_dies(tmp_path: Path) -> None:
+    with world(tmp_path, 2, 1) as hall:
+        remote = {"kind": "zenoh", "connect": [f"tcp/127.0.0.1:{hall.hub_port}"]}
+        with Rig("zenoh", remote=hall.broker, mqtt_bridge={"remote": remote}) as rig:
+            assert {"outgoing/capabilities", "outgoing/status"} <= retained_messages(hall.broker.port, BASE).keys()
+            driver = Driver(rig.operator)
+            assert until(rig.mcu.turning, 10)
+            for one in hall.gateways.values():
+                began = time.monotonic()
+                one.kill()
+                assert until(lambda began=began: rig.mcu.moving(began + 0.75), 10), "the other carries it"
+                one.start()
+                hall.wait_until_shared()
+            stopped = time.monotonic()
+            rig.operator.send("incoming/estop", {"stop": "s" * 16, "by": "ann"})
+            assert until(lambda: not rig.mcu.turning(), 1)
+            assert rig.operator.wait_for("outgoing/estop/serial", since=stopped).json["latched"]
+            driver.stop()
         assert hall.wrong() == dict.fromkeys(NEVER, 0)
