@@ -40,6 +40,7 @@ COMMANDS = {
     "cert": "cert",
     "fleet": "fleet",
     "hub": "hub",
+    "gateway": "gateway",
     "audit": "audit",
     "conform": "conform",
     "flash": "flash",

@@ -21,7 +21,7 @@ from pebble.config.transport import Mqtt, Tls, TransportSection
 from pebble.config.tree import MqttBridge, Root, SerialBridge, SerialBridges, SerialSafety, Services
 from pebble.config.types import Secret
 from pebble.config.web import WebInterface, WebMqtt, WebTls
-from pebble.contract.identity import SERVERS
+from pebble.contract.identity import GATEWAYS, SERVERS
 
 _MOST_HOSTS = 8  # in a list of brokers: each that is hung takes two seconds of a round
 _LATER = ("ros1_bridge",)
@@ -37,8 +37,8 @@ def _root(reader: Reader, root: Root, _path: Path) -> Root:
         reader.notes.doubt(
             ("transport", "mqtt_mirror"), f'only a Zenoh robot has a mirror and kind is "{kind}": leave it out'
         )
-    if root.robot.type == SERVERS:
-        reader.notes.problem(("robot", "type"), f'must not be "{SERVERS}": those are operators\' servers, not robots')
+    if root.robot.type in (SERVERS, GATEWAYS):
+        reader.notes.problem(("robot", "type"), f'must not be "{root.robot.type}": those are no robots')
     if platform == "linux" and root.local_mqtt.hosts:
         reader.notes.problem(("local_mqtt", "hosts"), "cannot be several: write host, the broker inside the robot")
     if platform != "linux" and kind != "mqtt":

@@ -14,8 +14,8 @@ _RESERVED = r"/+#$\x00-\x1f\x7f-\x9f\ufdd0-\ufdef\ufffe\uffff"
 LEVEL = rf"^[^{_RESERVED}]{{1,64}}$(?!\n)"
 LEVEL_RULE = "a topic level: 1 to 64 characters, without / + # $ and control characters"
 
-#: The type of operators' servers, which publish below their own identity but are no robots.
-SERVERS = "servers"
+#: The types of operators' servers and of gateways, which publish below their own identity but are no robots.
+SERVERS, GATEWAYS = "servers", "gateways"
 
 _REMEMBERED, _REMEMBERED_LENGTH = 1024, 128  # topics, and characters of each: 1.5 MB at most
 
@@ -61,8 +61,8 @@ class Identity(Struct, frozen=True):
 
     @property
     def is_server(self) -> bool:
-        """Whether it is an operators' server: nothing that drives, is stopped or is listed among robots."""
-        return self.type == SERVERS
+        """Whether it is an operators' server or a gateway: nothing that drives, is stopped or is listed with robots."""
+        return self.type in (SERVERS, GATEWAYS)
 
     def incoming(self, metric: str) -> str:
         """A topic that this component subscribes to; ``metric`` may have several levels."""

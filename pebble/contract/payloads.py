@@ -215,6 +215,15 @@ class Heartbeat(Payload, frozen=True, kw_only=True):
     online: bool | UnsetType = UNSET
 
 
+class GatewayHeartbeat(Payload, frozen=True, kw_only=True):
+    """Sign of life of a gateway, on ``outgoing/online`` of its own identity; as the will the topic is emptied."""
+
+    t: int  # epoch milliseconds
+    run: str  # another one at each start
+    number: int  # of this heartbeat, by which its gateway knows when it sent it
+    robots: tuple[str, ...] = ()  # bases of those that it hears at its hub
+
+
 class ChargingStatus(Payload, frozen=True, kw_only=True):
     """Whether the robot is on its charger; null: unknown."""
 

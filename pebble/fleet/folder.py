@@ -59,9 +59,9 @@ class Fleet(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     accounts: dict[str, Account] = msgspec.field(default_factory=dict)
     extra: Extra = Extra()
 
-    def rules_of(self, name: str) -> tuple[Rule, ...]:
+    def rules_of(self, name: str, *, at_hub: bool = False) -> tuple[Rule, ...]:
         account = self.accounts[name]
-        return rules(name, account, self.level, plain=self._plain_bases(), extra=self.extra)
+        return rules(name, account, self.level, plain=self._plain_bases(), extra=self.extra, at_hub=at_hub)
 
     def with_account(self, name: str, account: Account) -> "Fleet":
         return replace(self, accounts={**self.accounts, name: account})

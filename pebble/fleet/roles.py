@@ -14,12 +14,12 @@ from msgspec import Struct
 from pebble.config.security import SecurityLevel
 from pebble.contract import INCOMING, OUTGOING, Channel, Kind
 from pebble.contract import channels as c
+from pebble.contract.identity import GATEWAYS as GATEWAYS
 from pebble.contract.identity import SERVERS
 from pebble.contract.names import BY
 from pebble.contract.rights import WRITES as WRITES
 from pebble.contract.rights import Right as Right
 
-GATEWAYS = "gateways"  # the type of programs that carry the topics of several robots to a broker
 CONTROL_TOPIC, CONTROL_ANSWERS = "$CONTROL/dynamic-security/v1", "$CONTROL/dynamic-security/#"
 _ANY = "+/+/+"  # any component
 
@@ -134,13 +134,15 @@ def rules(
     *,
     plain: Sequence[str] = (),
     extra: Extra | None = None,
+    at_hub: bool = False,
 ) -> tuple[Rule, ...]:
     """All that a broker lets this account do. ``plain``: bases of robots that do not know names, or ``+/+/+``.
 
-    They are literal: the ``%u`` of some brokers is unknown to mosquitto 2.0's plugin.
+    They are literal: the ``%u`` of some brokers is unknown to mosquitto 2.0's plugin. ``at_hub``: what a Zenoh hub lets
+    it do. That differs for a gateway, whose robots are at the hub, and their operators at the broker.
     """
     found = [
-        *_of_bases(name, account),
+        *_of_bases(name, account, at_hub=at_hub),
         *_of_rights(name, rights(account.roles, level), level, plain, extra or Extra()),
     ]
     return tuple(dict.fromkeys(found))
@@ -152,15 +154,15 @@ def metrics(right: Right, extra: Extra | None = None) -> tuple[str, ...]:
     return (*(re.sub(r"{[^}]*}", "+", one) for one in own), *getattr(extra, right, ()))
 
 
-def _of_bases(name: str, account: Account) -> Iterator[Rule]:
+def _of_bases(name: str, account: Account, *, at_hub: bool) -> Iterator[Rule]:
     for base in account.bases:
         if ProgramRole.ROBOT in account.roles:
             yield from (Rule(access, f"{base}/#") for access in ("read", "write"))
         else:
             yield from (Rule("read", f"{base}/{direction}/#") for direction in (INCOMING, OUTGOING))
-            yield Rule("write", f"{base}/{OUTGOING}/#")
+            yield Rule("write", f"{base}/{INCOMING if at_hub else OUTGOING}/#")
             yield from (Rule("write", one.filter(base)) for one in c.CHANNELS if one.kind is Kind.FLAG)
-    if ProgramRole.GATEWAY in account.roles:
+    if ProgramRole.GATEWAY in account.roles and not at_hub:
         yield Rule("read", c.ONLINE.filter(f"+/{GATEWAYS}/+"))
         yield Rule("write", c.ONLINE.filter(f"+/{GATEWAYS}/{name}"))
 

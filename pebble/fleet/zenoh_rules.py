@@ -3,7 +3,6 @@
 from collections.abc import Iterable, Iterator, Sequence
 
 from pebble.contract import CHANNELS, ESTOP, INCOMING, OUTGOING, Kind
-from pebble.contract.channels import ONLINE
 from pebble.contract.names import with_name
 from pebble.fleet.folder import Fleet
 from pebble.fleet.roles import Account, ProgramRole, Rule
@@ -28,7 +27,7 @@ _FLAGS = tuple(f"/{one.suffix}" for one in CHANNELS if one.kind is Kind.FLAG)
 
 def zenoh_text(fleet: Fleet) -> bytes:
     """The file that a hub reads as ``transport.access``."""
-    rules = {name: fleet.rules_of(name) for name in fleet.accounts}
+    rules = {name: fleet.rules_of(name, at_hub=True) for name in fleet.accounts}
     accounts = {name: _hub_account(fleet.accounts[name], held) for name, held in rules.items()}
     rows = (
         ([name], _grants(name, rules[name], accounts[name].retains, is_hub=ProgramRole.HUB in account.roles))
@@ -39,11 +38,11 @@ def zenoh_text(fleet: Fleet) -> bytes:
 
 
 def _hub_account(account: Account, held: Iterable[Rule]) -> HubAccount:
-    """A robot or a gateway retains what it publishes and leaves its will there; others retain flags without a name."""
+    """A robot retains what it publishes and leaves its will there; others retain flags without a name."""
     writes = [rule.filter for rule in held if rule.access == "write"]
-    wills = [f"{base}/{OUTGOING}/#" for base in account.bases]
-    wills += [one for one in writes if account.bases and one.endswith(f"/{ONLINE.suffix}")]
-    whole = [one for one in writes if one.endswith("/#")]
+    robot = ProgramRole.ROBOT in account.roles
+    wills = [f"{base}/{OUTGOING}/#" for base in account.bases if robot]
+    whole = [one for one in writes if robot and one.endswith("/#")]
     flags = [one for one in writes if one.endswith(_FLAGS)]
     return HubAccount(tuple(wills), tuple(dict.fromkeys((*wills, *whole, *flags))))
 

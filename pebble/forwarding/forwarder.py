@@ -90,7 +90,7 @@ class Forwarder:
         self.ages = CommandAges()
         self.cycles = Cycles(clock, yields=not rules.leaves_robot)  # a mirror, to the bridge
         both_ways = frozenset(kind for kind in Kind if rules.both_ways(kind))
-        self.publisher = Publisher(self.sides, self.cycles, subjects, self.counters, both_ways)
+        self.publisher = Publisher(self.sides, self.cycles, subjects, self.counters, both_ways, stored=rules.stored)
         self.retained = RetainedTopics(self.sides, subjects, self.publisher, winner, both_ways, on_value)
         self._quiet_log = RateLimitedLog(log, period_s=60.0)
         self._mirroring = self._mirror_refused = False

@@ -18,10 +18,18 @@ class Publisher:
     """Publishes messages, and probes for cycles; ``both_ways`` are the kinds that pass in both directions."""
 
     def __init__(
-        self, sides: Sides, cycles: Cycles, subjects: Subjects, counters: Counters, both_ways: frozenset[Kind]
+        self,
+        sides: Sides,
+        cycles: Cycles,
+        subjects: Subjects,
+        counters: Counters,
+        both_ways: frozenset[Kind],
+        *,
+        stored: bool,
     ) -> None:
+        """``stored``: what is retained is sent again after an outage."""
         self._sides, self._cycles, self._subjects = sides, cycles, subjects
-        self._counters, self._both_ways = counters, both_ways
+        self._counters, self._both_ways, self._stored = counters, both_ways, stored
 
     def publish(self, to: SideState, subject: Subject, message: Message, forward: Forward) -> None:
         topic, payload, transport = message.topic, message.payload, to.transport
@@ -36,6 +44,7 @@ class Publisher:
             qos=forward.qos,
             retain=forward.retain,
             urgent=forward.urgent,
+            remember=self._stored,
             shared=subject.kind in self._both_ways,
         )
         if not accepted:

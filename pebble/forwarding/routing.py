@@ -73,6 +73,8 @@ class Rules:
     passes: Mapping[Side, frozenset[Kind]]
     mirrored: Mapping[Side, frozenset[Kind]] = field(default_factory=dict)
     leaves_robot: bool  # the other side is not on the robot
+    media: bool = False  # pictures and sound pass, too, which have no connection of their own here
+    stored: bool = True  # what is retained is sent again after an outage, because no other program forwards it
 
     def both_ways(self, kind: Kind) -> bool:
         """Whether both sides may be the origin of such messages."""
@@ -91,12 +93,23 @@ TABLE_A1: Final = Rules(
 #: Between a robot's own transport and a broker on the robot: everything, both ways, except media.
 MIRROR: Final = Rules(passes={side: frozenset(Kind) for side in Side}, leaves_robot=False)
 
+#: Between a hub and a broker, for a robot of the hub whose bridge forwards by the first one.
+GATEWAY: Final = Rules(
+    passes={
+        Side.LOCAL: frozenset({Kind.STATE, Kind.EVENT, Kind.STREAM, Kind.FLAG}),
+        Side.REMOTE: frozenset({Kind.COMMAND, Kind.FLAG, Kind.ACTION, Kind.FEED}),
+    },
+    leaves_robot=True,
+    media=True,
+    stored=False,
+)
+
 
 def route(rules: Rules, side: Side, subject: Subject | None, message: Message, *, mirroring: bool) -> Forward | Drop:
     """How to forward ``message``, received on ``side``, or why not. Pure."""
     if subject is None:
         return Drop.FOREIGN
-    if not subject.bridged:
+    if not subject.bridged and not rules.media:
         return Drop.MEDIA
     if subject.stays and rules.leaves_robot:
         return Drop.STAYS

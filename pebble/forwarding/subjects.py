@@ -93,15 +93,19 @@ class Subjects(dict[str, Subject | None]):
     """Subjects by effective topic, those of every serial instance included.
 
     None: the topic is not this robot's, or not valid. What was looked up before is found without a call of Python's.
+    ``config``: that of the robot, or its base if it renames nothing.
     """
 
-    def __init__(self, config: Config) -> None:
+    def __init__(self, config: Config | str) -> None:
         super().__init__()
-        self._base = config.base
-        names = dict.fromkeys(["", *config.serial_instances()])
-        self._addresses = [Addresses(view_of(config, name)) for name in names]
         self._subject = cache(Subject)
-        self._thin = config.services.mqtt_bridge.link.profile != "wide"
+        if isinstance(config, str):
+            self._base, self._thin = config, False
+            self._addresses = [Addresses(config)]
+        else:
+            self._base, self._thin = config.base, config.services.mqtt_bridge.link.profile != "wide"
+            names = dict.fromkeys(["", *config.serial_instances()])
+            self._addresses = [Addresses(view_of(config, name)) for name in names]
         self._incoming = f"{self._base}/{INCOMING}/".encode()
         named = (addresses[one].topic.encode() for addresses in self._addresses for one in CHANNELS)
         self._named = frozenset(topic.removeprefix(self._incoming) for topic in named)

@@ -16,11 +16,17 @@ class Address(NamedTuple):
 
 
 class Addresses:
-    """Looks up the address of a channel, and the channel of a topic."""
+    """Looks up the address of a channel, and the channel of a topic.
 
-    def __init__(self, config: Config) -> None:
-        self.base = config.base
-        self._of = {channel: _address(channel, config) for channel in CHANNELS}
+    ``config``: that of the robot, or its base if it renames nothing.
+    """
+
+    def __init__(self, config: Config | str) -> None:
+        self.base = config if isinstance(config, str) else config.base
+        self._of = {
+            channel: _default(channel, config) if isinstance(config, str) else _address(channel, config)
+            for channel in CHANNELS
+        }
         self._channels = {address.topic: channel for channel, address in self._of.items() if not channel.is_pattern}
 
     def __getitem__(self, channel: Channel) -> Address:

@@ -15,6 +15,7 @@ from pebble.transports import Message, MqttSettings, TlsSettings, Transport, Zen
 from pebble.transports.socket_paths import FRAMES_SOCKET, PEER_SOCKET, fits_socket
 
 if TYPE_CHECKING:
+    from pebble.config.gateway_file import GatewayFile
     from pebble.config.hub_file import HubFile
 
 _ANY = "+/+/+"  # the levels of any robot
@@ -180,6 +181,27 @@ def fleet_hub_settings(hub: "HubFile", run_dir: Path) -> ZenohSettings:
         lease_ms=hub.lease_ms,
         journal=hub.journal,
         max_wills=hub.max_wills,
+    )
+
+
+def gateway_transports(gateway: "GatewayFile", run_dir: Path, will: Message) -> tuple[Transport, Transport, Transport]:
+    """The connections of a gateway: to the hub, and two to the broker, one of them for presence and stops alone."""
+    hub, mqtt = gateway.hub, gateway.mqtt
+    zenoh = ZenohSettings(
+        run_dir=run_dir,
+        connect=hub.connect,
+        tls=tls_settings(hub.tls),
+        lease_ms=hub.lease_ms,
+        client=True,
+        account=hub.account,
+    )
+    base = will.topic.removesuffix(f"/{c.ONLINE.suffix}")
+    forwards = mqtt_settings(mqtt, as_published=True, reconnect_max_s=REMOTE_RECONNECT_S)
+    presence = mqtt_settings(mqtt, reconnect_max_s=REMOTE_RECONNECT_S)
+    return (
+        create("zenoh", f"{base}-hub", zenoh),
+        create("mqtt", f"{base}/forwards", forwards, will=will),
+        create("mqtt", f"{base}/presence", presence),
     )
 
 

@@ -36,7 +36,6 @@ MAX_STATE_BYTES = 128 * 1024  # of values in one message: pings, by which pages 
 MAX_BYTES = 64 * 1024 * 1024  # of all values together
 RESERVED_BYTES = 16 * 1024  # of them for each component, whatever the others send
 MAX_ALIASES = 64  # of one component: topics that its microcontrollers declare besides the contract's
-_SERVERS = "servers"  # the type of other servers of this page: they are no components to be shown
 _REFRESH_S = 1.0  # values that change with every heartbeat are sent this often,
 _REFRESHES_PER_S = 100  # but of so many components at most, and of those that are open
 _LONGEST_ALIAS = 200  # characters
@@ -221,7 +220,7 @@ class Robots:
     def receive(self, message: Message, now: float) -> None:
         """Take a message of any component."""
         address = parse_topic(message.topic)
-        if address is None or address.direction is not Direction.OUTGOING or address.identity.type == _SERVERS:
+        if address is None or address.direction is not Direction.OUTGOING or address.identity.is_server:
             return
         self.receive_as(address.identity.base, address.metric, message, now)
 

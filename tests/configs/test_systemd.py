@@ -24,8 +24,8 @@ sys.path.insert(0, str(ROOT / "tools"))
 import emulate_unit  # type: ignore[import-not-found]
 
 UNITS = ROOT / "configs" / "systemd"
-NAMES = ("pebble", "pebble-update", "pebble-web", "pebble-record", "pebble-hub")
-ROBOT, UPDATE, PAGE, RECORDER, HUB = (UNITS / f"{name}.service" for name in NAMES)
+NAMES = ("pebble", "pebble-update", "pebble-web", "pebble-record", "pebble-hub", "pebble-gateway")
+ROBOT, UPDATE, PAGE, RECORDER, HUB, GATEWAY = (UNITS / f"{name}.service" for name in NAMES)
 MOST_EXPOSED = 20  # tenths, of systemd-analyze
 #: What every unit says, whatever systemd-analyze makes of the rest.
 CONFINED = {
@@ -77,7 +77,7 @@ MODULES = {
 }
 RESTART, REBOOT = "org.freedesktop.systemd1.manage-units", "org.freedesktop.login1.reboot"
 
-units = pytest.mark.parametrize("unit", [ROBOT, UPDATE, PAGE, RECORDER, HUB], ids=lambda path: path.stem)
+units = pytest.mark.parametrize("unit", [ROBOT, UPDATE, PAGE, RECORDER, HUB, GATEWAY], ids=lambda path: path.stem)
 
 
 def unavailable(reason: str) -> NoReturn:

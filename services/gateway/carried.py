@@ -1,0 +1,160 @@
+"""One robot for as long as this gateway carries it: a forwarder of its own, made anew each time, and its subscriptions.
+
+Nothing of an earlier time is left in it, because another gateway may have carried the robot meanwhile: what counts is
+what hub and broker retain now.
+"""
+
+import time
+from collections.abc import Callable
+from functools import partial
+
+from pebble.contract import (
+    AUDIO,
+    AUDIO_CONTROL,
+    CAMERA,
+    INCOMING,
+    MQTT_AUDIO,
+    MQTT_VIDEO,
+    OUTGOING,
+    VIDEO_CONTROL,
+    Channel,
+    Kind,
+    codec,
+)
+from pebble.contract.names import BY, stop_topic, without_name
+from pebble.errors import PayloadError
+from pebble.forwarding.forwarder import Forwarder
+from pebble.forwarding.routing import GATEWAY, Side
+from pebble.forwarding.subjects import Subject, Subjects
+from pebble.transports import Message, State, Subscription, Transport
+
+#: What the robot sends of each medium, by what allows and what requests it.
+_MEDIA = ((CAMERA, MQTT_VIDEO, VIDEO_CONTROL), (AUDIO, MQTT_AUDIO, AUDIO_CONTROL))
+
+
+class NamedSubjects(Subjects):
+    """Subjects of a robot that renames nothing, also behind the name of a sender, which passes as it is."""
+
+    def _find(self, topic: str) -> Subject | None:
+        if not topic.startswith(f"{self._base}/{INCOMING}/{BY}/"):
+            return super()._find(topic)
+        named = without_name(topic)
+        plain = named.topic if named is not None else stop_topic(topic)
+        found = None if plain is None else super()._find(plain)
+        if found is None or found.kind is not Kind.FLAG:
+            return found
+        return self._subject(Kind.COMMAND, found.channel, found.qos)  # nothing is retained behind a name
+
+
+class Carried:
+    """A robot of the hub, since ``since``.
+
+    ``holds`` is asked for each message: whether this gateway carries it at this moment, and has done so since then.
+    """
+
+    def __init__(
+        self,
+        base: str,
+        since: float,
+        hub: Transport,
+        broker: Transport,
+        holds: Callable[[], bool],
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.base, self.since = base, since
+        self._hub, self._broker, self._holds = hub, broker, holds
+        self._subscriptions: list[Subscription] = []
+        #: By the channel of each medium: what allows it, and whether it was requested at the broker; None: not known.
+        self._allowed: dict[Channel, bool] = {}
+        self._requested: dict[Channel, bool | None] = {medium: None for medium, _, _ in _MEDIA}
+        self.subjects = NamedSubjects(base)
+        self.forwarder = Forwarder(
+            self.subjects,
+            GATEWAY,
+            {Side.LOCAL: hub, Side.REMOTE: broker},
+            winner=Side.REMOTE,
+            on_value=self._on_value,
+            clock=clock,
+        )
+
+    def begin(self) -> bool:
+        """Forward from now on; first what the hub retains. Waits, bounded, for both sides.
+
+        False: meanwhile this gateway does not carry the robot any more.
+        """
+        sides, incoming = self.forwarder.sides, f"{self.base}/{INCOMING}"
+        sides[Side.LOCAL].subscribing()
+        self._subscribe(Side.LOCAL, self._hub, f"{self.base}/{OUTGOING}/#", f"{incoming}/flags/#")
+        self.forwarder.subscribed(Side.LOCAL)
+        if not self._holds():
+            return False
+        self.forwarder.open()
+        sides[Side.REMOTE].subscribing()
+        self._subscribe(Side.REMOTE, self._broker, f"{incoming}/#")
+        self._broker.ask(self.subjects.flags)
+        self.forwarder.subscribed(Side.REMOTE)
+        return True
+
+    def end(self) -> None:
+        self.forwarder.shut()
+        subscriptions, self._subscriptions = self._subscriptions, []
+        for one in subscriptions:
+            one.close()
+
+    def hub_changed(self, state: State) -> None:
+        """The connection to the hub was lost, or is back; then what it retains comes again."""
+        self.forwarder.sides[Side.LOCAL].watch(state)
+        if state is State.CONNECTED:
+            self.forwarder.subscribed(Side.LOCAL)
+
+    def synchronize(self) -> None:
+        """What both sides retain has arrived."""
+        if self._holds():
+            for side in Side:
+                self.forwarder.retained.synchronize(side)
+
+    def probe(self) -> None:
+        """Once a second: find out whether what circulated does so still."""
+        if self._holds():
+            self.forwarder.publisher.probe_again((Side.REMOTE,), self.forwarder.retained.value)
+
+    # -- the transports' threads
+
+    def receive(self, side: Side, message: Message) -> None:
+        """Pass a message on, unless this gateway does not carry the robot now."""
+        if not self._holds():
+            return
+        subject = self.subjects[message.topic]
+        channel = None if subject is None else subject.channel
+        if channel is not None and (side is Side.REMOTE or channel in self._requested):
+            if side is Side.REMOTE:
+                self._note_request(channel, message)
+            elif not self._is_wanted(channel):
+                return
+        self.forwarder.receive(side, message)
+
+    def _subscribe(self, side: Side, transport: Transport, *filters: str) -> None:
+        receive = partial(self.receive, side)
+        self._subscriptions += [transport.subscribe(one, receive, echo=False, direct=True) for one in filters]
+
+    # -- media
+
+    def _is_wanted(self, medium: Channel) -> bool:
+        """Whether pictures or sound pass. After a change of gateways it is not known who has requested them."""
+        return self._allowed.get(medium, False) and self._requested[medium] is not False
+
+    def _on_value(self, subject: Subject, payload: bytes) -> None:
+        for medium, flag, _ in _MEDIA:
+            if subject.channel is flag:
+                try:
+                    self._allowed[medium] = bool(payload) and codec.decode(flag, payload)
+                except PayloadError:
+                    self._allowed[medium] = False
+
+    def _note_request(self, channel: Channel, message: Message) -> None:
+        for medium, _, request in _MEDIA:
+            if channel is request and not message.retain:
+                try:
+                    self._requested[medium] = codec.decode(request, message.payload).enabled
+                except PayloadError:
+                    return

@@ -1,0 +1,293 @@
+"""The gateway as a program: it hears robots at a hub, agrees with other gateways at the broker, and carries robots.
+
+What only its owner forwards passes by :class:`Carried`. A live emergency stop is forwarded by every gateway, in every
+state, over the connection of the heartbeats, where nothing else holds it up: its name makes it count once.
+"""
+
+import logging
+import secrets
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+
+import msgspec
+
+from pebble.contract import ESTOP, ONLINE, Kind
+from pebble.contract.identity import GATEWAYS, Identity, parse_topic
+from pebble.contract.levels import silent_after
+from pebble.contract.names import with_name
+from pebble.contract.payloads import GatewayHeartbeat
+from pebble.forwarding.cycles import PROBE_PERIOD_S, Cycles, Finding
+from pebble.forwarding.retained_window import INITIAL_SYNC_S
+from pebble.forwarding.routing import Side
+from pebble.forwarding.subjects import Subject
+from pebble.runtime.rate_limit import RateLimitedLog
+from pebble.services.gateway.carried import Carried
+from pebble.services.gateway.ownership import MAX_ROBOTS, Ownership
+from pebble.transports import Message, QoS, State, Transport
+from pebble.transports.counters import Counters
+
+log = logging.getLogger(__name__)
+
+HEARTBEAT_S = 0.25
+TICK_S = 0.1
+BEGINNING_S = 0.1  # in one turn: taking many robots must not hold up the heartbeats
+#: Between two heartbeats of a robot that is not away, at most; and so that it is not away because one comes late.
+LONGEST_GAP_S, SHORTEST_GAP_S = 10.0, 0.75
+RIVAL_S = 5.0  # so long another gateway of the same name is there after its last heartbeat
+_SENT = 16  # heartbeats that may come back
+_STOP = Subject(Kind.COMMAND, ESTOP)
+_ANY = f"+/{GATEWAYS}/+"
+
+_encode = msgspec.json.encode
+_decode = msgspec.json.Decoder(GatewayHeartbeat).decode
+
+
+def identity(name: str) -> Identity:
+    return Identity("pebble", GATEWAYS, name)
+
+
+def will(name: str) -> Message:
+    """What tells the others that this gateway has gone."""
+    return Message(ONLINE.topic(identity(name).base), b"", QoS.DELIVERED, True)
+
+
+class PresentRobots:
+    """The robots that publish heartbeats at the hub. Silence is judged by their own pace."""
+
+    def __init__(self) -> None:
+        self._received: dict[str, tuple[float, float]] = {}  # when, and after how many seconds of silence it is away
+
+    def note(self, robot: str, now: float) -> None:
+        before = self._received.get(robot)
+        if before is None and len(self._received) >= MAX_ROBOTS:
+            self._forget(now)
+            if len(self._received) >= MAX_ROBOTS:
+                return
+        gap = 0.0 if before is None else now - before[0]
+        self._received[robot] = now, silent_after(max(gap, SHORTEST_GAP_S) if gap <= LONGEST_GAP_S else SHORTEST_GAP_S)
+
+    def robots(self, now: float) -> tuple[str, ...]:
+        return tuple(sorted(robot for robot, (at, silent_s) in list(self._received.items()) if now - at <= silent_s))
+
+    def _forget(self, now: float) -> None:
+        self._received = {robot: one for robot, one in self._received.items() if now - one[0] <= one[1]}
+
+
+class Gateway:
+    """``broker`` carries what is forwarded, as published, and has the :func:`will`; ``presence`` is a second
+    connection to the same broker. The transports are not yet open. ``robots`` are filters of their bases.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        robots: Sequence[str],
+        hub: Transport,
+        broker: Transport,
+        presence: Transport,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.ownership = Ownership(name)
+        self.counters = Counters()
+        self._robots, self._clock = tuple(robots), clock
+        self._hub, self._broker, self._presence = hub, broker, presence
+        self._topic = will(name).topic
+        self._run, self._number = secrets.token_hex(4), 0
+        self._sent: dict[int, tuple[float, tuple[str, ...]]] = {}  # heartbeats that have not come back
+        self._present = PresentRobots()
+        self._carried: dict[str, Carried] = {}
+        self._synchronize: dict[str, float] = {}  # when what is retained of it has arrived
+        self._stops = Cycles(clock)
+        self._quiet_log = RateLimitedLog(log, period_s=60.0)
+        self._rival_at = self._heartbeat_at = self._probed_at = float("-inf")
+        self._states = threading.Lock()
+        self._at_broker, self._at_hub = False, False
+        self._wake = threading.Event()
+        self._running = True
+
+    @property
+    def carries(self) -> frozenset[str]:
+        return frozenset(self._carried)
+
+    # -- the life of the program
+
+    def run(self, ready: Callable[[], None] = lambda: None) -> None:
+        """Run until :meth:`quit`."""
+        self.open()
+        ready()
+        try:
+            while self._running:
+                due = self.ownership.next_due(self._clock()) - self._clock()
+                self._wake.wait(min(TICK_S, max(0.0, due)))
+                self._wake.clear()
+                self.tick()
+        finally:
+            self.close()
+
+    def quit(self) -> None:
+        """End :meth:`run` soon. Safe from any thread and from signal handlers."""
+        self._running = False
+        self._wake.set()
+
+    def open(self) -> None:
+        for transport in (self._hub, self._broker, self._presence):
+            transport.judge_topics(is_stop=_is_stop)
+            transport.on_state(self._on_state)
+        self._hub.judge_topics(is_invented=self._is_invented)
+        self._broker.judge_topics(skips_retained=self._skips_retained, delivers_late=True)
+        for transport in (self._hub, self._broker, self._presence):
+            transport.open(timeout=0.0)
+        for base in self._robots:
+            stop = ESTOP.topic(base)
+            self._hub.subscribe(ONLINE.topic(base), self._on_robot, echo=False, direct=True)
+            for topic in (stop, with_name(stop, "+")):
+                self._presence.subscribe(topic, self._on_stop, direct=True)
+        self._presence.subscribe(ONLINE.filter(_ANY), self._on_gateway, direct=True)
+
+    def close(self) -> None:
+        """Stop forwarding, and only then tell the others."""
+        self.ownership.lost()
+        for robot in list(self._carried):
+            self._end(robot)
+        for transport in (self._broker, self._presence, self._hub):
+            transport.close()
+
+    def tick(self) -> None:
+        """A turn: heartbeat, who carries what, what is due."""
+        now = self._clock()
+        if now - self._heartbeat_at >= HEARTBEAT_S - TICK_S / 2:
+            self._publish_heartbeat(now)
+        self.ownership.judge(now)
+        held = self.ownership.held(now)
+        for robot, one in list(self._carried.items()):
+            if held.get(robot) != one.since:
+                self._end(robot)
+        self._begin({robot: since for robot, since in held.items() if robot not in self._carried})
+        for robot, due in list(self._synchronize.items()):
+            if self._clock() >= due:
+                del self._synchronize[robot]
+                if robot in self._carried:
+                    self._carried[robot].synchronize()
+        if now - self._probed_at >= PROBE_PERIOD_S:
+            self._probed_at = now
+            for one in self._carried.values():
+                one.probe()
+
+    def _publish_heartbeat(self, now: float) -> None:
+        if self._broker.state is not State.CONNECTED or now - self._rival_at < RIVAL_S:
+            return
+        self._heartbeat_at = now
+        robots = self._present.robots(now) if self._hub.state is State.CONNECTED else ()
+        self._number += 1
+        self._sent[self._number] = now, robots
+        if len(self._sent) > _SENT:
+            del self._sent[next(iter(self._sent))]
+        heartbeat = GatewayHeartbeat(t=int(time.time() * 1000), run=self._run, number=self._number, robots=robots)
+        raw = _encode(heartbeat)  # not stored: an old one must not be sent after an outage
+        self._broker.publish(self._topic, raw, qos=QoS.DELIVERED, retain=True, urgent=True, remember=False)
+
+    def _begin(self, robots: Mapping[str, float]) -> None:
+        end = self._clock() + BEGINNING_S
+        for robot, since in robots.items():
+            one = Carried(robot, since, self._hub, self._broker, partial(self._holds, robot, since), self._clock)
+            for transport in (self._hub, self._broker):
+                transport.judge_topics(is_stop=_is_stop)  # of all robots, not of this one
+            self._carried[robot] = one
+            if one.begin():
+                self._synchronize[robot] = self._clock() + INITIAL_SYNC_S
+                log.info("carries %s", robot)
+            else:
+                self._end(robot)
+            if self._clock() >= end:
+                self._wake.set()
+                return
+
+    def _end(self, robot: str) -> None:
+        self._synchronize.pop(robot, None)
+        self._carried.pop(robot).end()
+        log.info("carries %s no more", robot)
+
+    def _holds(self, robot: str, since: float) -> bool:
+        return self.ownership.since(robot, self._clock()) == since
+
+    # -- the transports' threads
+
+    def _on_state(self, _state: State) -> None:
+        """Both connections to the broker are needed: one carries, the other shows whether the others hear this one."""
+        with self._states:
+            at_broker = all(one.state is State.CONNECTED for one in (self._broker, self._presence))
+            if at_broker is not self._at_broker:
+                self._at_broker = at_broker
+                if at_broker:
+                    self.ownership.connected(self._clock())
+                else:
+                    self.ownership.lost()
+            at_hub = self._hub.state is State.CONNECTED
+            if at_hub is not self._at_hub:
+                self._at_hub = at_hub
+                for robot, one in list(self._carried.items()):
+                    one.hub_changed(self._hub.state)
+                    self._synchronize[robot] = self._clock() + INITIAL_SYNC_S
+        self._wake.set()
+
+    def _on_robot(self, message: Message) -> None:
+        address = parse_topic(message.topic)
+        if not message.retain and message.payload and address is not None and not address.identity.is_server:
+            self._present.note(address.identity.base, self._clock())
+
+    def _on_gateway(self, message: Message) -> None:
+        address, now = parse_topic(message.topic), self._clock()
+        if address is None:
+            return
+        name = address.identity.id
+        try:
+            heartbeat = _decode(message.payload) if message.payload else None
+        except msgspec.MsgspecError:
+            self._quiet_log.warning(name[:40], "%s is no heartbeat of a gateway", message.topic[:200])
+            return
+        if name != self.ownership.me:
+            if heartbeat is None:
+                self.ownership.left(name, now)
+            else:
+                self.ownership.received(name, heartbeat.robots[:MAX_ROBOTS], now)
+        elif heartbeat is None:  # the will of an earlier connection
+            self._heartbeat_at = float("-inf")
+        elif heartbeat.run != self._run:
+            self._on_rival(heartbeat, message, now)
+        elif heartbeat.number in self._sent:
+            sent_at, robots = self._sent.pop(heartbeat.number)
+            self.ownership.came_back(sent_at, robots, now)
+        self._wake.set()
+
+    def _on_rival(self, heartbeat: GatewayHeartbeat, message: Message, now: float) -> None:
+        if not message.retain and heartbeat.run > self._run:
+            self._rival_at = now
+            self._quiet_log.warning("rival", "another gateway is called %s: this one rests", self.ownership.me)
+
+    def _on_stop(self, message: Message) -> None:
+        if message.retain or self._stops.examine(Side.REMOTE, _STOP, message) is not Finding.PASS:
+            return
+        self.counters.add("stops")
+        self._hub.publish(message.topic, message.payload, qos=QoS.DELIVERED, urgent=True)
+
+    def _is_invented(self, topic: str) -> bool:
+        one = self._of(topic)
+        return one is None or one.subjects.invented(topic.encode()) is not None
+
+    def _skips_retained(self, topic: bytes) -> bool:
+        one = self._of(topic.decode(errors="replace"))
+        return one is not None and not topic.endswith(_STOP_END) and one.forwarder.skips_retained(Side.REMOTE, topic)
+
+    def _of(self, topic: str) -> Carried | None:
+        address = parse_topic(topic)
+        return None if address is None else self._carried.get(address.identity.base)
+
+
+_STOP_END = f"/{ESTOP.metric}".encode()
+
+
+def _is_stop(topic: str) -> bool:
+    """Whether it is a stop, with the name of a sender or without."""
+    return f"/{ESTOP.direction}/" in topic and topic.endswith(f"/{ESTOP.metric}")
