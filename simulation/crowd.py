@@ -26,7 +26,17 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any, Final
 
-from pebble.contract import CAPABILITIES, CHARGING_LEVEL, DRIVE, ESTOP, ESTOP_RESET, ESTOP_STATE, ONLINE, STATUS
+from pebble.contract import (
+    CAPABILITIES,
+    CHARGING_LEVEL,
+    CHARGING_STATUS,
+    DRIVE,
+    ESTOP,
+    ESTOP_RESET,
+    ESTOP_STATE,
+    ONLINE,
+    STATUS,
+)
 from pebble.contract.identity import Identity
 from pebble.motion.latch import Latch
 from pebble.transports import Message, QoS
@@ -62,7 +72,7 @@ def capabilities(identity: Identity) -> dict[str, Any]:
         "estop": {"available": True, "topic": ESTOP.topic(base), "reset_topic": ESTOP_RESET.topic(base),
                   "owners": [OWNER], "status_topics": [ESTOP_STATE.topic(base, owner=OWNER)]},
         "telemetry": {"touch_sensors": False, "charging_status": False,
-                      "charging_topic": f"{base}/outgoing/charging-status",
+                      "charging_topic": CHARGING_STATUS.topic(base),
                       "charging_level_topic": CHARGING_LEVEL.topic(base)},
         "lights": {"solid": False, "flash": False},
         **dict.fromkeys(("video", "audio", "soundboard", "autonomy"), none),
@@ -163,11 +173,11 @@ class Robot:
         return False
 
     def _obey(self, metric: str, payload: bytes) -> None:
-        if metric == "drive-values":
+        if metric == DRIVE.metric:
             self.drives += 1
             return
         order = json.loads(payload)
-        if metric == "estop":
+        if metric == ESTOP.metric:
             if self.latch.stop(order["stop"], order.get("by", ""), order.get("why", ""), _epoch_ms()):
                 self.stopped_ns = time.monotonic_ns()
                 self._publish_stop()

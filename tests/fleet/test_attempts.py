@@ -36,6 +36,7 @@ ACCOUNTS = {name: Account(roles=roles) for name, roles in PEOPLE.items() if name
     "fred": Account(roles=("robot",), bases=(FRED,)),
     "lamp": Account(roles=("robot",), bases=(LAMP,), plain=True),
     "gate": Account(roles=("gateway",), bases=("pebble/robots/+",)),
+    "hub": Account(roles=("hub",)),
 }
 LOOK = {"estop", "front-camera"}
 DRIVE = LOOK | {
@@ -82,6 +83,8 @@ def lets_through(name: str, topic: str, level: str) -> bool:
             topic.startswith("pebble/robots/")
             and ("/outgoing/" in topic or rest in ("flags/remote-mirror", "flags/mqtt-audio", "flags/mqtt-video"))
         ) or topic == "pebble/gateways/gate/outgoing/online"
+    if name == "hub":
+        return False
     if not rest:
         return topic == "pebble/servers/x1/outgoing/driving" and name != "vera"
     if rest == "estop":
