@@ -19,6 +19,9 @@ PLACES = """[...document.querySelectorAll('.slot, .stick, input[type=range]')].f
   .map((one) => one.getBoundingClientRect()).map(({ x, y, width, height }) => [x, y, width, height].map(Math.round))
   .join(' ')"""
 
+#: Behind which button of the fleet the notices are.
+NOTICES = {"desktop": "bell", "phone": "settings"}
+
 pytestmark = [pytest.mark.page, pytest.mark.timeout(180)]
 
 
@@ -111,6 +114,6 @@ def test_two_people_take_ask_let_keep_and_take_over(
         ann.page.evaluate("history.pushState(null, '', '/'); dispatchEvent(new PopStateEvent('popstate'))")
         assert ann.until("window.pebble.driver.ref !== 'pebble/robots/goob'")
         otto.test("ask").click()
-        ann.test("bell").click()
+        ann.test(NOTICES[size]).click()
         assert ann.until("document.querySelector('.notice')?.textContent.includes('otto asks to drive')")
         assert ann.complaints() + otto.complaints() == []
