@@ -27,7 +27,7 @@ help:
 	@echo "make brokers          install NATS, RabbitMQ and aedes where that is possible, test robots with them, judge them, four minutes"
 	@echo "make check            lint, types, imports and names only"
 	@echo "make firmware         measure the firmware's use of each board in the real MicroPython; writes docs/firmware.md"
-	@echo "make report           run every comparison and pebble impair, an hour and a half; writes docs/results"
+	@echo "make report           run every comparison and pebble impair, 95 minutes; writes docs/results"
 	@echo "make report QUICK=1   fewer cases, some five minutes; writes build/report-quick"
 	@echo "make lock             write requirements/ anew from pyproject.toml; UPGRADE=1: with the newest versions"
 	@echo "make audit            ask OSV for known vulnerabilities of all packages; without an answer it fails: not checked"

@@ -137,7 +137,7 @@ export function StopChip() {
   const chip = html`<span class="chip stopped"><${Icon} name="stop" />${words}</span>`;
   return html`<${Drop} test="stopped" className="stops" summary=${chip}>
     ${first.map((ref) => html`<${StopBanner} key=${ref} at=${ref} />`)}
-    ${refs.length > first.length && html`<p class="also">${refs.length - first.length} more: their cards open them.</p>`}
+    ${refs.length > first.length && html`<p class="also">${refs.length - first.length} more</p>`}
   <//>`;
 }
 
