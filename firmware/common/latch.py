@@ -85,7 +85,8 @@ class Latch:
         So many stops of one account do not keep another's from being confirmed. Senders that were not checked are one.
         """
         self.recent = [name] + self.recent  # a new list: states that were returned have the old one
-        senders = self._senders = [sender] + self._senders
+        senders = self._senders
+        senders.insert(0, sender)
         if len(senders) > self.names:
             place = max(range(len(senders)), key=lambda at: (senders[at] is None, senders.count(senders[at]), at))
             del self.recent[place], senders[place]

@@ -143,6 +143,8 @@ def new(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def hall(new: Path, tmp_path: Path) -> Path:
     shutil.copytree(new, tmp_path, dirs_exist_ok=True)
+    conf = tmp_path / "hall" / CONF
+    conf.write_text(conf.read_text().replace(str(new), str(tmp_path)))
     return tmp_path
 
 
