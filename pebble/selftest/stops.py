@@ -58,7 +58,7 @@ def _ended(robot: RobotUnderTest, name: str, before: dict[str, list[str]]) -> st
     if not view.latched:
         return ""
     for owner, state in view.estop.latched.items():
-        if state.recent[:1] != [name] or state.recent[1:] != before.get(owner, [])[: len(state.recent) - 1]:
+        if state.recent[:1] != [name] or not set(state.recent[1:]) <= set(before.get(owner, [])):
             return f"it was stopped by another one meanwhile, and stays so ({state.by or 'unknown'}: {state.why})"
     reset = Reset(view.estop, robot.by)
     if not robot.inside.publish(reset.messages()):

@@ -434,6 +434,17 @@ def test_more_holds_than_an_owner_remembers_names_come_to_rest() -> None:
     assert [stop.tick(20.0) for stop in stops] == [[]] * 9
 
 
+def test_it_is_confirmed_while_another_account_floods_the_robot_with_stops() -> None:
+    """A state comes four times a second, and thousands of other stops between two of them."""
+    stop, robot = sender(GOOB, by="mia"), Robot(GOOB, "serial")
+    receive(stop, robot.capabilities(), now=0.0)
+    robot.take(stop.tick(0.0))
+    for _ in range(2000):
+        robot.take(sender(GOOB, by="vera").tick(0.0))
+    receive(stop, robot.owners[0].state(), now=0.25)
+    assert (stop.confirmed, stop.tick(0.5)) == (True, [])
+
+
 def test_states_that_change_quickly_do_not_make_it_send_more_often() -> None:
     stop, robot = sender(GOOB, hold=True), Robot(GOOB, "serial")
     robot.owners[0].latch.boot = "ffffffff"

@@ -143,6 +143,8 @@ def new(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def hall(new: Path, tmp_path: Path) -> Path:
     shutil.copytree(new, tmp_path, dirs_exist_ok=True)
+    conf = tmp_path / "hall" / CONF
+    conf.write_text(conf.read_text().replace(str(new), str(tmp_path)))
     return tmp_path
 
 
@@ -239,6 +241,8 @@ def test_zenoh_hubs_have_the_same_accounts(hall: Path, monkeypatch: pytest.Monke
     run("pebble fleet add hub1 --role hub", hall)
     assert "name where others reach it" in pebble("pebble fleet certificate hub1", hall).stderr
     printed = run("pebble fleet certificate hub1 hub1.local", hall)
+    for name in ("hub1.pem", "hub1.key"):
+        (hall / "hall" / "accounts" / name).rename(hall / name)
     (hall / "hub1.json").write_text(printed[printed.index("{") :])
     assert load_hub(hall / "hub1.json")[0].access == hall / ZENOH
     assert pebble("pebble fleet remove hub1", hall).returncode == 1

@@ -45,11 +45,12 @@ MUTATIONS = {
     ),
     "the second stop of one name resets": Mutation(
         _LATCH,
-        "            return False\n        self.recent",
-        "            self.latched = False\n        self.recent",
+        "            return False\n        self._remember",
+        "            self.latched = False\n        self._remember",
     ),
     "names are not restored": Mutation(_LATCH, "if is_name(name)][: self.names]", "if not is_name(name)]"),
-    "one name is remembered": Mutation(_LATCH, "+ self.recent)[: self.names]", "+ self.recent)[:1]"),
+    "one name is remembered": Mutation(_LATCH, "[name] + self.recent", "[name]"),
+    "one sender's stops take the places of others": Mutation(_LATCH, "senders.count(senders[at]), at", "at"),
     "a damaged file is free": Mutation(
         _LATCH, "            self.latched = True\n", "            self.latched = False\n"
     ),

@@ -24,6 +24,7 @@ the order of the step in which a person made them, however late they arrive.
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import Any
 
 from tests.kit.schedules import ViolatedError, check
@@ -74,6 +75,7 @@ class Rules:
         lost = [name for name, published in self.confirmed.items() if published >= self.counted[name] > self.ended]
         check(latched or not lost, "a confirmed stop does not survive a restart")
         check(latched == self.latched, "an owner does not start as its file has it")
+        self.senders: dict[str, str] = {}  # of names of this life
         self.zeros = 0  # of persons, that wait
         self.count = 0
         self.barred_before = max(self.barred_before, getattr(self, "barred", 0))
@@ -105,11 +107,14 @@ class Rules:
             "a state that counts as saved is not on the disk",
         )
 
-    def stopped(self, name: str, given: int, order: int, latch: Any, moving: bool) -> None:
+    def stopped(self, name: str, by: str, given: int, order: int, latch: Any, moving: bool) -> None:
         """A stop was executed."""
         self.newest_given = max(self.newest_given, given)
         if name not in self.recent:
-            self.recent = [name, *self.recent][: self.names]
+            self.recent = [name, *self.recent]
+            self.senders[name] = by.partition("/")[0]
+            if len(self.recent) > self.names:
+                self.recent.remove(self._least_needed())
             self.counted[name] = order
             self.count += 1
             self.latched = True
@@ -118,6 +123,13 @@ class Rules:
             check(not moving, "a wheel turns after a stop")
         check(latch.latched == self.latched, "a stop that is new latches, and a known one changes nothing")
         check(latch.count == self.count and latch.recent == self.recent, "names and number of stops are not right")
+
+    def _least_needed(self) -> str:
+        """The oldest name of before the start, else of the sender that has the most."""
+        senders = Counter(self.senders[name] for name in self.recent if name in self.senders)
+        most = [by for by, number in senders.items() if number == max(senders.values())]
+        old = [name for name in self.recent if name not in self.senders]
+        return (old or [name for name in self.recent if self.senders[name] in most])[-1]
 
     def reset(self, boot: str, count: int, age: int, asked: int, now: int, order: int, latch: Any) -> None:
         """A reset was executed, or refused."""

@@ -216,10 +216,11 @@ class Owner:
     def _stop(self, message: Command, now: int, order: int) -> None:
         _, _, _, copy, name, given = message
         self.rules.executes(copy)
-        new = self.arbiter.stop(name, "anna", "", now)
+        by = ("anna", "otto", "otto/pad", "vera?")[int(name, 16) % 4]
+        new = self.arbiter.stop(name, by, "", now)
         if new:
             self._halt()
-        self.rules.stopped(name, given, order, self.latch, now < self.until or self.slot is not None)
+        self.rules.stopped(name, by, given, order, self.latch, now < self.until or self.slot is not None)
         if new:
             self._changed()
         self.publish(now)

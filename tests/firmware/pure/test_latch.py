@@ -59,6 +59,20 @@ def test_every_new_stop_counts_and_only_the_newest_names_are_remembered() -> Non
     assert latch.recent == [C, B]
 
 
+def test_the_name_of_a_stop_stays_while_another_sender_floods() -> None:
+    """Else a state, of which there are four a second, might never have it, and the stop would not be confirmed."""
+    latch = Latch("0badcafe", 4, diff)
+    latch.restore({"latched": False, "recent": [B, C]})
+    latch.stop(A, "otto?", "", 5)
+    latch.stop(A, "otto", "", 5)
+    for number in range(1000):
+        latch.stop(f"e{number:015x}", ("vera", "vera/pad", "vera/desk")[number % 3], "", 5)
+        latch.stop(f"f{number:015x}", f"p{number}?", "", 5)
+    vera, claimed = "e0000000000003e7", ["f0000000000003e7", "f0000000000003e6"]
+    assert latch.recent == [claimed[0], vera, claimed[1], A]
+    assert latch.count == 2001
+
+
 def test_latched_it_refuses_all_that_moves_and_no_zero() -> None:
     latch = stopped(A)
     for script in (True, False):
