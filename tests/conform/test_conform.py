@@ -72,7 +72,8 @@ VIOLATIONS = (
         "client.on_connect, client.on_message = robot.connected, robot.receive",
         "client.manual_ack_set(True)\n"
         "client.on_connect, client.on_message = robot.connected, lambda client, data, message: (\n"
-        "    robot.receive(client, data, message), len(message.payload) < 1024 and client.ack(message.mid, 1))",
+        "    robot.receive(client, data, message),\n"
+        "    len(message.payload) < 1024 and client.ack(message.mid, message.qos))",
     ),
     ("stop states", 'publish(f"estop/{OWNER}"', 'publish("estop/others"'),
     ("stop", 'self.stop = {"latched": True', 'self.stop = {"latched": False'),
