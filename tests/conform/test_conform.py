@@ -67,14 +67,6 @@ VIOLATIONS = (
     ("own topics", '"controls": True', '"controls": True, "topic": "pebble/robots/other/incoming/drive-values"'),
     ("identity", '"id": ID', '"id": "other"'),
     ("junk", "(ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError)", "(KeyError)"),
-    (
-        "junk",
-        "client.on_connect, client.on_message = robot.connected, robot.receive",
-        "client.manual_ack_set(True)\n"
-        "client.on_connect, client.on_message = robot.connected, lambda client, data, message: (\n"
-        "    robot.receive(client, data, message),\n"
-        "    len(message.payload) < 1024 and client.ack(message.mid, message.qos))",
-    ),
     ("stop states", 'publish(f"estop/{OWNER}"', 'publish("estop/others"'),
     ("stop", 'self.stop = {"latched": True', 'self.stop = {"latched": False'),
     ("stop once", 'if name not in self.stop["recent"]:', "if True:"),
