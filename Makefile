@@ -24,7 +24,7 @@ help:
 	@echo "make looks            store anew how the page looks, for make page-tests to compare; look at the pictures, a minute"
 	@echo "make page-schedules   200 random sequences of inputs and faults at the operator page in Chromium, 15 minutes"
 	@echo "make gstreamer-tests  install GStreamer and OpenCV for the system's Python, and have the original's local media read by them, three minutes"
-	@echo "make brokers          install NATS, RabbitMQ and aedes where that is possible, test robots with them, judge them, four minutes"
+	@echo "make brokers          install NATS, RabbitMQ and aedes where that is possible, test robots with them, judge them, seven minutes"
 	@echo "make check            lint, types, imports and names only"
 	@echo "make firmware         measure the firmware's use of each board in the real MicroPython; writes docs/firmware.md"
 	@echo "make report           run every comparison and pebble impair, 95 minutes; writes docs/results"
@@ -144,6 +144,7 @@ brokers: .venv/.ready-dev
 	@sh tools/debian-packages.sh mosquitto=mosquitto
 	@sh tools/brokers.sh
 	@$(TESTS) -ra tests/transports/test_brokers.py tests/transports/test_client_ids.py tests/brokers
+	@$(TESTS) -ra -k "(nats or another) and in_python" tests/conform
 
 # What violates a rule is described in build/stops; the seed in its name repeats it.
 stops: .venv/.ready-dev

@@ -118,7 +118,7 @@ static void connect() {
     static const char *const METRICS[] = {"online", "capabilities", "link", "estop/+", "control/+"};
     offline = true, heartbeat = 0, forget_control();
     if (!mqtt.connect((std::string("operator-") + id).c_str(), USER, PASSWORD)) return delay(200);
-    for (const char *one : METRICS) snprintf(topic, sizeof topic, "%s%s", out, one), mqtt.subscribe(topic, 1);
+    for (const char *one : METRICS) snprintf(topic, sizeof topic, "%s%s", out, one), mqtt.subscribe(topic, 0);  // as the robot does
 }
 static void command() {
     double to_x = 0, to_z = 0;

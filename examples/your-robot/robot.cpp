@@ -127,7 +127,7 @@ static void connect() {  // which may take seconds
     snprintf(topic, sizeof topic, "pebble/robots/%s/outgoing/online", ID);
     snprintf(text, sizeof text, "{\"t\": %.0f, \"online\": false}", epoch_ms());
     if (!mqtt.connect((std::string("robot-") + ID).c_str(), USER, PASSWORD, topic, 1, true, text)) return delay(200);
-    snprintf(topic, sizeof topic, "pebble/robots/%s/incoming/#", ID), mqtt.subscribe(topic, 1);
+    snprintf(topic, sizeof topic, "pebble/robots/%s/incoming/#", ID), mqtt.subscribe(topic, 0);  // it acknowledges nothing that is too long
     publish("capabilities", "{\"t\": %.0f, \"schema\": \"pebble-capabilities/v1\", \"value\": {\"named\": %s, "
             "\"identity\": {\"system\": \"pebble\", \"type\": \"robots\", \"id\": \"%s\"}, \"drive\": {\"available\": true, \"controls\": true, "
             "\"control\": true}, \"estop\": {\"available\": true, \"owners\": [\"motors\"]}}}", epoch_ms(), BOOL[named], ID);

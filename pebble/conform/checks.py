@@ -31,8 +31,9 @@ _SHOWN = 3  # examples in one line
 _SLOWEST_S = 1.25  # between heartbeats, by their mean; they are to come each second
 BY, _WHY = "conform", "conformance test"
 
+_LONG, _LONGS = b"[" * 2000, 40  # mosquitto sends nothing more while 20 messages are unacknowledged
 #: Of what a program with an error sends. A robot reads none of it, and goes on.
-JUNK = (b"", b"{", b"[]", b"null", b'"x"', b"\xff\xfe\x00", b"[" * 2000, b'{"x": ' + b"9" * 400 + b"}")
+JUNK = (b"", b"{", b"[]", b"null", b'"x"', b"\xff\xfe\x00", _LONG, b'{"x": ' + b"9" * 400 + b"}")
 _LARGE = b"x" * 70_000  # once: small boards take a while to read it
 
 
@@ -248,11 +249,22 @@ def junk(component: Component) -> CheckResult:
         for payload in JUNK:
             component.send(channel, payload)
     component.send(c.DRIVE, _LARGE)
+    for _ in range(_LONGS):
+        component.send(c.CONTROL, _LONG)
+    sent = component.sent(ANSWER_S)
     interval = component.view.liveness.interval_s or ANSWER_S
-    if not component.wait(lambda: len(component.of(c.ONLINE, began + 2 * interval)) >= 2, 6 * interval + ANSWER_S):
+    if not component.wait(lambda: len(component.of(c.ONLINE, sent + 2 * interval)) >= 2, 6 * interval + ANSWER_S):
         return failed("its heartbeats ended", "drop what is no JSON of the contract, and go on")
     offline = [one for one in component.of(c.ONLINE, began) if one.value and one.value.online is False]
-    return failed("it went offline meanwhile", "drop what cannot be read") if offline else ok("it goes on")
+    if offline:
+        return failed("it went offline meanwhile", "drop what cannot be read")
+    may_stop = not any(need(component) for need in _STOP)
+    if may_stop and while_stopped(_confirmed)(component).state is not State.OK:
+        return failed(
+            f"after {_LONGS} messages of {len(_LONG)} bytes no stop reaches it",
+            "acknowledge what is too long to be read, too, or subscribe with QoS 0",
+        )
+    return ok("it goes on")
 
 
 # -- the emergency stop

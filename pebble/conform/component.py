@@ -91,6 +91,11 @@ class Component:
         self._transport.publish(channel.topic(self.base), payload, qos=QoS(channel.default_qos), urgent=True)
         return time.monotonic()
 
+    def sent(self, seconds: float) -> float:
+        """Wait until the broker has all that was sent, so long at most; returns when."""
+        self.wait(lambda: self._transport.outgoing.waiting == 0, seconds)
+        return time.monotonic()
+
     def retain(self, channel: c.Channel, payload: bytes) -> None:
         """Leave a command at the broker; empty bytes remove it. It bears no name: nothing with one is retained."""
         with connected(self._target) as (beside, _):

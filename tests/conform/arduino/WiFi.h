@@ -1,9 +1,9 @@
 // The network of this machine in place of WiFi, with the interface of Arduino's Client.
 #pragma once
 #include "Arduino.h"
+#include <algorithm>
 #include <netdb.h>
 #include <string>
-#include <sys/ioctl.h>
 #include <sys/socket.h>
 
 enum { WL_CONNECTED = 3 };
@@ -27,11 +27,15 @@ public:
         ssize_t sent = send(fd_, bytes, size, MSG_NOSIGNAL);
         return sent < 0 ? 0 : sent;
     }
-    int available() override { int n = 0; return fd_ >= 0 && ioctl(fd_, FIONREAD, &n) == 0 ? n : 0; }
-    int read() override { uint8_t one; return fd_ >= 0 && recv(fd_, &one, 1, MSG_DONTWAIT) == 1 ? one : -1; }
-    void stop() override { if (fd_ >= 0) close(fd_); fd_ = -1; }
+    int available() override {
+        if (at_ == end_ && fd_ >= 0) at_ = 0, end_ = std::max<ssize_t>(0, recv(fd_, in_, sizeof in_, MSG_DONTWAIT));
+        return end_ - at_;
+    }
+    int read() override { return available() ? in_[at_++] : -1; }
+    void stop() override { if (fd_ >= 0) close(fd_); fd_ = -1, at_ = end_ = 0; }
     uint8_t connected() override {
         uint8_t one;
+        if (at_ < end_) return true;
         ssize_t found = fd_ < 0 ? 0 : recv(fd_, &one, 1, MSG_PEEK | MSG_DONTWAIT);
         return found > 0 || (found < 0 && errno == EAGAIN);
     }
@@ -49,4 +53,6 @@ protected:
 
 private:
     int fd_ = -1;
+    uint8_t in_[1436];  // as in that of the ESP32: a system call for each byte would be slow
+    ssize_t at_ = 0, end_ = 0;
 };
