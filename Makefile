@@ -28,7 +28,7 @@ help:
 	@echo "make check            lint, types, imports and names only"
 	@echo "make firmware         measure the firmware's use of each board in the real MicroPython; writes docs/firmware.md"
 	@echo "make report           run every comparison and pebble impair, 95 minutes; writes docs/results"
-	@echo "make report QUICK=1   fewer cases, some five minutes; writes build/report-quick"
+	@echo "make report QUICK=1   fewer cases, five and a half minutes; writes build/report-quick"
 	@echo "make lock             write requirements/ anew from pyproject.toml; UPGRADE=1: with the newest versions"
 	@echo "make audit            ask OSV for known vulnerabilities of all packages; without an answer it fails: not checked"
 	@echo "make sbom             write build/sbom.cdx.json: what a robot's software consists of"

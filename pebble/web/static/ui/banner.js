@@ -15,7 +15,6 @@ const MOST_LISTED = 50;
 const STOP = "web/estop";
 const HINT_MS = 3000;
 const SHOWN_MS = 60_000; // a finished stop
-const TALLY_MS = 10_000;
 
 /** Whether the screen has a place of its own for them: then it is not said twice. */
 const places = new (class extends Model {
@@ -302,7 +301,7 @@ function PressBanner() {
   if (!pressed || age > SHOWN_MS) return null;
   const known = stops(store).some(({ stop, latched }) => stop === pressed.stop || (latched && age > NO_ANSWER_MS));
   if (known && connection.isOpen) {
-    const words = age < TALLY_MS && !unconfirmed(store).length && tally(estop, store);
+    const words = age < 10_000 && !unconfirmed(store).length && tally(estop, store);
     return words && html`<${Banner} kind="warn" icon="stop"><p role="status">${words}</p><//>`;
   }
   const whom = pressed.ref ? nameIn(store, pressed.ref) : "all robots";
