@@ -14,7 +14,7 @@ class Latch:
         self.boot = boot
         self.count = 0  # stops since the start
         self.recent: list[str] = []  # the names of the newest stops, the last one first
-        self._senders: list[str | None] = []  # of each of them; None: of before the start
+        self.client: list[str | None] = []  # who sent each of them; None: of before the start
         self.by = ""
         self.why = ""
         self.since = 0  # epoch milliseconds of the newest stop
@@ -30,7 +30,7 @@ class Latch:
         if isinstance(saved, dict) and isinstance(saved.get("latched"), bool) and isinstance(recent, list):
             self.latched = saved["latched"]
             self.recent = [name for name in recent if is_name(name)][: self.names]
-            self._senders = [None] * len(self.recent)
+            self.client = [None] * len(self.recent)
             self.by = _text(saved.get("by"), 32)
             self.why = _text(saved.get("why"), 40)
             since = saved.get("since")
@@ -59,17 +59,24 @@ class Latch:
         """Latch, unless this stop is known already: then the result is False, and at most its sender changes: one that
         was not checked has a mark, and gives way.
 
-        ``name`` is never empty: the receiver of a stop without a name makes one.
+        ``name`` is never empty: the receiver of a stop without a name makes one. If there are too many names, the
+        oldest of the sender that has the most is forgotten, so that stops of one account do not keep another's from
+        being confirmed. Senders that were not checked are one.
         """
         sender = "?" if by[-1:] == "?" else by.split("/")[0]
         if name in self.recent:
             place = self.recent.index(name)
-            if by and self._senders[place] == "?":
-                self._senders[place] = sender
+            if by and self.client[place] == "?":
+                self.client[place] = sender
             if name == self.recent[0] and by and self.by[-1:] == "?" and by[-1] != "?":
                 self.by = by
             return False
-        self._remember(name, sender)
+        senders = self.client
+        senders.insert(0, sender)
+        self.recent = [name] + self.recent  # a new list: states that were returned have the old one
+        if len(senders) > self.names:
+            place = max([(one is None, senders.count(one), at) for at, one in enumerate(senders)])[2]
+            del self.recent[place], senders[place]
         self.latched = True
         self.count += 1
         self.by = by
@@ -78,18 +85,6 @@ class Latch:
         self.reset_refused = None
         self._waits = False
         return True
-
-    def _remember(self, name: str, sender: str) -> None:
-        """If there are too many, forget the oldest of the sender that has the most.
-
-        So many stops of one account do not keep another's from being confirmed. Senders that were not checked are one.
-        """
-        self.recent = [name] + self.recent  # a new list: states that were returned have the old one
-        senders = self._senders
-        senders.insert(0, sender)
-        if len(senders) > self.names:
-            place = max(range(len(senders)), key=lambda at: (senders[at] is None, senders.count(senders[at]), at))
-            del self.recent[place], senders[place]
 
     def reset(self, boot: str, count: int, age: int, now: int) -> bool:
         """End the stop if the sender saw the newest state, and if it was read, ``age`` ago, in the last second.

@@ -37,7 +37,7 @@ class NetworkRobot:
 
     def __init__(self, settings: dict, body, charging: bytes, wrap) -> None:
         """``body`` has ``drive(x, z, y)``, True if anything moves; ``stop()``; ``report(publish)``; ``refresh()``.
-        ``AXES``, if it has the auxiliary one: see `describe`.
+        ``axes``, if it has the auxiliary one: see `describe`.
 
         ``charging``: whether it reports a charging status, in JSON. ``wrap`` wraps a socket in TLS; None: no TLS.
         """
@@ -116,7 +116,7 @@ class NetworkRobot:
             if self.body.drive(*self._next[:3]):
                 self.deadman.limit_ms = self._limit_ms
                 self.deadman.feed(now)
-                self.session.moved = now
+                self.session.last = now
             else:
                 self.deadman.rest()
 
@@ -190,7 +190,7 @@ class NetworkRobot:
             return False
         if not self._heartbeats:
             now_ms = self._clock.read(now)
-            axes = getattr(self.body, "AXES", b"")
+            axes = getattr(self.body, "axes", b"")
             session.publish(b"capabilities", describe(now_ms, session.root, self.name, stops, self.charging, axes), 1)
             stops.changed = stops.lease.changed = True
             self._due = now

@@ -37,7 +37,7 @@ class Session:
         ValueError.
         """
         self.settings = settings
-        self._hosts = hosts(settings)
+        self.hosts = hosts(settings)
         self.root = root
         # A broker disconnects a client when another one uses the same id: so it cannot be guessed, and is the same
         # until the next boot. A broker must accept 23 bytes of it, and may refuse more (3.1.3.1).
@@ -47,9 +47,9 @@ class Session:
         self.wrap = wrap
         self._take = take
         self.connection = Connection()
-        self.moved = 0  # the motors, or the connection to another broker than the first one
-        if len(self._hosts) > 1 and not wrap:
-            self.connection.connecting_ms = _HUNG_MS
+        self.last = 0  # when motors moved, or the connection to another broker than the first one was made
+        if len(self.hosts) > 1 and not wrap:
+            self.connection.limit_ms = _HUNG_MS
         self._open: Stream | None = None  # to the broker; before that, the query for its address
         self._in_flight = 0  # writes that may not have arrived yet
         self._behind = 0  # those after the last ping
@@ -73,14 +73,10 @@ class Session:
             self._paused = connection.reason == "silence" and diff(now, self._received) < 500
             raise OSError(connection.reason)
         if due == "resolve":
-            turn, count = connection.failures, len(self._hosts)
-            self._host = self._hosts[turn % count]
+            turn, count = connection.failures, len(self.hosts)
+            self._host = self.hosts[turn % count]
             self._open = query_name(self._host, server, now, turn // count)  # type: ignore[assignment]
-        if (
-            connection.state == "online"
-            and diff(now, self.moved) >= _REST_MS
-            and connection.failures % len(self._hosts)
-        ):
+        if connection.state == "online" and diff(now, self.last) >= _REST_MS and connection.failures % len(self.hosts):
             connection.failures = 0
             raise OSError("back to the first broker")
         if connection.state == "resolving":
@@ -154,7 +150,7 @@ class Session:
                         self._take(kind, now)
                     if self.connection.state != "online":
                         self._in_flight = 0
-                        self._since = self.moved = now
+                        self._since = self.last = now
                         self.connection.move("online", now)
                 kind = client.take()
             if count < len(space):

@@ -14,7 +14,7 @@ _THRESHOLD = const(0.25)  # below it a motor stays off
 
 
 class Body:
-    AXES = b',"y"'  # its grousers
+    axes = b',"y"'  # its grousers
 
     def __init__(self) -> None:
         self._motors = [Motor(pair) for pair in (pins.LEFT, pins.RIGHT, pins.GROUSERS)]

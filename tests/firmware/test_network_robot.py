@@ -293,7 +293,7 @@ def test_of_two_brokers_it_uses_one_and_returns_to_the_first_when_it_has_rested(
 
     def rest(minutes: int) -> None:
         """Have it rest for so long, without the time that takes."""
-        session.moved = (session.moved - 60_000 * minutes) % (1 << 30)  # as ticks wrap
+        session.last = (session.last - 60_000 * minutes) % (1 << 30)  # as ticks wrap
         drill.run(drill.seconds + 10)
 
     assert session.connection.state == "online"
