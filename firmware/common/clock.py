@@ -19,7 +19,7 @@ class Clock:
 
     def __init__(self, host: str, now: int) -> None:
         """``host`` is the time server; "": none."""
-        self._host = host
+        self.host = host
         self._wall = sntp.WallClock(now)
         self.read = self._wall.read
         self._open: Query | None = None  # the DNS query for the server's name; with a nonce, the request to it
@@ -28,7 +28,7 @@ class Clock:
 
     def step(self, now: int, server: str) -> None:
         """``server`` is the DNS server; "": there is no network. Failures are retried later."""
-        if not server or not self._host:
+        if not server or not self.host:
             self._close(now)
             return
         try:
@@ -40,7 +40,7 @@ class Clock:
         if not self._open:
             if age >= 0:
                 self._due = now
-                self._open = query_name(self._host, server, now)
+                self._open = query_name(self.host, server, now)
         elif self._nonce:
             epoch = sntp.epoch_ms(self._open.step(now), self._nonce)
             if epoch is not None:

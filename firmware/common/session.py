@@ -74,8 +74,8 @@ class Session:
             raise OSError(connection.reason)
         if due == "resolve":
             turn, count = connection.failures, len(self.hosts)
-            self._host = self.hosts[turn % count]
-            self._open = query_name(self._host, server, now, turn // count)  # type: ignore[assignment]
+            self.host = self.hosts[turn % count]
+            self._open = query_name(self.host, server, now, turn // count)  # type: ignore[assignment]
         if connection.state == "online" and diff(now, self.last) >= _REST_MS and connection.failures % len(self.hosts):
             connection.failures = 0
             raise OSError("back to the first broker")
@@ -94,9 +94,9 @@ class Session:
         self._open = None
         settings = self.settings
         if not address:
-            raise OSError("no address for " + self._host)
+            raise OSError("no address for " + self.host)
         if self.wrap:
-            self.wrap.host = self._host
+            self.wrap.host = self.host
             self.wrap.set_time(clock.read(now))
         self._open = Stream(address, get(settings, "mqtt", "port", 8883 if self.wrap else 1883), self.wrap)
         self.client.restart()

@@ -69,7 +69,7 @@ class Query:
     """Sends one datagram every second and receives its answers, from its destination only."""
 
     def __init__(self, host: str, port: int, data: bytes, now: int, skip: int = 0) -> None:
-        self._host = host
+        self.host = host
         self._port = port
         self.data = data
         self._skip = skip
@@ -82,15 +82,15 @@ class Query:
         try:
             if diff(now, self._due) >= 0:
                 self._due = now + _AGAIN_MS
-                self.socket.sendto(self.data, (self._host, self._port))
+                self.socket.sendto(self.data, (self.host, self._port))
             data, (host, port) = self.socket.recvfrom(_DATAGRAM)  # type: ignore[misc, str-unpack]  # no str
         except OSError:  # no data; or no route, which counts as a lost packet
             return b""
-        return data if port == self._port and (host == self._host or self._host.startswith("224.")) else b""
+        return data if port == self._port and (host == self.host or self.host.startswith("224.")) else b""
 
     def address(self, now: int) -> str | None:
         """Return the address of the queried name; "" if there is none; None: not known yet."""
-        return dns.answer(self.step(now), self.data, self._skip) if self.data else self._host
+        return dns.answer(self.step(now), self.data, self._skip) if self.data else self.host
 
 
 def query_name(host: str, server: str, now: int, skip: int = 0) -> Query:
