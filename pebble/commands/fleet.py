@@ -100,7 +100,10 @@ def add(
     roles: _Roles,
     base: Annotated[
         list[str] | None,
-        typer.Option(help="Of a robot, unless pebble/robots/NAME; of a gateway, each that it carries.", metavar="BASE"),
+        typer.Option(
+            help="Of a robot, unless pebble/robots/NAME; of a neighbour; of a gateway, each that it carries.",
+            metavar="BASE",
+        ),
     ] = None,
     plain: Annotated[
         bool, typer.Option("--plain", help="A robot that does not know names: its topics stay without them.")
@@ -119,6 +122,7 @@ def add(
         pebble fleet add goob --role robot
         pebble fleet add lamp --role robot --base a/b/lamp --plain --board
         pebble fleet add page-1 --role page
+        pebble fleet add goob-lan --role neighbour --base pebble/robots/goob
     """
     given = tuple(dict.fromkeys(split_names(roles)))
     bases = tuple(base or ((f"pebble/robots/{name}",) if given == (ProgramRole.ROBOT,) else ()))
@@ -232,12 +236,15 @@ def certificate(
     typer.echo(
         f"Move the key to its machine, with copies of {copies} beside it. `pebble fleet check` watches the date."
     )
+    tls = {"enabled": True, "ca_cert": certificates.CA_CERT, "client_cert": f"{name}.pem"}
+    link = {"kind": "zenoh", "account": name, "connect": [f"tls/{fleet.brokers[0].host}:{_ZENOH_PORT}"]}
+    remote = {**link, "tls": {**tls, "client_key": f"{name}.key"}}
     if ProgramRole.ROBOT in account.roles:
-        tls = {"enabled": True, "ca_cert": certificates.CA_CERT, "client_cert": f"{name}.pem"}
-        link = {"kind": "zenoh", "account": name, "connect": [f"tls/{fleet.brokers[0].host}:{_ZENOH_PORT}"]}
-        remote = {**link, "tls": {**tls, "client_key": f"{name}.key"}}
         piece = {"services": {"mqtt_bridge": {"enabled": True, "remote": remote}}}
         typer.echo(json.dumps({"security": {"level": _level(fleet, account)}, **piece}, indent=2))
+    elif ProgramRole.NEIGHBOUR in account.roles:
+        lan = {key: value for key, value in remote.items() if key != "kind"}
+        typer.echo(json.dumps({"services": {"neighbours": {"enabled": True, "lan": lan}}}, indent=2))
     return 0
 
 
@@ -357,7 +364,7 @@ def _print_account(place: Path, fleet: Fleet, name: str, secret: str, how: str, 
     url = f"mqtts://{name}@" + ",".join(_host_and_port(server) for server in fleet.brokers)
     if ProgramRole.PAGE in account.roles:
         typer.echo(f"    pebble web --url {url} --ca-cert {ca} --password-file FILE")
-    elif ProgramRole.GATEWAY not in account.roles:
+    elif not set(account.roles) & {ProgramRole.GATEWAY, ProgramRole.NEIGHBOUR}:
         typer.echo(f"    pebble drive ROBOT --url {url} --ca-cert {ca} --password-file FILE")
 
 

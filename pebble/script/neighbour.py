@@ -16,7 +16,7 @@ PRESENT_S = 1.0  # so long a robot is there after it was heard last; it is heard
 _SLOT_S = 0.019  # between commands: at most 50 in a second
 
 
-class NotGranted(PebbleError):
+class NotGrantedError(PebbleError):
     """The other robot's config does not let this one do that."""
 
 
@@ -66,13 +66,13 @@ class Neighbour:
 
     def drive(self, x: float = 0.0, z: float = 0.0, y: float = 0.0) -> bool:
         """Drive it, as :meth:`Robot.drive` does this one, for 0.3 s at most. False: that has no effect, as far as is
-        known. Raises NotGranted if it does not let this robot drive it.
+        known. Raises NotGrantedError if it does not let this robot drive it.
         """
         self._way.check()
         command = Drive(x=float(x), z=float(z), y=float(y), source=SCRIPT, run=self._way.wheels.run)
         state, now = self._state, self._way.clock()
         if state is not None and DRIVE.metric not in state.commanded.get(self._me, ()):
-            raise NotGranted(
+            raise NotGrantedError(
                 f"{self.name} does not let {self._me} drive it: its config needs "
                 f'services.neighbours.commanded: {{"{self._me}": ["{DRIVE.metric}"]}}'
             )

@@ -204,7 +204,11 @@ class AutonomyManager(Service):
             raise StartError(refusal)
         self._began = self.clock()
         self._local.hold()
-        run = self._owners.newest_run = next_run(self.config, self._owners.barred, self._owners.newest_run)
+        try:
+            run = self._owners.newest_run = next_run(self.config, self._owners.barred, self._owners.newest_run)
+        except PebbleError:
+            self._local.release()
+            raise
         for step in self._owners.steps_to(run):
             self.halt(step)
         return run, self._owners.baseline()

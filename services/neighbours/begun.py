@@ -56,7 +56,8 @@ class Begun:
         new = self._path.with_suffix(".new")
         try:
             self._path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-            with open(os.open(new, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600), "wb") as file:
+            new.unlink(missing_ok=True)
+            with new.open("xb") as file:
                 file.write(msgspec.json.encode(newest))
                 file.flush()
                 os.fsync(file.fileno())
