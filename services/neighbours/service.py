@@ -69,11 +69,11 @@ class NeighboursService(Service):
         for channel in (ESTOP_STATE, CAPABILITIES):
             self.transport.subscribe(channel.filter(self.config.base), self._on_owner, direct=True)
         for metric in self._section.heard:
-            channel = channel_of(f"{OUTGOING}/{metric}")
-            topic = self._me.outgoing(metric) if channel is None else self.addresses[channel].topic
+            known = channel_of(f"{OUTGOING}/{metric}")
+            topic = self._me.outgoing(metric) if known is None else self.addresses[known].topic
             self.transport.subscribe(topic, partial(self._tell, metric), direct=True)
-        for name, metrics in self._section.commanded.items():
-            if DRIVE.metric in metrics:
+        for name, granted in self._section.commanded.items():
+            if DRIVE.metric in granted:
                 receive = self.refusals.reader(FROM_NEIGHBOUR, self._on_command)
                 self._lan.subscribe(FROM_NEIGHBOUR.topic(self._me.base, robot=name), receive, direct=True)
         for name, metrics in self._section.listens.items():
@@ -98,7 +98,7 @@ class NeighboursService(Service):
         refused = {name: NeighbourRefusal(run=run, why=why) for name, (run, why) in self._visit.refused(now).items()}
         state = Neighbours(
             heard=self._section.heard,
-            commanded=dict(self._section.commanded),
+            commanded={name: tuple(granted) for name, granted in self._section.commanded.items()},
             hears={name: self._hears(name, now) for name in self._others},
             driven_by=self._visit.driver(now),
             refused=refused,
