@@ -97,8 +97,8 @@ class NeighboursService(Service):
         now = self.clock()
         refused = {name: NeighbourRefusal(run=run, why=why) for name, (run, why) in self._visit.refused(now).items()}
         state = Neighbours(
-            heard=self._section.heard,
-            commanded={name: tuple(granted) for name, granted in self._section.commanded.items()},
+            heard=list(self._section.heard),
+            commanded={name: list(granted) for name, granted in self._section.commanded.items()},
             hears={name: self._hears(name, now) for name in self._others},
             driven_by=self._visit.driver(now),
             refused=refused,

@@ -183,4 +183,4 @@ def test_operators_see_who_hears_and_drives_whom(pair: Pair) -> None:
     assert until(lambda: pair.goob.state.hears == {"fred": True, "carl": False})
     pair.robot.neighbour("fred").drive(z=0.4)
     assert until(lambda: pair.fred.state.driven_by == "goob")
-    assert pair.fred.state.commanded == {"goob": ("drive-values",)}
+    assert pair.fred.state.commanded == {"goob": ["drive-values"]}
