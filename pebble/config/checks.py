@@ -125,14 +125,14 @@ def _neighbours(reader: Reader, section: Neighbours, path: Path) -> Neighbours:
     for key, names in (("commanded", section.commanded), ("listens", section.listens)):
         if len(names) > MOST_NEIGHBOURS:
             problem((*path, key), f"has {len(names)} robots: {MOST_NEIGHBOURS} are the most")
-    named = [(("heard",), section.heard), *((("listens", name), found) for name, found in section.listens.items())]
+    named = [(("shares",), section.shares), *((("listens", name), found) for name, found in section.listens.items())]
     for place, metrics in named:
         if len(metrics) > MOST_METRICS:
             problem((*path, *place), f"has {len(metrics)} metrics: {MOST_METRICS} are the most")
         for metric in metrics:
             channel = channel_of(f"{OUTGOING}/{metric}")
             if is_reserved(metric) or (channel is not None and not (channel.remote and channel.bridged)):
-                problem((*path, *place), f"{metric} cannot be heard: no pictures or sound, nor who stops and drives")
+                problem((*path, *place), f"{metric} cannot be shared: no pictures or sound, nor who stops and drives")
     return section
 
 

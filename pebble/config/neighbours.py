@@ -25,8 +25,8 @@ class Neighbours(ServiceSection, frozen=True, kw_only=True):
     """Scripts of other robots hear and drive this one, as far as it lets them: docs/neighbours.md."""
 
     lan: Annotated[Lan, doc("Where the robots meet.")] = Lan()
-    heard: Annotated[
-        tuple[Topic, ...], doc('What the others may hear: metrics of outgoing/, such as "wheel-odometry".')
+    shares: Annotated[
+        tuple[Topic, ...], doc('What the others may receive: metrics of outgoing/, such as "wheel-odometry".')
     ] = ()
     commanded: Annotated[
         dict[Level, tuple[Literal["drive-values"], ...]],

@@ -234,9 +234,9 @@ class NeighbourRefusal(Payload, frozen=True, kw_only=True):
 class Neighbours(Payload, frozen=True, kw_only=True):
     """What robots of a LAN tell each other, and operators. Names are those of robots in the config."""
 
-    heard: list[str] = []  # metrics that the others may hear
+    shares: list[str] = []  # metrics that the others may receive
     commanded: dict[str, list[str]] = {}  # metrics that a script of this robot may command
-    hears: dict[str, bool] = {}  # whether this robot hears that one now
+    receives: dict[str, bool] = {}  # whether this robot receives what that one sends, now
     driven_by: str = ""  # whose script drives this robot now; empty: none
     refused: dict[str, NeighbourRefusal] = {}  # the newest run of that one, while it has no effect
 

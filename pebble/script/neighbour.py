@@ -46,7 +46,7 @@ class Neighbour:
         self._topic = TO_NEIGHBOUR.topic(way.addresses.base, robot=name)
         self._sent_at = float("-inf")
         self._moves = False  # the newest command does
-        self._hear(NEIGHBOURS)
+        self._receive(NEIGHBOURS)
 
     @property
     def online(self) -> bool:
@@ -56,11 +56,11 @@ class Neighbour:
     def latest(self, channel: Channel, max_age: float = 1.0) -> Any:
         """The newest payload of ``channel`` that arrived within the last ``max_age`` seconds, or None. Does not wait.
 
-        The first call subscribes, and mostly returns None. The other robot's config has to list it in ``heard``, and
+        The first call subscribes, and mostly returns None. The other robot's config has to list it in ``shares``, and
         this one's in ``listens``.
         """
         self._way.check()
-        self._hear(channel)
+        self._receive(channel)
         newest = self._newest.get(channel.metric)
         return None if newest is None or self._way.clock() - newest.at > max_age else newest.value
 
@@ -113,7 +113,7 @@ class Neighbour:
         raw = codec.encode(TO_NEIGHBOUR, command)
         return self._way.transport.publish(self._topic, raw, qos=QoS.DELIVERED, urgent=True)
 
-    def _hear(self, channel: Channel) -> None:
+    def _receive(self, channel: Channel) -> None:
         metric = channel.metric
         if metric not in self._newest:
             self._newest[metric] = _Arrived(None, float("-inf"))

@@ -54,7 +54,7 @@ class NeighboursService(Service):
         self._estop = RobotEstop(self.config.base)
         begun = Begun(self.config.state_file("neighbour-runs"), self._section.commanded)
         self._visit = Visit(begun.begin, self._number, self._drive, self._local_runs)
-        self._heard_at: dict[str, float] = {}
+        self._received_at: dict[str, float] = {}
         self._counts: dict[str, tuple[int, int]] = {}  # by robot: a second, and its messages so far
         self._state: Neighbours | None = None
 
@@ -68,10 +68,10 @@ class NeighboursService(Service):
         super().set_up()
         for channel in (ESTOP_STATE, CAPABILITIES):
             self.transport.subscribe(channel.filter(self.config.base), self._on_owner, direct=True)
-        for metric in self._section.heard:
+        for metric in self._section.shares:
             known = channel_of(f"{OUTGOING}/{metric}")
             topic = self._me.outgoing(metric) if known is None else self.addresses[known].topic
-            self.transport.subscribe(topic, partial(self._tell, metric), direct=True)
+            self.transport.subscribe(topic, partial(self._share, metric), direct=True)
         for name, granted in self._section.commanded.items():
             if DRIVE.metric in granted:
                 receive = self.refusals.reader(FROM_NEIGHBOUR, self._on_command)
@@ -79,14 +79,14 @@ class NeighboursService(Service):
         for name, metrics in self._section.listens.items():
             for metric in dict.fromkeys((NEIGHBOURS.metric, *metrics)):
                 topic = self._others[name].outgoing(metric)
-                self._lan.subscribe(topic, partial(self._hear, name, metric), direct=True)
+                self._lan.subscribe(topic, partial(self._receive, name, metric), direct=True)
 
     def stop(self) -> None:
         self._visit.end("its neighbours were switched off", self.clock())
 
     # -- to the others
 
-    def _tell(self, metric: str, message: Message) -> None:
+    def _share(self, metric: str, message: Message) -> None:
         """On the transport's thread: what another robot may hear, as it is; never an old value."""
         if not message.retain:
             self._lan.publish(self._me.outgoing(metric), message.payload, qos=QoS.LATEST)
@@ -97,9 +97,9 @@ class NeighboursService(Service):
         now = self.clock()
         refused = {name: NeighbourRefusal(run=run, why=why) for name, (run, why) in self._visit.refused(now).items()}
         state = Neighbours(
-            heard=list(self._section.heard),
+            shares=list(self._section.shares),
             commanded={name: list(granted) for name, granted in self._section.commanded.items()},
-            hears={name: self._hears(name, now) for name in self._others},
+            receives={name: self._is_present(name, now) for name in self._others},
             driven_by=self._visit.driver(now),
             refused=refused,
         )
@@ -115,7 +115,7 @@ class NeighboursService(Service):
             self.counters.add("refused")
             return
         now = self.clock()
-        if drive.moves and (now - arrived > WAIT_LIMIT_S or not self._hears(robot, now)):
+        if drive.moves and (now - arrived > WAIT_LIMIT_S or not self._is_present(robot, now)):
             self.counters.add("late")
             return
         topic = FROM_NEIGHBOUR.topic(self._others[robot].base, robot=self._me.id)
@@ -123,7 +123,7 @@ class NeighboursService(Service):
 
     # -- from the others
 
-    def _hear(self, name: str, metric: str, message: Message) -> None:
+    def _receive(self, name: str, metric: str, message: Message) -> None:
         """On the transport's thread: what another robot lets this one hear."""
         now = self.clock()
         second, count = self._counts.get(name, (0, 0))
@@ -138,7 +138,7 @@ class NeighboursService(Service):
             except PayloadError as error:
                 self.refusals.malformed(NEIGHBOURS, error)
                 return
-            self._heard_at[name] = now
+            self._received_at[name] = now
         topic = NEIGHBOUR_VALUE.topic(self._me.base, robot=name, metric=metric)
         self.transport.publish(topic, message.payload, qos=QoS.LATEST)
 
@@ -197,5 +197,5 @@ class NeighboursService(Service):
     def _tick(self) -> None:
         self._visit.tick(self.clock())
 
-    def _hears(self, name: str, now: float) -> bool:
-        return now - self._heard_at.get(name, float("-inf")) <= PRESENT_S
+    def _is_present(self, name: str, now: float) -> bool:
+        return now - self._received_at.get(name, float("-inf")) <= PRESENT_S

@@ -42,7 +42,7 @@ run(main)
 BY_GOOB, BY_STRANGER = (0.4, 0.4), (0.25, 0.25)
 _RUNS = itertools.count(int(time.time()) - 1_735_689_600 + 10_000, 1000)
 HOLD_S = 2.1  # after a person's command
-SETTLES_S = 1.0  # what was sent before a stop has arrived or is too old
+OLD_S = 1.0  # what was sent before a stop has arrived or is too old
 
 
 def neighbour(name: str) -> Account:
@@ -99,7 +99,7 @@ class Hall:
         hub.settings = replace(hub.settings, listen=(self.endpoint,), tls=own, access=folder / ZENOH, lease_ms=2000)
         hub.start()
         stack.callback(hub.end)
-        self.fred = self._robot("fred", heard=["wheel-odometry"], commanded={"goob": ["drive-values"]})
+        self.fred = self._robot("fred", shares=["wheel-odometry"], commanded={"goob": ["drive-values"]})
         self.goob = self._robot("goob", listens={"fred": ["wheel-odometry"]})
         local = ZenohSettings(run_dir=self.fred.folder / "run", client=True)
         self.local = stack.enter_context(create("zenoh", "eye", local))
@@ -185,8 +185,8 @@ def test_a_script_drives_another_robot_until_a_person_does(hall: Hall, stack: Ex
     hall.fred.operator.send("incoming/drive-values", {"x": 0, "z": -0.3})
     assert until(lambda: (-0.3, -0.3) in [wheels for _, wheels in hall.fred.mcu.drives(began)])
     taken = next(at for at, wheels in hall.fred.mcu.drives(began) if wheels == (-0.3, -0.3)) - began
-    time.sleep(SETTLES_S)
-    after = hall.by_goob(began + SETTLES_S / 2)
+    time.sleep(OLD_S)
+    after = hall.by_goob(began + OLD_S / 2)
     sys.stdout.write(f"\na person takes over after {1000 * taken:.0f} ms\n")
     assert (after, taken < 1.0) == ([], True)
 
@@ -202,7 +202,7 @@ def test_after_a_persons_zero_who_still_sends_moves_nothing(hall: Hall, stack: E
     hall.fred.operator.send("incoming/drive-values", {"x": 0, "z": 0})
     began = time.monotonic()
     assert until(lambda: not hall.fred.mcu.moving(), 1)
-    sends(goob, "goob", number, SETTLES_S)
+    sends(goob, "goob", number, OLD_S)
     seconds = cases(5, 60)
     since = time.monotonic()
     sends(goob, "goob", number, seconds)

@@ -73,8 +73,8 @@ class Pair:
     def __init__(self, folder: Path, stack: ExitStack) -> None:
         self.lan = lan = Lan()
         self.stranger = MemoryTransport("stranger", lan).open()
-        heard, granted = {"heard": ["wheel-odometry"]}, {"commanded": {"goob": ["drive-values"]}}
-        self.fred = One(folder / "fred", lan, "fred", stack, **heard, **granted)
+        shared, granted = {"shares": ["wheel-odometry"]}, {"commanded": {"goob": ["drive-values"]}}
+        self.fred = One(folder / "fred", lan, "fred", stack, **shared, **granted)
         self.goob = One(folder / "goob", lan, "goob", stack, listens={"fred": ["wheel-odometry"], "carl": []})
         self.robot = Robot(self.goob.config, MemoryTransport("script", self.goob.hub).open(), lambda _above: 7)
         stack.callback(self.robot.close)
@@ -97,15 +97,15 @@ def pair() -> Iterator[Pair]:
         yield pair
 
 
-def test_a_script_hears_and_drives_another_robot_and_stops_it_at_its_end(pair: Pair) -> None:
+def test_a_script_receives_from_and_drives_another_robot_and_stops_it_at_its_end(pair: Pair) -> None:
     fred = pair.robot.neighbour("fred")
     odometry = codec.encode(WHEEL_ODOMETRY, WheelOdometry(value={"x_mm": 5.0}, timestamp=0.0))
 
-    def hears() -> object:
+    def received() -> object:
         pair.fred.publish("outgoing/wheel-odometry", odometry)
         return fred.latest(WHEEL_ODOMETRY)
 
-    assert until(hears)
+    assert until(received)
     assert fred.latest(WHEEL_ODOMETRY).value["x_mm"] == 5.0
     assert fred.drive(x=0.1, z=0.4)
     assert until(lambda: pair.fred.drives)
@@ -129,14 +129,14 @@ def test_a_script_learns_why_its_commands_have_no_effect(pair: Pair) -> None:
 
 
 def test_who_is_not_granted_learns_so(pair: Pair) -> None:
-    state = json.dumps({"heard": [], "commanded": {"ann": ["drive-values"]}}).encode()
+    state = json.dumps({"shares": [], "commanded": {"ann": ["drive-values"]}}).encode()
     carl = pair.robot.neighbour("carl")
 
-    def heard() -> bool:
+    def present() -> bool:
         pair.stranger.publish("pebble/robots/carl/outgoing/neighbours", state)
         return carl.online
 
-    assert until(heard)
+    assert until(present)
     with pytest.raises(NotGrantedError, match="carl does not let goob drive it"):
         carl.drive(z=0.1)
 
@@ -169,7 +169,7 @@ def test_what_is_no_command_of_a_running_script_moves_nothing(pair: Pair) -> Non
     assert [one.z for one in pair.fred.drives] == [0.01]
 
 
-def test_nothing_old_or_large_is_heard(pair: Pair) -> None:
+def test_nothing_old_or_large_is_received(pair: Pair) -> None:
     received: list[Message] = []
     pair.goob.client.subscribe(f"{pair.goob.base}/outgoing/neighbours/fred/wheel-odometry", received.append)
     topic = WHEEL_ODOMETRY.topic(pair.fred.base)
@@ -179,8 +179,8 @@ def test_nothing_old_or_large_is_heard(pair: Pair) -> None:
     assert [one.payload for one in received] == [b"{}"]
 
 
-def test_operators_see_who_hears_and_drives_whom(pair: Pair) -> None:
-    assert until(lambda: pair.goob.state.hears == {"fred": True, "carl": False})
+def test_operators_see_who_receives_what_and_who_drives(pair: Pair) -> None:
+    assert until(lambda: pair.goob.state.receives == {"fred": True, "carl": False})
     pair.robot.neighbour("fred").drive(z=0.4)
     assert until(lambda: pair.fred.state.driven_by == "goob")
     assert pair.fred.state.commanded == {"goob": ["drive-values"]}

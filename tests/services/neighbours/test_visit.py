@@ -39,7 +39,7 @@ class Fred:
         latch = Latch(f"boot{next(self._boots)}", 8, self._diff)
         lease = Lease(self._ms, self._diff, lambda count: "0badf00d"[: 2 * count], 0)
         self.owner = Arbiter(latch, lease, self._ms, self._diff, 750)
-        self.tell()
+        self.publish_state()
 
     @staticmethod
     def _diff(later: int, earlier: int) -> int:
@@ -56,10 +56,10 @@ class Fred:
         for _ in range(round(seconds / STEP_S)):
             self.now += STEP_S
             self.owner.tick(self._ms)
-            self.tell()
+            self.publish_state()
             self.visit.tick(self.now)
 
-    def tell(self) -> None:
+    def publish_state(self) -> None:
         latch = self.owner.latch
         state = EstopState(**latch.state(True), barred=self.owner.barred)
         self.visit.owners({"wheels": state}, self.now)
@@ -69,7 +69,7 @@ class Fred:
         if self.owner.judge(drive.moves, run, drive.valid_ms if isinstance(drive.valid_ms, int) else -1, self._ms) > 0:
             self.moved.append(sender)
         self.visit.received(drive, self.now)
-        self.tell()
+        self.publish_state()
         return True
 
     # -- what happens
@@ -103,11 +103,11 @@ class Fred:
 
     def stopped_and_reset(self) -> None:
         self.owner.stop("0" * 16, "ann", "", 0)
-        self.tell()
+        self.publish_state()
         self.wait(0.5)
         latch = self.owner.latch
         assert latch.reset(latch.boot, latch.count, 0, self._ms)
-        self.tell()
+        self.publish_state()
 
     def unwritable(self) -> None:
         self.file.unlink()
