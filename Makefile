@@ -112,7 +112,7 @@ thorough: gstreamer
 	@PEBBLE_THOROUGH=1 $(MAKE) --no-print-directory test
 
 # Whole fleets; make test has one row of each rule.
-FLEET := tests/fleet/test_hosts.py tests/fleet/test_gateways.py tests/transports/zenoh/test_mesh.py
+FLEET := tests/fleet/test_hosts.py tests/fleet/test_gateways.py tests/fleet/test_neighbours.py tests/transports/zenoh/test_mesh.py
 fleet: .venv/.ready-dev
 	@sh tools/debian-packages.sh mosquitto=mosquitto
 	@PEBBLE_THOROUGH=1 $(TESTS) --timeout 900 -s $(FLEET)

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import itertools
 import json
+import random
+import secrets
 import statistics
 import sys
 import tempfile
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +27,8 @@ from pebble.fleet.roles import Account, rules
 from pebble.transports import Message, QoS, TlsSettings, Transport, ZenohSettings, create
 from pebble.transports.topics import matches
 from tests.robot.rig import STOP, Rig
-from tests.support import Child, cases, free_port, until
+from tests.support import Child, beside, cases, free_port, until
+from tests.tcp_proxy import TcpProxy
 from tests.transports.zenoh_net import HubProcess
 
 FRED, GOOB = "pebble/robots/fred", "pebble/robots/goob"
@@ -97,10 +101,14 @@ class Hall:
         own = self._tls(folder / certificates.SERVER_CERT, folder / certificates.SERVER_KEY)
         hub = HubProcess(folder / "run")
         hub.settings = replace(hub.settings, listen=(self.endpoint,), tls=own, access=folder / ZENOH, lease_ms=2000)
-        hub.start()
+        self.hub = hub.start()
         stack.callback(hub.end)
-        self.fred = self._robot("fred", shares=["wheel-odometry"], commanded={"goob": ["drive-values"]})
-        self.goob = self._robot("goob", listens={"fred": ["wheel-odometry"]})
+        self.proxy = TcpProxy(int(self.endpoint.rpartition(":")[2]))
+        stack.callback(self.proxy.stop)
+        self.fred = self._robot(
+            "fred", f"tls/127.0.0.1:{self.proxy.port}", shares=["wheel-odometry"], commanded={"goob": ["drive-values"]}
+        )
+        self.goob = self._robot("goob", self.endpoint, listens={"fred": ["wheel-odometry"]})
         local = ZenohSettings(run_dir=self.fred.folder / "run", client=True)
         self.local = stack.enter_context(create("zenoh", "eye", local))
         self.incoming: list[tuple[float, Message]] = []
@@ -112,11 +120,11 @@ class Hall:
     def _tls(self, certificate: Path, key: Path) -> TlsSettings:
         return TlsSettings(ca_cert=self.folder / certificates.CA_CERT, client_cert=certificate, client_key=key)
 
-    def _robot(self, name: str, **section: Any) -> Rig:
+    def _robot(self, name: str, endpoint: str, **section: Any) -> Rig:
         place, account = self.folder / certificates.ACCOUNTS, f"{name}-lan"
         files = {"client_cert": str(place / f"{account}.pem"), "client_key": str(place / f"{account}.key")}
         tls = {"enabled": True, "ca_cert": str(self.folder / certificates.CA_CERT), **files}
-        lan = {"connect": [self.endpoint], "account": account, "tls": tls}
+        lan = {"connect": [endpoint], "account": account, "tls": tls}
         rig = Rig("zenoh", name=name, direct=True, neighbours={"enabled": True, "lan": lan, **section})
         self._stack.callback(rig.close)
         return rig
@@ -142,8 +150,28 @@ class Hall:
     def by_goob(self, since: float) -> list[float]:
         return [at for at, wheels in self.fred.mcu.drives(since) if wheels == BY_GOOB]
 
+    def stop(self) -> float:
+        """Stop fred, by its operator; seconds until its wheels have stopped."""
+        began = time.monotonic()
+        self.fred.operator.send("incoming/estop", {"stop": secrets.token_hex(8), "by": "ann"})
+        assert until(self._latched, 10)
+        assert until(lambda: not self.fred.mcu.turning(), 10)
+        return max([at for at, drive in self.fred.mcu.motors(began) if drive == STOP], default=began) - began
+
+    def reset(self) -> None:
+        if self._latched():
+            state = self.fred.operator.last("outgoing/estop/serial")
+            assert state is not None
+            self.fred.operator.send("incoming/estop-reset", {one: state.json[one] for one in ("boot", "count")})
+            assert until(lambda: not self._latched(), 10)
+
+    def _latched(self) -> bool:
+        state = self.fred.operator.last("outgoing/estop/serial")
+        return state is not None and state.json["latched"]
+
     def rests(self, timeout: float = 5.0) -> None:
-        """Wait until fred's wheels rest, and no person drives it."""
+        """Wait until fred's wheels rest, it is not stopped, and no person drives it."""
+        self.reset()
         assert until(lambda: not self.fred.mcu.turning(), timeout)
         time.sleep(HOLD_S)
 
@@ -262,14 +290,104 @@ def test_a_stop_ends_it_and_it_is_fast(hall: Hall, stack: ExitStack) -> None:
         if at > began and (found := json.loads(message.payload)["z"]) in sent
     ]
     stopped = time.monotonic()
-    hall.fred.operator.send("incoming/estop", {"stop": "0123456789abcdef", "by": "ann"})
-    for _ in range(20):
-        send(goob, "goob", number)
-        time.sleep(0.05)
-    wheels = [(at, drive) for at, drive in hall.fred.mcu.motors(stopped)]
-    rested = next(at for at, drive in wheels if drive == STOP) - stopped
-    assert all(drive == STOP for at, drive in wheels if at >= stopped + rested)
-    figures = {"p50 ms": round(statistics.median(took), 2), "commands": len(took), "stop s": round(rested, 3)}
+    stop = hall.stop()
+    sends(goob, "goob", number, 1.0)
+    moved = [drive for at, drive in hall.fred.mcu.motors(stopped + stop) if drive != STOP]
+    figures = {"p50 ms": round(statistics.median(took), 2), "commands": len(took), "stop s": round(stop, 3)}
     sys.stdout.write(f"\nneighbours: {json.dumps(figures)}\n")
-    assert rested <= 1.0
+    assert (moved, stop <= 1.0) == ([], True)
     assert len(took) > 0.9 * len(sent)
+
+
+class Stream:
+    """Numbered commands of one run of goob's, 40 a second, by a client that may be replaced."""
+
+    def __init__(self, hall: Hall, client: Transport) -> None:
+        self.client, self.ending, self.sent = client, threading.Event(), dict[float, float]()
+        self._hall, self._run = hall, newer()
+        hall.incoming.clear()
+
+    def run(self) -> None:
+        for number in itertools.count():
+            if self.ending.wait(0.025):
+                return
+            z = round(0.2 + number / 100_000, 5)
+            self.sent[z] = time.monotonic()
+            send(self.client, "goob", self._run, z)
+
+    @property
+    def arrived(self) -> list[tuple[float, float]]:
+        """When each came to fred's motors' topic, and which one it is."""
+        found = [(at, json.loads(message.payload)["z"]) for at, message in list(self._hall.incoming)]
+        return [(at, z) for at, z in found if z in self.sent]
+
+    def arrives(self, since: float) -> bool:
+        arrived = self.arrived
+        return bool(arrived) and self.sent[arrived[-1][1]] > since
+
+    def wrong(self) -> dict[str, int]:
+        order = [z for _, z in self.arrived]
+        return {
+            "twice": len(order) - len(set(order)),
+            "out of order": sum(b < a for a, b in itertools.pairwise(order)),
+            "older than 0.5 s": sum(at - self.sent[z] > 0.5 for at, z in self.arrived),
+        }
+
+
+def _away(hall: Hall, stream: Stream, stack: ExitStack) -> Callable[[], None]:
+    stream.client.close()
+
+    def back() -> None:
+        stream.client = hall.client("goob-lan", stack)
+
+    return back
+
+
+def _hub_killed(hall: Hall, _stream: Stream, _stack: ExitStack) -> Callable[[], object]:
+    hall.hub.kill()
+    return hall.hub.start
+
+
+def _still(hall: Hall, _stream: Stream, _stack: ExitStack) -> Callable[[], None]:
+    hall.proxy.blackhole()
+    return hall.proxy.resume
+
+
+def _cut(hall: Hall, _stream: Stream, _stack: ExitStack) -> Callable[[], None]:
+    hall.proxy.cut()
+    return hall.proxy.mend
+
+
+#: What happens to the LAN, which returns its end, and for how long.
+FAULTS: dict[str, tuple[Callable[[Hall, Stream, ExitStack], Callable[[], object]], list[float]]] = {
+    "still": (_still, [0.3 + 2.7 * random.Random(3).random() for _ in range(cases(3, 20))]),
+    "cut": (_cut, [2.0, *([10.0] * cases(0, 1))]),
+    "hub killed": (_hub_killed, [1.0]),
+    "goob away": (_away, [1.0]),
+}
+
+
+@pytest.mark.thorough
+@pytest.mark.alone
+@pytest.mark.parametrize("fault", FAULTS)
+def test_after_a_fault_nothing_comes_twice_late_or_out_of_order(hall: Hall, stack: ExitStack, fault: str) -> None:
+    begin, lasting = FAULTS[fault]
+    hall.rests()
+    stream, gaps = Stream(hall, hall.client("goob-lan", stack)), list[float]()
+    with beside(stream.run, stream.ending):
+        assert until(lambda: stream.arrives(0), 10)
+        for seconds in lasting:
+            end = begin(hall, stream, stack)
+            time.sleep(seconds)
+            end()
+            ended = time.monotonic()
+            assert until(lambda ended=ended: stream.arrives(ended), 20)
+            gaps.append(stream.arrived[-1][0] - ended)
+        end = begin(hall, stream, stack)
+        stop = hall.stop()
+        end()
+        time.sleep(1.0)
+    figures = {"faults": len(lasting), "longest until it drives again s": round(max(gaps), 2), "stop s": round(stop, 3)}
+    sys.stdout.write(f"\nLAN, {fault}: {json.dumps({**figures, **stream.wrong()})}\n")
+    assert stream.wrong() == dict.fromkeys(stream.wrong(), 0)
+    assert stop <= 1.0
