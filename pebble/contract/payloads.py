@@ -237,7 +237,7 @@ class Neighbours(Payload, frozen=True, kw_only=True):
     shares: list[str] = []  # metrics that the others may receive
     commanded: dict[str, list[str]] = {}  # metrics that a script of this robot may command
     receives: dict[str, bool] = {}  # whether this robot receives what that one sends, now
-    driven_by: str = ""  # whose script drives this robot now; empty: none
+    driven_by: str = ""  # whose script drives this robot, or did last and has not ended; empty: none
     refused: dict[str, NeighbourRefusal] = {}  # the newest run of that one, while it has no effect
 
 
