@@ -22,7 +22,7 @@ from pebble.config.transport import Mqtt, Tls, TransportSection
 from pebble.config.tree import MqttBridge, Root, SerialBridge, SerialBridges, SerialSafety, Services
 from pebble.config.types import Secret
 from pebble.config.web import WebInterface, WebMqtt, WebTls
-from pebble.contract import OUTGOING, channel_of, is_reserved
+from pebble.contract import DRIVE, OUTGOING, channel_of, is_reserved
 from pebble.contract.identity import GATEWAYS, SERVERS
 
 MOST_NEIGHBOURS, MOST_METRICS = 16, 32  # of one robot; metrics of one neighbour
@@ -125,6 +125,9 @@ def _neighbours(reader: Reader, section: Neighbours, path: Path) -> Neighbours:
     for key, names in (("commanded", section.commanded), ("listens", section.listens)):
         if len(names) > MOST_NEIGHBOURS:
             problem((*path, key), f"has {len(names)} robots: {MOST_NEIGHBOURS} are the most")
+    for name, granted in section.commanded.items():
+        if any(metric != DRIVE.metric for metric in granted):
+            problem((*path, "commanded", name), f'must be ["{DRIVE.metric}"]: nothing else can be granted')
     named = [(("shares",), section.shares), *((("listens", name), found) for name, found in section.listens.items())]
     for place, metrics in named:
         if len(metrics) > MOST_METRICS:

@@ -1,6 +1,6 @@
 """The config section of robots that hear and drive each other on a LAN."""
 
-from typing import Annotated, Literal
+from typing import Annotated
 
 from msgspec import Meta
 
@@ -29,7 +29,7 @@ class Neighbours(ServiceSection, frozen=True, kw_only=True):
         tuple[Topic, ...], doc('What the others may receive: metrics of outgoing/, such as "wheel-odometry".')
     ] = ()
     commanded: Annotated[
-        dict[Level, tuple[Literal["drive-values"], ...]],
+        dict[Level, tuple[Topic, ...]],
         doc('By the id of another robot, what its scripts may command: {"goob": ["drive-values"]}.'),
     ] = EMPTY
     listens: Annotated[

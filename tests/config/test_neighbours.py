@@ -18,7 +18,7 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"lan": LAN | {"account": "goob-lan"}}, r"lan\.account: needs tls\.client_cert"),
     ({"shares": ["front-camera"]}, "front-camera cannot be shared"),
     ({"listens": {"fred": ["control/wheels"]}}, "control/wheels cannot be shared"),
-    ({"commanded": {"goob": ["estop-reset"]}}, 'must be "drive-values"'),
+    ({"commanded": {"goob": ["estop-reset"]}}, r'must be \["drive-values"\]'),
     ({"listens": {f"r{n}": [] for n in range(MOST_NEIGHBOURS + 1)}}, "are the most"),
     ({"shares": [f"m{n}" for n in range(MOST_METRICS + 1)]}, "are the most"),
 ]

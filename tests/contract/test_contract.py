@@ -192,8 +192,9 @@ def services() -> list[type[Service]]:
     return found
 
 
-#: A manager of scripts stops the wheels as the scripts do, and reads whether a motor owner is stopped.
-AGAINST_THE_DIRECTION = {("autonomy_manager", DRIVE), ("autonomy_manager", ESTOP_STATE)}
+#: A manager of scripts stops the wheels as the scripts do, and reads whether a motor owner is stopped. Scripts of other
+#: robots drive through a program of this one.
+AGAINST_THE_DIRECTION = {("autonomy_manager", DRIVE), ("autonomy_manager", ESTOP_STATE), ("neighbours", DRIVE)}
 
 
 def test_services_publish_what_goes_out_and_handle_what_comes_in() -> None:
