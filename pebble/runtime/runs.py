@@ -48,7 +48,7 @@ class LocalScripts:
                 self._held = self._open()
                 _lock(self._held, self._path, fcntl.LOCK_SH)
             except (OSError, PebbleError) as error:
-                log.debug("scripts of neighbours are not kept off: %s", error)
+                log.debug("scripts of other robots are not refused: %s", error)
 
     def release(self) -> None:
         file, self._held = self._held, None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -12,7 +13,7 @@ from pebble.runtime.addresses import Addresses
 from pebble.script.wheels import Wheels
 from pebble.transports import QoS, Transport
 
-PRESENT_S = 1.0  # so long a robot is there after it was heard last; it is heard four times a second
+PRESENT_S = 1.0  # so long a robot is there after it was received last; it comes four times a second
 _SLOT_S = 0.019  # between commands: at most 50 in a second
 
 
@@ -46,6 +47,8 @@ class Neighbour:
         self._topic = TO_NEIGHBOUR.topic(way.addresses.base, robot=name)
         self._sent_at = float("-inf")
         self._moves = False  # the newest command does
+        self._over = False
+        self._lock = threading.Lock()  # else the last command might come after the final zero
         self._receive(NEIGHBOURS)
 
     @property
@@ -99,6 +102,7 @@ class Neighbour:
 
     def end(self) -> None:
         """Stop what this script moves there."""
+        self._over = True
         if self._moves:
             self._send(Drive(source=SCRIPT, run=self._way.wheels.run))
 
@@ -109,9 +113,12 @@ class Neighbour:
         return newest.value if newest is not None and fresh else None
 
     def _send(self, command: Drive) -> bool:
-        self._moves = command.moves
         raw = codec.encode(TO_NEIGHBOUR, command)
-        return self._way.transport.publish(self._topic, raw, qos=QoS.DELIVERED, urgent=True)
+        with self._lock:
+            if command.moves and self._over:
+                return False
+            self._moves = command.moves
+            return self._way.transport.publish(self._topic, raw, qos=QoS.DELIVERED, urgent=True)
 
     def _receive(self, channel: Channel) -> None:
         metric = channel.metric

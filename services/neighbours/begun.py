@@ -26,13 +26,15 @@ class Begun:
     def __init__(self, path: Path, names: Collection[str]) -> None:
         self._path, self._names = path, names
         self._newest: dict[str, int] | None = self._read()
+        if self._newest is None:
+            log.error("%s", self._unreadable)
 
     def begin(self, name: str, run: int) -> str:
         """Why this run cannot begin; empty: it has, and does not again."""
         if self._newest is None:
             self._newest = self._read()
         if self._newest is None:
-            return f"{self._path} cannot be read: delete it while no other robot drives this one"
+            return self._unreadable
         if not newer(run, self._newest.get(name, 0)):
             return "it was ended here: start it again"
         after = {known: last for known, last in self._newest.items() if known in self._names} | {name: run}
@@ -41,14 +43,17 @@ class Begun:
         self._newest = after
         return ""
 
+    @property
+    def _unreadable(self) -> str:
+        return f"{self._path} cannot be read: delete it while the scripts of other robots are stopped"
+
     def _read(self) -> dict[str, int] | None:
         try:
             with self._path.open("rb") as file:
                 found = _decode(file.read(_MOST_BYTES))
         except FileNotFoundError:
             return {}
-        except (OSError, msgspec.MsgspecError) as error:
-            log.error("%s cannot be read, so no other robot drives this one: %s", self._path, error)
+        except (OSError, msgspec.MsgspecError):
             return None
         return found if all(0 < run <= LAST_RUN for run in found.values()) else None
 

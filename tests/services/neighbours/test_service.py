@@ -10,13 +10,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 
 from pebble.config import Config, parse
 from pebble.contract import DRIVE, ESTOP_STATE, FROM_NEIGHBOUR, NEIGHBOURS, WHEEL_ODOMETRY, codec
 from pebble.contract.payloads import SCRIPT, Drive, EstopState, Neighbours, WheelOdometry
 from pebble.errors import PebbleError
 from pebble.runtime.runs import LocalScripts
-from pebble.script import NotGrantedError, Robot
+from pebble.script import NotGrantedError, Robot, Stopped
 from pebble.services.neighbours.service import MOST_BYTES, NeighboursService
 from pebble.transports import Message, QoS, clock
 from pebble.transports.memory import MemoryHub, MemoryTransport
@@ -115,6 +116,17 @@ def test_a_script_receives_from_and_drives_another_robot_and_stops_it_at_its_end
     pair.robot.close()
     assert until(lambda: not pair.fred.drives[-1].moves)
     assert [one.moves for one in pair.goob.drives] == [False], "that of its own end"
+
+
+def test_an_emergency_stop_of_the_sender_ends_what_it_drives_elsewhere(pair: Pair) -> None:
+    fred = pair.robot.neighbour("fred")
+    assert until(lambda: fred.drive(z=0.4))
+    stopped = replace(FREE, latched=True, count=1)
+    topic = ESTOP_STATE.topic(pair.goob.base, owner="wheels")
+    pair.goob.client.publish(topic, codec.encode(ESTOP_STATE, stopped), retain=True)
+    assert until(lambda: bool(pair.fred.drives) and not pair.fred.drives[-1].moves)
+    with pytest.raises(Stopped):
+        fred.drive(z=0.4)
 
 
 def test_a_script_learns_why_its_commands_have_no_effect(pair: Pair) -> None:
