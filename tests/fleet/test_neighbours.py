@@ -318,7 +318,8 @@ class Stream:
     @property
     def arrived(self) -> list[tuple[float, float]]:
         """When each came to fred's motors' topic, and which one it is."""
-        found = [(at, json.loads(message.payload)["z"]) for at, message in list(self._hall.incoming)]
+        drives = [(at, one) for at, one in list(self._hall.incoming) if one.topic == DRIVE.topic(FRED)]
+        found = [(at, json.loads(one.payload)["z"]) for at, one in drives]
         return [(at, z) for at, z in found if z in self.sent]
 
     def arrives(self, since: float) -> bool:
