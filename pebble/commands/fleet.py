@@ -236,14 +236,16 @@ def certificate(
     typer.echo(
         f"Move the key to its machine, with copies of {copies} beside it. `pebble fleet check` watches the date."
     )
-    tls = {"enabled": True, "ca_cert": certificates.CA_CERT, "client_cert": f"{name}.pem"}
-    link = {"kind": "zenoh", "account": name, "connect": [f"tls/{fleet.brokers[0].host}:{_ZENOH_PORT}"]}
-    remote = {**link, "tls": {**tls, "client_key": f"{name}.key"}}
     if ProgramRole.ROBOT in account.roles:
+        tls = {"enabled": True, "ca_cert": certificates.CA_CERT, "client_cert": f"{name}.pem"}
+        link = {"kind": "zenoh", "account": name, "connect": [f"tls/{fleet.brokers[0].host}:{_ZENOH_PORT}"]}
+        remote = {**link, "tls": {**tls, "client_key": f"{name}.key"}}
         piece = {"services": {"mqtt_bridge": {"enabled": True, "remote": remote}}}
         typer.echo(json.dumps({"security": {"level": _level(fleet, account)}, **piece}, indent=2))
-    elif ProgramRole.NEIGHBOUR in account.roles:
-        lan = {key: value for key, value in remote.items() if key != "kind"}
+    if ProgramRole.NEIGHBOUR in account.roles:
+        files_here = {"ca_cert": certificates.CA_CERT, "client_cert": f"{name}.pem", "client_key": f"{name}.key"}
+        place_of_hub = f"tls/{fleet.brokers[0].host}:{_ZENOH_PORT}"
+        lan = {"account": name, "connect": [place_of_hub], "tls": {"enabled": True, **files_here}}
         typer.echo(json.dumps({"services": {"neighbours": {"enabled": True, "lan": lan}}}, indent=2))
     return 0
 
@@ -353,6 +355,9 @@ def _keep_admin(name: str) -> None:
 
 def _print_account(place: Path, fleet: Fleet, name: str, secret: str, how: str, *, board: bool = False) -> None:
     account = fleet.accounts[name]
+    if ProgramRole.NEIGHBOUR in account.roles:  # it logs in nowhere: its certificate admits it to the hub
+        typer.echo(f"{name} is {account.bases[0]} at the hub of a LAN ({how}): `pebble fleet certificate {name}`")
+        return
     typer.echo(f"{name} may log in as {', '.join(account.roles)} ({how})")
     typer.echo(f"    password: {secret}")
     typer.echo("It is shown this once.")
@@ -364,7 +369,7 @@ def _print_account(place: Path, fleet: Fleet, name: str, secret: str, how: str, 
     url = f"mqtts://{name}@" + ",".join(_host_and_port(server) for server in fleet.brokers)
     if ProgramRole.PAGE in account.roles:
         typer.echo(f"    pebble web --url {url} --ca-cert {ca} --password-file FILE")
-    elif not set(account.roles) & {ProgramRole.GATEWAY, ProgramRole.NEIGHBOUR}:
+    elif ProgramRole.GATEWAY not in account.roles:
         typer.echo(f"    pebble drive ROBOT --url {url} --ca-cert {ca} --password-file FILE")
 
 

@@ -39,8 +39,8 @@ class ProgramRole(StrEnum):
 
     PAGE = "page"  # a server of the operator page, which asks the rights of its own people
     ROBOT = "robot"
-    GATEWAY = "gateway"
     NEIGHBOUR = "neighbour"  # what a robot is to the other robots at the hub of a LAN
+    GATEWAY = "gateway"
 
 
 _EVERYBODY = frozenset({Right.LOOK, Right.STOP})
@@ -52,9 +52,9 @@ _RIGHTS: Mapping[str, frozenset[Right]] = {
     Role.SAFETY: _DRIVING | {Right.RESET, Right.TAKE},
     Role.ADMIN: frozenset(Right),
     ProgramRole.PAGE: frozenset(Right) - {Right.PEOPLE},
+    ProgramRole.NEIGHBOUR: frozenset(),
     ProgramRole.ROBOT: frozenset(),  # robots and gateways have the topics of their own bases
     ProgramRole.GATEWAY: frozenset(),
-    ProgramRole.NEIGHBOUR: frozenset(),
 }
 ROLES = tuple(_RIGHTS)
 #: Roles that go with no other one.
