@@ -112,7 +112,7 @@ thorough: gstreamer
 	@PEBBLE_THOROUGH=1 $(MAKE) --no-print-directory test
 
 # Whole fleets; make test has one row of each rule.
-FLEET := tests/bench/test_fleet.py tests/transports/zenoh/test_mesh.py $(addprefix tests/fleet/test_,gateways.py hosts.py hubs.py)
+FLEET := tests/bench/test_fleet.py tests/transports/zenoh/test_mesh.py $(addprefix tests/fleet/test_,gateways.py hosts.py hubs.py neighbours.py)
 fleet: .venv/.ready-dev
 	@sh tools/debian-packages.sh mosquitto=mosquitto
 	@PEBBLE_THOROUGH=1 $(TESTS) --timeout 900 -s $(FLEET)

@@ -32,7 +32,6 @@ RETIRED = {
     "clerk": "worker",
     "keepers?": "supervisor",
     "agreement": "reconciliation",
-    "neighbours?": "peers",
     "chatter": "device_log",
     "parked": "pending",
     "unwant": "release",

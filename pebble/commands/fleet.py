@@ -106,7 +106,10 @@ def add(
     roles: _Roles,
     base: Annotated[
         list[str] | None,
-        typer.Option(help="Of a robot, unless pebble/robots/NAME; of a gateway, each that it carries.", metavar="BASE"),
+        typer.Option(
+            help="Of a robot, unless pebble/robots/NAME; of a neighbour; of a gateway, each that it carries.",
+            metavar="BASE",
+        ),
     ] = None,
     plain: Annotated[
         bool, typer.Option("--plain", help="A robot that does not know names: its topics stay without them.")
@@ -125,6 +128,7 @@ def add(
         pebble fleet add goob --role robot
         pebble fleet add lamp --role robot --base a/b/lamp --plain --board
         pebble fleet add page-1 --role page
+        pebble fleet add goob-lan --role neighbour --base pebble/robots/goob
     """
     given = tuple(dict.fromkeys(split_names(roles)))
     bases = tuple(base or ((f"pebble/robots/{name}",) if given == (ProgramRole.ROBOT,) else ()))
@@ -251,6 +255,11 @@ def certificate(
         remote = {**link, "tls": tls}
         piece = {"services": {"mqtt_bridge": {"enabled": True, "remote": remote}}}
         typer.echo(json.dumps({"security": {"level": _level(fleet, account)}, **piece}, indent=2))
+    if ProgramRole.NEIGHBOUR in account.roles:
+        files_here = {"ca_cert": certificates.CA_CERT, "client_cert": f"{name}.pem", "client_key": f"{name}.key"}
+        place_of_hub = f"tls/{fleet.brokers[0].host}:{_ZENOH_PORT}"
+        lan = {"account": name, "connect": [place_of_hub], "tls": {"enabled": True, **files_here}}
+        typer.echo(json.dumps({"services": {"neighbours": {"enabled": True, "lan": lan}}}, indent=2))
     return 0
 
 
@@ -359,6 +368,9 @@ def _keep_admin(name: str) -> None:
 
 def _print_account(place: Path, fleet: Fleet, name: str, secret: str, how: str, *, board: bool = False) -> None:
     account = fleet.accounts[name]
+    if ProgramRole.NEIGHBOUR in account.roles:  # it logs in nowhere: its certificate admits it to the hub
+        typer.echo(f"{name} is {account.bases[0]} at the hub of a LAN ({how}): `pebble fleet certificate {name}`")
+        return
     typer.echo(f"{name} may log in as {', '.join(account.roles)} ({how})")
     typer.echo(f"    password: {secret}")
     typer.echo("It is shown this once.")

@@ -12,6 +12,7 @@ from pebble.config.doors import check_doors
 from pebble.config.exposure import warn_if_readable, warn_of_known_id, warn_of_logins_in_clear
 from pebble.config.hosts import HostError, check_web_url
 from pebble.config.media import AvDaemon, VideoStream
+from pebble.config.neighbours import Neighbours
 from pebble.config.problems import Path
 from pebble.config.reader import Check, Reader
 from pebble.config.secret_text import without_login
@@ -21,8 +22,10 @@ from pebble.config.transport import Mqtt, Tls, TransportSection
 from pebble.config.tree import MqttBridge, Root, SerialBridge, SerialBridges, SerialSafety, Services
 from pebble.config.types import Secret
 from pebble.config.web import WebInterface, WebMqtt, WebTls
+from pebble.contract import DRIVE, OUTGOING, channel_of, is_reserved
 from pebble.contract.identity import GATEWAYS, SERVERS
 
+MOST_NEIGHBOURS, MOST_METRICS = 16, 32  # of one robot; metrics of one neighbour
 _MOST_HOSTS = 8  # in a list of brokers: each that is hung takes two seconds of a round
 _LATER = ("ros1_bridge",)
 _TLS = ("tls/", "quic/")  # endpoints of Zenoh that are encrypted
@@ -109,6 +112,31 @@ def _video_stream(reader: Reader, stream: VideoStream, path: Path) -> VideoStrea
     except HostError as error:
         reader.notes.warning((*path, "webrtc_url"), f"no page can show it: {error}")
     return replace(stream, webrtc_url=public)
+
+
+def _neighbours(reader: Reader, section: Neighbours, path: Path) -> Neighbours:
+    problem, lan = reader.notes.problem, section.lan
+    if section.enabled and not lan.connect:
+        reader.notes.doubt((*path, "lan", "connect"), 'is missing, write where the hub listens: ["tls/hub.lab:7447"]')
+    if lan.listen:
+        problem((*path, "lan", "listen"), "must be left out: robots meet at a hub")
+    if lan.account and (not lan.tls.enabled or lan.tls.client_cert is None):
+        problem((*path, "lan", "account"), "needs tls.client_cert, in which it is the name")
+    for key, names in (("commanded", section.commanded), ("listens", section.listens)):
+        if len(names) > MOST_NEIGHBOURS:
+            problem((*path, key), f"has {len(names)} robots: {MOST_NEIGHBOURS} are the most")
+    for name, granted in section.commanded.items():
+        if any(metric != DRIVE.metric for metric in granted):
+            problem((*path, "commanded", name), f'must be ["{DRIVE.metric}"]: nothing else can be granted')
+    named = [(("shares",), section.shares), *((("listens", name), found) for name, found in section.listens.items())]
+    for place, metrics in named:
+        if len(metrics) > MOST_METRICS:
+            problem((*path, *place), f"has {len(metrics)} metrics: {MOST_METRICS} are the most")
+        for metric in metrics:
+            channel = channel_of(f"{OUTGOING}/{metric}")
+            if is_reserved(metric) or (channel is not None and not (channel.remote and channel.bridged)):
+                problem((*path, *place), f"{metric} cannot be shared: no pictures or sound, nor who stops and drives")
+    return section
 
 
 def _bridge(reader: Reader, bridge: MqttBridge, path: Path) -> MqttBridge:
@@ -302,6 +330,7 @@ CHECKS = _table(
     (AvDaemon, _av_daemon),
     (VideoStream, _video_stream),
     (MqttBridge, _bridge),
+    (Neighbours, _neighbours),
     (SerialBridges, _serial),
     (SerialSafety, _safety),
     (Tls, _tls),

@@ -59,12 +59,14 @@ def _check_links(notes: Notes, root: Root) -> None:
     for path, endpoint in _endpoints(root):
         if not endpoint.startswith(_ZENOH_ENCRYPTED):
             notes.problem(path, f'{endpoint} is not encrypted: write tls/… at security.level "{level}"')
-    remote = root.services.mqtt_bridge.remote
-    if remote is not None and not remote.account and any("remote" in path for path, _ in _endpoints(root)):
-        notes.problem(
-            ("services", "mqtt_bridge", "remote", "account"),
-            f'is missing at security.level "{level}": `pebble fleet certificate NAME` prints what belongs there',
-        )
+    remote, lan = root.services.mqtt_bridge.remote, root.services.neighbours.lan
+    links = {("mqtt_bridge", "remote"): "" if remote is None else remote.account, ("neighbours", "lan"): lan.account}
+    for link, account in links.items():
+        if not account and any(path[1:3] == link for path, _ in _endpoints(root)):
+            notes.problem(
+                ("services", *link, "account"),
+                f'is missing at security.level "{level}": `pebble fleet certificate NAME` prints what belongs there',
+            )
 
 
 def _endpoints(root: Root) -> Iterator[tuple[Path, str]]:
@@ -73,6 +75,8 @@ def _endpoints(root: Root) -> Iterator[tuple[Path, str]]:
     sections = {("transport",): transport if transport.kind == "zenoh" else None}
     if bridge.enabled and bridge.remote is not None and bridge.remote.kind == "zenoh":
         sections["services", "mqtt_bridge", "remote"] = bridge.remote  # type: ignore[index, assignment]
+    if root.services.neighbours.enabled:
+        sections["services", "neighbours", "lan"] = root.services.neighbours.lan  # type: ignore[index, assignment]
     for path, section in sections.items():
         for key in ("listen", "connect") if section is not None else ():
             for endpoint in getattr(section, key):

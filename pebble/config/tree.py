@@ -6,6 +6,7 @@ from msgspec import Meta, field
 
 from pebble.config.autonomy import AutonomyManager
 from pebble.config.media import AvDaemon, Media, SoundboardHandler, VideoStream
+from pebble.config.neighbours import Neighbours
 from pebble.config.planned import Ros1Bridge
 from pebble.config.recorder import Recorder
 from pebble.config.security import Security
@@ -311,6 +312,7 @@ class Services(Section, frozen=True, kw_only=True):
     autonomy_manager: Annotated[AutonomyManager, doc("Runs autonomy scripts.")] = AutonomyManager()
     web_handler: Annotated[WebHandler, doc("Runs the operator page.")] = WebHandler()
     recorder: Annotated[Recorder, doc("Records the robot.")] = Recorder()
+    neighbours: Annotated[Neighbours, doc("Hears and drives other robots of the LAN.")] = Neighbours()
 
 
 class Root(Section, frozen=True, kw_only=True):

@@ -11,8 +11,8 @@ from pebble.contract.identity import LEVEL, LEVEL_RULE
 
 # As pebble.transports.topics checks it: brokers close the connection on what is refused here.
 _BAD = r"+#\x00-\x1f\x7f-\x9f\ufdd0-\ufdef\ufffe\uffff"
-# Of any robot, who stops and who drives it: nothing else may be published there.
-_RESERVED = "(?:[^/]+/){3}(?:incoming|outgoing)/(?:estop|(?:by|control)(?:/|$))"
+# Of any robot, who stops and who drives it, and its neighbours: nothing else may be published there.
+_RESERVED = "(?:[^/]+/){3}(?:incoming|outgoing)/(?:estop|(?:by|control|from|to|neighbours)(?:/|$))"
 _TOPIC = rf"^(?!\$)(?!{_RESERVED})(?!(?:[^/]*/){{200}})[^{_BAD}]{{1,250}}$(?!\n)"
 
 # ``expected`` completes a problem's text "must be …, not …".

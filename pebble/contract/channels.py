@@ -253,9 +253,24 @@ NAVIGATION_LOCAL_PLAN = _c("navigation/local-plan", Kind.STREAM, p.AnyObject, "N
 NAVIGATION_GLOBAL_PLAN = _c("navigation/global-plan", Kind.STREAM, p.AnyObject, "Whole route of a ROS planner.")
 DIAGNOSTICS = _c("diagnostics", Kind.STATE, p.AnyObject, "Diagnostics of a ROS robot.", rate_hz=1)
 
+# -- between robots of a LAN: docs/neighbours.md
+FROM_NEIGHBOUR = _c("from/{robot}/drive-values", Kind.COMMAND, p.Drive,
+                    "What a script of another robot drives, at the hub of the LAN; only `neighbours` reads it.",
+                    rate_hz=20, newest=True, remote=False)  # fmt: skip
+TO_NEIGHBOUR = _c("to/{robot}/drive-values", Kind.COMMAND, p.Drive,
+                  "What a script of this robot wants another one to do; only `neighbours` reads it.",
+                  rate_hz=20, newest=True, remote=False)  # fmt: skip
+NEIGHBOURS = _c("neighbours", Kind.STATE, p.Neighbours, "Which robots this one hears, and which may drive it.")
+NEIGHBOUR_VALUE = _c("neighbours/{robot}/{metric}", Kind.STREAM, bytes,
+                     "What another robot of the LAN publishes, as it does, for scripts of this one.",
+                     remote=False)  # fmt: skip
+
 # -- outgoing: of servers, which are no robots
 DRIVING = _c("driving", Kind.EVENT, p.Driving, "Which robots are driven by way of a server (`{system}/servers/{id}`).",
              rate_hz=1, bridged=False)  # fmt: skip
+
+#: Families that pass neither to operators nor to a mirror, whatever stands below them.
+BETWEEN_ROBOTS = (f"{INCOMING}/from/", f"{INCOMING}/to/", f"{OUTGOING}/neighbours/")
 
 CHANNELS: tuple[Channel, ...] = tuple(value for value in list(vars().values()) if isinstance(value, Channel))
 _EXACT = {channel.suffix: channel for channel in CHANNELS if not channel.is_pattern}
@@ -264,10 +279,13 @@ _PATTERNS = [
 ]
 
 
+_RESERVED = frozenset(("audit", "by", "control", "from", "to", "neighbours"))
+
+
 def is_reserved(metric: str) -> bool:
     """Whether only the robot itself may define ``metric``, in either direction: who stops and drives it, or did."""
     family = metric.partition("/")[0]
-    return family.startswith(("estop", "audit-")) or family in ("audit", "by", "control")
+    return family.startswith(("estop", "audit-")) or family in _RESERVED
 
 
 def channel_of(suffix: str) -> Channel | None:

@@ -224,6 +224,23 @@ class GatewayHeartbeat(Payload, frozen=True, kw_only=True):
     robots: tuple[str, ...] = ()  # bases of those that it hears at its hub
 
 
+class NeighbourRefusal(Payload, frozen=True, kw_only=True):
+    """Why one run of a script of another robot has no effect."""
+
+    run: int
+    why: str
+
+
+class Neighbours(Payload, frozen=True, kw_only=True):
+    """What robots of a LAN tell each other, and operators. Names are those of robots in the config."""
+
+    shares: list[str] = []  # metrics that the others may receive
+    commanded: dict[str, list[str]] = {}  # metrics that a script of this robot may command
+    receives: dict[str, bool] = {}  # whether this robot receives what that one sends, now
+    driven_by: str = ""  # whose script drives this robot, or did last and has not ended; empty: none
+    refused: dict[str, NeighbourRefusal] = {}  # the newest run of that one, while it has no effect
+
+
 class ChargingStatus(Payload, frozen=True, kw_only=True):
     """Whether the robot is on its charger; null: unknown."""
 

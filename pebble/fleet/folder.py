@@ -111,9 +111,10 @@ def refused(fleet: Fleet, name: str, account: Account) -> str:
         return f"{name} exists already, as {', '.join(fleet.accounts[name].roles)}"
     if why := add_up(account.roles):
         return why
-    robot, gateway = (role in account.roles for role in (ProgramRole.ROBOT, ProgramRole.GATEWAY))
+    gateway = ProgramRole.GATEWAY in account.roles
+    robot = any(role in account.roles for role in (ProgramRole.ROBOT, ProgramRole.NEIGHBOUR))
     if robot != (len(account.bases) == 1) and not gateway:
-        return "a robot has one base, and nobody else has any"
+        return "a robot, or a neighbour, has one base, and nobody else has any"
     if account.plain and not robot:
         return "only a robot can be plain"
     if account.people and ProgramRole.PAGE not in account.roles:
@@ -121,8 +122,8 @@ def refused(fleet: Fleet, name: str, account: Account) -> str:
     for base in account.bases:
         if why := _refused_base(base, several=gateway):
             return why
-        owner = next((one for one, other in fleet.accounts.items() if robot and base in other.bases), None)
-        if owner is not None and ProgramRole.ROBOT in fleet.accounts[owner].roles:
+        same = (one for one, other in fleet.accounts.items() if base in other.bases and other.roles == account.roles)
+        if robot and (owner := next(same, None)) is not None:
             return f"{base} belongs to {owner}"
     return ""
 

@@ -39,6 +39,7 @@ class ProgramRole(StrEnum):
 
     PAGE = "page"  # a server of the operator page, which asks the rights of its own people
     ROBOT = "robot"
+    NEIGHBOUR = "neighbour"  # what a robot is to the other robots at the hub of a LAN
     GATEWAY = "gateway"
     HUB = "hub"  # a Zenoh hub that is linked to others, which carries what all accounts send
 
@@ -52,6 +53,7 @@ _RIGHTS: Mapping[str, frozenset[Right]] = {
     Role.SAFETY: _DRIVING | {Right.RESET, Right.TAKE},
     Role.ADMIN: frozenset(Right),
     ProgramRole.PAGE: frozenset(Right) - {Right.PEOPLE},
+    ProgramRole.NEIGHBOUR: frozenset(),
     ProgramRole.ROBOT: frozenset(),  # robots and gateways have the topics of their own bases
     ProgramRole.GATEWAY: frozenset(),
     ProgramRole.HUB: frozenset(),  # at a broker; at other hubs everything
@@ -156,7 +158,9 @@ def metrics(right: Right, extra: Extra | None = None) -> tuple[str, ...]:
 
 def _of_bases(name: str, account: Account, *, at_hub: bool) -> Iterator[Rule]:
     for base in account.bases:
-        if ProgramRole.ROBOT in account.roles:
+        if ProgramRole.NEIGHBOUR in account.roles:
+            yield from _of_neighbour(base) if at_hub else ()
+        elif ProgramRole.ROBOT in account.roles:
             yield from (Rule(access, f"{base}/#") for access in ("read", "write"))
         else:
             yield from (Rule("read", f"{base}/{direction}/#") for direction in (INCOMING, OUTGOING))
@@ -165,6 +169,15 @@ def _of_bases(name: str, account: Account, *, at_hub: bool) -> Iterator[Rule]:
     if ProgramRole.GATEWAY in account.roles and not at_hub:
         yield Rule("read", c.ONLINE.filter(f"+/{GATEWAYS}/+"))
         yield Rule("write", c.ONLINE.filter(f"+/{GATEWAYS}/{name}"))
+
+
+def _of_neighbour(base: str) -> Iterator[Rule]:
+    """Its id in the topics of its commands is that of its base, so no other one can claim it."""
+    kind, _, name = base.rpartition("/")
+    yield Rule("read", f"{kind}/+/{OUTGOING}/#")
+    yield Rule("write", f"{base}/{OUTGOING}/#")
+    yield Rule("read", c.FROM_NEIGHBOUR.filter(base))
+    yield Rule("write", c.FROM_NEIGHBOUR.topic(f"{kind}/+", robot=name))
 
 
 def _of_rights(

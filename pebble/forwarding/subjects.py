@@ -6,6 +6,7 @@ from math import inf
 
 from pebble.config import Config
 from pebble.contract import CHANNELS, INCOMING, OUTGOING, WAITS_S, Channel, Kind
+from pebble.contract.channels import BETWEEN_ROBOTS
 from pebble.contract.payloads import ControlRequest, Drive, EstopCommand
 from pebble.errors import TransportError
 from pebble.runtime.addresses import Addresses
@@ -106,6 +107,7 @@ class Subjects(dict[str, Subject | None]):
             self._base, self._thin = config.base, config.services.mqtt_bridge.link.profile != "wide"
             names = dict.fromkeys(["", *config.serial_instances()])
             self._addresses = [Addresses(view_of(config, name)) for name in names]
+        self._between_robots = tuple(f"{self._base}/{family}" for family in BETWEEN_ROBOTS)
         self._incoming = f"{self._base}/{INCOMING}/".encode()
         named = (addresses[one].topic.encode() for addresses in self._addresses for one in CHANNELS)
         self._named = frozenset(topic.removeprefix(self._incoming) for topic in named)
@@ -156,6 +158,8 @@ class Subjects(dict[str, Subject | None]):
         try:
             check_topic(topic)
         except TransportError:
+            return None
+        if topic.startswith(self._between_robots):
             return None
         for addresses in self._addresses:
             channel = addresses.channel(topic)

@@ -66,6 +66,7 @@ def programs(config: Config) -> tuple[Program, ...]:
         (bool(services.av_daemon.sockets()), _service(config, "gstreamer_mirror", Stage.CONNECTION, preloaded=False)),
         (services.soundboard_handler.enabled, _service(config, "soundboard_handler", Stage.CONNECTION)),
         (services.web_handler.enabled, _web_handler(config)),
+        (services.neighbours.enabled, _service(config, "neighbours", Stage.CONNECTION, preloaded=False)),
         (services.recorder.enabled, _service(config, "recorder", Stage.CONNECTION, preloaded=False)),
         *((True, _on_demand(config, name)) for name in config.on_demand_programs()),
     ]

@@ -184,6 +184,20 @@ def fleet_hub_settings(hub: "HubFile", run_dir: Path) -> ZenohSettings:
     )
 
 
+def lan_transport(config: Config) -> Transport:
+    """The connection of ``neighbours`` to the hub of the LAN, not yet opened."""
+    lan = config.services.neighbours.lan
+    settings = ZenohSettings(
+        run_dir=config.run_dir() / "lan",
+        connect=tuple(lan.connect),
+        tls=tls_settings(lan.tls),
+        lease_ms=lan.lease_ms,
+        client=True,
+        account=lan.account,
+    )
+    return create("zenoh", _name(config, "zenoh", "lan"), settings)
+
+
 def gateway_transports(gateway: "GatewayFile", run_dir: Path, will: Message) -> tuple[Transport, Transport, Transport]:
     """The connections of a gateway: to the hub, and two to the broker, one of them for presence and stops alone."""
     hub, mqtt = gateway.hub, gateway.mqtt

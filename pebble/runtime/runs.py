@@ -7,7 +7,8 @@ import fcntl
 import logging
 import os
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from functools import reduce
 from pathlib import Path
 
@@ -27,6 +28,55 @@ _DIGITS = 10  # of the number in the file
 _LOCKED_S = 2.0
 _TRY_S = 0.005
 _EPOCH_S = 1_735_689_600  # 2025-01-01: counted from here, seconds fit into a run's number until 2059
+
+
+class LocalScripts:
+    """Whether a script of the robot's own runs: each one holds a lock, or its manager does, from before its number.
+
+    So a number that is taken while none runs is older than that of every script that starts later. The kernel frees
+    the lock of a process that was killed.
+    """
+
+    def __init__(self, config: Config) -> None:
+        self._path = config.run_dir() / "local-scripts.lock"
+        self._held: int | None = None
+
+    def hold(self) -> None:
+        """From now on one runs. Without the lock it starts all the same: neighbours then take no number, either."""
+        if self._held is None:
+            try:
+                self._held = self._open()
+                _lock(self._held, self._path, fcntl.LOCK_SH)
+            except (OSError, PebbleError) as error:
+                log.debug("scripts of other robots are not refused: %s", error)
+
+    def release(self) -> None:
+        file, self._held = self._held, None
+        if file is not None:
+            os.close(file)
+
+    @contextmanager
+    def none_runs(self) -> Iterator[bool]:
+        """False: one runs, or that is unknown. While it is True none begins."""
+        try:
+            file = self._open()
+        except OSError as error:
+            log.warning("%s cannot be opened (%s): no neighbour drives", self._path, error.strerror)
+            yield False
+            return
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(file)
+            yield False
+            return
+        try:
+            yield True
+        finally:
+            os.close(file)
+
+    def _open(self) -> int:
+        return os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
 
 
 def newest(runs: Iterable[int]) -> int:
@@ -68,12 +118,12 @@ def _next(path: Path, barred: int, wall_clock: Callable[[], float], received: in
     return number
 
 
-def _lock(file: int, path: Path) -> None:
+def _lock(file: int, path: Path, how: int = fcntl.LOCK_EX) -> None:
     """Wait for other processes, but not for one that is frozen meanwhile. Raises PebbleError."""
     deadline = time.monotonic() + _LOCKED_S
     while True:
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(file, how | fcntl.LOCK_NB)
             return
         except BlockingIOError:
             if time.monotonic() > deadline:

@@ -67,6 +67,11 @@ class DriveSender:
         self._pending = signed
         return obeyed
 
+    def drive_another(self, now: float) -> str:
+        """A command for another robot: what ends this run ends that, too. Returns :meth:`refusal`."""
+        self._tried = True
+        return self.refusal(now)
+
     def end(self, why: str, now: float) -> None:
         """Publish the final zero, if the script has ever commanded anything; nothing is published after it."""
         if self._final:

@@ -16,7 +16,7 @@ from pebble.contract.payloads import LAST_RUN, LONGEST_SUMMARY, MOST_MAIN
 from pebble.errors import ConfigError, PebbleError, TransportError
 from pebble.runtime.connections import local_transport
 from pebble.runtime.parent import launcher_runs, set_up_logging
-from pebble.runtime.runs import CONFIG, RUN, next_run
+from pebble.runtime.runs import CONFIG, RUN, LocalScripts, next_run
 from pebble.script.guard import END_S, Guard
 from pebble.script.options import OneLineParser, form, parse
 from pebble.script.robot import EXIT_ENDED, Robot
@@ -145,6 +145,8 @@ class _Program:
     def run(self, main: Callable[..., None], config_path: Path, arguments: tuple[msgspec.Struct, ...]) -> None:
         Guard(self._end_on_signal)
         config = load(config_path)
+        local = LocalScripts(config)
+        local.hold()
         transport = _connected(config, config_path)
         robot = self._robot = Robot(config, transport, _numbered(config), name=self._name, on_ended=self._end_run)
         try:

@@ -10,12 +10,13 @@ from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pebble.config import Config
-from pebble.contract import AUTONOMY_COMMAND, DRIVE, ESTOP_RESET, ESTOP_STATE, Channel, Kind, codec
+from pebble.contract import AUTONOMY_COMMAND, DRIVE, ESTOP_RESET, ESTOP_STATE, TO_NEIGHBOUR, Channel, Kind, codec
 from pebble.contract.payloads import Drive
 from pebble.errors import PebbleError
 from pebble.runtime.addresses import Addresses
 from pebble.runtime.rate_limit import RateLimitedLog
 from pebble.runtime.receive import Refusals
+from pebble.script.neighbour import Neighbour, Way
 from pebble.script.pictures import Pictures
 from pebble.script.wheels import Wheels
 from pebble.transports import QoS, Transport
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 #: What no script publishes, and why; the gate of `autonomy_manager` drops the same from scripts of others.
 _REFUSED = {
     DRIVE: "use robot.drive() to move",
+    TO_NEIGHBOUR: "use robot.neighbour(…).drive()",
     ESTOP_RESET: "let people reset",
     ESTOP_STATE: "motor owners publish it",
     AUTONOMY_COMMAND: "let people start scripts, or list those it needs in run(main, needs=…)",
@@ -71,6 +73,7 @@ class Robot:
         self._latest: dict[str, _Arrived] = {}
         self._subscribed: set[str] = set()
         self._last_values: dict[Channel, Callable[[], Any]] = {}
+        self._neighbours: dict[str, Neighbour] = {}
         self._pictures = Pictures(config.run_dir())
         self._publishing = threading.RLock()  # the last values are published after all others, before disconnecting
         self._stopped = threading.Event()
@@ -159,6 +162,18 @@ class Robot:
         check_publish(self._addresses[channel].topic, self._addresses)
         self._last_values[channel] = value
 
+    def neighbour(self, name: str) -> Neighbour:
+        """Another robot of the LAN, which ``services.neighbours.listens`` names. Raises PebbleError for others."""
+        self._check()
+        found = self._neighbours.get(name)
+        if found is None:
+            section = self.config.services.neighbours
+            if not section.enabled or name not in section.listens:
+                raise PebbleError(f'robot.neighbour: {name!r} is not in services.neighbours.listens: add "{name}": []')
+            way = Way(self._transport, self._addresses, self._wheels, self._receive, self._check, self._clock)
+            found = self._neighbours[name] = Neighbour(name, self.config.identity.id, way)
+        return found
+
     def sleep(self, seconds: float) -> None:
         """Wait; the wheels stop after 0.75 s without a command."""
         self._check()
@@ -175,6 +190,8 @@ class Robot:
             self._exit_code = exit_code
         self._stopped.set()
         self._wheels.end(why)
+        for one in list(self._neighbours.values()):
+            one.end()
         locked = self._publishing.acquire(timeout=_STUCK_S)
         try:
             values, self._last_values = self._last_values, {}
@@ -212,8 +229,10 @@ class Robot:
             raise Stopped(self._exit_code)
 
     def _subscribe(self, channel: Channel, handler: Callable[..., None]) -> None:
+        self._receive(self._addresses[channel].topic, channel, handler)
+
+    def _receive(self, topic: str, channel: Channel, handler: Callable[..., None]) -> None:
         receive = self._refusals.reader(channel, lambda _message, value, names: handler(value, **names))
-        topic = self._addresses[channel].topic
         self._transport.subscribe(topic, receive, qos=QoS(channel.default_qos), limit=_WAITING)
 
 

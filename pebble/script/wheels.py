@@ -58,14 +58,20 @@ class Wheels:
             now = self._clock()
             self._sender.owners(self.estop.states, now)
             obeyed = self._sender.drive(wanted, now)
-            if self._thread is None:
-                self._thread = threading.Thread(target=self._tick, name="pebble-drive", daemon=True)
-                self._thread.start()
+            self._watch()
             if self._sender.due is not None:
                 self._changed.set()
             refusal = self._sender.refusal(now) or ("" if obeyed else "there is no connection")
         self._report(refusal)
         return obeyed
+
+    def drive_another(self) -> str:
+        """To be called before each command for another robot: why there is none now; empty: it may be sent."""
+        with self._lock:
+            now = self._clock()
+            self._sender.owners(self.estop.states, now)
+            self._watch()
+            return self._sender.drive_another(now)
 
     @property
     def overridden(self) -> bool:
@@ -87,6 +93,11 @@ class Wheels:
             if locked:
                 self._lock.release()
         self._changed.set()
+
+    def _watch(self) -> None:
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._tick, name="pebble-drive", daemon=True)
+            self._thread.start()
 
     def _report(self, refusal: str) -> None:
         """Log when commands begin to have an effect, and when they have none any more."""

@@ -28,7 +28,7 @@ from pebble.errors import PebbleError
 from pebble.motion.arbiter import HOLD_MS
 from pebble.runtime.addresses import Addresses
 from pebble.runtime.process import view_of
-from pebble.runtime.runs import following, next_run
+from pebble.runtime.runs import LocalScripts, following, next_run
 from pebble.runtime.service import Service, on
 from pebble.services.autonomy_manager.catalogue import Catalogue, files
 from pebble.services.autonomy_manager.child import Processes, Spawn
@@ -65,6 +65,7 @@ class AutonomyManager(Service):
         self._section = self.config.services.autonomy_manager
         motors = self.config.motor_lines()
         self.addresses = Addresses(view_of(self.config, next(iter(motors), "")))
+        self._local = LocalScripts(self.config)
         self._owners = MotorOwners([self.config.motor_owner(line) for line in motors])
         processes = Processes(self.config.run_dir() / "scripts.lock")
         self.on_stop(processes.close)
@@ -202,7 +203,12 @@ class AutonomyManager(Service):
         if refusal := self._owners.refusal:
             raise StartError(refusal)
         self._began = self.clock()
-        run = self._owners.newest_run = next_run(self.config, self._owners.barred, self._owners.newest_run)
+        self._local.hold()
+        try:
+            run = self._owners.newest_run = next_run(self.config, self._owners.barred, self._owners.newest_run)
+        except PebbleError:
+            self._local.release()
+            raise
         for step in self._owners.steps_to(run):
             self.halt(step)
         return run, self._owners.baseline()
@@ -228,6 +234,7 @@ class AutonomyManager(Service):
             self._gate = None
         self._owners.note_run(following(run))  # a person may bar it, too, before the next run
         self.halt(following(run))  # bars this run: a process of it may have escaped
+        self._local.release()
 
     def halt(self, run: int) -> None:
         if self._gate is not None and self._gate[0] == run:

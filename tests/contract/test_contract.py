@@ -116,7 +116,10 @@ def test_delivery_rules_are_those_of_the_wire() -> None:
 
 def test_what_stays_on_the_robot_and_what_never_passes_the_bridge() -> None:
     inside = [channel.metric for channel in CHANNELS if not channel.remote]
-    assert inside == ["sensors/imu-fast", "media-report/{program}"]
+    assert inside == [
+        *("sensors/imu-fast", "media-report/{program}"),
+        *("from/{robot}/drive-values", "to/{robot}/drive-values", "neighbours/{robot}/{metric}"),
+    ]
     assert {channel.suffix for channel in CHANNELS if not channel.bridged} == {
         "incoming/audio-stream", "outgoing/front-camera", "outgoing/audio", "outgoing/driving",
     }  # fmt: skip
@@ -189,8 +192,9 @@ def services() -> list[type[Service]]:
     return found
 
 
-#: A manager of scripts stops the wheels as the scripts do, and reads whether a motor owner is stopped.
-AGAINST_THE_DIRECTION = {("autonomy_manager", DRIVE), ("autonomy_manager", ESTOP_STATE)}
+#: A manager of scripts stops the wheels as the scripts do, and reads whether a motor owner is stopped. Scripts of other
+#: robots drive through a program of this one.
+AGAINST_THE_DIRECTION = {("autonomy_manager", DRIVE), ("autonomy_manager", ESTOP_STATE), ("neighbours", DRIVE)}
 
 
 def test_services_publish_what_goes_out_and_handle_what_comes_in() -> None:

@@ -128,6 +128,8 @@ class TestOthers:
             *("/pebble/robots/goob/incoming/drive-values", "/pebble/robots/rover2/outgoing/status"),
             *("/pebble/robots/rover", f"/{BASE}/incoming", f"/{BASE}/elsewhere/x", "/pebble/infrastructure"),
             *("/other/robots/rover/incoming/drive-values", "/drive-values"),
+            *(f"/{BASE}/incoming/{way}/goob/drive-values" for way in ("from", "to")),
+            *(f"/{BASE}/outgoing/neighbours/fred/sensors/imu", f"/{BASE}/incoming/from/goob/by/ann/estop"),
         ],
     )
     def test_other_topics_never_pass(self, topic: str, side: Side, rules: Rules) -> None:

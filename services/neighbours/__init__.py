@@ -1,0 +1,1 @@
+"""Robots of a LAN hear each other, and scripts of one drive another that lets them."""

@@ -1,0 +1,201 @@
+"""Between a robot and the hub of its LAN: what others may hear of it, and what their scripts may have it do."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from pebble.contract import (
+    CAPABILITIES,
+    DRIVE,
+    ESTOP_STATE,
+    FROM_NEIGHBOUR,
+    NEIGHBOUR_VALUE,
+    NEIGHBOURS,
+    OUTGOING,
+    TO_NEIGHBOUR,
+    channel_of,
+    codec,
+)
+from pebble.contract.identity import Identity
+from pebble.contract.payloads import Drive, NeighbourRefusal, Neighbours
+from pebble.errors import PayloadError, PebbleError
+from pebble.runtime.addresses import Addresses
+from pebble.runtime.connections import lan_transport
+from pebble.runtime.process import view_of
+from pebble.runtime.robot_estop import RobotEstop
+from pebble.runtime.runs import LocalScripts, next_run
+from pebble.runtime.service import WAIT_LIMIT_S, Service, every, on
+from pebble.script.neighbour import PRESENT_S
+from pebble.services.neighbours.begun import Begun
+from pebble.services.neighbours.visit import Visit
+from pebble.transports import Message, QoS, Transport
+
+HEARTBEAT_S = 0.25
+MOST_BYTES = 16 * 1024  # of a message of another robot
+MOST_HZ = 200  # messages of another robot in a second
+
+
+class NeighboursService(Service):
+    """``lan`` replaces the connection to the hub in tests."""
+
+    name = "neighbours"
+    publishes = (DRIVE, NEIGHBOURS, NEIGHBOUR_VALUE)
+
+    def __init__(self, *arguments: Any, lan: Transport | None = None, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self._section = self.config.services.neighbours
+        self._me = me = self.config.identity
+        self.addresses = Addresses(view_of(self.config, next(iter(self.config.motor_lines()), "")))
+        self._lan = lan or lan_transport(self.config)
+        self._others = {name: Identity(me.system, me.type, name) for name in self._section.listens}
+        self._local = LocalScripts(self.config)
+        self._estop = RobotEstop(self.config.base)
+        begun = Begun(self.config.state_file("neighbour-runs"), self._section.commanded)
+        self._visit = Visit(begun.begin, self._number, self._drive, self._local_runs)
+        self._received_at: dict[str, float] = {}
+        self._counts: dict[str, tuple[int, int]] = {}  # by robot: a second, and its messages so far
+        self._state: Neighbours | None = None
+
+    # -- its life
+
+    def start(self) -> None:
+        self._lan.open(timeout=0.0)
+        self.on_stop(self._lan.close)
+
+    def set_up(self) -> None:
+        super().set_up()
+        for channel in (ESTOP_STATE, CAPABILITIES):
+            self.transport.subscribe(channel.filter(self.config.base), self._on_owner, direct=True)
+        for metric in self._section.shares:
+            known = channel_of(f"{OUTGOING}/{metric}")
+            topic = self._me.outgoing(metric) if known is None else self.addresses[known].topic
+            self.transport.subscribe(topic, partial(self._share, metric), direct=True)
+        for name, granted in self._section.commanded.items():
+            if DRIVE.metric in granted:
+                receive = self.refusals.reader(FROM_NEIGHBOUR, self._on_command)
+                self._lan.subscribe(FROM_NEIGHBOUR.topic(self._me.base, robot=name), receive, direct=True)
+        for name, metrics in self._section.listens.items():
+            for metric in dict.fromkeys((NEIGHBOURS.metric, *metrics)):
+                topic = self._others[name].outgoing(metric)
+                self._lan.subscribe(topic, partial(self._receive, name, metric), direct=True)
+
+    def stop(self) -> None:
+        self._visit.end("its neighbours were switched off", self.clock())
+
+    # -- to the others
+
+    def _share(self, metric: str, message: Message) -> None:
+        """On the transport's thread: what another robot may hear, as it is; never an old value."""
+        if not message.retain:
+            self._lan.publish(self._me.outgoing(metric), message.payload, qos=QoS.LATEST)
+
+    @every(HEARTBEAT_S)
+    def _announce(self) -> None:
+        """To the hub again and again; to operators when it changes."""
+        now = self.clock()
+        refused = {name: NeighbourRefusal(run=run, why=why) for name, (run, why) in self._visit.refused(now).items()}
+        state = Neighbours(
+            shares=list(self._section.shares),
+            commanded={name: list(granted) for name, granted in self._section.commanded.items()},
+            receives={name: self._is_present(name, now) for name in self._others},
+            driven_by=self._visit.driver(now),
+            refused=refused,
+        )
+        self._lan.publish(self._me.outgoing(NEIGHBOURS.metric), codec.encode(NEIGHBOURS, state), qos=QoS.LATEST)
+        if state != self._state:
+            self._state = state
+            self.publish(NEIGHBOURS, state)
+
+    @on(TO_NEIGHBOUR, direct=True)
+    def to_neighbour(self, drive: Drive, arrived: float, robot: str) -> None:
+        """On the transport's thread: a command of a script of this robot, for another one."""
+        if robot not in self._others or not drive.signed:
+            self.counters.add("refused")
+            return
+        now = self.clock()
+        if drive.moves and (now - arrived > WAIT_LIMIT_S or not self._is_present(robot, now)):
+            self.counters.add("late")
+            return
+        topic = FROM_NEIGHBOUR.topic(self._others[robot].base, robot=self._me.id)
+        self._lan.publish(topic, codec.encode(FROM_NEIGHBOUR, drive), qos=QoS.DELIVERED, urgent=True)
+
+    # -- from the others
+
+    def _receive(self, name: str, metric: str, message: Message) -> None:
+        """On the transport's thread: what another robot lets this one hear."""
+        now = self.clock()
+        second, count = self._counts.get(name, (0, 0))
+        count = count + 1 if second == int(now) else 1
+        self._counts[name] = int(now), count
+        if message.retain or len(message.payload) > MOST_BYTES or count > MOST_HZ:
+            self.counters.add("refused")
+            return
+        if metric == NEIGHBOURS.metric:
+            try:
+                codec.decode(NEIGHBOURS, message.payload)
+            except PayloadError as error:
+                self.refusals.malformed(NEIGHBOURS, error)
+                return
+            self._received_at[name] = now
+        topic = NEIGHBOUR_VALUE.topic(self._me.base, robot=name, metric=metric)
+        self.transport.publish(topic, message.payload, qos=QoS.LATEST)
+
+    def _on_command(self, message: Message, drive: Drive, names: dict[str, str]) -> None:
+        """On the transport's thread."""
+        if not message.retain_requested:
+            job = partial(self._command, names["robot"], message, drive)
+            self.post_message(FROM_NEIGHBOUR, job, newest_of=message.topic)
+
+    def _command(self, name: str, message: Message, drive: Drive) -> None:
+        if drive.moves and message.waited_s > WAIT_LIMIT_S:
+            self.count_late(FROM_NEIGHBOUR)
+        elif not self._visit.command(name, drive, self.clock()):
+            self.counters.add("refused")
+        self._set_timer()
+
+    # -- what happens on this robot
+
+    def _on_owner(self, message: Message) -> None:
+        """On the transport's thread."""
+        if self._estop.receive(message):
+            self.post(self._owners_changed, newest_of="owners")
+
+    def _owners_changed(self) -> None:
+        self._visit.owners(self._estop.states, self.clock())
+        self._set_timer()
+
+    @on(DRIVE, direct=True)
+    def drive(self, drive: Drive, _arrived: float) -> None:
+        """On the transport's thread. A person's commands all mean the same here."""
+        job: Callable[[], None] = lambda: self._visit.received(drive, self.clock())  # noqa: E731
+        self.post(job, newest_of="script" if drive.signed else "person")
+
+    # -- what a visit needs
+
+    def _number(self, barred: int, received: int) -> int | None:
+        """The number of a run that begins now; None: a script of this robot runs, or none can be had."""
+        with self._local.none_runs() as free:
+            try:
+                return next_run(self.config, barred, received) if free else None
+            except PebbleError as error:
+                self.log_limited.log("number", 30, "%s", error)
+                return None
+
+    def _local_runs(self) -> bool:
+        with self._local.none_runs() as free:
+            return not free
+
+    def _drive(self, command: Drive) -> bool:
+        return self.publish(DRIVE, command)
+
+    def _set_timer(self) -> None:
+        if (due := self._visit.due) is not None:
+            self.call_at(due, self._tick)
+
+    def _tick(self) -> None:
+        self._visit.tick(self.clock())
+
+    def _is_present(self, name: str, now: float) -> bool:
+        return now - self._received_at.get(name, float("-inf")) <= PRESENT_S

@@ -1,0 +1,110 @@
+"""Which run of which other robot drives this one, and under which number of its own. Pure.
+
+A run of another robot is here a script like any other: it gets one number, once, and :class:`DriveSender`, which every
+script has, ends it by what motor owners publish. A person ends it by any command. What has ended never goes on.
+"""
+
+from collections.abc import Callable, Mapping
+
+from pebble.contract.payloads import Drive, EstopState
+from pebble.runtime.runs import SUPERSEDED, newest
+from pebble.script.drive_sender import HOLD_S, DriveSender
+
+VALID_MS = 300  # for which a command of another robot moves this one, at most
+
+LOCAL, PERSON = "a script of its own runs", "a person drives it"
+
+
+class Visit:
+    """``begin`` returns why a run cannot begin, ``number`` gives it a number above those of these, ``publish`` drives.
+
+    ``local_runs``: whether a script of this robot's own runs; it comes first. One thread; times are of one clock.
+    """
+
+    def __init__(
+        self,
+        begin: Callable[[str, int], str],
+        number: Callable[[int, int], int | None],
+        publish: Callable[[Drive], bool],
+        local_runs: Callable[[], bool],
+    ) -> None:
+        self._begin, self._number, self._publish, self._local_runs = begin, number, publish, local_runs
+        self._who = ("", 0)  # robot and its run that drive this one, or did so last
+        self._sender: DriveSender | None = None
+        self._states: Mapping[str, EstopState] = {}
+        self._received = 0  # the newest number of all commands here
+        self._person_at = float("-inf")
+        self._refused: dict[str, tuple[int, str]] = {}
+
+    def command(self, name: str, drive: Drive, now: float) -> bool:
+        """A command of a robot that may drive this one. False: it has no effect."""
+        if not drive.signed or not isinstance(drive.run, int):
+            return False  # no script's: it could neither be ended nor told from the next one
+        if self._who != (name, drive.run):
+            if not drive.moves:
+                return False  # it moves nothing here
+            self._start(name, drive.run, now)
+        sender = self._sender
+        if sender is None or self._who != (name, drive.run):
+            return False
+        if drive.moves and not sender.ended(now) and self._local_runs():
+            sender.end(LOCAL, now)
+        sender.owners(self._states, now)
+        valid = drive.valid_ms if isinstance(drive.valid_ms, int) else VALID_MS
+        return sender.drive(Drive(x=drive.x, z=drive.z, y=drive.y, valid_ms=min(valid, VALID_MS)), now)
+
+    def owners(self, states: Mapping[str, EstopState], now: float) -> None:
+        self._states = states
+        self.tick(now)
+
+    def received(self, drive: Drive, now: float) -> None:
+        """A command on this robot's own topic, of whomever."""
+        if not drive.signed:
+            self._person_at = now
+            self.end(PERSON, now)
+            return
+        if isinstance(drive.run, int):
+            self._received = newest((self._received, drive.run))
+        if self._sender is not None:
+            self._sender.receive(drive, now)
+
+    def tick(self, now: float) -> None:
+        if self._sender is not None:
+            self._sender.owners(self._states, now)
+            self._sender.tick(now)
+            self._sender.ended(now)
+
+    def end(self, why: str, now: float) -> None:
+        if self._sender is not None:
+            self._sender.end(why, now)
+
+    @property
+    def due(self) -> float | None:
+        """When to call :meth:`tick`; None: not before something happens."""
+        return None if self._sender is None else self._sender.due
+
+    def driver(self, now: float) -> str:
+        """Whose run drives this robot; empty: none does."""
+        return self._who[0] if self._sender is not None and not self._sender.ended(now) else ""
+
+    def refused(self, now: float) -> dict[str, tuple[int, str]]:
+        """By robot its newest run here, and why that has no effect."""
+        found = dict(self._refused)
+        if self._sender is not None and (why := self._sender.refusal(now)):
+            found[self._who[0]] = self._who[1], why
+        return found
+
+    def _start(self, name: str, run: int, now: float) -> None:
+        known, _ = self._refused.get(name, (0, ""))
+        why = self._begin(name, run) or (PERSON if now - self._person_at < HOLD_S else "")
+        barred = newest(state.last_barred for state in self._states.values())
+        number = None if why else self._number(barred, self._received)
+        if number is None:
+            if known != run:  # else the first reason is the one to know
+                self._refused[name] = run, why or LOCAL
+            return
+        if self._sender is not None:
+            self._refused[self._who[0]] = self._who[1], self._sender.refusal(now) or SUPERSEDED
+            self._sender.end(SUPERSEDED, now)
+        self._refused.pop(name, None)
+        self._who, self._sender = (name, run), DriveSender(number, self._publish)

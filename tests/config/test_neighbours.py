@@ -1,0 +1,46 @@
+"""What is refused in `services.neighbours`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pebble.config import parse
+from pebble.config.checks import MOST_METRICS, MOST_NEIGHBOURS
+from pebble.errors import ConfigError
+
+LAN = {"connect": ["tls/hub.lab:7447"]}
+WRONG: list[tuple[dict[str, Any], str]] = [
+    ({"lan": {}}, r"lan\.connect: is missing"),
+    ({"lan": LAN | {"listen": ["tcp/0.0.0.0:7447"]}}, r"lan\.listen: must be left out"),
+    ({"lan": LAN | {"account": "goob-lan"}}, r"lan\.account: needs tls\.client_cert"),
+    ({"shares": ["front-camera"]}, "front-camera cannot be shared"),
+    ({"listens": {"fred": ["control/wheels"]}}, "control/wheels cannot be shared"),
+    ({"commanded": {"goob": ["estop-reset"]}}, r'must be \["drive-values"\]'),
+    ({"listens": {f"r{n}": [] for n in range(MOST_NEIGHBOURS + 1)}}, "are the most"),
+    ({"shares": [f"m{n}" for n in range(MOST_METRICS + 1)]}, "are the most"),
+]
+
+
+def read(section: dict[str, Any], **more: Any) -> Any:
+    raw = {"robot": {"id": "goob"}, "services": {"neighbours": {"enabled": True, "lan": LAN, **section}}, **more}
+    return parse(raw, folder=Path("/"), env={}).services.neighbours
+
+
+@pytest.mark.parametrize(("section", "why"), WRONG)
+def test_what_is_refused(section: dict[str, Any], why: str) -> None:
+    with pytest.raises(ConfigError, match=why):
+        read(section)
+
+
+def test_above_open_a_hub_elsewhere_needs_encryption_and_an_account() -> None:
+    with pytest.raises(ConfigError) as refused:
+        read({"lan": {"connect": ["tcp/hub.lab:7447"]}}, security={"level": "login"})
+    assert [text in str(refused.value) for text in ("is not encrypted", "lan.account: is missing")] == [True, True]
+
+
+def test_nothing_is_granted_unless_it_is_written() -> None:
+    found = read({"shares": ["sensors/imu", "mood"]})
+    assert (found.commanded, found.listens, found.lan.lease_ms) == ({}, {}, 500)
