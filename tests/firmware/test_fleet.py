@@ -2,25 +2,18 @@
 
 from __future__ import annotations
 
-import re
 import signal
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import replace
-from io import StringIO
 from pathlib import Path
 from typing import Self
 
 import pytest
-from rich.console import Console
 
 from pebble import cli
-from pebble.bench import engine
-from pebble.bench.comparison import Case, Measuring
-from pebble.bench.fleet import FLEET, STEPS, cell_of, latencies_ms, longest_gap_s, measure
-from pebble.bench.results import load
-from pebble.errors import ConfigError, PebbleError
+from pebble.bench.fleet import STEPS, latencies_ms, longest_gap_s
+from pebble.errors import ConfigError
 from pebble.simulation.fleet import MOST, Moved, members
 from tests.support import ROOT, Broker, Child, free_port, until
 
@@ -85,52 +78,6 @@ def test_a_robot_that_falls_silent_is_missed_until_the_end() -> None:
     assert longest_gap_s([alive], 0, 10 * second) == 1.0
     assert longest_gap_s([alive, dead], 0, 10 * second) == 8.0
     assert longest_gap_s([alive, []], 0, 10 * second) == 10.0
-
-
-def test_a_quick_fleet_is_small_and_its_command_shows_it() -> None:
-    quick, full = FLEET.run_of(quick=True, seconds=2.0), FLEET.run_of()
-    assert (quick["robots"], quick["seconds"]) == (30, 2.0)
-    assert " ".join(quick.command) == "pebble bench fleet --robots 30 --seconds 2 --quick"
-    assert (full["robots"], full["seconds"]) == (200, 60.0)
-
-
-def case_of(**given: object) -> Case:
-    return Case(run=FLEET.run_of(**given), number=0, variant="mqtt", role="mqtt", condition={})
-
-
-@pytest.mark.thorough
-def test_a_small_fleet_is_measured() -> None:
-    """Whole: a broker, ten robots, an operator; with bounds that hold on a busy machine too."""
-    (cell,) = measure(case_of(robots=10, seconds=5.0))
-    assert cell.figures["sent"] == 500
-    assert cell.lost is not None
-    assert cell.lost <= 0.8 * 500  # overtaken, where a busy machine let several wait
-    assert 0.2 < cell.single("longest_gap_s") < 2.0  # of heartbeats at 4 Hz
-    assert cell.percentile(50) < 200
-    assert {"cpu_broker", "cpu_fleet", "cpu_operator"} <= cell.figures.keys()
-    assert 0 < cell.figures["mb_per_robot"] < 20
-
-
-def test_what_cannot_be_measured_is_named(tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    for bad in ({"robots": MOST + 1}, {"seconds": 0.0}, {"output": tmp_path / "file" / "no"}):
-        with pytest.raises(PebbleError):
-            engine.run(FLEET.run_of(**bad))
-
-
-def test_figures_are_shown_and_written(tmp_path: Path) -> None:
-    second = 1_000_000_000
-    heartbeats = [[number * second // 4 for number in range(5)], [number * second // 4 for number in range(9)]]
-    sent = {"minilamp-001": [0, second], "benjr-001": [0]}
-    answer = {"sent": sent, "late": 0, "heartbeats": heartbeats}
-    moves = {name: [Moved(ms * 1_000_000, name, (1.0, 1.0))] for name, ms in (("minilamp-001", 1), ("benjr-001", 9))}
-    measure = Measuring(measure=lambda case: [cell_of(case, answer, moves, {"fleet": 1.0, "mb": 8.0})])
-    measured = replace(FLEET, measuring=measure)
-    out = StringIO()
-    assert engine.run(measured.run_of(robots=2, output=tmp_path, console=Console(file=out, width=120))) == 0
-    # p50 … max, n, lost, sent, late
-    assert re.search(r"2 +10 Hz +1.00 +9.00 +9.00 +9.00 +2 +1 +3 +0 ", out.getvalue())
-    assert load(tmp_path / "fleet.json").cells[0].rounds == [[1.0, 9.0]]
 
 
 class Command:
