@@ -140,7 +140,7 @@ def test_malformed_messages(rig: Rig) -> None:
     for first in range(0, MESSAGES, CHUNK):
         for _ in range(CHUNK):
             channel = chance.choice(_TARGETS)
-            topic = channel.suffix.format(uid="u", name="n", outlet="o1")
+            topic = channel.suffix.format(uid="u", name="n", outlet="o1", robot="r")
             sent[channel.metric] += 1
             rig.operator.send(topic, garbage(channel, chance), qos=0)
         assert _still_responds(rig, first / MESSAGES), f"no response after {first + CHUNK} messages"
