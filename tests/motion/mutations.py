@@ -45,12 +45,12 @@ MUTATIONS = {
     ),
     "the second stop of one name resets": Mutation(
         _LATCH,
-        "            return False\n        self._remember",
-        "            self.latched = False\n        self._remember",
+        "            return False\n        senders =",
+        "            self.latched = False\n        senders =",
     ),
     "names are not restored": Mutation(_LATCH, "if is_name(name)][: self.names]", "if not is_name(name)]"),
     "one name is remembered": Mutation(_LATCH, "[name] + self.recent", "[name]"),
-    "one sender's stops take the places of others": Mutation(_LATCH, "senders.count(senders[at]), at", "at"),
+    "one sender's stops take the places of others": Mutation(_LATCH, "senders.count(one), at", "0, at"),
     "a damaged file is free": Mutation(
         _LATCH, "            self.latched = True\n", "            self.latched = False\n"
     ),
