@@ -260,7 +260,7 @@ FROM_NEIGHBOUR = _c("from/{robot}/drive-values", Kind.COMMAND, p.Drive,
 TO_NEIGHBOUR = _c("to/{robot}/drive-values", Kind.COMMAND, p.Drive,
                   "What a script of this robot wants another one to do; only `neighbours` reads it.",
                   rate_hz=20, newest=True, remote=False)  # fmt: skip
-NEIGHBOURS = _c("neighbours", Kind.STATE, p.Neighbours, "Which robots this one hears, and which may drive it.")
+NEIGHBOURS = _c("neighbours", Kind.STATE, p.Neighbours, "Which robots this one receives from, and which may drive it.")
 NEIGHBOUR_VALUE = _c("neighbours/{robot}/{metric}", Kind.STREAM, bytes,
                      "What another robot of the LAN publishes, as it does, for scripts of this one.",
                      remote=False)  # fmt: skip

@@ -17,6 +17,7 @@ from pebble.transports.socket_paths import FRAMES_SOCKET, PEER_SOCKET, fits_sock
 if TYPE_CHECKING:
     from pebble.config.gateway_file import GatewayFile
     from pebble.config.hub_file import HubFile
+    from pebble.config.neighbours import Lan
 
 _ANY = "+/+/+"  # the levels of any robot
 #: Topics of the robot's states, and of all commands, that are published even to a broker that hangs up on them.
@@ -137,13 +138,17 @@ def _remote_settings(config: Config, remote: RemoteConnection) -> Any:
     """A Zenoh uplink is a client of a hub elsewhere, separate from the robot's local transport."""
     if remote.kind != "zenoh":
         return remote.settings
+    return _client_of_hub(config, "remote", remote)
+
+
+def _client_of_hub(config: Config, folder: str, hub: "RemoteConnection | Lan") -> ZenohSettings:
     return ZenohSettings(
-        run_dir=config.run_dir() / "remote",
-        connect=tuple(remote.connect),
-        tls=tls_settings(remote.tls),
-        lease_ms=remote.lease_ms,
+        run_dir=config.run_dir() / folder,
+        connect=tuple(hub.connect),
+        tls=tls_settings(hub.tls),
+        lease_ms=hub.lease_ms,
         client=True,
-        account=remote.account,
+        account=hub.account,
     )
 
 
@@ -186,15 +191,7 @@ def fleet_hub_settings(hub: "HubFile", run_dir: Path) -> ZenohSettings:
 
 def lan_transport(config: Config) -> Transport:
     """The connection of ``neighbours`` to the hub of the LAN, not yet opened."""
-    lan = config.services.neighbours.lan
-    settings = ZenohSettings(
-        run_dir=config.run_dir() / "lan",
-        connect=tuple(lan.connect),
-        tls=tls_settings(lan.tls),
-        lease_ms=lan.lease_ms,
-        client=True,
-        account=lan.account,
-    )
+    settings = _client_of_hub(config, "lan", config.services.neighbours.lan)
     return create("zenoh", _name(config, "zenoh", "lan"), settings)
 
 

@@ -1,4 +1,4 @@
-"""The gateway as a program: it hears robots at a hub, agrees with other gateways at the broker, and carries robots.
+"""The gateway as a program: it receives robots at a hub, agrees with other gateways at the broker, and carries robots.
 
 What only its owner forwards passes by :class:`Carried`. A live emergency stop is forwarded by every gateway, in every
 state, over the connection of the heartbeats, where nothing else holds it up: its name makes it count once.

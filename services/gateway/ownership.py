@@ -144,7 +144,7 @@ class Ownership:
 
     @property
     def others(self) -> Mapping[str, frozenset[str]]:
-        """The other gateways that are known, fresh or not, and what each hears."""
+        """The other gateways that are known, fresh or not, and what each receives."""
         with self._lock:
             return {name: one.robots for name, one in self._others.items()}
 

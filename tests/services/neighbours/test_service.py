@@ -69,7 +69,7 @@ class One:
 
 
 class Pair:
-    """goob drives and hears fred."""
+    """goob drives fred and receives from it."""
 
     def __init__(self, folder: Path, stack: ExitStack) -> None:
         self.lan = lan = Lan()
