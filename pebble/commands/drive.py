@@ -17,7 +17,7 @@ from pebble.client.terminal.key_decoder import END
 from pebble.client.terminal.key_gesture import PERIOD_S, KeyGesture
 from pebble.commands.estop import me
 from pebble.commands.options import with_target
-from pebble.commands.terminal_loop import TerminalLoop
+from pebble.commands.terminal.loop import TerminalLoop
 from pebble.media.in_flight import InFlight
 from pebble.transports import Message, QoS, State, Transport
 from pebble.transports.clock import since_boot as clock

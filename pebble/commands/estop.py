@@ -22,8 +22,8 @@ from pebble.client.estop import Progress, RobotStop, StopSender, new_name, send
 from pebble.client.estop_states import Reset, RobotEstop
 from pebble.client.names import id_of
 from pebble.client.robot_view import RobotView
-from pebble.commands import show
 from pebble.commands.options import with_target
+from pebble.commands.terminal import show
 from pebble.config.visible import shown
 from pebble.contract import CAPABILITIES, ESTOP_STATE, LINK, ONLINE, STATUS
 from pebble.contract.levels import LEVELS

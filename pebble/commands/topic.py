@@ -16,9 +16,9 @@ import typer
 from pebble.client.connection import Listener, Target, connected, put_names, subscribed_stop
 from pebble.client.estop_states import RobotEstop
 from pebble.client.names import Names, id_of
-from pebble.commands import show
 from pebble.commands.draft import Draft, draft
 from pebble.commands.options import with_target
+from pebble.commands.terminal import show
 from pebble.config.visible import shown
 from pebble.contract import CHANNELS, DRIVE, ONLINE, codec
 from pebble.contract.identity import parse_topic

@@ -56,7 +56,7 @@ def watch(
         pebble watch goob.json
         pebble watch goob --url mqtt://127.0.0.1 --encoding h264 --seconds 10
     """
-    from pebble.commands import screens
+    from pebble.commands.terminal import screens
 
     end = float("inf") if seconds is None else time.monotonic() + seconds
     with ExitStack() as stack:
@@ -87,7 +87,7 @@ def snapshot(
         pebble snapshot goob.json front.png
         pebble snapshot goob front.png --url mqtt://127.0.0.1
     """
-    from pebble.commands.screens import save_picture
+    from pebble.commands.terminal.screens import save_picture
 
     with interrupted_by_signals(), _receiver(robot, url, password_file, ca_cert) as receiver:
         receiver.request(encoding, sound=False)

@@ -12,7 +12,7 @@ import pytest
 
 from pebble.client.media_receiver import MediaReceiver
 from pebble.client.overlays import STALE_S, Label, Overlays
-from pebble.commands.screens import Files, save_picture, with_overlays
+from pebble.commands.terminal.screens import Files, save_picture, with_overlays
 from pebble.errors import PebbleError
 from pebble.media.decode import Decoded
 from pebble.media.sound import ReceivedSound

@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from pebble.client.names import ANY_ROBOT, Names
-from pebble.commands import show
+from pebble.commands.terminal import show
 from pebble.media.rate_meter import RateMeter
 from pebble.transports import Message, QoS
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pebble.commands.gateway import gateway
+from pebble.commands.fleet.gateway import gateway
 
 
 def main(file: str) -> int:

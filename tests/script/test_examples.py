@@ -46,7 +46,7 @@ class Driven(SimulatedRobot):
 
 
 def test_the_first_script_is_what_pebble_script_new_writes() -> None:
-    assert blocks("python", '"""Follow a tag') == [(ROOT / "pebble/commands/starter/run.py.txt").read_text()]
+    assert blocks("python", '"""Follow a tag') == [(ROOT / "pebble/commands/script/starter/run.py.txt").read_text()]
 
 
 @pytest.mark.parametrize(("ends_at", "way_m"), [(float("inf"), 0.5), (1.5, 0.25)])

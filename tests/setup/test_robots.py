@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from pebble.commands import web_people
+from pebble.commands.web import people as web_people
 from pebble.config import load
 from pebble.contract.identity import Identity
 from pebble.doctor.broker_probe import probe

@@ -11,10 +11,10 @@ from typing import Annotated, BinaryIO
 import typer
 
 from pebble.client.names import base_of
-from pebble.commands import show
 from pebble.commands.recordings.options import Places, RobotOption, Since, Topics, Until, period
 from pebble.commands.recordings.progress import progress_of_time
 from pebble.commands.recordings.report import report_unread
+from pebble.commands.terminal import show
 from pebble.config.visible import shown
 from pebble.errors import PebbleError
 from pebble.recordings import catalogue

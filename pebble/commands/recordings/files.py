@@ -8,10 +8,10 @@ from typing import Annotated
 import typer
 
 from pebble.client.names import base_of
-from pebble.commands import show
 from pebble.commands.recordings.options import RobotOption, Since, Until, period
 from pebble.commands.recordings.progress import progress
 from pebble.commands.recordings.report import report_left, report_unread
+from pebble.commands.terminal import show
 from pebble.config.visible import shown
 from pebble.errors import PebbleError
 from pebble.recordings.catalogue import Query, check_names

@@ -11,10 +11,10 @@ from rich.console import Console
 from rich.table import Table
 
 from pebble.client.names import base_of
-from pebble.commands import show
 from pebble.commands.recordings.options import Places, RobotOption, Since, Topics, Until, period
 from pebble.commands.recordings.progress import progress
 from pebble.commands.recordings.report import local_time, one_line, report_unread
+from pebble.commands.terminal import show
 from pebble.config.visible import shown
 from pebble.recordings import catalogue
 from pebble.recordings.catalogue import FileInfo, Query

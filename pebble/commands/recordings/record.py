@@ -14,8 +14,8 @@ import typer
 
 from pebble.client.connection import Target, password, resolve
 from pebble.client.url import settings_of
-from pebble.commands import show
 from pebble.commands.options import with_target
+from pebble.commands.terminal import show
 from pebble.errors import PebbleError
 from pebble.launcher.sd_notify import SystemdNotifier
 from pebble.recordings.recorder import metrics

@@ -22,7 +22,7 @@ from pebble.client.url import settings_of
 from pebble.commands.options import CaCert, PasswordFile
 from pebble.commands.recordings.options import Since, Until, period
 from pebble.commands.recordings.report import report_unread
-from pebble.commands.terminal_loop import TerminalLoop
+from pebble.commands.terminal.loop import TerminalLoop
 from pebble.config.visible import shown
 from pebble.errors import PebbleError
 from pebble.recordings.catalogue import check_name, look_at

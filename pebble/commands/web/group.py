@@ -16,9 +16,8 @@ from typer.core import TyperCommand, TyperGroup
 from pebble.client.connection import password as broker_password
 from pebble.client.page_packages import require_packages
 from pebble.client.url import settings_of as settings_of_url
-from pebble.commands import web_people
 from pebble.commands.options import CaCert, PasswordFile, host_of
-from pebble.commands.web_people import PEOPLE, TLS, PeopleOption, default_folder, opened
+from pebble.commands.web.people import PEOPLE, TLS, PeopleOption, default_folder, opened, register_people
 from pebble.config import load
 from pebble.config.hosts import name_of_page
 from pebble.config.web import WebTls, is_loopback
@@ -116,7 +115,7 @@ class _Serve(TyperCommand):
 def register(app: typer.Typer) -> None:
     group = typer.Typer(cls=_Group, help="Serve the operator page.", rich_markup_mode=None)
     group.command("serve", cls=_Serve)(serve)
-    web_people.register(group)
+    register_people(group)
     app.add_typer(group, name="web")
 
 

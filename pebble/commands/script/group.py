@@ -45,7 +45,7 @@ def new(
         cd follow
         python -m pytest
     """
-    from pebble.commands.script_starter import write
+    from pebble.commands.script.new import write
 
     for path in write(name, folder):
         typer.echo(path)

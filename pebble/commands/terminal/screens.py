@@ -17,7 +17,7 @@ import typer
 
 from pebble.client.media_receiver import MediaReceiver
 from pebble.client.overlays import Overlays
-from pebble.commands import show
+from pebble.commands.terminal import show
 from pebble.errors import PebbleError
 from pebble.media.sound import ReceivedSound
 

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from pebble.commands.show import print_table
+from pebble.commands.terminal.show import print_table
 from pebble.config import load
 from pebble.config.config import default_state_folder
 from pebble.errors import PebbleError
@@ -124,7 +124,7 @@ def role_(name: _Name, role: _RoleArgument, config: _ConfigOption = None, people
     return 0
 
 
-def register(group: typer.Typer) -> None:
+def register_people(group: typer.Typer) -> None:
     """Add both to the commands of ``pebble web``."""
     users = typer.Typer(help=_USER_HELP, rich_markup_mode=None)
     for name, command in (("add", add), ("list", list_), ("remove", remove), ("password", password), ("role", role_)):

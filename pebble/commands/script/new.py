@@ -43,7 +43,7 @@ def _alike(target: Path) -> Path | None:
 
 
 def _text(file: str) -> str:
-    return files("pebble.commands").joinpath("starter", file).read_text(encoding="utf-8")
+    return files("pebble.commands.script").joinpath("starter", file).read_text(encoding="utf-8")
 
 
 def _room() -> str:

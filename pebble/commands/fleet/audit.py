@@ -8,7 +8,7 @@ import msgspec
 import typer
 
 from pebble.commands.options import ConfigArgument
-from pebble.commands.show import print_table
+from pebble.commands.terminal.show import print_table
 from pebble.config import load
 from pebble.contract import chain
 from pebble.errors import PebbleError

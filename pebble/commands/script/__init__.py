@@ -1,0 +1,1 @@
+"""``pebble script``, and the program that a new script begins with."""

@@ -1,0 +1,1 @@
+"""``pebble web``, and the people who may log in there."""
