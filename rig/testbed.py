@@ -15,7 +15,7 @@ from urllib.parse import urlsplit
 import msgspec
 
 from pebble.client.discovery import ALL_OUTGOING, Discovery
-from pebble.client.page_packages import require_packages
+from pebble.client.page.packages import require_packages
 from pebble.config.raw import deep_merge
 from pebble.contract.identity import Identity
 from pebble.errors import PebbleError

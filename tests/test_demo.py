@@ -164,7 +164,7 @@ def test_a_phone_can_log_in_and_a_closed_terminal_ends_everything_though_its_sig
 def test_without_the_packages_of_the_page_everything_else_goes_on(demos: list[Demo], temporary: Path) -> None:
     code = """
 import sys
-import pebble.client.page_packages as extra
+import pebble.client.page.packages as extra
 extra.find_spec = lambda name: None if name == "starlette" else object()
 import pebble.demo.main as main
 sys.exit(main.run())

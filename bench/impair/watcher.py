@@ -12,7 +12,7 @@ import threading
 import time
 from typing import Final
 
-from pebble.client.page_settings import WebSettings
+from pebble.client.page.settings import WebSettings
 from pebble.rig.worker_end import answer, serve_on_thread
 from pebble.transports import MqttSettings
 

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
-from pebble.client.page_packages import require_packages
+from pebble.client.page.packages import require_packages
 from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
 from pebble.setup.places import Places
 from pebble.setup.questions import AnswersError

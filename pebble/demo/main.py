@@ -13,8 +13,8 @@ from typing import Any, NamedTuple, cast
 
 from rich.console import Console
 
-from pebble.client.page_packages import require_packages
-from pebble.client.page_settings import DEFAULT_PORT
+from pebble.client.page.packages import require_packages
+from pebble.client.page.settings import DEFAULT_PORT
 from pebble.contract.encodings import ALL_VIDEO
 from pebble.demo import emergency, following, invitation, phone
 from pebble.demo.brokers import BrokerKind, best_kind

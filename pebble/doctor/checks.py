@@ -16,8 +16,8 @@ from importlib import metadata
 from pathlib import Path
 
 from pebble.check_result import CheckResult, State
-from pebble.client.page_from_config import settings_of
-from pebble.client.page_packages import require_packages
+from pebble.client.page.from_config import settings_of
+from pebble.client.page.packages import require_packages
 from pebble.config import Config, Mqtt
 from pebble.config.web import is_loopback
 from pebble.contract.levels import LEVELS

@@ -11,8 +11,8 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from pebble.check_result import CheckResult, State
-from pebble.client.page_from_config import settings_of
-from pebble.client.page_settings import WebSettings
+from pebble.client.page.from_config import settings_of
+from pebble.client.page.settings import WebSettings
 from pebble.doctor import checks as doctor
 from pebble.errors import PebbleError
 from pebble.selftest import failed, ok, skipped

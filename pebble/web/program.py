@@ -10,8 +10,8 @@ from typing import Any
 
 import msgspec
 
-from pebble.client.page_packages import require_packages
-from pebble.client.page_settings import WebSettings
+from pebble.client.page.packages import require_packages
+from pebble.client.page.settings import WebSettings
 from pebble.errors import PebbleError
 from pebble.runtime.parent import set_up_logging
 

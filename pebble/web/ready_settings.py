@@ -1,7 +1,7 @@
 """The settings of an operator page that people can use: where a login is needed, there is a user."""
 
-from pebble.client.page_from_config import has_login, people_of, settings_of
-from pebble.client.page_settings import WebSettings
+from pebble.client.page.from_config import has_login, people_of, settings_of
+from pebble.client.page.settings import WebSettings
 from pebble.config import Config
 from pebble.errors import ConfigError, PebbleError
 from pebble.fleet.people import People

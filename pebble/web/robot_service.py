@@ -5,8 +5,8 @@ import logging
 import signal
 import sys
 
-from pebble.client.page_packages import require_packages
-from pebble.client.page_settings import WebSettings
+from pebble.client.page.packages import require_packages
+from pebble.client.page.settings import WebSettings
 from pebble.config import config_of_process
 from pebble.errors import PebbleError
 from pebble.runtime.parent import ALIVE_PERIOD_S, Notifier, set_log_level, set_up_logging

@@ -16,7 +16,7 @@ from pebble.client.estop import send
 from pebble.client.named_topics import why_not
 from pebble.client.pace_of_link import WIDE
 from pebble.client.pace_of_link import Pace as LinkPace
-from pebble.client.page_settings import WebSettings
+from pebble.client.page.settings import WebSettings
 from pebble.client.robot_topics import FLEET, SYNONYMS
 from pebble.client.robot_view import RobotView
 from pebble.config.security import SecurityLevel

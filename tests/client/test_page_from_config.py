@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from pebble.client.page_from_config import settings_of
-from pebble.client.page_settings import WebSettings
+from pebble.client.page.from_config import settings_of
+from pebble.client.page.settings import WebSettings
 from pebble.config import load, parse
 from pebble.errors import ConfigError
 from pebble.web.ready_settings import settings_or_all_problems

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from pebble.client.connection import Target, resolve
-from pebble.client.page_from_config import settings_of
+from pebble.client.page.from_config import settings_of
 from pebble.config import Config, load
 from pebble.doctor.broker_probe import probe
 from pebble.runtime.connections import local_transport, mirror_transport, remote_transport

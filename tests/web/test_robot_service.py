@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from pebble.client import page_packages as extra
+from pebble.client.page import packages as extra
 from pebble.web import robot_service
 from tests.support import ROOT, Broker, Child, free_port, until
 

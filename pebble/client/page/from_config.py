@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from pebble.client.page_settings import WebSettings
+from pebble.client.page.settings import WebSettings
 from pebble.config import Config, Mqtt
 from pebble.config.web import WebInterface
 from pebble.errors import ConfigError
