@@ -6,6 +6,7 @@ The robot remembers the stop; the sender repeats it until each motor owner has p
 import secrets
 from collections.abc import Callable, Collection, Iterable
 from enum import Enum
+from typing import NamedTuple
 
 from pebble.client.driveable import Driveable, driveable_of
 from pebble.client.estop_states import RobotEstop
@@ -41,22 +42,27 @@ class Progress(Enum):
     NOT_CONFIRMED = "not confirmed"  # it is no longer sent to
 
 
+class Order(NamedTuple):
+    """What is the same for every robot that one stop is sent to."""
+
+    name: str
+    payload: bytes
+    named: bool  # robots, by who presses; False: all that publish anything
+    hold: bool  # it lasts until it is ended
+    own_only: bool  # topics that a robot's capabilities name are used only if they are incoming ones of its own
+
+
 class RobotStop:
     """The stop of one robot: what is sent to it when, and whether it is confirmed."""
 
-    def __init__(
-        self, base: str, stop: str, payload: bytes, now: float, *, named: bool, hold: bool, known: bool = False
-    ) -> None:
+    def __init__(self, base: str, order: Order, now: float, *, known: bool = False) -> None:
         self.estop = RobotEstop(base)
         self.live = False  # anything but retained messages has arrived from it
         self.driveable: Driveable | None = None  # as its status says
         self.confirmed_s: float | None = None  # how long it took; None: it is not confirmed
-        self.own_only = False  # topics that its capabilities name are used only if they are incoming ones of its own
         self.next: float = now  # when to send again, unless it is confirmed or spared
-        self._stop, self._payload = stop, payload
         self.rank = Rank(known=known)
-        self._named, self._hold = named, hold
-        self._began = now
+        self._order, self._began = order, now
         self._sent_at = float("-inf")
         self._script_ended = False
         self._given_up = False
@@ -69,7 +75,7 @@ class RobotStop:
         """How far its stop is."""
         if self.confirmed_s is not None:
             return Progress.CONFIRMED
-        if self.estop.has_capabilities and not (self.estop.available or self.estop.drives or self._named):
+        if self.estop.has_capabilities and not (self.estop.available or self.estop.drives or self._order.named):
             return Progress.SPARED
         if self.estop.old:
             return Progress.OLD
@@ -127,7 +133,7 @@ class RobotStop:
         if self.confirmed_s is None:
             if self.estop.owners and self.estop.available and not self.unconfirmed:
                 self.confirmed_s = now - self._began
-        elif self._hold and not all(map(self._has_taken_it, self.estop.owners)):
+        elif self._order.hold and not all(map(self._has_taken_it, self.estop.owners)):
             self.confirmed_s = None  # it has restarted, and saved nothing
             self._began = now
             self.next = max(now, self._sent_at + REPEAT_S)
@@ -138,12 +144,12 @@ class RobotStop:
         self._sent_at, self.next, self._names_due = now, now + REPEAT_S, False
         messages = []
         if not self.estop.old:
-            messages.append(_message(ESTOP, ESTOP.topic(self.estop.base), self._payload))
+            messages.append(_message(ESTOP, ESTOP.topic(self.estop.base), self._order.payload))
         elif not self._script_ended:
             self._script_ended = True
             messages.append(_message(AUTONOMY_COMMAND, self.estop.script_topic, _END_SCRIPT))
         messages.append(_message(DRIVE, self.estop.drive_topic, _ZERO))
-        return [one for one in messages if not self.own_only or _is_incoming(one.topic, self.estop.base)]
+        return [one for one in messages if not self._order.own_only or _is_incoming(one.topic, self.estop.base)]
 
     def give_up(self) -> None:
         """Send no more."""
@@ -156,7 +162,7 @@ class RobotStop:
 
     def _lists_it(self, owner: str) -> bool:
         state = self.estop.states.get(owner)
-        return state is not None and self._stop in state.recent
+        return state is not None and self._order.name in state.recent
 
     def _has_taken_it(self, owner: str) -> bool:
         """Whether it has listed this stop since its start: later stops of others may have taken its place."""
@@ -194,12 +200,11 @@ class StopSender:
         if not is_name(name):
             raise ValueError(f"{name!r} is not 16 hex digits")
         _, by, why = stop_of({"by": by, "why": why})
-        self.name, self.hold = name, hold
+        payload = codec.encode(ESTOP, EstopCommand(stop=name, by=by, why=why))
+        self.order = Order(name, payload, named=robots is not None, hold=hold, own_only=own_only)
         self.robots = RankedTable[RobotStop](MAX_ROBOTS)
         self.omitted = 0  # messages of robots for which ``robots`` had no room
-        self._payload = codec.encode(ESTOP, EstopCommand(stop=name, by=by, why=why))
-        self._named = robots is not None
-        self._known, self._own_only = frozenset(known), own_only
+        self._known = frozenset(known)
         self._began = self._now = now
         self._ended = False
         self._passed: dict[str, float] = {}  # when the stop was sent to a robot that is not in ``robots``
@@ -210,12 +215,16 @@ class StopSender:
     @property
     def collecting(self) -> bool:
         """Whether further robots are stopped when they publish anything."""
-        return not self._named and not self._ended and (self.hold or self._now < self._began + self._collect_s)
+        return (
+            not self.order.named and not self._ended and (self.order.hold or self._now < self._began + self._collect_s)
+        )
 
     @property
     def finished(self) -> bool:
         """Whether nothing more will be sent."""
-        return self._ended or not (self.hold or self.collecting or any(robot.sending for robot in self.robots.values()))
+        return self._ended or not (
+            self.order.hold or self.collecting or any(robot.sending for robot in self.robots.values())
+        )
 
     @property
     def confirmed(self) -> bool:
@@ -229,7 +238,7 @@ class StopSender:
         if self.finished:
             return None
         times = [robot.next for robot in self.robots.values() if robot.sending]
-        if not self.hold:
+        if not self.order.hold:
             times.append(self._began + (self._collect_s if self.collecting else GIVE_UP_S))
         return self._now if self._passing else min(times, default=None)
 
@@ -252,7 +261,7 @@ class StopSender:
         ``again`` False: only to robots that it was not sent to yet, because what was sent still waits.
         """
         self._now = now
-        if not self.hold and now >= self._began + GIVE_UP_S:
+        if not self.order.hold and now >= self._began + GIVE_UP_S:
             self.end()
         due = sorted((one for one in self.robots.values() if one.next <= now), key=lambda one: one.rank, reverse=True)
         passing, self._passing = self._passing, []
@@ -296,10 +305,7 @@ class StopSender:
             self._passed[base] = now
 
     def _stop_of(self, base: str, now: float) -> RobotStop:
-        known = base in self._known
-        one = RobotStop(base, self.name, self._payload, now, named=self._named, hold=self.hold, known=known)
-        one.own_only = self._own_only
-        return one
+        return RobotStop(base, self.order, now, known=base in self._known)
 
 
 def send(publish: Callable[..., bool], messages: Iterable[Message]) -> None:

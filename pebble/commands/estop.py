@@ -178,8 +178,8 @@ class _Report:
         self._lines: dict[str, str] = {}  # the last one of each robot
         self._problem = ""
         self._began = self._updated = time.monotonic()
-        if sender.hold:
-            _echo(f"stop {sender.name} is held until Ctrl-C; robots stay stopped after it")
+        if sender.order.hold:
+            _echo(f"stop {sender.order.name} is held until Ctrl-C; robots stay stopped after it")
 
     def connection(self, problem: str) -> None:
         """Warn once of each outage."""

@@ -43,7 +43,7 @@ def test_the_first_stop_needs_nothing_from_the_robot() -> None:
     stop = sender(GOOB, why="dog")
     first = stop.tick(0.0)
     assert topics(first) == [ESTOP, DRIVE]
-    assert json.loads(first[0].payload) == {"stop": stop.name, "by": "ann@desk", "why": "dog"}
+    assert json.loads(first[0].payload) == {"stop": stop.order.name, "by": "ann@desk", "why": "dog"}
     assert json.loads(first[1].payload) == {"x": 0, "z": 0, "y": 0, "valid_ms": 0}
     assert [(message.qos, message.retain) for message in first] == [(1, False), (1, False)]
     assert (stop.tick(0.1), stop.due) == ([], 0.5)
@@ -379,7 +379,7 @@ def test_a_hold_stops_every_robot_that_comes_online_under_one_name() -> None:
     robot = Robot(GOOB, "serial")
     receive(stop, outgoing(GOOB, "online", {"t": 1}), now=1000.0)
     first = stop.tick(1000.0)
-    assert json.loads(first[0].payload)["stop"] == stop.name
+    assert json.loads(first[0].payload)["stop"] == stop.order.name
     receive(stop, robot.capabilities(), *robot.take(first), now=1000.1)
     assert (stop.confirmed, stop.due, stop.finished) == (True, None, False)
     late = Robot(FRED, "mcu")
