@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import threading
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -30,13 +29,13 @@ from pebble.runtime.addresses import Addresses
 from pebble.runtime.process import view_of
 from pebble.runtime.runs import LocalScripts, following, next_run
 from pebble.runtime.service import Service, on
-from pebble.services.autonomy_manager.catalogue import Catalogue, files
 from pebble.services.autonomy_manager.child import Processes, Spawn
 from pebble.services.autonomy_manager.forms import shown
 from pebble.services.autonomy_manager.gate.activity import SILENT_S
 from pebble.services.autonomy_manager.gate.config_copy import broker_of
 from pebble.services.autonomy_manager.local_media import LocalMedia
 from pebble.services.autonomy_manager.motor_owners import OVERRIDDEN, Baseline, MotorOwners
+from pebble.services.autonomy_manager.offer import Offer
 from pebble.services.autonomy_manager.runner import Runner
 from pebble.services.autonomy_manager.script import Plan, Script, StartError, plan
 from pebble.transports import QoS
@@ -70,12 +69,8 @@ class AutonomyManager(Service):
         processes = Processes(self.config.run_dir() / "scripts.lock")
         self.on_stop(processes.close)
         self._runner = Runner(self, spawn or processes, self._section.stop_timeout_seconds)
-        self._scripts = dict(scripts or {})
-        self._fixed = self._listed = scripts is not None
-        self._scan_now = threading.Event()
-        self._stopping = False
+        self._offer = Offer(self.config, self.post, self._publish_files, scripts)
         self._overridden_until = self._refused_until = float("-inf")
-        self._files: list[dict[str, object]] | None = None
         self._status: AutonomyStatus | None = None
         self._connected_before = False
         self._media, self._began = LocalMedia(self.config), 0.0
@@ -86,18 +81,14 @@ class AutonomyManager(Service):
         return self._section.retained_publish_interval_seconds
 
     def start(self) -> None:
-        if self._fixed:
-            self._found(self._scripts)
-        else:
-            threading.Thread(target=self._scan, name="scripts", daemon=True).start()
+        if self._offer.begin():
             period = max(_SHORTEST_SCAN_S, self._section.scan_interval_seconds)
-            self.timers.add(self.clock(), self._scan_now.set, period=period)
+            self.timers.add(self.clock(), self._offer.scan, period=period)
         self.timers.add(self.clock(), self._look, period=_LOOK_S)
         self.changed()
 
     def stop(self) -> None:
-        self._stopping = True
-        self._scan_now.set()
+        self._offer.close()
         self._runner.close(_CLOSE_S)
 
     def on_connected(self) -> None:
@@ -131,9 +122,9 @@ class AutonomyManager(Service):
                 raise StartError(f"{holder} has control, and starts scripts")
             if not file:
                 raise StartError("Start command missing file")
-            if file not in self._scripts and not self._listed:
+            if file not in self._offer.scripts and not self._offer.complete:
                 raise StartError(f"Unknown autonomy file: {shown(file)}: scripts are still being listed, try again")
-            wanted = plan(self._scripts, file, config)
+            wanted = plan(self._offer.scripts, file, config)
             self._check(wanted)
         except StartError as error:
             self.log_limited.log("refused", logging.WARNING, "%s", error)
@@ -287,6 +278,9 @@ class AutonomyManager(Service):
             waiting_for=waiting_for or msgspec.UNSET,
         )
 
+    def _publish_files(self, found: list[dict[str, object]]) -> None:
+        self.publish(AUTONOMY_FILES, AutonomyFiles(files=found, timestamp=time.time()))
+
     def _look(self) -> None:
         """A script that begins to wait says nothing: ask again and again."""
         if self._runner.active is not None:
@@ -309,26 +303,3 @@ class AutonomyManager(Service):
             return known
         media = {"pictures": needs.pictures, "sound": needs.sound, "hall samples": needs.hall}
         return next((what for what, needed in media.items() if needed), activity.waits_for)
-
-    # -- the catalogue
-
-    def _scan(self) -> None:
-        """On a thread of its own: to ask a script what it is takes long."""
-        catalogue = Catalogue(self.config)
-        while self._scan_now.wait() and not self._stopping:
-            self._scan_now.clear()
-            try:
-                catalogue.scan(lambda scripts: self.post(lambda: self._found(scripts), newest_of="scripts"))
-                self.post(self._scanned, newest_of="scanned")
-            except Exception:  # the thread's boundary: the next scan may succeed
-                self.log.exception("the scripts cannot be listed")
-
-    def _scanned(self) -> None:
-        self._listed = True
-
-    def _found(self, scripts: Mapping[str, Script]) -> None:
-        self._scripts = dict(scripts)
-        found = files(scripts.values())
-        if found != self._files:
-            self._files = found
-            self.publish(AUTONOMY_FILES, AutonomyFiles(files=found, timestamp=time.time()))

@@ -173,7 +173,9 @@ MUTATIONS = {
     "a sender ignores whether it is saved": Mutation(
         "estop", "if self.estop.states[owner].persisted is False else", "if False else"
     ),
-    "a sender takes any stop for its own": Mutation("estop", "and self._order.name in state.recent", "and state.latched"),
+    "a sender takes any stop for its own": Mutation(
+        "estop", "and self._order.name in state.recent", "and state.latched"
+    ),
     "a hold repeats whenever its name is not listed": Mutation(
         "estop", "self._boots.get(owner) == state.boot", "self._lists_it(owner)"
     ),
@@ -188,7 +190,9 @@ MUTATIONS = {
         "estop", "messages.append(_message(DRIVE,", "self.estop.old and messages.append(_message(DRIVE,"
     ),
     "a hold ends after 60 s": Mutation("estop", "if not self.order.hold and now >=", "if now >="),
-    "a sender never gives up": Mutation("estop", "if not self.order.hold and now >= self._began + GIVE_UP_S:", "if False:"),
+    "a sender never gives up": Mutation(
+        "estop", "if not self.order.hold and now >= self._began + GIVE_UP_S:", "if False:"
+    ),
     "the number of a run is not saved": Mutation("world", "self.run = self.saved_run = max(", "self.run = max("),
     "the manager ignores a restart": Mutation("world", 'if state["latched"] or changed or', 'if state["latched"] or'),
 }

@@ -1,0 +1,73 @@
+"""The scripts that operators may start now: listed again and again, because people add and change them."""
+
+import logging
+import threading
+from collections.abc import Callable, Mapping
+from typing import Protocol
+
+from pebble.config import Config
+from pebble.services.autonomy_manager.catalogue import Catalogue, files
+from pebble.services.autonomy_manager.script import Script
+
+log = logging.getLogger(__name__)
+
+
+class Post(Protocol):
+    """How the thread that lists hands over to the service's thread."""
+
+    def __call__(self, job: Callable[[], None], /, *, newest_of: str) -> None: ...
+
+
+class Offer:
+    """All but the listing itself runs on the service's thread; ``on_change`` gets the new `autonomy-files`."""
+
+    def __init__(
+        self,
+        config: Config,
+        post: Post,
+        on_change: Callable[[list[dict[str, object]]], None],
+        fixed: Mapping[str, Script] | None,
+    ) -> None:
+        """``fixed`` replaces the folders in tests."""
+        self.scripts = dict(fixed or {})
+        self.complete = self._fixed = fixed is not None  # whether every folder was looked at once
+        self._config, self._post, self._on_change = config, post, on_change
+        self._files: list[dict[str, object]] | None = None
+        self._wanted, self._ended = threading.Event(), False
+
+    def begin(self) -> bool:
+        """Whether :meth:`scan` is to be called from now on."""
+        if self._fixed:
+            self._found(self.scripts)
+        else:
+            threading.Thread(target=self._scan, name="scripts", daemon=True).start()
+        return not self._fixed
+
+    def scan(self) -> None:
+        """List them again, soon."""
+        self._wanted.set()
+
+    def close(self) -> None:
+        self._ended = True
+        self._wanted.set()
+
+    def _scan(self) -> None:
+        """On a thread of its own: to ask a script what it is takes long."""
+        catalogue = Catalogue(self._config)
+        while self._wanted.wait() and not self._ended:
+            self._wanted.clear()
+            try:
+                catalogue.scan(lambda scripts: self._post(lambda: self._found(scripts), newest_of="scripts"))
+                self._post(self._completed, newest_of="scanned")
+            except Exception:  # the thread's boundary: the next scan may succeed
+                log.exception("the scripts cannot be listed")
+
+    def _completed(self) -> None:
+        self.complete = True
+
+    def _found(self, scripts: Mapping[str, Script]) -> None:
+        self.scripts = dict(scripts)
+        found = files(scripts.values())
+        if found != self._files:
+            self._files = found
+            self._on_change(found)
