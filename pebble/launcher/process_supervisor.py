@@ -1,19 +1,16 @@
-"""Supervises one program of the robot: starts it, reads its pipes, restarts it and stops it."""
+"""Supervises one program of the robot: starts it, restarts it and stops it."""
 
 import logging
 from collections.abc import Callable
-from contextlib import suppress
 from enum import Enum, auto
+from functools import partial
 
-from pebble.launcher.child import Child, read_available
-from pebble.launcher.log_forwarding import LINE_LIMIT, text_of
+from pebble.launcher.child import Child
+from pebble.launcher.pipes import Pipes
 from pebble.launcher.programs import Program
 from pebble.launcher.reactor import Reactor
 from pebble.launcher.restart_policy import LOOP_EXITS, LOOP_WINDOW_S, RestartPolicy
-from pebble.runtime.lines import LineSplitter
 from pebble.runtime.timers import Timer
-
-_LAST_READS = 16  # 64 KiB each, of what a child left in its pipe when it died
 
 log = logging.getLogger(__name__)
 
@@ -64,7 +61,7 @@ class ProcessSupervisor:
         self._on_line, self._on_note, self._on_change, self._on_end = on_line, on_note, on_change, on_end
         self._is_stopping = is_stopping
         self._child: Child | None = None
-        self._lines, self._notes = _splitter(), _splitter()
+        self._pipes: Pipes | None = None  # of the newest child
         self._timer: Timer | None = None
 
     @property
@@ -120,7 +117,6 @@ class ProcessSupervisor:
         if self._is_stopping():
             self.stop()
             return
-        self._lines, self._notes = _splitter(), _splitter()
         self.policy.started(self._reactor.now())
         try:
             self._child = child = self._spawn(self.program)
@@ -128,8 +124,7 @@ class ProcessSupervisor:
             self._restart(f"could not start: {error}")
             return
         self.state = State.RUNNING
-        self._reactor.watch(child.output, lambda: self._read_output(child))
-        self._reactor.watch(child.notes, lambda: self._read_notes(child))
+        self._pipes = Pipes(child, self._reactor, partial(self._on_line, child.pid), self._noted)
         self._reactor.watch(child.exited, lambda: self._exited(child))
         self._check_at(self.policy.stuck_at)
         self._on_change()
@@ -144,30 +139,15 @@ class ProcessSupervisor:
         if self._child is not None:
             self._child.kill()
 
-    # -- reading the child's pipes
+    # -- what the child tells
 
-    def _read_output(self, child: Child) -> None:
-        data = read_available(child.output)
-        if data == b"":
-            self._reactor.forget(child.output)  # it closed its stderr, or has ended
-        elif data is not None:
-            self._forward(child, self._lines.feed(data))
-
-    def _read_notes(self, child: Child) -> None:
-        data = read_available(child.notes)
-        if data == b"":
-            self._reactor.forget(child.notes)
-        elif data is not None:
-            self._handle_notes(data)
-
-    def _handle_notes(self, data: bytes) -> None:
-        for line in map(text_of, self._notes.feed(data)):
-            if line == "ALIVE":
-                self.policy.alive(self._reactor.now())
-            elif line == "READY":
-                self._ready()
-            elif line:
-                self._on_note(line)
+    def _noted(self, line: str) -> None:
+        if line == "ALIVE":
+            self.policy.alive(self._reactor.now())
+        elif line == "READY":
+            self._ready()
+        else:
+            self._on_note(line)
 
     def _ready(self) -> None:
         if self.state is not State.RUNNING:  # too late
@@ -175,11 +155,6 @@ class ProcessSupervisor:
         self.policy.ready(self._reactor.now())
         self._check_at(self.policy.stuck_at)  # from now on signs of life come more often
         self._on_change()
-
-    def _forward(self, child: Child, lines: list[bytes]) -> None:
-        for text in map(text_of, lines):
-            if text:
-                self._on_line(child.pid, text)
 
     # -- the timer
 
@@ -230,10 +205,9 @@ class ProcessSupervisor:
 
     def _exited(self, child: Child) -> None:
         child.kill()  # what it started must not go on without it; until it is reaped the group's number is its own
-        self._read_rest(child)
-        for descriptor in (child.output, child.notes, child.exited):
-            with suppress(KeyError):  # already forgotten at end of file
-                self._reactor.forget(descriptor)
+        if self._pipes is not None:
+            self._pipes.close()
+        self._reactor.forget(child.exited)
         how = child.end()
         self._child = None
         self._cancel_timer()
@@ -254,15 +228,6 @@ class ProcessSupervisor:
         if again:
             self._start_after_request()
 
-    def _read_rest(self, child: Child) -> None:
-        self._handle_notes(read_available(child.notes) or b"")
-        for _ in range(_LAST_READS):
-            data = read_available(child.output)
-            if not data:
-                break
-            self._forward(child, self._lines.feed(data))
-        self._forward(child, [self._lines.rest()])
-
     def _restart(self, how: str) -> None:
         was_in_crash_loop = self.policy.in_crash_loop
         wait_s = self.policy.exited(self._reactor.now(), how)
@@ -276,7 +241,3 @@ class ProcessSupervisor:
                 name, LOOP_EXITS, LOOP_WINDOW_S, how, wait_s,
             )  # fmt: skip
         self._on_change()
-
-
-def _splitter() -> LineSplitter:
-    return LineSplitter(LINE_LIMIT, truncate=True)

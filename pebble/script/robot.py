@@ -49,6 +49,25 @@ class _Arrived(NamedTuple):
     at: float  # on the monotonic clock
 
 
+class _Latest:
+    """The newest payload of each channel that was asked for."""
+
+    def __init__(self, subscribe: Callable[[Channel, Callable[..., None]], None], clock: Callable[[], float]) -> None:
+        self._subscribe, self._clock = subscribe, clock
+        self._arrived: dict[Channel, _Arrived | None] = {}
+
+    def of(self, channel: Channel, max_age: float) -> Any:
+        """The first call subscribes."""
+        if channel not in self._arrived:
+            self._arrived[channel] = None
+            self._subscribe(channel, lambda value, **_: self._receive(channel, value))
+        newest = self._arrived[channel]
+        return None if newest is None or self._clock() - newest.at > max_age else newest.value
+
+    def _receive(self, channel: Channel, value: Any) -> None:
+        self._arrived[channel] = _Arrived(value, self._clock())
+
+
 class Robot:
     """The robot of this script. Any thread may call every method; none may be called in a fork of the process.
 
@@ -70,8 +89,7 @@ class Robot:
         self.log = logging.getLogger(f"pebble.script.{name}")
         self._refusals = Refusals(RateLimitedLog(self.log), Counters())
         self._transport, self._addresses, self._clock = transport, Addresses(config), clock
-        self._latest: dict[str, _Arrived] = {}
-        self._subscribed: set[str] = set()
+        self._latest = _Latest(self._subscribe, clock)
         self._last_values: dict[Channel, Callable[[], Any]] = {}
         self._neighbours: dict[str, Neighbour] = {}
         self._pictures = Pictures(config.run_dir())
@@ -107,12 +125,7 @@ class Robot:
         The first call subscribes, and mostly returns None.
         """
         self._check()
-        topic = self._addresses[channel].topic
-        if topic not in self._subscribed:
-            self._subscribed.add(topic)
-            self._subscribe(channel, lambda value, **_: self._latest.__setitem__(topic, _Arrived(value, self._clock())))
-        newest = self._latest.get(topic)
-        return None if newest is None or self._clock() - newest.at > max_age else newest.value
+        return self._latest.of(channel, max_age)
 
     def on(self, channel: Channel, handler: Callable[..., None]) -> None:
         """Call ``handler`` with each payload of ``channel``, on a thread of its own.
