@@ -35,6 +35,34 @@ _TRACED_LINE = 4096  # bytes; far longer than any line that the MCU accepts
 T = TypeVar("T")
 
 
+class _Recorder:
+    """Adds to a trace what passes the port, in lines."""
+
+    def __init__(self, trace: Trace, *, is_text: bool, output: bool) -> None:
+        self._trace = trace
+        self._received = LineSplitter(_TRACED_LINE) if is_text else None
+        self._sent = LineSplitter(_TRACED_LINE) if is_text and output else None
+
+    def event(self, event: Event) -> None:
+        self._trace.add(Entry(time.monotonic_ns(), event))
+
+    def received(self, ns: int, data: bytes) -> None:
+        if self._received is not None:
+            self._add(ns, "line", self._received.feed(data))
+
+    def sent(self, ns: int, data: bytes, *, whole: bool) -> None:
+        """``whole``: nothing was lost after it."""
+        if self._sent is not None:
+            self._add(ns, "said", self._sent.feed(data))
+            if not whole:
+                self._sent.reset()  # the host never gets the rest of this line
+
+    def _add(self, ns: int, event: Event, lines: list[bytes]) -> None:
+        for line in lines:
+            if text := line.strip().decode("utf-8", "backslashreplace"):  # blank lines are not recorded
+                self._trace.add(Entry(ns, event, text))
+
+
 class PtyMcu:
     """A SimulatedMcu, its pty, the thread that runs them, and ``symlink``, the stable path of the port.
 
@@ -76,9 +104,7 @@ class PtyMcu:
             settings=settings,
         )
         self._tick_s = self._mcu.profile.tick_s
-        is_text = self._mcu.profile.is_text
-        self._splitter = LineSplitter(_TRACED_LINE) if is_text else None
-        self._output_splitter = LineSplitter(_TRACED_LINE) if is_text and trace_output else None
+        self._recorder = _Recorder(self.trace, is_text=self._mcu.profile.is_text, output=trace_output)
         self._master: int | None = None
         self._tty = ""
         self._host = False
@@ -202,12 +228,12 @@ class PtyMcu:
         hung_up = bool(events and events[0][1] & select.POLLHUP)
         if (has_data or not hung_up) and not self._host:
             self._host = True
-            self._record_event("opened")
+            self._recorder.event("opened")
         if has_data:
             self._receive(master)
         elif hung_up and self._host:
             self._host = False
-            self._record_event("closed")
+            self._recorder.event("closed")
 
     def _receive(self, master: int) -> None:
         try:
@@ -215,8 +241,7 @@ class PtyMcu:
         except OSError:  # the host has just closed the port
             return
         arrived = time.monotonic_ns()
-        if self._splitter is not None:
-            self._record(arrived, "line", self._splitter.feed(data))
+        self._recorder.received(arrived, data)
         self._transmit(self._mcu.receive(data, arrived / 1e9))
 
     def _transmit(self, data: bytes) -> None:
@@ -228,10 +253,7 @@ class PtyMcu:
             with suppress(OSError):  # the host's buffer is full, or it has just closed
                 sent = os.write(self._master, data)
         self.dropped += len(data) - sent
-        if self._output_splitter is not None:
-            self._record(began, "said", self._output_splitter.feed(data[:sent]))
-            if sent < len(data):
-                self._output_splitter.reset()  # the host never gets the rest of this line
+        self._recorder.sent(began, data[:sent], whole=sent == len(data))
 
     def _run_requests(self) -> None:
         with suppress(queue.Empty):
@@ -255,7 +277,7 @@ class PtyMcu:
         self._master, self._tty = master, os.ttyname(slave)
         os.close(slave)
         new.symlink_to(self._tty)
-        self._record_event("plugged")
+        self._recorder.event("plugged")
         new.replace(self.symlink)
 
     def _unplug(self) -> None:
@@ -266,7 +288,7 @@ class PtyMcu:
             self.symlink.unlink()
         os.close(self._master)
         self._master, self._host = None, False
-        self._record_event("unplugged")
+        self._recorder.event("unplugged")
 
     def _stop(self) -> None:
         self._stopping = True
@@ -278,11 +300,3 @@ class PtyMcu:
         change = f"{outlet} {'on' if on else 'off'}"
         self.trace.add(Entry(round(now * 1e9), "relay", change))
         self._on_relay(change)
-
-    def _record(self, ns: int, event: Event, lines: list[bytes]) -> None:
-        for line in lines:
-            if text := line.strip().decode("utf-8", "backslashreplace"):  # blank lines are not recorded
-                self.trace.add(Entry(ns, event, text))
-
-    def _record_event(self, event: Event) -> None:
-        self.trace.add(Entry(time.monotonic_ns(), event))
