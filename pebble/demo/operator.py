@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import queue
-import secrets
 import threading
 import time
 from collections import deque
@@ -17,15 +16,11 @@ from contextlib import ExitStack, closing, suppress
 from functools import partial
 from typing import NamedTuple
 
-from msgspec.structs import replace
-
 from pebble import contract
-from pebble.client.control import ControlClient
 from pebble.client.discovery import ALL_OUTGOING, Discovery
 from pebble.client.driver_lease import FILTER
 from pebble.client.estop import StopSender, new_name
 from pebble.client.estop_states import Reset
-from pebble.client.pace_of_link import WIDE, Pace
 from pebble.client.robot_view import RobotView
 from pebble.contract import (
     APRILTAG_DATA,
@@ -38,18 +33,18 @@ from pebble.contract import (
 )
 from pebble.contract.identity import parse_topic
 from pebble.contract.payloads import AutonomyCommand, Drive, LightsFlash, LightsSolid, SoundboardCommand, TagData
+from pebble.demo.steering import Steering
 from pebble.demo.visitors import Visitors
 from pebble.errors import PayloadError
 from pebble.motion.arbiter import HOLD_MS
 from pebble.rig.testbed import CLIP, TAG_ID
-from pebble.transports import Message, MqttSettings, QoS, create
+from pebble.transports import Message, MqttSettings, create
 
 COMMAND_PERIOD_S = 0.05  # how often a held stick is repeated
 NAME = "the demo's operator"
 STOP = Drive()
 OBSERVING = ": observing"  # after the name of a step
 _POLL_S = 0.02
-_CONTROL_S = 1.0  # until every robot has given it, on the smallest machine
 _MOST_TIMES = 3  # for the emergency stop and for the script
 _MOST_WAITING = 1000  # events and completed steps; beyond them the oldest is dropped
 _ASSESSED_S = 5.0  # until what was completed is assessed, on the smallest machine
@@ -138,10 +133,6 @@ class CompletedFollow(NamedTuple):
     clip: str
 
 
-def _pace_of(robot: RobotView) -> Pace:
-    return robot.pace
-
-
 class EndedEarlyError(Exception):
     """The demo ends, or a person has taken the robot."""
 
@@ -159,13 +150,11 @@ class Operator:
         self.discovery = Discovery()
         self.again: frozenset[str] = frozenset()
         self.rounds = 0
-        self.commands: dict[str, tuple[Drive, float]] = {}  # by base topic: the last one sent, and when
         self.events: deque[tuple[float, str]] = deque(maxlen=_MOST_WAITING)
         self.completed: deque[CompletedStep | CompletedStop | CompletedFollow] = deque(maxlen=_MOST_WAITING)
         self._doing = "discovering robots"
-        self._key = secrets.token_hex(4)  # where a robot has given none
         self._visitors = Visitors(NAME)
-        self._controls: dict[str, ControlClient] = {}  # by base topic, of robots that keep control themselves
+        self.steering = Steering(NAME, self._publish_all, self._visitors.own_ids)
         self._drawing: set[str] = set()  # base topics of robots that have listed the script for their trail
         self._robots: list[RobotView] = []  # that take part in the present step
         self._scripted: RobotView | None = None  # if a person takes it, the present step ends
@@ -241,7 +230,7 @@ class Operator:
                     self.until_right(EMERGENCY_STOP, partial(self._stop_all, robots))
                     self.until_right(BY_ITSELF, partial(self._take_over, robots))
                 self.rounds += 1
-            self._release_control()
+            self.steering.release()
             self._doing = yours
             while True:
                 self._show_trails(robots)
@@ -260,7 +249,7 @@ class Operator:
     def _begin(self, step: str, robots: Sequence[RobotView]) -> None:
         """Chooses among those that are free."""
         self._doing = step
-        self._release_control()
+        self.steering.release()
         self._visitors.begin_step(time.monotonic())
         self._robots = [robot for robot in robots if self._mine(robot)]
 
@@ -286,62 +275,12 @@ class Operator:
     def _drive(self, drive: Drive) -> float:
         """Send one command to all robots that are free; returns when."""
         for robot in filter(self._mine, self._robots):
-            self._send(robot, drive, time.monotonic())
+            self.steering.drive(robot, drive, time.monotonic())
         return time.monotonic()
-
-    def _send(self, robot: RobotView, drive: Drive, now: float) -> None:
-        """A zero at once; what moves the robot at the pace that it asks for."""
-        pace, (last, sent_at) = robot.pace, self.commands.get(robot.base, (STOP, -math.inf))
-        if drive.moves and last.moves and now - sent_at < pace.step_s:
-            return
-        self.commands[robot.base] = drive, now
-        signed, qos = self._signed(robot, drive), QoS.DELIVERED
-        if drive.moves:
-            signed, qos = pace.dated(signed, now, self._key), pace.qos
-        self._publish(robot.drive_topic, codec.encode(DRIVE, signed), qos)
-
-    def _signed(self, robot: RobotView, drive: Drive) -> Drive:
-        """The command with the key of control, which it renews if it has it."""
-        control = self._controls.get(robot.base)
-        if control is None:
-            return drive
-        if control.asked_by:
-            control.release()
-        self._publish_all(control.tick(time.monotonic()))
-        return replace(drive, key=control.key) if control.key else drive
-
-    def _take_control(self) -> None:
-        """Have control of the robots of this step that keep it themselves, as a person would."""
-        for robot in [one for one in self._robots if one.controlled and self._mine(one)]:
-            control = self._controls.get(robot.base)
-            if control is None or control.robot is not robot.control:
-                control = self._controls[robot.base] = ControlClient(
-                    robot.control, by=NAME, device="demo", pace_of=partial(_pace_of, robot)
-                )
-                self._visitors.own_ids.add(control.id)
-            if not control.wanted:
-                control.ask(time.monotonic())
-        answers_s = [one.pace.answer_s for one in self._robots if one.pace is not WIDE]
-        self._until(self._has_control, max([_CONTROL_S, *answers_s]))
-        for control in self._controls.values():
-            if not control.held:  # a person was faster
-                control.release()
-
-    def _has_control(self) -> bool:
-        wanted = [one for one in self._controls.values() if one.wanted]
-        for control in wanted:
-            self._publish_all(control.tick(time.monotonic()))
-        return all(one.held or not one.wanted for one in wanted)
-
-    def _release_control(self) -> None:
-        """Leave control to people."""
-        for control in self._controls.values():
-            control.release()
-            self._publish_all(control.tick(time.monotonic()))
 
     def _hold(self, drive: Drive, seconds: float) -> float:
         """Send a command again and again, as a held stick does; returns when it was last sent."""
-        self._take_control()
+        self.steering.take(filter(self._mine, self._robots), self._until)
         began = due = sent = time.monotonic()
         while due < began + seconds:
             sent = self._drive(drive)
@@ -349,9 +288,9 @@ class Operator:
             self._wait(max(0.0, due - sent))
         return sent
 
-    def _publish(self, topic: str | None, payload: bytes, qos: QoS = QoS.DELIVERED) -> None:
+    def _publish(self, topic: str | None, payload: bytes) -> None:
         if topic is not None:
-            self._publish_all([Message(topic, payload, qos)])
+            self._publish_all([Message(topic, payload)])
 
     def _publish_all(self, messages: Iterable[Message]) -> None:
         for one in messages:

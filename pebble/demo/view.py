@@ -146,9 +146,9 @@ class View:
         return next((seen for seen in self._operator.discovery.all_robots() if seen.name == name), None)
 
     def _command(self, seen: RobotView, now: float) -> str:
-        if seen.base not in self._operator.commands:
+        if seen.base not in self._operator.steering.commands:
             return "none yet"
-        drive, sent_at = self._operator.commands[seen.base]
+        drive, sent_at = self._operator.steering.commands[seen.base]
         return f"x {drive.x:+.2f} z {drive.z:+.2f}, {now - sent_at:3.1f} s ago"
 
 
