@@ -38,7 +38,7 @@ from pebble.demo.visitors import Visitors
 from pebble.errors import PayloadError
 from pebble.motion.arbiter import HOLD_MS
 from pebble.rig.testbed import CLIP, TAG_ID
-from pebble.transports import Message, MqttSettings, create
+from pebble.transports import Message, MqttSettings, QoS, create
 
 COMMAND_PERIOD_S = 0.05  # how often a held stick is repeated
 NAME = "the demo's operator"
@@ -290,7 +290,7 @@ class Operator:
 
     def _publish(self, topic: str | None, payload: bytes) -> None:
         if topic is not None:
-            self._publish_all([Message(topic, payload)])
+            self._publish_all([Message(topic, payload, QoS.DELIVERED)])
 
     def _publish_all(self, messages: Iterable[Message]) -> None:
         for one in messages:

@@ -110,7 +110,7 @@ async def _page(request: Request) -> Response:
 def _policy(request: Request) -> dict[str, str]:
     """The page may show the streams of robots in a frame: exactly the origins that they report now."""
     robots, ref = request.app.state.robots, request.path_params.get("ref", "")
-    allowed = robot_streams.origins(robots, ref, request.app.state.server.own_hosts)
+    allowed = robot_streams.origins(robots, ref, request.app.state.server.sources.own_hosts)
     if not allowed:
         return {}
     return {"content-security-policy": f"{CONTENT_SECURITY_POLICY}; frame-src {' '.join(allowed)}"}

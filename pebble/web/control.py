@@ -208,7 +208,7 @@ class Control:
                     self._server.media.pin(op.ref, op.encoding)
             case m.PictureFromOp():
                 if self._may("drive", op):
-                    self._server.picture_from(op.ref, op.source)
+                    self._server.sources.choose_picture(op.ref, op.source)
             case m.StreamAddressOp():
                 self._stream_address(op)
             case m.Hello():
@@ -221,7 +221,7 @@ class Control:
         """Sets the value for all, and of any host: hence only those who look after robots may."""
         if not self._may("system", op):
             return
-        if why := self._server.stream_address(op.ref, op.url):
+        if why := self._server.sources.choose_stream(op.ref, op.url):
             self._refuse(op, why)
         else:
             self._audit(_tag(op), op.ref, detail=op.url)
@@ -230,7 +230,7 @@ class Control:
         """Publish what is asked of a robot, once: nothing repeats it, and the robot's states tell what came of it."""
         if not self._may(robot_commands.right(op), op):
             return
-        if why := (self._why_not if robot_commands.moves(op) else "") or self._server.refuses(op):
+        if why := (self._why_not if robot_commands.moves(op) else "") or self._server.refusals.of_op(op):
             self._refuse(op, why)
             return
         message = robot_commands.publication(op, self._server.robots.topic)
@@ -255,7 +255,7 @@ class Control:
         if op.ref not in server.robots.components:
             self._refuse(op, "unknown component")
             return
-        outcome = server.driving.drive(self._tab, op, now, self._why_not or server.blocked(op.ref))
+        outcome = server.driving.drive(self._tab, op, now, self._why_not or server.refusals.of_driving(op.ref))
         accepted = server.publish(outcome.commands, self._session.user)
         if outcome.refused:
             self._refuse(op, outcome.refused)

@@ -11,9 +11,7 @@ from typing import Any
 import msgspec
 
 from pebble.client.broker import Broker
-from pebble.client.drive_reasons import SCRIPT_ORDER, SERVER_ORDER, Code, Situation, first_reason
 from pebble.client.estop import send
-from pebble.client.named_topics import why_not
 from pebble.client.pace_of_link import WIDE
 from pebble.client.pace_of_link import Pace as LinkPace
 from pebble.client.page.settings import WebSettings
@@ -31,17 +29,18 @@ from pebble.runtime.by_name import ByName
 from pebble.transports import Message
 from pebble.transports.clock import since_boot as clock
 from pebble.web import messages as m
-from pebble.web import robot_commands
 from pebble.web.controls import Controls
 from pebble.web.driven_here import DrivenHere
 from pebble.web.driving import Command, Driving, Tab
 from pebble.web.known_robots import SavedRobots
+from pebble.web.media.chosen_sources import ChosenSources
 from pebble.web.media.connection import MediaConnection
 from pebble.web.media.pictures import MediaHub
-from pebble.web.media.robot_streams import OwnHosts, origin
+from pebble.web.media.robot_streams import OwnHosts
 from pebble.web.media.sound import SoundHub
 from pebble.web.open_components import OpenComponents
 from pebble.web.pace import STOP_WAITS_S, Pace
+from pebble.web.refusals import Refusals
 from pebble.web.robot_audits import RobotAudits
 from pebble.web.robots import Robots
 from pebble.web.stops import Stops
@@ -53,7 +52,6 @@ PEOPLE_S = 0.5  # between two looks at whether people or sessions were changed
 _REFRESH_S = 0.25
 _MANY_WAIT = 16 * 1024  # bytes that the broker has not confirmed
 _ESTOP_METRIC = "web/estop"
-_STREAM_ADDRESS = "stream-address "  # what a setting of the server begins with; then the component
 _DAY_S = 24 * 3600
 
 
@@ -71,13 +69,14 @@ class Server:
         self.driving.pace_of = self._pace_of
         self.saved = SavedRobots(people)
         known = self.robots.before = self.saved.robots
-        self.own_hosts = OwnHosts(settings)
+        self.refusals = Refusals(self.broker, self.driving, self._robot)
         self.broker.is_named = self.media_connection.broker.is_named = self._is_named
         self.broker.is_known = lambda topic: "/".join(topic.split("/", 3)[:3]) in known
-        self.robots.streams.update(people.all(_STREAM_ADDRESS))
         self.media = MediaHub(self.media_connection, self.robots)
         self.sound = SoundHub(self.media_connection, self.robots, self._note_talk)
         self.open_components = OpenComponents(self.broker, self.robots, self.spawn)
+        # What is drawn over the picture comes from there.
+        self.sources = ChosenSources(people, self.robots, OwnHosts(settings), self.open_components.update)
         self.by_name = ByName(FLEET, lambda ref: ref in known or ref in self.open_components)
         self.robots.on_forget = self.by_name.forget
         self.driven_here = DrivenHere(server)
@@ -215,7 +214,7 @@ class Server:
     ) -> None:
         """A page wants control; ``granted``, or ``failed`` with the reason, is called as soon as that is known."""
         ref, now = robot.base, clock()
-        if why := self._nameless(robot):
+        if why := self.refusals.nameless(robot):
             failed(why)
             return
         if robot.controlled:
@@ -267,13 +266,6 @@ class Server:
         robot = self._robot(ref)
         return WIDE if robot is None else robot.pace
 
-    # -- what is asked of robots
-
-    def blocked(self, ref: str) -> str:
-        """Why this component may not be moved by any page; empty if it may."""
-        robot = self._robot(ref) or RobotView(ref)
-        return self._words(robot, first_reason(self._situation(robot), SERVER_ORDER)) or self._nameless(robot)
-
     def level(self, ref: str) -> SecurityLevel:
         """How strictly that robot checks names, as far as it tells; of others it is as in the server's config."""
         robot = self._robot(ref)
@@ -285,92 +277,8 @@ class Server:
         robot = self._robot(ref)
         return robot is not None and robot.named
 
-    def _nameless(self, robot: RobotView) -> str:
-        """Why it takes no commands of this server, which has no name; empty if it does."""
-        return why_not(robot.name, self.broker.names.account) if robot.named else ""
-
-    def refuses(self, op: m.RobotOp) -> str:
-        """Why this is not asked of a robot now; empty if it is. What ends something is always asked."""
-        robot = self._robot(op.ref)
-        if robot is None:
-            return "unknown component"
-        if robot_commands.ends(op):
-            return "" if self.broker.connected else "The server cannot reach the broker"
-        order = (Code.BROKER,) if isinstance(op, m.FlagOp) else (Code.BROKER, Code.SILENT)  # a broker remembers flags
-        why = self._words(robot, first_reason(self._situation(robot), order))
-        why = why or self._nameless(robot) or robot_commands.refusal(op, robot.capabilities)
-        return self._script_refused(robot) if isinstance(op, m.AutonomyOp) and not why else why
-
-    def _script_refused(self, robot: RobotView) -> str:
-        """Why no script may begin now; empty if one may."""
-        by = self.driving.moved_by(robot.base, clock())
-        situation = self._situation(robot)._replace(driven=bool(by) and not robot.arbitrates)
-        match first_reason(situation, SCRIPT_ORDER):
-            case Code.UNSEEN:
-                return f"{robot.name} has not been seen yet"
-            case Code.STOPPED:
-                return "Stopped: reset it first"
-            case Code.LEASE:
-                return f"{by} is driving"
-        return ""
-
-    def _situation(self, robot: RobotView) -> Situation:
-        return robot.situation(time.monotonic())._replace(problem=self.broker.problem)
-
-    def _words(self, robot: RobotView, code: Code | None) -> str:
-        match code:
-            case Code.BROKER:
-                return f"The server cannot reach the broker: {self.broker.problem}"
-            case Code.NO_DRIVE:
-                return "This component does not drive"
-            case Code.STOPPED:
-                by = robot.stopped_by
-                return f"Stopped by {by.by or 'unknown'}" if by else "Stopped"
-            case Code.RESET:
-                return "It was just reset: wait a moment"
-            case Code.SILENT:
-                return f"{robot.name} is silent"
-        return ""
-
     def _note_talk(self, ref: str, session: Session, device: str, address: str) -> None:
         self.audit.write("talk", ref=ref, user=session.user, device=device, address=address)
-
-    def picture_from(self, ref: str, source: str) -> None:
-        """Show the picture of ``source`` on the page of ``ref``, for everybody; "" is its own."""
-        if ref in self.robots.components and (not source or source in self.robots.components):
-            self.people.set(f"picture-from {ref}", "" if source == ref else source)
-            self._show_picture_from(ref)
-
-    def _show_picture_from(self, ref: str) -> None:
-        try:
-            source = self.people.get(f"picture-from {ref}") or ""
-        except DatabaseError as error:
-            log.warning("where the picture of %s comes from is not known: %s", ref, error)
-            return
-        self.robots.sources.pop(ref, None)
-        if source:
-            self.robots.sources[ref] = source
-        self.open_components.update(ref)  # what is drawn over the picture comes from there
-        self.robots.set_server_metric(ref, "web/picture-from", m.PictureFrom(source=source))
-
-    def stream_address(self, ref: str, url: str) -> str:
-        """Offer the stream at ``url`` on the page of ``ref``, for everybody; "" is the one that it reports.
-
-        Returns why not; empty if it is done.
-        """
-        if ref not in self.robots.components:
-            return "unknown component"
-        if url and not origin(url):
-            return "No stream: an address begins with http:// or https://, and has no login"
-        if url and not origin(url, self.own_hosts):
-            return "No stream: the page can be opened by this name or address, and browsers would send its login there"
-        self.people.set(_STREAM_ADDRESS + ref, url)
-        self.robots.streams[ref] = url
-        self._show_stream_address(ref)
-        return ""
-
-    def _show_stream_address(self, ref: str) -> None:
-        self.robots.set_server_metric(ref, "web/stream-address", m.StreamAddress(url=self.robots.streams.get(ref, "")))
 
     # -- what is open
 
@@ -378,8 +286,7 @@ class Server:
         """A page has opened this component."""
         if _is_base(ref):
             self.open_components.open(ref)
-            self._show_picture_from(ref)
-            self._show_stream_address(ref)
+            self.sources.show(ref)
 
     def unwatch(self, ref: str) -> None:
         if _is_base(ref):

@@ -1,0 +1,72 @@
+"""Why a page may not ask a robot for something now, in words for people. Each returns "" where it may."""
+
+import time
+from collections.abc import Callable
+
+from pebble.client.broker import Broker
+from pebble.client.drive_reasons import SCRIPT_ORDER, SERVER_ORDER, Code, Situation, first_reason
+from pebble.client.named_topics import why_not
+from pebble.client.robot_view import RobotView
+from pebble.transports.clock import since_boot as clock
+from pebble.web import messages as m
+from pebble.web import robot_commands
+from pebble.web.driving import Driving
+
+
+class Refusals:
+    """For one server; ``robot_of`` finds a component that is known."""
+
+    def __init__(self, broker: Broker, driving: Driving, robot_of: Callable[[str], RobotView | None]) -> None:
+        self._broker, self._driving, self._robot_of = broker, driving, robot_of
+
+    def of_driving(self, ref: str) -> str:
+        """Why this component may not be moved by any page."""
+        robot = self._robot_of(ref) or RobotView(ref)
+        return self._words(robot, first_reason(self._situation(robot), SERVER_ORDER)) or self.nameless(robot)
+
+    def nameless(self, robot: RobotView) -> str:
+        """Why it takes no commands of this server, which has no name."""
+        return why_not(robot.name, self._broker.names.account) if robot.named else ""
+
+    def of_op(self, op: m.RobotOp) -> str:
+        """Why this is not asked of a robot now. What ends something is always asked."""
+        robot = self._robot_of(op.ref)
+        if robot is None:
+            return "unknown component"
+        if robot_commands.ends(op):
+            return "" if self._broker.connected else "The server cannot reach the broker"
+        order = (Code.BROKER,) if isinstance(op, m.FlagOp) else (Code.BROKER, Code.SILENT)  # a broker remembers flags
+        why = self._words(robot, first_reason(self._situation(robot), order))
+        why = why or self.nameless(robot) or robot_commands.refusal(op, robot.capabilities)
+        return self._of_script(robot) if isinstance(op, m.AutonomyOp) and not why else why
+
+    def _of_script(self, robot: RobotView) -> str:
+        """Why no script may begin now."""
+        by = self._driving.moved_by(robot.base, clock())
+        situation = self._situation(robot)._replace(driven=bool(by) and not robot.arbitrates)
+        match first_reason(situation, SCRIPT_ORDER):
+            case Code.UNSEEN:
+                return f"{robot.name} has not been seen yet"
+            case Code.STOPPED:
+                return "Stopped: reset it first"
+            case Code.LEASE:
+                return f"{by} is driving"
+        return ""
+
+    def _situation(self, robot: RobotView) -> Situation:
+        return robot.situation(time.monotonic())._replace(problem=self._broker.problem)
+
+    def _words(self, robot: RobotView, code: Code | None) -> str:
+        match code:
+            case Code.BROKER:
+                return f"The server cannot reach the broker: {self._broker.problem}"
+            case Code.NO_DRIVE:
+                return "This component does not drive"
+            case Code.STOPPED:
+                by = robot.stopped_by
+                return f"Stopped by {by.by or 'unknown'}" if by else "Stopped"
+            case Code.RESET:
+                return "It was just reset: wait a moment"
+            case Code.SILENT:
+                return f"{robot.name} is silent"
+        return ""
