@@ -18,7 +18,7 @@ from pebble.contract import DRIVE, codec
 from pebble.fleet.roles import Role, Session
 from pebble.transports import MqttSettings
 from pebble.transports import clock as message_clock
-from pebble.web import control, robots, server
+from pebble.web import control, refusals, robots, server
 from tests.robot.lockstep.network import Connection, Network
 from tests.robot.lockstep.processes import Process
 from tests.web.driving_lockstep.pages import EPOCH
@@ -74,9 +74,9 @@ def virtual() -> Iterator[None]:
         token_hex=lambda size: f"{next(numbers):0{2 * size}x}", token_urlsafe=lambda _: f"token-{next(numbers)}"
     )
     with ExitStack() as stack:
-        for module in (server, robots, control, broker):
+        for module in (server, refusals, robots, control, broker):
             stack.enter_context(patch.object(module, "time", TIME))
-        for module, name in ((server, "clock"), (control, "clock"), (message_clock, "since_boot")):
+        for module, name in ((server, "clock"), (refusals, "clock"), (control, "clock"), (message_clock, "since_boot")):
             stack.enter_context(patch.object(module, name, TIME.monotonic))
         for module in (server, control, broker):
             stack.enter_context(patch.object(module, "secrets", secrets))
