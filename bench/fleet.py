@@ -60,7 +60,7 @@ PINS, LAST, CONFIRMED = "command to pins", "stop of all, until the last has it",
 KILLED, MUTE = "connection lost, until the page shows it", "silent, until the page shows it"
 BROKER_CPU, PAGE_CPU, VIEWER_CPU = "CPU, broker", "CPU, page server", "CPU, page server with a viewer"
 BROKER_MB, PAGE_MB, VIEWER_RATE = "memory, broker", "memory, page server", "to a viewer"
-_UNITS = {
+UNITS = {
     **dict.fromkeys((PINS, LAST, CONFIRMED, KILLED, MUTE), "ms"),
     **dict.fromkeys((BROKER_CPU, PAGE_CPU, VIEWER_CPU), "%"),
     **dict.fromkeys((BROKER_MB, PAGE_MB), "MB"),
@@ -149,7 +149,7 @@ def measure(case: Case) -> Iterator[Cell]:
     boards = min(run["boards"], robots - 1)
     with World(robots, boards, run.show) as world:
         for name, values, figures in _phases(world, run):
-            yield case.cell(name, _UNITS[name], values, **figures)
+            yield case.cell(name, UNITS[name], values, **figures)
         run.notes.extend(world.notes())
 
 
@@ -305,7 +305,7 @@ def at_ten_thousand(cells: Sequence[Cell]) -> Iterator[str]:
         if len(found) > 1:
             less, more = sorted(found)[-2:]
             each = (found[more] - found[less]) / (more - less)
-            whole, unit = found[more] + each * (_TEN_THOUSAND - more), _UNITS[name]
+            whole, unit = found[more] + each * (_TEN_THOUSAND - more), UNITS[name]
             yield (
                 f"{name}: {figure(found[more])} {unit} with {more:,} robots, {figure(1000 * each)} {unit} for each"
                 f" 1,000 more; 10,000 would be {figure(whole)} {unit} if it goes on so"
@@ -339,7 +339,7 @@ FLEET = Comparison(
     constants={"rate_hz": RATE_HZ},
     variants=("mqtt",),
     conditions=lambda run: [{"robots": one} for one in run["robots"]],
-    measuring=Measuring(prepare=prepare, measure=measure, measures=tuple(_UNITS), alone=True),
+    measuring=Measuring(prepare=prepare, measure=measure, measures=tuple(UNITS), alone=True),
     report=Report(
         tables=(
             Grid(

@@ -28,8 +28,8 @@ OFF_ROBOT = ("bench", "client", "commands", "demo", "doctor", "flash", "impair",
 #: Top-level folders that are imported as parts of the package (docs/decisions/0002).
 LINKED = ("bench", "rig", "services", "simulation", "transports")
 MANY = 15  # attributes of one class
-#: Methods of named tuples, which are public in spite of their names.
-PUBLIC = {"_asdict", "_fields", "_make", "_replace"}
+#: Methods of named tuples and :func:`os._exit`, which are public in spite of their names.
+PUBLIC = {"_asdict", "_exit", "_fields", "_make", "_replace"}
 _JS_IMPORT = re.compile(r"""(?:from|import|import\()\s*["'](\.[^"']+\.js)["']""")
 
 

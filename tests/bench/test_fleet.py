@@ -89,7 +89,7 @@ def test_a_whole_fleet_is_measured(tmp_path: Path, robots: int) -> None:
     run = FLEET.run_of(quick=True, output=tmp_path, console=Console(file=io.StringIO()), robots=[robots // 2, robots])
     assert engine.run(run) == 0, run.console.file.getvalue()  # type: ignore[attr-defined]
     found = load(tmp_path / "fleet.json")
-    assert {cell.measure for cell in found.cells} == set(fleet._UNITS)
+    assert {cell.measure for cell in found.cells} == set(fleet.UNITS)
     assert not [cell for cell in found.cells if not cell.samples]
     assert found.assessment[0].startswith("CPU, broker")
     assert (tmp_path / "fleet-growth.png").exists()
