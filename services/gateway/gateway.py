@@ -5,7 +5,6 @@ state, over the connection of the heartbeats, where nothing else holds it up: it
 """
 
 import logging
-import secrets
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -14,8 +13,7 @@ from functools import partial
 import msgspec
 
 from pebble.contract import ESTOP, ONLINE, Kind
-from pebble.contract.identity import GATEWAYS, Identity, parse_topic
-from pebble.contract.levels import silent_after
+from pebble.contract.identity import GATEWAYS, parse_topic
 from pebble.contract.names import with_name
 from pebble.contract.payloads import GatewayHeartbeat
 from pebble.forwarding.cycles import PROBE_PERIOD_S, Cycles, Finding
@@ -24,55 +22,19 @@ from pebble.forwarding.routing import Side
 from pebble.forwarding.subjects import Subject
 from pebble.runtime.rate_limit import RateLimitedLog
 from pebble.services.gateway.carried import Carried
+from pebble.services.gateway.heartbeats import OwnHeartbeats, PresentRobots
 from pebble.services.gateway.ownership import MAX_ROBOTS, Ownership
 from pebble.transports import Message, QoS, State, Transport
 from pebble.transports.counters import Counters
 
 log = logging.getLogger(__name__)
 
-HEARTBEAT_S = 0.25
 TICK_S = 0.1
 BEGINNING_S = 0.1  # in one turn: taking many robots must not hold up the heartbeats
-#: Between two heartbeats of a robot that is not away, at most; and so that it is not away because one comes late.
-LONGEST_GAP_S, SHORTEST_GAP_S = 10.0, 0.75
-RIVAL_S = 5.0  # so long another gateway of the same name is there after its last heartbeat
-_SENT = 16  # heartbeats that may come back
 _STOP = Subject(Kind.COMMAND, ESTOP)
 _ANY = f"+/{GATEWAYS}/+"
 
-_encode = msgspec.json.encode
 _decode = msgspec.json.Decoder(GatewayHeartbeat).decode
-
-
-def identity(name: str) -> Identity:
-    return Identity("pebble", GATEWAYS, name)
-
-
-def will(name: str) -> Message:
-    """What tells the others that this gateway has gone."""
-    return Message(ONLINE.topic(identity(name).base), b"", QoS.DELIVERED, True)
-
-
-class PresentRobots:
-    """The robots that publish heartbeats at the hub. Silence is judged by their own pace."""
-
-    def __init__(self) -> None:
-        self._received: dict[str, tuple[float, float]] = {}  # when, and after how many seconds of silence it is away
-
-    def note(self, robot: str, now: float) -> None:
-        before = self._received.get(robot)
-        if before is None and len(self._received) >= MAX_ROBOTS:
-            self._forget(now)
-            if len(self._received) >= MAX_ROBOTS:
-                return
-        gap = 0.0 if before is None else now - before[0]
-        self._received[robot] = now, silent_after(max(gap, SHORTEST_GAP_S) if gap <= LONGEST_GAP_S else SHORTEST_GAP_S)
-
-    def robots(self, now: float) -> tuple[str, ...]:
-        return tuple(sorted(robot for robot, (at, silent_s) in list(self._received.items()) if now - at <= silent_s))
-
-    def _forget(self, now: float) -> None:
-        self._received = {robot: one for robot, one in self._received.items() if now - one[0] <= one[1]}
 
 
 class Gateway:
@@ -93,15 +55,12 @@ class Gateway:
         self.counters = Counters()
         self._robots, self._clock = tuple(robots), clock
         self._hub, self._broker, self._presence = hub, broker, presence
-        self._topic = will(name).topic
-        self._run, self._number = secrets.token_hex(4), 0
-        self._sent: dict[int, tuple[float, tuple[str, ...]]] = {}  # heartbeats that have not come back
-        self._present = PresentRobots()
+        self._heartbeats, self._present = OwnHeartbeats(name, broker), PresentRobots()
         self._carried: dict[str, Carried] = {}
         self._synchronize: dict[str, float] = {}  # when what is retained of it has arrived
         self._stops = Cycles(clock)
         self._quiet_log = RateLimitedLog(log, period_s=60.0)
-        self._rival_at = self._heartbeat_at = self._probed_at = float("-inf")
+        self._probed_at = float("-inf")
         self._states = threading.Lock()
         self._at_broker, self._at_hub = False, False
         self._wake = threading.Event()
@@ -157,8 +116,8 @@ class Gateway:
     def tick(self) -> None:
         """A turn: heartbeat, who carries what, what is due."""
         now = self._clock()
-        if now - self._heartbeat_at >= HEARTBEAT_S - TICK_S / 2:
-            self._publish_heartbeat(now)
+        if self._broker.state is State.CONNECTED and self._heartbeats.due(now, TICK_S):
+            self._heartbeats.publish(self._present.robots(now) if self._hub.state is State.CONNECTED else (), now)
         self.ownership.judge(now)
         held = self.ownership.held(now)
         for robot, one in list(self._carried.items()):
@@ -174,19 +133,6 @@ class Gateway:
             self._probed_at = now
             for one in self._carried.values():
                 one.probe()
-
-    def _publish_heartbeat(self, now: float) -> None:
-        if self._broker.state is not State.CONNECTED or now - self._rival_at < RIVAL_S:
-            return
-        self._heartbeat_at = now
-        robots = self._present.robots(now) if self._hub.state is State.CONNECTED else ()
-        self._number += 1
-        self._sent[self._number] = now, robots
-        if len(self._sent) > _SENT:
-            del self._sent[next(iter(self._sent))]
-        heartbeat = GatewayHeartbeat(t=int(time.time() * 1000), run=self._run, number=self._number, robots=robots)
-        raw = _encode(heartbeat)  # not stored: an old one must not be sent after an outage
-        self._broker.publish(self._topic, raw, qos=QoS.DELIVERED, retain=True, urgent=True, remember=False)
 
     def _begin(self, robots: Mapping[str, float]) -> None:
         end = self._clock() + BEGINNING_S
@@ -253,18 +199,12 @@ class Gateway:
             else:
                 self.ownership.received(name, heartbeat.robots[:MAX_ROBOTS], now)
         elif heartbeat is None:  # the will of an earlier connection
-            self._heartbeat_at = float("-inf")
-        elif heartbeat.run != self._run:
-            self._on_rival(heartbeat, message, now)
-        elif heartbeat.number in self._sent:
-            sent_at, robots = self._sent.pop(heartbeat.number)
-            self.ownership.came_back(sent_at, robots, now)
-        self._wake.set()
-
-    def _on_rival(self, heartbeat: GatewayHeartbeat, message: Message, now: float) -> None:
-        if not message.retain and heartbeat.run > self._run:
-            self._rival_at = now
+            self._heartbeats.repeat()
+        elif (sent := self._heartbeats.came_back(heartbeat)) is not None:
+            self.ownership.came_back(*sent, now)
+        elif not message.retain and self._heartbeats.yields_to(heartbeat, now):
             self._quiet_log.warning("rival", "another gateway is called %s: this one rests", self.ownership.me)
+        self._wake.set()
 
     def _on_stop(self, message: Message) -> None:
         if message.retain or self._stops.examine(Side.REMOTE, _STOP, message) is not Finding.PASS:

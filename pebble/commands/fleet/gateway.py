@@ -33,7 +33,8 @@ def gateway(file: FileArgument) -> int:
     from pebble.config.gateway_file import load_gateway
     from pebble.runtime.connections import gateway_transports
     from pebble.runtime.parent import Notifier, set_up_logging
-    from pebble.services.gateway.gateway import Gateway, will
+    from pebble.services.gateway.gateway import Gateway
+    from pebble.services.gateway.heartbeats import will
 
     settings, name, run_dir = load_gateway(file)
     set_up_logging("INFO")

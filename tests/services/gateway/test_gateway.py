@@ -11,7 +11,8 @@ import pytest
 
 from pebble.contract import ONLINE
 from pebble.services.gateway import gateway as module
-from pebble.services.gateway.gateway import Gateway, will
+from pebble.services.gateway.gateway import Gateway
+from pebble.services.gateway.heartbeats import will
 from pebble.services.gateway.ownership import TAKING_S
 from tests.forwarding.virtual import Connection, Hub
 from tests.services.mqtt_bridge.bridge_rig import Client
