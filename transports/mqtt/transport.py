@@ -77,7 +77,7 @@ class MqttTransport(Transport):
     @property
     def host(self) -> str:
         dialler = self._dialler
-        return str(dialler.turns.place) if len(dialler.places) > 1 and self._connection is not None else ""
+        return str(dialler.turns.place) if dialler.hosts.several and self._connection is not None else ""
 
     @property
     def outgoing(self) -> Outgoing:
@@ -259,7 +259,7 @@ class MqttTransport(Transport):
                 self._log(logging.INFO, f"connected to {connection.where}; before it {failed}")
             while not stopping.is_set():
                 receive = self._deliver_all if self._retention.current is None else self._deliver_and_note
-                connection.pump(self._dialler.patience_s, receive)
+                connection.pump(self._dialler.hosts.patience_s, receive)
                 if leaving := self._dialler.leave(self.idle_s):
                     self._leave(connection, leaving)
                 if self._renewal:
