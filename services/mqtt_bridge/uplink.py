@@ -23,7 +23,6 @@ POLL_S = 0.1
 _STATE_S, _STATES_S = 2.0, 10.0  # between two publications of the state at least, and at most
 _CROWDED_STATE_S = 1.0  # while a queue stands operators have to know soon how long it still is
 _CHANGE_S = 0.05  # a queue that has changed by less is the same, and by less than half a round trip
-_UNANSWERED_S = 0.5  # how often a question without an answer counts
 _CROWDED_DRIVE, _CROWDED_STREAMS = 2 / 3, 1 / 4  # of what is sent at a level, while a queue stands
 _PAUSE = 25  # so much longer on a thin link what can wait is spread
 _HEARTBEAT_BYTES = 80  # about
@@ -52,9 +51,9 @@ class Uplink:
         self._sieve = Sieve(self._takes, forwarder.counters, clock)
         self._quiet_log = RateLimitedLog(log, period_s=60.0)
         self._level, self._crowded = "", False  # that the others know; none yet
-        self._heartbeat_at = self._state_at = self._answered_at = self._flooded_at = -inf
+        self._heartbeat_at = self._state_at = self._flooded_at = -inf
         self._state_queue_s = 0.0
-        self._answers, self._shed = 0, 0
+        self._shed = 0
         remote.proof = address.topic
         self._suit_transport()
 
@@ -92,7 +91,7 @@ class Uplink:
         outgoing = self._remote.outgoing
         with self._guard:
             self._room.poll(outgoing.waiting, outgoing.round_trip_s, now)
-        self._measure(now)
+        self._meter.follow(self._remote.answer, now)
         if (self._meter.level, self._meter.crowded) != (self._level, self._crowded):
             self._suit()
         self._drop_late()
@@ -104,17 +103,6 @@ class Uplink:
         if (changed or now - self._state_at >= _STATES_S) and self._takes(Rank.STATE, _HEARTBEAT_BYTES):
             self._publish(now)
         return self.level.heartbeat_s > 0
-
-    def _measure(self, now: float) -> None:
-        answer = self._remote.answer
-        if answer is None:
-            self._answers = 0
-            self._meter.lost()
-        elif answer.number != self._answers or (
-            answer.seconds > _UNANSWERED_S and now - self._answered_at >= _UNANSWERED_S
-        ):
-            self._answers, self._answered_at = answer.number, now
-            self._meter.answered(answer.seconds, now, answer.queue_s)
 
     def _drop_late(self) -> None:
         """Who sends more commands than a thin link carries fills the broker's queue with them; a stop would wait there.
