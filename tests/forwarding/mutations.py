@@ -296,18 +296,18 @@ services/mqtt_bridge/link.py
 
 operators do not learn that a queue stands: test_thin.py::TestLevels
 services/mqtt_bridge/uplink.py
-- (_CROWDED_DRIVE if self._crowded else 1)
+- (_CROWDED_DRIVE if meter.crowded else 1)
 + 1
 
 streams fill a queue that stands: test_thin.py::TestLevels
 services/mqtt_bridge/uplink.py
-- (_CROWDED_STREAMS if self._crowded else 1)
+- (_CROWDED_STREAMS if self._meter.crowded else 1)
 + 1
 
 the level alone is looked at: test_thin.py::TestLevels
 services/mqtt_bridge/uplink.py
-- if (self._meter.level, self._meter.crowded) != (self._level, self._crowded):
-+ if self._meter.level != self._level:
+- return (self._meter.level, self._meter.crowded) != (self._level, self._crowded)
++ return self._meter.level != self._level
 
 who floods keeps the robot away: test_thin.py::TestFloods
 services/mqtt_bridge/uplink.py
