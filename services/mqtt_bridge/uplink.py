@@ -130,7 +130,7 @@ class Uplink:
         if self._report.is_outdated:
             self._suit(now)
         self._drop_late()
-        self._forwarder.send_waiting()
+        self._forwarder.sifter.send_waiting()
         self._report_shed()
         if self._report.is_due(now) and self._takes(Rank.STATE, _HEARTBEAT_BYTES):
             self._report.publish(now)
@@ -154,7 +154,7 @@ class Uplink:
         self._suit_transport()
         stream_hz = (self.level.stream_hz or 0.0) * (_CROWDED_STREAMS if self._meter.crowded else 1)
         self._sieve.stream_s = 1 / stream_hz if stream_hz else 0.0
-        self._forwarder.sift(None if self._meter.level == "wide" else self._sieve)
+        self._forwarder.sifter.use(None if self._meter.level == "wide" else self._sieve)
         self._report.publish(now)
 
     def _suit_transport(self) -> None:

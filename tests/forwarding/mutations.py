@@ -264,12 +264,12 @@ pebble/forwarding/sieve.py
 + return True
 
 streams go before states: test_thin.py::TestNoRoom
-pebble/forwarding/forwarder.py
+pebble/forwarding/sifter.py
 - self._send(self._sieve.due(Rank.STATE))
 + self._send(self._sieve.due(Rank.STREAM))
 
 what waits stays on a link that is wide again: test_thin.py::TestStreams
-pebble/forwarding/forwarder.py
+pebble/forwarding/sifter.py
 - self._send(before.empty())
 + pass
 
