@@ -55,6 +55,29 @@ class Routed(msgspec.Struct, frozen=True):
     by: str | None = None
 
 
+class Mirroring:
+    """Whether commands of the robot's own programs are forwarded as well: the flag remote-mirror."""
+
+    def __init__(self, sides: Sides) -> None:
+        self.on = False
+        self._sides, self._was_refused = sides, False
+
+    def switch(self, *, on: bool) -> None:
+        self.on, self._was_refused = on, on and self._was_refused
+
+    def is_possible(self) -> bool:
+        """A broker that sends our own commands back would repeat each one later: also after the stop."""
+        if all(one.transport.exact_echo for one in self._sides.values()):
+            return True
+        if not self._was_refused:
+            self._was_refused = True
+            log.error(
+                "remote-mirror is refused: a broker sends our own messages back; use one with bridge mode "
+                '(mosquitto), or protocol "5" on both sides'
+            )
+        return False
+
+
 class Forwarder:
     """Forwards between two transports.
 
@@ -92,7 +115,7 @@ class Forwarder:
         self.publisher = Publisher(self.sides, self.cycles, subjects, self.counters, both_ways, stored=rules.stored)
         self.retained = RetainedTopics(self.sides, subjects, self.publisher, winner, both_ways, on_value)
         self._quiet_log = RateLimitedLog(log, period_s=60.0)
-        self._mirroring = self._mirror_refused = False
+        self.mirroring = Mirroring(self.sides)
         self.sifter = Sifter(self.sides, self._pass)
         for transport in transports.values():
             transport.judge_topics(is_stop=self._is_stop)
@@ -100,14 +123,6 @@ class Forwarder:
     @property
     def gate(self) -> Gate:
         return self.sides.gate
-
-    @property
-    def mirroring(self) -> bool:
-        return self._mirroring
-
-    @mirroring.setter
-    def mirroring(self, on: bool) -> None:
-        self._mirroring, self._mirror_refused = on, on and self._mirror_refused
 
     def dropped(self) -> dict[str, int]:
         """How many messages did not pass, here or in a transport, because of a bound; by reason, like ``too_many``."""
@@ -212,7 +227,7 @@ class Forwarder:
             message = Message(message.topic, message.payload, message.qos)  # live: passes, and is retained nowhere
         if subject is None:
             return Drop.FOREIGN
-        side, mirroring = here.side, self._mirroring and self._may_mirror()
+        side, mirroring = here.side, self.mirroring.on and self.mirroring.is_possible()
         key = side, subject, message.qos, message.retain, message.retain_requested, mirroring
         forward = self._routes.get(key)
         if forward is None:
@@ -298,18 +313,6 @@ class Forwarder:
     def _is_stop(self, topic: str) -> bool:
         subject = self._subjects[topic] if self._names is None else self._names[topic].subject
         return subject is not None and subject.is_stop
-
-    def _may_mirror(self) -> bool:
-        """A broker that sends our own commands back would repeat each one later: also after the stop."""
-        if all(one.transport.exact_echo for one in self.sides.values()):
-            return True
-        if not self._mirror_refused:
-            self._mirror_refused = True
-            log.error(
-                "remote-mirror is refused: a broker sends our own messages back; use one with bridge mode "
-                '(mosquitto), or protocol "5" on both sides'
-            )
-        return False
 
     def _warn(self, drop: Drop, topic: str) -> None:
         self._quiet_log.warning(drop.name, "%s is not forwarded: %s", topic, drop.value)

@@ -316,11 +316,11 @@ class MqttBridge(ForwardingService):
 
     def _has_passed(self, message: Message) -> bool:
         """Whether this stop has come over the connection that stops have of their own."""
-        return self._stops is not None and not self.forwarder.mirroring and self._stops.is_copy(message)
+        return self._stops is not None and not self.forwarder.mirroring.on and self._stops.is_copy(message)
 
     def _pass_stop(self, message: Message) -> None:
         """Forward a stop of that connection. While the robot's own stops are mirrored, they come back there."""
-        if not self.forwarder.mirroring:
+        if not self.forwarder.mirroring.on:
             self._react(Side.REMOTE, message, self.forwarder.receive(Side.REMOTE, message))
 
     def _react(self, side: Side, message: Message, routed: Routed) -> None:
@@ -353,7 +353,7 @@ class MqttBridge(ForwardingService):
             reaction(payload)
 
     def _on_remote_mirror(self, payload: bytes) -> None:
-        self.forwarder.mirroring = self._boolean(REMOTE_MIRROR, payload)
+        self.forwarder.mirroring.switch(on=self._boolean(REMOTE_MIRROR, payload))
 
     def _on_media_flag(self, flag: Channel, payload: bytes) -> None:
         self.post_message(flag, partial(self._media.allow, flag, self._boolean(flag, payload)), newest_of=flag.metric)
