@@ -398,9 +398,9 @@ pebble/forwarding/command_ages.py
 + or False:
 
 a media flag is not gated: ../services/mqtt_bridge/test_bridge_media.py -k TestBridge
-services/mqtt_bridge/service.py
-- self.post_message(flag, partial(self._media.allow, flag, self._boolean(flag, payload)), newest_of=flag.metric)
-+ self.post_message(flag, partial(self._media.allow, flag, True), newest_of=flag.metric)
+services/mqtt_bridge/own_requests.py
+- self._post(flag, partial(self._media.allow, flag, self._boolean(flag, payload)), newest_of=flag.metric)
++ self._post(flag, partial(self._media.allow, flag, True), newest_of=flag.metric)
 """
 
 if __name__ == "__main__":
