@@ -70,6 +70,7 @@ class Subscription:
         self.dropped = 0  # messages lost because the handler was too slow
         self.refused = False  # by the other end, on the newest connection; its transport sets it (T21)
         self._transport, self._handler = transport, handler
+        self._count_delivered = transport.counters.adder("delivered")
         self._lock = threading.RLock()
         self._arrived = threading.Condition(self._lock)
         self._queue = BoundedQueue[Message](limit, QUEUE_BYTES)
@@ -134,7 +135,7 @@ class Subscription:
             self._call(message)
 
     def _call(self, message: Message) -> None:
-        self._transport.count_delivered()
+        self._count_delivered()
         try:
             self._handler(message)
         except Exception:  # a handler must not take the receiving thread down (T13)
@@ -240,9 +241,7 @@ class Transport(ABC):
             check_topic(will.topic)
         self.client_id, self.will = client_id, will
         self.counters = Counters()
-        self._count_sent, self.count_received, self.count_delivered = map(
-            self.counters.adder, ("sent", "received", "delivered")
-        )
+        self._count_sent, self.count_received = map(self.counters.adder, ("sent", "received"))
         #: One line that explains why there is no connection; empty while there is one.
         self.problem = ""
         self._state = State.CLOSED
