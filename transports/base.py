@@ -11,7 +11,6 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass
-from enum import Enum
 from types import TracebackType
 from typing import Self
 
@@ -21,6 +20,8 @@ from pebble.transports.counters import Counters
 from pebble.transports.message import Message as Message
 from pebble.transports.message import QoS as QoS
 from pebble.transports.own_retained import OwnRetained
+from pebble.transports.state import State as State
+from pebble.transports.state import StateChanges, Watcher
 from pebble.transports.topics import REMEMBERED_LENGTH, check_filter, check_topic, matches
 
 log = logging.getLogger(__name__)
@@ -33,12 +34,6 @@ _DELIVERED_TOPICS_BYTES = 4 << 20
 _HANDLER_END_S = 1.0  # how long closing waits for handlers that are running
 _TURN_S = 0.02  # how soon the end of a turn is noticed
 _WARNING_PERIOD_S = 5.0  # between two log lines about the same overflowing subscription
-
-
-class State(Enum):
-    CLOSED = "closed"
-    CONNECTING = "connecting"
-    CONNECTED = "connected"
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +58,6 @@ class Answer:
 
 
 Handler = Callable[[Message], None]
-Watcher = Callable[[State], None]
 
 
 class Subscription:
@@ -76,6 +70,7 @@ class Subscription:
         self.dropped = 0  # messages lost because the handler was too slow
         self.refused = False  # by the other end, on the newest connection; its transport sets it (T21)
         self._transport, self._handler = transport, handler
+        self._count_delivered = transport.counters.adder("delivered")
         self._lock = threading.RLock()
         self._arrived = threading.Condition(self._lock)
         self._queue = BoundedQueue[Message](limit, QUEUE_BYTES)
@@ -140,7 +135,7 @@ class Subscription:
             self._call(message)
 
     def _call(self, message: Message) -> None:
-        self._transport.count_delivered()
+        self._count_delivered()
         try:
             self._handler(message)
         except Exception:  # a handler must not take the receiving thread down (T13)
@@ -246,15 +241,11 @@ class Transport(ABC):
             check_topic(will.topic)
         self.client_id, self.will = client_id, will
         self.counters = Counters()
-        self._count_sent, self.count_received, self.count_delivered = map(
-            self.counters.adder, ("sent", "received", "delivered")
-        )
+        self._count_sent, self.count_received = map(self.counters.adder, ("sent", "received"))
         #: One line that explains why there is no connection; empty while there is one.
         self.problem = ""
         self._state = State.CLOSED
-        self._state_lock = threading.RLock()
-        self._connected = threading.Event()
-        self._watchers: list[Watcher] = []
+        self._changes = StateChanges(client_id)
         self._subscriptions = Subscriptions()
         self._publishing = threading.RLock()  # one publish at a time: the order of calls is the order per topic (T3)
         self._own = OwnRetained(self.counters)
@@ -310,7 +301,7 @@ class Transport(ABC):
 
     def on_state(self, watcher: Watcher) -> None:
         """Call ``watcher`` on every change of state, in order, on a thread of the transport: it must return at once."""
-        self._watchers.append(watcher)
+        self._changes.watch(watcher)
 
     def open(self, timeout: float = 5.0) -> Self:
         """Start connecting and wait up to ``timeout`` seconds for success.
@@ -327,14 +318,14 @@ class Transport(ABC):
         except TransportError:
             self._set_state(State.CLOSED)
             raise
-        connected = self._connected.wait(timeout)
+        connected = self._changes.await_connected(timeout)
         while timeout and not connected and self.untried and self.state is State.CONNECTING:
-            connected = self._connected.wait(_TURN_S)
+            connected = self._changes.await_connected(_TURN_S)
         return self
 
     def close(self) -> None:
         """Disconnect and free all resources. The will is published here too, so that others receive it either way."""
-        with self._state_lock:
+        with self._changes.lock:
             if self._state is State.CLOSED:
                 return
             connected = self._state is State.CONNECTED
@@ -437,22 +428,14 @@ class Transport(ABC):
 
     def _set_state(self, state: State) -> None:
         """Notify the watchers, once per change. A closed transport stays closed unless it is opened again."""
-        with self._state_lock:
+        with self._changes.lock:
             if state is self._state or (self._state is State.CLOSED and state is State.CONNECTED):
                 return
             if state is State.CONNECTED:
                 self.problem = ""
                 self.counters.add("connected")
             self._state = state
-            if state is State.CONNECTED:
-                self._connected.set()
-            else:
-                self._connected.clear()
-            for watcher in list(self._watchers):
-                try:
-                    watcher(state)
-                except Exception:  # foreign code on our thread
-                    log.exception("a state watcher of %s failed", self.client_id)
+            self._changes.tell(state)
 
     def _renew(self) -> None:
         """Backends call this when a new connection begins, before its first message is offered."""

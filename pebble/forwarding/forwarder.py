@@ -11,10 +11,9 @@ waited, in a process that was stopped or stuck, or at the broker; what only ends
 
 import itertools
 import logging
-import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 
 import msgspec
 
@@ -28,7 +27,7 @@ from pebble.forwarding.publisher import Publisher
 from pebble.forwarding.retained_topics import RetainedTopics
 from pebble.forwarding.routing import Drop, Forward, Rules, Side, route
 from pebble.forwarding.side import Gate, Sides, SideState
-from pebble.forwarding.sieve import Rank, Sieve, Waiting
+from pebble.forwarding.sifter import Sifter
 from pebble.forwarding.signatures import unsigned
 from pebble.forwarding.subjects import Subject, Subjects
 from pebble.runtime.rate_limit import RateLimitedLog
@@ -54,6 +53,29 @@ class Routed(msgspec.Struct, frozen=True):
     subject: Subject | None
     outcome: Forward | Drop
     by: str | None = None
+
+
+class Mirroring:
+    """Whether commands of the robot's own programs are forwarded as well: the flag remote-mirror."""
+
+    def __init__(self, sides: Sides) -> None:
+        self.on = False
+        self._sides, self._was_refused = sides, False
+
+    def switch(self, *, on: bool) -> None:
+        self.on, self._was_refused = on, on and self._was_refused
+
+    def is_possible(self) -> bool:
+        """A broker that sends our own commands back would repeat each one later: also after the stop."""
+        if all(one.transport.exact_echo for one in self._sides.values()):
+            return True
+        if not self._was_refused:
+            self._was_refused = True
+            log.error(
+                "remote-mirror is refused: a broker sends our own messages back; use one with bridge mode "
+                '(mosquitto), or protocol "5" on both sides'
+            )
+        return False
 
 
 class Forwarder:
@@ -93,24 +115,14 @@ class Forwarder:
         self.publisher = Publisher(self.sides, self.cycles, subjects, self.counters, both_ways, stored=rules.stored)
         self.retained = RetainedTopics(self.sides, subjects, self.publisher, winner, both_ways, on_value)
         self._quiet_log = RateLimitedLog(log, period_s=60.0)
-        self._mirroring = self._mirror_refused = False
-        self._sieve: Sieve | None = None
-        self._sifting = threading.RLock()  # so that a message which has waited is not sent after a newer one
-        self._forward = self._pass
+        self.mirroring = Mirroring(self.sides)
+        self.sifter = Sifter(self.sides, self._pass)
         for transport in transports.values():
             transport.judge_topics(is_stop=self._is_stop)
 
     @property
     def gate(self) -> Gate:
         return self.sides.gate
-
-    @property
-    def mirroring(self) -> bool:
-        return self._mirroring
-
-    @mirroring.setter
-    def mirroring(self, on: bool) -> None:
-        self._mirroring, self._mirror_refused = on, on and self._mirror_refused
 
     def dropped(self) -> dict[str, int]:
         """How many messages did not pass, here or in a transport, because of a bound; by reason, like ``too_many``."""
@@ -149,46 +161,6 @@ class Forwarder:
             self.sides[Side.REMOTE].restarted = True
             self.sides.gate = Gate.WAITING
 
-    # -- a thin link
-
-    def sift(self, sieve: Sieve | None) -> None:
-        """From now on what leaves the robot passes ``sieve``, whose owner calls :meth:`send_waiting`; None: no more."""
-        with self._sifting:
-            before, self._sieve = self._sieve, sieve
-            self._forward = self._pass if sieve is None else self._sift
-            self.sides[Side.REMOTE].events.has_room = None if sieve is None else sieve.takes_event
-            if before is not None and sieve is None:
-                self._send(before.empty())
-                self.sides[Side.REMOTE].events.resume()
-
-    def send_waiting(self) -> None:
-        """Send what waits in the sieve, as far as there is room."""
-        with self._sifting:
-            if self._sieve is not None:
-                self._send(self._sieve.due(Rank.STATE))
-                self.sides[Side.REMOTE].events.resume()
-                self._send(self._sieve.due(Rank.STREAM))
-
-    def _send(self, waiting: Iterable[Waiting]) -> None:
-        here = self.sides[Side.LOCAL]
-        for one in waiting:
-            if isinstance(self._pass(here, one.subject, one.message, one.forward), Forward):
-                here.count_forwarded()
-
-    def _sift(
-        self, here: SideState, subject: Subject, message: Message, forward: Forward, account: str = ""
-    ) -> Forward | Drop:
-        """Like :meth:`_pass`, where the link is thin."""
-        if here.side is not Side.LOCAL or subject.prompt:
-            return self._pass(here, subject, message, forward, account)
-        with self._sifting:
-            sieve = self._sieve
-            if sieve is None or self.sides.gate is not Gate.OPEN:
-                return self._pass(here, subject, message, forward, account)
-            if sieve.keeps(subject, message, forward):
-                return Drop.NO_ROOM
-            return self._pass(here, subject, message, forward, account)
-
     # -- the receiving threads
 
     def skips_retained(self, side: Side, topic: bytes) -> bool:
@@ -212,7 +184,7 @@ class Forwarder:
             subject = self._subjects[message.topic]
             outcome = self._admit(here, subject, message, message.topic, True)
             if subject is not None and isinstance(outcome, Forward):
-                outcome = self._forward(here, subject, message, outcome)
+                outcome = self.sifter.forward(here, subject, message, outcome)
             routed = Routed(subject, outcome)
         if isinstance(routed.outcome, Drop):
             self.counters.add(f"{side.value}: {routed.outcome.value}")
@@ -255,7 +227,7 @@ class Forwarder:
             message = Message(message.topic, message.payload, message.qos)  # live: passes, and is retained nowhere
         if subject is None:
             return Drop.FOREIGN
-        side, mirroring = here.side, self._mirroring and self._may_mirror()
+        side, mirroring = here.side, self.mirroring.on and self.mirroring.is_possible()
         key = side, subject, message.qos, message.retain, message.retain_requested, mirroring
         forward = self._routes.get(key)
         if forward is None:
@@ -341,18 +313,6 @@ class Forwarder:
     def _is_stop(self, topic: str) -> bool:
         subject = self._subjects[topic] if self._names is None else self._names[topic].subject
         return subject is not None and subject.is_stop
-
-    def _may_mirror(self) -> bool:
-        """A broker that sends our own commands back would repeat each one later: also after the stop."""
-        if all(one.transport.exact_echo for one in self.sides.values()):
-            return True
-        if not self._mirror_refused:
-            self._mirror_refused = True
-            log.error(
-                "remote-mirror is refused: a broker sends our own messages back; use one with bridge mode "
-                '(mosquitto), or protocol "5" on both sides'
-            )
-        return False
 
     def _warn(self, drop: Drop, topic: str) -> None:
         self._quiet_log.warning(drop.name, "%s is not forwarded: %s", topic, drop.value)

@@ -68,7 +68,7 @@ class ForwardingService(Service, ABC):
         forwarder = self.forwarder
         return Status(
             gate=forwarder.gate,
-            mirroring=forwarder.mirroring,
+            mirroring=forwarder.mirroring.on,
             synchronized=frozenset(filter(forwarder.retained.synchronized, Side)),
             circulating=frozenset(forwarder.cycles.closed_ways),
             epoch=self.epoch,

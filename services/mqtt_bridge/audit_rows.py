@@ -2,10 +2,15 @@
 
 from typing import Any
 
+from pebble.contract.names import NO_ACCOUNT
+from pebble.motion.lease import shown
+
 ACCOUNTS = 100  # that have rows of their own
 WAITING = 1000  # rows that are not written yet
 OTHERS = "(others)"  # in place of an account, like
 ROBOT = "(robot)"  # a program of the robot: no account has such a name
+UNKNOWN = "?"  # in place of an account: the name was not checked
+_NAME = 40  # characters of a sender
 _HOLD_S = 0.3  # a stop comes on two topics: what the second one tells is still put into the row
 
 Row = dict[str, Any]
@@ -99,3 +104,13 @@ class AuditRows:
                 self._fill(room, now)
             if all(room.merged is None and room.left >= self._burst for room in rooms.values()):
                 del self._rooms[account]
+
+
+def sender(by: str | None, claim: object) -> tuple[str, str]:
+    """Who to show, and whose quota it is."""
+    name = shown(claim.rstrip(UNKNOWN), _NAME) if isinstance(claim, str) else ""  # a motor owner shows it marked
+    if by == ROBOT:
+        return f"{ROBOT}/{name}" if name else ROBOT, ROBOT
+    if by is None or by == NO_ACCOUNT:
+        return f"{name}{UNKNOWN}", UNKNOWN
+    return by, by.partition("/")[0]

@@ -10,9 +10,11 @@ from msgspec import Struct
 from pebble.contract.payloads import LinkLevel
 from pebble.forwarding.sieve import Rank
 from pebble.media.in_flight import InFlight
+from pebble.transports import Answer
 
 _ORDER: tuple[LinkLevel, ...] = ("wide", "narrow", "thin")
 _LITTLE_KBIT = 32.0  # less does not carry the commands and heartbeats of a robot on a wide link
+_UNANSWERED_S = 0.5  # how often a question without an answer counts
 _REST_S = 0.05  # a shorter queue is none
 _STANDING_S, _STANDS_S = 0.3, 1.5  # a queue that is longer for so long does not drain by itself: as much comes as goes
 _DRAINED_S, _DRAINED_FOR_S = 0.1, 5.0  # one that is shorter for so long has drained
@@ -89,6 +91,7 @@ class LinkMeter:
         self.level: LinkLevel = "thin" if thin else "wide"
         self.queue_s = 0.0
         self._fixed = thin or profile != "auto"
+        self._answers, self._answered_at = 0, float("-inf")  # of this connection, and when one counted last
         self._shortest = ShortestTrip()
         self._newest: deque[float] = deque(maxlen=3)  # queues, at this level
         self._rise_s = {level: rule.rise_s for level, rule in _RULES.items()}
@@ -105,6 +108,16 @@ class LinkMeter:
     def round_trip_s(self) -> float:
         return self._shortest.seconds
 
+    def follow(self, answer: Answer | None, now: float) -> None:
+        """What the connection knows of its newest question: an answer counts once, its absence again and again."""
+        if answer is None:
+            self.lost()
+        elif answer.number != self._answers or (
+            answer.seconds > _UNANSWERED_S and now - self._answered_at >= _UNANSWERED_S
+        ):
+            self._answers, self._answered_at = answer.number, now
+            self.answered(answer.seconds, now, answer.queue_s)
+
     def answered(self, seconds: float, now: float, tcp_queue_s: float | None = None) -> None:
         """An answer took so long. ``tcp_queue_s``: by so much TCP's own round trips exceed the shortest one."""
         self._shortest.note(seconds, now)
@@ -117,6 +130,7 @@ class LinkMeter:
 
     def lost(self) -> None:
         """The connection is lost: what is measured next does not follow what was measured."""
+        self._answers = 0
         self._crowd = Crowd()
         self._forget()
 

@@ -1,15 +1,11 @@
 """The bridge as a process: forwarding, heartbeat, same-broker probe, system actions and media requests."""
 
-from collections.abc import Callable
-from contextlib import suppress
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from pebble.contract import AUDIT_READ, BRIDGE_PROBE, DRIVE, ESTOP, LINK, ONLINE, REMOTE_MIRROR, Channel, codec
 from pebble.contract.levels import LEVELS
 from pebble.contract.names import with_name
-from pebble.contract.payloads import SCRIPT, AuditRead, Drive, MediaRequest
-from pebble.errors import PayloadError
 from pebble.forwarding.forwarder import Routed, barrier
 from pebble.forwarding.names import Names
 from pebble.forwarding.retained_window import INITIAL_SYNC_S
@@ -18,16 +14,17 @@ from pebble.forwarding.service import ForwardingService
 from pebble.forwarding.side import Gate
 from pebble.forwarding.subjects import Subject
 from pebble.runtime.connections import remote_transport, stops_transport
-from pebble.runtime.parent import Notifier, earlier_requests
+from pebble.runtime.parent import Notifier
 from pebble.runtime.service import every
 from pebble.runtime.timers import Timer
-from pebble.services.mqtt_bridge.actions import ACTIONS, SystemActions
+from pebble.services.mqtt_bridge.actions import ACTIONS
 from pebble.services.mqtt_bridge.audit import Audit
 from pebble.services.mqtt_bridge.audit_rows import ROBOT
 from pebble.services.mqtt_bridge.heartbeat import Heartbeat
 from pebble.services.mqtt_bridge.leftovers import Leftovers
-from pebble.services.mqtt_bridge.media import MEDIA, Hold, Media, MediaRequests
+from pebble.services.mqtt_bridge.media import MEDIA
 from pebble.services.mqtt_bridge.motor_owners import CHECK_S, MotorOwners
+from pebble.services.mqtt_bridge.own_requests import OwnRequests
 from pebble.services.mqtt_bridge.private_topics import PrivateTopics
 from pebble.services.mqtt_bridge.same_broker import SameBrokerProbe, now_ms
 from pebble.services.mqtt_bridge.uplink import POLL_S, Uplink
@@ -67,10 +64,7 @@ class MqttBridge(ForwardingService):
         section = self.config.services.mqtt_bridge
         self._heartbeat = Heartbeat(self.addresses[ONLINE]) if section.heartbeat.enabled else None
         self._same_broker = SameBrokerProbe(self.config, self.transport, self.remote, self.clock)
-        self._actions = SystemActions(section, folder=self.config.state_dir(), clock=self.clock)
         notifier = Notifier()
-        self._media = MediaRequests(Media(self.config.on_demand_programs(), earlier_requests()), notifier.request)
-        self._hold = Hold(self.config.on_demand_programs(), notifier.hold)
         owners = map(self.config.motor_owner, self.config.motor_lines())
         self._owners = MotorOwners(self.config.base, owners, notifier)
         self._audit = Audit(self.config, self.remote, self.clock)
@@ -78,6 +72,7 @@ class MqttBridge(ForwardingService):
         self._uplink: Uplink | None = None
         if section.link.profile != "wide":
             self._uplink = Uplink(section, self.addresses[LINK], self.remote, self.forwarder, self.clock)
+        self._requests = OwnRequests(self, self._audit.ask, self.forwarder.mirroring, notifier, self._uplink)
         own, sparing = ((), False) if self._uplink is None else ((LINK,), True)
         self._leftovers = Leftovers(self.config.base, self.subjects, self.remote, *own, sparing=sparing)
         self._leftover_timer: Timer | None = None
@@ -85,29 +80,12 @@ class MqttBridge(ForwardingService):
         self._stops = self._make_stops()
         self.transport.judge_topics(is_invented=lambda topic: self.subjects.invented(topic.encode()) is not None)
         self.remote.judge_topics(skips_retained=partial(self.forwarder.skips_retained, Side.REMOTE), delivers_late=True)
-        #: What the bridge itself does about a message, and about a flag's value, by channel.
-        self._message_reactions: dict[str, Callable[[bytes], None]] = {
-            **{row.request.suffix: partial(self._on_media_request, row.request) for row in MEDIA},
-            **{row.channel.suffix: partial(self._on_action, row.channel) for row in ACTIONS},
-            AUDIT_READ.suffix: self._on_audit_read,
-        }
-        self._moved_at = self.clock()  # of the newest command that moves something
-        if section.link.profile != "wide" or section.remote_mqtt.hosts:
-            self._message_reactions[DRIVE.suffix] = self._on_drive
-        self.remote.idle_s = lambda: self.clock() - self._moved_at
-        self._flag_reactions: dict[str, Callable[[bytes], None]] = {
-            **{row.flag.suffix: partial(self._on_media_flag, row.flag) for row in MEDIA},
-            REMOTE_MIRROR.suffix: self._on_remote_mirror,
-        }
+        self.remote.idle_s = self._requests.idle_s
 
     @property
     def winner(self) -> Side:
         """Where names are checked, nothing on the remote side but the robot itself can have left a flag there."""
         return Side.LOCAL if self.config.security.named else Side.REMOTE
-
-    @property
-    def _is_thin(self) -> bool:
-        return self._uplink is not None and self._uplink.level is LEVELS["thin"]
 
     @property
     def _stop_filters(self) -> list[str]:
@@ -263,13 +241,9 @@ class MqttBridge(ForwardingService):
         self._check_brokers()
         self.check_later()
 
-    def _run_action(self, channel: Channel) -> None:
-        self.counters.add("actions" if self._actions.request(channel) else "actions_refused")
-
     @every(_RETRY_S)
     def _send_media_requests(self) -> None:
-        self._media.send()
-        self._hold.send(self.clock())
+        self._requests.send()
 
     @every(CHECK_S)
     def _check_owners(self) -> None:
@@ -316,11 +290,11 @@ class MqttBridge(ForwardingService):
 
     def _has_passed(self, message: Message) -> bool:
         """Whether this stop has come over the connection that stops have of their own."""
-        return self._stops is not None and not self.forwarder.mirroring and self._stops.is_copy(message)
+        return self._stops is not None and not self.forwarder.mirroring.on and self._stops.is_copy(message)
 
     def _pass_stop(self, message: Message) -> None:
         """Forward a stop of that connection. While the robot's own stops are mirrored, they come back there."""
-        if not self.forwarder.mirroring:
+        if not self.forwarder.mirroring.on:
             self._react(Side.REMOTE, message, self.forwarder.receive(Side.REMOTE, message))
 
     def _react(self, side: Side, message: Message, routed: Routed) -> None:
@@ -333,7 +307,7 @@ class MqttBridge(ForwardingService):
         if not local and isinstance(routed.outcome, Drop):
             self._audit.drop(routed.outcome, routed.by)
         if routed.outcome is Drop.STALE:
-            if channel is None or not (local and self._actions.accepts_retained(channel)):
+            if channel is None or not (local and self._requests.actions.accepts_retained(channel)):
                 self.refusals.stale("a command" if channel is None else channel.metric)
                 return
         elif not isinstance(routed.outcome, Forward) and (routed.outcome in _IGNORED or not local):
@@ -343,54 +317,8 @@ class MqttBridge(ForwardingService):
         if not message.retain and routed.outcome is not Drop.KNOWN:
             own = local and self.forwarder.gate is Gate.OPEN
             self._audit.passed(channel, ROBOT if own else routed.by, message.payload)
-        reaction = self._message_reactions.get(channel.suffix)
-        if reaction is not None:
-            reaction(message.payload)
+        self._requests.message(channel, message.payload)
 
     def on_value(self, subject: Subject, payload: bytes) -> None:
-        reaction = self._flag_reactions.get(subject.channel.suffix) if subject.channel is not None else None
-        if reaction is not None:
-            reaction(payload)
-
-    def _on_remote_mirror(self, payload: bytes) -> None:
-        self.forwarder.mirroring = self._boolean(REMOTE_MIRROR, payload)
-
-    def _on_media_flag(self, flag: Channel, payload: bytes) -> None:
-        self.post_message(flag, partial(self._media.allow, flag, self._boolean(flag, payload)), newest_of=flag.metric)
-
-    def _on_media_request(self, channel: Channel, payload: bytes) -> None:
-        try:
-            request: MediaRequest = codec.decode(channel, payload)
-        except PayloadError as error:
-            self.refusals.malformed(channel, error)
-        else:
-            self.post_message(channel, partial(self._media.request, channel, request), newest_of=channel.metric)
-
-    def _on_drive(self, payload: bytes) -> None:
-        """On a thin link pictures and sound wait while a person drives; who the robot obeys is decided elsewhere."""
-        with suppress(PayloadError):
-            command: Drive = codec.decode(DRIVE, payload)
-            if command.moves:
-                self._moved_at = self.clock()
-            if self._is_thin and command.moves and command.source != SCRIPT:
-                self.post_message(DRIVE, lambda: self._hold.drive(self.clock()), newest_of="hold")
-
-    def _on_audit_read(self, payload: bytes) -> None:
-        try:
-            request: AuditRead = codec.decode(AUDIT_READ, payload)
-        except PayloadError as error:
-            self.refusals.malformed(AUDIT_READ, error)
-        else:
-            self._audit.ask(request)
-
-    def _on_action(self, channel: Channel, payload: bytes) -> None:
-        if self._boolean(channel, payload):
-            self.post_message(channel, partial(self._run_action, channel), newest_of=channel.metric)
-
-    def _boolean(self, channel: Channel, payload: bytes) -> bool:
-        """The value of a boolean control; an empty payload (a removed flag) and a malformed one are false."""
-        try:
-            return bool(payload) and bool(codec.decode(channel, payload))
-        except PayloadError as error:
-            self.refusals.malformed(channel, error)
-            return False
+        if subject.channel is not None:
+            self._requests.flag(subject.channel, payload)

@@ -23,13 +23,48 @@ POLL_S = 0.1
 _STATE_S, _STATES_S = 2.0, 10.0  # between two publications of the state at least, and at most
 _CROWDED_STATE_S = 1.0  # while a queue stands operators have to know soon how long it still is
 _CHANGE_S = 0.05  # a queue that has changed by less is the same, and by less than half a round trip
-_UNANSWERED_S = 0.5  # how often a question without an answer counts
 _CROWDED_DRIVE, _CROWDED_STREAMS = 2 / 3, 1 / 4  # of what is sent at a level, while a queue stands
 _PAUSE = 25  # so much longer on a thin link what can wait is spread
 _HEARTBEAT_BYTES = 80  # about
 _LATE, _LATE_S = 8, 1.5  # commands, and since when all of them were late: the broker holds more of the kind
 _FLOODED_S = 60.0  # after what was done about it
 RENEW_S = 30.0  # between two connections that are renewed for it, at least: who floods must not keep the robot away
+
+
+class LinkReport:
+    """The retained state by which others know what the link carries: a change of level at once, of its queue soon."""
+
+    def __init__(self, meter: LinkMeter, address: Address, remote: Transport) -> None:
+        self._meter, self._address, self._remote = meter, address, remote
+        self._level, self._crowded, self._queue_s = "", False, 0.0  # that the others know; none yet
+        self._at = -inf
+
+    @property
+    def is_outdated(self) -> bool:
+        """Whether the others have to act otherwise."""
+        return (self._meter.level, self._meter.crowded) != (self._level, self._crowded)
+
+    def is_due(self, now: float) -> bool:
+        """Whether its figures have changed enough, or are old."""
+        change_s = abs(self._meter.queue_s - self._queue_s)
+        state_s = _CROWDED_STATE_S if self._crowded else _STATE_S
+        changed = now - self._at >= state_s and change_s >= max(_CHANGE_S, self._meter.round_trip_s / 2)
+        return changed or now - self._at >= _STATES_S
+
+    def publish(self, now: float) -> None:
+        """A retained message: without a connection it is sent at the next one."""
+        meter, before = self._meter, self._level
+        self._level, self._crowded, self._queue_s, self._at = meter.level, meter.crowded, meter.queue_s, now
+        trip_ms, queue_ms = round(1000 * meter.round_trip_s), round(1000 * meter.queue_s)
+        if before not in ("", meter.level):
+            log.info(
+                "the link to the remote broker is %s now (it was %s): a round trip of %d ms, and %d ms of queue",
+                meter.level, before, trip_ms, queue_ms
+            )  # fmt: skip
+        drive_hz = round(LEVELS[meter.level].drive_hz * (_CROWDED_DRIVE if meter.crowded else 1), 2)
+        state = LinkState(level=meter.level, drive_hz=drive_hz, rtt_ms=trip_ms, queue_ms=queue_ms, t=now_ms())
+        address = self._address
+        self._remote.publish(address.topic, codec.encode(LINK, state), qos=QoS(address.qos), retain=address.retain)
 
 
 class Uplink:
@@ -43,18 +78,17 @@ class Uplink:
         forwarder: Forwarder,
         clock: Callable[[], float],
     ) -> None:
-        self._address, self._remote, self._forwarder, self._clock = address, remote, forwarder, clock
+        self._remote, self._forwarder, self._clock = remote, forwarder, clock
         #: QoS 0 saves acknowledgements of MQTT; Zenoh has none, and may deliver the two in another order.
         self._saves_acks = section.remote is None or section.remote.kind == "mqtt"
         self._heartbeat_s = section.heartbeat.interval_seconds
         self._meter, self._room = LinkMeter(section.link.profile, section.link.kbit), Room(section.link.kbit)
+        self._report = LinkReport(self._meter, address, remote)
         self._guard = threading.Lock()  # of the room: messages take it on the thread that received them
         self._sieve = Sieve(self._takes, forwarder.counters, clock)
         self._quiet_log = RateLimitedLog(log, period_s=60.0)
-        self._level, self._crowded = "", False  # that the others know; none yet
-        self._heartbeat_at = self._state_at = self._answered_at = self._flooded_at = -inf
-        self._state_queue_s = 0.0
-        self._answers, self._shed = 0, 0
+        self._heartbeat_at = self._flooded_at = -inf
+        self._shed = 0
         remote.proof = address.topic
         self._suit_transport()
 
@@ -92,29 +126,15 @@ class Uplink:
         outgoing = self._remote.outgoing
         with self._guard:
             self._room.poll(outgoing.waiting, outgoing.round_trip_s, now)
-        self._measure(now)
-        if (self._meter.level, self._meter.crowded) != (self._level, self._crowded):
-            self._suit()
+        self._meter.follow(self._remote.answer, now)
+        if self._report.is_outdated:
+            self._suit(now)
         self._drop_late()
-        self._forwarder.send_waiting()
+        self._forwarder.sifter.send_waiting()
         self._report_shed()
-        change_s = abs(self._meter.queue_s - self._state_queue_s)
-        state_s = _CROWDED_STATE_S if self._crowded else _STATE_S
-        changed = now - self._state_at >= state_s and change_s >= max(_CHANGE_S, self._meter.round_trip_s / 2)
-        if (changed or now - self._state_at >= _STATES_S) and self._takes(Rank.STATE, _HEARTBEAT_BYTES):
-            self._publish(now)
+        if self._report.is_due(now) and self._takes(Rank.STATE, _HEARTBEAT_BYTES):
+            self._report.publish(now)
         return self.level.heartbeat_s > 0
-
-    def _measure(self, now: float) -> None:
-        answer = self._remote.answer
-        if answer is None:
-            self._answers = 0
-            self._meter.lost()
-        elif answer.number != self._answers or (
-            answer.seconds > _UNANSWERED_S and now - self._answered_at >= _UNANSWERED_S
-        ):
-            self._answers, self._answered_at = answer.number, now
-            self._meter.answered(answer.seconds, now, answer.queue_s)
 
     def _drop_late(self) -> None:
         """Who sends more commands than a thin link carries fills the broker's queue with them; a stop would wait there.
@@ -124,39 +144,21 @@ class Uplink:
         """
         late, now = self._forwarder.ages.late, self._clock()
         since_s = now - self._flooded_at
-        if self._level == "thin" and late.count >= _LATE and late.seconds(now) >= _LATE_S and since_s >= RENEW_S:
+        if self._meter.level == "thin" and late.count >= _LATE and late.seconds(now) >= _LATE_S and since_s >= RENEW_S:
             late.count = 0
             self._flooded_at = now
             self._remote.renew_connection("only late commands come over a thin link: those that wait there are dropped")
 
-    def _suit(self) -> None:
+    def _suit(self, now: float) -> None:
         """The level is another one, or a queue begins or ends to stand."""
-        before, self._level, self._crowded = self._level, self._meter.level, self._meter.crowded
         self._suit_transport()
-        stream_hz = (self.level.stream_hz or 0.0) * (_CROWDED_STREAMS if self._crowded else 1)
+        stream_hz = (self.level.stream_hz or 0.0) * (_CROWDED_STREAMS if self._meter.crowded else 1)
         self._sieve.stream_s = 1 / stream_hz if stream_hz else 0.0
-        self._forwarder.sift(None if self._level == "wide" else self._sieve)
-        if before not in ("", self._level):
-            log.info(
-                "the link to the remote broker is %s now (it was %s): a round trip of %d ms, and %d ms of queue",
-                self._level, before, *self._milliseconds()
-            )  # fmt: skip
-        self._publish(self._clock())
+        self._forwarder.sifter.use(None if self._meter.level == "wide" else self._sieve)
+        self._report.publish(now)
 
     def _suit_transport(self) -> None:
         self._remote.suit_link(slow=self._meter.level != "wide")
-
-    def _publish(self, now: float) -> None:
-        """A retained message: without a connection it is sent at the next one."""
-        self._state_at, self._state_queue_s = now, self._meter.queue_s
-        trip_ms, queue_ms = self._milliseconds()
-        drive_hz = round(self.level.drive_hz * (_CROWDED_DRIVE if self._crowded else 1), 2)
-        state = LinkState(level=self._meter.level, drive_hz=drive_hz, rtt_ms=trip_ms, queue_ms=queue_ms, t=now_ms())
-        address = self._address
-        self._remote.publish(address.topic, codec.encode(LINK, state), qos=QoS(address.qos), retain=address.retain)
-
-    def _milliseconds(self) -> tuple[int, int]:
-        return round(1000 * self._meter.round_trip_s), round(1000 * self._meter.queue_s)
 
     def _takes(self, rank: Rank, size: int) -> bool:
         with self._guard:

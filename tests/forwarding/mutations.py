@@ -264,12 +264,12 @@ pebble/forwarding/sieve.py
 + return True
 
 streams go before states: test_thin.py::TestNoRoom
-pebble/forwarding/forwarder.py
+pebble/forwarding/sifter.py
 - self._send(self._sieve.due(Rank.STATE))
 + self._send(self._sieve.due(Rank.STREAM))
 
 what waits stays on a link that is wide again: test_thin.py::TestStreams
-pebble/forwarding/forwarder.py
+pebble/forwarding/sifter.py
 - self._send(before.empty())
 + pass
 
@@ -296,18 +296,18 @@ services/mqtt_bridge/link.py
 
 operators do not learn that a queue stands: test_thin.py::TestLevels
 services/mqtt_bridge/uplink.py
-- (_CROWDED_DRIVE if self._crowded else 1)
+- (_CROWDED_DRIVE if meter.crowded else 1)
 + 1
 
 streams fill a queue that stands: test_thin.py::TestLevels
 services/mqtt_bridge/uplink.py
-- (_CROWDED_STREAMS if self._crowded else 1)
+- (_CROWDED_STREAMS if self._meter.crowded else 1)
 + 1
 
 the level alone is looked at: test_thin.py::TestLevels
 services/mqtt_bridge/uplink.py
-- if (self._meter.level, self._meter.crowded) != (self._level, self._crowded):
-+ if self._meter.level != self._level:
+- return (self._meter.level, self._meter.crowded) != (self._level, self._crowded)
++ return self._meter.level != self._level
 
 who floods keeps the robot away: test_thin.py::TestFloods
 services/mqtt_bridge/uplink.py
@@ -398,9 +398,9 @@ pebble/forwarding/command_ages.py
 + or False:
 
 a media flag is not gated: ../services/mqtt_bridge/test_bridge_media.py -k TestBridge
-services/mqtt_bridge/service.py
-- self.post_message(flag, partial(self._media.allow, flag, self._boolean(flag, payload)), newest_of=flag.metric)
-+ self.post_message(flag, partial(self._media.allow, flag, True), newest_of=flag.metric)
+services/mqtt_bridge/own_requests.py
+- self._post(flag, partial(self._media.allow, flag, self._boolean(flag, payload)), newest_of=flag.metric)
++ self._post(flag, partial(self._media.allow, flag, True), newest_of=flag.metric)
 """
 
 if __name__ == "__main__":

@@ -98,7 +98,7 @@ def bridge(
     clients = {Side.LOCAL: Client(local), Side.REMOTE: Client(remote)}
     subjects, clock = Subjects(make_config()), local.network.clock
     forwarder = Forwarder(subjects, rules, dict(clients), winner=Side.REMOTE, names=names, clock=clock)
-    forwarder.mirroring = mirroring
+    forwarder.mirroring.switch(on=mirroring)
     leaving = (f"{BASE}/incoming/#", f"{BASE}/outgoing/#")
     entering = leaving[:1] if rules.leaves_robot else leaving
     for side, filters in ((Side.LOCAL, leaving), (Side.REMOTE, entering)):

@@ -370,7 +370,7 @@ _MOTORS = "pebble.services.serial_mcu_bridge"
 #: Of the sieve alone tests/forwarding/test_sieve.py has more.
 MUTATIONS = {
     "confirmations wait like other states": Mutation(
-        f"{_FORWARDING}.forwarder", "Side.LOCAL or subject.prompt:", "Side.LOCAL or subject.drives:"
+        f"{_FORWARDING}.sifter", "Side.LOCAL or subject.prompt:", "Side.LOCAL or subject.drives:"
     ),
     "there is always room": Mutation(f"{_BRIDGE}.link", "        return fits\n", "        return True\n"),
     "what is sent takes no room": Mutation(
@@ -382,7 +382,7 @@ MUTATIONS = {
         "        self._waiting[topic] = Waiting(rank, subject, message, forward, since)\n",
         "        self._waiting.setdefault(topic, Waiting(rank, subject, message, forward, since))\n",
     ),
-    "nothing that waits is sent": Mutation(f"{_BRIDGE}.uplink", "        self._forwarder.send_waiting()\n", ""),
+    "nothing that waits is sent": Mutation(f"{_BRIDGE}.uplink", "        self._forwarder.sifter.send_waiting()\n", ""),
     "a stop leaves the wheels turning": Mutation(
         f"{_MOTORS}.text.motor_bridge",
         "        for stop in batch.stops:\n            self._halt()\n",

@@ -3,13 +3,16 @@
 import logging
 import os
 import threading
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from pebble.transports.hosts import Place
+from pebble.transports.hosts import Address, Place, addresses_of
+from pebble.transports.settings import MqttSettings
 
 log = logging.getLogger(__name__)
 
+_LOOK_S, _IDLE_S = 1.0, 60.0  # the connection wakes up earlier, for its pings
 REST_S = 60.0  # so long a robot was not driven before it changes its host without need
 _PROBE_S = 20.0  # between two looks at the first host
 _GOOD_S = 40.0  # so long, in three looks, it has accepted a login
@@ -101,3 +104,64 @@ class Probes:
         """The newest result, once; None: none."""
         result, self._result = self._result, None
         return result
+
+
+class HostChoice:
+    """The hosts of one program: where it is connected, and when it leaves for another one."""
+
+    def __init__(self, settings: MqttSettings, accepts_login: Callable[[Place, Address], bool]) -> None:
+        self._places = tuple(Place(*one) for one in settings.hosts or ((settings.host, settings.port),))
+        self._chosen = None if settings.chosen is None else ChosenHost(settings.chosen, self._places)
+        self._follows = settings.follows
+        self._accepts_login = accepts_login
+        self._connected: Place | None = None  # in the newest connection
+        self._returning, self._probes = Return(), Probes(self._probe_first)
+
+    @property
+    def several(self) -> bool:
+        return len(self._places) > 1
+
+    @property
+    def patience_s(self) -> float:
+        """So long a connection may sleep before it looks for another host."""
+        return _LOOK_S if self.several else _IDLE_S
+
+    def next_round(self) -> Sequence[Place]:
+        """The hosts that have their turns in the next round."""
+        return [self._chosen.read()] if self._follows and self._chosen is not None else self._places
+
+    def moves_to(self, place: Place) -> bool:
+        """Whether a connection to ``place`` is to another host than the one before."""
+        return self._connected not in (None, place)
+
+    def connected(self, place: Place) -> None:
+        """The connection to ``place`` can be used."""
+        self._connected = place
+        self._returning.connected(time.monotonic(), first=place == self._places[0])
+        if self._chosen is not None and not self._follows:
+            self._chosen.write(place)
+
+    def why_leave(self, idle_s: Callable[[], float]) -> str:
+        """Why to leave this host now, empty if it is to stay; ``idle_s``: for how long a change has disturbed nothing.
+
+        Call it after :attr:`patience_s` at the latest.
+        """
+        if not self.several:
+            return ""
+        if self._follows and self._chosen is not None:
+            place = self._chosen.read()
+            return "" if place == self._connected else f"the robot is at {place} now"
+        now = time.monotonic()
+        if (good := self._probes.take()) is not None:
+            self._returning.probed(now, good=good)
+        if self._returning.wants_probe(now):
+            self._probes.begin()
+        return f"returns to {self._places[0]}" if self._returning.is_due(now, idle_s()) else ""
+
+    def _probe_first(self) -> bool:
+        """Whether the first host accepts a login. On a thread of its own."""
+        place = self._places[0]
+        try:
+            return any(self._accepts_login(place, one) for one in addresses_of(*place))
+        except (OSError, ValueError):
+            return False

@@ -8,18 +8,17 @@ from dataclasses import replace
 from pebble.transports.base import Message
 from pebble.transports.counters import Counters
 from pebble.transports.credentials import Credentials
-from pebble.transports.hosts import CONNECT_TIMEOUT_S, Address, Place, Turns, addresses_of
+from pebble.transports.hosts import CONNECT_TIMEOUT_S, Address, Place, Turns
 from pebble.transports.mqtt import client_ids
 from pebble.transports.mqtt.bridge_mode import Attempt, BridgeMode, Result
 from pebble.transports.mqtt.broker_limits import EVERYTHING, BrokerLimits, Limits
-from pebble.transports.mqtt.chosen_host import ChosenHost, Probes, Return
+from pebble.transports.mqtt.chosen_host import HostChoice
 from pebble.transports.mqtt.client import Opening
 from pebble.transports.mqtt.connection import Connection, Owner
 from pebble.transports.mqtt.ending import Absent, Lost, Refused, Silent, TlsLate
 from pebble.transports.settings import MqttSettings
 
 _ENDING_S = 1.0  # so long a broker that ends may still accept connections, and hang up on them
-_LOOK_S, _IDLE_S = 1.0, 60.0  # the connection wakes up earlier, for its pings
 _HESITATION_S = 0.5  # a CONNACK that takes longer comes over a very slow connection, or from a suspended broker
 
 
@@ -46,12 +45,9 @@ class Dialler:
         # It stays the same over reconnects: the broker closes our own half-dead connection at once.
         self._client_id = client_ids.unique(client_id) if settings.client_id is None else settings.client_id
         self._settings, self._will = settings, will
-        self.places = tuple(Place(*one) for one in settings.hosts or ((settings.host, settings.port),))
-        self._chosen = None if settings.chosen is None else ChosenHost(settings.chosen, self.places)
-        self.turns = Turns(self._turns_of)
+        self.hosts = HostChoice(settings, self._accepts_login)
+        self.turns = Turns(self.hosts.next_round)
         self.moved = False  # the newest connection is to another host than the one before
-        self._connected: Place | None = None  # in the newest connection
-        self._returning, self._probes = Return(), Probes(self._probe_first)
         self.attempt: Connection | None = None  # the newest connection, in any state
         self.stalled = False  # the broker may have been suspended, and have old messages to forward first
         self._credentials: Credentials | None = None
@@ -90,60 +86,19 @@ class Dialler:
 
     # -- one of several hosts
 
-    @property
-    def _follows(self) -> bool:
-        return self._settings.follows and self._chosen is not None
-
-    def _turns_of(self) -> list[Place]:
-        """The hosts that have their turns in the next round."""
-        return [self._chosen.read()] if self._follows and self._chosen is not None else list(self.places)
-
-    @property
-    def patience_s(self) -> float:
-        """So long a connection may sleep before it looks for another host."""
-        return _LOOK_S if len(self.places) > 1 else _IDLE_S
-
     def succeeded(self) -> str:
         """The connection can be used; returns which addresses failed before it, and how."""
-        place, first = self.turns.place, self.turns.place == self.places[0]
-        self._connected = place
-        self._returning.connected(time.monotonic(), first=first)
-        if self._chosen is not None and not self._settings.follows:
-            self._chosen.write(place)
+        self.hosts.connected(self.turns.place)
         return self.turns.succeeded()
 
     def leave(self, idle_s: Callable[[], float]) -> str:
-        """Why to leave this host now, empty if it is to stay; ``idle_s``: for how long a change has disturbed nothing.
-
-        Call it after :attr:`patience_s` at the latest.
-        """
-        if len(self.places) == 1:
-            return ""
-        if self._follows:
-            place = self._turns_of()[0]
-            why = "" if place == self._connected else f"the robot is at {place} now"
-        else:
-            why = self._return(time.monotonic(), idle_s)
-        if why:
+        """Why to leave this host now, see `HostChoice.why_leave`; the next turn is another host's then."""
+        if why := self.hosts.why_leave(idle_s):
             self.turns.begin_anew()
         return why
 
-    def _return(self, now: float, idle_s: Callable[[], float]) -> str:
-        if (good := self._probes.take()) is not None:
-            self._returning.probed(now, good=good)
-        if self._returning.wants_probe(now):
-            self._probes.begin()
-        return f"returns to {self.places[0]}" if self._returning.is_due(now, idle_s()) else ""
-
-    def _probe_first(self) -> bool:
-        """Whether the first host accepts a login. On a thread of its own."""
-        place = self.places[0]
-        try:
-            return any(self._accepts_login(one, place) for one in addresses_of(*place))
-        except (OSError, ValueError):
-            return False
-
-    def _accepts_login(self, address: Address, place: Place) -> bool:
+    def _accepts_login(self, place: Place, address: Address) -> bool:
+        """On a thread of :attr:`hosts`."""
         assert self._credentials is not None  # noqa: S101 - there is a connection
         password, given = self._credentials.password(), self._settings.client_id
         settings = replace(self._settings, host=place.host, port=place.port, password=password)
@@ -183,7 +138,7 @@ class Dialler:
                 connection.discard()
         self._note_result(Result.ACCEPTED)
         self.turns.opened(connection.opened_s)
-        self.moved = self._connected not in (None, self.turns.place)
+        self.moved = self.hosts.moves_to(self.turns.place)
         return connection
 
     def _make(self, will: Message | None, owner: Owner, counters: Counters, *, as_published: bool) -> Connection:

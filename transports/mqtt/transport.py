@@ -36,10 +36,19 @@ _REPEAT_LOG_S = 30.0  # between two equal log lines
 _TRIED_S = 1.0  # after which a connection shows what the broker has
 
 
-class _Stop(threading.Event):
-    """Ends one run of the network thread, which then publishes the will."""
+class _Run:
+    """One run of the network thread, and what other threads want of it."""
 
-    will: Message | None = None
+    def __init__(self, target: Callable[[_Run], None], name: str) -> None:
+        self.stopping = threading.Event()
+        self.will: Message | None = None  # to publish when it stops
+        self.renewal = ""  # why the connection is to be made anew
+        self.thread = threading.Thread(target=target, args=(self,), name=name, daemon=True)
+
+    def join(self, timeout: float) -> None:
+        """Wait for its end, unless it is the caller's thread."""
+        if self.thread is not threading.current_thread():
+            self.thread.join(timeout)
 
 
 class MqttTransport(Transport):
@@ -57,9 +66,7 @@ class MqttTransport(Transport):
         self._connection: Connection | None = None  # the newest one, once it can be used
         self._filters = BrokerFilters()
         self._own_message_filter = OwnMessageFilter()
-        self._stopping = _Stop()
-        self._renewal = ""  # why the connection is to be made anew
-        self._thread: threading.Thread | None = None
+        self._network: _Run | None = None
         self._refused = RefusedTopics(client_id, settings.vital)
         self._retention = RetentionChecks()
         self._retained_proof: RetainedProof | None = None
@@ -77,7 +84,7 @@ class MqttTransport(Transport):
     @property
     def host(self) -> str:
         dialler = self._dialler
-        return str(dialler.turns.place) if len(dialler.places) > 1 and self._connection is not None else ""
+        return str(dialler.turns.place) if dialler.hosts.several and self._connection is not None else ""
 
     @property
     def outgoing(self) -> Outgoing:
@@ -96,7 +103,9 @@ class MqttTransport(Transport):
             attempt.suit(slow=slow)
 
     def renew_connection(self, why: str) -> None:
-        connection, self._renewal = self._connection, why
+        run, connection = self._network, self._connection
+        if run is not None:
+            run.renewal = why
         if connection is not None:
             connection.wake()
 
@@ -105,23 +114,22 @@ class MqttTransport(Transport):
     def _open(self, timeout: float) -> None:  # noqa: ARG002  (base waits)
         self._dialler.open()
         self._retained_proof = RetainedProof(self.proof) if self.proof else None
-        if self._thread is not None and self._thread is not threading.current_thread():
-            self._thread.join(_ANSWER_S)  # closed while it was dialling
-        self._stopping = stopping = _Stop()
-        self._thread = threading.Thread(
-            target=self._run, args=(stopping,), name=f"pebble-mqtt {self.client_id}", daemon=True
-        )
-        self._thread.start()
+        if self._network is not None:
+            self._network.join(_ANSWER_S)  # closed while it was dialling
+        self._network = _Run(self._run, f"pebble-mqtt {self.client_id}")
+        self._network.thread.start()
 
     def _close(self, will: Message | None) -> None:
         """Do not wait for a thread that is connecting: it ends by itself, within HANDSHAKE_S."""
-        self._stopping.will = will
-        self._stopping.set()
+        run = self._network
+        if run is None:
+            return
+        run.will = will
+        run.stopping.set()
         attempt = self._dialler.attempt
         if attempt is not None:
             attempt.wake()
-        if self._thread is not None and self._thread is not threading.current_thread():
-            self._thread.join(_DIALLING_S if attempt is None or attempt.dialling else _CLOSING_S + _ANSWER_S)
+        run.join(_DIALLING_S if attempt is None or attempt.dialling else _CLOSING_S + _ANSWER_S)
 
     def _send(self, message: Message, urgent: bool) -> bool:
         connection = self._connection
@@ -159,7 +167,7 @@ class MqttTransport(Transport):
             asked = connection.subscribe([(filter_, self._no_local(filter_))])
             # Retained messages come after the SUBACK, on a bad network long after it; a ping's answer follows them.
             acks = [asked, connection.unsubscribe(replaced), connection.ping()]
-        if threading.current_thread() is not self._thread:
+        if self._network is None or threading.current_thread() is not self._network.thread:
             deadline = time.monotonic() + _ANSWER_S
             for ack in acks:
                 ack.wait(deadline - time.monotonic())
@@ -197,12 +205,12 @@ class MqttTransport(Transport):
 
     # -- the network thread
 
-    def _run(self, stopping: _Stop) -> None:
-        failures = 0
+    def _run(self, run: _Run) -> None:
+        failures, stopping = 0, run.stopping
         while not stopping.is_set():
             began, problem = time.monotonic(), "failed unexpectedly"
             try:
-                self._run_connection(stopping)
+                self._run_connection(run)
             except Leaving as leaving:
                 self.problem, self.was_ended, failures = str(leaving), False, 0
                 self._log(logging.INFO, str(leaving))
@@ -231,11 +239,11 @@ class MqttTransport(Transport):
                 failures = min(failures + 1, 20)
             stopping.wait(pause * random.uniform(0.5, 1.0))  # noqa: S311  (jitter, no secret)
 
-    def _run_connection(self, stopping: _Stop) -> None:
+    def _run_connection(self, run: _Run) -> None:
         """Run one connection from its start to its end; raises Lost unless it ends by `close`."""
         self._dialler.begin()
-        connection = self._dialler.connect(self, self.counters, stopping)
-        self._renewal = ""
+        connection = self._dialler.connect(self, self.counters, run.stopping)
+        run.renewal = ""
         connection.suit(slow=self.is_slow)
         try:
             if self.settings.as_published:
@@ -243,28 +251,28 @@ class MqttTransport(Transport):
                 if self.as_published and not as_published:
                     log.warning("%s has no bridge mode: own messages come back on this connection", connection.where)
                 self.as_published = self.exact_echo = as_published
-            self._serve(connection, stopping)
-            self._finish(connection, stopping.will)
+            self._serve(connection, run)
+            self._finish(connection, run.will)
         finally:
             with self._filters.lock:
                 self._connection = None
             connection.discard()
             self._keep_unconfirmed(connection)
 
-    def _serve(self, connection: Connection, stopping: _Stop) -> None:
+    def _serve(self, connection: Connection, run: _Run) -> None:
         tried_at = time.monotonic() + _TRIED_S
         try:
-            self._synchronize(connection, stopping)
+            self._synchronize(connection, run.stopping)
             if failed := self._dialler.succeeded():
                 self._log(logging.INFO, f"connected to {connection.where}; before it {failed}")
-            while not stopping.is_set():
+            while not run.stopping.is_set():
                 receive = self._deliver_all if self._retention.current is None else self._deliver_and_note
-                connection.pump(self._dialler.patience_s, receive)
+                connection.pump(self._dialler.hosts.patience_s, receive)
                 if leaving := self._dialler.leave(self.idle_s):
                     self._leave(connection, leaving)
-                if self._renewal:
+                if run.renewal:
                     connection.disconnect()
-                    raise Lost(self._renewal)
+                    raise Lost(run.renewal)
                 if connection.limits is not self._dialler.reported and time.monotonic() > tried_at:
                     self._report_limits(connection)
                 if self._own.pending and connection.has_room:
@@ -330,7 +338,7 @@ class MqttTransport(Transport):
             log.log(level, "%s: %s %s", self.client_id, connection.where, limits.losses)
         self._dialler.reported = limits
 
-    def _synchronize(self, connection: Connection, stopping: _Stop) -> None:
+    def _synchronize(self, connection: Connection, stopping: threading.Event) -> None:
         """Query which of our retained messages the broker has, subscribe, and send what it lacks."""
         self._renew()
         self._own_message_filter.begin()
@@ -351,14 +359,14 @@ class MqttTransport(Transport):
         if not self.is_slow:  # it costs as much as a beginning
             self._retention.begin(self._dialler.address, now)
 
-    def _let_catch_up(self, connection: Connection, stopping: _Stop) -> None:
+    def _let_catch_up(self, connection: Connection, stopping: threading.Event) -> None:
         """Wait before subscribing: a broker that was suspended first forwards old messages of others."""
         end = time.monotonic() + _CATCH_UP_S
         while not stopping.is_set() and (left := end - time.monotonic()) > 0:
             connection.pump(left, ignore)
         self._dialler.stalled = False
 
-    def _query_own(self, connection: Connection, stopping: _Stop) -> set[str]:
+    def _query_own(self, connection: Connection, stopping: threading.Event) -> set[str]:
         """Own topics of which the broker has our newest retained message, or that others publish on as well.
 
         A ping's answer follows these messages (QoS 0).
@@ -379,7 +387,7 @@ class MqttTransport(Transport):
         return (found.keys() - older) | (proved or set())
 
     def _find_few(
-        self, connection: Connection, own: Mapping[str, Message], stopping: _Stop
+        self, connection: Connection, own: Mapping[str, Message], stopping: threading.Event
     ) -> tuple[dict[str, bytes], set[str] | None]:
         """What the broker has of few topics, and of which others that proves that it has them; None: of none."""
         proof = self._retained_proof
@@ -395,7 +403,7 @@ class MqttTransport(Transport):
             asked.add(self.will.topic)  # the broker has published it in place of ours
         return found, {topic for topic, one in own.items() if topic not in asked and self._accepts(connection, one)}
 
-    def _find(self, connection: Connection, topics: list[str], stopping: _Stop) -> dict[str, bytes]:
+    def _find(self, connection: Connection, topics: list[str], stopping: threading.Event) -> dict[str, bytes]:
         """What the broker has retained on these topics."""
         found: dict[str, bytes] = {}
         if not topics:
@@ -414,7 +422,11 @@ class MqttTransport(Transport):
         return connection.takes(message) and self._refused.suspects.accepts(message)
 
     def _await(
-        self, connection: Connection, ack: PendingAck, stopping: _Stop, receive: Callable[[list[Message]], None]
+        self,
+        connection: Connection,
+        ack: PendingAck,
+        stopping: threading.Event,
+        receive: Callable[[list[Message]], None],
     ) -> None:
         asked_at = clock.since_boot()
         while not ack.done:

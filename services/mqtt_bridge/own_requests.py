@@ -1,0 +1,112 @@
+"""What messages request of the bridge itself: system actions, pictures and sound, and rows of the audit."""
+
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
+from typing import Any
+
+from pebble.contract import AUDIT_READ, DRIVE, REMOTE_MIRROR, Channel, codec
+from pebble.contract.levels import LEVELS
+from pebble.contract.payloads import SCRIPT, AuditRead, Drive
+from pebble.errors import PayloadError
+from pebble.forwarding.forwarder import Mirroring
+from pebble.runtime.parent import Notifier, earlier_requests
+from pebble.runtime.service import Service
+from pebble.services.mqtt_bridge.actions import ACTIONS, SystemActions
+from pebble.services.mqtt_bridge.media import MEDIA, Hold, Media, MediaRequests
+from pebble.services.mqtt_bridge.uplink import Uplink
+
+
+class OwnRequests:
+    """Reads them on the transports' threads; what takes longer is done on that of ``service``."""
+
+    def __init__(
+        self,
+        service: Service,
+        ask: Callable[[AuditRead], None],
+        mirroring: Mirroring,
+        notifier: Notifier,
+        uplink: Uplink | None,
+    ) -> None:
+        config, section = service.config, service.config.services.mqtt_bridge
+        self._service, self._post, self._clock, self._ask = service, service.post_message, service.clock, ask
+        self._mirroring, self._uplink = mirroring, uplink
+        self.actions = SystemActions(section, folder=config.state_dir(), clock=service.clock)
+        self._media = MediaRequests(Media(config.on_demand_programs(), earlier_requests()), notifier.request)
+        self._hold = Hold(config.on_demand_programs(), notifier.hold)
+        self._moved_at = self._clock()  # of the newest command that moves something
+        self._messages: dict[str, Callable[[bytes], None]] = {
+            **{row.request.suffix: partial(self._on_media_request, row.request) for row in MEDIA},
+            **{row.channel.suffix: partial(self._on_action, row.channel) for row in ACTIONS},
+            AUDIT_READ.suffix: self._on_audit_read,
+        }
+        if section.link.profile != "wide" or section.remote_mqtt.hosts:
+            self._messages[DRIVE.suffix] = self._on_drive
+        self._flags: dict[str, Callable[[bytes], None]] = {
+            **{row.flag.suffix: partial(self._on_media_flag, row.flag) for row in MEDIA},
+            REMOTE_MIRROR.suffix: self._on_remote_mirror,
+        }
+
+    def message(self, channel: Channel, payload: bytes) -> None:
+        """A message that is no flag."""
+        reaction = self._messages.get(channel.suffix)
+        if reaction is not None:
+            reaction(payload)
+
+    def flag(self, channel: Channel, payload: bytes) -> None:
+        """The value of a flag."""
+        reaction = self._flags.get(channel.suffix)
+        if reaction is not None:
+            reaction(payload)
+
+    def idle_s(self) -> float:
+        """For so long the robot was not driven."""
+        return self._clock() - self._moved_at
+
+    def send(self) -> None:
+        """Tell the launcher which media programs are to run, and which wait."""
+        self._media.send()
+        self._hold.send(self._clock())
+
+    def _on_remote_mirror(self, payload: bytes) -> None:
+        self._mirroring.switch(on=self._boolean(REMOTE_MIRROR, payload))
+
+    def _on_media_flag(self, flag: Channel, payload: bytes) -> None:
+        self._post(flag, partial(self._media.allow, flag, self._boolean(flag, payload)), newest_of=flag.metric)
+
+    def _on_media_request(self, channel: Channel, payload: bytes) -> None:
+        if (request := self._decoded(channel, payload)) is not None:
+            self._post(channel, partial(self._media.request, channel, request), newest_of=channel.metric)
+
+    def _on_drive(self, payload: bytes) -> None:
+        """On a thin link pictures and sound wait while a person drives; who the robot obeys is decided elsewhere."""
+        with suppress(PayloadError):
+            command: Drive = codec.decode(DRIVE, payload)
+            if command.moves:
+                self._moved_at = self._clock()
+            thin = self._uplink is not None and self._uplink.level is LEVELS["thin"]
+            if thin and command.moves and command.source != SCRIPT:
+                self._post(DRIVE, lambda: self._hold.drive(self._clock()), newest_of="hold")
+
+    def _on_audit_read(self, payload: bytes) -> None:
+        if (request := self._decoded(AUDIT_READ, payload)) is not None:
+            self._ask(request)
+
+    def _on_action(self, channel: Channel, payload: bytes) -> None:
+        if self._boolean(channel, payload):
+            self._post(channel, partial(self._run_action, channel), newest_of=channel.metric)
+
+    def _boolean(self, channel: Channel, payload: bytes) -> bool:
+        """The value of a boolean control; an empty payload (a removed flag) and a malformed one are false."""
+        return bool(payload) and bool(self._decoded(channel, payload))
+
+    def _decoded(self, channel: Channel, payload: bytes) -> Any:
+        """None if it is malformed."""
+        try:
+            return codec.decode(channel, payload)
+        except PayloadError as error:
+            self._service.refusals.malformed(channel, error)
+            return None
+
+    def _run_action(self, channel: Channel) -> None:
+        self._service.counters.add("actions" if self.actions.request(channel) else "actions_refused")

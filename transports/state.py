@@ -1,0 +1,45 @@
+"""The state of a transport's connection, and who learns of its changes."""
+
+import logging
+import threading
+from collections.abc import Callable
+from enum import Enum
+
+log = logging.getLogger(__name__)
+
+
+class State(Enum):
+    CLOSED = "closed"
+    CONNECTING = "connecting"
+    CONNECTED = "connected"
+
+
+Watcher = Callable[[State], None]
+
+
+class StateChanges:
+    """Tells each change of one transport's state, in order; any thread may use it."""
+
+    def __init__(self, client_id: str) -> None:
+        self.lock = threading.RLock()  # held while the state changes and its watchers are called
+        self._client_id = client_id
+        self._connected = threading.Event()
+        self._watchers: list[Watcher] = []
+
+    def watch(self, watcher: Watcher) -> None:
+        self._watchers.append(watcher)
+
+    def await_connected(self, timeout: float) -> bool:
+        return self._connected.wait(timeout)
+
+    def tell(self, state: State) -> None:
+        """The state is another one now. Call it with :attr:`lock` held."""
+        if state is State.CONNECTED:
+            self._connected.set()
+        else:
+            self._connected.clear()
+        for watcher in list(self._watchers):
+            try:
+                watcher(state)
+            except Exception:  # foreign code on our thread
+                log.exception("a state watcher of %s failed", self._client_id)
