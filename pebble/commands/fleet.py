@@ -289,12 +289,12 @@ def check_(
     """
     require_packages("pebble fleet")
     with _changing(folder_) as (place, fleet):
-        found = check.compare(place, fleet)
+        by_hand, rules = check.by_hand(place, fleet), check.of_rules(place, fleet)
         tried = check.attempt(place, fleet) if live else None
-    wrong = found + ([] if tried is None else tried.wrong)
+    wrong = by_hand + rules + ([] if tried is None else tried.wrong)
     for line in wrong:
         typer.echo(f"pebble: {line}", err=True)
-    if found:
+    if rules:
         typer.echo(f"pebble: `pebble fleet init {_shown(place)}` gives every account its rules again", err=True)
     if tried is not None:
         typer.echo(f"{tried.attempts} attempts, {len(tried.wrong)} not as the table says")

@@ -306,13 +306,13 @@ def test_what_is_retained_is_one_key(hall: Hall) -> None:
         assert until(lambda: not hall.retained())
 
 
-@pytest.mark.parametrize("what", ["hellos", "queries"])
-def test_what_an_account_asks_of_the_hub_holds_up_no_one_who_comes(hall: Hall, what: str) -> None:
+@pytest.mark.parametrize(("name", "what"), [("vera", "hellos"), ("vera", "queries"), ("fred", "states")])
+def test_what_an_account_asks_or_retains_holds_up_no_one_who_comes(hall: Hall, name: str, what: str) -> None:
     """A hub had ten thousand hellos of a viewer wait, 2 GB of them, and a client that came heard nothing meanwhile."""
     hall.eye.publish(STATE, b"before", qos=QoS.DELIVERED, retain=True)
     before = memory(hall.hub.pid)
-    with hall.account("vera", flood=what) as vera:
-        assert vera.stdout.readline() == "flows\n"
+    with hall.account(name, flood=what) as flooding:
+        assert flooding.stdout.readline() == "flows\n"
         for number in range(5):
             received: list[str] = []
             with create("zenoh", f"late-{number}", hall.settings("otto")) as late:
