@@ -26,7 +26,7 @@ from pebble.transports.zenoh import session as zenoh_session
 from pebble.transports.zenoh import wire
 from pebble.transports.zenoh.hub.admission import SESSIONS
 from tests.fleet import test_attempts
-from tests.fleet.test_attempts import ACCOUNTS, GOOB, TOPICS
+from tests.fleet.test_attempts import ACCOUNTS, FRED, GOOB, TOPICS
 from tests.fleet.zenoh_account import Plan
 from tests.support import free_port, until
 from tests.transports.forked import Forked
@@ -38,9 +38,11 @@ NAMED = f"{GOOB}/incoming/by/otto/drive-values"
 
 
 def lets_through(name: str, topic: str, level: str) -> bool:
-    """By hand: as at a broker, but for a gateway, whose robots are at the hub."""
+    """By hand: as at a broker, but for a gateway, whose robots are at the hub, and for a neighbour."""
     if name == "gate":
         return topic.startswith("pebble/robots/") and "/incoming/" in topic
+    if name == "lan":
+        return topic.startswith(f"{FRED}/outgoing/")
     return test_attempts.lets_through(name, topic, level)
 
 
@@ -143,6 +145,7 @@ def test_each_account_reads_what_it_may_and_nothing_else(hall: Hall) -> None:
     public = {STATE, FLAG}
     everything = {*public, DRIVE, NAMED}
     expected = dict.fromkeys(NAMES, public) | {"goob": everything, "gate": everything, "fred": set(), "lamp": set()}
+    expected["lan"] = {STATE}
     found = {}
     for topic in public:
         hall.eye.publish(topic, b"before", qos=QoS.DELIVERED, retain=True)

@@ -55,6 +55,7 @@ ASKED_BYTES = 128 << 10  # of one hello, some 2,000 retained topics, or query
 RETAINING_BYTES = 1 << 20  # of retained messages of one robot that wait; beyond it their senders wait, as above
 COMING = 100  # sessions of one account that come or go; the same
 PATIENCE_S = 0.5  # a query waits this long for retained messages that are known to be on their way
+_SENT_S = 0.1  # a will has left by then; what a session that is closed has to send reaches some and not others
 _LOOK_S = 0.25  # a hub among others looks so often whether it stood still
 
 _NEVER = float("inf")
@@ -139,6 +140,7 @@ class ZenohHub:
             return
         self._used = self._newest
         if self._session is not None:
+            worker.hold_wills()
             close_session(self._session)
         self._problem = ""
         self._listen(worker)
@@ -243,6 +245,7 @@ class HubWorker:
         self._asking, self._greeting = Places(ASKED, SENDERS), Places(HELLOS)
         self._retaining, self._coming = Places(RETAINING_BYTES, SENDERS), Places(COMING, SENDERS)
         self._session: zenoh.Session | None = None
+        self._publishing, self._holds, self._published = threading.Lock(), False, float("-inf")
         self._thread = threading.Thread(target=self._run, name="pebble-hub", daemon=True)
         if journal is not None:
             self._write_journal(journal)
@@ -255,7 +258,7 @@ class HubWorker:
         """Serve the clients of ``session`` instead of those of the one before, which is closed."""
         if self._session is not None:
             self.post(self._await_return)
-        self._session = session
+        self._session, self._holds = session, False
         # Its own messages would wait for room in the queue that this thread empties.
         others, retain = zenoh.Locality.REMOTE, direct(self._retain)
         session.declare_subscriber(wire.RETAINED + "**", retain, allowed_origin=others)
@@ -269,6 +272,12 @@ class HubWorker:
         self._token = session.liveliness().declare_token(wire.UP + self._name)
         if not self._thread.is_alive():
             self._thread.start()
+
+    def hold_wills(self) -> None:
+        """Publish no will before the next session: hubs that did not get it of this one would publish it, too."""
+        with self._publishing:
+            self._holds = True
+        time.sleep(max(0.0, self._published + _SENT_S - time.monotonic()))
 
     def close(self) -> None:
         if self._thread.is_alive():
@@ -358,7 +367,7 @@ class HubWorker:
     def _pause(self) -> float | None:
         now = time.monotonic()
         merged = self._mesh.merging_until
-        pauses = [self._wills.next_due - now]
+        pauses = [_NEVER if self._holds else self._wills.next_due - now]
         if self._waiting_queries:
             pauses.append((merged if self._looks else max(self._waiting_queries[0][0], merged)) - now)
         if self._journal is not None:
@@ -486,9 +495,11 @@ class HubWorker:
             self._wills.on_gone(name, time.monotonic())
 
     def _publish_due_wills(self) -> None:
-        for name, is_successor in self._wills.take_due(time.monotonic()):
-            if (will := self._store.will(name)) is not None:
-                self._do(partial(self._publish_due_will, name, will, is_successor=is_successor))
+        with self._publishing:
+            for name, is_successor in () if self._holds else self._wills.take_due(time.monotonic()):
+                if (will := self._store.will(name)) is not None:
+                    self._published = time.monotonic()
+                    self._do(partial(self._publish_due_will, name, will, is_successor=is_successor))
 
     def _publish_due_will(self, name: str, will: wire.Will, *, is_successor: bool) -> None:
         try:
