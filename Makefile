@@ -14,7 +14,7 @@ help:
 	@echo "make test             all checks and tests, some rows of each rule, some twelve minutes"
 	@echo "make quick            what to run before each commit: lint, types, contract, memory transport, one robot; a minute"
 	@echo "make thorough         the same, with all rows, all cases of the random tests, and the tests that take longest"
-	@echo "make fleet            brokers and hubs that are killed, hung and cut off under driven robots and 300 boards; 300 robots at a page; half an hour"
+	@echo "make fleet            brokers and hubs that are killed, hung and cut off under driven robots and 300 boards; 300 robots at a page; a quarter of an hour"
 	@echo "make stops            400 random schedules of emergency stops and faults with whole robots, 40 minutes"
 	@echo "make soak             floods, kills, freezes, full disks and more while an operator drives; MINUTES=30 for each transport"
 	@echo "make floods           60,000 retained flags, 10,000 actions a second and more, also while a robot starts, four minutes"
@@ -115,7 +115,7 @@ thorough: gstreamer
 FLEET := tests/bench/test_fleet.py tests/transports/zenoh/test_mesh.py $(addprefix tests/fleet/test_,gateways.py hosts.py hubs.py neighbours.py)
 fleet: .venv/.ready-dev
 	@sh tools/debian-packages.sh mosquitto=mosquitto
-	@PEBBLE_THOROUGH=1 $(TESTS) --timeout 900 -s $(FLEET)
+	@PEBBLE_THOROUGH=1 $(TESTS) --workers 3 --spread --timeout 900 -s $(FLEET)
 
 # Every state of the operator page on every size, every card, its sound, every interruption, and fingers.
 page-tests: .venv/.ready-dev

@@ -86,7 +86,10 @@ def write_conf(folder: Path, fleet: Fleet, plugin: Path | None) -> None:
 
 
 def conf_differences(folder: Path, fleet: Fleet) -> Iterator[str]:
-    """Lines of `mosquitto.conf` that are not what :func:`write_conf` wrote: another listener is another door."""
+    """Lines of `mosquitto.conf` that are not what :func:`write_conf` wrote: another listener is another door.
+
+    They may be there for a reason, so no command takes them back.
+    """
     file = folder / CONF
     try:
         found = file.read_text(encoding="utf-8").splitlines()
@@ -95,8 +98,10 @@ def conf_differences(folder: Path, fleet: Fleet) -> Iterator[str]:
     plugin = next((Path(line.split()[1]) for line in found if line.startswith("plugin /")), None)
     user = next((line.split()[1] for line in found if line.startswith("user ")), "")
     wanted = broker_files.conf_text(fleet, folder, plugin, user).splitlines()
-    yield from (f"{file}: has a line of its own: {line}" for line in found if line.strip() and line not in wanted)
-    yield from (f"{file}: is without the line: {line}" for line in wanted if line not in found)
+    own = (line for line in found if line.strip() and line not in wanted)
+    yield from (f"{file}: has a line of its own: {line}: remove it there, then restart mosquitto" for line in own)
+    lacking = (line for line in wanted if line not in found)
+    yield from (f"{file}: is without the line: {line}: add it there, then restart mosquitto" for line in lacking)
 
 
 def apply(folder: Path, before: Fleet, after: Fleet, passwords: Mapping[str, str] | None = None) -> str:

@@ -30,7 +30,17 @@ _OTHER = "check-other"  # whose name others take
 
 def compare(folder: Path, fleet: Fleet) -> list[str]:
     """What a broker has too much or too little, and what will not do for long; one line each. Raises FleetError."""
-    found = [*conf_differences(folder, fleet), *zenoh_differences(folder, fleet), *_certificates(folder, fleet)]
+    return [*by_hand(folder, fleet), *of_rules(folder, fleet)]
+
+
+def by_hand(folder: Path, fleet: Fleet) -> list[str]:
+    """Of these the differences that no command mends; each line names what does."""
+    return [*conf_differences(folder, fleet), *_certificates(folder, fleet)]
+
+
+def of_rules(folder: Path, fleet: Fleet) -> list[str]:
+    """Of these the accounts and rules, which a second `pebble fleet init` gives again."""
+    found = list(zenoh_differences(folder, fleet))
     if fleet.rules == "files":
         return [*found, *_of_files(folder, fleet)]
     for number, server in enumerate(fleet.brokers):

@@ -26,7 +26,7 @@ from tests.support import ROOT, until
 PICTURE = ROOT / "docs" / "fleet-attempts.png"
 COLUMNS = {
     "vera": "viewer", "otto": "driver", "mia": "maintainer", "sam": "safety", "admin": "admin", "page-1": "page",
-    "goob": "the robot", "fred": "another robot",
+    "goob": "the robot", "fred": "another robot", "gate": "gateway", "lan": "its neighbour",
 }  # fmt: skip
 TRIED = tuple(row for row in ROWS if not row.metrics[0].startswith("$"))  # accounts are changed at mosquitto only
 WAYS = ("mosquitto, plugin", "mosquitto, acl_file", "Zenoh hub")
@@ -38,7 +38,8 @@ def expected(level: SecurityLevel, way: str) -> Passed:
     """By the one table. A hub takes no command as a will, and retains none but a robot's own, never below a name."""
     found = {}
     for name in COLUMNS:
-        held = rules(name, Account(roles=("admin",)) if name == "admin" else ACCOUNTS[name], level)
+        account = Account(roles=("admin",)) if name == "admin" else ACCOUNTS[name]
+        held = rules(name, account, level, at_hub=way == WAYS[2])
         for row in TRIED:
             allowed = all(may(held, "write", topic) for topic in topics(row, GOOB, name, level, "dora"))
             left = row.will or (row.retained and (name != "goob" or level == "named"))

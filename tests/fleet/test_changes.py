@@ -209,7 +209,10 @@ def test_it_finds_changes_of_files(tmp_path: Path, file: str, old: str, new: str
     broker = FleetBroker(tmp_path / "hall", {"otto": DRIVER, "goob": GOOB}, rules="files")
     changed = (broker.folder / file).read_text().replace(old, new)
     (broker.folder / file).write_text(changed)
-    assert any(found in line for line in check.compare(broker.folder, broker.fleet))
+    by_hand, rules = check.by_hand(broker.folder, broker.fleet), check.of_rules(broker.folder, broker.fleet)
+    assert any(found in line for line in (*by_hand, *rules))
+    assert bool(by_hand) == (file == CONF), "`pebble fleet init` is advised for what it mends"
+    assert all(line.endswith("then restart mosquitto") for line in by_hand)
 
 
 def test_it_finds_changes_of_the_plugin(tmp_path: Path) -> None:

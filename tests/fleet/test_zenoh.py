@@ -26,7 +26,7 @@ from pebble.transports.zenoh import session as zenoh_session
 from pebble.transports.zenoh import wire
 from pebble.transports.zenoh.hub.admission import SESSIONS
 from tests.fleet import test_attempts
-from tests.fleet.test_attempts import ACCOUNTS, GOOB, TOPICS
+from tests.fleet.test_attempts import ACCOUNTS, FRED, GOOB, TOPICS
 from tests.fleet.zenoh_account import Plan
 from tests.support import free_port, until
 from tests.transports.forked import Forked
@@ -38,9 +38,11 @@ NAMED = f"{GOOB}/incoming/by/otto/drive-values"
 
 
 def lets_through(name: str, topic: str, level: str) -> bool:
-    """By hand: as at a broker, but for a gateway, whose robots are at the hub."""
+    """By hand: as at a broker, but for a gateway, whose robots are at the hub, and for a neighbour."""
     if name == "gate":
         return topic.startswith("pebble/robots/") and "/incoming/" in topic
+    if name == "lan":
+        return topic.startswith(f"{FRED}/outgoing/")
     return test_attempts.lets_through(name, topic, level)
 
 
@@ -143,6 +145,7 @@ def test_each_account_reads_what_it_may_and_nothing_else(hall: Hall) -> None:
     public = {STATE, FLAG}
     everything = {*public, DRIVE, NAMED}
     expected = dict.fromkeys(NAMES, public) | {"goob": everything, "gate": everything, "fred": set(), "lamp": set()}
+    expected["lan"] = {STATE}
     found = {}
     for topic in public:
         hall.eye.publish(topic, b"before", qos=QoS.DELIVERED, retain=True)
@@ -237,6 +240,7 @@ def test_a_program_with_a_certificate_poses_as_no_one_else(hall: Hall) -> None:
     take = zenoh.handlers.Callback(lambda sample: received.append(str(sample.key_expr)), indirect=False)
     for prefix in (wire.UP, wire.LIVE):
         seen.liveliness().declare_subscriber(f"{prefix}*", take)
+    seen.declare_subscriber(wire.PUBLISHED, take)
     will = wire.Will(STATE, b"otto", QoS.DELIVERED, False, "robot")
     hello = partial(wire.Hello, retained_count=0, will=None, own={})
     with raw(hall.settings("otto")) as session:
@@ -253,12 +257,15 @@ def test_a_program_with_a_certificate_poses_as_no_one_else(hall: Hall) -> None:
             "another's name": answers(named, hello(name="goob~1")),
             "a local name": answers(named, hello(name="0badf00d")),
             "another's will": answers(wire.asked(wire.BYE, "otto"), "goob~1"),
+            "a hub's state": answers(f"{wire.STATE}*", "otto~1"),
+            "a hub's table": answers(f"{wire.MERGE}*", "otto~1"),
             "who is there": len(list(session.liveliness().get("@live/**", timeout=1))),
             "what is retained": len(list(session.get(f"{wire.RETAINED}**", timeout=1))),
         }
         assert refused == dict.fromkeys(refused, 0)
-        posing = [wire.UP + "otto", wire.LIVE + "0badf00d", wire.LIVE + "goob~1"]
-        tokens = [session.liveliness().declare_token(key) for key in (*posing, wire.LIVE + "otto~1")]
+        session.put(wire.PUBLISHED, wire.encode("goob~1"))  # by which a hub has others forget a will
+        posing = [wire.PUBLISHED, wire.UP + "otto", wire.LIVE + "0badf00d", wire.LIVE + "goob~1"]
+        tokens = [session.liveliness().declare_token(key) for key in (*posing[1:], wire.LIVE + "otto~1")]
         asked: list[str] = []
         for key in (wire.HELLO, wire.SYNC + "*", f"{wire.RETAINED}**"):
             session.declare_queryable(key, zenoh.handlers.Callback(lambda one: asked.append(str(one)), indirect=False))
@@ -306,13 +313,13 @@ def test_what_is_retained_is_one_key(hall: Hall) -> None:
         assert until(lambda: not hall.retained())
 
 
-@pytest.mark.parametrize("what", ["hellos", "queries"])
-def test_what_an_account_asks_of_the_hub_holds_up_no_one_who_comes(hall: Hall, what: str) -> None:
+@pytest.mark.parametrize(("name", "what"), [("vera", "hellos"), ("vera", "queries"), ("fred", "states")])
+def test_what_an_account_asks_or_retains_holds_up_no_one_who_comes(hall: Hall, name: str, what: str) -> None:
     """A hub had ten thousand hellos of a viewer wait, 2 GB of them, and a client that came heard nothing meanwhile."""
     hall.eye.publish(STATE, b"before", qos=QoS.DELIVERED, retain=True)
     before = memory(hall.hub.pid)
-    with hall.account("vera", flood=what) as vera:
-        assert vera.stdout.readline() == "flows\n"
+    with hall.account(name, flood=what) as flooding:
+        assert flooding.stdout.readline() == "flows\n"
         for number in range(5):
             received: list[str] = []
             with create("zenoh", f"late-{number}", hall.settings("otto")) as late:

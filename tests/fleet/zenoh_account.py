@@ -29,7 +29,7 @@ class Plan(msgspec.Struct):
     filters: list[str] = []
     retain: bool = False
     will: str = ""
-    flood: Literal["", "messages", "hellos", "queries"] = ""
+    flood: Literal["", "messages", "hellos", "queries", "states"] = ""
 
 
 def flood(session: zenoh.Session, plan: Plan) -> None:
@@ -40,8 +40,10 @@ def flood(session: zenoh.Session, plan: Plan) -> None:
     hello = wire.encode(wire.Hello(f"{plan.name}{wire.OF}1", 0, None, own))
     asked: dict[str, tuple[str, bytes]] = {
         "hellos": (wire.asked(wire.HELLO, plan.name), hello),
-        "queries": (f"{wire.RETAINED}*/*/*/outgoing/**", wire.encode({})),
+        "queries": (f"{wire.RETAINED}*/*/*/outgoing/**", wire.encode({"comes-never": 1})),
     }
+    states = f"{wire.RETAINED}pebble/robots/fred/outgoing"
+    stamp = wire.Stamp(QoS.DELIVERED, 0, f"{plan.name}{wire.OF}1").pack()
     ignore = zenoh.handlers.Callback(lambda _reply: None, indirect=False)
     for number in itertools.count():
         for one in publishers:
@@ -49,6 +51,10 @@ def flood(session: zenoh.Session, plan: Plan) -> None:
         if plan.flood in asked:
             key, payload = asked[plan.flood]
             session.get(key, ignore, payload=payload, timeout=0.5, **first)
+        if plan.flood == "states":
+            session.put(
+                f"{states}/{number % 5000}", bytes(60 + number % 100 // 99 * 200_000), attachment=stamp, **first
+            )
         if number == 500:
             sys.stdout.write("flows\n")
             sys.stdout.flush()

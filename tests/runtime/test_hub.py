@@ -16,7 +16,7 @@ from pebble.runtime.connections import hub_settings
 from pebble.runtime.hub import WILLS
 from pebble.transports import Message, QoS, ZenohSettings, create
 from pebble.transports.counters import Counters
-from pebble.transports.zenoh.hub import HELLO_BYTES, HELLOS, HubWorker
+from pebble.transports.zenoh.hub import ASKED_BYTES, HELLOS, HubWorker
 from pebble.transports.zenoh.hub.admission import Admission
 from pebble.transports.zenoh.hub.journal import Journal
 from pebble.transports.zenoh.hub.records import StoredWill
@@ -149,12 +149,11 @@ def test_hellos_of_one_account_that_wait_are_few_and_short() -> None:
         return not asked.dropped
 
     assert [greet("vera") for _ in range(HELLOS + 2)] == [True] * HELLOS + [False] * 2
-    assert greet("otto", HELLO_BYTES)
-    assert not greet("otto", HELLO_BYTES + 1)
+    assert greet("otto", ASKED_BYTES)
+    assert not greet("otto", ASKED_BYTES + 1)
     hub.close()
-    while not hub._tasks.empty():
-        *_, task = hub._tasks.get()
-        assert task is not None
+    hub._turns.end()
+    while (task := hub._turns.take(0)) is not None:
         task()
     assert len(greeted) == HELLOS + 1
     assert greet("vera"), "there is room again"

@@ -254,7 +254,7 @@ def certificate(
         link = {"kind": "zenoh", "account": name, "connect": [f"tls/{fleet.brokers[0].host}:{_ZENOH_PORT}"]}
         remote = {**link, "tls": tls}
         piece = {"services": {"mqtt_bridge": {"enabled": True, "remote": remote}}}
-        typer.echo(json.dumps({"security": {"level": _level(fleet, account)}, **piece}, indent=2))
+        typer.echo(json.dumps({**_who(fleet, name), **piece}, indent=2))
     if ProgramRole.NEIGHBOUR in account.roles:
         files_here = {"ca_cert": certificates.CA_CERT, "client_cert": f"{name}.pem", "client_key": f"{name}.key"}
         place_of_hub = f"tls/{fleet.brokers[0].host}:{_ZENOH_PORT}"
@@ -289,12 +289,12 @@ def check_(
     """
     require_packages("pebble fleet")
     with _changing(folder_) as (place, fleet):
-        found = check.compare(place, fleet)
+        by_hand, rules = check.by_hand(place, fleet), check.of_rules(place, fleet)
         tried = check.attempt(place, fleet) if live else None
-    wrong = found + ([] if tried is None else tried.wrong)
+    wrong = by_hand + rules + ([] if tried is None else tried.wrong)
     for line in wrong:
         typer.echo(f"pebble: {line}", err=True)
-    if found:
+    if rules:
         typer.echo(f"pebble: `pebble fleet init {_shown(place)}` gives every account its rules again", err=True)
     if tried is not None:
         typer.echo(f"{tried.attempts} attempts, {len(tried.wrong)} not as the table says")
@@ -399,7 +399,15 @@ def piece_of_config(fleet: Fleet, name: str, secret: str, *, board: bool) -> dic
     login = places | {"username": name, "password": secret}
     link = login | {"tls": {"enabled": True, "ca_cert": certificates.CA_CERT}}
     found = {"local_mqtt": link} if board else {"services": {"mqtt_bridge": {"enabled": True, "remote_mqtt": link}}}
-    return {"security": {"level": _level(fleet, fleet.accounts[name])}, **found}
+    return {**_who(fleet, name), **found}
+
+
+def _who(fleet: Fleet, name: str) -> dict[str, Any]:
+    """The id with the account, which may do nothing below another base: its messages would be dropped in silence."""
+    account = fleet.accounts[name]
+    parts = dict(zip(("system", "type", "id"), account.bases[0].split("/"), strict=True))
+    robot = {key: part for key, part in parts.items() if key == "id" or part != {"system": "pebble"}.get(key, "robots")}
+    return {"robot": robot, "security": {"level": _level(fleet, account)}}
 
 
 def _host_and_port(server: Server) -> str:

@@ -72,7 +72,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     """Room for 100 bytes, 40 of them reserved."""
     monkeypatch.setattr(hub_store, "MAX_BYTES", 100)
     monkeypatch.setattr(hub_store, "RESERVED_BYTES", 40)
-    monkeypatch.setattr(hub_store, "_OVERHEAD", 0)
+    monkeypatch.setattr(hub_store, "OVERHEAD", 0)
     monkeypatch.setattr(hub_store, "MAX_WILLS", 1)
 
 
@@ -99,6 +99,15 @@ def test_what_has_no_room_is_refused_and_leaves_the_others_and_its_own_older_val
 def test_long_names_take_room_too() -> None:
     made = store(retained("a", b"1", "x" * 1000), StoredWill("client", Will("a", b"", QoS.DELIVERED, True, "x" * 1000)))
     assert (made.retained(), made.wills(), made.refused) == ([], set(), 2)
+
+
+@pytest.mark.usefixtures("small")
+def test_at_a_hub_of_several_no_robot_fills_the_room_of_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(hub_store, "ROBOT_BYTES", 50)
+    made = store(*(retained(f"a/b/{name}", bytes(25)) for name in ("x/1", "x/2", "y/1", "y/2")))
+    assert [one.key for one in made.retained()] == ["a/b/x/1", "a/b/y/1"]
+    made.apply(retained("a/b/x/1", b""))
+    assert made.apply(retained("a/b/x/2", bytes(25)))
 
 
 @pytest.mark.usefixtures("small")

@@ -75,6 +75,9 @@ HOME = (hub("n"), linked(0), hello(0))
         pytest.param([hub("n"), hello(0), gone(1)], 1 + SUCCESSOR_S, True, id="the first successor"),
         pytest.param([hub("a"), hello(0), gone(1)], 1 + SUCCESSOR_S + RANK_S, True, id="the second successor"),
         pytest.param(
+            [hub("a"), hello(0), gone(1), hub("a", False)], 1 + SUCCESSOR_S, True, id="its turn when it is due"
+        ),
+        pytest.param(
             [hub("a"), hub("a", False), hello(0), gone(1)], 1 + SUCCESSOR_S, True, id="the first is gone, too"
         ),
         pytest.param(

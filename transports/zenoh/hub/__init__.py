@@ -8,15 +8,13 @@ from __future__ import annotations
 
 import errno
 import logging
-import queue
 import socket
 import threading
 import time
-from collections import Counter
+from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -39,8 +37,9 @@ from pebble.transports.zenoh.hub.admission import Admission
 from pebble.transports.zenoh.hub.history import History
 from pebble.transports.zenoh.hub.journal import Journal
 from pebble.transports.zenoh.hub.mesh import Mesh
-from pebble.transports.zenoh.hub.records import Record, Retained, StoredWill
-from pebble.transports.zenoh.hub.store import HubStore
+from pebble.transports.zenoh.hub.records import Record, Retained, StoredWill, robot_of
+from pebble.transports.zenoh.hub.store import OVERHEAD, HubStore
+from pebble.transports.zenoh.hub.turns import Places, Task, Turns
 from pebble.transports.zenoh.hub.wills import STILL_S, WillTimes
 from pebble.transports.zenoh.keymap import topic_to_key
 from pebble.transports.zenoh.presence import Barrier
@@ -48,19 +47,18 @@ from pebble.transports.zenoh.session import HUB_SOCKET, close_at_exit, close_ses
 
 log = logging.getLogger(__name__)
 
-QUEUE_LIMIT = 10_000  # events waiting for the hub's thread; beyond it their senders wait
 QUERIES = 1000  # that wait for what is on its way; further ones are answered at once
-ASKED = 2000  # queries that wait for the hub's thread, which does all else first; beyond it …
-_ASKERS = 8  # … their senders wait, each connection in its turn; more would take the threads that receive stops
+ASKED = 2000  # queries that wait for the hub's thread; beyond it …
+SENDERS = 8  # … their senders wait, each connection in its turn; more would take the threads that receive stops
 HELLOS = 8  # of one account that wait
-HELLO_BYTES = 128 << 10  # of one; some 2,000 retained topics
+ASKED_BYTES = 128 << 10  # of one hello, some 2,000 retained topics, or query
+RETAINING_BYTES = 1 << 20  # of retained messages of one robot that wait; beyond it their senders wait, as above
+COMING = 100  # sessions of one account that come or go; the same
 PATIENCE_S = 0.5  # a query waits this long for retained messages that are known to be on their way
+_SENT_S = 0.1  # a will has left by then; what a session that is closed has to send reaches some and not others
 _LOOK_S = 0.25  # a hub among others looks so often whether it stood still
 
 _NEVER = float("inf")
-
-_Task = Callable[[], None]
-_FIRST, _QUERY, _LAST = range(3)  # in the order of their turns
 
 
 class ZenohHub:
@@ -142,6 +140,7 @@ class ZenohHub:
             return
         self._used = self._newest
         if self._session is not None:
+            worker.hold_wills()
             close_session(self._session)
         self._problem = ""
         self._listen(worker)
@@ -239,12 +238,14 @@ class HubWorker:
         self._mesh = Mesh(name, self, self._wills)
         self._token: zenoh.LivelinessToken | None = None  # clients ask a hub when its token appears
         self._renewals = 0
-        self._waiting_queries: list[tuple[float, dict[str, int], zenoh.Query]] = []
-        self._tasks: queue.PriorityQueue[tuple[int, int, _Task | None]] = queue.PriorityQueue(QUEUE_LIMIT)
-        self._turns, self._places, self._askers = count(), threading.Semaphore(ASKED), threading.Semaphore(_ASKERS)
-        self._hellos = Counter[str]()  # that wait, of accounts
-        self._guard = threading.Lock()  # of these
+        self._waiting_queries: deque[tuple[float, dict[str, int], zenoh.Query]] = deque()
+        self._awaited: set[str] = set()  # clients whose messages these wait for
+        self._looks = False  # whether some of them may wait no longer
+        self._turns = Turns()
+        self._asking, self._greeting = Places(ASKED, SENDERS), Places(HELLOS)
+        self._retaining, self._coming = Places(RETAINING_BYTES, SENDERS), Places(COMING, SENDERS)
         self._session: zenoh.Session | None = None
+        self._publishing, self._holds, self._published = threading.Lock(), False, float("-inf")
         self._thread = threading.Thread(target=self._run, name="pebble-hub", daemon=True)
         if journal is not None:
             self._write_journal(journal)
@@ -257,24 +258,30 @@ class HubWorker:
         """Serve the clients of ``session`` instead of those of the one before, which is closed."""
         if self._session is not None:
             self.post(self._await_return)
-        self._session = session
+        self._session, self._holds = session, False
         # Its own messages would wait for room in the queue that this thread empties.
-        others, work_on = zenoh.Locality.REMOTE, self._queued(self._store_retained)
-        session.declare_subscriber(wire.RETAINED + "**", work_on, allowed_origin=others)
+        others, retain = zenoh.Locality.REMOTE, direct(self._retain)
+        session.declare_subscriber(wire.RETAINED + "**", retain, allowed_origin=others)
         session.declare_queryable(wire.RETAINED + "**", direct(self._ask), complete=True)
         for what, work in ((wire.HELLO, self._on_hello), (wire.BYE, self._on_bye)):
             session.declare_queryable(what, self._queued(work))
             session.declare_queryable(f"{what}/*", direct(partial(self._greeted, work)))
-        session.liveliness().declare_subscriber(wire.LIVE + "*", self._queued(self._on_client), history=True)
+        session.liveliness().declare_subscriber(wire.LIVE + "*", direct(self._come), history=True)
         if self._store.has_history:
             self._mesh.serve(session, self._queued)
         self._token = session.liveliness().declare_token(wire.UP + self._name)
         if not self._thread.is_alive():
             self._thread.start()
 
+    def hold_wills(self) -> None:
+        """Publish no will before the next session: hubs that did not get it of this one would publish it, too."""
+        with self._publishing:
+            self._holds = True
+        time.sleep(max(0.0, self._published + _SENT_S - time.monotonic()))
+
     def close(self) -> None:
         if self._thread.is_alive():
-            self._tasks.put((_LAST, 0, None))
+            self._turns.end()
             self._thread.join(5)
         for _, _, query in self._waiting_queries:
             query.drop()  # type: ignore[no-untyped-call]
@@ -287,62 +294,65 @@ class HubWorker:
     def _queued(self, work: Callable[[Any], None]) -> zenoh.handlers.Callback[Any]:
         return direct(lambda event: self.post(lambda: work(event)))
 
-    def post(self, task: _Task, turn: int = _FIRST) -> None:
+    def post(self, task: Task) -> None:
         """Do ``task`` on the hub's thread."""
-        self._tasks.put((turn, next(self._turns), task))
+        self._turns.put(task)
 
-    def _ask(self, query: zenoh.Query) -> None:
-        """Have a query for retained messages answered after all else: what an account asks holds up nothing of it."""
-        if not self._places.acquire(blocking=False):
-            if not self._askers.acquire(blocking=False):
-                query.drop()  # type: ignore[no-untyped-call]
-                return
-            self._places.acquire()
-            self._askers.release()
+    def _retain(self, sample: zenoh.Sample) -> None:
+        """Have a message stored, in the room that waiting ones of its robot have: others come in between."""
+        name = robot_of(str(sample.key_expr).removeprefix(wire.RETAINED))
+        size = OVERHEAD + len(sample.payload)
 
         def work() -> None:
-            self._places.release()
-            self._query(query)
+            self._retaining.leave(name, size)
+            self._store_retained(sample)
 
-        self.post(work, _QUERY)
+        if self._retaining.take(name, size):
+            self.post(work)
+
+    def _come(self, sample: zenoh.Sample) -> None:
+        """Note that a client is there, or is gone; those of an account in the room that it has."""
+        account, of, _ = str(sample.key_expr).removeprefix(wire.LIVE).partition(wire.OF)
+
+        def work() -> None:
+            if of:
+                self._coming.leave(account)
+            self._on_client(sample)
+
+        if not of or self._coming.take(account):
+            self.post(work)
+
+    def _ask(self, query: zenoh.Query) -> None:
+        """Have a query for retained messages answered, which holds its place until then."""
+        if _admits(query, self._asking, ""):
+            self._turns.put(partial(self._query, query), asked=True)
 
     def _greeted(self, work: Callable[[zenoh.Query], None], query: zenoh.Query) -> None:
-        """Queue the hello or goodbye of an account, unless it is too long, or too many of it wait already."""
+        """Queue the hello or goodbye of an account."""
         account = str(query.key_expr).rpartition("/")[2]
-        with self._guard:
-            fits = self._hellos[account] < HELLOS and (query.payload is None or len(query.payload) <= HELLO_BYTES)
-            self._hellos[account] += fits
-        if not fits:
-            query.drop()  # type: ignore[no-untyped-call]
-            return
 
         def greet() -> None:
-            with self._guard:
-                self._hellos -= Counter((account,))
+            self._greeting.leave(account)
             work(query)
 
-        self.post(greet, _QUERY)
+        if _admits(query, self._greeting, account):
+            self._turns.put(greet, asked=True)
 
     def _run(self) -> None:
         turn = clock.since_boot()
         while True:
-            try:
-                *_, task = self._tasks.get(timeout=self._pause())
-                if task is None:
-                    return
-            except queue.Empty:
-                task = None
+            if (task := self._turns.take(self._pause())) is None:
+                return
             before, turn = turn, clock.since_boot()
             if self._wills.met_others and turn - before > _LOOK_S + STILL_S:
                 self._wills.on_standstill(time.monotonic())
-            if task is not None:
-                self._do(task)
+            self._do(task)
             self._answer_waiting()
             self._publish_due_wills()
             if self._journal is not None and self._journal.rewrite_due:
                 self._do(partial(self._write_journal, self._journal))
 
-    def _do(self, task: _Task) -> None:
+    def _do(self, task: Task) -> None:
         try:
             task()
         # What another program or a lost connection can cause:
@@ -357,8 +367,9 @@ class HubWorker:
     def _pause(self) -> float | None:
         now = time.monotonic()
         merged = self._mesh.merging_until
-        answers = (max(until, merged) for until, _, _ in self._waiting_queries)
-        pauses = [due - now for due in (self._wills.next_due, *answers)]
+        pauses = [_NEVER if self._holds else self._wills.next_due - now]
+        if self._waiting_queries:
+            pauses.append((merged if self._looks else max(self._waiting_queries[0][0], merged)) - now)
         if self._journal is not None:
             pauses.append(self._journal.wait_s)
         if self._wills.met_others:
@@ -376,6 +387,8 @@ class HubWorker:
         self._wills.on_message(stamp.origin, time.monotonic())
         if stamp.retained_count and stamp.origin in self._received:
             self._received[stamp.origin] = max(stamp.retained_count, self._received[stamp.origin])
+            if stamp.origin in self._awaited:
+                self._looks = True
 
     def _query(self, query: zenoh.Query) -> None:
         """Queue a subscriber's query, which names the messages that the answer must include."""
@@ -383,25 +396,38 @@ class HubWorker:
             needs = wire.decode_counts(_payload(query))
         except (ValueError, msgspec.DecodeError):
             query.drop()  # type: ignore[no-untyped-call]
+            self._asking.leave()
             raise
-        if len(self._waiting_queries) >= QUERIES:
-            needs = {}
-        self._waiting_queries.append((time.monotonic() + PATIENCE_S, needs, query))
+        now, merging = time.monotonic(), time.monotonic() < self._mesh.merging_until
+        if len(self._waiting_queries) >= QUERIES or (self._has_arrived(needs) and not merging):
+            self._answer(query)
+            return
+        self._waiting_queries.append((now + PATIENCE_S, needs, query))
+        self._awaited.update(needs)
+        self._looks = self._looks or merging
+
+    def _has_arrived(self, needs: dict[str, int]) -> bool:
+        return all(self._received.get(name, -1) >= count for name, count in needs.items())
 
     def _answer_waiting(self) -> None:
-        if not self._waiting_queries:
-            return
+        """Those that have waited for long enough, or for nothing more."""
         now = time.monotonic()
-        waiting, self._waiting_queries = self._waiting_queries, []
-        merging = now < self._mesh.merging_until
-        for until, needs, query in waiting:
-            arrived = all(self._received.get(name, -1) >= count for name, count in needs.items())
-            if (now >= until or arrived) and not merging:
-                self._do(lambda query=query: self._answer(query))  # type: ignore[misc]
-            else:
-                self._waiting_queries.append((until, needs, query))
+        if now < self._mesh.merging_until:
+            return
+        due = []
+        while self._waiting_queries and now >= self._waiting_queries[0][0]:
+            due.append(self._waiting_queries.popleft())
+        if self._looks:
+            self._looks = False
+            due += [one for one in self._waiting_queries if self._has_arrived(one[1])]
+            self._waiting_queries = deque(one for one in self._waiting_queries if not self._has_arrived(one[1]))
+        if not self._waiting_queries:
+            self._awaited.clear()
+        for _, _, query in due:
+            self._turns.put(partial(self._answer, query), asked=True)
 
     def _answer(self, query: zenoh.Query) -> None:
+        self._asking.leave()
         with query:
             for retained in self._selected(query.key_expr):
                 query.reply(wire.RETAINED + retained.key, retained.payload, attachment=retained.stamp.pack())
@@ -469,9 +495,11 @@ class HubWorker:
             self._wills.on_gone(name, time.monotonic())
 
     def _publish_due_wills(self) -> None:
-        for name, is_successor in self._wills.take_due(time.monotonic()):
-            if (will := self._store.will(name)) is not None:
-                self._do(partial(self._publish_due_will, name, will, is_successor=is_successor))
+        with self._publishing:
+            for name, is_successor in () if self._holds else self._wills.take_due(time.monotonic()):
+                if (will := self._store.will(name)) is not None:
+                    self._published = time.monotonic()
+                    self._do(partial(self._publish_due_will, name, will, is_successor=is_successor))
 
     def _publish_due_will(self, name: str, will: wire.Will, *, is_successor: bool) -> None:
         try:
@@ -582,6 +610,14 @@ def _answer_nothing(key: str, query: zenoh.Query) -> None:
     """A hub has sent no retained messages of its own."""
     with query:
         query.reply(key, wire.pack_count(0))
+
+
+def _admits(query: zenoh.Query, places: Places, name: str) -> bool:
+    """Whether there is a place for a query that is short enough; else it is answered with nothing."""
+    admitted = (query.payload is None or len(query.payload) <= ASKED_BYTES) and places.take(name)
+    if not admitted:
+        query.drop()  # type: ignore[no-untyped-call]
+    return admitted
 
 
 def _payload(query: zenoh.Query) -> bytes:

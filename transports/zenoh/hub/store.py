@@ -7,17 +7,18 @@ from collections.abc import Iterable, Iterator, Mapping
 
 from pebble.transports.zenoh.hub.history import History
 from pebble.transports.zenoh.hub.merge import Row, Value
-from pebble.transports.zenoh.hub.records import Record, Retained, StoredWill
+from pebble.transports.zenoh.hub.records import Record, Retained, StoredWill, robot_of
 from pebble.transports.zenoh.keymap import topic_to_key
 from pebble.transports.zenoh.wire import Hello, Will, digest
 
 log = logging.getLogger(__name__)
 
 MAX_BYTES = 64 << 20  # of retained messages and wills together
+ROBOT_BYTES = 8 << 20  # of them for the keys of one robot, at a hub of several: none fills the room of all
 RESERVED_BYTES = 16 << 20  # of them, for keys that are reserved: other clients cannot fill these
 MAX_WILLS = 1000
 RESERVED_WILLS = 100  # of them, for the same keys
-_OVERHEAD = 400  # bytes of Python's objects for one record, about
+OVERHEAD = 400  # bytes of Python's objects for one record, about
 
 
 class HubStore:
@@ -37,6 +38,7 @@ class HubStore:
         self._retained: dict[str, Retained] = {}
         self._wills: dict[str, Will] = {}
         self._bytes = {True: 0, False: 0}  # by whether the key is reserved
+        self._bytes_of: dict[str, int] = {}  # by robot, if none is reserved
 
     def empty(self) -> HubStore:
         """An empty one with the same room."""
@@ -160,12 +162,17 @@ class HubStore:
 
     def _resize(self, key: str, grown: int) -> bool:
         """Account for ``grown`` bytes more, or less, of ``key``; False if there is no room for them."""
-        reserved = key.startswith(self._reserved)
+        reserved, robot = key.startswith(self._reserved), robot_of(key)
+        of_robot = 0 if self._reserved else self._bytes_of.get(robot, 0) + grown
         if grown > 0:
-            full = sum(self._bytes.values()) + grown > MAX_BYTES
+            full = sum(self._bytes.values()) + grown > MAX_BYTES or of_robot > ROBOT_BYTES
             if full or (self._reserved and not reserved and self._bytes[False] + grown > MAX_BYTES - RESERVED_BYTES):
                 return False
         self._bytes[reserved] += grown
+        if of_robot:
+            self._bytes_of[robot] = of_robot
+        else:
+            self._bytes_of.pop(robot, None)
         return True
 
     def _refuse(self, what: str) -> None:
@@ -181,4 +188,4 @@ def _size(message: Retained | Will | None) -> int:
         where, who = message.key, message.stamp.origin
     else:
         where, who = message.topic, message.client
-    return _OVERHEAD + len(where) + len(who) + len(message.payload)
+    return OVERHEAD + len(where) + len(who) + len(message.payload)

@@ -24,10 +24,13 @@ MAX_LOST = 1000  # sessions whose lost links are remembered
 
 
 class Due(msgspec.Struct):
-    """``successor``: another hub was the home. ``latest``: it is put off no further."""
+    """``successor``: another hub was the home. ``ranked``: it waits for its turn among the successors that are there at
+    that time, because hubs do not learn at one instant that another is gone. ``latest``: it is put off no further.
+    """
 
     at: float
     successor: bool
+    ranked: bool
     latest: float
 
 
@@ -68,7 +71,7 @@ class WillTimes:
         elif has_will and (not self._met_others or self.is_home(name, now)):
             self._put(name, now + RETURN_S, successor=False)
         elif has_will:
-            self._put(name, now + RETURN_S + SUCCESSOR_S + RANK_S * self._rank, successor=True)
+            self._put(name, now + RETURN_S + SUCCESSOR_S, successor=True, ranked=True)
 
     def on_alive(self, name: str) -> None:
         self._due.pop(name, None)
@@ -85,7 +88,7 @@ class WillTimes:
             roamed = lost is not None and now - lost > SAME_S
             self._put(name, now + HOME_S + RANK_S * roamed, successor=False)
         else:
-            self._put(name, now + SUCCESSOR_S + RANK_S * self._rank, successor=True)
+            self._put(name, now + SUCCESSOR_S, successor=True, ranked=True)
 
     def on_message(self, name: str, now: float) -> None:
         """A retained message of a client has come, perhaps on another way than its token went."""
@@ -116,7 +119,7 @@ class WillTimes:
         """Others have had these wills while this hub was away, and come first."""
         for name in names:
             if (due := self._due.get(name)) is not None:
-                self._put(name, max(due.at, now + SUCCESSOR_S + RANK_S * (MAX_RANK + self._rank)), successor=True)
+                self._put(name, max(due.at, now + SUCCESSOR_S + RANK_S * MAX_RANK), successor=True, ranked=True)
 
     def forget(self, name: str) -> None:
         """The client has no will any more."""
@@ -127,7 +130,8 @@ class WillTimes:
 
     @property
     def next_due(self) -> float:
-        return min((due.at for due in self._due.values()), default=float("inf"))
+        turn = self._turn
+        return min((due.at + turn * due.ranked for due in self._due.values()), default=float("inf"))
 
     @property
     def met_others(self) -> bool:
@@ -135,7 +139,8 @@ class WillTimes:
 
     def take_due(self, now: float) -> list[tuple[str, bool]]:
         """The clients whose wills are due, and whether this hub publishes one as a successor; each is returned once."""
-        taken = [(name, due.successor) for name, due in self._due.items() if now >= due.at]
+        turn = self._turn
+        taken = [(name, due.successor) for name, due in self._due.items() if now >= due.at + turn * due.ranked]
         for name, _ in taken:
             self.forget(name)
         return taken
@@ -159,5 +164,10 @@ class WillTimes:
     def _rank(self) -> int:
         return min(MAX_RANK, sorted({*self.hubs, self._name}).index(self._name))
 
-    def _put(self, name: str, at: float, successor: bool) -> None:
-        self._due[name] = Due(at, successor, at + PUT_OFF_S)
+    @property
+    def _turn(self) -> float:
+        """How long it leaves the successors before it."""
+        return RANK_S * self._rank
+
+    def _put(self, name: str, at: float, *, successor: bool, ranked: bool = False) -> None:
+        self._due[name] = Due(at, successor, ranked, at + PUT_OFF_S)
