@@ -45,6 +45,7 @@ class Component:
         self.ask = ask_person  # tells the person at the robot what to do
         self.person_s = 180.0  # until that is done, and a broker has noticed it: 1.5 times a keep-alive of a minute
         self.records: deque[Record] = deque(maxlen=_MOST)
+        self.stalled_s = 0.0  # the longest time that this program waited in vain to go on
         #: When its wheels changed (monotonic), and to what, left and right: from where it is seen besides.
         self.eyes: Callable[[], list[tuple[float, list[float]]]] = list
         self.view = RobotView(base)
@@ -69,7 +70,9 @@ class Component:
                 return True
             if time.monotonic() >= end:
                 return False
+            slept = time.monotonic()
             time.sleep(_STEP_S)
+            self.stalled_s = max(self.stalled_s, time.monotonic() - slept)
 
     def look(self, seconds: float) -> float:
         """Only let time pass; returns when that began."""
