@@ -84,11 +84,7 @@ class Component:
 
     def of(self, channel: c.Channel, since: float = 0.0, *, retained: bool = False) -> list[Record]:
         """Its live messages of a channel, or with ``retained`` all."""
-        return [
-            one
-            for one in self._of[channel]
-            if one.at >= since and one.payload and (retained or not one.retain)
-        ]
+        return [one for one in self._of[channel] if one.at >= since and one.payload and (retained or not one.retain)]
 
     def send(self, channel: c.Channel, value: object) -> float:
         """Publish a command, as bytes or as its struct; returns when."""
