@@ -1,6 +1,5 @@
-"""The smallest honest robot in MicroPython, on an ESP32 or a Pico W, with mqtt.py. Your settings.py has WIFI,
-WIFI_PASSWORD, ID, HOST, PORT, STOP_FILE, and LOGIN: () or user, password and the broker's CA in PEM. With a user it is
-at level named: only what has the sender's account in its topic moves it, or ends a stop."""
+"""The smallest honest robot in MicroPython (ESP32, Pico W), with mqtt.py. Your settings.py has WIFI, WIFI_PASSWORD, ID,
+HOST, PORT, STOP_FILE and LOGIN: (), or for level named user, password and the broker's CA in PEM."""
 
 import binascii, json, network, os, time
 from mqtt import Mqtt
@@ -26,7 +25,7 @@ class Robot:
         self.holder, self.account, self.holds_ms, self.ends = NONE, "", 0, 0  # who drives, and until when
         self.asker, self.asks_end = UNASKED, 0  # who waits for control
         self.end, self.wheels, self.shown = 0, [0, 0], None  # when the wheels stop, and what they do
-        self.stop = {"latched": False, "recent": [], "by": "", "why": "", "since": 0}
+        self.stop, self.saved = {"latched": False, "recent": [], "by": "", "why": "", "since": 0}, False
         try:
             with open(STOP_FILE) as file:  # OSError: there was no stop yet
                 self.stop["latched"] = True  # what cannot be read is one
@@ -35,13 +34,16 @@ class Robot:
             pass
 
     def publish_stop(self):
-        state = dict(self.stop, boot=self.boot, count=self.count, reset_refused=self.refused, persisted=True)
         try:
-            with open(STOP_FILE + ".new", "w") as file:
-                json.dump(self.stop, file)
-            os.rename(STOP_FILE + ".new", STOP_FILE)
+            if not self.saved:
+                with open(STOP_FILE + ".new", "w") as file:
+                    json.dump(self.stop, file)
+                os.rename(STOP_FILE + ".new", STOP_FILE)
+                self.saved = True
         except OSError:
-            state["persisted"] = False
+            pass  # it is tried again
+        self.pause_end = later(PAUSE_MS)  # after saving: what came meanwhile moves nothing
+        state = dict(self.stop, boot=self.boot, count=self.count, reset_refused=self.refused, persisted=self.saved)
         publish("estop/" + OWNER, state)
 
     def turn(self, left, right, ms):  # set your pins here, and for so long
@@ -64,20 +66,18 @@ class Robot:
 
     def halt(self, claims, account):  # whatever arrives is a stop; what has a name counts once
         self.turn(0, 0, 0)
-        name = str(claims.get("stop"))
-        name = name if len(name) == 16 and letters(name, HEX, 16) == name else token(8)
+        name = name if len(name := str(claims.get("stop"))) == 16 and letters(name, HEX, 16) == name else token(8)
         if name not in self.stop["recent"]:
-            self.count, self.refused = self.count + 1, None
+            self.count, self.refused, self.saved = self.count + 1, None, False
             by = account[:32] or letters(claims.get("by", ""), PLAIN, 31) + "?" * NAMED  # no broker has checked it
             why, recent = letters(claims.get("why", ""), PLAIN, 40), [name] + self.stop["recent"][:7]  # noqa: RUF005
             self.stop = {"latched": True, "recent": recent, "by": by, "why": why, "since": epoch_ms()}
         self.publish_stop()
 
     def reset(self, command):  # ends the stop that its sender has seen, and no other
-        seen = None if command.get("count") == self.count else "count"
-        self.refused = seen if command.get("boot") == self.boot else "boot"
+        self.refused = next((one for one in ("boot", "count") if command.get(one) != getattr(self, one)), None)
         if self.refused is None and self.stop["latched"]:
-            self.stop["latched"], self.pauses, self.pause_end = False, True, later(PAUSE_MS)
+            self.stop["latched"], self.saved, self.pauses = False, False, True
         self.publish_stop()
 
     def control(self, command, account, take):  # until it ends, is released or taken; who asks meanwhile is shown

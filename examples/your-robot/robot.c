@@ -18,7 +18,7 @@ enum { LONGEST = 512, RECENT = 8, VERSION = 1 };
 static struct mosquitto *client;
 static const char *id, *stop_file, *refused = "null";
 static char boot[9], topic[128], text[1024], password[128];
-static int named, online, count, shown;  // shown: what the wheels do has been published
+static int named, online, count, shown, saved;  // shown: what the wheels do has been published
 static double paused_at = -INFINITY, until, left, right;  // when the wheels stop, and what they do
 static struct stop { int version, latched; char recent[RECENT][17], by[34], why[41]; double since; } stop = {.version = VERSION};
 static struct client { char id[9], by[75], device[21], key[9], account[33]; double holds_s, ends; } holder, asker;  // who drives, who waits
@@ -43,9 +43,10 @@ static void publish_stop(void) {  // and save it: in a new file that replaces th
     char names[RECENT * 21] = "", new[512];
     for (int i = 0; i < RECENT && *stop.recent[i]; i++) sprintf(names + strlen(names), "%s\"%s\"", i ? ", " : "", stop.recent[i]);
     snprintf(new, sizeof new, "%s.new", stop_file);
-    FILE *file = fopen(new, "w");
-    int saved = file && fwrite(&stop, sizeof stop, 1, file) == 1 && fflush(file) == 0 && fsync(fileno(file)) == 0;
-    if (file) saved = fclose(file) == 0 && saved && rename(new, stop_file) == 0;
+    if (!saved) mosquitto_loop_write(client, 1);  // shows that the wheels stand: saving may take a while
+    FILE *file = saved ? NULL : fopen(new, "w");
+    int whole = file && fwrite(&stop, sizeof stop, 1, file) == 1 && fflush(file) == 0 && fsync(fileno(file)) == 0;
+    if (file) saved = fclose(file) == 0 && whole && rename(new, stop_file) == 0, paused_at = now();  // what came meanwhile moves nothing
     publish("estop/motors", 1, "{\"latched\": %s, \"recent\": [%s], \"by\": \"%s\", \"why\": \"%s\", \"since\": %.0f, \"boot\": \"%s\", "
             "\"count\": %d, \"reset_refused\": %s, \"persisted\": %s}", BOOL[stop.latched], names, stop.by, stop.why, stop.since,
             boot, count, refused, BOOL[saved]);
@@ -74,19 +75,18 @@ static void drive(const cJSON *command, const char *account) {
     turn(CLAMP(z + x, -1, 1), CLAMP(z - x, -1, 1), CLAMP(valid_s, 0, DEAD_MAN_S));
 }
 static void halt(const cJSON *told, const char *account) {  // whatever arrives is a stop; what has a name counts once
-    char name[18];
-    turn(0, 0, 0);
+    char name[18]; turn(0, 0, 0);
     if (copy(name, sizeof name, get(told, "stop"), "0123456789abcdef") != 16 || name[16]) hex8(name), hex8(name + 8);
     for (int i = 0; i < RECENT; i++) if (!strcmp(stop.recent[i], name)) return publish_stop();
     memmove(stop.recent[1], stop.recent[0], sizeof stop.recent - sizeof stop.recent[0]), strcpy(stop.recent[0], name);
     copy(stop.by, 32, get(told, "by"), TEXT), copy(stop.why, sizeof stop.why, get(told, "why"), TEXT);
     if (*account) strcpy(stop.by, account); else if (named) strcat(stop.by, "?");  // "?": no broker has checked it
-    stop.latched = 1, stop.since = epoch_ms(), count++, refused = "null", publish_stop();
+    stop.latched = 1, stop.since = epoch_ms(), count++, refused = "null", saved = 0, publish_stop();
 }
 static void reset(const cJSON *command) {  // ends the stop that its sender has seen, and no other
     int seen = cJSON_GetNumberValue(get(command, "count")) == count;
     refused = !same(get(command, "boot"), boot) ? "\"boot\"" : seen ? "null" : "\"count\"";
-    if (!strcmp(refused, "null") && stop.latched) stop.latched = 0, paused_at = now();
+    if (!strcmp(refused, "null") && stop.latched) stop.latched = saved = 0;
     publish_stop();
 }
 static void publish_control(void) {

@@ -26,7 +26,7 @@ template <class Link> struct Watched : Link {  // PubSubClient does not pass on 
 };
 static Watched<WiFiClient> plain; static Watched<WiFiClientSecure> secure;
 static PubSubClient mqtt; static Preferences flash; static Ticker dead_man;
-static int named, count, shown;  // shown: what the wheels do has been published
+static int named, count, shown, saved;  // shown: what the wheels do has been published
 static const char *refused = "null";
 static char boot[9], topic[160], text[1024];
 static double paused_at = -INFINITY, until, left, right, sign_at;  // when the wheels stop, and what they do
@@ -48,7 +48,7 @@ static void publish_text(const char *metric) {  // with QoS 0: PubSubClient has 
 static void publish_stop() {  // and save it
     char names[RECENT * 21] = "";
     for (int i = 0; i < RECENT && *stop.recent[i]; i++) sprintf(names + strlen(names), "%s\"%s\"", i ? ", " : "", stop.recent[i]);
-    bool saved = flash.putBytes("stop", &stop, sizeof stop) == sizeof stop;
+    if (!saved) saved = flash.putBytes("stop", &stop, sizeof stop) == sizeof stop, paused_at = now();  // what came meanwhile moves nothing
     publish("estop/motors", "{\"latched\": %s, \"recent\": [%s], \"by\": \"%s\", \"why\": \"%s\", \"since\": %.0f, \"boot\": \"%s\", "
             "\"count\": %d, \"reset_refused\": %s, \"persisted\": %s}", BOOL[stop.latched], names, stop.by, stop.why, stop.since,
             boot, count, refused, BOOL[saved]);
@@ -85,11 +85,11 @@ static void halt(JsonVariantConst told, const char *account) {  // whatever arri
     memmove(stop.recent[1], stop.recent[0], sizeof stop.recent - sizeof stop.recent[0]), strcpy(stop.recent[0], name);
     copy(stop.by, 32, told["by"] | "", TEXT), copy(stop.why, sizeof stop.why, told["why"] | "", TEXT);
     if (*account) strcpy(stop.by, account); else if (named) strcat(stop.by, "?");  // "?": no broker has checked it
-    stop.latched = 1, stop.since = epoch_ms(), count++, refused = "null", publish_stop();
+    stop.latched = 1, stop.since = epoch_ms(), count++, refused = "null", saved = 0, publish_stop();
 }
 static void reset(JsonVariantConst command) {  // ends the stop that its sender has seen, and no other
     refused = !same(command["boot"], boot) ? "\"boot\"" : number(command["count"], NAN) == count ? "null" : "\"count\"";
-    if (!strcmp(refused, "null") && stop.latched) stop.latched = 0, paused_at = now();
+    if (!strcmp(refused, "null") && stop.latched) stop.latched = saved = 0;
     publish_stop();
 }
 static void publish_control() {

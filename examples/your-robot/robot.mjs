@@ -19,7 +19,7 @@ const NOBODY = { id: "", by: "", device: "", key: "" }, UNASKED = { asks: "", as
 const now = () => performance.now(), clamp = (value, least, most) => Math.max(least, Math.min(most, value));
 const text = (value) => (typeof value === "string" ? value : "");
 const boot = randomBytes(4).toString("hex");
-let count = 0, refused = null, pausedAt = -Infinity;
+let count = 0, refused = null, pausedAt = -Infinity, saved = false;
 let holder = NOBODY, lease = { account: "", forMs: 0, ends: 0 }; // who drives, and until when
 let asker = UNASKED, asksUntil = 0; // who waits for control
 let until = 0, wheels = [0, 0], shown = ""; // when the wheels stop, and what they do
@@ -35,14 +35,12 @@ function publish(metric, value, qos = 1) {
 }
 
 function publishStop() {
-  let persisted = true;
   try {
-    fs.writeFileSync(STOP_FILE + ".new", JSON.stringify(stop), { flush: true });
-    fs.renameSync(STOP_FILE + ".new", STOP_FILE);
-  } catch {
-    persisted = false;
-  }
-  publish(`estop/${OWNER}`, { ...stop, boot, count, reset_refused: refused, persisted });
+    if (!saved) fs.writeFileSync(STOP_FILE + ".new", JSON.stringify(stop), { flush: true });
+    if (!saved) fs.renameSync(STOP_FILE + ".new", STOP_FILE);
+    [saved, pausedAt] = [true, saved ? pausedAt : now()]; // what came meanwhile moves nothing
+  } catch {} // it is tried again
+  publish(`estop/${OWNER}`, { ...stop, boot, count, reset_refused: refused, persisted: saved });
 }
 
 /** Motors get this, and nothing after so many milliseconds: here they are shown, a real robot sets its pins. */
@@ -76,18 +74,18 @@ function halt(payload, account) {
   } catch {} // it is one, all the same
   const name = /^[0-9a-f]{16}$/.test(text(told.stop)) ? told.stop : randomBytes(8).toString("hex");
   if (!stop.recent.includes(name)) {
-    [count, refused] = [count + 1, null];
+    [count, refused, saved] = [count + 1, null, false];
     const [by, why] = [told.by, told.why].map((one) => text(one).replace(/[^ !#-[\]-~]/g, "_"));
     stop = { latched: true, recent: [name, ...stop.recent].slice(0, 8), why: why.slice(0, 40), since: Date.now() };
     stop.by = account.slice(0, 32) || by.slice(0, 31) + (NAMED ? "?" : ""); // a name that no broker has checked
   }
-  publishStop();
+  setTimeout(publishStop, 20); // saving may take a while: first it is published that the wheels stand
 }
 
 /** End the stop that its sender has seen, and no other. */
 function reset(command) {
   refused = command.boot !== boot ? "boot" : command.count !== count ? "count" : null;
-  if (refused === null && stop.latched) [stop, pausedAt] = [{ ...stop, latched: false }, now()];
+  if (refused === null && stop.latched) [stop, saved, pausedAt] = [{ ...stop, latched: false }, false, now()];
   publishStop();
 }
 

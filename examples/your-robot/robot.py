@@ -22,17 +22,18 @@ class Robot:
         self.holder, self.account, self.holds_s, self.ends = NONE, "", 0.0, 0.0  # who drives, and until when
         self.asker, self.asks_until = UNASKED, 0.0  # who waits for control
         self.until, self.wheels, self.shown = 0.0, [0.0, 0.0], None  # when the wheels stop, and what they do
-        self.stop = FREE | {"latched": os.path.exists(STOP_FILE)}  # what cannot be read is a stop
+        self.stop, self.saved = FREE | {"latched": os.path.exists(STOP_FILE)}, False  # what cannot be read is a stop
         with suppress(OSError, ValueError, TypeError):
             self.stop |= json.load(open(STOP_FILE))
 
     def publish_stop(self):
-        state = {"boot": self.boot, "count": self.count, "reset_refused": self.refused, "persisted": False}
-        with suppress(OSError), open(STOP_FILE + ".new", "w") as file:
-            json.dump(self.stop, file)
-            file.flush(), os.fsync(file.fileno())
-            os.replace(STOP_FILE + ".new", STOP_FILE)
-            state["persisted"] = True
+        if not self.saved:
+            self.show(), client.loop_write()  # that the wheels stand: saving may take a while
+            with suppress(OSError), open(STOP_FILE + ".new", "w") as file:
+                json.dump(self.stop, file), file.flush(), os.fsync(file.fileno())
+                os.replace(STOP_FILE + ".new", STOP_FILE)
+                self.saved, self.paused_at = True, now()  # what has come meanwhile moves nothing
+        state = {"boot": self.boot, "count": self.count, "reset_refused": self.refused, "persisted": self.saved}
         self.publish(f"estop/{OWNER}", self.stop | state)
 
     def turn(self, left, right, seconds):  # set your pins here, and for so long
@@ -59,10 +60,9 @@ class Robot:
         claims = {}
         with suppress(ValueError, TypeError, RecursionError):
             claims = dict(json.loads(payload))
-        name = str(claims.get("stop"))
-        name = name if re.fullmatch("[0-9a-f]{16}", name) else secrets.token_hex(8)
+        name = name if re.fullmatch("[0-9a-f]{16}", name := str(claims.get("stop"))) else secrets.token_hex(8)
         if name not in self.stop["recent"]:
-            self.count, self.refused = self.count + 1, None
+            self.count, self.refused, self.saved = self.count + 1, None, False
             by, why = (re.sub(r"[^ !#-\[\]-~]", "_", str(claims.get(one, ""))) for one in ("by", "why"))
             by = account[:32] or by[:31] + "?" * NAMED  # a name that the broker has not checked
             recent = [name, *self.stop["recent"]][:8]
@@ -72,7 +72,7 @@ class Robot:
     def reset(self, command):  # ends the stop that its sender has seen, and no other
         self.refused = "boot" if command["boot"] != self.boot else "count" if command["count"] != self.count else None
         if self.refused is None and self.stop["latched"]:
-            self.stop, self.paused_at = self.stop | {"latched": False}, now()
+            self.stop, self.saved, self.paused_at = self.stop | {"latched": False}, False, now()
         self.publish_stop()
 
     def control(self, command, account, take):  # until it ends, is released or taken; who asks meanwhile is shown

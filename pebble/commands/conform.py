@@ -73,7 +73,7 @@ def conform(
 
 
 def _of_robot(options: Target, *, may_move: bool, cut: bool, as_json: bool) -> int:
-    from pebble.conform.checks import CHECKS
+    from pebble.conform.checks import CHECKS, LAST
     from pebble.conform.component import reached
     from pebble.conform.control import CONTROL
     from pebble.conform.motion import MOVING
@@ -82,7 +82,7 @@ def _of_robot(options: Target, *, may_move: bool, cut: bool, as_json: bool) -> i
     with reached(options, _LOOKS_S) as component:
         if not component.records:
             raise PebbleError(f"nothing came from {component.base} within {_LOOKS_S:g} s: is it on, at this broker?")
-        checks = (*CHECKS, *CONTROL, *(MOVING if may_move else ()), *(CUT if cut else ()))
+        checks = (*CHECKS, *CONTROL, *(MOVING if may_move else ()), *LAST, *(CUT if cut else ()))
         found = _judged(component, checks, as_json=as_json)
         left = {
             option: of for option, of, wanted in (("--may-move", MOVING, may_move), ("--cut", CUT, cut)) if not wanted

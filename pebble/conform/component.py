@@ -3,7 +3,7 @@
 import secrets
 import sys
 import time
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -45,6 +45,8 @@ class Component:
         self.ask = ask_person  # tells the person at the robot what to do
         self.person_s = 180.0  # until that is done, and a broker has noticed it: 1.5 times a keep-alive of a minute
         self.records: deque[Record] = deque(maxlen=_MOST)
+        self._of: defaultdict[c.Channel | None, deque[Record]] = defaultdict(lambda: deque(maxlen=_MOST))
+        self.stalled_s = 0.0  # the longest time that this program waited in vain to go on
         #: When its wheels changed (monotonic), and to what, left and right: from where it is seen besides.
         self.eyes: Callable[[], list[tuple[float, list[float]]]] = list
         self.view = RobotView(base)
@@ -64,12 +66,15 @@ class Component:
                 message, at, wall = self._arrived.popleft()
                 record = record_of(message, self.base, at)
                 self.records.append(record)
+                self._of[record.channel].append(record)
                 self.view.receive(record.channel, message, at, wall)
             if condition():
                 return True
             if time.monotonic() >= end:
                 return False
+            slept = time.monotonic()
             time.sleep(_STEP_S)
+            self.stalled_s = max(self.stalled_s, time.monotonic() - slept)
 
     def look(self, seconds: float) -> float:
         """Only let time pass; returns when that began."""
@@ -79,11 +84,7 @@ class Component:
 
     def of(self, channel: c.Channel, since: float = 0.0, *, retained: bool = False) -> list[Record]:
         """Its live messages of a channel, or with ``retained`` all."""
-        return [
-            one
-            for one in self.records
-            if one.channel is channel and one.at >= since and one.payload and (retained or not one.retain)
-        ]
+        return [one for one in self._of[channel] if one.at >= since and one.payload and (retained or not one.retain)]
 
     def send(self, channel: c.Channel, value: object) -> float:
         """Publish a command, as bytes or as its struct; returns when."""

@@ -171,12 +171,14 @@ def steering(component: Component) -> CheckResult:
 
 
 def stop_moving(component: Component) -> CheckResult:
-    """Commands go on, and move nothing."""
+    """Commands go on, and begin again after the stick was let go; they move nothing."""
     with _at_the_wheel(component) as wheel:
         began, _ = wheel.drive()
         at = time.monotonic()
         stop(component, secrets.token_hex(8))
         wheel.drive()
+        wheel.send(0)
+        wheel.drive(DRIVES_S / 2)
         outcome = _rest(component, began, at, 0.25, "the stop")
     return outcome if freed(component) else failed("a reset does not end the stop", "end it on incoming/estop-reset")
 

@@ -74,6 +74,7 @@ class StandIn:
         self.ask = ask_person
         self.person_s = 180.0  # until a person has done it
         self.sent: deque[Sent] = deque(maxlen=_MOST)
+        self.stalled_s = 0.0  # is not measured: a person would have to do all again
         self.alive = True  # whether heartbeats are sent
         self.other = ""  # who has control instead of the client under test
         self.confirms = True  # whether a stop is confirmed

@@ -60,13 +60,17 @@ def in_c(program: str, folder: Path) -> Command:
 
 
 def in_arduino(program: str, folder: Path) -> Command:
+    return sketch(source(program, "cpp"), folder / program)
+
+
+def sketch(file: Path, program: Path) -> Command:
     """A stand-in takes the place of Arduino's libraries; its TLS is the openssl program."""
     if shutil.which("g++") is None or shutil.which("openssl") is None or not CJSON.exists():
         missing("needs a compiler, OpenSSL and cJSON (apt install g++ openssl libcjson-dev)")
     board = ROOT / "tests" / "conform" / "arduino"
-    command: Command = ["g++", "-std=gnu++17", *WARNINGS, "-I", board, "-o", folder / program, board / "main.cpp"]
-    subprocess.run([*command, source(program, "cpp"), "-lcjson", "-pthread"], check=True)
-    return [folder / program]
+    command: Command = ["g++", "-std=gnu++17", *WARNINGS, "-I", board, "-o", program, board / "main.cpp"]
+    subprocess.run([*command, file, "-lcjson", "-pthread"], check=True)
+    return [program]
 
 
 def in_micropython(program: str, _folder: Path) -> Command:

@@ -15,7 +15,7 @@ import pytest
 
 from pebble.check_result import State
 from pebble.client.connection import Target
-from pebble.conform.checks import CHECKS, Check
+from pebble.conform.checks import CHECKS, LAST, Check
 from pebble.conform.checks import run as results
 from pebble.conform.component import Component, reached
 from pebble.conform.control import CONTROL, UNSEEN
@@ -38,6 +38,7 @@ from tests.conform.programs import (
     ended,
     named_by_nats,
     named_by_the_fleet,
+    sketch,
     source,
 )
 from tests.fleet.conftest import cheap_hashes as cheap_hashes
@@ -46,7 +47,7 @@ from tests.support import Broker, Child, beside, further, some
 pytestmark = pytest.mark.alone  # deadlines of wheels are checked
 
 SOURCE = source("robot", "py").read_text()
-ALL = {check.name: check for check in (*CHECKS, *CONTROL, *MOVING, *CUT)}
+ALL = {check.name: check for check in (*CHECKS, *CONTROL, *MOVING, *LAST, *CUT)}
 LOOKS_S = 2.0
 
 #: The check that finds it, and what is written into the robot's program, in place of what.
@@ -111,6 +112,14 @@ VIOLATIONS = (
     ("stop moving", 'elif not self.stop["latched"] and', "elif"),
     ("reset waits", "elif now() < self.paused_at + PAUSE_S:", "elif False:"),
     ("reset waits", '-math.inf if mine or not self.holder["key"] else self.paused_at', "-math.inf"),
+    (
+        "long messages",
+        "client.on_connect, client.on_message = robot.connected, robot.receive",
+        "client.manual_ack_set(True)\n"
+        "client.on_connect, client.on_message = robot.connected, lambda client, data, message: (\n"
+        "    robot.receive(client, data, message),\n"
+        "    len(message.payload) < 1024 and client.ack(message.mid, message.qos))",
+    ),
     ("will", 'json.dumps({"t": epoch_ms(), "online": False})', 'json.dumps({"t": epoch_ms()})'),
     ("retained commands", "if message.retain:", "if False:"),
     ("stop survives", "self.stop |= json.load(open(STOP_FILE))", "self.stop = FREE"),
@@ -258,6 +267,25 @@ def test_a_violation_at_level_named_is_found(tmp_path: Path, name: str, old: str
         arguments, target = at_named(broker, tmp_path, "mine", "ann")
         with switched_on([*mutant(tmp_path, old, new), *with_stop_file(arguments, tmp_path)], target) as component:
             assert judged(component, ALL[name])[name][0] is State.FAILED
+
+
+@pytest.mark.thorough
+def test_a_library_that_acknowledges_no_long_message_is_found(broker: Broker, tmp_path: Path) -> None:
+    """The sample subscribes with QoS 0, because PubSubClient is one."""
+    text = source("robot", "cpp").read_text()
+    (tmp_path / "robot.cpp").write_text(text.replace("mqtt.subscribe(topic, 0)", "mqtt.subscribe(topic, 1)"))
+    program = sketch(tmp_path / "robot.cpp", tmp_path / "robot")
+    arguments, target = at_open(broker)
+    with switched_on([*program, *with_stop_file(arguments, tmp_path)], target) as component:
+        assert [*lacking(judged(component, ALL["junk"], ALL["long messages"]))] == ["long messages"]
+
+
+@pytest.mark.thorough
+def test_a_robot_whose_disk_is_slow_passes(broker: Broker, tmp_path: Path) -> None:
+    program = mutant(tmp_path, "os.fsync(file.fileno())", "time.sleep(0.7)")
+    arguments, target = at_open(broker)
+    with switched_on([*program, *with_stop_file(arguments, tmp_path)], target) as component:
+        assert lacking(judged(component, ALL["stop"], ALL["stop moving"], ALL["reset waits"])) == {}
 
 
 def test_what_was_not_judged_is_no_pass(

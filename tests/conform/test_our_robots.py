@@ -6,7 +6,7 @@ import pytest
 
 from pebble.check_result import State
 from pebble.client.connection import Target
-from pebble.conform.checks import CHECKS, run
+from pebble.conform.checks import CHECKS, LAST, run
 from pebble.conform.component import reached
 from pebble.conform.control import CONTROL
 from pebble.conform.motion import MOVING
@@ -22,5 +22,5 @@ def test_a_robot_of_ours_passes(name: str) -> None:
         reached(Target(url=f"mqtt://127.0.0.1:{stage.broker_port}", robot=name), 4.0) as component,
     ):
         component.eyes = lambda: [(ns / 1e9, [*wheels]) for ns, wheels in stage.motors(name)]
-        found = [(one.name, result) for one, result in run(component, (*CHECKS, *CONTROL, *MOVING))]
+        found = [(one.name, result) for one, result in run(component, (*CHECKS, *CONTROL, *MOVING, *LAST))]
     assert {name: result.text for name, result in found if result.state is not State.OK} == {}

@@ -192,7 +192,7 @@ pebble/recordings/recorder/recorder.py
 -             self._writing.rotate(all_of_them=True)
 + pass
 
-time goes back in a file: test_recorder.py -k flags or jump or times_are
+time goes back in a file: test_recorder.py -k goes_back
 pebble/recordings/recorder/lane.py
 - self.last_ns = log_ns = max(self.last_ns, at_ns)
 + self.last_ns = log_ns = at_ns

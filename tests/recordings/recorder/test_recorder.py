@@ -20,11 +20,11 @@ import pytest
 
 from pebble.recordings import library
 from pebble.recordings.files.finish import finish
-from pebble.recordings.files.mcap import Recorded, RecordingError
+from pebble.recordings.files.mcap import Packer, Recorded, RecordingError
 from pebble.recordings.files.reader import mapped, metadata_of, read
-from pebble.recordings.recorder.folder import Folder
+from pebble.recordings.recorder.folder import STATE, Folder
 from pebble.recordings.recorder.intake import EVENTS, Clocks
-from pebble.recordings.recorder.lane import RawFile
+from pebble.recordings.recorder.lane import Item, OpenFile, RawFile
 from pebble.recordings.recorder.recorder import Recorder
 from pebble.recordings.recorder.settings import Options
 from tests.small_disk import SmallDisk
@@ -75,6 +75,41 @@ def running(tmp_path: Path) -> Iterator[Running]:
     one = Running(tmp_path / "rec")
     yield one
     one.stop()
+
+
+class TestOneFile:
+    @pytest.fixture
+    def file(self, tmp_path: Path) -> OpenFile:
+        return OpenFile(Folder(tmp_path), STATE, 1, {}, Packer())
+
+    def test_time_never_goes_back(self, file: OpenFile, tmp_path: Path) -> None:
+        """A message that another thread has brought late bears the time of the one before it."""
+        for at_ns in (30, 20, 40):
+            file.add(item(b"1"), at_ns)
+        file.finish()
+        assert [message.log_ns for message in recorded(tmp_path)] == [30, 30, 40]
+
+    def test_a_full_disk_lacks_only_what_it_has_not_taken(
+        self, file: OpenFile, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        sent = [b"%d" % number + bytes(100_000) for number in range(30)]
+        for payload in sent:
+            file.add(item(payload), 1)
+        monkeypatch.setattr(RawFile, "write", fails)
+        with pytest.raises(OSError, match="No space"):
+            file.flush()
+        taken = file.writer.flushed
+        assert 0 < taken < len(sent)
+        assert [one.payload for one in file.take_lacking()] == sent[taken:]
+        file.file.close()
+
+
+def item(payload: bytes) -> Item:
+    return Item(1, ONLINE, payload, 1, False, "")
+
+
+def fails(_self: Any, _data: memoryview) -> int | None:
+    raise OSError(errno.ENOSPC, "No space left on device")
 
 
 class TestFiles:
@@ -394,13 +429,10 @@ class TestDisk:
     def test_what_a_full_disk_never_took_is_counted_at_the_end(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        def full(self: Any, data: memoryview) -> int | None:
-            raise OSError(errno.ENOSPC, "No space left on device")
-
         running = Running(tmp_path / "rec")
         running.send(20)
         assert running.written(20)
-        monkeypatch.setattr(RawFile, "write", full)
+        monkeypatch.setattr(RawFile, "write", fails)
         running.send(30)
         assert until(lambda: bool(running.recorder.blocked), 10)
         running.send(40)
