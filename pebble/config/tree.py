@@ -32,7 +32,7 @@ from pebble.config.types import (
     doc,
 )
 from pebble.config.web import WebHandler, WebInterface
-from pebble.contract.capabilities import Body, Colour
+from pebble.contract.looks import Body, Colour
 from pebble.contract.payloads import LinkLevel
 from pebble.contract.serial_protocols import SerialProtocolName
 

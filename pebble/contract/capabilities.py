@@ -8,13 +8,8 @@ from typing import Literal
 
 from msgspec import UNSET, UnsetType
 
+from pebble.contract.looks import Body, Colour
 from pebble.contract.payloads import Payload
-
-#: Colours of robots on the operator page, and its drawings of them (pebble/web/static/faces.svg).
-Colour = Literal["blue", "amber", "violet", "green", "coral", "rose", "teal", "slate"]
-Body = Literal[
-    "goob", "fred", "minilamp", "benjr", "pitcam", "outlets", "wheeled", "walker", "arm", "drone", "boat", "unknown"
-]  # fmt: skip
 
 
 class RobotIdentity(Payload, frozen=True, kw_only=True):

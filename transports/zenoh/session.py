@@ -10,14 +10,16 @@ import signal
 import threading
 import weakref
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import zenoh
 
 from pebble.errors import TransportError
 from pebble.transports.settings import TlsSettings, ZenohSettings
 from pebble.transports.zenoh import callbacks
-from pebble.transports.zenoh.access import EVERYTHING, Access, access_control
+
+if TYPE_CHECKING:
+    from pebble.transports.zenoh.access import Access
 
 # By default connections are accepted, opened and read on separate runtimes: a received message wakes a thread that only
 # wakes another one; docs/transports.md has what that costs. Sending has its own runtime, because a callback may send.
@@ -47,7 +49,7 @@ def unix_endpoint(socket: Path) -> str:
 
 
 def session_config(
-    settings: ZenohSettings, mode: str, *, listen: list[Path], connect: list[Path], access: Access | None = None
+    settings: ZenohSettings, mode: str, *, listen: list[Path], connect: list[Path], access: "Access | None" = None
 ) -> str:
     """The configuration of a ``mode`` (router, peer or client) on unix sockets plus the settings' own endpoints.
 
@@ -143,10 +145,14 @@ def _tls(tls: TlsSettings | None) -> dict[str, Any]:
     return {"tls": link}
 
 
-def _access_control(names: tuple[str, ...] | None, access: Access | None) -> dict[str, Any]:
+def _access_control(names: tuple[str, ...] | None, access: "Access | None") -> dict[str, Any]:
     if access is not None:
         return {"access_control": access.control, "qos": access.qos}
-    return {} if names is None else {"access_control": access_control([(names, EVERYTHING)])}
+    if names is None:
+        return {}
+    from pebble.transports.zenoh.access import EVERYTHING, access_control  # only who needs it pays for it
+
+    return {"access_control": access_control([(names, EVERYTHING)])}
 
 
 # -- forks and exits

@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable
 from typing import Any, get_args
 
-from pebble.contract.capabilities import Body, Colour
+from pebble.contract.looks import Body, Colour
 from tests.support import ROOT
 from tests.web.in_node import Rows, Script, evaluate, rows
 

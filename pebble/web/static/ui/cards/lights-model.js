@@ -87,7 +87,8 @@ export class Lights extends Model {
     const end = connection.onChange(() => {
       const answer = connection.answers.get(n);
       if (answer?.op === "done") {
-        this.passed = state;
+        // Of what does not flash, the period is only the next flash's: it may have changed since.
+        this.passed = state.mode === "flash" ? state : { ...state, period: this.passed.period };
         this.save();
       } else if ((answer || !connection.isOpen) && n === this.n && !this.pacer.waiting) {
         this.restore();

@@ -3,6 +3,7 @@
 import { html, useModel } from "../parts/hooks.js";
 import { LONGEST_S, SHORTEST_S, lightsOf, toggleFlash, whyNotLights } from "./lights-model.js";
 import { Why, useName } from "../parts/parts.js";
+import { Typed } from "../parts/typed.js";
 import { useReasons, whyNotEnd } from "../parts/why-not.js";
 
 const COLOURS = {
@@ -82,15 +83,15 @@ function ModeButton({ lights, mode, why, onPress, children }) {
 }
 
 function Period({ page, lights, why }) {
-  const change = (event) => {
-    const seconds = event.currentTarget.valueAsNumber;
-    if (!(seconds >= SHORTEST_S && seconds <= LONGEST_S)) event.currentTarget.value = String(lights.period);
-    else if (lights.mode === "flash") lights.ask(page, { period: seconds });
+  const done = (text) => {
+    const seconds = Number.parseFloat(text);
+    if (!(seconds >= SHORTEST_S && seconds <= LONGEST_S)) return;
+    if (lights.mode === "flash") lights.ask(page, { period: seconds });
     else lights.setPeriod(seconds);
   };
   return html`<label class="field">
     <span>Period, s</span>
-    <input
+    <${Typed}
       type="number"
       data-test="lights-period"
       min=${SHORTEST_S}
@@ -99,7 +100,7 @@ function Period({ page, lights, why }) {
       value=${lights.period}
       disabled=${Boolean(why)}
       aria-describedby=${why ? "why-lights" : undefined}
-      onChange=${change}
+      onDone=${done}
     />
   </label>`;
 }

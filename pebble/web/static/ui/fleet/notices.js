@@ -9,6 +9,7 @@ import { nameIn } from "../parts/looks.js";
 import { Icon, RouteLink, useName } from "../parts/parts.js";
 import { RecordingsLink } from "./recordings-link.js";
 import { shortTime } from "../parts/more-words.js";
+import { Typed } from "../parts/typed.js";
 import { battery, inner, isObject, nameOf } from "../parts/words.js";
 
 const LIMITS = "battery limits"; // by component, in the unit that it reports
@@ -224,21 +225,21 @@ function Limits({ model }) {
 
 function Limit({ at, model }) {
   const level = useValue(at, "charging-level");
-  const set = (event) => {
-    const limit = event.currentTarget.value === "" ? null : Number(event.currentTarget.value);
+  const set = (text) => {
+    const limit = text === "" ? null : Number(text);
     model.setLimit(at, limit !== null && Number.isFinite(limit) ? limit : null);
   };
   return html`<li>
     <label class="limit"
       ><span>${useName(at)} <small>now ${battery(level)}</small></span
       ><span>below</span
-      ><input
+      ><${Typed}
         type="number"
         step="any"
         data-test=${`limit-${nameOf(at)}`}
         placeholder="off"
         value=${model.limit(at) ?? ""}
-        onChange=${set}
+        onDone=${set}
     /></label>
   </li>`;
 }

@@ -5,6 +5,7 @@ import { lacks } from "../parts/lacks.js";
 import { NoticeList } from "../fleet/notices.js";
 import { Panel } from "./panel.js";
 import { Icon, useName } from "../parts/parts.js";
+import { Typed } from "../parts/typed.js";
 import { RecordingsLink } from "../fleet/recordings-link.js";
 
 const THEMES = { auto: "as the system", light: "light", dark: "dark" };
@@ -127,21 +128,21 @@ function WhoAmI() {
 function OwnName({ you }) {
   const { commands, settings } = usePage();
   useModel(settings);
-  const change = (event) => {
-    const name = event.currentTarget.value.trim();
+  const change = (text) => {
+    const name = text.trim();
     if (name !== settings.name) commands.setName(name);
   };
   return html`<div class="own-name">
     <label
       >Your name on this page
-      <input
+      <${Typed}
         type="text"
         maxlength="32"
         autocomplete="nickname"
         data-test="own-name"
         aria-describedby="own-name-why"
         value=${settings.name}
-        onChange=${change}
+        onDone=${change}
     /></label>
     <span class="why" id="own-name-why">Others see “${you.user}”. Nobody checks it: here is no login.</span>
   </div>`;

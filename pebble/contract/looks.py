@@ -1,0 +1,9 @@
+"""How robots look on the operator page. Configs may name it: they need nothing else of what capabilities have."""
+
+from typing import Literal
+
+Colour = Literal["blue", "amber", "violet", "green", "coral", "rose", "teal", "slate"]
+#: Its drawings of robots (pebble/web/static/faces.svg).
+Body = Literal[
+    "goob", "fred", "minilamp", "benjr", "pitcam", "outlets", "wheeled", "walker", "arm", "drone", "boat", "unknown"
+]  # fmt: skip
