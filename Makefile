@@ -11,6 +11,7 @@ help:
 	@echo "make demo             four simulated robots, on Zenoh, on MQTT and on MCUs, driven through a broker; Ctrl-C ends it"
 	@echo "make demo SECONDS=30  ends by itself; succeeds only if every robot moved, stopped and obeyed as it should"
 	@echo "make demo PHONE=1     opens its page to the network, by https, with a login and a QR code"
+	@echo "make demo FLEET=1     two robots that hear each other on a LAN, two hubs and a gateway; goob follows fred without the broker"
 	@echo "make test             all checks and tests, some rows of each rule, some twelve minutes"
 	@echo "make quick            what to run before each commit: lint, types, contract, memory transport, one robot; a minute"
 	@echo "make thorough         the same, with all rows, all cases of the random tests, and the tests that take longest"
@@ -39,13 +40,13 @@ help:
 
 # Before the set-up, which takes a minute; the shortest is that of pebble.demo.main, rounded up.
 demo-options:
-	@awk 'BEGIN { exit ARGV[1] + 0 < 26 }' "$(or $(SECONDS),26)" || \
+	@test -n "$(FLEET)" || awk 'BEGIN { exit ARGV[1] + 0 < 26 }' "$(or $(SECONDS),26)" || \
 		{ echo "make demo: one round of driving takes 26 s: give it at least that many, make demo SECONDS=30" >&2; exit 2; }
 	@test -z "$(PHONE)" || test -t 1 || \
 		{ echo "make demo: PHONE=1 prints a password, to a terminal only: start it in one, without a pipe" >&2; exit 2; }
 
 demo: demo-options .venv/.ready-demo
-	@$(VENV) -m pebble.cli demo $(if $(SECONDS),--seconds $(SECONDS)) $(if $(PHONE),--phone)
+	@$(VENV) -m pebble.cli demo $(if $(SECONDS),--seconds $(SECONDS)) $(if $(PHONE),--phone) $(if $(FLEET),--fleet)
 
 TESTS := $(VENV) tools/run_tests.py
 LESS := $(if $(PEBBLE_THOROUGH),, and not thorough)
@@ -112,10 +113,10 @@ thorough: gstreamer
 	@PEBBLE_THOROUGH=1 $(MAKE) --no-print-directory test
 
 # Whole fleets; make test has one row of each rule.
-FLEET := tests/bench/test_fleet.py tests/transports/zenoh/test_mesh.py $(addprefix tests/fleet/test_,gateways.py hosts.py hubs.py neighbours.py)
+FLEET_TESTS := tests/bench/test_fleet.py tests/transports/zenoh/test_mesh.py $(addprefix tests/fleet/test_,demo.py gateways.py hosts.py hubs.py neighbours.py)
 fleet: .venv/.ready-dev
 	@sh tools/debian-packages.sh mosquitto=mosquitto
-	@PEBBLE_THOROUGH=1 $(TESTS) --workers 3 --spread --timeout 900 -s $(FLEET)
+	@PEBBLE_THOROUGH=1 $(TESTS) --workers 3 --spread --timeout 900 -s $(FLEET_TESTS)
 
 # Every state of the operator page on every size, every card, its sound, every interruption, and fingers.
 page-tests: .venv/.ready-dev

@@ -81,7 +81,7 @@ def run(
         require_packages()
         phone.require_terminal()
     kind = broker or best_kind()
-    with _ending_on_signals() as ending, Testbed(ending) as testbed:
+    with ending_on_signals() as ending, Testbed(ending) as testbed:
         opened = Phone(testbed.folder) if for_phones else None
         results, media, problems, left_alone = _run_demo(testbed, kind, seconds, ending, console, opened)
         with_media = [robot.name for robot in testbed.robots.values() if robot.has_media]
@@ -151,14 +151,14 @@ def _start_page(testbed: Testbed, ending: threading.Event, console: Console, ope
         require_packages()
     except PebbleError as error:
         what, _, remedy = str(error).partition(" needs ")
-        _print_line(console, f"Without {what}, which needs {remedy}")
+        print_line(console, f"Without {what}, which needs {remedy}")
         return ""
     recordings = testbed.folder / "recordings"
     recordings.mkdir()
     testbed.start_recorder(recordings, *_RECORDED)
-    page = _usual_or_free(testbed, ending, recordings=recordings, **({} if opened is None else opened.settings))
-    _print_line(console, f"See and drive them in a browser: {page.url}")
-    _print_line(console, f"They are recorded into {recordings}, for its Recordings; the folder goes with the demo.")
+    page = usual_or_free(testbed, ending, recordings=recordings, **({} if opened is None else opened.settings))
+    print_line(console, f"See and drive them in a browser: {page.url}")
+    print_line(console, f"They are recorded into {recordings}, for its Recordings; the folder goes with the demo.")
     if opened is not None:
         opened.show(page.url, console)
     return page.url
@@ -166,17 +166,17 @@ def _start_page(testbed: Testbed, ending: threading.Event, console: Console, ope
 
 def _invite(port: int, console: Console) -> None:
     """Print the broker's address, and what can be pasted into another terminal."""
-    _print_line(console, f"Or from another terminal, by their broker at {invitation.broker_url(port)}:")
+    print_line(console, f"Or from another terminal, by their broker at {invitation.broker_url(port)}:")
     for what, line in invitation.lines(port):
-        _print_line(console, f"  # {what}\n  {line}")
+        print_line(console, f"  # {what}\n  {line}")
 
 
-def _print_line(console: Console, line: str) -> None:
+def print_line(console: Console, line: str) -> None:
     """To be copied: neither wrapped nor coloured."""
     console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
-def _usual_or_free(testbed: Testbed, ending: threading.Event, **settings: Any) -> PageServer:
+def usual_or_free(testbed: Testbed, ending: threading.Event, **settings: Any) -> PageServer:
     """The page at its usual port, or at a free one if another program has that."""
     with suppress(PebbleError):
         usual = testbed.start_page(DEFAULT_PORT, **settings)
@@ -274,7 +274,7 @@ def _encodings_not_checked(names: Sequence[str], media: list[MediaResult]) -> li
 
 
 @contextmanager
-def _ending_on_signals() -> Iterator[threading.Event]:
+def ending_on_signals() -> Iterator[threading.Event]:
     """An event that Ctrl-C, a closed terminal and SIGTERM set, so that every process is ended in order."""
     ending = threading.Event()
 

@@ -42,6 +42,8 @@ class Station:
             "robot": {"id": "goob"},
             "local_mqtt": {"host": "127.0.0.1", "port": port},
             "transport": {"kind": kind, "run_dir": str(self.folder / "run")},
+            "services": {"neighbours": {"enabled": True, "listens": {"fred": ["wheel-odometry"]},
+                                        "lan": {"connect": ["tcp/127.0.0.1:7447"]}}},
         }))  # fmt: skip
         self.config = load(self.config_path)
         self.received: list[Received] = []
