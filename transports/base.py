@@ -435,7 +435,7 @@ class Transport(ABC):
                 self.problem = ""
                 self.counters.add("connected")
             self._state = state
-            self._changes.tell(state)
+            self._changes.notify(state)
 
     def _renew(self) -> None:
         """Backends call this when a new connection begins, before its first message is offered."""

@@ -18,7 +18,7 @@ Watcher = Callable[[State], None]
 
 
 class StateChanges:
-    """Tells each change of one transport's state, in order; any thread may use it."""
+    """Notifies watchers of each change of one transport's state, in order; any thread may use it."""
 
     def __init__(self, client_id: str) -> None:
         self.lock = threading.RLock()  # held while the state changes and its watchers are called
@@ -32,7 +32,7 @@ class StateChanges:
     def await_connected(self, timeout: float) -> bool:
         return self._connected.wait(timeout)
 
-    def tell(self, state: State) -> None:
+    def notify(self, state: State) -> None:
         """The state is another one now. Call it with :attr:`lock` held."""
         if state is State.CONNECTED:
             self._connected.set()

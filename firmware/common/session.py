@@ -74,8 +74,7 @@ class Session:
             raise OSError(connection.reason)
         if due == "resolve":
             turn, count = connection.failures, len(self.hosts)
-            self.host = self.hosts[turn % count]
-            self._open = query_name(self.host, server, now, turn // count)  # type: ignore[assignment]
+            self._open = query_name(self.hosts[turn % count], server, now, turn // count)  # type: ignore[assignment]
         if connection.state == "online" and diff(now, self.last) >= _REST_MS and connection.failures % len(self.hosts):
             connection.failures = 0
             raise OSError("back to the first broker")
@@ -93,10 +92,11 @@ class Session:
         self._open.socket.close()
         self._open = None
         settings = self.settings
+        host = self.hosts[self.connection.failures % len(self.hosts)]  # as when it was asked for
         if not address:
-            raise OSError("no address for " + self.host)
+            raise OSError("no address for " + host)
         if self.wrap:
-            self.wrap.host = self.host
+            self.wrap.host = host
             self.wrap.set_time(clock.read(now))
         self._open = Stream(address, get(settings, "mqtt", "port", 8883 if self.wrap else 1883), self.wrap)
         self.client.restart()
