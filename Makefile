@@ -115,7 +115,7 @@ thorough: gstreamer
 FLEET := tests/bench/test_fleet.py tests/transports/zenoh/test_mesh.py $(addprefix tests/fleet/test_,gateways.py hosts.py hubs.py neighbours.py)
 fleet: .venv/.ready-dev
 	@sh tools/debian-packages.sh mosquitto=mosquitto
-	@PEBBLE_THOROUGH=1 $(TESTS) --workers 3 --spread --timeout 900 -s $(FLEET)
+	@PEBBLE_THOROUGH=1 $(TESTS) --workers 2 --spread --timeout 900 -s $(FLEET)
 
 # Every state of the operator page on every size, every card, its sound, every interruption, and fingers.
 page-tests: .venv/.ready-dev
