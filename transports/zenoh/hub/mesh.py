@@ -118,7 +118,7 @@ class Mesh:
         (measured: once in some ten times, in one direction of one connection, which it had not lost).
         """
         now = time.monotonic()
-        if len(self._wills.hubs) >= len(self._routers):
+        if len(self._wills.hubs) >= len(self._routers) or not self._wills.met_others:  # a router may be no hub of ours
             self._whole_at = now
         times = self._renewed_at
         if now - self._whole_at < self._patience_s or (len(times) == RENEWALS and now - times[0] < RENEWALS_S):
