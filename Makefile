@@ -116,7 +116,7 @@ thorough: gstreamer
 FLEET_TESTS := tests/bench/test_fleet.py tests/transports/zenoh/test_mesh.py $(addprefix tests/fleet/test_,demo.py gateways.py hosts.py hubs.py neighbours.py)
 fleet: .venv/.ready-dev
 	@sh tools/debian-packages.sh mosquitto=mosquitto
-	@PEBBLE_THOROUGH=1 $(TESTS) --workers 3 --spread --timeout 900 -s $(FLEET_TESTS)
+	@PEBBLE_THOROUGH=1 $(TESTS) --workers 2 --spread --timeout 900 -s $(FLEET_TESTS)
 
 # Every state of the operator page on every size, every card, its sound, every interruption, and fingers.
 page-tests: .venv/.ready-dev

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import pytest
 
+from pebble.transports.zenoh.hub import mesh as mesh_module
+from pebble.transports.zenoh.hub.mesh import CUT_S, RENEWALS
 from pebble.transports.zenoh.hub.wills import (
     ALONE_S,
     HOME_S,
@@ -223,3 +226,23 @@ class _Mesh:
         for name, wills in self._hubs.items():
             if name not in self._late and (not names or name in names):
                 event(wills)
+
+
+def test_a_hub_that_does_not_see_another_one_it_is_connected_to_begins_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock, wills = [0.0], WillTimes("m")
+    monkeypatch.setattr(mesh_module.time, "monotonic", lambda: clock[0])
+    hub_: Any = None
+    made = mesh_module.Mesh("m", hub_, wills)
+    made._routers.add("z1")
+    clock[0] = 50.0
+    assert not made.is_cut(), "it is connected to what is no hub of ours"
+    wills.on_hub("n", present=True)
+    clock[0] = 100.0
+    assert not made.is_cut(), "each is seen"
+    made._routers.add("z2")
+    renewed = []
+    for second in range(100, 100 + 2 * 3600):
+        clock[0] = float(second)
+        renewed += [second - 100] if made.is_cut() else []
+    assert CUT_S <= renewed[0] <= 2 * CUT_S + 1
+    assert [len([at for at in renewed if at // 3600 == hour]) for hour in (0, 1)] == [RENEWALS, RENEWALS]

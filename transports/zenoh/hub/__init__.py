@@ -125,7 +125,8 @@ class ZenohHub:
         if lock is None or worker is None:
             return
         try:
-            if lock.in_place and self._listening.in_place and not self._is_renewed():
+            cut = self._store is not None and self._store.has_history and worker.is_cut()
+            if lock.in_place and self._listening.in_place and not self._is_renewed() and not cut:
                 return
             self._lock = lock if lock.in_place else self._take_lock()
         except (OSError, TransportError) as error:
@@ -136,7 +137,7 @@ class ZenohHub:
         if lock is not self._lock:
             lock.release()
         found = self._listening.in_place
-        if found and not self._is_renewed():
+        if found and not self._is_renewed() and not cut:
             return
         self._used = self._newest
         if self._session is not None:
@@ -144,7 +145,9 @@ class ZenohHub:
             close_session(self._session)
         self._problem = ""
         self._listen(worker)
-        if found:
+        if found and cut:
+            log.warning("the hub did not see another one that it is connected to: it has made its connections anew")
+        elif found:
             log.info("the hub uses renewed certificates or rules")
         else:
             log.warning("the socket of the hub was removed from %s, it has made a new one", self._settings.run_dir)
@@ -272,6 +275,10 @@ class HubWorker:
         self._token = session.liveliness().declare_token(wire.UP + self._name)
         if not self._thread.is_alive():
             self._thread.start()
+
+    def is_cut(self) -> bool:
+        """Whether another hub is not seen, and a new session would mend it."""
+        return self._mesh.is_cut()
 
     def hold_wills(self) -> None:
         """Publish no will before the next session: hubs that did not get it of this one would publish it, too."""

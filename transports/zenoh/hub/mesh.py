@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import logging
 import queue
+import random
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator
 from functools import partial
 from itertools import chain
@@ -35,6 +37,8 @@ VALUES_S = 10.0  # for values, which may be large
 ASKED = 5  # times, before another hub counts as one that does not merge
 MAX_REPLACED = 1000  # values that a will replaced, in case its client comes back
 MAX_REPLACED_BYTES = 4096  # of one of them: heartbeats have a tenth of it
+CUT_S = 4.0  # a connection to a hub that is not seen stands so long, or up to twice that, before all are made anew
+RENEWALS, RENEWALS_S = 5, 3600.0  # of them in so many seconds: each costs clients some 0.3 s
 _PAUSE_S = 0.1
 _LONGEST_NAME = 12  # of a hub; an exchange is longer
 
@@ -81,6 +85,11 @@ class Mesh:
         self._names: dict[str, set[str]] = {}  # under which each other hub is there
         self._compared: dict[str, float] = {}  # when another hub got our table
         self._taken: dict[str, int] = {}  # values of another hub, in the parts so far
+        self._routers: set[str] = set()  # hubs that this one has a connection to, by Zenoh's ids
+        # Two that miss each other do not begin anew at one instant.
+        self._patience_s = CUT_S * random.uniform(1, 2)  # noqa: S311  (not a secret)
+        self._whole_at = time.monotonic()  # when it last saw as many hubs as it has connections to
+        self._renewed_at: deque[float] = deque(maxlen=RENEWALS)
 
     def serve(self, session: zenoh.Session, queued: _Queued) -> None:
         """Take part in the mesh of ``session``; ``queued`` brings an event to the hub's thread."""
@@ -92,6 +101,7 @@ class Mesh:
 
         self._session = session
         self._names.clear()
+        self._hub.post(self._routers.clear)
         others = zenoh.Locality.REMOTE
         session.declare_subscriber(wire.PUBLISHED, queued(self._on_published), allowed_origin=others)
         session.declare_queryable(wire.MERGE + self._name, queued(self._on_merge))
@@ -100,6 +110,22 @@ class Mesh:
         session.info.declare_transport_events_listener(queued(self._on_link), history=True)
 
     # -- for the hub's other tasks
+
+    def is_cut(self) -> bool:
+        """Whether its connections must be made anew: it has one to a hub that it does not see.
+
+        After a hub hung, or was away, Zenoh's routers lose some of what others have declared, and never ask again
+        (measured: once in some ten times, in one direction of one connection, which it had not lost).
+        """
+        now = time.monotonic()
+        if len(self._wills.hubs) >= len(self._routers) or not self._wills.met_others:  # a router may be no hub of ours
+            self._whole_at = now
+        times = self._renewed_at
+        if now - self._whole_at < self._patience_s or (len(times) == RENEWALS and now - times[0] < RENEWALS_S):
+            return False
+        self._whole_at = now
+        times.append(now)
+        return True
 
     @property
     def merging_until(self) -> float:
@@ -143,8 +169,10 @@ class Mesh:
     # -- other hubs
 
     def _on_link(self, event: zenoh.TransportEvent) -> None:
-        present = event.kind == zenoh.SampleKind.PUT
-        self._wills.on_link(str(event.transport.zid), time.monotonic(), present=present)
+        present, session = event.kind == zenoh.SampleKind.PUT, str(event.transport.zid)
+        self._wills.on_link(session, time.monotonic(), present=present)
+        if event.transport.whatami == zenoh.WhatAmI.ROUTER:
+            (self._routers.add if present else self._routers.discard)(session)
 
     def _on_published(self, sample: zenoh.Sample) -> None:
         name = wire.decode_name(sample.payload.to_bytes())
