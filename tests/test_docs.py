@@ -16,6 +16,11 @@ import pytest
 import typer
 
 from pebble.commands.app import application
+from pebble.conform.checks import CHECKS, LAST
+from pebble.conform.control import CONTROL, named
+from pebble.conform.motion import MOVING
+from pebble.conform.operators import OPERATOR
+from pebble.conform.power import CUT
 from tests.support import ROOT
 
 GENERATED = ("topics.md", "configuration.md", "web-messages.md")
@@ -152,6 +157,17 @@ def test_the_table_of_samples_has_their_lines() -> None:
     samples = {path: len(path.read_text().splitlines()) for path in ROOT.glob("examples/your-*/*.*")}
     assert listed == samples
     assert max(samples.values()) <= 150
+
+
+def test_each_check_is_beside_its_duty_and_counted() -> None:
+    text = (ROOT / "docs" / "your-robot.md").read_text()
+    described = {name for row in re.findall(r"^\|.*\| (.*) \|$", text, re.MULTILINE) for name in row.split(", ")}
+    made = {check.name for checks in (CHECKS, CONTROL, MOVING, LAST, CUT, OPERATOR) for check in checks}
+    assert made - described == set()
+    at_rest, moving, cut = (
+        len([one for one in checks if one.binds is not named]) for checks in ((*CHECKS, *CONTROL, *LAST), MOVING, CUT)
+    )
+    assert f"{at_rest} passed, 0 failed; NOT JUDGED: {moving} with --may-move; {cut} with --cut" in text
 
 
 def test_the_table_of_bounds_names_nothing_else() -> None:

@@ -86,7 +86,7 @@ static void halt(const cJSON *told, const char *account) {  // whatever arrives 
 static void reset(const cJSON *command) {  // ends the stop that its sender has seen, and no other
     int seen = cJSON_GetNumberValue(get(command, "count")) == count;
     refused = !same(get(command, "boot"), boot) ? "\"boot\"" : seen ? "null" : "\"count\"";
-    if (!strcmp(refused, "null") && stop.latched) stop.latched = saved = 0;
+    if (!strcmp(refused, "null") && stop.latched) stop.latched = saved = 0, paused_at = now();
     publish_stop();
 }
 static void publish_control(void) {

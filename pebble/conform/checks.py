@@ -437,9 +437,14 @@ def run(judged: J, checks: Iterable[Check[J]]) -> Iterator[tuple[Check[J], Check
 
 
 def _made(check: Check[J], judged: J) -> CheckResult:
-    for _ in range(_TRIES):
-        judged.stalled_s = 0.0
-        outcome = check.run(judged)
-        if outcome.state is not State.FAILED or judged.stalled_s < _STALL_S:
+    """A failed check may leave what it judges so that the next try is skipped: only a pass takes a failure back."""
+    judged.stalled_s = 0.0
+    first = check.run(judged)
+    for _ in range(_TRIES - 1):
+        if first.state is not State.FAILED or judged.stalled_s < _STALL_S:
             break
-    return outcome
+        judged.stalled_s = 0.0
+        again = check.run(judged)
+        if again.state is State.OK:
+            return again
+    return first

@@ -102,7 +102,7 @@ def _shows_asker(component: Component, driver: Driver) -> CheckResult:
 def _released(component: Component, driver: Driver) -> CheckResult:
     driver.asks(for_ms=5 * _SHORTEST_MS)
     Driver(component).asks("release")
-    if component.wait(lambda: not driver.holds, ANSWER_S / 4):
+    if component.wait(lambda: not driver.holds, ANSWER_S):
         return failed("another's release ends it", "a release counts with the id, and account, of who has control")
     if not driver.leaves():
         return failed("it is kept after its release", 'end it by {"want": "release"}')
@@ -138,11 +138,11 @@ def _nameless(component: Component, _name: str) -> CheckResult:
     stranger = Driver(component)
     if not component.send_as("", c.CONTROL, stranger.request()):
         return skipped(UNSEEN)
-    if component.wait(lambda: stranger.holds, ANSWER_S / 4):
+    if component.wait(lambda: stranger.holds, ANSWER_S):
         return failed("it gives control to a request without an account", fix)
     for one in states(component).values():
         component.send_as("", c.ESTOP_RESET, EstopReset(boot=one.boot, count=one.count, by=BY))
-    if component.wait(lambda: not component.view.latched, ANSWER_S / 4):
+    if component.wait(lambda: not component.view.latched, ANSWER_S):
         return failed("a reset without an account ends a stop", fix)
     return ok("requests and resets without an account do nothing")
 
