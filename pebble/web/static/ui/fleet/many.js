@@ -101,7 +101,8 @@ function Rows({ refs, look, draw }) {
     drawn.set(key, old.get(key) ?? html`<li key=${ref} aria-posinset=${number} aria-setsize=${refs.length}>${draw(ref)}</li>`);
   });
   drawnBefore.current = drawn;
-  const style = { paddingTop: `${from * step}px`, height: `${Math.max(0, rows * step - gap)}px` };
+  const height = Math.max(0, rows * step - gap);
+  const style = { paddingTop: `${Math.min(from * step, height)}px`, height: `${height}px` }; // else it grows out of sight
   return html`<ul class=${`rows ${look}`} style=${style} ref=${place}>
     ${[...drawn.values()]}
   </ul>`;
