@@ -32,15 +32,18 @@ class PageSocket:
         return value.get(field) if isinstance(value, dict) else None
 
     def take(self, ref: str) -> None:
-        """Ask for control. A gesture begins."""
-        self._gestures += 1
+        """Ask for control."""
         self._send("lease", ref=ref, take=True)
 
     def holds(self, ref: str) -> bool:
         return self.value(ref, "web/driver", "you") is True
 
+    def begin_gesture(self) -> None:
+        """As one who lets the stick go and takes it again: a gesture that came late at the server has ended there."""
+        self._gestures += 1
+
     def drive(self, ref: str, z: float) -> None:
-        """To be repeated 20 times a second."""
+        """To be repeated 20 times a second, in one gesture."""
         self._send("drive", ref=ref, g=self._gestures, t=_now_ms(), z=z)
 
     def let_go(self, ref: str) -> None:
