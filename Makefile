@@ -77,6 +77,9 @@ quick-tests:
 	@$(TESTS) -k memory tests/transports/test_contract.py
 	@$(TESTS) -k "(drive_forms or silence) and zenoh" tests/robot/test_robot.py
 
+# Numbers are few here: threads of numpy's own only wait in a loop, beside tests that need the processors.
+test quick: export OPENBLAS_NUM_THREADS := 1
+
 # Types, lint and what only computes use what tests that wait and measure leave of the processors.
 test: .venv/.ready-dev
 	@sh tools/debian-packages.sh mosquitto=mosquitto mosquitto_pub=mosquitto-clients chromium=chromium node=nodejs g++=g++ openssl=openssl ip=iproute2 tc=iproute2 nft=nftables systemd-analyze=systemd
@@ -96,8 +99,8 @@ test-checks:
 	@echo "pebble: lint, types, imports and names are in order"
 
 test-robots: test-running
-	@echo "pebble: whole robots and serial lines, five at a time because these tests check deadlines"
-	@$(TESTS) --workers 5 --spread -m "alone and not page$(LESS)" $(ALONE)
+	@echo "pebble: whole robots and serial lines, six at a time because these tests check deadlines"
+	@$(TESTS) --workers 6 --spread -m "alone and not page$(LESS)" $(ALONE)
 
 test-demo: test-robots
 	@echo "pebble: the demo, whose robots need all processors"
