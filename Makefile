@@ -77,9 +77,6 @@ quick-tests:
 	@$(TESTS) -k memory tests/transports/test_contract.py
 	@$(TESTS) -k "(drive_forms or silence) and zenoh" tests/robot/test_robot.py
 
-# Numbers are few here: threads of numpy's own only wait in a loop, beside tests that need the processors.
-test quick: export OPENBLAS_NUM_THREADS := 1
-
 # Types, lint and what only computes use what tests that wait and measure leave of the processors.
 test: .venv/.ready-dev
 	@sh tools/debian-packages.sh mosquitto=mosquitto mosquitto_pub=mosquitto-clients chromium=chromium node=nodejs g++=g++ openssl=openssl ip=iproute2 tc=iproute2 nft=nftables systemd-analyze=systemd
