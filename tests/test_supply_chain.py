@@ -117,15 +117,16 @@ def test_a_clone_installs_what_is_locked(tmp_path: Path) -> None:
     done, installed = set_up(tmp_path, "")
     assert done.returncode == 0, done.stderr
     assert installed == [
-        "--disable-pip-version-check --require-hashes --only-binary :all: --no-binary esptool -r requirements/demo.txt",
-        "--disable-pip-version-check --no-deps --no-build-isolation --editable .",
+        "--disable-pip-version-check --no-compile --require-hashes --only-binary :all: --no-binary esptool "
+        "-r requirements/demo.txt",
+        "--disable-pip-version-check --no-compile --no-deps --no-build-isolation --editable .",
     ]
 
 
 def test_a_python_without_these_wheels_installs_the_newest_and_reports_it(tmp_path: Path) -> None:
     done, installed = set_up(tmp_path, "No matching distribution found for numpy==2.4.6")
     assert done.returncode == 0, done.stderr
-    assert installed[-1] == "--disable-pip-version-check --editable .[demo]"
+    assert installed[-1] == "--disable-pip-version-check --no-compile --editable .[demo]"
     assert "requirements/demo.txt cannot be installed here: ERROR: No matching distribution found" in done.stdout
 
 

@@ -55,7 +55,13 @@ make_venv() {
 say "installing Pebble and its dependencies for '$extra' into .venv; the first time takes a minute"
 locked=requirements/$extra.txt
 
-pip_install() { .venv/bin/python -m pip install --disable-pip-version-check "$@" >.venv/pip.log 2>&1; }
+# Not compiled by pip, which has one process for that: compile_all uses all processors.
+pip_install() { .venv/bin/python -m pip install --disable-pip-version-check --no-compile "$@" >.venv/pip.log 2>&1; }
+
+# What cannot be compiled is imported by none of our programs, nor is what packages test themselves with.
+compile_all() {
+    .venv/bin/python -m compileall -q -j 0 -x '/tests?/' .venv/lib pebble pebble/*/ >/dev/null 2>&1 || true
+}
 
 # Tested together, and checked by their hashes: docs/decisions/0017. All are wheels but esptool.
 install_locked() {
@@ -75,17 +81,6 @@ pip_failed() {
     fail "$1, see above"
 }
 
-rm -f .venv/pip.log
-# For 32-bit Raspberry Pis there are only piwheels' own builds.
-if .venv/bin/python -c "import sys; sys.exit(sys.maxsize < 2**32)" && install_locked; then
-    :
-else
-    ! grep -qs 'DO NOT MATCH THE HASHES' .venv/pip.log || pip_failed "the package index has other files than $locked"
-    say "$locked cannot be installed here: $(grep -s ERROR: .venv/pip.log | tail -n 1)"
-    say "installing the newest versions that pyproject.toml allows"
-    install_newest || pip_failed "pip could not install the dependencies"
-fi
-
 # Programs in JavaScript that tests use, and type stubs of each board's own modules. The ports' stubs
 # contradict each other, so each has its own folder.
 fetch_for_tests() {
@@ -96,12 +91,28 @@ fetch_for_tests() {
         say "installing the type stubs of MicroPython's $port port"
         rm -rf "$stubs"
         .venv/bin/python -m pip install --disable-pip-version-check --target "$stubs" \
-            "micropython-$port-stubs==$stubs_version" "micropython-stdlib-stubs==1.29.0.post2" >.venv/pip.log 2>&1 || {
-            cat .venv/pip.log >&2
+            --no-compile "micropython-$port-stubs==$stubs_version" "micropython-stdlib-stubs==1.29.0.post2" \
+            >.venv/stubs.log 2>&1 || {
+            cat .venv/stubs.log >&2
             fail "pip could not install the stubs of MicroPython's $port port, see above"
         }
     done
 }
-[ "$extra" != dev ] || fetch_for_tests
+
+rm -f .venv/pip.log
+[ "$extra" != dev ] || fetch_for_tests &
+fetching=$!
+# For 32-bit Raspberry Pis there are only piwheels' own builds.
+if .venv/bin/python -c "import sys; sys.exit(sys.maxsize < 2**32)" && install_locked; then
+    :
+else
+    ! grep -qs 'DO NOT MATCH THE HASHES' .venv/pip.log || pip_failed "the package index has other files than $locked"
+    say "$locked cannot be installed here: $(grep -s ERROR: .venv/pip.log | tail -n 1)"
+    say "installing the newest versions that pyproject.toml allows"
+    install_newest || pip_failed "pip could not install the dependencies"
+fi
+
+wait "$fetching" || exit 1
+compile_all
 touch ".venv/.ready-$extra"
 [ "$extra" != dev ] || touch .venv/.ready-demo .venv/.ready-bench # it includes the others

@@ -26,11 +26,12 @@ def _processor_s() -> float:
 
 def _descendants(pid: int) -> Iterator[int]:
     """Running ones; of Linux only."""
-    for path in Path(f"/proc/{pid}/task").glob("*/children"):
-        with suppress(OSError):
-            for child in map(int, path.read_text().split()):
-                yield child
-                yield from _descendants(child)
+    with suppress(OSError):
+        for thread in Path(f"/proc/{pid}/task").iterdir():
+            with suppress(OSError):
+                for child in map(int, (thread / "children").read_text().split()):
+                    yield child
+                    yield from _descendants(child)
 
 
 def _used_s(pid: int) -> float:
@@ -44,23 +45,27 @@ def _used_s(pid: int) -> float:
 class Costs:
     """Measures each test from its set-up to its clean-up, in the process that runs it.
 
-    What a shared fixture takes counts for the test that starts or ends it.
+    What a shared fixture takes counts for the test that starts or ends it; what runs on between two, for the second.
     """
 
     def __init__(self) -> None:
-        self._began = 0.0, 0.0
+        self._began = self._used = 0.0
+        self._pid = 0  # of the worker that has measured last
 
     @pytest.hookimpl(tryfirst=True)
     def pytest_runtest_setup(self) -> None:
-        self._began = time.monotonic(), _processor_s()
+        self._began = time.monotonic()
+        if self._pid != os.getpid():
+            self._pid, self._used = os.getpid(), _processor_s()
 
     @pytest.hookimpl(wrapper=True, tryfirst=True)
     def pytest_runtest_teardown(self, item: pytest.Item) -> Iterator[None]:
         try:
             yield
         finally:
-            began, used = self._began
-            item.user_properties.append((COST, f"{time.monotonic() - began:.2f}\t{_processor_s() - used:.2f}"))
+            used, self._used = self._used, _processor_s()
+            took = time.monotonic() - self._began
+            item.user_properties.append((COST, f"{took:.2f}\t{self._used - used:.2f}"))
 
 
 class Records:

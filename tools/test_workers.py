@@ -145,6 +145,8 @@ class Reports:
         self._config, self._connection = config, connection
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        if report.when == "setup" and report.passed:
+            return  # of which nothing is shown: two thirds of the reports cost two thirds
         self._connection.send(self._config.hook.pytest_report_to_serializable(config=self._config, report=report))
 
 

@@ -5,6 +5,7 @@ import json
 import re
 import sys
 from collections.abc import Iterable, Mapping
+from functools import cache
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
@@ -164,9 +165,14 @@ def _default(member: FieldInfo) -> str:
     return "absent" if value is UNSET else f"`{json.dumps(value)}`"
 
 
+@cache  # inspect parses the whole module for each class
+def _source(struct: type[Payload]) -> str:
+    return inspect.getsource(struct)
+
+
 def _remarks(struct: type[Payload]) -> dict[str, str]:
     """The comments behind the fields of the structs: units and meanings."""
-    sources = [inspect.getsource(base) for base in reversed(struct.__mro__) if issubclass(base, Payload)]
+    sources = [_source(base) for base in reversed(struct.__mro__) if issubclass(base, Payload)]
     lines = [line for source in sources for line in source.splitlines()]
     found = (re.match(r"    (\w+): [^#]*#\s*(.+)$", line) for line in lines)
     return {match[1]: match[2] for match in found if match is not None}

@@ -66,8 +66,9 @@ def gives_its_place_to_another(level: LinkLevel, after_s: float) -> bool:
 
 def lets_a_replay_begin(level: LinkLevel, after_s: float) -> bool:
     now, hub = [0.0], MemoryHub()
-    robot, replay = (MemoryTransport(name, hub).open() for name in ("robot", "replay"))
+    robot = MemoryTransport("robot", hub).open()
     robot.publish(link(level).topic, link(level).payload, retain=True)
+    replay = MemoryTransport("replay", hub).open()  # after it: what comes live is a sign of life
     live = LiveRobots([BASE], lambda: now[0])
     after: list[Message] = []  # what arrives behind that which is retained
     replay.subscribe("after", after.append)

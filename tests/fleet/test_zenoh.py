@@ -128,11 +128,17 @@ def hall(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
 
 def test_each_account_writes_what_it_may_and_nothing_else(hall: Hall) -> None:
     wrong, expected = [], {}
+
+    def writes_all(name: str, client: Forked) -> bool:
+        play(client)
+        return until(lambda: expected[name] <= hall.of(name), 2)
+
     for name in NAMES:
         expected[name] = {topic for topic in TOPICS if lets_through(name, topic, hall.fleet.level)}
         with hall.account(name, topics=TOPICS) as client:
-            play(client)
-            assert until(lambda name=name: expected[name] <= hall.of(name)), (name, expected[name] - hall.of(name))
+            # A drive command that a busy machine holds up is too old for the hub: that is sent again.
+            arrived = until(lambda name=name, client=client: writes_all(name, client), 30)
+            assert arrived, (name, expected[name] - hall.of(name))
     hall.mark("written")
     for name in set(NAMES) - {"dora"}:
         wrong += [(name, topic) for topic in sorted(hall.of(name) ^ expected[name])]

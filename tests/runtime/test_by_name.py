@@ -122,7 +122,7 @@ def flood(count: int, *, lasting: bool, last: float = 100.0) -> Arriving:
         further(flood(1000, lasting=True), True, 2.0),
         further(flood(1000, lasting=True), False, 60.0),
         (flood(1000, lasting=True, last=4.0), False, 7.0),
-        (flood(MAX_ROBOTS + 500, lasting=True, last=50.0), True, 2.0),
+        (flood(MAX_ROBOTS + 500, lasting=True, last=10.0), True, 2.0),
     ],
     ids=["1,000", "more than there is room for", "that last", "and it is new", "that have ended", "the same, too many"],
 )

@@ -128,7 +128,7 @@ def test_received_speech_is_played(receive: Receive, operator: Operator, recorde
 
 @pytest.mark.alone
 def test_opus_on_a_robot_with_zenoh_inside(receive: Receive, operator: Operator, recorder: Recorder) -> None:
-    robot = receive("zenoh", latency_ms=300)
+    robot = receive("zenoh", latency_ms=1000)  # the most there is: what a busy machine delivers later is not played
     operator.speak("opus", 2, bundle=2)
     speech = np.pad(Speech(16000).samples(0, 32000)[:, 0].astype(float), (8000, 8000))
     assert until(lambda: len(recorder.samples()) >= 32000 * 0.95)
