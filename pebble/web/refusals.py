@@ -14,7 +14,7 @@ from pebble.web.driving import Driving
 
 
 class Refusals:
-    """For one server; ``robot_of`` finds a component that is known."""
+    """It belongs to one server; ``robot_of`` finds a component that is known."""
 
     def __init__(self, broker: Broker, driving: Driving, robot_of: Callable[[str], RobotView | None]) -> None:
         self._broker, self._driving, self._robot_of = broker, driving, robot_of

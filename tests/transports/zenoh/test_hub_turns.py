@@ -1,4 +1,4 @@
-"""In which order the hub's thread works, and what waits for it."""
+"""The order in which the hub's thread works, and what waits for it."""
 
 from __future__ import annotations
 

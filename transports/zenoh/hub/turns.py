@@ -1,4 +1,4 @@
-"""In which order a hub's thread does its tasks, and how much of them waits."""
+"""Orders the tasks of a hub's thread, and bounds how much of them waits."""
 
 from __future__ import annotations
 
