@@ -47,7 +47,7 @@ class PageSocket:
         self._send("drive", ref=ref, g=self._gestures, t=_now_ms(), z=z)
 
     def let_go(self, ref: str) -> None:
-        """Let the stick come to rest, then give control back, as a person does. A drive that breaks off ends scripts."""
+        """Let the stick come to rest, then give control back: a drive that breaks off ends scripts."""
         for _ in range(3):
             self.drive(ref, 0.0)
         self._send("lease", ref=ref, take=False)
