@@ -277,7 +277,7 @@ class Story:
         self.until("", lambda: not self._page.holds(base))
 
     def _page_drives_on(self) -> None:
-        """It takes several gestures: on an overloaded machine one comes late, and the page's server ends it."""
+        """The page drives in several gestures: on an overloaded machine its server ends one that comes late."""
         if time.monotonic() > self._gesture_ends:
             self._gesture_ends = time.monotonic() + _GESTURE_S
             self._page.begin_gesture()

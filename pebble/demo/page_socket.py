@@ -39,7 +39,7 @@ class PageSocket:
         return self.value(ref, "web/driver", "you") is True
 
     def begin_gesture(self) -> None:
-        """Let the stick go and take it again: a gesture that came late at the server has ended there."""
+        """A person lets the stick go and takes it again: the server has ended a gesture that came late."""
         self._gestures += 1
 
     def drive(self, ref: str, z: float) -> None:
@@ -47,7 +47,7 @@ class PageSocket:
         self._send("drive", ref=ref, g=self._gestures, t=_now_ms(), z=z)
 
     def let_go(self, ref: str) -> None:
-        """Let the stick come to rest, then give control back: a drive that breaks off ends scripts."""
+        """The stick comes to rest, and control is given back. A drive that breaks off ends scripts."""
         for _ in range(3):
             self.drive(ref, 0.0)
         self._send("lease", ref=ref, take=False)

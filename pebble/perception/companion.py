@@ -29,7 +29,7 @@ class Companion:
 
 
 def _motion(before: Pose | None, now: Pose) -> Pose:
-    """The motion in the frame of ``before``; none at a jump."""
+    """Return it in the frame of ``before``; none at a jump."""
     if before is None or math.hypot(now.x_m - before.x_m, now.y_m - before.y_m) > _JUMP_M:
         return Pose(0.0, 0.0, 0.0)
     return _seen_from(before, now)

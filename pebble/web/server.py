@@ -19,7 +19,7 @@ from pebble.client.robot_topics import FLEET, SYNONYMS
 from pebble.client.robot_view import RobotView
 from pebble.config.security import SecurityLevel
 from pebble.contract import AUDIT, CAPABILITIES, CONTROL_STATE, DRIVE, DRIVING, LINK, ONLINE, channel_of, codec
-from pebble.contract.identity import Identity, parse_topic
+from pebble.contract.identity import GATEWAYS, Identity, parse_topic
 from pebble.errors import ConfigError
 from pebble.fleet.audit import Audit
 from pebble.fleet.database import DatabaseError
@@ -32,6 +32,7 @@ from pebble.web import messages as m
 from pebble.web.controls import Controls
 from pebble.web.driven_here import DrivenHere
 from pebble.web.driving import Command, Driving, Tab
+from pebble.web.gateways import Gateways
 from pebble.web.known_robots import SavedRobots
 from pebble.web.media.chosen_sources import ChosenSources
 from pebble.web.media.connection import MediaConnection
@@ -80,6 +81,7 @@ class Server:
         self.by_name = ByName(FLEET, lambda ref: ref in known or ref in self.open_components)
         self.robots.on_forget = self.by_name.forget
         self.driven_here = DrivenHere(server)
+        self.gateways = Gateways()
         self.robot_audits = RobotAudits(
             self.broker,
             audit,
@@ -103,6 +105,7 @@ class Server:
             await self.broker.subscribe(channel.filter("+/+/+"), self.receive, deferred=deferred)
         await self.broker.subscribe(AUDIT.filter("+/+/+"), self.robot_audits.receive, deferred=True)
         await self.broker.subscribe(DRIVING.filter("+/+/+"), self._announced)
+        await self.broker.subscribe(ONLINE.filter(f"+/{GATEWAYS}/+"), self._gateway, deferred=True)
         self.spawn(self._tick())
         if self.settings.login:
             self.spawn(self._watch_people())
@@ -152,6 +155,15 @@ class Server:
         self.publish(self.driving.interrupt(ref, clock()))
         if host:
             self.robots.set_server_metric(ref, "web/host", m.HostView(host=host, first=first))
+
+    def _gateway(self, message: Message, _now: float) -> None:
+        """A gateway tells which components it receives at its hub; nothing once it has gone."""
+        address = parse_topic(message.topic)
+        if address is None:
+            return
+        changed = self.gateways.receive(address.identity.id, message.payload, self.robots.components)
+        for ref, names in changed.items():
+            self.robots.set_server_metric(ref, "web/gateways", m.GatewaysView(names=names))
 
     def _announced(self, message: Message, _now: float) -> None:
         """Another server drives robots."""

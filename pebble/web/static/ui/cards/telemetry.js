@@ -15,6 +15,7 @@ export function Telemetry({ at }) {
     <${Row} at=${at} metric="charging-level" name="Battery" online=${online}>${battery}<//>
     <${Row} at=${at} metric="charging-status" name="Charger" online=${online}>${charging}<//>
     <${Heartbeat} at=${at} />
+    <${Neighbours} at=${at} />
     <${Row} at=${at} metric="sensors/imu" name="Tilt" online=${online} streams>${attitude}<//>
     <${Row} at=${at} metric="sensors/imu" name="Turn rate" online=${online} streams>${rate}<//>
     <${Row} at=${at} metric="sensors/imu" name="Acceleration" online=${online} streams>${acceleration}<//>
@@ -77,6 +78,16 @@ function Heartbeat({ at }) {
       <dd>${late}</dd>
     </div>
     ${host && html`<div><dt>Broker</dt><dd>${host}</dd></div>`}`;
+}
+
+/** By which gateways it is received, and which robots of its LAN it hears. */
+function Neighbours({ at }) {
+  const gateways = useValue(at, "web/gateways")?.names ?? [];
+  const { receives, driven_by: driver } = useValue(at, "neighbours") ?? {};
+  const hears = Object.entries(isObject(receives) ? receives : {}).map(([name, is]) => (is ? name : `not ${name}`));
+  return html`${gateways.length > 0 && html`<div><dt>Gateway</dt><dd>${gateways.join(", ")}</dd></div>`}
+    ${hears.length > 0 && html`<div><dt>Hears</dt><dd>${hears.join(", ")}</dd></div>`}
+    ${driver && html`<div><dt>Driven by</dt><dd>a script of ${plain(driver)}</dd></div>`}`;
 }
 
 const degrees = (value) => `${number(value, 1)}°`;
