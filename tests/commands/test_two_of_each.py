@@ -29,7 +29,7 @@ from tests.support import ROOT, Child, free_port, until
 
 pytestmark = [pytest.mark.alone, pytest.mark.thorough]
 FIRST, SECOND = "127.0.0.2", "127.0.0.3"
-LIMIT_S = 5.0  # until a robot is heard elsewhere, or is known to be gone
+LIMIT_S = 5.0  # until a robot is received elsewhere, or is known to be gone
 
 
 class Walk:
@@ -37,7 +37,7 @@ class Walk:
 
     def __init__(self, folder: Path, stack: ExitStack) -> None:
         self.folder, self.port, self.hubs = folder, free_port(), {name: free_port() for name in ("hub1", "hub2")}
-        self.heard: dict[str, float] = {}  # when the newest heartbeat came, and the newest will
+        self.received: dict[str, float] = {}  # when the newest heartbeat came, and the newest will
         self.gone: dict[str, float] = {}
         self._running: dict[str, Child] = {}
         self._lines: dict[str, list[str]] = {}
@@ -58,7 +58,7 @@ class Walk:
     def _take(self, message: Message) -> None:
         if not message.retain:
             online = json.loads(message.payload).get("online", True)  # a heartbeat is without it
-            (self.heard if online else self.gone)[message.topic.split("/")[2]] = time.monotonic()
+            (self.received if online else self.gone)[message.topic.split("/")[2]] = time.monotonic()
 
     def _brokers(self) -> None:
         hall, spare = self.folder / "hall", self.folder / "spare"
@@ -122,10 +122,10 @@ class Walk:
         process.wait(10)
         return at
 
-    def hears(self, *names: str, since: float) -> float:
-        """Seconds after ``since`` when all of them were heard again."""
-        assert until(lambda: all(self.heard.get(name, 0.0) > since for name in names), 60), (self.heard, names)
-        return max(self.heard[name] for name in names) - since
+    def receives(self, *names: str, since: float) -> float:
+        """Seconds after ``since`` when all of them were received again."""
+        assert until(lambda: all(self.received.get(name, 0.0) > since for name in names), 60), (self.received, names)
+        return max(self.received[name] for name in names) - since
 
     def misses(self, name: str, since: float) -> float:
         assert until(lambda: self.gone.get(name, 0.0) > since, LIMIT_S), (name, self.gone)
@@ -148,7 +148,7 @@ def until_done(line: str, folder: Path) -> str:
 
 
 def _config(kind: str) -> dict[str, Any]:
-    """As it is, but for the broker's name: `pebble up` says to leave it out where there are several."""
+    """Return the file without the name of its broker: `pebble up` wants it left out where there are several."""
     found: dict[str, Any] = json.loads((ROOT / "configs" / f"{kind}.json").read_text())
     for section in (
         found.get("local_mqtt", {}),
@@ -168,7 +168,7 @@ def test_one_of_each_is_killed_and_the_rest_is_right_again(tmp_path: Path) -> No
     began = time.monotonic()
     took: dict[str, float] = {}
     with walk(tmp_path) as walked:
-        walked.hears("goob", "fred", "minilamp", since=began)
+        walked.receives("goob", "fred", "minilamp", since=began)
         took["begin"] = time.monotonic() - began
         killed = walked.kill("hall")
         second = f"{SECOND}:{walked.port}"
@@ -177,11 +177,11 @@ def test_one_of_each_is_killed_and_the_rest_is_right_again(tmp_path: Path) -> No
         took["broker"] = time.monotonic() - killed
         walked.start("hall")
         killed = walked.kill("hub1") + 0.3  # what it had passed on is not new
-        took["hub"] = walked.hears("fred", since=killed)
+        took["hub"] = walked.receives("fred", since=killed)
         walked.start("hub1")
         for name in ("goob", "fred", "minilamp"):
             took[f"{name} is gone"] = walked.misses(name, walked.kill(name))
             walked.start(name)
-            took[f"{name} is back"] = walked.hears(name, since=time.monotonic())
+            took[f"{name} is back"] = walked.receives(name, since=time.monotonic())
     sys.stdout.write(f"\nafter s: { {what: round(seconds, 2) for what, seconds in took.items()} }\n")
     assert max(took["broker"], took["hub"]) <= LIMIT_S

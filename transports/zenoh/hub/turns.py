@@ -1,4 +1,4 @@
-"""In which order a hub's thread does its tasks, and how much of them waits."""
+"""The tasks of a hub's thread have an order, and what waits for it has room that is bounded."""
 
 from __future__ import annotations
 
