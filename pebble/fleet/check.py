@@ -34,12 +34,12 @@ def compare(folder: Path, fleet: Fleet) -> list[str]:
 
 
 def by_hand(folder: Path, fleet: Fleet) -> list[str]:
-    """The differences that no command mends; each line names what does."""
+    """Return those of them that no command mends; each line names what does."""
     return [*conf_differences(folder, fleet), *_certificates(folder, fleet)]
 
 
 def of_rules(folder: Path, fleet: Fleet) -> list[str]:
-    """The differences in accounts and rules, which a second `pebble fleet init` gives again."""
+    """Return those of accounts and rules, which a second `pebble fleet init` gives again."""
     found = list(zenoh_differences(folder, fleet))
     if fleet.rules == "files":
         return [*found, *_of_files(folder, fleet)]

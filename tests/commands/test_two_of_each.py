@@ -148,7 +148,7 @@ def until_done(line: str, folder: Path) -> str:
 
 
 def _config(kind: str) -> dict[str, Any]:
-    """The config as it is, but for the broker's name: `pebble up` says to leave it out where there are several."""
+    """Return the file without the name of its broker: `pebble up` wants it left out where there are several."""
     found: dict[str, Any] = json.loads((ROOT / "configs" / f"{kind}.json").read_text())
     for section in (
         found.get("local_mqtt", {}),

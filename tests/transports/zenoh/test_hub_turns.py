@@ -1,4 +1,4 @@
-"""The order in which the hub's thread works, and what waits for it."""
+"""The hub's thread does its tasks in order, and what waits for it has room that is bounded."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Orders the tasks of a hub's thread, and bounds how much of them waits."""
+"""The tasks of a hub's thread have an order, and what waits for it has room that is bounded."""
 
 from __future__ import annotations
 
