@@ -60,7 +60,7 @@ class OwnRequests:
             reaction(payload)
 
     def idle_s(self) -> float:
-        """For so long the robot was not driven."""
+        """Returns for how long the robot was not driven."""
         return self._clock() - self._moved_at
 
     def send(self) -> None:
