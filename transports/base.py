@@ -66,7 +66,7 @@ class Subscription:
     def __init__(
         self, transport: Transport, filter_: str, handler: Handler, *, qos: QoS, echo: bool, direct: bool, limit: int
     ) -> None:
-        self.filter, self.qos, self.echo, self.direct = filter_, qos, echo, direct
+        self.filter, self.qos, self.echo = filter_, qos, echo
         self.dropped = 0  # messages lost because the handler was too slow
         self.refused = False  # by the other end, on the newest connection; its transport sets it (T21)
         self._transport, self._handler = transport, handler
@@ -81,6 +81,11 @@ class Subscription:
         if not direct:
             self._thread = threading.Thread(target=self._run, name=f"pebble-sub {filter_}", daemon=True)
             self._thread.start()
+
+    @property
+    def direct(self) -> bool:
+        """Whether the handler runs on the receiving thread."""
+        return self._thread is None
 
     def close(self) -> None:
         """Stop delivery: no handler call starts after this has returned. Safe from inside the handler."""
@@ -104,7 +109,7 @@ class Subscription:
             elif repeat if self._transport.as_published else message.retain and not self._transport.delivers_late:
                 self._transport.counters.add("stale")
                 return
-            if self.direct:
+            if self._thread is None:
                 self._call(message)
                 return
             for lost in self._queue.append(message, len(message.topic) + len(message.payload)):
