@@ -143,7 +143,7 @@ class Fleet(Testbed):
     def _tool(self, command: str, name: str, contents: dict[str, Any]) -> None:
         """``pebble hub FILE`` or ``pebble gateway FILE``."""
         file = self.folder / f"{name}.json"
-        file.write_text(json.dumps(contents, indent=1))
+        file.write_text(json.dumps(contents, indent=1), encoding="utf-8")
         self.add(Program(name, python("pebble.cli", command, file), self.folder / f"{name}.log"), OPERATORS)
 
 
