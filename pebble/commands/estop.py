@@ -34,6 +34,7 @@ from pebble.transports import Message, State, Transport
 
 _VERBS = ("reset", "status")
 _TICK_S = 0.25
+_ON_ITS_WAY_S = 0.05  # between the thread that has received a message and this one
 _REPORT_PERIOD_S = 0.05
 _QUICK_S = 1.0  # an answer within this time needs no line before it
 _ANSWER_S = LEVELS["wide"].answer_s  # longest wait for what the broker has of a robot
@@ -123,40 +124,46 @@ def _stop(target: Target, why: str, *, every: bool, hold: bool) -> int:
         report = _Report(sender)
         try:
             _publish(transport, sender)
-            listener = _listen(transport, [ALL_OUTGOING] if every else _filters(names.base))
+            listener, subscribing = _listen(transport, [ALL_OUTGOING] if every else _filters(names.base))
             by_name = ByName([STATUS])
             ask_beside(transport, by_name)
             while not sender.finished:
-                _receive(listener, sender, by_name)
+                _receive(listener, sender, by_name, _until_due(sender))
                 _publish(transport, sender)
                 report.connection("" if transport.state is State.CONNECTED else transport.problem or "no connection")
                 report.update(time.monotonic())
+            subscribing.join(_ANSWER_S)  # a status tells whether the motors obey, and may come after the confirmation
+            _receive(listener, sender, by_name, _ON_ITS_WAY_S)
         except KeyboardInterrupt:
             sender.end()
         report.end()
     return 0 if sender.confirmed else 1
 
 
-def _listen(transport: Transport, filters: list[str]) -> Listener:
-    """Subscribe on a thread of its own: what the network takes for it must not delay a stop."""
+def _listen(transport: Transport, filters: list[str]) -> tuple[Listener, threading.Thread]:
+    """Subscribe on a thread, which is returned, too: what the network takes for it must not delay a stop."""
     listener = Listener(transport, ())
 
     def subscribe() -> None:
         with suppress(TransportError):  # closed meanwhile
             listener.subscribe(transport, filters)
 
-    threading.Thread(target=subscribe, name="pebble-estop-subscribe", daemon=True).start()
-    return listener
+    subscribing = threading.Thread(target=subscribe, name="pebble-estop-subscribe", daemon=True)
+    subscribing.start()
+    return listener, subscribing
 
 
 def _filters(base: str) -> list[str]:
     return [channel.filter(base) for channel in (ESTOP_STATE, STATUS, CAPABILITIES, ONLINE)]
 
 
-def _receive(listener: Listener, sender: StopSender, by_name: ByName) -> None:
-    """Handle what has arrived; wait for something if nothing has, until something is due."""
+def _until_due(sender: StopSender) -> float:
     due = sender.due
-    left = _TICK_S if due is None else min(_TICK_S, due - time.monotonic())
+    return _TICK_S if due is None else min(_TICK_S, due - time.monotonic())
+
+
+def _receive(listener: Listener, sender: StopSender, by_name: ByName, left: float) -> None:
+    """Handle what has arrived; wait for something if nothing has, for ``left`` seconds."""
     for _ in range(_BATCH):
         message = listener.next(left)
         if message is None:

@@ -164,6 +164,7 @@ def test_a_copy_that_cannot_run_does_not_hide_ours(tmp_path: Path, caplog: pytes
         "apriltag-follow": (False, "", ""),
         "apriltag-locations": (True, "", why),
         "apriltag-odom-follow": (True, "", ""),
+        "follow": (True, "", ""),
         "mine": (False, why, ""),
         "wheel-odometry": (True, "", why),
     }

@@ -11,7 +11,6 @@ import logging
 import socket
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -40,6 +39,7 @@ from pebble.transports.zenoh.hub.mesh import Mesh
 from pebble.transports.zenoh.hub.records import Record, Retained, StoredWill, robot_of
 from pebble.transports.zenoh.hub.store import OVERHEAD, HubStore
 from pebble.transports.zenoh.hub.turns import Places, Task, Turns
+from pebble.transports.zenoh.hub.waiting import WaitingQueries
 from pebble.transports.zenoh.hub.wills import STILL_S, WillTimes
 from pebble.transports.zenoh.keymap import topic_to_key
 from pebble.transports.zenoh.presence import Barrier
@@ -47,14 +47,12 @@ from pebble.transports.zenoh.session import HUB_SOCKET, close_at_exit, close_ses
 
 log = logging.getLogger(__name__)
 
-QUERIES = 1000  # that wait for what is on its way; further ones are answered at once
 ASKED = 2000  # queries that wait for the hub's thread; beyond it …
 SENDERS = 8  # … their senders wait, each connection in its turn; more would take the threads that receive stops
 HELLOS = 8  # of one account that wait
 ASKED_BYTES = 128 << 10  # of one hello, some 2,000 retained topics, or query
 RETAINING_BYTES = 1 << 20  # of retained messages of one robot that wait; beyond it their senders wait, as above
 COMING = 100  # sessions of one account that come or go; the same
-PATIENCE_S = 0.5  # a query waits this long for retained messages that are known to be on their way
 _SENT_S = 0.1  # a will has left by then; what a session that is closed has to send reaches some and not others
 _LOOK_S = 0.25  # a hub among others looks so often whether it stood still
 
@@ -235,15 +233,12 @@ class HubWorker:
         self._name, self._store, self._journal, self._counters = name, store, journal, counters
         self._admission = admission
         self._recalled = False  # the records of the journal
-        self._received: dict[str, int] = {}  # how many retained messages have arrived, by client
         self.alive_clients: set[str] = set()
         self._wills = WillTimes(name)
         self._mesh = Mesh(name, self, self._wills)
         self._token: zenoh.LivelinessToken | None = None  # clients ask a hub when its token appears
         self._renewals = 0
-        self._waiting_queries: deque[tuple[float, dict[str, int], zenoh.Query]] = deque()
-        self._awaited: set[str] = set()  # clients whose messages these wait for
-        self._looks = False  # whether some of them may wait no longer
+        self._waiting = WaitingQueries()
         self._turns = Turns()
         self._asking, self._greeting = Places(ASKED, SENDERS), Places(HELLOS)
         self._retaining, self._coming = Places(RETAINING_BYTES, SENDERS), Places(COMING, SENDERS)
@@ -290,9 +285,7 @@ class HubWorker:
         if self._thread.is_alive():
             self._turns.end()
             self._thread.join(5)
-        for _, _, query in self._waiting_queries:
-            query.drop()  # type: ignore[no-untyped-call]
-        self._waiting_queries.clear()
+        self._waiting.drop()
         if self._journal is not None:
             self._journal.close()
 
@@ -373,10 +366,8 @@ class HubWorker:
 
     def _pause(self) -> float | None:
         now = time.monotonic()
-        merged = self._mesh.merging_until
         pauses = [_NEVER if self._holds else self._wills.next_due - now]
-        if self._waiting_queries:
-            pauses.append((merged if self._looks else max(self._waiting_queries[0][0], merged)) - now)
+        pauses.append(self._waiting.due(self._mesh.merging_until) - now)
         if self._journal is not None:
             pauses.append(self._journal.wait_s)
         if self._wills.met_others:
@@ -392,10 +383,7 @@ class HubWorker:
         stamp = wire.Stamp.unpack(sample.attachment.to_bytes())
         self.apply(Retained(str(sample.key_expr).removeprefix(wire.RETAINED), sample.payload.to_bytes(), stamp))
         self._wills.on_message(stamp.origin, time.monotonic())
-        if stamp.retained_count and stamp.origin in self._received:
-            self._received[stamp.origin] = max(stamp.retained_count, self._received[stamp.origin])
-            if stamp.origin in self._awaited:
-                self._looks = True
+        self._waiting.received(stamp.origin, stamp.retained_count)
 
     def _query(self, query: zenoh.Query) -> None:
         """Queue a subscriber's query, which names the messages that the answer must include."""
@@ -405,33 +393,15 @@ class HubWorker:
             query.drop()  # type: ignore[no-untyped-call]
             self._asking.leave()
             raise
-        now, merging = time.monotonic(), time.monotonic() < self._mesh.merging_until
-        if len(self._waiting_queries) >= QUERIES or (self._has_arrived(needs) and not merging):
+        now = time.monotonic()
+        if not self._waiting.add(needs, query, now, merging=now < self._mesh.merging_until):
             self._answer(query)
-            return
-        self._waiting_queries.append((now + PATIENCE_S, needs, query))
-        self._awaited.update(needs)
-        self._looks = self._looks or merging
-
-    def _has_arrived(self, needs: dict[str, int]) -> bool:
-        return all(self._received.get(name, -1) >= count for name, count in needs.items())
 
     def _answer_waiting(self) -> None:
-        """Those that have waited for long enough, or for nothing more."""
         now = time.monotonic()
-        if now < self._mesh.merging_until:
-            return
-        due = []
-        while self._waiting_queries and now >= self._waiting_queries[0][0]:
-            due.append(self._waiting_queries.popleft())
-        if self._looks:
-            self._looks = False
-            due += [one for one in self._waiting_queries if self._has_arrived(one[1])]
-            self._waiting_queries = deque(one for one in self._waiting_queries if not self._has_arrived(one[1]))
-        if not self._waiting_queries:
-            self._awaited.clear()
-        for _, _, query in due:
-            self._turns.put(partial(self._answer, query), asked=True)
+        if now >= self._mesh.merging_until:
+            for query in self._waiting.take(now):
+                self._turns.put(partial(self._answer, query), asked=True)
 
     def _answer(self, query: zenoh.Query) -> None:
         self._asking.leave()
@@ -463,9 +433,9 @@ class HubWorker:
             self.apply(StoredWill(hello.name, hello.will))
             lacking = self._store.lacks(hello)
             if lacking:
-                self._received.pop(hello.name, None)
+                self._waiting.forget(hello.name)
             elif not account:  # no subscriber waits for what other machines retain
-                self._received[hello.name] = hello.retained_count
+                self._waiting.count_from(hello.name, hello.retained_count)
             query.reply(wire.asked(wire.HELLO, account), wire.encode(lacking))
 
     def _end_predecessor(self, hello: wire.Hello) -> None:
@@ -497,7 +467,7 @@ class HubWorker:
             self._mesh.on_alive(name)
             return
         self.alive_clients.discard(name)
-        self._received.pop(name, None)
+        self._waiting.forget(name)
         if self._store.will(name) is not None:
             self._wills.on_gone(name, time.monotonic())
 
@@ -596,7 +566,7 @@ class HubWorker:
         """Clients of a session that was closed have as long to come back as after a restart."""
         self._wills.on_new_session()
         self.alive_clients.clear()
-        self._received.clear()
+        self._waiting.forget_all()
         self._await_wills()
 
     def _await_wills(self) -> None:

@@ -1,0 +1,71 @@
+"""Queries of subscribers that wait in the hub for retained messages which are known to be on their way."""
+
+from collections import deque
+
+import zenoh
+
+QUERIES = 1000  # that wait; further ones are answered at once
+PATIENCE_S = 0.5  # so long each waits
+
+
+class WaitingQueries:
+    """A query names how many retained messages of which clients its answer must include. For the hub's thread."""
+
+    def __init__(self) -> None:
+        self._received: dict[str, int] = {}  # how many retained messages have arrived, by client
+        self._waiting: deque[tuple[float, dict[str, int], zenoh.Query]] = deque()
+        self._awaited: set[str] = set()  # clients whose messages these wait for
+        self._looks = False  # whether some of them may wait no longer
+
+    def count_from(self, client: str, count: int) -> None:
+        """All that this client has retained until now is here: ``count`` messages."""
+        self._received[client] = count
+
+    def received(self, client: str, count: int) -> None:
+        """A message has come, which is the ``count``-th that this client has retained; 0: it does not count them."""
+        if count and client in self._received:
+            self._received[client] = max(count, self._received[client])
+            self._looks = self._looks or client in self._awaited
+
+    def forget(self, client: str) -> None:
+        self._received.pop(client, None)
+
+    def forget_all(self) -> None:
+        self._received.clear()
+
+    def add(self, needs: dict[str, int], query: zenoh.Query, now: float, *, merging: bool) -> bool:
+        """Have it wait; False: it is to be answered now. While hubs are ``merging`` nothing is complete."""
+        if len(self._waiting) >= QUERIES or (self._has_arrived(needs) and not merging):
+            return False
+        self._waiting.append((now + PATIENCE_S, needs, query))
+        self._awaited.update(needs)
+        self._looks = self._looks or merging
+        return True
+
+    def due(self, merging_until: float) -> float:
+        """When to :meth:`take`; infinite if nothing waits."""
+        if not self._waiting:
+            return float("inf")
+        return merging_until if self._looks else max(self._waiting[0][0], merging_until)
+
+    def take(self, now: float) -> list[zenoh.Query]:
+        """Those that have waited for long enough, or for nothing more."""
+        due = []
+        while self._waiting and now >= self._waiting[0][0]:
+            due.append(self._waiting.popleft())
+        if self._looks:
+            self._looks = False
+            due += [one for one in self._waiting if self._has_arrived(one[1])]
+            self._waiting = deque(one for one in self._waiting if not self._has_arrived(one[1]))
+        if not self._waiting:
+            self._awaited.clear()
+        return [query for _, _, query in due]
+
+    def drop(self) -> None:
+        """Answer none of them."""
+        for _, _, query in self._waiting:
+            query.drop()  # type: ignore[no-untyped-call]
+        self._waiting.clear()
+
+    def _has_arrived(self, needs: dict[str, int]) -> bool:
+        return all(self._received.get(name, -1) >= count for name, count in needs.items())
