@@ -92,7 +92,7 @@ class Gateway:
 
     def open(self) -> None:
         for transport in (self._hub, self._broker, self._presence):
-            transport.judge_topics(is_stop=_is_stop)
+            transport.judge_topics(is_stop=_is_stop, may_leave=self._may_leave)
             transport.on_state(self._on_state)
         self._hub.judge_topics(is_invented=self._is_invented)
         self._broker.judge_topics(skips_retained=self._skips_retained, delivers_late=True)
@@ -211,6 +211,14 @@ class Gateway:
             return
         self.counters.add("stops")
         self._hub.publish(message.topic, message.payload, qos=QoS.DELIVERED, urgent=True)
+
+    def _may_leave(self, topic: str) -> bool:
+        """Whether it is a stop, or of a robot that is carried at this moment, or no robot's: a heartbeat."""
+        address = parse_topic(topic)
+        if _is_stop(topic) or address is None or address.identity.is_server:
+            return True
+        one = self._carried.get(address.identity.base)
+        return one is not None and self._holds(one.base, one.since)
 
     def _is_invented(self, topic: str) -> bool:
         one = self._of(topic)

@@ -16,6 +16,7 @@ from pebble.runtime.connections import hub_settings
 from pebble.runtime.hub import WILLS
 from pebble.transports import Message, QoS, ZenohSettings, create
 from pebble.transports.counters import Counters
+from pebble.transports.zenoh import wire
 from pebble.transports.zenoh.hub import ASKED_BYTES, HELLOS, HubWorker
 from pebble.transports.zenoh.hub.admission import Admission
 from pebble.transports.zenoh.hub.journal import Journal
@@ -157,6 +158,23 @@ def test_hellos_of_one_account_that_wait_are_few_and_short() -> None:
         task()
     assert len(greeted) == HELLOS + 1
     assert greet("vera"), "there is room again"
+
+
+@pytest.mark.parametrize(("waits_s", "works"), [(3.0, True), (0.0, False)])
+def test_a_query_that_no_one_waits_for_any_more_is_not_answered(
+    monkeypatch: pytest.MonkeyPatch, waits_s: float, works: bool
+) -> None:
+    monkeypatch.setattr(wire, "RETAINED_ANSWER_S", waits_s)
+    hub = HubWorker("hub", HubStore(), Admission(WILLS), None, Counters())
+    worked: list[Any] = []
+    monkeypatch.setattr(hub, "_query", worked.append)
+    asked: Any = Asked("@retain/**", 1)
+    hub._ask(asked)
+    task = hub._turns.take(0)
+    assert task is not None
+    task()
+    assert (asked.dropped, worked == [asked]) == (not works, works)
+    assert hub._asking._taken == dict.fromkeys([""] * works, 1), "it holds its place until it is answered"
 
 
 def test_each_client_is_logged_once_and_a_flood_of_them_not_without_end(caplog: pytest.LogCaptureFixture) -> None:

@@ -17,7 +17,6 @@ from pebble.transports.zenoh.presence import HubWatch
 from pebble.transports.zenoh.publishers import remember_first
 
 HUB_ANSWER_S = 1.0
-RETAINED_ANSWER_S = 3.0
 FETCH_S = 0.7  # the longest wait for the hub's retained messages, which it may delay for half a second
 GOODBYE_S = 0.3  # the longest wait for an answer when closing
 
@@ -135,7 +134,7 @@ class HubConnection:
             direct(take, answered.set),
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
-            timeout=RETAINED_ANSWER_S,
+            timeout=wire.RETAINED_ANSWER_S,
             payload=wire.encode({name: count for name, count in counts.items() if count}),
             **wire.BLOCK,
         )

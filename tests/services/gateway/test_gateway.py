@@ -10,10 +10,12 @@ from collections.abc import Callable
 import pytest
 
 from pebble.contract import ONLINE
+from pebble.forwarding.routing import Side
 from pebble.services.gateway import gateway as module
 from pebble.services.gateway.gateway import Gateway
 from pebble.services.gateway.heartbeats import will
-from pebble.services.gateway.ownership import TAKING_S
+from pebble.services.gateway.ownership import FRESH_S, TAKING_S
+from pebble.transports import Message
 from tests.forwarding.virtual import Connection, Hub
 from tests.services.mqtt_bridge.bridge_rig import Client
 from tests.support import cases
@@ -225,6 +227,24 @@ def test_every_gateway_forwards_a_live_stop_in_every_state(monkeypatch: pytest.M
     world.run(3)
     assert late.gateway.counters["stops"] == 0, "a retained one is old"
     assert len(world.robots[0].on("incoming/estop")) == before
+
+
+@pytest.mark.parametrize("stood_s", [0.0, 2 * FRESH_S])
+def test_what_it_has_in_hand_while_it_stands_still_does_not_leave(
+    monkeypatch: pytest.MonkeyPatch, alone: World, stood_s: float
+) -> None:
+    """It passed when it came; another gateway may have carried the robot since."""
+    forwarder = alone.running["a"].gateway._carried[GOOB].forwarder
+    receive = forwarder.receive
+
+    def stand_still(side: Side, message: Message) -> None:
+        alone.now += stood_s
+        receive(side, message)
+
+    monkeypatch.setattr(forwarder, "receive", stand_still)
+    alone.robots[0].publish("outgoing/counted", b"-1")
+    alone.rest()
+    assert (b"-1" in alone.operators[0].payloads("outgoing/counted")) is (stood_s == 0)
 
 
 def test_of_two_with_one_name_one_rests(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -23,13 +23,27 @@ def test_what_is_asked_for_comes_last_and_has_a_fifth_of_the_time(monkeypatch: p
 
     for number in range(64):
         if number < 4:
-            waiting.put(partial(work, "asked", 1 / 8), asked=True)
+            waiting.ask("queries", "", partial(work, "asked", 1 / 8))
         waiting.put(partial(work, "other", 1 / 64))
     waiting.end()
     while (task := waiting.take(0)) is not None:
         task()
     others = ["other"] * 32  # four times as long as what was asked for
     assert done == ["asked", *others, "asked", *others, "asked", "asked"]
+
+
+def test_kinds_of_what_is_asked_for_have_their_turns_and_names_of_each_kind() -> None:
+    """So that who asks for one thing on and on holds up no one who greets, or asks for another."""
+    waiting, done = Turns(), list[str]()
+    for row in ("queries vera", "queries vera", "queries vera", "queries otto", "hellos otto", "hellos otto"):
+        waiting.ask(*row.split(), partial(done.append, row))
+    waiting.end()
+    while (task := waiting.take(0)) is not None:
+        task()
+    assert done == [
+        *("queries vera", "hellos otto", "queries otto", "hellos otto"),
+        *("queries vera", "queries vera"),
+    ]
 
 
 def test_it_waits_for_a_task_and_for_no_longer_than_it_should() -> None:

@@ -77,6 +77,11 @@ class Hub:
         assert self._process is not None
         os.kill(self._process.pid, number)
 
+    @property
+    def state(self) -> tuple[int | None, str]:
+        """Its exit code, None while it runs, and what it has written."""
+        return (None, "") if self._process is None else (self._process.poll(), getattr(self._process, "printed", ""))
+
 
 class Listener:
     """A client of one hub that counts wills and heartbeats, by robot."""
@@ -131,7 +136,8 @@ class Mesh:
         connect = tuple(self.hubs[one].endpoint for one in hubs)
         settings = settings_of(self.folder / "clients", connect, EYE, self._fleet)
         client = create("zenoh", name, settings, will=will).open(20)
-        assert until(lambda: client.state is State.CONNECTED, 30), client.problem
+        connected = until(lambda: client.state is State.CONNECTED, 30)
+        assert connected, (client.problem, {one: self.hubs[one].state for one in hubs})
         self._clients.append(client)
         return client
 

@@ -325,7 +325,20 @@ class HubWorker:
     def _ask(self, query: zenoh.Query) -> None:
         """Have a query for retained messages answered, which holds its place until then."""
         if _admits(query, self._asking, ""):
-            self._turns.put(partial(self._query, query), asked=True)
+            self._in_turn(self._query, query)
+
+    def _in_turn(self, work: Callable[[zenoh.Query], None], query: zenoh.Query) -> None:
+        """Do ``work`` in turn with queries for other keys, as a hub is not told who asks; unless it waited too long."""
+        came = time.monotonic()
+
+        def turn() -> None:
+            if time.monotonic() - came < wire.RETAINED_ANSWER_S:
+                work(query)
+            else:
+                query.drop()  # type: ignore[no-untyped-call]
+                self._asking.leave()
+
+        self._turns.ask("queries", str(query.key_expr), turn)
 
     def _greeted(self, work: Callable[[zenoh.Query], None], query: zenoh.Query) -> None:
         """Queue the hello or goodbye of an account."""
@@ -336,7 +349,7 @@ class HubWorker:
             work(query)
 
         if _admits(query, self._greeting, account):
-            self._turns.put(greet, asked=True)
+            self._turns.ask("hellos", account, greet)
 
     def _run(self) -> None:
         turn = clock.since_boot()
@@ -401,7 +414,7 @@ class HubWorker:
         now = time.monotonic()
         if now >= self._mesh.merging_until:
             for query in self._waiting.take(now):
-                self._turns.put(partial(self._answer, query), asked=True)
+                self._in_turn(self._answer, query)
 
     def _answer(self, query: zenoh.Query) -> None:
         self._asking.leave()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections import deque
+from collections import OrderedDict, deque
 from collections.abc import Callable
 from time import monotonic
 
@@ -14,21 +14,30 @@ Task = Callable[[], None]
 
 
 class Turns:
-    """Tasks for one thread. What is asked for comes after all else, but has a fifth of the time while both wait."""
+    """Tasks for one thread. What is asked for comes after all else, but has a fifth of the time while both wait.
+
+    Its kinds have their turns one after the other, and so have the names of each kind.
+    """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._changed, self._room = threading.Condition(self._lock), threading.Condition(self._lock)
-        self._tasks, self._asked = deque[Task](), deque[Task]()
+        self._tasks, self._asked = deque[Task](), OrderedDict[str, OrderedDict[str, deque[Task]]]()
         self._ended = False
         self._is_asked, self._began, self._again = False, 0.0, 0.0  # of the task that was taken last
 
-    def put(self, task: Task, *, asked: bool = False) -> None:
-        """Wait for room, unless it was asked for: who asks has taken a place before."""
+    def put(self, task: Task) -> None:
+        """Wait for room."""
         with self._lock:
-            while not asked and len(self._tasks) >= QUEUE_LIMIT:
+            while len(self._tasks) >= QUEUE_LIMIT:
                 self._room.wait()
-            (self._asked if asked else self._tasks).append(task)
+            self._tasks.append(task)
+            self._changed.notify()
+
+    def ask(self, kind: str, name: str, task: Task) -> None:
+        """Queue what was asked for, without waiting: who asks has taken a place before."""
+        with self._lock:
+            self._asked.setdefault(kind, OrderedDict()).setdefault(name, deque()).append(task)
             self._changed.notify()
 
     def end(self) -> None:
@@ -48,11 +57,21 @@ class Turns:
             self._began = monotonic()
             if self._asked and (not self._tasks or self._began >= self._again):
                 self._is_asked = True
-                return self._asked.popleft()
+                return self._next_asked()
             if self._tasks:
                 self._room.notify()
                 return self._tasks.popleft()
             return None if self._ended else _nothing
+
+    def _next_asked(self) -> Task:
+        kind, names = self._asked.popitem(last=False)
+        name, tasks = names.popitem(last=False)
+        task = tasks.popleft()
+        if tasks:
+            names[name] = tasks
+        if names:
+            self._asked[kind] = names
+        return task
 
 
 class Places:
