@@ -6,8 +6,8 @@ import secrets
 
 from pebble import contract as c
 from pebble.check_result import CheckResult, State
-from pebble.conform.checks import ANSWER_S, Check, commanded, drives, free, freed, stop, stops
-from pebble.conform.component import Component
+from pebble.conform.checks import Check, commanded, drives, free, freed, stop, stops
+from pebble.conform.component import ANSWER_S, Component
 from pebble.conform.motion import moves_until
 from pebble.selftest import failed, ok, skipped
 

@@ -41,8 +41,8 @@ SOURCE = source("operator", "py").read_text()
 ALL = {check.name: check for check in OPERATOR}
 #: What a person types who is asked to do something; its end is the end of the program.
 LINES = {
-    operators.DRIVE: "0 0.5\n",
-    operators.FULL: "9 -9\n",
+    operators.DRIVE: "0 0\n0 0.5\n",  # a client that was kept from driving asks to let go first
+    operators.FULL: "0 0\n9 -9\n",
     operators.LET_GO: "0 0\n",
     operators.STOP: "stop\n",
     operators.RESET: "reset\n",
@@ -95,7 +95,10 @@ def driven(command: Command, target: Target) -> Iterator[StandIn]:
 
         try:
             robot.ask, robot.person_s = ask, 10.0
-            robot.look(3.0)
+            ask(operators.LET_GO)
+            robot.wait(lambda: robot.sent, 10.0)
+            robot.look(1.0)  # until it has seen a heartbeat
+            robot.sent.clear()
             yield robot
         finally:
             process.kill()
