@@ -52,13 +52,17 @@ J = TypeVar("J", bound=Judged)
 
 @dataclass(frozen=True)
 class Check(Generic[J]):
-    """``why`` tells what goes wrong where it fails. ``binds``: whether what is judged has this duty at all."""
+    """``why`` tells what goes wrong where it fails. ``binds``: whether what is judged has this duty at all.
+
+    ``once``: a person does something for it, and cannot do it twice.
+    """
 
     name: str
     why: str
     run: Callable[[J], CheckResult]
     needs: tuple[Callable[[J], str], ...] = ()
     binds: Callable[[J], bool] = lambda _: True
+    once: bool = False
 
 
 # -- what a check needs: empty, or why it is lacking
@@ -437,7 +441,7 @@ def _made(check: Check[J], judged: J) -> CheckResult:
     """A failed check may leave what it judges so that the next try is skipped: only a pass takes a failure back."""
     judged.stalled_s = 0.0
     first = check.run(judged)
-    for _ in range(_TRIES - 1):
+    for _ in range(0 if check.once else _TRIES - 1):
         if first.state is not State.FAILED or judged.stalled_s < _STALL_S:
             break
         judged.stalled_s = 0.0

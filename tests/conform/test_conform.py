@@ -7,13 +7,13 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
-from pebble.check_result import State
+from pebble.check_result import CheckResult, State
 from pebble.client.connection import Target
 from pebble.conform.checks import CHECKS, LAST, Check
 from pebble.conform.checks import run as results
@@ -22,6 +22,7 @@ from pebble.conform.control import CONTROL, UNSEEN
 from pebble.conform.motion import MOVING
 from pebble.conform.power import CUT
 from pebble.contract import ONLINE
+from pebble.selftest import failed, ok
 from pebble.transports import MqttSettings, QoS
 from pebble.transports.mqtt.transport import MqttTransport
 from tests.commands.command_line import Run
@@ -247,7 +248,7 @@ def switched_on(command: Sequence[str | Path], target: Target) -> Iterator[Compo
             component.wait(lambda: component.view.capabilities, 10)
             component.look(LOOKS_S)
             component.wait(lambda: len(component.of(ONLINE)) > 2, LOOKS_S)  # its interval is seen by three of them
-            component.ask, component.person_s = machine.ask, 15.0
+            component.ask, component.person_s = machine.ask, 30.0
             yield component
     finally:
         machine.off()
@@ -356,6 +357,33 @@ def test_a_robot_whose_disk_is_slow_passes(broker: Broker, tmp_path: Path) -> No
     arguments, target = at_open(broker)
     with switched_on([*program, *with_stop_file(arguments, tmp_path)], target) as component:
         assert lacking(judged(component, ALL["stop"], ALL["stop moving"], ALL["reset waits"])) == {}
+
+
+class Stalled:
+    """What is judged while this machine stalls; only its second answer is good."""
+
+    def __init__(self) -> None:
+        self.stalled_s = 0.0
+        self._answers = iter((failed("it is late", ""), ok("in time")))
+
+    def wait(self, _condition: Callable[[], object], _seconds: float) -> bool:
+        return True
+
+    def answer(self) -> CheckResult:
+        self.stalled_s = 1.0
+        return next(self._answers)
+
+
+@pytest.mark.parametrize(
+    ("once", "found"),
+    [
+        (False, (State.OK, "in time; tried again, because this machine stalled: it is late, at first")),
+        (True, (State.FAILED, "it is late")),
+    ],
+)
+def test_a_check_that_was_tried_again_tells_it(once: bool, found: tuple[State, str]) -> None:
+    ((_, outcome),) = results(Stalled(), [Check("answer", "", Stalled.answer, once=once)])
+    assert (outcome.state, outcome.text) == found
 
 
 def test_what_was_not_judged_is_no_pass(
