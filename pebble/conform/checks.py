@@ -81,6 +81,8 @@ def controls(component: Component) -> str:
 
 
 def free(component: Component) -> str:
+    """The end of the check before may still be on its way."""
+    component.wait(lambda: not why_not_free(component.view), ANSWER_S)
     return why_not_free(component.view)
 
 

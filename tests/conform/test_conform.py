@@ -245,7 +245,7 @@ def switched_on(command: Sequence[str | Path], target: Target) -> Iterator[Compo
     machine.on()
     try:
         with reached(target, LOOKS_S) as component:
-            component.wait(lambda: component.view.capabilities, 10)
+            component.wait(lambda: component.view.capabilities, 30)
             component.look(LOOKS_S)
             component.wait(lambda: len(component.of(ONLINE)) > 2, LOOKS_S)  # its interval is seen by three of them
             component.ask, component.person_s = machine.ask, 30.0
