@@ -322,22 +322,22 @@ def mutant(folder: Path, old: str, new: str) -> Command:
     return [sys.executable, folder / "robot.py"]
 
 
-@pytest.mark.parametrize(("name", "told", "old", "new"), some(VIOLATIONS, 10))
-def test_a_violation_is_found(broker: Broker, tmp_path: Path, name: str, told: str, old: str, new: str) -> None:
+@pytest.mark.parametrize(("name", "reason", "old", "new"), some(VIOLATIONS, 10))
+def test_a_violation_is_found(broker: Broker, tmp_path: Path, name: str, reason: str, old: str, new: str) -> None:
     arguments, target = at_open(broker)
     needs = [ALL["will"]] if name == "retained commands" else []
     with switched_on([*mutant(tmp_path, old, new), *with_stop_file(arguments, tmp_path)], target) as component:
         state, text = judged(component, *needs, ALL[name])[name]
-    assert (state, told in text) == (State.FAILED, True), text
+    assert (state, reason in text) == (State.FAILED, True), text
 
 
-@pytest.mark.parametrize(("name", "told", "old", "new"), some(NAMED_VIOLATIONS, 5))
-def test_a_violation_at_level_named_is_found(tmp_path: Path, name: str, told: str, old: str, new: str) -> None:
+@pytest.mark.parametrize(("name", "reason", "old", "new"), some(NAMED_VIOLATIONS, 5))
+def test_a_violation_at_level_named_is_found(tmp_path: Path, name: str, reason: str, old: str, new: str) -> None:
     with believing(tmp_path / "hall") as broker:
         arguments, target = at_named(broker, tmp_path, "mine", "ann")
         with switched_on([*mutant(tmp_path, old, new), *with_stop_file(arguments, tmp_path)], target) as component:
             state, text = judged(component, ALL[name])[name]
-    assert (state, told in text) == (State.FAILED, True), text
+    assert (state, reason in text) == (State.FAILED, True), text
 
 
 @pytest.mark.thorough
@@ -381,7 +381,7 @@ class Stalled:
         (True, (State.FAILED, "it is late")),
     ],
 )
-def test_a_check_that_was_tried_again_tells_it(once: bool, found: tuple[State, str]) -> None:
+def test_a_check_that_was_tried_again_shows_it(once: bool, found: tuple[State, str]) -> None:
     ((_, outcome),) = results(Stalled(), [Check("answer", "", Stalled.answer, once=once)])
     assert (outcome.state, outcome.text) == found
 

@@ -184,7 +184,7 @@ def test_where_names_are_checked(hall: Hall, tmp_path: Path, language: Language,
 
 @pytest.mark.parametrize("name", some(VIOLATIONS, 5))
 def test_a_violation_is_found(broker: Broker, tmp_path: Path, name: str) -> None:
-    old, new, told = VIOLATIONS[name]
+    old, new, reason = VIOLATIONS[name]
     assert old in SOURCE
     program = tmp_path / "operator.py"
     program.write_text(SOURCE.replace(old, new))
@@ -192,7 +192,7 @@ def test_a_violation_is_found(broker: Broker, tmp_path: Path, name: str) -> None
     needs = ["rate"] if name in ("stamps", "payloads", "numbers", "retained") else []
     with driven([sys.executable, program, *arguments], target) as robot:
         state, text = judged(robot, *needs, name)[name]
-    assert (state, told in text) == (State.FAILED, True), text
+    assert (state, reason in text) == (State.FAILED, True), text
 
 
 def test_no_robot_is_played_where_it_runs(broker: Broker) -> None:
