@@ -5,7 +5,7 @@ from __future__ import annotations
 import secrets
 import time
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Generic, Protocol, TypeVar
 
@@ -14,7 +14,7 @@ import msgspec
 from pebble import contract as c
 from pebble.check_result import CheckResult, State
 from pebble.client.robot_topics import section_of
-from pebble.conform.component import Component, Record
+from pebble.conform.component import ANSWER_S, Component, Record
 from pebble.contract.capabilities import CapabilitiesValue
 from pebble.contract.identity import parse_topic
 from pebble.contract.levels import silent_after
@@ -22,7 +22,6 @@ from pebble.contract.payloads import EstopCommand, EstopReset, EstopState
 from pebble.errors import PebbleError
 from pebble.selftest import failed, ok, skipped, why_not_free
 
-ANSWER_S = 1.0  # within which a robot answers
 _CLOCK_S = 60.0  # that its clock may differ
 _LARGEST = 64 * 1024  # bytes of JSON
 _LARGEST_STATE = 400  # bytes of a state of the emergency stop
@@ -53,13 +52,17 @@ J = TypeVar("J", bound=Judged)
 
 @dataclass(frozen=True)
 class Check(Generic[J]):
-    """``why`` tells what goes wrong where it fails. ``binds``: whether what is judged has this duty at all."""
+    """``why`` tells what goes wrong where it fails. ``binds``: whether what is judged has this duty at all.
+
+    ``once``: a person does something for it, and cannot do it twice.
+    """
 
     name: str
     why: str
     run: Callable[[J], CheckResult]
     needs: tuple[Callable[[J], str], ...] = ()
     binds: Callable[[J], bool] = lambda _: True
+    once: bool = False
 
 
 # -- what a check needs: empty, or why it is lacking
@@ -78,6 +81,8 @@ def controls(component: Component) -> str:
 
 
 def free(component: Component) -> str:
+    """The end of the check before may still be on its way."""
+    component.wait(lambda: not why_not_free(component.view), ANSWER_S)
     return why_not_free(component.view)
 
 
@@ -277,7 +282,7 @@ def owners(component: Component) -> CheckResult:
 
 def stop(component: Component, name: str) -> bool:
     component.send(c.ESTOP, EstopCommand(stop=name, by=BY, why=_WHY))
-    return component.wait(lambda: _has(component, name), ANSWER_S)
+    return component.answers(lambda: _has(component, name))
 
 
 def _has(component: Component, name: str) -> bool:
@@ -292,7 +297,7 @@ def reset(component: Component, *, boot: str = "", more: int = 0) -> None:
 
 def freed(component: Component) -> bool:
     reset(component)
-    return component.wait(lambda: not component.view.latched, ANSWER_S)
+    return component.answers(lambda: not component.view.latched)
 
 
 def while_stopped(test: Callable[[Component, str], CheckResult]) -> Callable[[Component], CheckResult]:
@@ -307,7 +312,7 @@ def while_stopped(test: Callable[[Component, str], CheckResult]) -> Callable[[Co
             outcome = test(component, name)
         finally:
             is_free = freed(component)
-        if not is_free:
+        if not is_free and outcome.state is not State.FAILED:
             return failed("a reset with its boot and count does not end it", "end it on incoming/estop-reset")
         return outcome
 
@@ -343,7 +348,7 @@ def _repeated(component: Component) -> CheckResult:
         names.append(name)
         before = {owner: one.count for owner, one in states(component).items()}
         component.send(c.ESTOP, EstopCommand(stop=name, by=BY, why=_WHY))
-        component.look(ANSWER_S / 2)
+        component.look(component.patience_s)
         counted = [owner for owner, one in states(component).items() if one.count != before.get(owner)]
         if counted:
             return failed(f"its repetition counts again ({some_of(counted)})", "a name in recent is the same stop")
@@ -361,27 +366,25 @@ def _repeated(component: Component) -> CheckResult:
 def _unreadable(component: Component, _name: str) -> CheckResult:
     before = {owner: one.count for owner, one in states(component).items()}
     component.send(c.ESTOP, b"stop!")
-    if not component.wait(
-        lambda: all(one.count > before.get(of, 0) for of, one in states(component).items()), ANSWER_S
-    ):
+    if not component.answers(lambda: all(one.count > before.get(of, 0) for of, one in states(component).items())):
         return failed(
             "a stop that is no JSON does nothing", "whatever arrives on incoming/estop is a stop, if not empty"
         )
-    component.look(ANSWER_S / 2)  # at named it is sent with a name and without, and counts twice
+    component.look(component.patience_s)  # at named it is sent with a name and without, and counts twice
     return ok("what cannot be read stops, too")
 
 
 def _wrong_reset(component: Component, _name: str) -> CheckResult:
     for more, boot, what in ((-1, "", "an older count"), (0, "ffffffff", "another boot")):
         reset(component, boot=boot, more=more)
-        if component.wait(lambda: not component.view.latched, ANSWER_S / 2):
+        if component.happens(lambda: not component.view.latched):
             return failed(f"a reset with {what} ends it", "reset only with the boot and count of the state now")
     return ok("it is refused")
 
 
 def _driven(component: Component, _name: str) -> CheckResult:
     component.send(c.DRIVE, b'{"x": 0, "z": 0}')
-    if component.wait(lambda: not component.view.latched, ANSWER_S / 2):
+    if component.happens(lambda: not component.view.latched):
         return failed("a drive command ends the stop", "only a reset ends it")
     return ok("a drive command does not end it")
 
@@ -440,11 +443,12 @@ def _made(check: Check[J], judged: J) -> CheckResult:
     """A failed check may leave what it judges so that the next try is skipped: only a pass takes a failure back."""
     judged.stalled_s = 0.0
     first = check.run(judged)
-    for _ in range(_TRIES - 1):
+    for _ in range(0 if check.once else _TRIES - 1):
         if first.state is not State.FAILED or judged.stalled_s < _STALL_S:
             break
         judged.stalled_s = 0.0
         again = check.run(judged)
         if again.state is State.OK:
-            return again
+            text = f"{again.text}; tried again, because this machine stalled: {first.text}, at first"
+            return replace(again, text=text)
     return first

@@ -19,6 +19,7 @@ from pebble.contract.payloads import ControlRequest
 from pebble.errors import PayloadError
 from pebble.transports import Message, QoS, Transport
 
+ANSWER_S = 1.0  # within which a robot answers
 _STEP_S = 0.005
 _MOST = 50_000  # messages that are kept; a robot at rest sends some ten a second
 _RETAINED_S = 1.0  # some brokers send what is retained a moment after the subscription
@@ -47,6 +48,7 @@ class Component:
         self.records: deque[Record] = deque(maxlen=_MOST)
         self._of: defaultdict[c.Channel | None, deque[Record]] = defaultdict(lambda: deque(maxlen=_MOST))
         self.stalled_s = 0.0  # the longest time that this program waited in vain to go on
+        self._slowest_s = ANSWER_S / 4  # of its answers
         #: When its wheels changed (monotonic), and to what, left and right: from where it is seen besides.
         self.eyes: Callable[[], list[tuple[float, list[float]]]] = list
         self.view = RobotView(base)
@@ -81,6 +83,23 @@ class Component:
         began = time.monotonic()
         self.wait(lambda: False, seconds)
         return began
+
+    def answers(self, condition: Callable[[], object]) -> bool:
+        """Whether the robot does what was asked, in time."""
+        began = time.monotonic()
+        done = self.wait(condition, ANSWER_S)
+        if done:
+            self._slowest_s = max(self._slowest_s, time.monotonic() - began)
+        return done
+
+    @property
+    def patience_s(self) -> float:
+        """How long one must look on to be sure that something does not happen: it may answer late, here or always."""
+        return 2 * self._slowest_s
+
+    def happens(self, condition: Callable[[], object]) -> bool:
+        """Whether the robot does what it must not do."""
+        return self.wait(condition, self.patience_s)
 
     def of(self, channel: c.Channel, since: float = 0.0, *, retained: bool = False) -> list[Record]:
         """Its live messages of a channel, or with ``retained`` all."""

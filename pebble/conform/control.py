@@ -9,8 +9,8 @@ from typing import Literal
 
 from pebble import contract as c
 from pebble.check_result import CheckResult
-from pebble.conform.checks import ANSWER_S, BY, Check, commanded, controls, drives, free, states, stops, while_stopped
-from pebble.conform.component import Component
+from pebble.conform.checks import BY, Check, commanded, controls, drives, free, states, stops, while_stopped
+from pebble.conform.component import ANSWER_S, Component
 from pebble.contract.payloads import ControlRequest, ControlState, EstopReset
 from pebble.selftest import failed, ok, skipped
 
@@ -35,7 +35,7 @@ class Driver:
     def leaves(self) -> bool:
         """Release it; False: the robot keeps it."""
         self.asks("release")
-        return self._component.wait(lambda: not self.holds, ANSWER_S)
+        return self._component.answers(lambda: not self.holds)
 
     def takes(self) -> float:
         """Ask nobody; returns when."""
@@ -62,7 +62,7 @@ def _with_control(test: Callable[[Component, Driver], CheckResult]) -> Callable[
         driver = Driver(component)
         driver.asks()
         try:
-            if not component.wait(lambda: driver.holds, ANSWER_S):
+            if not component.answers(lambda: driver.holds):
                 return failed(f"no key within {ANSWER_S:g} s", "answer incoming/control on outgoing/control/{owner}")
             return test(component, driver)
         finally:
@@ -77,7 +77,7 @@ def _first_keeps(component: Component, driver: Driver) -> CheckResult:
         return failed(f"its state tells that {by!r} has it", "at level named, by begins with the account in the topic")
     second = Driver(component)
     second.asks()
-    took = component.wait(lambda: second.holds, ANSWER_S / 2)
+    took = component.happens(lambda: second.holds)
     second.leaves()
     if took:
         return failed("a second request takes it", "while one holds control, others wait: show them in asks")
@@ -92,7 +92,7 @@ def _shows_asker(component: Component, driver: Driver) -> CheckResult:
     def shown() -> bool:
         return driver.state is not None and driver.state.asks_id == second.id
 
-    if not component.wait(shown, ANSWER_S):
+    if not component.answers(shown):
         return failed("a second request is not shown", "publish its by and id as asks and asks_id while it is repeated")
     if not component.wait(lambda: not shown(), _SHORTEST_MS / 1000 + ANSWER_S):
         return failed("it is shown after its end", "who asks is shown until for_ms after the last request")
@@ -102,7 +102,7 @@ def _shows_asker(component: Component, driver: Driver) -> CheckResult:
 def _released(component: Component, driver: Driver) -> CheckResult:
     driver.asks(for_ms=5 * _SHORTEST_MS)
     Driver(component).asks("release")
-    if component.wait(lambda: not driver.holds, ANSWER_S):
+    if component.happens(lambda: not driver.holds):
         return failed("another's release ends it", "a release counts with the id, and account, of who has control")
     if not driver.leaves():
         return failed("it is kept after its release", 'end it by {"want": "release"}')
@@ -112,7 +112,7 @@ def _released(component: Component, driver: Driver) -> CheckResult:
 def _taken(component: Component, driver: Driver) -> CheckResult:
     key, second = driver.key, Driver(component)
     second.takes()
-    took = component.wait(lambda: second.holds, ANSWER_S)
+    took = component.answers(lambda: second.holds)
     same = second.key == key
     second.leaves()
     if not took:
@@ -138,11 +138,11 @@ def _nameless(component: Component, _name: str) -> CheckResult:
     stranger = Driver(component)
     if not component.send_as("", c.CONTROL, stranger.request()):
         return skipped(UNSEEN)
-    if component.wait(lambda: stranger.holds, ANSWER_S):
+    if component.happens(lambda: stranger.holds):
         return failed("it gives control to a request without an account", fix)
     for one in states(component).values():
         component.send_as("", c.ESTOP_RESET, EstopReset(boot=one.boot, count=one.count, by=BY))
-    if component.wait(lambda: not component.view.latched, ANSWER_S):
+    if component.happens(lambda: not component.view.latched):
         return failed("a reset without an account ends a stop", fix)
     return ok("requests and resets without an account do nothing")
 

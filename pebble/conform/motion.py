@@ -12,8 +12,8 @@ import msgspec
 
 from pebble import contract as c
 from pebble.check_result import CheckResult, State
-from pebble.conform.checks import ANSWER_S, Check, commanded, controls, drives, free, freed, reset, stop, stops
-from pebble.conform.component import Component
+from pebble.conform.checks import Check, commanded, controls, drives, free, freed, reset, stop, stops
+from pebble.conform.component import ANSWER_S, Component
 from pebble.conform.control import UNSEEN, Driver, named
 from pebble.selftest import failed, ok, skipped
 
@@ -97,7 +97,7 @@ def _at_the_wheel(component: Component) -> Iterator[_Wheel]:
     wheel = _Wheel(component)
     if component.view.controlled:
         wheel.driver.asks(for_ms=10_000)
-        component.wait(lambda: wheel.driver.holds, ANSWER_S)
+        component.answers(lambda: wheel.driver.holds)
     wheel.send(0)
     component.wait(lambda: moves_until(component, time.monotonic()) != float("inf"), ANSWER_S)
     try:
@@ -124,7 +124,7 @@ def _rest(
 
 def _moved(component: Component, since: float, why: str, fix: str) -> CheckResult:
     """A failure if it has moved."""
-    component.look(_LATE_S)
+    component.look(component.patience_s)
     until = moves_until(component, since)
     if until is None:
         return skipped(_NOT_SHOWN, _SHOW_IT)
@@ -243,7 +243,7 @@ def control_passes(component: Component) -> CheckResult:
         began, _ = wheel.drive()
         key, second = wheel.driver.key, Driver(component)
         at = second.takes()
-        component.wait(lambda: second.holds, ANSWER_S)
+        component.answers(lambda: second.holds)
         wheel.drive(key=key)
         outcome = _rest(component, began, at, 0.25, "another took control")
         second.leaves()

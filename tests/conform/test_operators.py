@@ -41,37 +41,56 @@ SOURCE = source("operator", "py").read_text()
 ALL = {check.name: check for check in OPERATOR}
 #: What a person types who is asked to do something; its end is the end of the program.
 LINES = {
-    operators.DRIVE: "0 0.5\n",
-    operators.FULL: "9 -9\n",
+    operators.DRIVE: "0 0\n0 0.5\n",  # a client that was kept from driving asks to let go first
+    operators.FULL: "0 0\n9 -9\n",
     operators.LET_GO: "0 0\n",
     operators.STOP: "stop\n",
     operators.RESET: "reset\n",
 }
 
-#: By check: what is written into the operator's program, and in place of what.
-VIOLATIONS: dict[str, tuple[str, str]] = {
-    "control": ("or (self.controlled and not self.key) or now() < self.drives_at", "or now() < self.drives_at"),
-    "requests": ('value = {"id": self.id', 'value = {"id": secrets.token_hex(4)'),
-    "rate": ("max(2.0, min(20.0, self.link", "max(2.0, min(50.0, 5 * self.link"),
-    "stamps": ('"t": ms()} if self.key else {})', '"t": ms() // 1000} if self.key else {})'),
-    "thin link": ('self.link["drive_hz"]))', "20.0))"),
-    "clamps": ("(max(-1.0, min(1.0, x)), max(-1.0, min(1.0, z)))", "(x, z)"),
-    "zero": ('            self.send("drive-values", {"x": 0, "z": 0}', '            ({"x": 0, "z": 0}'),
-    "silence": ('SILENT_S.get(self.link["level"], 1.5)', "60"),
-    "offline": ('value.get("online") is False', "False"),
-    "refused": ('self.request("hold")', 'self.send("control/take", {"id": self.id})'),
-    "stop": ("self.pressed = stop, now() + REPEATS_S, end", "self.pressed = None"),
-    "stopped": ('if any(state.get("latched") is not False', "if any(False"),
-    "reset": ('"count": state.get("count")', '"count": 0'),
-    "payloads": ('self.send("control", value if', 'self.send("control", {"id": self.id, "want": "drive"} if'),
-    "numbers": ('command = {"x": self.stick[0],', 'command = {"x": math.nan,'),
-    "release": ('operator.request("release")\nclient', "client"),
-    "retained": ("json.dumps(value), qos)", "json.dumps(value), qos, True)"),
-    # These two send without a pause, which costs more than all others: only `make thorough` tries them.
-    "idle": ("    operator.drive()\n", '    operator.drive()\n    operator.send("drive-values", {"x": 0, "z": 0})\n'),
+#: By check: what is written into the operator's program in place of what, and how the check names it.
+VIOLATIONS: dict[str, tuple[str, str, str]] = {
+    "control": (
+        "or (self.controlled and not self.key) or now() < self.drives_at",
+        "or now() < self.drives_at",
+        "without a key",
+    ),
+    "requests": ('value = {"id": self.id', 'value = {"id": secrets.token_hex(4)', "its ids"),
+    "rate": ("max(2.0, min(20.0, self.link", "max(2.0, min(50.0, 5 * self.link", "commands a second"),
+    "stamps": ('"t": ms()} if self.key else {})', '"t": ms() // 1000} if self.key else {})', "t grew by"),
+    "thin link": ('self.link["drive_hz"]))', "20.0))", "commands a second"),
+    "clamps": ("(max(-1.0, min(1.0, x)), max(-1.0, min(1.0, z)))", "(x, z)", "it sends 9"),
+    "zero": (
+        '            self.send("drive-values", {"x": 0, "z": 0}',
+        '            ({"x": 0, "z": 0}',
+        "asked to let go of the stick: nothing came",
+    ),
+    "silence": ('SILENT_S.get(self.link["level"], 1.5)', "60", "a robot that is silent"),
+    "offline": ('value.get("online") is False', "False", "a robot that is offline"),
+    "refused": ('self.request("hold")', 'self.send("control/take", {"id": self.id})', "it takes control"),
+    "stop": ("self.pressed = stop, now() + REPEATS_S, end", "self.pressed = None", "it is not repeated"),
+    "stopped": ('if any(state.get("latched") is not False', "if any(False", "it drives a stopped robot"),
+    "reset": ('"count": state.get("count")', '"count": 0', "not that of the state"),
+    "payloads": (
+        'self.send("control", value if',
+        'self.send("control", {"id": self.id, "want": "drive"} if',
+        "Invalid enum value",
+    ),
+    "numbers": ('command = {"x": self.stick[0],', 'command = {"x": math.nan,', "NaN"),
+    "release": ('operator.request("release")\nclient', "client", "control is kept"),
+    "retained": ("json.dumps(value), qos)", "json.dumps(value), qos, True)", "incoming/drive-values"),
+    # It sends without a pause, which costs more than all others: only `make thorough` tries it.
+    "idle": (
+        "    operator.drive()\n",
+        '    operator.drive()\n    operator.send("drive-values", {"x": 0, "z": 0})\n',
+        "it publishes incoming/drive-values",
+    ),
     "taken": (
         "if pushed and (self.why_not or (self.moves and self.controlled and not self.key)):",
-        'if not self.key:\n            self.send("control/take", {"id": self.id})\n        if self.why_not:',
+        "if pushed and self.moves and self.controlled and not self.key:\n"
+        '            self.send("control/take", {"id": self.id})\n'
+        "        if pushed and self.why_not:",
+        "it takes control back",
     ),
 }
 
@@ -95,7 +114,10 @@ def driven(command: Command, target: Target) -> Iterator[StandIn]:
 
         try:
             robot.ask, robot.person_s = ask, 10.0
-            robot.look(3.0)
+            ask(operators.LET_GO)
+            robot.wait(lambda: robot.sent, 10.0)
+            robot.look(1.0)  # until it has seen a heartbeat
+            robot.sent.clear()
             yield robot
         finally:
             process.kill()
@@ -163,14 +185,15 @@ def test_where_names_are_checked(hall: Hall, tmp_path: Path, language: Language,
 
 @pytest.mark.parametrize("name", some(VIOLATIONS, 5))
 def test_a_violation_is_found(broker: Broker, tmp_path: Path, name: str) -> None:
-    old, new = VIOLATIONS[name]
+    old, new, reason = VIOLATIONS[name]
     assert old in SOURCE
     program = tmp_path / "operator.py"
     program.write_text(SOURCE.replace(old, new))
     arguments, target = at_open(broker)
     needs = ["rate"] if name in ("stamps", "payloads", "numbers", "retained") else []
     with driven([sys.executable, program, *arguments], target) as robot:
-        assert judged(robot, *needs, name)[name][0] is State.FAILED
+        state, text = judged(robot, *needs, name)[name]
+    assert (state, reason in text) == (State.FAILED, True), text
 
 
 def test_no_robot_is_played_where_it_runs(broker: Broker) -> None:
