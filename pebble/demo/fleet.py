@@ -329,7 +329,7 @@ def run(seconds: float | None = None, *, broker: BrokerKind | None = None, conso
     Every process ends with it; the folder of logs stays only after a failure. Raises PebbleError without a broker.
     """
     require_packages()
-    console, kind = console or Console(), broker or best_kind()
+    console, kind, longest = console or Console(), broker or best_kind(), seconds or LONGEST_S
     with ending_on_signals() as ending, Fleet(ending) as fleet:
         print_line(
             console, f"The operators' broker ({kind}); two hubs, lan and site; a gateway from site to the broker."
@@ -337,18 +337,23 @@ def run(seconds: float | None = None, *, broker: BrokerKind | None = None, conso
         fleet.start_network(kind)
         url = usual_or_free(fleet, ending).url
         print_line(console, f"See and drive them in a browser: {url}")
+        print_line(console, f"The steps take half a minute, at most {longest:.0f} s; Ctrl-C ends them.")
         page = PageSocket(url)
         try:
-            Story(fleet, page, console, ending, time.monotonic() + (seconds or LONGEST_S)).play()
+            Story(fleet, page, console, ending, time.monotonic() + longest).play()
         except PebbleError as error:
             fleet.keep = not ending.is_set()
-            print_line(console, f"{error}. Logs, configs and traces: {fleet.folder}")
+            if ending.is_set():
+                print_line(console, "Ended before every step was seen.")
+                return int(seconds is not None)
+            print_line(console, f"Failed: {error}. Logs, configs and traces: {fleet.folder}")
             return 1
         finally:
             page.close()
         fleet.keep = False
-        print_line(console, "Every step was seen.")
         if seconds is None:
-            print_line(console, f"The robots are yours: {url}; Ctrl-C ends it")
+            print_line(console, f"Every step was seen. The robots are yours: {url}; Ctrl-C ends it.")
             ending.wait()
+        else:
+            print_line(console, "Every step was seen; the demo ends.")
     return 0
