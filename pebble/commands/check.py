@@ -270,8 +270,8 @@ def _uplink(config: Config) -> str:
 
 def _lan(section: Neighbours) -> str:
     ways = [f"connects to {one}" for one in section.lan.connect]
-    heard, drivers = section.listens, [name for name, granted in section.commanded.items() if granted]
-    names = {"hears": heard, "driven by scripts of": drivers, "shares": section.shares}
+    drivers = [name for name, granted in section.commanded.items() if granted]
+    names = {"hears": section.listens, "driven by scripts of": drivers, "shares": section.shares}
     return ", ".join([*ways, *(f"{what} {' and '.join(found)}" for what, found in names.items() if found)])
 
 
