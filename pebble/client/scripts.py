@@ -66,7 +66,7 @@ class RobotScripts:
             )
         if file not in self.files:
             known = ", ".join(self.files) or "none"
-            raise PebbleError(f"there is no script {file}, only: {known}")
+            raise PebbleError(f"there is no script {file}, only: {known}; just after the robot's start, try again")
         chosen = settings(self.files[file], words)
         return self._publish(transport, AutonomyCommand(action="start", file=file, config=chosen))
 

@@ -11,6 +11,7 @@ import typer
 
 from pebble.config import Config, Mqtt, load, resolved
 from pebble.config.doors import places_of
+from pebble.config.neighbours import Neighbours
 from pebble.config.secret_text import shown_user, without_secrets
 from pebble.config.visible import shown
 from pebble.contract import CHANNELS, MEDIA_STATUS, STATUS, TOUCH_SENSORS, Channel
@@ -190,6 +191,8 @@ def facts(config: Config) -> list[tuple[str, str]]:
         found.append(("mirror", _mqtt(config.transport.mqtt_mirror)))
     if config.services.mqtt_bridge.enabled:
         found.append(("uplink", _uplink(config)))
+    if config.services.neighbours.enabled:
+        found.append(("lan", _lan(config.services.neighbours)))
     found += _scripts(config)
     found += [("serial", line) for line in _serial_lines(config)]
     found += [("for the original's scripts", text) for text in _local_media(config)]
@@ -263,6 +266,13 @@ def _uplink(config: Config) -> str:
         ways = [f"listens on {one}" for one in bridge.remote.listen]
         return ", ".join([bridge.remote.kind, *ways, *(f"connects to {one}" for one in bridge.remote.connect)])
     return f"mqtt, {_mqtt(bridge.remote_mqtt)}"
+
+
+def _lan(section: Neighbours) -> str:
+    ways = [f"connects to {one}" for one in section.lan.connect]
+    drivers = [name for name, granted in section.commanded.items() if granted]
+    names = {"hears": section.listens, "driven by scripts of": drivers, "shares": section.shares}
+    return ", ".join([*ways, *(f"{what} {' and '.join(found)}" for what, found in names.items() if found)])
 
 
 def _scripts(config: Config) -> list[tuple[str, str]]:

@@ -8,7 +8,7 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from pebble.config.doors import check_doors
+from pebble.config.doors import check_doors, check_lan
 from pebble.config.exposure import warn_if_readable, warn_of_known_id, warn_of_logins_in_clear
 from pebble.config.hosts import HostError, check_web_url
 from pebble.config.media import AvDaemon, VideoStream
@@ -52,6 +52,7 @@ def _root(reader: Reader, root: Root, _path: Path) -> Root:
         warn_of_logins_in_clear(reader.notes, root)
         warn_of_known_id(reader.notes, root)
     check_doors(reader.notes, root)
+    check_lan(reader.notes, root)
     return root
 
 

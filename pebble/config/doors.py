@@ -1,4 +1,4 @@
-"""What the security level of a config refuses: ways to the robot without a login."""
+"""What the security level of a config refuses: ways to the robot without a login; and one hub for two uses."""
 
 import re
 from collections.abc import Iterator
@@ -6,12 +6,14 @@ from collections.abc import Iterator
 from pebble.config.exposure import brokers
 from pebble.config.problems import Notes, Path
 from pebble.config.shared_topics import renamed_commands
-from pebble.config.transport import Mqtt
+from pebble.config.transport import Mqtt, ZenohSection
 from pebble.config.tree import Root
 from pebble.config.web import is_loopback
 
 _ZENOH_ENCRYPTED = ("tls/", "quic/")
 _ZENOH_LOCAL = ("unixsock-stream/", "unixpipe/", "vsock/")
+_EVERYWHERE = ("0.0.0.0", "::")  # noqa: S104 -- compared only
+_LAN: Path = ("services", "neighbours", "lan")
 _BARE_HOST = re.compile(r"^[a-z0-9-]+/\[?([^\]/]*?)\]?(?::\d+)?(?:[?#].*)?$")
 
 
@@ -69,19 +71,45 @@ def _check_links(notes: Notes, root: Root) -> None:
             )
 
 
+def check_lan(notes: Notes, root: Root) -> None:
+    """Note where the hub of the LAN is also that of the operators, or of the robot itself."""
+    sections = _zenoh_sections(root)
+    lan = sections.pop(_LAN, None)
+    meets = {_place(endpoint): endpoint for endpoint in (() if lan is None else lan.connect)}
+    for path, key, endpoint in _each(sections):
+        if (mine := meets.get(_place(endpoint))) is not None:
+            other = ".".join(map(str, (*path, key)))
+            why = f"is also {other}: what is shared would come twice, or without end; take another hub"
+            notes.problem((*_LAN, "connect"), f"{mine} {why}")
+
+
 def _endpoints(root: Root) -> Iterator[tuple[Path, str]]:
     """Those of Zenoh that lead beyond this machine."""
+    for path, key, endpoint in _each(_zenoh_sections(root)):
+        if not _is_near(endpoint):
+            yield (*path, key), endpoint
+
+
+def _zenoh_sections(root: Root) -> dict[Path, ZenohSection]:
     transport, bridge = root.transport, root.services.mqtt_bridge
-    sections = {("transport",): transport if transport.kind == "zenoh" else None}
+    found: dict[Path, ZenohSection] = {("transport",): transport} if transport.kind == "zenoh" else {}
     if bridge.enabled and bridge.remote is not None and bridge.remote.kind == "zenoh":
-        sections["services", "mqtt_bridge", "remote"] = bridge.remote  # type: ignore[index, assignment]
+        found["services", "mqtt_bridge", "remote"] = bridge.remote
     if root.services.neighbours.enabled:
-        sections["services", "neighbours", "lan"] = root.services.neighbours.lan  # type: ignore[index, assignment]
+        found[_LAN] = root.services.neighbours.lan
+    return found
+
+
+def _each(sections: dict[Path, ZenohSection]) -> Iterator[tuple[Path, str, str]]:
     for path, section in sections.items():
-        for key in ("listen", "connect") if section is not None else ():
-            for endpoint in getattr(section, key):
-                if not _is_near(endpoint):
-                    yield (*path, key), endpoint
+        yield from ((path, key, one) for key in ("listen", "connect") for one in getattr(section, key))
+
+
+def _place(endpoint: str) -> tuple[str, str]:
+    """Host and port; all names of this machine are one."""
+    host, _, port = re.sub(r"[?#].*", "", endpoint.partition("/")[2]).rpartition(":")
+    host = host.strip("[]")
+    return ("" if host in _EVERYWHERE or is_loopback(host) else host), port
 
 
 def _is_near(endpoint: str) -> bool:

@@ -46,7 +46,7 @@ LONGEST_S = 180.0  # for all steps, unless told otherwise; a third of it on two 
 GATEWAY = "gate-1"
 SCRIPTS = FOLLOW, ODOMETRY = "follow", WHEEL_ODOMETRY.metric
 _BY = "the demo's person at the LAN"
-_STEP_S, _DRIVE_S, _GESTURE_S = 0.02, 0.05, 2.0
+_STEP_S, _DRIVE_S, _GESTURE_S, _AGAIN_S = 0.02, 0.05, 2.0, 5.0
 _FOLLOWED_MM, _DRIVEN_MM, _STOP_S = 80.0, 60.0, 1.0
 _POWER = 0.15
 #: What the config of each has besides the hubs; ids as in its name.
@@ -207,7 +207,7 @@ class Story:
     def __init__(self, fleet: Fleet, page: PageSocket, console: Console, ending: threading.Event, end: float) -> None:
         self._fleet, self._page, self._console = fleet, page, console
         self._ending, self._end, self._began = ending, end, time.monotonic()
-        self._gesture_ends = 0.0
+        self._gesture_ends = self._start_due = 0.0
         self._robots = fleet.start_walkers()
         self._goob, self._fred = self._robots["goob"], self._robots["fred"]
         self._person = Person(fleet.folder / "run-person", fleet.hubs["site"])
@@ -265,8 +265,14 @@ class Story:
         self.until("goob receives fred's odometry at the hub of the LAN", lambda: bool(goob.arrived))
 
     def _start_follow(self) -> None:
-        self._page.start_script(self._goob.base, FOLLOW)
-        self.until("follow runs at goob", lambda: self._person.runs(self._goob.base, FOLLOW))
+        """Asked for again where it was refused: the gateway's zero, as it takes goob over, bars scripts for seconds."""
+        self._start_due = 0.0
+        self.until("follow runs at goob", lambda: self._person.runs(self._goob.base, FOLLOW), self._start_when_due)
+
+    def _start_when_due(self) -> None:
+        if time.monotonic() > self._start_due:
+            self._start_due = time.monotonic() + _AGAIN_S
+            self._page.start_script(self._goob.base, FOLLOW)
 
     def _page_drives(self, line: str) -> None:
         base = self._fred.base
@@ -329,7 +335,7 @@ def run(seconds: float | None = None, *, broker: BrokerKind | None = None, conso
     Every process ends with it; the folder of logs stays only after a failure. Raises PebbleError without a broker.
     """
     require_packages()
-    console, kind = console or Console(), broker or best_kind()
+    console, kind, longest = console or Console(), broker or best_kind(), seconds or LONGEST_S
     with ending_on_signals() as ending, Fleet(ending) as fleet:
         print_line(
             console, f"The operators' broker ({kind}); two hubs, lan and site; a gateway from site to the broker."
@@ -337,18 +343,23 @@ def run(seconds: float | None = None, *, broker: BrokerKind | None = None, conso
         fleet.start_network(kind)
         url = usual_or_free(fleet, ending).url
         print_line(console, f"See and drive them in a browser: {url}")
+        print_line(console, f"The steps take half a minute, at most {longest:.0f} s; Ctrl-C ends them.")
         page = PageSocket(url)
         try:
-            Story(fleet, page, console, ending, time.monotonic() + (seconds or LONGEST_S)).play()
+            Story(fleet, page, console, ending, time.monotonic() + longest).play()
         except PebbleError as error:
             fleet.keep = not ending.is_set()
-            print_line(console, f"{error}. Logs, configs and traces: {fleet.folder}")
+            if ending.is_set():
+                print_line(console, "Ended before every step was seen.")
+                return int(seconds is not None)
+            print_line(console, f"Failed: {error}. Logs, configs and traces: {fleet.folder}")
             return 1
         finally:
             page.close()
         fleet.keep = False
-        print_line(console, "Every step was seen.")
         if seconds is None:
-            print_line(console, f"The robots are yours: {url}; Ctrl-C ends it")
+            print_line(console, f"Every step was seen. The robots are yours: {url}; Ctrl-C ends it.")
             ending.wait()
+        else:
+            print_line(console, "Every step was seen; the demo ends.")
     return 0

@@ -114,7 +114,7 @@ def refused(fleet: Fleet, name: str, account: Account) -> str:
     gateway = ProgramRole.GATEWAY in account.roles
     robot = any(role in account.roles for role in (ProgramRole.ROBOT, ProgramRole.NEIGHBOUR))
     if robot != (len(account.bases) == 1) and not gateway:
-        return "a robot, or a neighbour, has one base, and nobody else has any"
+        return "a robot, or a neighbour, has one base (--base pebble/robots/goob), and no other account has any"
     if account.plain and not robot:
         return "only a robot can be plain"
     if account.people and ProgramRole.PAGE not in account.roles:

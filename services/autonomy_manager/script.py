@@ -15,6 +15,10 @@ class StartError(PebbleError):
     """A start that is refused; the text is for the person who asked for it."""
 
 
+class UnknownScriptError(StartError):
+    """It names a script that is not listed, or not yet."""
+
+
 class Dependency(Struct, frozen=True):
     """Another script that runs while a script runs, and its settings."""
 
@@ -67,7 +71,7 @@ def plan(scripts: Mapping[str, Script], file: str, config: Mapping[str, Any]) ->
     """Check a start. Raises StartError."""
     script = scripts.get(file)
     if script is None:
-        raise StartError(f"Unknown autonomy file: {shown(file)}")
+        raise UnknownScriptError(f"Unknown autonomy file: {shown(file)}")
     if script.broken:
         raise StartError(f"Failed to start {file}: {script.broken}")
     step, values = _step(script, config, f"Invalid config for {file}")
@@ -79,7 +83,7 @@ def _dependency(scripts: Mapping[str, Script], file: str, dependency: Dependency
     failed = f"Failed to start {file}"
     script = scripts.get(dependency.file)
     if script is None:
-        raise StartError(f"{failed}: Dependency script not found: {shown(dependency.file)}")
+        raise UnknownScriptError(f"{failed}: Dependency script not found: {shown(dependency.file)}")
     if script.broken:
         raise StartError(f"{failed}: {dependency.file}: {script.broken}")
     return _step(script, dependency.config, f"{failed}: Invalid config for {dependency.file}")[0]

@@ -30,14 +30,13 @@ from pebble.runtime.process import view_of
 from pebble.runtime.runs import LocalScripts, following, next_run
 from pebble.runtime.service import Service, on
 from pebble.services.autonomy_manager.child import Processes, Spawn
-from pebble.services.autonomy_manager.forms import shown
 from pebble.services.autonomy_manager.gate.activity import SILENT_S
 from pebble.services.autonomy_manager.gate.config_copy import broker_of
 from pebble.services.autonomy_manager.local_media import LocalMedia
 from pebble.services.autonomy_manager.motor_owners import OVERRIDDEN, Baseline, MotorOwners
 from pebble.services.autonomy_manager.offer import Offer
 from pebble.services.autonomy_manager.runner import Runner
-from pebble.services.autonomy_manager.script import Plan, Script, StartError, plan
+from pebble.services.autonomy_manager.script import Plan, Script, StartError, UnknownScriptError, plan
 from pebble.transports import QoS
 
 if TYPE_CHECKING:
@@ -122,15 +121,21 @@ class AutonomyManager(Service):
                 raise StartError(f"{holder} has control, and starts scripts")
             if not file:
                 raise StartError("Start command missing file")
-            if file not in self._offer.scripts and not self._offer.complete:
-                raise StartError(f"Unknown autonomy file: {shown(file)}: scripts are still being listed, try again")
-            wanted = plan(self._offer.scripts, file, config)
+            wanted = self._plan(file, config)
             self._check(wanted)
         except StartError as error:
             self.log_limited.log("refused", logging.WARNING, "%s", error)
             self._runner.refuse(str(error))
         else:
             self._runner.start(wanted)
+
+    def _plan(self, file: str, config: Mapping[str, Any]) -> Plan:
+        try:
+            return plan(self._offer.scripts, file, config)
+        except UnknownScriptError as error:
+            if self._offer.complete:
+                raise
+            raise StartError(f"{error}: scripts are still being listed, try again") from None
 
     def _check(self, wanted: Plan) -> None:
         """Raise StartError if this robot cannot run ``wanted`` at present."""

@@ -125,7 +125,7 @@ def test_status_exits_1_if_nothing_runs(run: Run, config: Path, manager: Manager
 
 def test_an_unknown_script_is_named(run: Run, config: Path, manager: Manager) -> None:
     assert run("script", "start", config, "folow") == 1
-    assert run.err == "pebble: there is no script folow, only: follow\n"
+    assert run.err == "pebble: there is no script folow, only: follow; just after the robot's start, try again\n"
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ import pytest
 
 from pebble.config import parse
 from pebble.config.checks import MOST_METRICS, MOST_NEIGHBOURS
+from pebble.config.raw import deep_merge
 from pebble.errors import ConfigError
 
 LAN = {"connect": ["tls/hub.lab:7447"]}
@@ -39,6 +40,23 @@ def test_above_open_a_hub_elsewhere_needs_encryption_and_an_account() -> None:
     with pytest.raises(ConfigError) as refused:
         read({"lan": {"connect": ["tcp/hub.lab:7447"]}}, security={"level": "login"})
     assert [text in str(refused.value) for text in ("is not encrypted", "lan.account: is missing")] == [True, True]
+
+
+LISTENS = {"transport": {"kind": "zenoh", "listen": ["tcp/0.0.0.0:7447"]}}
+BRIDGE = {"services": {"mqtt_bridge": {"enabled": True, "remote": {"kind": "zenoh", "connect": ["tls/hub.lab:7447"]}}}}
+
+
+@pytest.mark.parametrize(
+    ("more", "connect", "why"),
+    [
+        (BRIDGE, "tls/hub.lab:7447#x=1", "is also services.mqtt_bridge.remote.connect"),
+        (LISTENS, "tcp/127.0.0.1:7447", "is also transport.listen"),
+    ],
+)
+def test_the_hub_of_the_lan_is_no_other_one(more: dict[str, Any], connect: str, why: str) -> None:
+    raw = deep_merge({"services": {"neighbours": {"enabled": True, "lan": {"connect": [connect]}}}}, more)
+    with pytest.raises(ConfigError, match=why):
+        parse({"robot": {"id": "goob"}, **raw}, folder=Path("/"), env={})
 
 
 def test_nothing_is_granted_unless_it_is_written() -> None:

@@ -291,7 +291,7 @@ def test_the_wheels_stop_within_a_second_when_the_driver_is_removed(tmp_path: Pa
         ("x", Account(roles=("robot", "driver"), bases=("a/b/c",)), "robot goes with no other role"),
         ("x", Account(roles=("page", "driver")), "page goes with no other role"),
         ("x", Account(roles=("robot",)), "has one base"),
-        ("x", Account(roles=("driver",), bases=("a/b/c",)), "nobody else has any"),
+        ("x", Account(roles=("driver",), bases=("a/b/c",)), "no other account has any"),
         ("x", Account(roles=("driver",), plain=True), "only a robot can be plain"),
         ("x", Account(roles=("robot",), bases=("pebble/robots/goob",)), "belongs to goob"),
         ("x", Account(roles=("robot",), bases=("pebble/+/goob",)), "is no base"),

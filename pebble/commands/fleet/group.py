@@ -141,8 +141,15 @@ def add(
             raise FleetError(f"{place} has {folder.MAX_ACCOUNTS} accounts already: remove one, or make another fleet")
         after = fleet.with_account(name, account)
         secret = new_password()
+        is_neighbour = given == (ProgramRole.NEIGHBOUR,)  # which is at a hub, and nowhere else
+        if is_neighbour:
+            require_packages("pebble fleet")
+            after = replace(after, hubs="here" if fleet.hubs == "none" else fleet.hubs)
         how = applying.apply(place, fleet, after, {name: secret})
+        files = certificates.of_account(place, name, ()) if is_neighbour else None
     _print_account(place, after, name, secret, how, board=board)
+    if files is not None:
+        _print_certificate(place, after, name, files)
     return 0
 
 
@@ -239,27 +246,7 @@ def certificate(
         if is_hub and not hosts:
             raise FleetError(f"{name} is a hub: name where others reach it, `pebble fleet certificate {name} HOST`")
         files = certificates.of_account(place, name, hosts or ())
-        until = certificates.show(files[0]).until
-    typer.echo(f"{' and '.join(map(_shown, files))} are for {name}, until {until:%Y-%m-%d}.")
-    copies = " and ".join(map(_shown, (files[0], place / certificates.CA_CERT)))
-    typer.echo(
-        f"Move the key to its machine, with copies of {copies} beside it. `pebble fleet check` watches the date."
-    )
-    tls = {"enabled": True, "ca_cert": certificates.CA_CERT, "client_cert": f"{name}.pem", "client_key": f"{name}.key"}
-    if is_hub:
-        typer.echo(f"And a copy of {_shown(place / ZENOH)}. The file of that hub, with the other hubs in connect:")
-        file = {"listen": [f"tls/0.0.0.0:{_ZENOH_PORT}"], "connect": [], "tls": tls, "access": ZENOH}
-        typer.echo(json.dumps({**file, "journal": f"{name}.journal"}, indent=2))
-    if ProgramRole.ROBOT in account.roles:
-        link = {"kind": "zenoh", "account": name, "connect": [f"tls/{fleet.brokers[0].host}:{_ZENOH_PORT}"]}
-        remote = {**link, "tls": tls}
-        piece = {"services": {"mqtt_bridge": {"enabled": True, "remote": remote}}}
-        typer.echo(json.dumps({**_who(fleet, name), **piece}, indent=2))
-    if ProgramRole.NEIGHBOUR in account.roles:
-        files_here = {"ca_cert": certificates.CA_CERT, "client_cert": f"{name}.pem", "client_key": f"{name}.key"}
-        place_of_hub = f"tls/{fleet.brokers[0].host}:{_ZENOH_PORT}"
-        lan = {"account": name, "connect": [place_of_hub], "tls": {"enabled": True, **files_here}}
-        typer.echo(json.dumps({"services": {"neighbours": {"enabled": True, "lan": lan}}}, indent=2))
+    _print_certificate(place, fleet, name, files)
     return 0
 
 
@@ -369,7 +356,7 @@ def _keep_admin(name: str) -> None:
 def _print_account(place: Path, fleet: Fleet, name: str, secret: str, how: str, *, board: bool = False) -> None:
     account = fleet.accounts[name]
     if ProgramRole.NEIGHBOUR in account.roles:  # it logs in nowhere: its certificate admits it to the hub
-        typer.echo(f"{name} is {account.bases[0]} at the hub of a LAN ({how}): `pebble fleet certificate {name}`")
+        typer.echo(f"{name} is {account.bases[0]} at the hub of a LAN ({how}).")
         return
     typer.echo(f"{name} may log in as {', '.join(account.roles)} ({how})")
     typer.echo(f"    password: {secret}")
@@ -387,6 +374,30 @@ def _print_account(place: Path, fleet: Fleet, name: str, secret: str, how: str, 
         typer.echo(f"    pebble fleet certificate {name} HOST")
     elif ProgramRole.GATEWAY not in account.roles:
         typer.echo(f"    pebble drive ROBOT --url {url} --ca-cert {ca} --password-file FILE")
+
+
+def _print_certificate(place: Path, fleet: Fleet, name: str, files: tuple[Path, Path]) -> None:
+    """Where the certificate of an account and its key are, and what belongs into its config."""
+    roles, until = fleet.accounts[name].roles, certificates.show(files[0]).until
+    typer.echo(f"{' and '.join(map(_shown, files))} are for {name}, until {until:%Y-%m-%d}.")
+    copies = " and ".join(map(_shown, (files[0], place / certificates.CA_CERT)))
+    typer.echo(
+        f"Move the key to its machine, with copies of {copies} beside it. `pebble fleet check` watches the date."
+    )
+    tls = {"enabled": True, "ca_cert": certificates.CA_CERT, "client_cert": f"{name}.pem", "client_key": f"{name}.key"}
+    connect = [f"tls/{fleet.brokers[0].host}:{_ZENOH_PORT}"]
+    if ProgramRole.HUB in roles:
+        typer.echo(f"And a copy of {_shown(place / ZENOH)}. The file of that hub, with the other hubs in connect:")
+        file = {"listen": [f"tls/0.0.0.0:{_ZENOH_PORT}"], "connect": [], "tls": tls, "access": ZENOH}
+        typer.echo(json.dumps({**file, "journal": f"{name}.journal"}, indent=2))
+    if ProgramRole.ROBOT in roles:
+        remote = {"kind": "zenoh", "account": name, "connect": connect, "tls": tls}
+        piece = {"services": {"mqtt_bridge": {"enabled": True, "remote": remote}}}
+        typer.echo(json.dumps({**_who(fleet, name), **piece}, indent=2))
+    if ProgramRole.NEIGHBOUR in roles:
+        lan = {"account": name, "connect": connect, "tls": tls}
+        robot = _who(fleet, name)["robot"]
+        typer.echo(json.dumps({"robot": robot, "services": {"neighbours": {"enabled": True, "lan": lan}}}, indent=2))
 
 
 def piece_of_config(fleet: Fleet, name: str, secret: str, *, board: bool) -> dict[str, Any]:

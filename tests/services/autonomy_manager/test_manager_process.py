@@ -241,10 +241,14 @@ def test_a_start_before_all_scripts_are_listed_is_refused_with_the_reason(mqtt: 
     slow = mqtt.root / "slow"
     slow.mkdir()
     (slow / "run.py").write_text("import os, time\nwhile not os.path.exists('go'): time.sleep(0.01)\n" + OURS + SLEEPER)
+    mqtt.script("needs", dependencies=[{"file": "slow"}])
     mqtt.start()
-    mqtt.launch("slow")
-    expected = "Unknown autonomy file: slow: scripts are still being listed, try again"
-    assert mqtt.becomes(error=expected), mqtt.status
+    for file, why in (
+        ("slow", "Unknown autonomy file: slow"),
+        ("needs", "Failed to start needs: Dependency script not found: slow"),
+    ):
+        mqtt.launch(file)
+        assert mqtt.becomes(error=f"{why}: scripts are still being listed, try again"), mqtt.status
     (slow / "go").touch()
-    assert until(lambda: len(mqtt.newest("autonomy-files")["files"]) == 2)
+    assert until(lambda: len(mqtt.newest("autonomy-files")["files"]) == 3)
     mqtt.run_script("slow")
