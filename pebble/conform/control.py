@@ -75,6 +75,7 @@ def _first_keeps(component: Component, driver: Driver) -> CheckResult:
     by = "" if driver.state is None else driver.state.by
     if component.view.named and by.partition("/")[0] != component.account:
         return failed(f"its state tells that {by!r} has it", "at level named, by begins with the account in the topic")
+    driver.asks(for_ms=5 * _SHORTEST_MS)  # longer than one looks on, else the second gets what has ended
     second = Driver(component)
     second.asks()
     took = component.happens(lambda: second.holds)
