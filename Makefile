@@ -97,8 +97,8 @@ test-checks:
 	@echo "pebble: lint, types, imports and names are in order"
 
 test-robots: test-running
-	@echo "pebble: whole robots and serial lines, six at a time because these tests check deadlines"
-	@$(TESTS) --workers 6 --spread -m "alone and not page$(LESS)" $(ALONE)
+	@echo "pebble: whole robots and serial lines, five at a time because these tests check deadlines"
+	@$(TESTS) --workers 5 --spread -m "alone and not page$(LESS)" $(ALONE)
 
 test-demo: test-robots
 	@echo "pebble: the demo, whose robots need all processors"
