@@ -271,7 +271,7 @@ def _uplink(config: Config) -> str:
 def _lan(section: Neighbours) -> str:
     ways = [f"connects to {one}" for one in section.lan.connect]
     drivers = [name for name, granted in section.commanded.items() if granted]
-    names = {"hears": section.listens, "driven by scripts of": drivers, "shares": section.shares}
+    names = {"receives": section.listens, "driven by scripts of": drivers, "shares": section.shares}
     return ", ".join([*ways, *(f"{what} {' and '.join(found)}" for what, found in names.items() if found)])
 
 

@@ -87,7 +87,7 @@ def free(component: Component) -> str:
 
 
 def commanded(component: Component) -> str:
-    """At level named a robot hears only accounts."""
+    """At level named a robot takes commands of accounts only."""
     named = component.view.named and not component.account
     return "it takes commands only with a name: use an account, as in --url mqtts://ANN@BROKER" if named else ""
 

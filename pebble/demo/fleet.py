@@ -55,7 +55,7 @@ _KINDS = {"goob": "zenoh", "fred": "mqtt"}
 
 
 class LanRobot(Robot):
-    """Its operators are at the hub ``site``; it hears others at the hub ``lan``."""
+    """Its operators are at the hub ``site``; it receives others at the hub ``lan``."""
 
     runs_on, stop_s = "Linux, SAMD21", 0.85
 
@@ -225,7 +225,7 @@ class Story:
             self._start_scripts()
             self._page_drives("the page drives fred, and goob follows")
             self._fleet.stop_broker()
-            self.until("the operators' broker is stopped: the page hears no robot", lambda: self._online(False))
+            self.until("the operators' broker is stopped: the page receives no robot", lambda: self._online(False))
             self._person_drives("a person at the LAN drives fred, and goob follows without the broker")
             self._stop(goob, "goob")
             self._stop(fred, "fred")

@@ -22,7 +22,7 @@ CHANGES: dict[str, tuple[list[tuple[str, bytes]], dict[str, Any]]] = {
     "the first": ([("a", BOTH)], {GOOB: ("a",), FRED: ("a",)}),
     "the same again": ([("a", BOTH), ("a", BOTH)], {}),
     "a second gateway": ([("b", BOTH), ("a", heartbeat(GOOB))], {GOOB: ("a", "b")}),
-    "it hears one no more": ([("a", BOTH), ("a", heartbeat(GOOB))], {FRED: ()}),
+    "it receives one no more": ([("a", BOTH), ("a", heartbeat(GOOB))], {FRED: ()}),
     "its will": ([("a", BOTH), ("b", heartbeat(FRED)), ("a", b"")], {GOOB: (), FRED: ("b",)}),
     "no heartbeat": ([("a", heartbeat(GOOB)), ("a", b"{")], {GOOB: ()}),
     "one that is not known": ([("a", heartbeat("pebble/robots/x"))], {}),
