@@ -113,7 +113,7 @@ thorough: gstreamer
 	@PEBBLE_THOROUGH=1 $(MAKE) --no-print-directory test
 
 # Whole fleets; make test has one row of each rule.
-FLEET_TESTS := tests/bench/test_fleet.py tests/transports/zenoh/test_mesh.py $(addprefix tests/fleet/test_,demo.py gateways.py hosts.py hubs.py neighbours.py typed.py)
+FLEET_TESTS := tests/bench/test_fleet.py tests/transports/zenoh/test_mesh.py $(addprefix tests/fleet/test_,demo.py boards.py gateways.py lan.py hosts.py hubs.py neighbours.py typed.py)
 fleet: .venv/.ready-dev
 	@sh tools/debian-packages.sh mosquitto=mosquitto
 	@PEBBLE_THOROUGH=1 $(TESTS) --workers 2 --spread --timeout 900 -s $(FLEET_TESTS)
