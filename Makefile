@@ -5,7 +5,7 @@ VENV := .venv/bin/python
 
 .DEFAULT_GOAL := help
 unexport PYTHONDONTWRITEBYTECODE  # every test starts programs: compiling them each time would cost a third of the time
-.PHONY: help demo demo-options test quick thorough fleet stops soak floods schedules script-schedules page-schedules page-tests looks gstreamer gstreamer-tests brokers check firmware report clean lock audit sbom release life life-long check-types check-names check-collection quick-tests test-running test-robots test-computing test-checks test-demo
+.PHONY: help demo demo-options test quick thorough fleet stops soak floods schedules script-schedules page-schedules page-tests looks gstreamer gstreamer-tests brokers check firmware report clean lock audit sbom release life life-long check-types check-names check-collection quick-tests test-running test-robots test-computing test-checks test-demo test-waiting
 
 help:
 	@echo "make demo             four simulated robots, on Zenoh, on MQTT and on MCUs, driven through a broker; Ctrl-C ends it"
@@ -53,14 +53,19 @@ LESS := $(if $(PEBBLE_THOROUGH),, and not thorough)
 # Runs when nothing else wants a processor.
 GENTLY := chrt --idle 0
 # Tests that check no times.
-COMPUTING := tests/config tests/contract tests/media tests/motion tests/perception tests/robot/test_lockstep.py \
-	tests/forwarding/test_command_ages.py \
+COMPUTING := tests/config tests/contract tests/media tests/motion tests/perception tests/test_packaging.py \
+	$(addprefix tests/robot/test_,lockstep.py thin_schedules.py) tests/forwarding/test_command_ages.py \
+	tests/runtime/test_by_name.py tests/simulation/world/test_lockstep.py \
+	$(addprefix tests/recordings/,exports files seek traffic test_unread.py) \
 	$(addprefix tests/bench/,judging $(addprefix test_,plots.py report.py results.py)) \
 	$(addprefix tests/firmware/test_,compile.py deadman_virtual.py golden.py heap.py motor_boards.py outlets.py) \
 	$(addprefix tests/firmware/test_,types.py vm.py) \
 	$(addprefix tests/web/,modules $(addprefix test_,driving_lockstep.py log_lines.py page_clock.py recent.py types.py))
+# Robots of a hundred lines, watched for most of a minute: they leave the processors to the demo.
+WAITING := $(addprefix tests/conform/test_,conform.py operators.py)
 # Files with tests of whole robots, to collect no others.
-ALONE = $(shell grep --recursive --files-with-matches --include=test_*.py 'mark\.alone' tests | grep --invert-match test_demo.py)
+ALONE = $(filter-out tests/test_demo.py $(WAITING),\
+	$(shell grep --recursive --files-with-matches --include=test_*.py 'mark\.alone' tests))
 
 # Each run of pytest appends what its tests took; without it, for parts that are called alone.
 TIMES := .venv/test-times.tsv
@@ -83,7 +88,7 @@ test: .venv/.ready-dev
 	@sh tools/debian-packages.sh mosquitto=mosquitto mosquitto_pub=mosquitto-clients chromium=chromium node=nodejs g++=g++ openssl=openssl ip=iproute2 tc=iproute2 nft=nftables systemd-analyze=systemd
 	@test -e /usr/include/mosquitto.h -a -e /usr/include/cjson/cJSON.h || sh tools/debian-packages.sh =gcc =libc6-dev =libmosquitto-dev =libcjson-dev
 	@rm -f $(TIMES)
-	@$(MAKE) --no-print-directory --jobs=3 test-checks test-computing test-demo
+	@$(MAKE) --no-print-directory --jobs=4 test-checks test-computing test-demo test-waiting
 	@$(SHOW_TIMES)
 	@$(VENV) tools/tree_growth.py
 
@@ -104,6 +109,11 @@ test-demo: test-robots
 	@echo "pebble: the demo, whose robots need all processors"
 	@$(TESTS) $(if $(PEBBLE_THOROUGH),,-m "not thorough") tests/test_demo.py
 
+test-waiting: test-robots
+	@$(TESTS) --workers 4 --spread -m "not page$(LESS)" $(WAITING) >.venv/waiting.log 2>&1 || \
+		{ cat .venv/waiting.log; exit 1; }
+	@echo "pebble: robots of a hundred lines: $$(tail -n 1 .venv/waiting.log)"
+
 test-computing:
 	@$(GENTLY) $(TESTS) --workers 2 --timeout=600 -m "not alone and not page$(LESS)" $(COMPUTING) >.venv/computing.log 2>&1 || \
 		{ cat .venv/computing.log; exit 1; }
@@ -113,7 +123,7 @@ thorough: gstreamer
 	@PEBBLE_THOROUGH=1 $(MAKE) --no-print-directory test
 
 # Whole fleets; make test has one row of each rule.
-FLEET_TESTS := tests/bench/test_fleet.py tests/transports/zenoh/test_mesh.py $(addprefix tests/fleet/test_,demo.py gateways.py hosts.py hubs.py neighbours.py typed.py)
+FLEET_TESTS := tests/bench/test_fleet.py tests/transports/zenoh/test_mesh.py $(addprefix tests/fleet/test_,demo.py boards.py gateways.py lan.py hosts.py hubs.py neighbours.py typed.py)
 fleet: .venv/.ready-dev
 	@sh tools/debian-packages.sh mosquitto=mosquitto
 	@PEBBLE_THOROUGH=1 $(TESTS) --workers 2 --spread --timeout 900 -s $(FLEET_TESTS)

@@ -3,6 +3,7 @@
 import json
 import os
 import queue
+import random
 import shutil
 import signal
 import socket
@@ -24,6 +25,7 @@ OPERATORS, ROBOTS, MCUS, BROKERS = range(4)
 
 HOST = "127.0.0.1"  # of brokers
 SBIN = "/usr/local/sbin:/usr/sbin:/sbin"  # where Debian puts brokers and network tools, not in the PATH of users
+_PORTS = 10_000, 32_768  # below those of outgoing connections, on Linux and elsewhere
 _LONGEST_FOLDER = 40  # characters: Unix sockets live below, and their paths end at 108 bytes
 
 Wrap = Callable[[Sequence[str]], Sequence[str]]  # extends a command, so that it runs in another network
@@ -170,10 +172,16 @@ def mosquitto_command(port: int, stem: Path, extra: Sequence[str] = (), host: st
 
 
 def free_port() -> int:
-    """An unused TCP port, also where there is no loopback device; in a new network namespace every port is unused."""
-    with socket.socket() as probe:
-        probe.bind(("", 0))
-        return int(probe.getsockname()[1])
+    """An unused TCP port, also where there is no loopback device; in a new network namespace every port is unused.
+
+    It is none that the system gives to outgoing connections: a client that tries again and again while its server is
+    away gets that server's port some day, is connected to itself, and the server cannot start.
+    """
+    while True:
+        port = random.SystemRandom().randrange(*_PORTS)
+        with socket.socket() as probe, suppress(OSError):
+            probe.bind(("", port))
+            return port
 
 
 class Broker(Program):

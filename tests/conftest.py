@@ -36,12 +36,14 @@ os.environ["XDG_STATE_HOME"] = _STATE
 
 #: Modules that take longest begin first: begun last, one of them would delay the end of the run.
 _LONG = (
-    *("web/robots/test_controls.py", "web/robots/test_actions.py", "robot/test_faults.py", "robot/test_media.py"),
+    *("robot/test_closed_loop.py", "web/robots/test_controls.py", "web/robots/test_actions.py"),
+    *("selftest/test_robot.py", "conform/test_conform.py", "conform/test_operators.py", "robot/test_names.py"),
+    *("robot/test_media.py", "robot/test_robot.py", "transports/zenoh/test_mesh.py", "robot/test_faults.py"),
     *("robot/test_driveable.py", "robot/test_hostile.py", "robot/test_runs.py", "commands/test_fleet.py"),
     *("robot/test_surroundings.py", "robot/test_retained.py", "web/test_attacks.py", "web/test_hostile_broker.py"),
     "forwarding/links/test_table.py",
-    *("recordings/test_unread.py", "commands/test_estop.py", "commands/test_drive.py", "launcher/test_launcher.py"),
-    *("flash/test_steps.py", "web/test_types.py", "firmware/test_deadman_virtual.py", "web/test_driving_lockstep.py"),
+    *("commands/test_estop.py", "commands/test_drive.py", "launcher/test_launcher.py", "flash/test_steps.py"),
+    *("web/test_types.py", "firmware/test_heap.py", "firmware/test_deadman_virtual.py", "web/test_driving_lockstep.py"),
 )
 
 
@@ -49,7 +51,13 @@ _LONG = (
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for row in rows.fewer(items):
         row.add_marker(pytest.mark.thorough)
-    items.sort(key=lambda item: next((at for at, end in enumerate(_LONG) if item.path.as_posix().endswith(end)), 99))
+    places = {path: _place(path) for path in {item.path for item in items}}
+    items.sort(key=lambda item: places[item.path])
+
+
+def _place(path: Path) -> int:
+    """When a module begins."""
+    return next((at for at, end in enumerate(_LONG) if path.as_posix().endswith(end)), len(_LONG))
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -131,6 +131,7 @@ def pasted(line: str, output: Path) -> Iterator[Callable[[], str]]:
         assert running.wait(20) in (0, 130), log.read_text()
 
 
+@pytest.mark.thorough
 def test_a_phone_can_log_in_and_a_closed_terminal_ends_everything_though_its_signal_goes_elsewhere(
     demos: list[Demo], temporary: Path
 ) -> None:

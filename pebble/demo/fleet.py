@@ -265,7 +265,7 @@ class Story:
         self.until("goob receives fred's odometry at the hub of the LAN", lambda: bool(goob.arrived))
 
     def _start_follow(self) -> None:
-        """Asked for again where it was refused: after a zero that counts as a person's no script starts for seconds."""
+        """Asked for again where it was refused: after the zero that comes with each stop no script starts for 2 s."""
         self._start_due = 0.0
         self.until("follow runs at goob", lambda: self._person.runs(self._goob.base, FOLLOW), self._start_when_due)
 

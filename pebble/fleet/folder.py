@@ -111,7 +111,7 @@ def refused(fleet: Fleet, name: str, account: Account) -> str:
         return f"{name} exists already, as {', '.join(fleet.accounts[name].roles)}"
     if why := add_up(account.roles):
         return why
-    gateway = ProgramRole.GATEWAY in account.roles
+    gateway = any(role in account.roles for role in (ProgramRole.GATEWAY, ProgramRole.BOARDS))
     robot = any(role in account.roles for role in (ProgramRole.ROBOT, ProgramRole.NEIGHBOUR))
     if robot != (len(account.bases) == 1) and not gateway:
         return "a robot, or a neighbour, has one base (--base pebble/robots/goob), and no other account has any"

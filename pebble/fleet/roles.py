@@ -41,6 +41,7 @@ class ProgramRole(StrEnum):
     ROBOT = "robot"
     NEIGHBOUR = "neighbour"  # what a robot is to the other robots at the hub of a LAN
     GATEWAY = "gateway"
+    BOARDS = "boards"  # a gateway at the broker of a LAN, where the robots are that it carries
     HUB = "hub"  # a Zenoh hub that is linked to others, which carries what all accounts send
 
 
@@ -56,6 +57,7 @@ _RIGHTS: Mapping[str, frozenset[Right]] = {
     ProgramRole.NEIGHBOUR: frozenset(),
     ProgramRole.ROBOT: frozenset(),  # robots and gateways have the topics of their own bases
     ProgramRole.GATEWAY: frozenset(),
+    ProgramRole.BOARDS: frozenset(),
     ProgramRole.HUB: frozenset(),  # at a broker; at other hubs everything
 }
 ROLES = tuple(_RIGHTS)
@@ -160,7 +162,9 @@ def _of_bases(name: str, account: Account, *, at_hub: bool) -> Iterator[Rule]:
     for base in account.bases:
         if ProgramRole.NEIGHBOUR in account.roles:
             yield from _of_neighbour(base) if at_hub else ()
-        elif ProgramRole.ROBOT in account.roles:
+        elif ProgramRole.BOARDS in account.roles and at_hub:
+            return
+        elif ProgramRole.ROBOT in account.roles or ProgramRole.BOARDS in account.roles:
             yield from (Rule(access, f"{base}/#") for access in ("read", "write"))
         else:
             yield from (Rule("read", f"{base}/{direction}/#") for direction in (INCOMING, OUTGOING))

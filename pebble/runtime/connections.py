@@ -195,9 +195,27 @@ def lan_transport(config: Config) -> Transport:
     return create("zenoh", _name(config, "zenoh", "lan"), settings)
 
 
-def gateway_transports(gateway: "GatewayFile", run_dir: Path, will: Message) -> tuple[Transport, Transport, Transport]:
-    """The connections of a gateway: to the hub, and two to the broker, one of them for presence and stops alone."""
-    hub, mqtt = gateway.hub, gateway.mqtt
+def gateway_transports(
+    gateway: "GatewayFile", operators: Mqtt, run_dir: Path, will: Message
+) -> tuple[Transport, Transport, Transport]:
+    """The connections of a gateway: to where the robots are, and two to the operators' broker, one of them for
+    presence and stops alone.
+    """
+    base = will.topic.removesuffix(f"/{c.ONLINE.suffix}")
+    forwards = mqtt_settings(operators, as_published=True, reconnect_max_s=REMOTE_RECONNECT_S)
+    presence = mqtt_settings(operators, reconnect_max_s=REMOTE_RECONNECT_S)
+    return (
+        _robots_transport(gateway, base, run_dir),
+        create("mqtt", f"{base}/forwards", forwards, will=will),
+        create("mqtt", f"{base}/presence", presence),
+    )
+
+
+def _robots_transport(gateway: "GatewayFile", base: str, run_dir: Path) -> Transport:
+    if gateway.boards is not None:
+        settings = mqtt_settings(gateway.boards, as_published=True, reconnect_max_s=LOCAL_RECONNECT_S)
+        return create("mqtt", f"{base}/boards", settings)
+    hub = gateway.hub
     zenoh = ZenohSettings(
         run_dir=run_dir,
         connect=hub.connect,
@@ -206,14 +224,7 @@ def gateway_transports(gateway: "GatewayFile", run_dir: Path, will: Message) -> 
         client=True,
         account=hub.account,
     )
-    base = will.topic.removesuffix(f"/{c.ONLINE.suffix}")
-    forwards = mqtt_settings(mqtt, as_published=True, reconnect_max_s=REMOTE_RECONNECT_S)
-    presence = mqtt_settings(mqtt, reconnect_max_s=REMOTE_RECONNECT_S)
-    return (
-        create("zenoh", f"{base}-hub", zenoh),
-        create("mqtt", f"{base}/forwards", forwards, will=will),
-        create("mqtt", f"{base}/presence", presence),
-    )
+    return create("zenoh", f"{base}-hub", zenoh)
 
 
 def _renamed_wills(config: Config) -> Iterator[tuple[str, bool]]:

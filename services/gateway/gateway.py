@@ -1,5 +1,7 @@
 """The gateway as a program: it receives robots at a hub, agrees with other gateways at the broker, and carries robots.
 
+Where boards are, the broker of a LAN takes the place of the hub.
+
 What only its owner forwards passes by :class:`Carried`. A live emergency stop is forwarded by every gateway, in every
 state, over the connection of the heartbeats, where nothing else holds it up: its name makes it count once.
 """
@@ -30,7 +32,7 @@ from pebble.transports.counters import Counters
 log = logging.getLogger(__name__)
 
 TICK_S = 0.1
-BEGINNING_S = 0.1  # in one turn: taking many robots must not hold up the heartbeats
+BEGINNING_S = 0.1  # in one turn: taking many robots must not hold up the end of others
 _STOP = Subject(Kind.COMMAND, ESTOP)
 _ANY = f"+/{GATEWAYS}/+"
 
@@ -63,7 +65,7 @@ class Gateway:
         self._probed_at = float("-inf")
         self._states = threading.Lock()
         self._at_broker, self._at_hub = False, False
-        self._wake = threading.Event()
+        self._wake, self._heartbeat_due = threading.Event(), threading.Event()
         self._running = True
 
     @property
@@ -73,9 +75,15 @@ class Gateway:
     # -- the life of the program
 
     def run(self, ready: Callable[[], None] = lambda: None) -> None:
-        """Run until :meth:`quit`."""
+        """Run until :meth:`quit`.
+
+        Heartbeats have a thread of their own: who begins to carry a robot waits for hub and broker, and one that sends
+        none meanwhile would be taken for dead, by itself too.
+        """
         self.open()
         ready()
+        beating = threading.Thread(target=self._publish_heartbeats, name="heartbeats", daemon=True)
+        beating.start()
         try:
             while self._running:
                 due = self.ownership.next_due(self._clock()) - self._clock()
@@ -83,12 +91,15 @@ class Gateway:
                 self._wake.clear()
                 self.tick()
         finally:
+            self.quit()
+            beating.join()
             self.close()
 
     def quit(self) -> None:
-        """End :meth:`run` soon. Safe from any thread and from signal handlers."""
+        """End :meth:`run` soon. Safe from any thread."""
         self._running = False
         self._wake.set()
+        self._heartbeat_due.set()
 
     def open(self) -> None:
         for transport in (self._hub, self._broker, self._presence):
@@ -113,11 +124,24 @@ class Gateway:
         for transport in (self._broker, self._presence, self._hub):
             transport.close()
 
-    def tick(self) -> None:
-        """A turn: heartbeat, who carries what, what is due."""
+    def publish_heartbeat(self) -> None:
+        """Publish a heartbeat if one is due."""
         now = self._clock()
         if self._broker.state is State.CONNECTED and self._heartbeats.due(now, TICK_S):
             self._heartbeats.publish(self._present.robots(now) if self._hub.state is State.CONNECTED else (), now)
+
+    def _publish_heartbeats(self) -> None:
+        try:
+            while self._running:
+                self.publish_heartbeat()
+                self._heartbeat_due.wait(TICK_S)
+                self._heartbeat_due.clear()
+        finally:
+            self.quit()
+
+    def tick(self) -> None:
+        """A turn: who carries what, what is due."""
+        now = self._clock()
         self.ownership.judge(now)
         held = self.ownership.held(now)
         for robot, one in list(self._carried.items()):
@@ -144,16 +168,16 @@ class Gateway:
             if one.begin():
                 self._synchronize[robot] = self._clock() + INITIAL_SYNC_S
                 log.info("carries %s", robot)
-            else:
-                self._end(robot)
+            else:  # it was not the owner any more before it had begun
+                self._end(robot, begun=False)
             if self._clock() >= end:
                 self._wake.set()
                 return
 
-    def _end(self, robot: str) -> None:
+    def _end(self, robot: str, *, begun: bool = True) -> None:
         self._synchronize.pop(robot, None)
         self._carried.pop(robot).end()
-        log.info("carries %s no more", robot)
+        log.info("carries %s no more" if begun else "was to carry %s, and is no more", robot)
 
     def _holds(self, robot: str, since: float) -> bool:
         return self.ownership.since(robot, self._clock()) == since
@@ -180,8 +204,12 @@ class Gateway:
 
     def _on_robot(self, message: Message) -> None:
         address = parse_topic(message.topic)
-        if not message.retain and message.payload and address is not None and not address.identity.is_server:
+        if not message.payload or address is None or address.identity.is_server:
+            return
+        if not message.retain:
             self._present.note(address.identity.base, self._clock())
+        elif self._hub.as_published:
+            self._present.note_copy(address.identity.base, message.payload, self._clock())
 
     def _on_gateway(self, message: Message) -> None:
         address, now = parse_topic(message.topic), self._clock()
@@ -200,6 +228,7 @@ class Gateway:
                 self.ownership.received(name, heartbeat.robots[:MAX_ROBOTS], now)
         elif heartbeat is None:  # the will of an earlier connection
             self._heartbeats.repeat()
+            self._heartbeat_due.set()
         elif (sent := self._heartbeats.came_back(heartbeat)) is not None:
             self.ownership.came_back(*sent, now)
         elif not message.retain and self._heartbeats.yields_to(heartbeat, now):

@@ -32,6 +32,14 @@ class PresentRobots:
 
     def __init__(self) -> None:
         self._received: dict[str, tuple[float, float]] = {}  # when, and after how many seconds of silence it is away
+        self._first: dict[str, bytes] = {}  # of what may be retained
+
+    def note_copy(self, robot: str, payload: bytes, now: float) -> None:
+        """As :meth:`note`, where a live heartbeat looks as the one that is retained: which comes first."""
+        if robot not in self._first and len(self._first) >= MAX_ROBOTS:
+            self._first.clear()
+        if self._first.setdefault(robot, payload) != payload:
+            self.note(robot, now)
 
     def note(self, robot: str, now: float) -> None:
         before = self._received.get(robot)

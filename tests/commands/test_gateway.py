@@ -12,6 +12,7 @@ from pebble.config.gateway_file import load_gateway
 from tests.commands.command_line import Run
 
 HUB = {"connect": ["tcp/127.0.0.1:1"]}
+LAMP, BOARDS = "pebble/robots/minilamp", {"id": "g", "hub": {}, "boards": {}}
 
 
 def gateway_file(folder: Path, **settings: Any) -> Path:
@@ -38,6 +39,14 @@ def test_it_is_called_as_its_account_unless_it_has_an_id(tmp_path: Path) -> None
         ({"id": "g", "robots": []}, "gate.json: robots: is empty"),
         ({"id": "g", "robots": ["pebble/robots"]}, "'pebble/robots' is no base: write SYSTEM/TYPE/ID"),
         ({"id": "g", "robots": ["pebble/gateways/+"]}, "'pebble/gateways/+' is no base"),
+        ({"id": "g", "boards": {}}, "gate.json: boards: must be left out beside hub"),
+        ({"id": "g", "hub": {}, "boards": {"hosts": ["a", "b"]}}, "gate.json: boards.hosts: cannot be several"),
+        ({"id": "g", "hub": {}, "boards": {"host": "localhost"}}, "gate.json: mqtt: is also boards"),
+        ({"id": "g", "neighbours": {LAMP: {"lan": HUB}}}, "gate.json: neighbours: must be left out without boards"),
+        ({**BOARDS, "neighbours": {"pebble/robots/+": {"lan": HUB}}}, "'pebble/robots/+' is no base"),
+        ({**BOARDS, "neighbours": {LAMP: {}}}, f"gate.json: neighbours.{LAMP}.lan.connect: is missing"),
+        ({**BOARDS, "neighbours": {LAMP: {"lan": HUB, "listens": {"a": []}}}}, f"{LAMP}.listens: must be left out"),
+        ({**BOARDS, "neighbours": {f"a/b/c{n}": {"lan": HUB} for n in range(17)}}, "has 17 robots: 16 are the most"),
         ({"id": "g", "robot": ["pebble/robots/+"]}, 'gate.json: robot: unknown key, did you mean "robots"?'),
     ],
 )

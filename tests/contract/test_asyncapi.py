@@ -52,6 +52,7 @@ def test_its_own_parser_takes_it_and_finds_every_channel(tmp_path: Path) -> None
     assert found["operations"] == [[f"{levels}/{one.suffix}", actions[one.direction]] for one in CHANNELS]
 
 
+@pytest.mark.thorough
 def test_a_struct_that_was_renamed_is_found(tmp_path: Path) -> None:
     found = parsed(document().replace("    Drive:\n", "    Motion:\n"), tmp_path)
     assert any("Drive" in error for error in found["errors"])

@@ -1,4 +1,4 @@
-"""Robots run for a minute in the real MicroPython within the memory of their boards; with ``make thorough`` each."""
+"""A robot runs for a minute in the real MicroPython within its board's memory; with ``make thorough`` each does."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.support import some
 _PEAK = 7  # column of the table
 
 
-@pytest.mark.parametrize("case", some(CASES, 11), ids=str)
+@pytest.mark.parametrize("case", some(CASES, len(CASES)), ids=str)
 def test_heap(case: Case, tmp_path: Path) -> None:
     cost = measure(case, tmp_path)
     limit = LIMITS[case]

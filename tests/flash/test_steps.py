@@ -106,6 +106,7 @@ def test_code_goes_where_it_runs_without_being_loaded(reported: list[str]) -> No
         assert ask(board, "exec", look).split() == ["/rom/common/ticks.mpy", "5", "main.py", "rom"]
 
 
+@pytest.mark.thorough
 def test_micropython_is_installed_first_by_esptool(board: NodeBoard, tmp_path: Path, reported: list[str]) -> None:
     """A stand-in for esptool: there is no chip here. Everything after it is real."""
     image, record = tmp_path / "c6.bin", tmp_path / "record"

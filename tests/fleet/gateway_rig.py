@@ -99,15 +99,21 @@ class Process:
 
 
 class World:
-    def __init__(self, folder: Path, stack: ExitStack, gateways: int, robots: int, *, proxied: bool) -> None:
+    """One client stands for all robots where there are ``many``, and each is driven twice a second."""
+
+    def __init__(
+        self, folder: Path, stack: ExitStack, gateways: int, robots: int, *, proxied: bool, many: bool = False
+    ) -> None:
         self._folder = folder
+        self._hz, self._heartbeat_each = (2, 1) if many else (COMMANDS_HZ, HEARTBEAT_EACH)
         self.broker = Broker(folder, "max_queued_messages 20000")
         stack.callback(self.broker.kill)
         self.hub_port = free_port()
         settings = ZenohSettings(run_dir=folder / "hub", listen=(f"tcp/127.0.0.1:{self.hub_port}",))
         hub = Forked("pebble.runtime.hub", [msgspec.json.encode(settings, enc_hook=str).decode()])
         stack.callback(hub.kill)
-        self.robots = [Robot(f"r{n}", self._client(f"r{n}", stack)) for n in range(robots)]
+        shared = self._client("robots", stack) if many else None
+        self.robots = [Robot(f"r{n}", shared or self._client(f"r{n}", stack)) for n in range(robots)]
         self.operator = create("mqtt", "operator", MqttSettings(host="127.0.0.1", port=self.broker.port)).open(10)
         stack.callback(self.operator.close)
         self.events: defaultdict[str, list[Arrival]] = defaultdict(list)
@@ -144,12 +150,12 @@ class World:
         for number in self._numbers:
             if self._ending.wait(max(0.0, due - time.monotonic())):
                 return
-            due += 1 / COMMANDS_HZ
+            due += 1 / self._hz
             command = json.dumps({"x": 0.5, "z": 0.0, "n": number}).encode()
             self.sent[number] = time.monotonic()
             for robot in self.robots:
                 self.operator.publish(DRIVE.topic(robot.base), command, qos=QoS.DELIVERED)
-                if number % HEARTBEAT_EACH == 0:
+                if number % self._heartbeat_each == 0:
                     robot.publish_heartbeat()
                 if number % EVENT_EACH == 0:
                     robot.publish_event()
@@ -181,7 +187,7 @@ class World:
     def wait_until_shared(self) -> None:
         """Wait until every gateway may have its share: after its start, or a fault."""
         now = time.monotonic()
-        assert until(lambda: self.driven(now + 2.5), 30), [len(one.commands) for one in self.robots]
+        assert until(lambda: self.driven(now + 2.5), 60), [len(one.commands) for one in self.robots]
 
     def stop_all(self) -> float:
         """Stop each robot, once; seconds until the last one has heard it."""
@@ -249,8 +255,8 @@ FAULTS: dict[str, Callable[[Process], Callable[[], None]]] = {
 
 
 @contextmanager
-def world(folder: Path, gateways: int = 2, robots: int = 6, *, proxied: bool = True) -> Iterator[World]:
+def world(folder: Path, gateways: int = 2, robots: int = 6, **options: bool) -> Iterator[World]:
     with ExitStack() as stack:
-        made = World(folder, stack, gateways, robots, proxied=proxied)
+        made = World(folder, stack, gateways, robots, **{"proxied": True, **options})
         made.wait_until_shared()
         yield made

@@ -36,6 +36,7 @@ ACCOUNTS = {name: Account(roles=roles) for name, roles in PEOPLE.items() if name
     "fred": Account(roles=("robot",), bases=(FRED,)),
     "lamp": Account(roles=("robot",), bases=(LAMP,), plain=True),
     "gate": Account(roles=("gateway",), bases=("pebble/robots/+",)),
+    "near": Account(roles=("boards",), bases=(FRED, LAMP)),
     "lan": Account(roles=("neighbour",), bases=(FRED,)),
     "hub": Account(roles=("hub",)),
 }
@@ -84,6 +85,8 @@ def lets_through(name: str, topic: str, level: str) -> bool:
             topic.startswith("pebble/robots/")
             and ("/outgoing/" in topic or rest in ("flags/remote-mirror", "flags/mqtt-audio", "flags/mqtt-video"))
         ) or topic == "pebble/gateways/gate/outgoing/online"
+    if name == "near":
+        return topic.startswith((f"{FRED}/", f"{LAMP}/"))
     if name in ("hub", "lan"):
         return False  # test_zenoh has what they are at a hub
     if not rest:

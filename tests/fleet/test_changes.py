@@ -300,6 +300,7 @@ def test_the_wheels_stop_within_a_second_when_the_driver_is_removed(tmp_path: Pa
         ("x", Account(roles=("gateway",), bases=("pebble/robots",)), "is no base"),
         ("x", Account(roles=("driver", "safety")), ""),
         ("x", Account(roles=("gateway",), bases=("pebble/robots/+",)), ""),
+        ("x", Account(roles=("boards",), bases=("pebble/robots/minilamp", "pebble/robots/benjr")), ""),
         ("x_-1", Account(roles=("robot",), bases=("pebble/lamps/x",), plain=True), ""),
     ],
     ids=str,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+import sys
 import time
 from contextlib import ExitStack
 from pathlib import Path
@@ -33,10 +34,10 @@ class Section:
         text = (ROOT / "docs" / page).read_text().partition(f"\n## {heading}\n")[2].partition("\n## ")[0]
         for there, mine in here.items():
             text = text.replace(there, mine)
-        (block,) = re.findall(r"^    pebble .*(?:\n    pebble .*)*", text, re.MULTILINE)[:1]
+        (block,) = re.findall(r"^    (?:pebble|mosquitto) .*(?:\n    pebble .*)*", text, re.MULTILINE)[:1]
         self.lines = [line.partition("#")[0].strip() for line in block.splitlines()]
         (pieces,) = re.findall(r"```jsonc\n(.*?)```", text, re.DOTALL)[:1]
-        found = re.findall(r"^// (\S+\.json)[^\n]*\n(.*?)(?=^//|\Z)", pieces, re.DOTALL | re.MULTILINE)
+        found = re.findall(r"^// (\S+\.(?:json|conf))[^\n]*\n(.*?)(?=^//|\Z)", pieces, re.DOTALL | re.MULTILINE)
         self.files = {name: re.sub(r"\s+//.*$", "", body, flags=re.MULTILINE) for name, body in found}
         assert len(self.lines) == 6
 
@@ -96,3 +97,21 @@ def test_two_robots_of_a_lan_receive_each_other_in_six_commands(tmp_path: Path) 
         for line in (start_hub, up_goob, up_fred):
             start(line, tmp_path, hub, stack)
         assert until(lambda: '"receives":{"fred":true}' in pebble(RECEIVES, tmp_path).stdout, 60)
+
+
+def test_a_lan_with_a_board_in_six_commands(tmp_path: Path) -> None:
+    port, hub = free_port(), free_port()
+    here = {f"{host}:7447": f"127.0.0.1:{hub}" for host in ("hub.lab", "0.0.0.0", "127.0.0.1")}
+    section = Section("fleet.md", "A LAN with boards", {**here, "listener 1883": f"listener {port} 127.0.0.1"})
+    broker, start_hub, *programs = section.lines
+    for name, body in section.files.items():
+        body = body.replace('"host": "hub.lab"', '"host": "127.0.0.1"')
+        (tmp_path / name).write_text(body.replace('"host": "127.0.0.1"', f'"host": "127.0.0.1", "port": {port}'))
+    with ExitStack() as stack:
+        stack.enter_context(mosquitto(tmp_path / broker.split()[2], port))
+        for line in (start_hub, *programs):
+            start(line, tmp_path, hub, stack)
+        began = time.monotonic()
+        both = '"receives":{"fred":true,"minilamp":true}'
+        assert until(lambda: both in pebble(RECEIVES, tmp_path).stdout, 60), (tmp_path / "simulation.log").read_text()
+        sys.stdout.write(f"\ngoob receives fred and the board after {time.monotonic() - began:.1f} s\n")

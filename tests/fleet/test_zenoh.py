@@ -41,6 +41,8 @@ def lets_through(name: str, topic: str, level: str) -> bool:
     """By hand: as at a broker, but for a gateway, whose robots are at the hub, and for a neighbour."""
     if name == "gate":
         return topic.startswith("pebble/robots/") and "/incoming/" in topic
+    if name == "near":
+        return False  # its robots are at a broker
     if name == "lan":
         return topic.startswith(f"{FRED}/outgoing/")
     return test_attempts.lets_through(name, topic, level)

@@ -33,7 +33,7 @@ def _station(wiring: str) -> Iterator[Station]:
             yield Station(rig, rig.operator)
 
 
-@pytest.fixture(scope="module", params=["mqtt", "zenoh", "single", "mirror"])
+@pytest.fixture(scope="module", params=["mqtt", "zenoh", further("single"), "mirror"])
 def station(request: pytest.FixtureRequest) -> Iterator[Station]:
     """An operator at the remote broker, at the only broker, or at the local broker of a Zenoh robot."""
     yield from _station(request.param)

@@ -8,13 +8,16 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Self
 
+import msgspec
+
 from pebble.rig.processes import children
-from pebble.simulation.trace import Entry, read_trace
+from pebble.simulation.trace import Entry, complete_lines
 from tests.kit.stalls import Stall
 from tests.robot.operator import Operator
 from tests.support import ROOT, Broker, gone, process_name, until
@@ -41,15 +44,20 @@ class Motors:
 
     def __init__(self, port: Path, trace: Path) -> None:
         self.port, self._trace = port, trace
-        self._start = 0  # byte of the trace
+        self._entries, self._read = list[Entry](), 0  # what was read, and up to which byte
+        self._reading = threading.Lock()
 
     def forget(self) -> None:
         """Read the trace from here on only: that of an hour takes a second each time."""
-        self._start = self._trace.stat().st_size
+        with self._reading:
+            self._entries, self._read = [], self._trace.stat().st_size
 
     def entries(self, since: float = 0.0) -> list[Entry]:
         """What happened on the line after ``since`` (monotonic seconds)."""
-        return [entry for entry in read_trace(self._trace, self._start) if entry.ns >= since * 1e9]
+        with self._reading:
+            lines, self._read = complete_lines(self._trace, self._read)
+            self._entries += [msgspec.json.decode(line, type=Entry) for line in lines]
+            return [entry for entry in self._entries if entry.ns >= since * 1e9]
 
     def drives(self, since: float = 0.0) -> list[tuple[float, tuple[float, float]]]:
         """Every drive line after ``since`` as (monotonic seconds, (left, right))."""

@@ -13,12 +13,12 @@ from pebble.contract.chain import Mark
 from tests.commands.command_line import Run
 from tests.robot.operator import retained_messages
 from tests.robot.rig import BASE, STOP, Rig
-from tests.support import until
+from tests.support import cases, until
 
 pytestmark = pytest.mark.alone
 
 OTTO = {"id": "aaaaaaaa", "by": "otto", "for_ms": 10_000}
-FLOOD = 20_000
+FLOOD = cases(4_000, 20_000)
 
 
 def written(rig: Rig, name: str = "acts") -> list[Path]:

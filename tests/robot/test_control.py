@@ -128,7 +128,7 @@ def test_a_client_that_knows_nothing_of_control_drives_as_ever(rig: Rig) -> None
     """Each of its commands reaches the line, also while a person has control, and its bytes are not changed."""
     held(rig, CONTROL, OTTO)
     began = time.monotonic()
-    wanted = [round(0.1 + number / 1000, 3) for number in range(200)]
+    wanted = [round(0.1 + number / 1000, 3) for number in range(cases(60, 200))]
     for z in wanted:
         rig.operator.send(DRIVE, json.dumps({"x": 0, "z": z, "source": "web", "t": 1}).encode())
         assert until(lambda z=z: lines(rig, z, began), 5), z

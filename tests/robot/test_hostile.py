@@ -28,7 +28,7 @@ from pebble.services.serial_mcu_bridge.text.motor_bridge import MotorBridge
 from tests.robot.rig import Rig
 from tests.support import cases, until
 
-MESSAGES = cases(3_200, 100_000)
+MESSAGES = cases(1_600, 100_000)
 CHUNK = 800  # messages before waiting for a sign that the robot has read them: less than any queue on the way holds
 LINES = 400  # the same for lines: together fewer bytes than may wait unread
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from itertools import pairwise, product
 from typing import Any
 
@@ -24,13 +25,9 @@ VIDEO_FLAG, AUDIO_FLAG = "incoming/flags/mqtt-video", "incoming/flags/mqtt-audio
 ASK_VIDEO, ASK_AUDIO = "incoming/front-camera", "incoming/audio"
 
 
-def make_rig(kind: str, **more: Any) -> Rig:
-    return Rig(kind, av_daemon=DEVICES, **more)
-
-
 @pytest.fixture(scope="module", params=["mqtt", "zenoh", further("single")])
 def rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
-    with make_rig(request.param) as rig:
+    with Rig(request.param, av_daemon=DEVICES) as rig:
         yield rig
 
 
@@ -172,18 +169,14 @@ def test_stopping_media_does_not_delay_driving(rig: Rig) -> None:
     assert max(later - earlier for earlier, later in pairwise(moves)) < 0.5
 
 
-@pytest.mark.parametrize("rig", ["mqtt"], indirect=True)  # the one that is quiet before and after
-def test_media_do_not_pass_the_robots_own_side() -> None:
-    with make_rig("mqtt") as rig:
-        assert rig.local is not None
-        inside = Operator(rig.local.port, BASE)
-        try:
-            assert pictures_come(rig, want_video(rig))
-            assert until(lambda: {"camera", "camera_publisher"} <= status(inside).keys(), 10)
-            assert until(lambda: status(rig.operator).keys() == status(inside).keys(), 10)
-            assert not inside.on(CAMERA)
-        finally:
-            inside.close()
+@pytest.mark.parametrize("rig", ["mqtt"], indirect=True)
+def test_media_do_not_pass_the_robots_own_side(rig: Rig) -> None:
+    assert rig.local is not None
+    with closing(Operator(rig.local.port, BASE)) as inside:
+        assert pictures_come(rig, want_video(rig))
+        assert until(lambda: {"camera", "camera_publisher"} <= status(inside).keys(), 10)
+        assert until(lambda: status(rig.operator).keys() == status(inside).keys(), 10)
+        assert not inside.on(CAMERA)
 
 
 def status(operator: Operator) -> dict[str, Any]:

@@ -14,7 +14,7 @@ import pytest
 
 from tests.robot.closed_loop.following import ORIGINAL_WITHIN_M, TARGET_M, Start
 from tests.robot.world_rig import FOLLOW, WorldRig
-from tests.support import cases, gone, until
+from tests.support import THOROUGH, cases, gone, until
 
 pytestmark = pytest.mark.alone  # deadlines are checked
 
@@ -22,12 +22,17 @@ SYSTEM = "/usr/bin/python3"
 _NEEDED = "import cv2, paho.mqtt.client; assert 'GStreamer:                   YES' in cv2.getBuildInformation()"
 #: The system's Python, whose OpenCV has GStreamer: what owners of the original run its scripts with.
 with_gstreamer = pytest.mark.skipif(
-    not Path(SYSTEM).exists() or subprocess.run([SYSTEM, "-c", _NEEDED], stderr=subprocess.DEVNULL).returncode != 0,
+    THOROUGH
+    and (
+        not Path(SYSTEM).exists() or subprocess.run([SYSTEM, "-c", _NEEDED], stderr=subprocess.DEVNULL).returncode != 0
+    ),
     reason="the system's Python has no OpenCV with GStreamer, or no paho",
 )
 ROBOTS = [
-    pytest.param(("zenoh", sys.executable), id="zenoh, stand-in", marks=pytest.mark.thorough),
-    pytest.param(("mqtt", sys.executable), id="mqtt, stand-in"),
+    *(
+        pytest.param((kind, sys.executable), id=f"{kind}, stand-in", marks=pytest.mark.thorough)
+        for kind in ("zenoh", "mqtt")
+    ),
     *(
         pytest.param((kind, SYSTEM), id=f"{kind}, shmsrc", marks=[pytest.mark.thorough, with_gstreamer])
         for kind in ("zenoh", "mqtt")

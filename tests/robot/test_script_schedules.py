@@ -10,11 +10,12 @@ from tests.robot.script_schedules.__main__ import perform
 from tests.robot.script_schedules.rules import Lines, problems
 from tests.robot.script_schedules.schedules import make
 from tests.robot.stop_schedules.history import History
+from tests.support import further
 
 pytestmark = pytest.mark.alone  # deadlines are checked
 
 
-@pytest.mark.parametrize(("transport", "seed"), [("zenoh", 2), pytest.param("mqtt", 4, marks=pytest.mark.thorough)])
+@pytest.mark.parametrize(("transport", "seed"), [("mqtt", 4), further("zenoh", 2)])
 def test_a_persons_stop_and_the_end_of_a_script_are_seen_at_the_wheels(transport: str, seed: int) -> None:
     ((_, found, log),) = perform(transport, [seed])
     assert not found, log

@@ -18,7 +18,7 @@ import pytest
 
 from tests.fakes.bad_brokers import BEHAVIOURS, mute, resolving, serving
 from tests.robot.rig import STOP, Rig, descendants
-from tests.support import ROOT, cases, further, gone, until
+from tests.support import ROOT, cases, further, gone, some, until
 
 pytestmark = pytest.mark.alone
 
@@ -93,7 +93,7 @@ def test_too_few_descriptors_are_an_error_or_enough(kind: str, files: int) -> No
 
 def test_a_stop_at_any_moment_of_the_start_leaves_nothing() -> None:
     with Rig("zenoh", start=False) as rig:
-        for index in range(cases(10, 20)):
+        for index in some(range(20), 4):
             rig.start(ready=False)
             time.sleep(0.04 * index)
             children = descendants(rig.launcher_pid)
@@ -115,7 +115,7 @@ def remains(rig: Rig) -> list[str]:
 
 def test_a_robot_whose_launcher_is_killed_starts_again_at_once() -> None:
     with Rig("zenoh") as rig:
-        for _ in range(cases(3, 5)):
+        for _ in range(cases(2, 5)):
             children = rig.kill_launcher()
             rig.start()
             assert until(lambda pids=children: all(map(gone, pids)))  # type: ignore[misc]

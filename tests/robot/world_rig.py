@@ -84,7 +84,8 @@ class WorldRig(Rig):
     """A robot in a world: its camera, scripts (Pebble's and those of the tests) and a simulated loudspeaker.
 
     Without ``world`` it has one of its own. ``camera`` False: none, for what needs no pictures. ``pictures_socket``:
-    programs of the original find its pictures. ``scripts``: their sections in the config.
+    programs of the original find its pictures. ``scripts``: their sections in the config. ``files``: which of the
+    tests' scripts it has, as a pattern; it asks each what it is, by a process.
     """
 
     def __init__(
@@ -96,8 +97,10 @@ class WorldRig(Rig):
         camera: bool = True,
         pictures_socket: bool = False,
         scripts: dict[str, Any] | None = None,
+        files: str = "*",
         **more: Any,
     ) -> None:
+        self._files = files
         self._own = None if world is not None else World()
         self.world = world or self._own
         self.sounds, self._record = (self.world.folder / f"{name}.{what}" for what in ("sounds", "played"))
@@ -119,7 +122,9 @@ class WorldRig(Rig):
             },
         }
         super().__init__(kind, name=name, motors=self.world.motors(name), direct=True, start=False, **(services | more))
-        (self.folder / "autonomy").symlink_to(SCRIPTS)
+        (self.folder / "autonomy").mkdir()
+        for script in SCRIPTS.glob(files):
+            (self.folder / "autonomy" / script.name).symlink_to(script)
         try:
             self.start()
         except BaseException:
@@ -132,7 +137,8 @@ class WorldRig(Rig):
 
     def wait_for_scripts(self, since: float, timeout: float = 60.0) -> None:
         """A catalogue with all scripts, Pebble's and those of the tests, was published after ``since``."""
-        wanted = {run.parent.name for root in (SCRIPTS, PEBBLES_SCRIPTS) for run in root.glob("*/run.py")}
+        places = ((SCRIPTS, self._files), (PEBBLES_SCRIPTS, "*"))
+        wanted = {run.parent.name for folder, files in places for run in folder.glob(f"{files}/run.py")}
         assert until(lambda: wanted <= self._offered(since), timeout), f"only {self._offered(since)} of {wanted}"
 
     def close(self) -> None:

@@ -11,7 +11,7 @@ from pebble.contract import CHARGING_LEVEL, DRIVE, ESTOP_STATE, ONLINE, STATUS
 from pebble.runtime.by_name import EACH_S, MAX_ROBOTS, ByName
 from pebble.transports import Message
 from tests.client.estop_robot import Robot
-from tests.support import further
+from tests.support import cases, further
 
 GOOB = "pebble/robots/goob"
 ROBOT = Robot(GOOB, "left", "right")
@@ -107,7 +107,10 @@ def test_what_came_before_an_outage_is_asked_for_again() -> None:
     assert robots.of(GOOB) == [1.0, 1.1, 121.0, 121.1]
 
 
-def flood(count: int, *, lasting: bool, last: float = 100.0) -> Arriving:
+LONG_S = cases(30, 100)
+
+
+def flood(count: int, *, lasting: bool, last: float = LONG_S) -> Arriving:
     for n in range(count):
         yield from (
             heartbeats(f"evil/robots/e{n}", 0.001, last, 1.0) if lasting else [(0.001, heartbeat(f"evil/robots/e{n}"))]
@@ -130,8 +133,8 @@ def test_robots_that_are_invented_cause_no_flood_and_keep_none_waiting(
     invented: Arriving, known: bool, within_s: float
 ) -> None:
     robots = Asked([CAPABILITIES, *STATES], lambda base: known and base == GOOB)
-    robots.run([*invented, *heartbeats(first=0.3, last=100)], 100)
+    robots.run([*invented, *heartbeats(first=0.3, last=LONG_S)], LONG_S)
     assert robots.of(GOOB)[0] <= within_s
     assert len(robots.of(GOOB)) == 2
-    assert len(robots.asks) <= 100 / EACH_S
+    assert len(robots.asks) <= LONG_S / EACH_S
     assert max(len(robots.of(f"evil/robots/e{n}")) for n in range(0, 1000, 50)) <= 3

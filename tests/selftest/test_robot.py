@@ -41,7 +41,7 @@ def page(folder: Path) -> dict[str, Any]:
     return {"web_interface": {"port": free_port(), "tls": {name: str(file) for name, file in files.items()}}}
 
 
-@pytest.fixture(scope="module", params=["mqtt", "zenoh"])
+@pytest.fixture(scope="module", params=["mqtt", further("zenoh")])
 def rig(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
     """A robot with everything, and a page by https."""
     folder = tmp_path_factory.mktemp("tls")
@@ -220,7 +220,7 @@ def test_how_a_robot_that_is_off_is_started(rig: Rig) -> None:
     assert all(check["fix"] for check in checks.values() if check["state"] == "failed")
 
 
-@pytest.mark.parametrize(("kind", "level"), [("mqtt", "named"), further("zenoh", "named"), ("zenoh", "login")])
+@pytest.mark.parametrize(("kind", "level"), [("zenoh", "named"), further("mqtt", "named"), further("zenoh", "login")])
 def test_at_every_level(kind: str, level: Any, tmp_path: Path) -> None:
     hall = Hall(tmp_path / "hall", level)
     with hall, Named(kind, hall, {"level": level}, av_daemon=DEVICES, start=False) as rig:

@@ -206,9 +206,14 @@ def console(
     *,
     url: str = "",
     script: str = "",
+    engineers: bool = True,
 ) -> Iterator[Console]:
-    """Open the page of a robot. ``url`` with a slash at the end: by another way than the server's own address."""
-    with tab(browser, f"{url or stage.url}r/{stage.ref(name)}", size, theme, script=_PADS + script) as opened:
+    """Open the page of a robot. ``url`` with a slash at the end: by another way than the server's own address.
+
+    Without ``engineers`` none of its cards for them is open: drawing plots takes most of what a page needs.
+    """
+    address = f"{url or stage.url}r/{stage.ref(name)}"
+    with tab(browser, address, size, theme, script=_PADS + script, engineers=engineers) as opened:
         yield Console(opened, stage, name)
 
 

@@ -1,16 +1,22 @@
-"""``pebble gateway``: carries robots of a Zenoh hub to an MQTT broker."""
+"""``pebble gateway``: carries robots of a Zenoh hub, or of a broker on a LAN, to the broker of their operators."""
 
+import logging
+import os
 import signal
+import threading
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Protocol
 
 import typer
+
+log = logging.getLogger(__name__)
 
 FileArgument = Annotated[Path, typer.Argument(help="The gateway's file, in JSON.", metavar="FILE", show_default=False)]
 
 
 def gateway(file: FileArgument) -> int:
-    """Carry robots of a Zenoh hub to an MQTT broker and back; Ctrl-C ends it.
+    """Carry robots of a Zenoh hub, or of a LAN's broker, to an MQTT broker and back; Ctrl-C ends it.
 
     Operators at the broker see, drive and stop them as if they were there. Run
     two or three on different machines: they share the robots, and when one dies
@@ -29,19 +35,71 @@ def gateway(file: FileArgument) -> int:
 
     \b
         pebble gateway gate-1.json
+
+    Boards cannot speak Zenoh: with "boards", their broker on a LAN, instead of
+    "hub" it carries them, and "neighbours" lets robots of the LAN's hub receive
+    and drive them.
     """
     from pebble.config.gateway_file import load_gateway
     from pebble.runtime.connections import gateway_transports
     from pebble.runtime.parent import Notifier, set_up_logging
     from pebble.services.gateway.gateway import Gateway
     from pebble.services.gateway.heartbeats import will
+    from pebble.services.neighbours.board import of_board
 
     settings, name, run_dir = load_gateway(file)
     set_up_logging("INFO")
-    program = Gateway(name, settings.robots, *gateway_transports(settings, run_dir, will(name)))
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: program.quit())
-    where = f"{settings.mqtt.host}:{settings.mqtt.port}"
-    typer.echo(f"gateway {name} between {', '.join(settings.hub.connect)} and {where}; Ctrl-C ends it", err=True)
-    program.run(ready=Notifier().ready)
-    return 0
+    programs: list[_Program] = []
+    places = [*settings.hub.connect]
+    if (boards := settings.boards) is not None:
+        places.append(f"{boards.host}:{boards.port}")
+        programs += [of_board(base, one, boards, run_dir) for base, one in settings.neighbours.items()]
+    if (mqtt := settings.operators) is not None:
+        transports = gateway_transports(settings, mqtt, run_dir, will(name))
+        programs.append(Gateway(name, settings.robots, *transports))
+    others = [f"{mqtt.host}:{mqtt.port}"] if mqtt is not None else []
+    others += [endpoint for one in settings.neighbours.values() for endpoint in one.lan.connect]
+    typer.echo(
+        f"gateway {name} between {', '.join(places)} and {', '.join(dict.fromkeys(others))}; Ctrl-C ends it", err=True
+    )
+    return _Together(programs).run(Notifier().ready)
+
+
+class _Program(Protocol):
+    def run(self, ready: Callable[[], None] = ...) -> None: ...
+
+    def quit(self) -> None: ...
+
+
+class _Together:
+    """Programs that end together: at a signal, or when one of them fails."""
+
+    def __init__(self, programs: list[_Program]) -> None:
+        self._programs, self._failed = programs, False
+        self._ended, self._ends = os.pipe()  # safe in handlers of signals, where an event may wait for itself
+
+    def run(self, ready: Callable[[], None]) -> int:
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, lambda *_: self._end())
+        threads = [threading.Thread(target=self._run, args=(one,)) for one in self._programs]
+        for thread in threads:
+            thread.start()
+        ready()
+        os.read(self._ended, 1)
+        for one in self._programs:
+            one.quit()
+        for thread in threads:
+            thread.join()
+        return int(self._failed)
+
+    def _end(self) -> None:
+        os.write(self._ends, b".")
+
+    def _run(self, program: _Program) -> None:
+        try:
+            program.run()
+        except Exception:  # the process boundary: its manager starts it again
+            log.exception("%s has failed", type(program).__name__)
+            self._failed = True
+        finally:
+            self._end()

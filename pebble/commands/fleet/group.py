@@ -38,7 +38,8 @@ _Roles = Annotated[
     str,
     typer.Option(
         "--role",
-        help="viewer, driver, maintainer, safety, admin, or several: driver,safety; else page, robot, gateway, hub.",
+        help="viewer, driver, maintainer, safety, admin, or several: driver,safety; else page, robot, neighbour, "
+        "gateway, boards, hub.",
         metavar="ROLE[,ROLE]",
     ),
 ]
@@ -370,7 +371,7 @@ def _print_account(place: Path, fleet: Fleet, name: str, secret: str, how: str, 
     elif ProgramRole.HUB in account.roles:
         typer.echo("A hub needs none, but a certificate:")
         typer.echo(f"    pebble fleet certificate {name} HOST")
-    elif ProgramRole.GATEWAY not in account.roles:
+    elif not {ProgramRole.GATEWAY, ProgramRole.BOARDS} & {*account.roles}:
         typer.echo(f"    pebble drive ROBOT --url {url} --ca-cert {ca} --password-file FILE")
 
 

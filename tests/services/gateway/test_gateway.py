@@ -6,6 +6,7 @@ import itertools
 import json
 import random
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 
@@ -13,9 +14,9 @@ from pebble.contract import ONLINE
 from pebble.forwarding.routing import Side
 from pebble.services.gateway import gateway as module
 from pebble.services.gateway.gateway import Gateway
-from pebble.services.gateway.heartbeats import will
+from pebble.services.gateway.heartbeats import PresentRobots, will
 from pebble.services.gateway.ownership import FRESH_S, TAKING_S
-from pebble.transports import Message
+from pebble.transports import Message, Subscription
 from tests.forwarding.virtual import Connection, Hub
 from tests.services.mqtt_bridge.bridge_rig import Client
 from tests.support import cases
@@ -83,6 +84,7 @@ class World:
             self.rest()
             for one in self.running.values():
                 if not one.hangs:
+                    one.gateway.publish_heartbeat()
                     one.gateway.tick()
             self.rest()
 
@@ -132,6 +134,15 @@ def test_a_robot_is_carried_with_all_that_it_retains(monkeypatch: pytest.MonkeyP
     assert retained == [b"false", b"false"], "the broker's flag counts"
     assert operator.payloads("incoming/flags/mqtt-audio") == [b"true"]
     assert world.all_pass()
+
+
+def test_a_heartbeat_that_may_be_retained_shows_its_robot_once_another_follows() -> None:
+    present = PresentRobots()
+    for payload in (b"1", b"1"):
+        present.note_copy(GOOB, payload, 0.0)
+    assert present.robots(0.0) == ()
+    present.note_copy(GOOB, b"2", 0.0)
+    assert present.robots(0.0) == (GOOB,)
 
 
 def test_a_successor_takes_what_the_robot_retains_now(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -245,6 +256,27 @@ def test_what_it_has_in_hand_while_it_stands_still_does_not_leave(
     alone.robots[0].publish("outgoing/counted", b"-1")
     alone.rest()
     assert (b"-1" in alone.operators[0].payloads("outgoing/counted")) is (stood_s == 0)
+
+
+def test_who_waits_for_the_hub_as_it_begins_is_not_taken_for_dead(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    world = World(monkeypatch, "a")
+    caplog.set_level("INFO", module.__name__)
+    one = world.running["a"]
+    subscribe = one.hub.subscribe
+
+    def slowly(topic: str, *arguments: Any, **options: Any) -> Subscription:
+        for _ in range(int(2 * FRESH_S / STEP_S) * topic.endswith("#")):
+            world.now += STEP_S
+            world.robots[0].publish("outgoing/online", b"{}", retain=True)
+            one.gateway.publish_heartbeat()  # as its thread does
+            world.rest()
+        return subscribe(topic, *arguments, **options)
+
+    monkeypatch.setattr(one.hub, "subscribe", slowly)
+    world.run(4)
+    assert [record.getMessage() for record in caplog.records] == [f"carries {GOOB}"]
 
 
 def test_of_two_with_one_name_one_rests(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -146,7 +146,7 @@ def test_a_command_with_an_old_key_is_refused(watched: Watched) -> None:
 
 def test_refusals_are_one_row_a_minute_for_each_account_and_reason(watched: Watched) -> None:
     drops = (Drop.UNNAMED, Drop.LATE, Drop.STALE, Drop.SIGNED, Drop.ECHO)
-    refusals = cases(20_000, 100_000)
+    refusals = cases(5_000, 100_000)
     for number in range(refusals):
         watched.acts.drop(drops[number % 5], f"eve{number % 1000}")
     first = watched.refused()

@@ -17,12 +17,12 @@ from pebble.transports import State
 from pebble.transports.hosts import CONNECT_TIMEOUT_S
 from tests.robot.operator import Operator
 from tests.services.mqtt_bridge.bridge_rig import BASE, Running, make_config
-from tests.support import Broker, until
+from tests.support import Broker, cases, until
 from tests.tcp_proxy import SlowTcpProxy, TcpProxy
 
 IMU, STOP, ONLINE, LINK = "outgoing/sensors/imu", "incoming/estop", "outgoing/online", "outgoing/link"
 DRIVE, OWN = "incoming/drive-values", "emergency stops have a connection of their own"
-FLOOD = 10_000
+FLOOD = cases(3_000, 10_000)
 
 
 @pytest.fixture

@@ -19,7 +19,7 @@ from pebble.errors import PebbleError
 from pebble.runtime.runs import LocalScripts
 from pebble.script import NotGrantedError, Robot, Stopped
 from pebble.services.neighbours.service import MOST_BYTES, NeighboursService
-from pebble.transports import Message, QoS, clock
+from pebble.transports import Message, QoS, Transport, clock
 from pebble.transports.memory import MemoryHub, MemoryTransport
 from tests.kit.robot import Running
 from tests.support import until
@@ -39,7 +39,7 @@ class Lan(MemoryHub):
 class One:
     """A robot: its local network, its program, and the drive commands on it."""
 
-    def __init__(self, folder: Path, lan: MemoryHub, name: str, stack: ExitStack, **section: Any) -> None:
+    def __init__(self, folder: Path, lan: Transport, name: str, stack: ExitStack, **section: Any) -> None:
         (folder / "run").mkdir(parents=True)
         raw = {
             "robot": {"id": name},
@@ -55,7 +55,7 @@ class One:
         self.client.subscribe(DRIVE.topic(self.base), self._on_drive, direct=True)
         self.client.subscribe(NEIGHBOURS.topic(self.base), self._on_state, direct=True)
         transport = MemoryTransport("neighbours", self.hub)
-        self.service = NeighboursService(self.config, transport, lan=MemoryTransport(f"{name}-lan", lan))
+        self.service = NeighboursService(self.config, transport, lan=lan)
         stack.callback(Running(self.service).stop)
 
     def _on_drive(self, message: Message) -> None:
@@ -75,8 +75,10 @@ class Pair:
         self.lan = lan = Lan()
         self.stranger = MemoryTransport("stranger", lan).open()
         shared, granted = {"shares": ["wheel-odometry"]}, {"commanded": {"goob": ["drive-values"]}}
-        self.fred = One(folder / "fred", lan, "fred", stack, **shared, **granted)
-        self.goob = One(folder / "goob", lan, "goob", stack, listens={"fred": ["wheel-odometry"], "carl": []})
+        at_hub = {name: MemoryTransport(f"{name}-lan", lan) for name in ("fred", "goob")}
+        self.fred = One(folder / "fred", at_hub["fred"], "fred", stack, **shared, **granted)
+        listens = {"fred": ["wheel-odometry"], "carl": []}
+        self.goob = One(folder / "goob", at_hub["goob"], "goob", stack, listens=listens)
         self.robot = Robot(self.goob.config, MemoryTransport("script", self.goob.hub).open(), lambda _above: 7)
         stack.callback(self.robot.close)
 

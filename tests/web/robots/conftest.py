@@ -33,7 +33,7 @@ def wire(stage: Stage) -> Iterator[Wire]:
 
 @pytest.fixture(scope="module")
 def lamp_page(browser: Browser, stage: Stage) -> Iterator[Console]:
-    with console(browser, stage, "minilamp") as opened:
+    with console(browser, stage, "minilamp", engineers=False) as opened:
         yield opened
 
 

@@ -32,7 +32,7 @@ _SOUND = """() => {
 
 @pytest.fixture(scope="module")
 def _benjr_page(browser: Browser, stage: Stage) -> Iterator[Console]:
-    with console(browser, stage, "benjr") as opened:
+    with console(browser, stage, "benjr", engineers=False) as opened:
         for name, source in _MODULES.items():
             opened.page.route(f"**/ui/cards/{name}", answer(source))
         opened.tab.until("!!window.pebble?.driver.actions")
@@ -324,7 +324,7 @@ def test_it_stops_robots_and_never_drives(browser: Browser, stage: Stage, wire: 
         assert opened.until(lambda: wire.latched("benjr"), 2)
         assert opened.page.locator("[data-test=reset]:visible").count() == 0
         assert opened.complaints() == []
-    with console(browser, stage, "benjr") as robot:
+    with console(browser, stage, "benjr", engineers=False) as robot:
         robot.take()  # resets it
 
 

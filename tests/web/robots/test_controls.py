@@ -22,7 +22,7 @@ pytestmark = pytest.mark.alone  # deadlines are checked
 
 @pytest.fixture(scope="module")
 def _benjr_page(browser: Browser, stage: Stage) -> Iterator[Console]:
-    with console(browser, stage, "benjr", theme="dark") as opened:
+    with console(browser, stage, "benjr", theme="dark", engineers=False) as opened:
         yield opened
 
 
@@ -221,7 +221,7 @@ def test_a_release_stops_the_wheels(at_lamp: Console) -> None:
 def test_a_second_tab_stops_by_the_space_bar_and_takes_over_by_a_hold(
     browser: Browser, stage: Stage, at_lamp: Console
 ) -> None:
-    with console(browser, stage, "minilamp") as second:
+    with console(browser, stage, "minilamp", engineers=False) as second:
         assert second.because("lease")
         second.down("KeyW")
         assert second.stays_at_rest(0.2)
