@@ -430,8 +430,11 @@ def _level(fleet: Fleet, account: Account) -> str:
 
 def _left(lines: Iterable[str]) -> int:
     """Print where a change does not count yet; the command's exit code."""
-    shown = [typer.echo(f"pebble: {line}", err=True) for line in lines]
-    return 1 if shown else 0
+    code = 0
+    for line in lines:
+        typer.echo(f"pebble: {line}", err=True)
+        code = 1
+    return code
 
 
 def _remove_from_pages(fleet: Fleet, name: str) -> Iterator[str]:
