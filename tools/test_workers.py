@@ -147,7 +147,10 @@ def path_of(item: pytest.Item) -> str:
 def shared(item: pytest.Item) -> str:
     """The same for tests that share a fixture which lives longer than one of them."""
     fixtures = cast(Any, item)._fixtureinfo.name2fixturedefs.values()
-    return item.nodeid if all(one[-1].scope in ("function", "session") for one in fixtures) else str(item.path)
+    scopes = {one[-1].scope for one in fixtures} - {"function", "session"}
+    if "package" in scopes:
+        return str(item.path.parent)
+    return str(item.path) if scopes else item.nodeid
 
 
 class Reports:
