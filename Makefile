@@ -94,7 +94,7 @@ test: .venv/.ready-dev
 
 test-running:
 	@echo "pebble: tests"
-	@$(TESTS) --workers 7 -m "not alone and not page$(LESS)" $(addprefix --ignore=,$(COMPUTING) tests/life) tests
+	@$(TESTS) --workers 8 -m "not alone and not page$(LESS)" $(addprefix --ignore=,$(COMPUTING) tests/life) tests
 
 test-checks:
 	@$(GENTLY) $(MAKE) --no-print-directory --jobs=2 check-types check-names >.venv/checks.log 2>&1 || \

@@ -1,8 +1,9 @@
 """A pytest plugin that runs tests in several processes: ``--workers 4``. They are forked once all tests are collected.
 
 A worker gets the tests of one module after another, in the order in which they were collected, so each fixture of a
-module is made once. With ``--spread``, for few tests that take long, tests that share no fixture are given one by one.
-A worker that dies fails its test, and another goes on with the rest.
+module is made once; tests that share a fixture of their package are one module. With ``--spread``, for few tests that
+take long, tests that share no fixture are given one by one. A worker that dies fails its test, and another goes on with
+the rest.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import traceback
 from collections import deque
 from collections.abc import Iterator
 from contextlib import suppress
-from itertools import groupby, pairwise
+from itertools import pairwise
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection, wait
 from types import SimpleNamespace
@@ -51,9 +52,11 @@ class Workers:
     def pytest_runtestloop(self, session: pytest.Session) -> bool | None:
         if session.testsfailed or session.config.option.collectonly:
             return None  # pytest's own loop runs nothing then, either
-        together = shared if session.config.getoption("--spread") else path_of
-        numbered = groupby(range(len(session.items)), key=lambda index: together(session.items[index]))
-        self._modules.extend(list(indexes) for _, indexes in numbered)
+        together = shared if session.config.getoption("--spread") else module_of
+        groups: dict[str, Indexes] = {}
+        for index, item in enumerate(session.items):
+            groups.setdefault(together(item), []).append(index)
+        self._modules.extend(groups.values())
         try:
             for _ in range(min(session.config.getoption("--workers"), len(self._modules))):
                 self._fork(session)
@@ -140,14 +143,19 @@ class Workers:
         os.waitpid(self._workers.pop(connection).pid, 0)
 
 
-def path_of(item: pytest.Item) -> str:
-    return str(item.path)
+def module_of(item: pytest.Item) -> str:
+    """The same for tests of one module, or of one folder if they share a fixture of the whole."""
+    return str(item.path.parent if "package" in scopes(item) else item.path)
 
 
 def shared(item: pytest.Item) -> str:
     """The same for tests that share a fixture which lives longer than one of them."""
-    fixtures = cast(Any, item)._fixtureinfo.name2fixturedefs.values()
-    return item.nodeid if all(one[-1].scope in ("function", "session") for one in fixtures) else str(item.path)
+    return module_of(item) if scopes(item) - {"function", "session"} else item.nodeid
+
+
+def scopes(item: pytest.Item) -> set[str]:
+    """Those of the fixtures of a test."""
+    return {one[-1].scope for one in cast(Any, item)._fixtureinfo.name2fixturedefs.values()}
 
 
 class Reports:

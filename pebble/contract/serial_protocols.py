@@ -21,6 +21,10 @@ class SerialProtocol(Struct, frozen=True):
     is_imu: bool = False  # every such device is an inertial sensor
     describes_itself: bool = False  # only its manifest says what the device is
 
+    @property
+    def module(self) -> str:
+        return self.service.partition(":")[0]
+
     def has_imu(self, instance: str) -> bool:
         """Return whether the line of this name is known to have an inertial sensor before the device is connected."""
         return self.is_imu or (self.describes_itself and instance == _IMU_INSTANCE)

@@ -3,17 +3,17 @@
 import gc
 import logging
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from enum import IntEnum
 from importlib import import_module
 from pathlib import Path
-from pkgutil import walk_packages
 from typing import Any
 
 from msgspec import Struct
 from msgspec.json import encode
 
-from pebble.config import Config
+from pebble.config import Config, SerialBridge
+from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
 from pebble.runtime.connections import hub_settings
 from pebble.transports import module_of
 
@@ -32,7 +32,8 @@ class Stage(IntEnum):
 class Program(Struct, frozen=True):
     """One process: its name in logs and status, and the module that it runs with ``arguments``, as ``python -m`` would.
 
-    The launcher imports the module, or all modules of the package, before it forks: importing must do nothing.
+    The launcher imports the module, or ``entry``, before it forks: importing must do nothing. What that module imports
+    later, because only some robots need it, is in the memory of those robots only.
     """
 
     name: str
@@ -44,6 +45,7 @@ class Program(Struct, frozen=True):
     may_request: bool = False  # may request on-demand programs
     on_demand: bool = False  # runs only while it is requested
     preloaded: bool = True  # False: its imports are needed by few, and would cost every process their memory
+    entry: str = ""  # what the package that is run begins with; "": the module is no package
     environment: dict[str, str] = {}
     folder: Path | None = None  # to run in; None: the launcher's
     stop_timeout_s: float = 10.0  # after this an on-demand program that was released is killed
@@ -58,13 +60,13 @@ def programs(config: Config) -> tuple[Program, ...]:
     table = [
         (config.transport.kind == "zenoh", _hub(config)),
         (True, _announcer(config)),
-        *((True, _service(config, "serial_mcu_bridge", Stage.DEVICE, line)) for line in config.serial_instances()),
+        *((True, _serial_line(config, *line)) for line in config.serial_instances().items()),
         (services.av_daemon.enabled, _av_daemon(config)),
-        (services.autonomy_manager.enabled, _service(config, "autonomy_manager", Stage.CONNECTION, runs_scripts=True)),
-        (services.mqtt_bridge.enabled, _service(config, "mqtt_bridge", Stage.CONNECTION, may_request=True)),
+        (services.autonomy_manager.enabled, _package(config, "autonomy_manager", Stage.CONNECTION, runs_scripts=True)),
+        (services.mqtt_bridge.enabled, _package(config, "mqtt_bridge", Stage.CONNECTION, may_request=True)),
         (mirror is not None, _service(config, "mqtt_mirror", Stage.CONNECTION)),
         (bool(services.av_daemon.sockets()), _service(config, "gstreamer_mirror", Stage.CONNECTION, preloaded=False)),
-        (services.soundboard_handler.enabled, _service(config, "soundboard_handler", Stage.CONNECTION)),
+        (services.soundboard_handler.enabled, _package(config, "soundboard_handler", Stage.CONNECTION)),
         (services.web_handler.enabled, _web_handler(config)),
         (services.neighbours.enabled, _service(config, "neighbours", Stage.CONNECTION, preloaded=False)),
         (services.recorder.enabled, _service(config, "recorder", Stage.CONNECTION, preloaded=False)),
@@ -74,33 +76,24 @@ def programs(config: Config) -> tuple[Program, ...]:
 
 
 def shared_modules(config: Config, table: Iterable[Program]) -> list[str]:
-    """The modules and packages to import before the first fork: what the programs run, and what several of them use."""
+    """The modules to import before the first fork: what the programs run, and what several of them use."""
     media = ["pebble.transports.frames", "pebble.media.sound"] if config.media_programs() else []
-    return [*_transport_modules(config), *media, *(program.module for program in table if program.preloaded)]
+    return [*_transport_modules(config), *media, *(one.entry or one.module for one in table if one.preloaded)]
 
 
 def preload(modules: Iterable[str]) -> None:
-    """Import ``modules``, and those inside packages: what is in memory before a fork, parent and children share.
+    """Import ``modules``: what is in memory before a fork, parent and children share.
 
     A module that cannot be imported is left to the process that runs it, which reports what is wrong.
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # else numpy starts threads, and no fork may follow
     for name in modules:
         try:
-            for part in _parts(name):
-                import_module(part)
+            import_module(name)
         except Exception:
             log.debug("%s cannot be imported", name, exc_info=True)
     gc.collect()
     gc.freeze()  # a collection writes into every object it visits, and a page that is written to is no longer shared
-
-
-def _parts(name: str) -> Iterator[str]:
-    """The module, and those inside it if it is a package."""
-    yield name
-    for found in walk_packages(getattr(import_module(name), "__path__", ()), f"{name}."):
-        if not found.name.endswith(".__main__"):
-            yield found.name
 
 
 def _transport_modules(config: Config) -> tuple[str, ...]:
@@ -122,6 +115,16 @@ def program_of(instance: str, name: str = "serial_mcu_bridge") -> str:
 def _service(config: Config, name: str, stage: Stage, instance: str = "", **more: Any) -> Program:
     arguments = (str(config.path), instance) if instance else (str(config.path),)
     return Program(program_of(instance, name), f"pebble.services.{name}", arguments, stage, **more)
+
+
+def _package(config: Config, name: str, stage: Stage, **more: Any) -> Program:
+    return _service(config, name, stage, entry=f"pebble.services.{name}.service", **more)
+
+
+def _serial_line(config: Config, instance: str, line: SerialBridge) -> Program:
+    """Its process imports the bridge of its protocol, not those of others."""
+    entry = SERIAL_PROTOCOLS[line.protocol].module
+    return _service(config, "serial_mcu_bridge", Stage.DEVICE, instance, entry=entry)
 
 
 def _av_daemon(config: Config) -> Program:

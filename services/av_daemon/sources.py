@@ -15,7 +15,6 @@ from pebble.services.av_daemon.libcamera import open_libcamera
 from pebble.services.av_daemon.source import Bytes, Capture, Source, opencv
 from pebble.services.av_daemon.synthetic import SyntheticCamera, SyntheticMicrophone
 from pebble.services.av_daemon.v4l2 import V4l2Camera
-from pebble.services.av_daemon.world_camera import WorldCamera
 from pebble.transports.frames.frame import picture
 
 Opener: TypeAlias = Callable[[], Source]
@@ -55,6 +54,8 @@ def chunk_bytes(options: AvDaemon) -> int:
 
 def _camera(options: AvDaemon, start: float) -> Source:
     if options.video.backend == "synthetic" and "#" in options.video.device:
+        from pebble.services.av_daemon.world_camera import WorldCamera  # only who needs it pays for it
+
         return WorldCamera(options.video, start)
     if options.video.backend == "synthetic":
         return SyntheticCamera(options.video, start)

@@ -2,18 +2,20 @@
 
 import logging
 import os
-import subprocess
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Final
+from typing import IO, TYPE_CHECKING, Final
 
 from pebble.config import MqttBridge, SystemControl
 from pebble.contract import GIT_PULL, REBOOT, SERVICE_RESTART, Channel
 from pebble.runtime.environment import child_environment
 from pebble.runtime.rate_limit import RateLimitedLog
+
+if TYPE_CHECKING:
+    import subprocess
 
 log = logging.getLogger(__name__)
 
@@ -76,6 +78,8 @@ class Action:
         return self._start()
 
     def _start(self) -> bool:
+        import subprocess  # 0.4 MB of every robot's memory, for a command that few robots run
+
         self._log.log("running", logging.WARNING, "%s: running its command", self.name)
         try:
             self._process = subprocess.Popen(
@@ -93,7 +97,7 @@ class Action:
         threading.Thread(target=self._follow, args=(self._process,), name=f"action {self.name}", daemon=True).start()
         return True
 
-    def _follow(self, process: subprocess.Popen[bytes]) -> None:
+    def _follow(self, process: "subprocess.Popen[bytes]") -> None:
         """Save the command's output, and log its exit code."""
         assert process.stdout is not None  # noqa: S101  (PIPE above)
         where = f"is in {self._output}"

@@ -148,6 +148,6 @@ class SerialService(Service, ABC):
 
 def bridge_of(config: Config) -> type[SerialService]:
     """Return the service class for the protocol in ``config``, which is the view of one instance."""
-    module, _, name = SERIAL_PROTOCOLS[config.services.serial_mcu_bridge.protocol].service.partition(":")
-    bridge: type[SerialService] = getattr(import_module(module), name)
+    protocol = SERIAL_PROTOCOLS[config.services.serial_mcu_bridge.protocol]
+    bridge: type[SerialService] = getattr(import_module(protocol.module), protocol.service.partition(":")[2])
     return bridge

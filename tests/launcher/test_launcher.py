@@ -456,6 +456,18 @@ CONTROLS = {
 
 
 MEDIA_MODULES = {"pebble.transports.frames", "pebble.media.sound"}
+#: Of a robot with a camera, a text protocol on its serial line, and the security level `open`.
+NEEDED = [
+    "numpy",
+    "pebble.runtime.process",
+    "pebble.services.mqtt_bridge.audit",
+    "pebble.services.serial_mcu_bridge.text.motor_bridge",
+]
+NOT_NEEDED = [
+    *("cv2", "av", "subprocess", "encodings.idna"),
+    "pebble.services.mqtt_bridge.stop_connection",
+    "pebble.services.serial_mcu_bridge.devices.described_bridge",
+]
 
 
 def _programs(devices: dict[str, Any], **bridge: Any) -> dict[str, Program]:
@@ -493,18 +505,19 @@ def test_there_are_media_for_what_there_is(devices: dict[str, Any], bridge: dict
 
 
 def test_the_launcher_of_a_robot_with_a_camera_imports_only_what_several_share_and_stays_single_threaded() -> None:
-    services = {"av_daemon": DEVICES, "mqtt_bridge": {"enabled": True, "remote_mqtt": {"host": "far"}}}
-    shared = shared_modules(_parsed(services=services), _programs(DEVICES).values())
+    bridge, line = {"enabled": True, "remote_mqtt": {"host": "far"}}, {"enabled": True, "serial": {"port": "/dev/x"}}
+    config = _parsed(services={"av_daemon": DEVICES, "mqtt_bridge": bridge, "serial_mcu_bridge": line})
+    shared = shared_modules(config, programs(config))
     assert {*shared} >= MEDIA_MODULES
     code = f"""
 import os, sys
 from pebble.launcher import launcher
 from pebble.launcher.programs import preload
 preload([*{shared}, "pebble.transports.mqtt.transport", "pebble.transports.zenoh.transport"])
-print([name for name in ("numpy", "cv2", "av") if name in sys.modules], len(os.listdir("/proc/self/task")))
+print([name for name in {(*NEEDED, *NOT_NEEDED)} if name in sys.modules], len(os.listdir("/proc/self/task")))
 """
     ran = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)
-    assert ran.stdout.strip() == "['numpy'] 1", ran.stderr
+    assert ran.stdout.strip() == f"{NEEDED} 1", ran.stderr
 
 
 def test_a_foreign_streaming_program_is_one_more_program_on_demand() -> None:

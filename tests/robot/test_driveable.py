@@ -95,6 +95,7 @@ def test_siblings_that_do_not_reach_each_other_are_noticed_until_they_do() -> No
         assert shows(rig, "yes")
 
 
+@pytest.mark.thorough  # in virtual time: tests/services/serial_mcu_bridge/test_silence.py
 def test_what_silence_means_depends_on_what_the_board_did_before(tmp_path: Path) -> None:
     board = Terminal(tmp_path)
     with Rig("mqtt", motors=board) as rig:

@@ -161,6 +161,7 @@ def test_malformed_messages(rig: Rig) -> None:
     assert all(lost[metric] < 0.05 * number for metric, number in expected.items() if metric not in _ACTIONS), lost
 
 
+@pytest.mark.thorough
 @pytest.mark.timeout(180)
 @pytest.mark.parametrize("rig", ["zenoh"], indirect=True)  # what reads the line knows nothing of transports
 def test_garbage_lines(rig: Rig) -> None:

@@ -1,4 +1,7 @@
-"""A stranger who signs as a script, on a whole robot: from outside, and where nothing stands between."""
+"""A stranger who signs as a script, on a whole robot: from outside, and where nothing stands between.
+
+tests/runtime/test_runs.py has the rule.
+"""
 
 from __future__ import annotations
 
@@ -51,6 +54,7 @@ def moves(rig: Rig) -> None:
     assert until(driven, 20), rig.log.read_text()
 
 
+@pytest.mark.thorough
 def test_the_next_script_drives_whatever_a_stranger_has_sent(rig: Rig) -> None:
     with rig:
         moves(rig)

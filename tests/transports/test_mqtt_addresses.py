@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import socket
 import subprocess
 import time
@@ -60,7 +61,11 @@ def names(monkeypatch: pytest.MonkeyPatch) -> Names:
 
     def give(*addresses: str, name: str = NAME) -> None:
         def resolve(host: Any, *more: Any, **options: Any) -> list[Any]:
-            return [info for one in (addresses if host == name else [host]) for info in real(one, *more, **options)]
+            return [
+                info
+                for one in (addresses if os.fsdecode(host) == name else [host])
+                for info in real(one, *more, **options)
+            ]
 
         monkeypatch.setattr(socket, "getaddrinfo", resolve)
 

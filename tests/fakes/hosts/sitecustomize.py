@@ -12,7 +12,7 @@ _real = socket.getaddrinfo
 
 
 def _getaddrinfo(host: Any, *arguments: Any, **options: Any) -> list[Any]:
-    return [info for one in _NAMES.get(host, [host]) for info in _real(one, *arguments, **options)]
+    return [info for one in _NAMES.get(os.fsdecode(host or ""), [host]) for info in _real(one, *arguments, **options)]
 
 
 socket.getaddrinfo = _getaddrinfo

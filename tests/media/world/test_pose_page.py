@@ -35,12 +35,14 @@ def path(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def busy_writer(path: Path) -> Iterator[Path]:
-    """A process that writes as fast as it can; sample ``ns`` can be checked."""
+def busy_writer(path: Path) -> Iterator[Child]:
+    """A process that writes as fast as it can, until it is killed; sample ``ns`` can be checked."""
     with Child([sys.executable, "-c", BUSY, str(path)]) as child:
-        yield path
-        child.kill()
-    path.unlink()
+        try:
+            assert until(lambda: readable(path), 60)
+            yield child
+        finally:
+            child.kill()
 
 
 def readable(path: Path) -> bool:
@@ -72,10 +74,10 @@ def test_the_page_remembers_more_than_a_second(path: Path) -> None:
     page.close()
 
 
-def test_no_sample_is_torn_under_a_busy_writer(busy_writer: Path) -> None:
+@pytest.mark.usefixtures("busy_writer")
+def test_no_sample_is_torn_under_a_busy_writer(path: Path) -> None:
     """Each reading has 64 samples of two robots."""
-    assert until(lambda: readable(busy_writer))
-    reader, samples, newest = PoseReader(busy_writer), 0, 0
+    reader, samples, newest = PoseReader(path), 0, 0
     while samples < 200_000:
         tracks = reader.tracks()
         for name, (a, b, c) in (("goob", (1, -1, 3)), ("fred", (5, 1, -1))):
@@ -120,11 +122,10 @@ def test_a_reader_notices_the_end_of_the_world_and_its_restart(path: Path) -> No
     page.close()
 
 
-def test_the_page_of_a_killed_program_is_taken_over(path: Path) -> None:
-    with Child([sys.executable, "-c", BUSY, str(path)]) as child:
-        assert until(lambda: readable(path))
-        reader = PoseReader(path)
-        child.kill()
+def test_the_page_of_a_killed_program_is_taken_over(busy_writer: Child, path: Path) -> None:
+    reader = PoseReader(path)
+    busy_writer.kill()
+    busy_writer.wait(10)
     assert reader.is_valid, "a killed program removes nothing"
     page = PosePage(path, ["goob"])
     assert not reader.is_valid
