@@ -86,7 +86,9 @@ def test_the_program_prints_what_its_relays_do(tmp_path: Path) -> None:
         assert until(lambda: host.received(wire.NACK))
         program.stdin.write(b"connect o2\n")
         program.stdin.flush()
-        assert until(lambda: [one for one in host.received(wire.STATE) if one.payload == b"\1\1\0"])
+        assert until(
+            lambda: [one for one in host.received(wire.STATE) if (one.interface, one.payload) == (4, b"\1\1\0")]
+        )
         host.send(wire.CMD, b"\1", interface=3)
         assert program.stdout.readline() == b"o2 on\n"
         host.close()
