@@ -17,7 +17,7 @@ from pebble.contract import ONLINE
 from pebble.transports import Message, MqttSettings, QoS, State, Transport, ZenohSettings, create
 from tests.support import until
 
-PERIOD_S, BEAT_S = 0.025, 0.25
+PERIOD_S, HEARTBEAT_S = 0.025, 0.25
 
 
 def connect(settings: dict[str, Any]) -> Transport:
@@ -54,10 +54,10 @@ def receive(client: Transport, topic: str, count: int, base: str) -> list[tuple[
 
     client.subscribe(topic, take, direct=True)
     report("up")
-    while not enough.wait(BEAT_S):
+    while not enough.wait(HEARTBEAT_S):
         if base:
-            beat = json.dumps({"t": int(time.time() * 1000)}).encode()
-            client.publish(ONLINE.topic(base), beat, qos=QoS.DELIVERED, retain=True)
+            heartbeat = json.dumps({"t": int(time.time() * 1000)}).encode()
+            client.publish(ONLINE.topic(base), heartbeat, qos=QoS.DELIVERED, retain=True)
     return received
 
 
