@@ -14,18 +14,21 @@ from pathlib import Path
 from typing import Any
 
 from pebble.contract import ONLINE
-from pebble.transports import Message, MqttSettings, QoS, State, Transport, ZenohSettings, create
+from pebble.transports import Message, MqttSettings, QoS, State, TlsSettings, Transport, ZenohSettings, create
 from tests.support import until
 
-PERIOD_S, BEAT_S = 0.025, 0.25
+PERIOD_S, HEARTBEAT_S = 0.025, 0.25
 
 
 def connect(settings: dict[str, Any]) -> Transport:
     if "port" in settings:
         client = create("mqtt", "far", MqttSettings(host=settings["host"], port=settings["port"]))
     else:
-        run_dir = Path(settings["run_dir"])
-        client = create("zenoh", "far", ZenohSettings(run_dir=run_dir, connect=(settings["connect"],), client=True))
+        tls = TlsSettings(**{key: Path(one) for key, one in settings["tls"].items() if key != "enabled"})
+        at_hub = {"connect": tuple(settings["connect"]), "account": settings["account"], "tls": tls, "client": True}
+        client = create(
+            "zenoh", f"{settings['account']}-far", ZenohSettings(run_dir=Path(settings["run_dir"]), **at_hub)
+        )
     client.open(20)
     assert until(lambda: client.state is State.CONNECTED, 20), client.problem
     return client
@@ -54,10 +57,10 @@ def receive(client: Transport, topic: str, count: int, base: str) -> list[tuple[
 
     client.subscribe(topic, take, direct=True)
     report("up")
-    while not enough.wait(BEAT_S):
+    while not enough.wait(HEARTBEAT_S):
         if base:
-            beat = json.dumps({"t": int(time.time() * 1000)}).encode()
-            client.publish(ONLINE.topic(base), beat, qos=QoS.DELIVERED, retain=True)
+            heartbeat = json.dumps({"t": int(time.time() * 1000)}).encode()
+            client.publish(ONLINE.topic(base), heartbeat, qos=QoS.DELIVERED, retain=True)
     return received
 
 

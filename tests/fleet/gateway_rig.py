@@ -99,13 +99,13 @@ class Process:
 
 
 class World:
-    """One client stands for all robots where there are ``many``, and each is driven twice a second."""
+    """One client stands for all robots where there are ``many``, and each is driven once a second."""
 
     def __init__(
         self, folder: Path, stack: ExitStack, gateways: int, robots: int, *, proxied: bool, many: bool = False
     ) -> None:
         self._folder = folder
-        self._hz, self._heartbeat_each = (2, 1) if many else (COMMANDS_HZ, HEARTBEAT_EACH)
+        self._hz, self._heartbeat_each = (1, 1) if many else (COMMANDS_HZ, HEARTBEAT_EACH)
         self.broker = Broker(folder, "max_queued_messages 20000")
         stack.callback(self.broker.kill)
         self.hub_port = free_port()

@@ -156,16 +156,16 @@ def test_its_own_cable_is_pulled(lan: Lan) -> None:
         assert until(lambda: lan.board.moving("minilamp"), 10)
         lan.cable.blackhole()
         pulled = time.monotonic()
-        assert until(lambda: not lamp.online, 10), "goob's script is told"
-        told = time.monotonic() - pulled
+        assert until(lambda: not lamp.online, 10), "goob's script knows it"
+        away = time.monotonic() - pulled
         assert until(lambda: not lan.board.moving("minilamp"), 5)
         rests = lan.board.stopped_at("minilamp") - pulled
-        time.sleep(CABLE_S - told)
+        time.sleep(CABLE_S - away)
         lan.cable.resume()
         mended = time.monotonic()
         assert until(lambda: lan.board.moving("minilamp"), 30), "the same run goes on"
         back = time.monotonic() - mended
-    sys.stdout.write(f"\nthe board's cable: {json.dumps({'rests s': rests, 'told s': told, 'back s': back})}\n")
+    sys.stdout.write(f"\nthe board's cable: {json.dumps({'rests s': rests, 'known s': away, 'back s': back})}\n")
     assert (rests <= STOP_S, back <= BACK_S) == (True, True)
 
 

@@ -81,37 +81,55 @@ def test_a_gateway_in_six_commands(tmp_path: Path) -> None:
         assert until(carried, 60), (robot.problem, (tmp_path / "simulation.log").read_text())
 
 
-def test_two_robots_of_a_lan_receive_each_other_in_six_commands(tmp_path: Path) -> None:
-    hub = free_port()
-    section = Section("neighbours.md", "goob drives fred", {"0.0.0.0:7447": f"127.0.0.1:{hub}", "hub.lab": "127.0.0.1"})
+def test_two_robots_of_a_lan_receive_each_other_in_six_commands_and_a_board_in_six_more(tmp_path: Path) -> None:
+    hub, port = free_port(), free_port()
+    here = {"0.0.0.0:7447": f"127.0.0.1:{hub}", "hub.lab": "127.0.0.1", "8883": str(port)}
+    section, more = Section("neighbours.md", "goob drives fred", here), Section("fleet.md", "A LAN with boards", here)
     init, *accounts, start_hub, up_goob, up_fred = section.lines
-    run(init, tmp_path)
-    for line, name in zip(accounts, ("goob.json", "fred.json"), strict=True):
-        (printed,) = re.findall(r"^\{.*^\}", run(line, tmp_path).replace("7447", str(hub)), re.DOTALL | re.MULTILINE)
+    run(f"{init} --port {port}", tmp_path)
+    listens = {"goob.json": {"listens": {"minilamp": ["online"]}}, "fred.json": {}}
+    for line, name in zip(accounts, listens, strict=True):
         piece: dict[str, Any] = json.loads(section.files[name].replace('"lan": {…}', '"enabled": true'))
-        (tmp_path / name).write_text(json.dumps(deep_merge(json.loads(printed), {"services": piece, **ZENOH})))
+        services = deep_merge({"services": piece}, {"services": {"neighbours": listens[name]}})
+        (tmp_path / name).write_text(json.dumps(deep_merge(printed(line, tmp_path, hub), {**services, **ZENOH})))
+    broker, *accounts, start_gateway, start_board = more.lines
     (tmp_path / "hub.json").write_text(section.files["hub.json"])
-    for file in (tmp_path / "lan" / certificates.CA_CERT, *(tmp_path / "lan" / certificates.ACCOUNTS).iterdir()):
-        shutil.copy(file, tmp_path)
-    with ExitStack() as stack:
-        for line in (start_hub, up_goob, up_fred):
-            start(line, tmp_path, hub, stack)
-        assert until(lambda: '"receives":{"fred":true}' in pebble(RECEIVES, tmp_path).stdout, 60)
-
-
-def test_a_lan_with_a_board_in_six_commands(tmp_path: Path) -> None:
-    port, hub = free_port(), free_port()
-    here = {f"{host}:7447": f"127.0.0.1:{hub}" for host in ("hub.lab", "0.0.0.0", "127.0.0.1")}
-    section = Section("fleet.md", "A LAN with boards", {**here, "listener 1883": f"listener {port} 127.0.0.1"})
-    broker, start_hub, *programs = section.lines
-    for name, body in section.files.items():
-        body = body.replace('"host": "hub.lab"', '"host": "127.0.0.1"')
-        (tmp_path / name).write_text(body.replace('"host": "127.0.0.1"', f'"host": "127.0.0.1", "port": {port}'))
     with ExitStack() as stack:
         stack.enter_context(mosquitto(tmp_path / broker.split()[2], port))
-        for line in (start_hub, *programs):
-            start(line, tmp_path, hub, stack)
+        board, gateway, neighbour = (run(line, tmp_path) for line in accounts)
+        lan = json.dumps(piece_in(neighbour, hub)["services"]["neighbours"]["lan"])
+        lamp = deep_merge(json.loads(more.files["minilamp.json"]), piece_in(board, hub))
+        lamp["local_mqtt"]["tls"]["ca_cert"] = f"lan/{certificates.CA_CERT}"
+        files = {
+            "lan-1-password": PASSWORD.findall(gateway)[0],
+            "lan-1.json": more.files["lan-1.json"].replace("{…}", lan),
+            "minilamp.json": json.dumps(lamp),
+        }
+        for name, body in files.items():
+            (tmp_path / name).write_text(body)
+            (tmp_path / name).chmod(0o600)
+        for file in (tmp_path / "lan" / certificates.CA_CERT, *(tmp_path / "lan" / certificates.ACCOUNTS).iterdir()):
+            shutil.copy(file, tmp_path)
         began = time.monotonic()
-        both = '"receives":{"fred":true,"minilamp":true}'
-        assert until(lambda: both in pebble(RECEIVES, tmp_path).stdout, 60), (tmp_path / "simulation.log").read_text()
+        for line in (start_hub, up_goob, up_fred, start_gateway, start_board):
+            start(line, tmp_path, hub, stack)
+        both = {"fred": True, "minilamp": True}
+        assert until(lambda: received(tmp_path) == both, 60), (tmp_path / "simulation.log").read_text()
         sys.stdout.write(f"\ngoob receives fred and the board after {time.monotonic() - began:.1f} s\n")
+
+
+def received(folder: Path) -> dict[str, bool]:
+    """Whom goob receives now."""
+    shown = pebble(RECEIVES, folder).stdout
+    return dict(json.loads(shown)["receives"]) if shown else {}
+
+
+def printed(line: str, folder: Path, hub: int) -> dict[str, Any]:
+    return piece_in(run(line, folder), hub)
+
+
+def piece_in(shown: str, hub: int) -> dict[str, Any]:
+    """The piece of a config that a command has printed, with the port of this test's hub."""
+    (piece,) = re.findall(r"^\{.*^\}", shown.replace("7447", str(hub)), re.DOTALL | re.MULTILINE)
+    found: dict[str, Any] = json.loads(piece)
+    return found

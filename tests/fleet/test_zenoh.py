@@ -152,8 +152,8 @@ def test_each_account_reads_what_it_may_and_nothing_else(hall: Hall) -> None:
     """Also what is retained, and whatever it subscribes to."""
     public = {STATE, FLAG}
     everything = {*public, DRIVE, NAMED}
-    expected = dict.fromkeys(NAMES, public) | {"goob": everything, "gate": everything, "fred": set(), "lamp": set()}
-    expected["lan"] = {STATE}
+    expected = dict.fromkeys(NAMES, public) | {"goob": everything, "gate": everything, "lan": {STATE}}
+    expected |= {name: set() for name in ("fred", "lamp", "near")}
     found = {}
     for topic in public:
         hall.eye.publish(topic, b"before", qos=QoS.DELIVERED, retain=True)

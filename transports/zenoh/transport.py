@@ -273,10 +273,10 @@ class ZenohTransport(Transport):
         """Store the will at the hub and send what the hub lacks, until it lacks nothing that it has room for."""
         end = time.monotonic() + HUB_ANSWER_S
         sent: set[str] = set()
-        while time.monotonic() < end:
-            with self._publishing:
+        while (left := end - time.monotonic()) > 0:  # looked at once: Zenoh refuses what is not positive
+            with self._publishing:  # which takes a moment on a busy machine
                 hello = self._hub.hello(session)
-            lacking = self._hub.greet(session, hello, end - time.monotonic())
+            lacking = self._hub.greet(session, hello, left)
             if lacking is None:
                 return False
             if not self._send_lacking(session, lacking - sent):  # it had no room for what it lacks again
