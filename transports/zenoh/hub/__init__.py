@@ -34,11 +34,12 @@ from pebble.transports.zenoh.access import Access, read_access
 from pebble.transports.zenoh.callbacks import direct
 from pebble.transports.zenoh.hub.admission import Admission
 from pebble.transports.zenoh.hub.history import History
+from pebble.transports.zenoh.hub.intake import Intake
 from pebble.transports.zenoh.hub.journal import Journal
 from pebble.transports.zenoh.hub.mesh import Mesh
-from pebble.transports.zenoh.hub.records import Record, Retained, StoredWill, robot_of
-from pebble.transports.zenoh.hub.store import OVERHEAD, HubStore
-from pebble.transports.zenoh.hub.turns import Places, Task, Turns
+from pebble.transports.zenoh.hub.records import Record, Retained, StoredWill
+from pebble.transports.zenoh.hub.store import HubStore
+from pebble.transports.zenoh.hub.turns import Task
 from pebble.transports.zenoh.hub.waiting import WaitingQueries
 from pebble.transports.zenoh.hub.wills import STILL_S, WillTimes
 from pebble.transports.zenoh.keymap import topic_to_key
@@ -47,12 +48,6 @@ from pebble.transports.zenoh.session import HUB_SOCKET, close_at_exit, close_ses
 
 log = logging.getLogger(__name__)
 
-ASKED = 2000  # queries that wait for the hub's thread; beyond it …
-SENDERS = 8  # … their senders wait, each connection in its turn; more would take the threads that receive stops
-HELLOS = 8  # of one account that wait
-ASKED_BYTES = 128 << 10  # of one hello, some 2,000 retained topics, or query
-RETAINING_BYTES = 1 << 20  # of retained messages of one robot that wait; beyond it their senders wait, as above
-COMING = 100  # sessions of one account that come or go; the same
 _SENT_S = 0.1  # a will has left by then; what a session that is closed has to send reaches some and not others
 _LOOK_S = 0.25  # a hub among others looks so often whether it stood still
 
@@ -230,20 +225,15 @@ class HubWorker:
     def __init__(
         self, name: str, store: HubStore, admission: Admission, journal: Journal | None, counters: Counters
     ) -> None:
-        self._name, self._store, self._journal, self._counters = name, store, journal, counters
-        self._admission = admission
+        self._store, self._journal, self._counters, self._admission = store, journal, counters, admission
         self._recalled = False  # the records of the journal
         self.alive_clients: set[str] = set()
         self._wills = WillTimes(name)
         self._mesh = Mesh(name, self, self._wills)
-        self._token: zenoh.LivelinessToken | None = None  # clients ask a hub when its token appears
-        self._renewals = 0
-        self._waiting = WaitingQueries()
-        self._turns = Turns()
-        self._asking, self._greeting = Places(ASKED, SENDERS), Places(HELLOS)
-        self._retaining, self._coming = Places(RETAINING_BYTES, SENDERS), Places(COMING, SENDERS)
+        self._token = _Token(name)
+        self._waiting, self._intake = WaitingQueries(), Intake()
         self._session: zenoh.Session | None = None
-        self._publishing, self._holds, self._published = threading.Lock(), False, float("-inf")
+        self._pause_of_wills = _PauseOfWills()
         self._thread = threading.Thread(target=self._run, name="pebble-hub", daemon=True)
         if journal is not None:
             self._write_journal(journal)
@@ -256,18 +246,20 @@ class HubWorker:
         """Serve the clients of ``session`` instead of those of the one before, which is closed."""
         if self._session is not None:
             self.post(self._await_return)
-        self._session, self._holds = session, False
+        self._session = session
+        self._pause_of_wills.end()
         # Its own messages would wait for room in the queue that this thread empties.
-        others, retain = zenoh.Locality.REMOTE, direct(self._retain)
+        others, retain = zenoh.Locality.REMOTE, direct(partial(self._intake.retain, self._store_retained))
         session.declare_subscriber(wire.RETAINED + "**", retain, allowed_origin=others)
-        session.declare_queryable(wire.RETAINED + "**", direct(self._ask), complete=True)
+        session.declare_queryable(wire.RETAINED + "**", direct(partial(self._intake.ask, self._query)), complete=True)
         for what, work in ((wire.HELLO, self._on_hello), (wire.BYE, self._on_bye)):
             session.declare_queryable(what, self._queued(work))
-            session.declare_queryable(f"{what}/*", direct(partial(self._greeted, work)))
-        session.liveliness().declare_subscriber(wire.LIVE + "*", direct(self._come), history=True)
+            session.declare_queryable(f"{what}/*", direct(partial(self._intake.greet, work)))
+        come = direct(partial(self._intake.come, self._on_client))
+        session.liveliness().declare_subscriber(wire.LIVE + "*", come, history=True)
         if self._store.has_history:
             self._mesh.serve(session, self._queued)
-        self._token = session.liveliness().declare_token(wire.UP + self._name)
+        self._token.declare(session)
         if not self._thread.is_alive():
             self._thread.start()
 
@@ -277,13 +269,11 @@ class HubWorker:
 
     def hold_wills(self) -> None:
         """Publish no will before the next session: hubs that did not get it of this one would publish it, too."""
-        with self._publishing:
-            self._holds = True
-        time.sleep(max(0.0, self._published + _SENT_S - time.monotonic()))
+        self._pause_of_wills.begin()
 
     def close(self) -> None:
         if self._thread.is_alive():
-            self._turns.end()
+            self._intake.end()
             self._thread.join(5)
         self._waiting.drop()
         if self._journal is not None:
@@ -296,65 +286,12 @@ class HubWorker:
 
     def post(self, task: Task) -> None:
         """Do ``task`` on the hub's thread."""
-        self._turns.put(task)
-
-    def _retain(self, sample: zenoh.Sample) -> None:
-        """Have a message stored, in the room that waiting ones of its robot have: others come in between."""
-        name = robot_of(str(sample.key_expr).removeprefix(wire.RETAINED))
-        size = OVERHEAD + len(sample.payload)
-
-        def work() -> None:
-            self._retaining.leave(name, size)
-            self._store_retained(sample)
-
-        if self._retaining.take(name, size):
-            self.post(work)
-
-    def _come(self, sample: zenoh.Sample) -> None:
-        """Note that a client is there, or is gone; those of an account in the room that it has."""
-        account, of, _ = str(sample.key_expr).removeprefix(wire.LIVE).partition(wire.OF)
-
-        def work() -> None:
-            if of:
-                self._coming.leave(account)
-            self._on_client(sample)
-
-        if not of or self._coming.take(account):
-            self.post(work)
-
-    def _ask(self, query: zenoh.Query) -> None:
-        """Have a query for retained messages answered, which holds its place until then."""
-        if _admits(query, self._asking, ""):
-            self._in_turn(self._query, query)
-
-    def _in_turn(self, work: Callable[[zenoh.Query], None], query: zenoh.Query) -> None:
-        """Do ``work`` in turn with queries for other keys, as a hub is not told who asks; unless it waited too long."""
-        came = time.monotonic()
-
-        def turn() -> None:
-            if time.monotonic() - came < wire.RETAINED_ANSWER_S:
-                work(query)
-            else:
-                query.drop()  # type: ignore[no-untyped-call]
-                self._asking.leave()
-
-        self._turns.ask("queries", str(query.key_expr), turn)
-
-    def _greeted(self, work: Callable[[zenoh.Query], None], query: zenoh.Query) -> None:
-        """Queue the hello or goodbye of an account."""
-        account = str(query.key_expr).rpartition("/")[2]
-
-        def greet() -> None:
-            self._greeting.leave(account)
-            work(query)
-
-        if _admits(query, self._greeting, account):
-            self._turns.ask("hellos", account, greet)
+        self._intake.put(task)
 
     def _run(self) -> None:
         turn = clock.since_boot()
         while True:
-            if (task := self._turns.take(self._pause())) is None:
+            if (task := self._intake.take(self._pause())) is None:
                 return
             before, turn = turn, clock.since_boot()
             if self._wills.met_others and turn - before > _LOOK_S + STILL_S:
@@ -379,7 +316,7 @@ class HubWorker:
 
     def _pause(self) -> float | None:
         now = time.monotonic()
-        pauses = [_NEVER if self._holds else self._wills.next_due - now]
+        pauses = [_NEVER if self._pause_of_wills.is_on else self._wills.next_due - now]
         pauses.append(self._waiting.due(self._mesh.merging_until) - now)
         if self._journal is not None:
             pauses.append(self._journal.wait_s)
@@ -404,7 +341,7 @@ class HubWorker:
             needs = wire.decode_counts(_payload(query))
         except (ValueError, msgspec.DecodeError):
             query.drop()  # type: ignore[no-untyped-call]
-            self._asking.leave()
+            self._intake.answered()
             raise
         now = time.monotonic()
         if not self._waiting.add(needs, query, now, merging=now < self._mesh.merging_until):
@@ -414,10 +351,10 @@ class HubWorker:
         now = time.monotonic()
         if now >= self._mesh.merging_until:
             for query in self._waiting.take(now):
-                self._in_turn(self._answer, query)
+                self._intake.in_turn(self._answer, query)
 
     def _answer(self, query: zenoh.Query) -> None:
-        self._asking.leave()
+        self._intake.answered()
         with query:
             for retained in self._selected(query.key_expr):
                 query.reply(wire.RETAINED + retained.key, retained.payload, attachment=retained.stamp.pack())
@@ -485,10 +422,11 @@ class HubWorker:
             self._wills.on_gone(name, time.monotonic())
 
     def _publish_due_wills(self) -> None:
-        with self._publishing:
-            for name, is_successor in () if self._holds else self._wills.take_due(time.monotonic()):
+        pause = self._pause_of_wills
+        with pause.lock:
+            for name, is_successor in () if pause.is_on else self._wills.take_due(time.monotonic()):
                 if (will := self._store.will(name)) is not None:
-                    self._published = time.monotonic()
+                    pause.published_at = time.monotonic()
                     self._do(partial(self._publish_due_will, name, will, is_successor=is_successor))
 
     def _publish_due_will(self, name: str, will: wire.Will, *, is_successor: bool) -> None:
@@ -531,22 +469,8 @@ class HubWorker:
         return changed
 
     def ask_again(self, *, merge: bool = False) -> None:
-        """Have all clients ask what is retained here, as if a hub had just come: it takes a further name.
-
-        The new one is there before the old one goes, so no client is without a hub for a moment. ``merge``: it goes
-        first, so that other hubs compare with this one again.
-        """
-        session, before = self._session, self._token
-        if session is None or before is None:
-            return
-        if merge:
-            before.undeclare()  # type: ignore[no-untyped-call]
-        self._renewals += 1
-        name = f"{self._name}{wire.RENEWAL}{self._renewals}"
-        session.declare_queryable(wire.SYNC + name, direct(partial(_answer_nothing, wire.SYNC + name)))
-        self._token = session.liveliness().declare_token(wire.UP + name)
-        if not merge:
-            before.undeclare()  # type: ignore[no-untyped-call]
+        """Have all clients ask what is retained here, as if a hub had just come; see :meth:`_Token.renew`."""
+        self._token.renew(merge=merge)
 
     def _write_journal(self, journal: Journal) -> None:
         """Write all records anew, together with those of an earlier hub: these are read once, as soon as they can be.
@@ -596,18 +520,57 @@ def _renewed(tls: TlsSettings) -> Renewed[Any]:
     return renewed_context(tls)
 
 
+class _Token:
+    """Clients ask a hub what is retained there as soon as its token appears: its name, or a further one of it."""
+
+    def __init__(self, name: str) -> None:
+        self._name, self._renewals = name, 0
+        self._session: zenoh.Session | None = None
+        self._token: zenoh.LivelinessToken | None = None
+
+    def declare(self, session: zenoh.Session) -> None:
+        self._session = session
+        self._token = session.liveliness().declare_token(wire.UP + self._name)
+
+    def renew(self, *, merge: bool) -> None:
+        """Take a further name, which is there before the old one goes: no client is without a hub for a moment.
+
+        ``merge``: the old one goes first, so that other hubs compare with this one again.
+        """
+        session, before = self._session, self._token
+        if session is None or before is None:
+            return
+        if merge:
+            before.undeclare()  # type: ignore[no-untyped-call]
+        self._renewals += 1
+        name = f"{self._name}{wire.RENEWAL}{self._renewals}"
+        session.declare_queryable(wire.SYNC + name, direct(partial(_answer_nothing, wire.SYNC + name)))
+        self._token = session.liveliness().declare_token(wire.UP + name)
+        if not merge:
+            before.undeclare()  # type: ignore[no-untyped-call]
+
+
+class _PauseOfWills:
+    """No will is published between two sessions."""
+
+    def __init__(self) -> None:
+        self.lock = threading.Lock()  # while wills are published
+        self.is_on = False
+        self.published_at = float("-inf")  # the last one
+
+    def begin(self) -> None:
+        with self.lock:
+            self.is_on = True
+        time.sleep(max(0.0, self.published_at + _SENT_S - time.monotonic()))
+
+    def end(self) -> None:
+        self.is_on = False
+
+
 def _answer_nothing(key: str, query: zenoh.Query) -> None:
     """A hub has sent no retained messages of its own."""
     with query:
         query.reply(key, wire.pack_count(0))
-
-
-def _admits(query: zenoh.Query, places: Places, name: str) -> bool:
-    """Whether there is a place for a query that is short enough; else it is answered with nothing."""
-    admitted = (query.payload is None or len(query.payload) <= ASKED_BYTES) and places.take(name)
-    if not admitted:
-        query.drop()  # type: ignore[no-untyped-call]
-    return admitted
 
 
 def _payload(query: zenoh.Query) -> bytes:
