@@ -20,7 +20,7 @@ from pebble.transports.clock import since_boot as clock
 from pebble.web import messages as m
 from pebble.web import robot_commands
 from pebble.web.access.login import named, printable
-from pebble.web.driving import Tab
+from pebble.web.drive.driving import Tab
 from pebble.web.log_lines import LogReader
 from pebble.web.pace import STOP_WAITS_S, Pace
 from pebble.web.page_clock import PING_S, ClockJumpError

@@ -29,9 +29,10 @@ from pebble.runtime.by_name import ByName
 from pebble.transports import Message
 from pebble.transports.clock import since_boot as clock
 from pebble.web import messages as m
-from pebble.web.controls import Controls
-from pebble.web.driven_here import DrivenHere
-from pebble.web.driving import Command, Driving, Tab
+from pebble.web.drive.controls import Controls
+from pebble.web.drive.driven_here import DrivenHere
+from pebble.web.drive.driving import Command, Driving, Tab
+from pebble.web.drive.refusals import Refusals
 from pebble.web.gateways import Gateways
 from pebble.web.known_robots import SavedRobots
 from pebble.web.media.chosen_sources import ChosenSources
@@ -41,7 +42,6 @@ from pebble.web.media.robot_streams import OwnHosts
 from pebble.web.media.sound import SoundHub
 from pebble.web.open_components import OpenComponents
 from pebble.web.pace import STOP_WAITS_S, Pace
-from pebble.web.refusals import Refusals
 from pebble.web.robot_audits import RobotAudits
 from pebble.web.robots import Robots
 from pebble.web.stops import Stops

@@ -22,7 +22,7 @@ def mutated(mutation: Mutation) -> Iterator[Path]:
 
 
 _DRIVING, _CLOCK, _SERVER, _CONTROLS = (
-    f"pebble.web.{name}" for name in ("driving", "page_clock", "server", "controls")
+    f"pebble.web.{name}" for name in ("drive.driving", "page_clock", "server", "drive.controls")
 )
 _DRIVER, _INPUTS, _GESTURE, _REASONS, _SOCKET = (
     f"core/{name}.js" for name in ("driver", "inputs", "gesture", "reasons", "control-socket")

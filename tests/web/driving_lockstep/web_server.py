@@ -18,7 +18,8 @@ from pebble.contract import DRIVE, codec
 from pebble.fleet.roles import Role, Session
 from pebble.transports import MqttSettings
 from pebble.transports import clock as message_clock
-from pebble.web import control, refusals, robots, server
+from pebble.web import control, robots, server
+from pebble.web.drive import refusals
 from tests.robot.lockstep.network import Connection, Network
 from tests.robot.lockstep.processes import Process
 from tests.web.driving_lockstep.pages import EPOCH
