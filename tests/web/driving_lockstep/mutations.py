@@ -21,8 +21,8 @@ def mutated(mutation: Mutation) -> Iterator[Path]:
             yield CORE
 
 
-_DRIVING, _CLOCK, _SERVER, _CONTROLS = (
-    f"pebble.web.{name}" for name in ("drive.driving", "page_clock", "server", "drive.controls")
+_DRIVING, _CLOCK, _DRIVERS, _CONTROLS = (
+    f"pebble.web.{name}" for name in ("drive.driving", "page_clock", "drive.drivers", "drive.controls")
 )
 _DRIVER, _INPUTS, _GESTURE, _REASONS, _SOCKET = (
     f"core/{name}.js" for name in ("driver", "inputs", "gesture", "reasons", "control-socket")
@@ -72,7 +72,7 @@ MUTATIONS = {
         "        lease = self.leases.get(op.ref)\n        if lease is None:\n",
     ),
     "a lost connection stops nothing": Mutation(
-        _SERVER, "            self.publish(end(tab, clock()))\n", "            end(tab, clock())\n"
+        _DRIVERS, "            self._publish(end(tab, now))\n", "            end(tab, now)\n"
     ),
     "zeros are not forwarded": Mutation(
         _DRIVING,
