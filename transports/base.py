@@ -257,7 +257,6 @@ class Transport(ABC):
         self._subscriptions = Subscriptions()
         self._publishing = threading.RLock()  # one publish at a time: the order of calls is the order per topic (T3)
         self._own = OwnRetained(self.counters)
-        self._syncing = False  # guarded by _publishing
 
     # -- what services call
 
@@ -454,18 +453,13 @@ class Transport(ABC):
     def _sync_retained(self, known: Collection[str]) -> None:
         """Send the pending retained messages, then our others that are not in ``known`` (T9)."""
         with self._publishing:
-            self._syncing = True
-            try:
-                for message in self._own.to_send(known):
-                    self._own.remember(message, sent=self._send(message, False))
-            finally:
-                self._syncing = False
+            self._own.send_again(known, lambda message: self._send(message, False))
 
     def _initial_sync(self, known: Collection[str]) -> None:
         """Finish a new connection that has its subscriptions: send the retained messages it lacks, and be connected.
 
-        Until then the ``_send`` of a backend that calls this accepts messages only while ``_syncing``: retained ones
-        that are published meanwhile are pending, and sent last.
+        Until then the ``_send`` of a backend that calls this accepts messages only while ``_own.syncing``: retained
+        ones that are published meanwhile are pending, and sent last.
         """
         self._sync_retained(known)
         self._set_state(State.CONNECTED)

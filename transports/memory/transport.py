@@ -149,7 +149,7 @@ class MemoryTransport(Transport):
 
     def _send(self, message: Message, urgent: bool) -> bool:  # noqa: ARG002  (nothing to overtake)
         with self._hub.lock:
-            if not (self._present and (self._state is State.CONNECTED or self._syncing)):
+            if not (self._present and (self._state is State.CONNECTED or self._own.syncing)):
                 return False
             self._hub.distribute(message, self)
             return True
