@@ -177,7 +177,7 @@ class WebServer(Process):
         def announced(server: str, robots: dict[str, Any], now: float) -> Any:
             for ref, (_, _, since_ms) in robots.items():
                 lease = driving.leases.get(ref)
-                if lease is not None and (lease.since_ms, driving._server) < (since_ms, server):
+                if lease is not None and (lease.since_ms, driving.server) < (since_ms, server):
                     self.lease_moved(lease.tab)
             return take(server, robots, now)
 

@@ -85,7 +85,7 @@ class Mesh:
         self._names: dict[str, set[str]] = {}  # under which each other hub is there
         self._compared: dict[str, float] = {}  # when another hub got our table
         self._taken: dict[str, int] = {}  # values of another hub, in the parts so far
-        self._routers: set[str] = set()  # hubs that this one has a connection to, by Zenoh's ids
+        self.routers: set[str] = set()  # hubs that this one has a connection to, by Zenoh's ids
         # Two that miss each other do not begin anew at one instant.
         self._patience_s = CUT_S * random.uniform(1, 2)  # noqa: S311  (not a secret)
         self._whole_at = time.monotonic()  # when it last saw as many hubs as it has connections to
@@ -101,7 +101,7 @@ class Mesh:
 
         self._session = session
         self._names.clear()
-        self._hub.post(self._routers.clear)
+        self._hub.post(self.routers.clear)
         others = zenoh.Locality.REMOTE
         session.declare_subscriber(wire.PUBLISHED, queued(self._on_published), allowed_origin=others)
         session.declare_queryable(wire.MERGE + self._name, queued(self._on_merge))
@@ -118,7 +118,7 @@ class Mesh:
         (measured: once in some ten times, in one direction of one connection, which it had not lost).
         """
         now = time.monotonic()
-        if len(self._wills.hubs) >= len(self._routers) or not self._wills.met_others:  # a router may be no hub of ours
+        if len(self._wills.hubs) >= len(self.routers) or not self._wills.met_others:  # a router may be no hub of ours
             self._whole_at = now
         times = self._renewed_at
         if now - self._whole_at < self._patience_s or (len(times) == RENEWALS and now - times[0] < RENEWALS_S):
@@ -172,7 +172,7 @@ class Mesh:
         present, session = event.kind == zenoh.SampleKind.PUT, str(event.transport.zid)
         self._wills.on_link(session, time.monotonic(), present=present)
         if event.transport.whatami == zenoh.WhatAmI.ROUTER:
-            (self._routers.add if present else self._routers.discard)(session)
+            (self.routers.add if present else self.routers.discard)(session)
 
     def _on_published(self, sample: zenoh.Sample) -> None:
         name = wire.decode_name(sample.payload.to_bytes())
