@@ -210,7 +210,7 @@ class Server:
         refresh_at = 0.0
         while True:
             await asyncio.sleep(TICK_S)
-            with _logged():
+            try:
                 self.broker.deliver()
                 now = clock()
                 self.drivers.tick(now)
@@ -223,6 +223,10 @@ class Server:
                     self._remember_robots()
                     self.robot_audits.tick(now)
                 self.drivers.announce(now)
+            except (
+                Exception
+            ):  # one faulty round must not end all later ones, on which the end of silent gestures depends
+                log.exception("a round of the server failed")
 
     async def _watch_people(self) -> None:
         """A person who is removed is out soon, though each page looks after its session rarely."""
@@ -256,19 +260,6 @@ def _is_base(ref: str) -> bool:
     with suppress(ConfigError):
         return Identity(*levels).base == ref
     return False
-
-
-class _logged:  # noqa: N801 - used like a function
-    """One faulty round must not end all later ones, on which the end of silent gestures depends."""
-
-    def __enter__(self) -> None:
-        return None
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _tb: object) -> bool:
-        if isinstance(error, Exception):
-            log.error("a round of the server failed", exc_info=error)
-            return True
-        return False
 
 
 def encode(message: m.ToPage) -> str:
