@@ -221,7 +221,8 @@ class Mesh:
     def _ask_table(self, session: zenoh.Session, name: str) -> merge.Table | None:
         """The parts of its table as one; None: it does not answer."""
         for _ in range(ASKED):
-            parts = [merge.decode_table(data) for data in _ask(session, wire.MERGE + name, self._name.encode(), ASK_S)]
+            answers = wire.ask(session, wire.MERGE + name, self._name.encode(), ASK_S)
+            parts = [merge.decode_table(data) for data in answers]
             if parts:
                 if parts.pop().rows:
                     raise ValueError("its table was cut off")
@@ -261,7 +262,7 @@ class Mesh:
             older = {key: age_s + waited for key, age_s in some.items()}
             want, forget = (decided.want, decided.they_forget) if last else ([], None)
             asked = merge.encode(merge.Exchange(self._name, want, give, older, forget))
-            answers = [merge.decode_values(data) for data in _ask(session, wire.MERGE + name, asked, VALUES_S)]
+            answers = [merge.decode_values(data) for data in wire.ask(session, wire.MERGE + name, asked, VALUES_S)]
             if not answers or answers.pop():
                 raise ValueError("its answer was cut off")
             got += chain.from_iterable(answers)
@@ -358,16 +359,3 @@ def _named(token: zenoh.Sample) -> tuple[str, str]:
 
 def _size(value: merge.Value) -> int:
     return len(value.payload)
-
-
-def _ask(session: zenoh.Session, key: str, payload: bytes, timeout: float) -> list[bytes]:
-    replies = session.get(
-        key,
-        zenoh.handlers.FifoChannel(256),
-        target=zenoh.QueryTarget.ALL,
-        consolidation=zenoh.ConsolidationMode.NONE,
-        timeout=timeout,
-        payload=payload,
-        **wire.BLOCK,
-    )
-    return [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]
