@@ -107,7 +107,7 @@ class MemoryTransport(Transport):
         self._hub = settings
         self._inbox: deque[_Delivery] = deque()
         self._changed = threading.Condition(settings.lock)
-        self._attached: int | None = None  # the era of the hub we are connected in
+        self._attached: int | None = None  # the era of the hub we are connected in; None: not connected
         self._stopping = False
         self._thread: threading.Thread | None = None
 
