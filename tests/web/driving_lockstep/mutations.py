@@ -61,10 +61,8 @@ MUTATIONS = {
     ),
     "a stop does not end the gesture": Mutation(
         _DRIVING,
-        "        if lease is not None and lease.tab.live is not None and lease.tab.live_ref == ref:\n"
-        "            self._end_gesture",
-        "        if lease is not None and lease.tab.live is not None and lease.tab.live_ref != ref:\n"
-        "            self._end_gesture",
+        "        self.interrupt(ref, now)\n        return self._final_zero(ref, now)\n",
+        "        return self._final_zero(ref, now)\n",
     ),
     "nobody needs the lease": Mutation(
         _DRIVING,
@@ -81,7 +79,7 @@ MUTATIONS = {
     ),
     "commands are valid for long": Mutation(
         _DRIVING,
-        "y=op.y, valid_ms=pace.valid_ms)",
+        "y=op.y, valid_ms=WIDE.valid_ms)",
         "y=op.y, valid_ms=5000)",
     ),
     "another server's driver is ignored": Mutation(
